@@ -1026,7 +1026,7 @@ MUTANTS = (
         ("io_limits",),
     ),
     Mutant(
-        "cli/limits.py",
+        "cli/process.py",
         "space != resource.RLIM_INFINITY and space < least",
         "space == least - 2",
         "a command begins with too little memory",
@@ -2079,7 +2079,7 @@ MUTANTS = (
         ("join::test_the_stage_makes_one_model_of_two",),
     ),
     Mutant(
-        "checks/validate/lengths.py",
+        "checks/validate/result.py",
         "rms_m=float(np.sqrt(np.mean(errors_m**2))),",
         "rms_m=float(np.mean(np.abs(errors_m))),",
         "the mean of length errors is taken for their root mean square",

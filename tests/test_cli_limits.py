@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from colmap_inertial.cli import limits, main
+from colmap_inertial.cli import main, process
 from colmap_inertial.cli.models import Scale
 from colmap_inertial.core.threads import usable_processors
 
@@ -23,8 +23,8 @@ ARGUMENTS = ("apply", "project", "out", "--factor", "2")
 @pytest.mark.parametrize(
     ("kind", "least"),
     [
-        ("RLIMIT_AS", limits.LEAST_BYTES + limits.THREAD_BYTES * usable_processors()),
-        ("RLIMIT_NOFILE", limits.LEAST_FILES),
+        ("RLIMIT_AS", process.LEAST_BYTES + process.THREAD_BYTES * usable_processors()),
+        ("RLIMIT_NOFILE", process.LEAST_FILES),
     ],
 )
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such limits")

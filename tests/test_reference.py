@@ -13,7 +13,7 @@ from cases import loop_over
 from test_cli import run
 from test_validate_lengths import validated
 
-from colmap_inertial.checks.validate.lengths import LengthCheck
+from colmap_inertial.checks.validate.result import LengthCheck
 from colmap_inertial.cli.terminal import show_reference
 from colmap_inertial.core.errors import InertialError, NotObservableError, TargetNotFoundError
 from colmap_inertial.core.options import ReferenceOptions

@@ -21,10 +21,9 @@ from test_pipeline import DETERMINISTIC, SCENE, copy_scene
 from colmap_inertial.checks.report import figures, signals, write_report
 from colmap_inertial.checks.report.content import _describe_path
 from colmap_inertial.checks.report.figure_3d import nice_length, scene_figure
-from colmap_inertial.checks.report.scene import scene_record
-from colmap_inertial.checks.report.series import rounded, strided, thinned
+from colmap_inertial.checks.report.photogrammetry import scene_record
+from colmap_inertial.checks.report.series import SIZES, rounded, strided, thinned
 from colmap_inertial.checks.report.signals import signal_record
-from colmap_inertial.checks.report.sizes import SIZES
 from colmap_inertial.checks.words import outcome_of_model
 from colmap_inertial.cli import main
 from colmap_inertial.core.errors import FormatError, InertialError, MappingError

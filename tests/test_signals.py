@@ -19,7 +19,7 @@ pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 #: The work is one call that holds Python's handlers off, as COLMAP's do; sqlite3 lets other threads run meanwhile.
 BUSY = textwrap.dedent("""
     import sqlite3, sys
-    from colmap_inertial.cli.signals import answering_signals
+    from colmap_inertial.cli.process import answering_signals
     with answering_signals():
         print("ready", flush=True)
         sqlite3.connect(":memory:").execute(

@@ -7,9 +7,8 @@ import pytest
 from validate_scenes import default_camera, orbit
 
 from colmap_inertial.checks.validate import parse_target
-from colmap_inertial.checks.validate.components import estimate_ratio, normal_equations, restricted_likelihood
 from colmap_inertial.checks.validate.detect import Detection
-from colmap_inertial.checks.validate.fit import fit_scale
+from colmap_inertial.checks.validate.fit import estimate_ratio, fit_scale, normal_equations, restricted_likelihood
 from colmap_inertial.checks.validate.measure import fit_without_outliers
 from colmap_inertial.checks.validate.observations import Placement, linearise, triangulate
 from colmap_inertial.checks.validate.place import observe

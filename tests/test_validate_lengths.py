@@ -15,8 +15,8 @@ from colmap_inertial.checks.validate import (
     with_bars,
     with_other_target,
 )
-from colmap_inertial.checks.validate.lengths import check_lengths, model_diagonal
 from colmap_inertial.checks.validate.markers import distance_between, with_check_points
+from colmap_inertial.checks.validate.result import check_lengths, model_diagonal
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError
 from colmap_inertial.core.geometry import quat_exp, quat_rotate
 from colmap_inertial.core.options import ValidateOptions

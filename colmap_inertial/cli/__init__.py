@@ -19,9 +19,8 @@ from tyro.conf import subcommand
 from colmap_inertial import __version__
 from colmap_inertial.cli.captures import Batch, Deblur, FuseApertures, FuseExposures, Reconstruct, Simulate
 from colmap_inertial.cli.help import options_of, print_help, print_overview
-from colmap_inertial.cli.limits import require_limits
 from colmap_inertial.cli.models import Align, Apply, CalibrateImu, Diagnose, Export, Scale, Validate, View
-from colmap_inertial.cli.signals import INTERRUPTED, TERMINATED, Terminated, answering_signals
+from colmap_inertial.cli.process import INTERRUPTED, TERMINATED, Terminated, answering_signals, require_limits
 from colmap_inertial.cli.speech import Speaker, log_on_terminal, print_json
 from colmap_inertial.core.errors import InertialError, exhausted
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, ReferenceOptions

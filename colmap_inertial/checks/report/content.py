@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from colmap_inertial import __version__
-from colmap_inertial.checks.report.series import strided
-from colmap_inertial.checks.report.sizes import SIZES
+from colmap_inertial.checks.report.series import SIZES, strided
 from colmap_inertial.checks.words import (
     half_width_pct,
     joined_in_words,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from colmap_inertial.checks.report.figures import CAMERA, GOOD, IMU, QUIET, Figure
-from colmap_inertial.checks.report.sizes import SIZES
+from colmap_inertial.checks.report.series import SIZES
 from colmap_inertial.checks.words import digits
 from colmap_inertial.core.arrays import Array
 

@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from colmap_inertial.checks.report import figures, photogrammetry_figures
+from colmap_inertial.checks.report import figures
 from colmap_inertial.checks.report.content import refined_parts
 from colmap_inertial.checks.report.figure_3d import scene_figure
 from colmap_inertial.checks.report.page import render_page
-from colmap_inertial.checks.report.sizes import SIZES
+from colmap_inertial.checks.report.series import SIZES
 from colmap_inertial.checks.words import (
     Fact,
     digits,
@@ -82,7 +82,6 @@ def run_page(content: Content, out: Path) -> str:
         left_out=left_out,
         has_data=has_data,
         figures=figures,
-        survey_figures=photogrammetry_figures,
         rms_of=_rms_of_images,
         z95=Z95,
         **{helper.__name__: helper for helper in helpers},

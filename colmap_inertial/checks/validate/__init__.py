@@ -1,10 +1,11 @@
 """Is a reconstruction the right size? Checked with a target of known size in its images."""
 
-from colmap_inertial.checks.validate.lengths import Corner, Distance
 from colmap_inertial.checks.validate.markers import distance_between, with_bars, with_check_points, with_other_target
 from colmap_inertial.checks.validate.measure import validate_model
 from colmap_inertial.checks.validate.overlays import write_overlays
 from colmap_inertial.checks.validate.result import (
+    Corner,
+    Distance,
     RejectedView,
     SetScale,
     Validation,

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from colmap_inertial.checks.validate.limits import FIT
+from colmap_inertial.checks.validate.fit import FIT
 from colmap_inertial.checks.validate.result import CheckPoint, CheckPoints, ScaleBar, TargetDistance, Validation
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, NotObservableError

@@ -9,18 +9,29 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from colmap_inertial.checks.validate.fit import ScaleFit, fit_scale
-from colmap_inertial.checks.validate.lengths import Corner, Distance, DistanceSet, check_lengths, model_diagonal
-from colmap_inertial.checks.validate.limits import DETECTION, FIT, PLACEMENT
+from colmap_inertial.checks.validate.detect import DETECTION
+from colmap_inertial.checks.validate.fit import FIT, ScaleFit, fit_scale
 from colmap_inertial.checks.validate.observations import Observations, Placement, triangulate
-from colmap_inertial.checks.validate.place import PartPlacement, median_residual_px, observe
+from colmap_inertial.checks.validate.place import (
+    PLACEMENT,
+    PartPlacement,
+    Progress,
+    Search,
+    explain_failure,
+    median_residual_px,
+    observe,
+)
 from colmap_inertial.checks.validate.result import (
+    Corner,
+    Distance,
+    DistanceSet,
     RejectedView,
     SetScale,
     Validation,
     ViewResiduals,
+    check_lengths,
+    model_diagonal,
 )
-from colmap_inertial.checks.validate.search import Progress, Search, explain_failure
 from colmap_inertial.checks.validate.targets import Target
 from colmap_inertial.checks.validate.views import Sighting, load_views
 from colmap_inertial.core.arrays import Array, BoolArray

@@ -4,21 +4,49 @@ Two views that see a part of the target from different places give its corners i
 scale included. Every other view then says whether it agrees. The pair on which most views agree wins, so false
 detections, wrong poses and a second board lose, and of the numberings that a symmetric board allows each view gets the
 one that fits.
+
+:class:`Search` goes through the images and, where there is no result, finds out why.
 """
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
+from colmap_inertial.checks.validate.detect import DETECTION, detect, other_checkerboard
 from colmap_inertial.checks.validate.fit import settle
-from colmap_inertial.checks.validate.limits import DETECTION, PLACEMENT
 from colmap_inertial.checks.validate.observations import Observations, Placement, linearise
 from colmap_inertial.checks.validate.targets import Target
-from colmap_inertial.checks.validate.views import Sighting, View
+from colmap_inertial.checks.validate.views import Sighting, View, sight
 from colmap_inertial.core.arrays import Array
-from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.errors import FormatError, NotObservableError, TargetNotFoundError
+from colmap_inertial.core.options import ValidateOptions
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlacementLimits:
+    """Where a target stands in a model, and which images agree on it."""
+
+    #: Images with the target after which checkerboards are no longer searched thoroughly, and images searched so.
+    enough_views: int = 10
+    most_thorough_views: int = 60
+    #: Smallest share of the images with sightings that must agree. Two boards in view leave half of them.
+    smallest_agreement: float = 0.2
+    #: Pairs of sightings that a place is computed from, and rounds of refining the best.
+    most_pairs: int = 80
+    refinements: int = 5
+    #: Two sightings give a place where their lines of sight meet at this angle.
+    least_parallax_deg: float = 0.5
+    #: Images that are looked at for a mirrored target, and for a board of another size.
+    mirror_views: int = 20
+    hint_views: int = 10
+
+
+PLACEMENT = PlacementLimits()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -270,3 +298,137 @@ def _fit_similarity(source: Array, target: Array) -> Placement | None:
         rotation=rotation[None],
         centre=(mean_t - scale * rotation @ mean_s)[None],
     )
+
+
+Progress = Callable[[int, int], None]
+
+
+class Search:
+    """Looks for the target in the images, and for its place in the model."""
+
+    def __init__(self, views: list[View], target: Target, options: ValidateOptions, progress: Progress | None) -> None:
+        self.views, self.target, self.options = views, target, options
+        self.sightings: list[Sighting] = []
+        self.searched: list[int] = []
+        self.unreadable: dict[int, str] = {}
+        self.parts: dict[int, list[Sighting]] = {}
+        self.one_line: NotObservableError | None = None
+        self._progress = progress
+
+    def run(self, images: Path) -> None:
+        found = 0
+        for done, v in enumerate(_spread_evenly(len(self.views))):
+            if self._progress is not None:
+                self._progress(done, len(self.views))
+            self.searched.append(v)
+            found += self._search_view(v, thorough=False)
+            if found >= self.options.max_views:
+                break
+        if self._progress is not None:
+            self._progress(len(self.views), len(self.views))
+        if len(self.unreadable) == len(self.searched):
+            first = min(self.unreadable)
+            raise FormatError(images / self.views[first].name, self.unreadable[first])
+
+    def look_closer(self, which: list[int]) -> None:
+        """Search these views again, thoroughly; what was found there before is forgotten."""
+        self.sightings = [s for s in self.sightings if s.view not in which]
+        for v in which:
+            self._search_view(v, thorough=True)
+
+    def _search_view(self, v: int, *, thorough: bool) -> bool:
+        image = self.views[v].read()
+        if isinstance(image, str):
+            self.unreadable[v] = image
+            return False
+        found = [sight(v, self.views[v].camera, d) for d in detect(image, self.target, thorough=thorough)]
+        found = [s for s in found if len(s.corner) >= DETECTION.least_corners]
+        self.sightings += found
+        return bool(found)
+
+    def place(self) -> dict[int, PartPlacement]:
+        """Where each part of the target is; parts on which no two views agree are left out."""
+        self.parts, self.one_line = {}, None
+        for s in self.sightings:
+            self.parts.setdefault(s.part, []).append(s)
+        out = {}
+        for part, sightings in sorted(self.parts.items()):
+            try:
+                placed = place_part(
+                    sightings,
+                    self.target,
+                    self.views,
+                    max_residual_px=self.options.max_residual_px,
+                    seed=self.options.seed,
+                )
+            except NotObservableError as error:
+                self.one_line = error
+                continue
+            if placed is not None:
+                out[part] = placed
+        return out
+
+
+def _spread_evenly(count: int) -> list[int]:
+    """0..count-1 in an order that covers the range evenly however early it is cut off (van der Corput)."""
+    bits = max(count - 1, 1).bit_length()
+    reverse = [int(f"{i:0{bits}b}"[::-1], 2) for i in range(2**bits)]
+    return [i for i in reverse if i < count]
+
+
+def explain_failure(search: Search, images: Path) -> Exception:
+    """The error that says why there is no result."""
+    target, views = search.target, search.views
+    seen = sorted({s.view for s in search.sightings})
+    mirrored = _find_mirroring(search)
+    if mirrored is not None:
+        return FormatError(images, f"the images are mirrored {mirrored} against the model: give those it was made from")
+    if not seen:
+        return TargetNotFoundError(
+            f"{target.spec} was not found in any of the {len(search.searched)} images that were searched; "
+            + _hint_at_absence(search)
+        )
+    if len(seen) == 1:
+        return NotObservableError(
+            "scale",
+            f"the target was found in one image only ({views[seen[0]].name}): a length needs it in two images or more, "
+            "taken from different places",
+        )
+    if search.one_line is not None:
+        return search.one_line
+    return TargetNotFoundError(
+        f"{target.spec} was found in {len(seen)} images, but no two of them agree on where it is in the model "
+        f"(to {search.options.max_residual_px:g} px): false detections, wrong poses, a target that moved between the "
+        "images, or images that do not belong to this model"
+    )
+
+
+def _find_mirroring(search: Search) -> str | None:
+    """How the images are mirrored against the model, if that explains them."""
+    for flip, words in ((1, "left to right"), (0, "top to bottom")):
+        again = Search(search.views, search.target, search.options, None)
+        for v in search.searched[: PLACEMENT.mirror_views]:
+            image = search.views[v].read(flip=flip)
+            if isinstance(image, str):
+                continue
+            found = [sight(v, search.views[v].camera, d) for d in detect(image, search.target)]
+            again.sightings += [s for s in found if len(s.corner) >= DETECTION.least_corners]
+        if again.place():
+            return words
+    return None
+
+
+def _hint_at_absence(search: Search) -> str:
+    if search.target.kind != "checkerboard":
+        return "is the description right, and is the target large and sharp enough in the images?"
+    sizes: Counter[tuple[int, int]] = Counter()
+    for v in search.searched[: PLACEMENT.hint_views]:
+        image = search.views[v].read()
+        size = None if isinstance(image, str) else other_checkerboard(image)
+        if size is not None:
+            sizes[max(size), min(size)] += 1
+    if sizes:
+        size = max(sizes, key=sizes.__getitem__)
+        if size != tuple(sorted((search.target.columns, search.target.rows), reverse=True)):
+            return f"a board with {size[0]}x{size[1]} inner corners is visible: is the size in the description right?"
+    return "COLSxROWS counts inner corners, one less than squares; the whole board must be in view, with a white rim"

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from colmap_inertial.checks.validate.detect import Detection
-from colmap_inertial.checks.validate.limits import DETECTION
+from colmap_inertial.checks.validate.detect import DETECTION, Detection
 from colmap_inertial.core.arrays import Array, IndexArray, UInt8Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.io.files import path_in, read_bytes
