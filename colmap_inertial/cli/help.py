@@ -63,32 +63,32 @@ def options_of(cls: type[Any], prefix: str = "", *, with_text: bool = True) -> l
 
     Without their texts it takes a quarter of the time: texts are read from the sources.
     """
-    found: list[Option] = []
-    hints, words = get_type_hints(cls, include_extras=True), _read_texts(cls) if with_text else {}
+    options: list[Option] = []
+    hints, texts = get_type_hints(cls, include_extras=True), _read_texts(cls) if with_text else {}
     for f in dataclasses.fields(cls):
         hint = hints[f.name]
         kind, *settings = get_args(hint) if get_origin(hint) is Annotated else (hint,)
         named = [setting.name for setting in settings if getattr(setting, "name", None) is not None]
         name = named[0] if named else f.name.replace("_", "-")
         if isinstance(kind, type) and dataclasses.is_dataclass(kind):
-            found += options_of(kind, f"{prefix}{name}." if name else prefix, with_text=with_text)
+            options += options_of(kind, f"{prefix}{name}." if name else prefix, with_text=with_text)
             continue
         positional = any("POSITIONAL" in str(setting).upper() for setting in settings)
         default = f.default if f.default_factory is dataclasses.MISSING else f.default_factory()
-        found.append(
+        options.append(
             Option(
                 names=(f.name.upper(),) if positional else _spell_names(kind, prefix, name, default),
                 group=prefix.rstrip("."),
                 field=f.name,
                 value="" if positional else _describe_value(kind, name),
-                text=words.get(f.name, ""),
-                default=_describe_default(default, words.get(f.name, "")),
+                text=texts.get(f.name, ""),
+                default=_describe_default(default, texts.get(f.name, "")),
                 positional=positional,
                 required=default is dataclasses.MISSING,
-                source=next(one for one in reversed(cls.__mro__) if f.name in vars(one).get("__annotations__", ())),
+                source=next(kind for kind in reversed(cls.__mro__) if f.name in vars(kind).get("__annotations__", ())),
             )
         )
-    return found
+    return options
 
 
 def _spell_names(kind: Any, prefix: str, name: str, default: object) -> tuple[str, ...]:
@@ -101,21 +101,21 @@ def _spell_names(kind: Any, prefix: str, name: str, default: object) -> tuple[st
 def _list_types(kind: Any) -> tuple[Any, ...]:
     """The types that a value may have, ``None`` left out."""
     if get_origin(kind) in (Union, UnionType):
-        return tuple(inner for one in get_args(kind) if one is not NoneType for inner in _list_types(one))
+        return tuple(inner for part in get_args(kind) if part is not NoneType for inner in _list_types(part))
     return (kind,)
 
 
 def _describe_value(kind: Any, name: str) -> str:
-    (one,) = _list_types(kind)
-    if one is bool:
+    (single_type,) = _list_types(kind)
+    if single_type is bool:
         return ""
-    if get_origin(one) is Literal:
-        return "{" + ",".join(map(str, get_args(one))) + "}"
-    if get_origin(one) is tuple:
-        inner = get_args(one)
+    if get_origin(single_type) is Literal:
+        return "{" + ",".join(map(str, get_args(single_type))) + "}"
+    if get_origin(single_type) is tuple:
+        inner = get_args(single_type)
         single = _describe_value(inner[0], name)
         return f"{single} ..." if len(inner) == 2 and inner[1] is Ellipsis else " ".join([single] * len(inner))
-    return _BY_NAME.get(name, _VALUES[one])
+    return _BY_NAME.get(name, _VALUES[single_type])
 
 
 def _describe_default(default: object, text: str) -> str:
@@ -129,17 +129,15 @@ def _describe_default(default: object, text: str) -> str:
 
 def _read_texts(cls: type[Any]) -> dict[str, str]:
     """The text below each field of a class and of those that it is made of."""
-    found: dict[str, str] = {}
-    for one in reversed(cls.__mro__):
-        if not dataclasses.is_dataclass(one):
-            continue
-        (tree,) = ast.parse(textwrap.dedent(inspect.getsource(one))).body
+    texts: dict[str, str] = {}
+    for base in filter(dataclasses.is_dataclass, reversed(cls.__mro__)):
+        (tree,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
         assert isinstance(tree, ast.ClassDef)
         for field, text in zip(tree.body, tree.body[1:], strict=False):
             match field, text:
                 case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(words))):
-                    found[name] = " ".join(words.split())
-    return found
+                    texts[name] = " ".join(words.split())
+    return texts
 
 
 def print_help(
@@ -159,25 +157,42 @@ def print_help(
         The class with the options of all commands, which come last.
     """
     page = _Page()
-    options = options_of(cls)
-    arguments = [option for option in options if option.positional]
-    rest = [option for option in options if not option.positional]
-    page.line(f"usage: colmap-inertial {name} {' '.join(a.names[0] for a in arguments)} [OPTIONS]".replace("  ", " "))
+    sections = _sort_into_sections(options_of(cls), common, titles, everywhere)
+    arguments = "".join(f" {argument.names[0]}" for argument in sections[_ARGUMENTS])
+    page.line(f"usage: colmap-inertial {name}{arguments} [OPTIONS]")
     for paragraph in inspect.cleandoc(cls.__doc__ or "").split("\n\n"):
         page.paragraph(paragraph)
-    page.group("Arguments", arguments)
-    first = [o for wanted in common for o in rest if o.field == wanted and not o.group]
-    first = [o for o in rest if o.required and o not in first] + first
-    page.group("Options", first)
-    left = [option for option in rest if option not in first]
-    own = [o for o in left if not o.group and o.source not in (*titles, everywhere)]
-    page.group("Less common" if first else "Options", own)
-    for kind, title in titles.items():
-        page.group(title, [o for o in left if not o.group and o.source is kind])
-    page.group("Of every command", [o for o in left if o.source is everywhere], more=[("-h, --help", "This page.")])
-    groups = dict.fromkeys(o.group for o in left if o.group)
-    for group in sorted(groups, key=lambda group: group in _LAST):
-        page.group(_TITLES.get(group, group.capitalize()), [o for o in left if o.group == group])
+    for title, options in sections.items():
+        page.group(title, options, more=[("-h, --help", "This page.")] if title == _EVERYWHERE else ())
+
+
+_ARGUMENTS, _OPTIONS, _REST, _EVERYWHERE = "Arguments", "Options", "Less common", "Of every command"
+
+
+def _sort_into_sections(
+    options: Sequence[Option], common: Sequence[str], titles: Mapping[type[Any], str], everywhere: type[Any]
+) -> dict[str, list[Option]]:
+    """The options of a page by the titles of its sections, both in the order in which they are shown."""
+    plain = [option for option in options if not option.positional and not option.group]
+    first = [option for wanted in common for option in plain if option.field == wanted]
+    first = [option for option in plain if option.required and option not in first] + first
+
+    def choose_title(option: Option) -> str:
+        if option.positional:
+            return _ARGUMENTS
+        if option.group:
+            return _TITLES.get(option.group, option.group.capitalize())
+        if option in first:
+            return _OPTIONS
+        rest = _REST if first else _OPTIONS
+        return _EVERYWHERE if option.source is everywhere else titles.get(option.source, rest)
+
+    order = (_ARGUMENTS, _OPTIONS, _REST, *titles.values(), _EVERYWHERE)
+    sections: dict[str, list[Option]] = {title: [] for title in order}
+    others = sorted((option for option in options if option not in first), key=lambda option: option.group in _LAST)
+    for option in (*first, *others):
+        sections.setdefault(choose_title(option), []).append(option)
+    return sections
 
 
 #: Titles of groups by what stands in front of their options; and those that fewest people need.

@@ -161,17 +161,8 @@ def _measure(
     ]
     everything, start = _observe_parts(search, placed, sightings)
     obs, fit, dropped = fit_without_outliers(everything, start)
-    half = fit.half_width_log()
-    if not half < np.log(FIT.widest_factor):
-        raise NotObservableError(
-            "scale",
-            f"{len(np.unique(obs.view))} views of the target lie too close together or agree too badly; "
-            "more views from different sides are needed",
-            sigma=min(fit.sigma_log, 9.99),
-        )
     of_target = 0.0 if target.sigma_m is None else Z95 * target.sigma_m / target.length_m
-    half = float(np.hypot(half, of_target)) if of_target else half
-    log_scale = fit.placement.log_scale
+    log_scale, half = fit.placement.log_scale, _widen(_require_narrow(obs, fit), of_target)
     seen = np.zeros(len(target.part), dtype=bool)
     seen[obs.corner] = True
     control_corner = target.control(seen)
@@ -186,16 +177,15 @@ def _measure(
     view_results = _collect_views(search, sightings, obs, fit, everything)
     position = _triangulate_corners(target, obs, fit)
     distances = _measure_distances(target, position, control_corner, to_metres)
-    corners = tuple(
-        Corner(name=target.label(i), in_model=position[i] + search.views[0].origin_in_model)
-        for i in np.flatnonzero(np.isfinite(position[:, 0])).tolist()
-    )
+    measured = np.flatnonzero(np.isfinite(position[:, 0])).tolist()
+    origin = search.views[0].origin_in_model
+    corners = tuple(Corner(name=target.label(i), in_model=position[i] + origin) for i in measured)
     return Validation(
         target=target,
         unscaled=options.unscaled,
         tolerance_pct=options.tolerance_pct,
-        scale_error_pct=None if options.unscaled else _per_cent(log_scale),
-        ci95_pct=None if options.unscaled else (_per_cent(log_scale - half), _per_cent(log_scale + half)),
+        scale_error_pct=None if options.unscaled else _to_per_cent(log_scale),
+        ci95_pct=None if options.unscaled else (_to_per_cent(log_scale - half), _to_per_cent(log_scale + half)),
         metres_per_unit=float(np.exp(-log_scale)),
         metres_per_unit_ci95=(float(np.exp(-log_scale - half)), float(np.exp(-log_scale + half))),
         views_used=len(view_results),
@@ -218,6 +208,29 @@ def _measure(
     )
 
 
+def _require_narrow(obs: Observations, fit: ScaleFit) -> float:
+    """Half the 95 % interval of the scale's logarithm, where that is narrow enough for a result.
+
+    Raises
+    ------
+    NotObservableError
+    """
+    half = fit.half_width_log()
+    if not half < np.log(FIT.widest_factor):
+        raise NotObservableError(
+            "scale",
+            f"{len(np.unique(obs.view))} views of the target lie too close together or agree too badly; "
+            "more views from different sides are needed",
+            sigma=min(fit.sigma_log, 9.99),
+        )
+    return half
+
+
+def _widen(half: float, of_target: float) -> float:
+    """The half width with that of the target's own length in it."""
+    return float(np.hypot(half, of_target)) if of_target else half
+
+
 def _observe_parts(
     search: Search, placed: dict[int, PartPlacement], sightings: list[tuple[Sighting, int, int]]
 ) -> tuple[Observations, Placement]:
@@ -225,9 +238,9 @@ def _observe_parts(
     seen, numbering, parts = (list(column) for column in zip(*sightings, strict=True))
     at = [placed[part].placement for part in sorted(placed)]
     start = Placement(
-        log_scale=float(np.median([one.log_scale for one in at])),
-        rotation=np.concatenate([one.rotation for one in at]),
-        centre=np.concatenate([one.centre for one in at]),
+        log_scale=float(np.median([placement.log_scale for placement in at])),
+        rotation=np.concatenate([placement.rotation for placement in at]),
+        centre=np.concatenate([placement.centre for placement in at]),
     )
     return observe(seen, numbering, parts, search.target, search.views), start
 
@@ -241,10 +254,10 @@ def _compare_sets(
     difference = check[0].placement.log_scale - control[0].placement.log_scale
     # the two share the poses' errors, which this counts twice
     both = float(np.hypot(check[0].half_width_log(), control[0].half_width_log()))
-    return _per_cent(difference), (_per_cent(difference - both), _per_cent(difference + both))
+    return _to_per_cent(difference), (_to_per_cent(difference - both), _to_per_cent(difference + both))
 
 
-def _per_cent(log: float) -> float:
+def _to_per_cent(log: float) -> float:
     return 100 * float(np.expm1(log))
 
 
@@ -311,8 +324,7 @@ def _make_set_scale(of: tuple[ScaleFit, int] | None, of_target: float) -> SetSca
     if of is None:
         return None
     fit, corners = of
-    log, half = fit.placement.log_scale, fit.half_width_log()
-    half = float(np.hypot(half, of_target)) if of_target else half
+    log, half = fit.placement.log_scale, _widen(fit.half_width_log(), of_target)
     return SetScale(
         metres_per_unit=float(np.exp(-log)),
         ci95=(float(np.exp(-log - half)), float(np.exp(-log + half))),

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -18,6 +18,7 @@ from colmap_inertial.checks.validate.fit import FIT
 from colmap_inertial.checks.validate.targets import Target
 from colmap_inertial.checks.words import target_facts
 from colmap_inertial.core.arrays import Array, IndexArray
+from colmap_inertial.io.files import as_plain
 
 if TYPE_CHECKING:
     from rich.console import Group
@@ -391,24 +392,15 @@ class Validation:
     def as_json(self) -> dict[str, Any]:
         """Everything but pixel coordinates, ready for ``json.dump``."""
 
-        kept = {field.name: getattr(self, field.name) for field in fields(self)}
-        kept["target"] = self.target.spec
-        kept["views"] = [{"name": v.name, "corners": len(v.corner), "rms_px": v.rms_px} for v in self.views]
-        found: dict[str, Any] = {}
-        for name, value in kept.items():
-            found[name] = _to_json(value)
-            if name == "tolerance_pct":
-                found["within_tolerance"] = self.within_tolerance
-        return found
-
-
-def _to_json(value: Any) -> Any:
-    """JSON's types: tuples become lists, arrays their numbers, and values of ours objects."""
-    if is_dataclass(value):
-        return {field.name: _to_json(getattr(value, field.name)) for field in fields(value)}
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    return [_to_json(one) for one in value] if isinstance(value, (tuple, list)) else value
+        values: dict[str, Any] = {}
+        for field in fields(self):
+            values[field.name] = getattr(self, field.name)
+            if field.name == "tolerance_pct":
+                values["within_tolerance"] = self.within_tolerance
+        values["target"] = self.target.spec
+        values["views"] = [{"name": v.name, "corners": len(v.corner), "rms_px": v.rms_px} for v in self.views]
+        json: dict[str, Any] = as_plain(values)
+        return json
 
 
 def validation_table(result: Validation) -> Group:
