@@ -426,7 +426,7 @@ def test_the_screen_says_the_layout_in_a_line(workspace, capsys):
     model = ModelResult(index=0, colmap_index=0, scale=refused, summary=summary, sparse=workspace.colmap_sparse / "0")
     show_result(ReconstructResult(workspace=workspace, models=(model,), seconds={}), Path("capture"))
     said = capsys.readouterr().out.splitlines()[-2]
-    assert said == f"no scale is accepted, so that nothing here is in metres: COLMAP's own is {model.sparse}"
+    assert said == f"no scale was accepted, so nothing here is in metres; COLMAP's own model: {model.sparse}"
     for folder in (workspace.images, workspace.sparse):
         folder.mkdir(parents=True)
     metric = ModelResult(**{**vars(model), "sparse_metric": workspace.sparse / "0"})
@@ -451,9 +451,10 @@ def test_the_screen_and_the_report_say_how_a_model_was_made(workspace, capsys):
     apart = ModelEnds(model=1, pairs=9, images=("c.jpg", "d.jpg"), agree=0.31, joined=False)
     other = ModelEnds(model=0, pairs=5, images=("e.jpg", "f.jpg"), agree=0.9, joined=True)
     said = {
-        (joined, other): "Its ends that meet (a.jpg and b.jpg, 12 pairs of images) were joined.",
-        (apart,): "Its ends that meet (c.jpg and d.jpg, 9 pairs of images) do not fit and stay apart (31 % of their "
-        "matches agree).",
+        (joined, other): "The loop (a.jpg and b.jpg, 12 pairs of images) was closed.",
+        (
+            apart,
+        ): "The loop (c.jpg and d.jpg, 9 pairs of images) does not fit and stays open (31 % of its matches agree).",
         (): "",
     }
     for ends, expected in said.items():

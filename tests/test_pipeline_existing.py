@@ -318,7 +318,7 @@ def test_the_model_of_a_refused_project_is_found_from_anywhere(box, tmp_path, mo
     assert len(scene.cameras) == result.models[0].summary["registered_images"]
     assert scene.image_of(0) == box.root / "images" / scene.cameras.names[0]
     page = (out / "report.html").read_text()
-    assert "could not be brought together" not in page
+    assert "could not be aligned" not in page
     assert "cannot be used as it is" in page
 
 

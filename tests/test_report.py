@@ -195,7 +195,7 @@ def test_a_refused_scale_has_no_number_and_says_what_to_do(tmp_path):
     ("gone", "anchor", "said"),
     [
         ("diagnosis.json", "findings", "was not looked at beforehand"),
-        ("report_data/model_0.json", "scene", "was not kept"),
+        ("report_data/model_0.json", "scene", "were not kept"),
         ("report_data/recording.json", "shutter", "Nothing was done about a rolling shutter"),
     ],
 )
@@ -277,7 +277,7 @@ def test_parts_of_the_recording_are_judged_as_the_estimator_judges_them(full, tm
         part["sigma_log"] = 1e4
     content, page = report_of_changed(out, result)
     assert "too uncertain to tell" in page.text
-    assert f"{len(drift['parts']) - 1} of {len(drift['parts'])} parts tell no scale" in page.text
+    assert f"{len(drift['parts']) - 1} of {len(drift['parts'])} parts do not determine a scale" in page.text
     figure = figures.drift(content["models"][0])
     assert len(figure["data"][0]["x"]) == 1
     part = drift["parts"][0]
@@ -537,7 +537,7 @@ def test_a_recording_that_cannot_be_used_is_not_said_to_disagree_with_the_pictur
     result = json.loads((out / "result.json").read_text(encoding="utf-8"))
     result["models"][0] |= {**estimate.as_json(), "excitation_m_s2": 0.5, "validation": None}
     _, page = report_of_changed(out, result)
-    assert "could not be brought together" not in page.text
+    assert "could not be aligned" not in page.text
     assert "cannot be used as it is" in page.text
     assert "camera acceleration" not in page.text  # which would be of the scale that was refused
     assert "COLMAP's own model (colmap/sparse/0) is complete" in page.text
@@ -735,7 +735,7 @@ def test_an_existing_project_gets_one_with_and_without_a_scale(project, tmp_path
     content, page = json.loads((tmp_path / "none" / "report.json").read_text()), Page(tmp_path / "none" / "report.html")
     assert refused.models[0].scale.verdict == content["outcome"]["verdict"] == "refused"
     assert content["models"][0]["signals"]["rotation"]["after"] is None
-    assert "could not be brought together" in page.text
+    assert "could not be aligned" in page.text
 
 
 def test_a_long_path_is_said_to_bend_and_a_refined_one_how_much_it_did():
@@ -743,9 +743,13 @@ def test_a_long_path_is_said_to_bend_and_a_refined_one_how_much_it_did():
     left = {"stage": "refine", "action": "", "values": {}}
     for treatments, length, said in (
         ([], 12.0, []),
-        ([], 85.2, ["Its path is 85 m long: --refine inertial fits the IMU to it, too, against bends and drift."]),
+        (
+            [],
+            85.2,
+            ["The camera path is 85 m long: --refine inertial fits it to the IMU, against bending and drift."],
+        ),
         ([left], 85.2, []),
-        ([done], 12.0, ["The IMU took drift out of its path: parts of it were stretched by -0.31 to +0.20 %."]),
+        ([done], 12.0, ["The refinement corrected drift of the path: parts of it were stretched by -0.31 to +0.20 %."]),
     ):
         model = {"treatments": treatments, "sparse_metric": "sparse/0", "scene": {"path_length": length}}
         assert _describe_path(model) == said

@@ -270,16 +270,16 @@ def test_the_last_screen_begins_with_metres_and_ends_with_the_next_command(made,
 def test_a_refused_scale_ends_with_what_to_look_at(still, tmp_path, capsys):
     args = ["--imu", still.imu, "--frame-times", still.frame_times]
     code, out, err = run(capsys, "reconstruct", still.model, tmp_path / "out", *args)
-    assert code == 3 and "no metres: the recording does not tell how large things are" in " ".join(out.split())
+    assert code == 3 and "no metres: the recording does not determine the scale" in " ".join(out.split())
     assert out.splitlines()[-1] == f"next: colmap-inertial diagnose {still.model}"
-    assert err.splitlines()[-1] == "error: no scale is accepted, for the reasons above"
+    assert err.splitlines()[-1] == "error: no scale was accepted, for the reasons above"
     assert err.count("(no-motion)") == 1
 
 
 @pytest.mark.parametrize(
     ("checked", "words"),
     [
-        (("gyroscope", "accelerometer", "frame times"), "whether camera and gyroscope belong together"),
+        (("gyroscope", "accelerometer", "frame times"), "whether camera and gyroscope match"),
         (("gyroscope", "frame times", "pictures"), "gravity and scale (no accelerometer)"),
         (("gyroscope", "accelerometer", "frame times", "pictures"), ""),
     ],

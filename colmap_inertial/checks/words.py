@@ -19,8 +19,8 @@ _LITTLE_M_S2, _USUAL = 0.3, "0.5 to 2 m/s²"
 
 _MOVE = (
     "Film again, and move the camera itself: swing it by 20 cm or more, to and fro and up and down, about once a "
-    "second, all through the recording, for 10 s or longer. Rotating on the spot, a tripod, or gliding at constant "
-    "speed tells nothing."
+    "second, all through the recording, for 10 s or longer. Rotation on the spot, a tripod, or motion at constant "
+    "speed does not determine the scale."
 )
 _RAW = (
     "Record the raw gyroscope and accelerometer (with gravity), from before the first frame to after the last, with "
@@ -30,7 +30,7 @@ _TARGET = (
     "To be independent of motion, put a printed board into the scene and name it in capture.toml ([target]), or give "
     "metres by a length you measured: reconstruct OUT/colmap NEW_FOLDER --scale-from distance, or --scale-from target."
 )
-_CHECK = "Look into what the reasons name; until then, check lengths against one that you know."
+_CHECK = "Resolve the reasons above; until then, check the model against a known length before you measure in it."
 
 
 def digits(value: float, count: int = 4) -> str:
@@ -58,7 +58,7 @@ def length_error(pct: float) -> str:
 
 
 def length_in_words(verdict: str, pct: float) -> str:
-    """What the half-width of a scale's interval means for a length of ten metres."""
+    """The error of a length of ten metres, by the half-width of the scale's interval."""
     if verdict == "trusted":
         return f"lengths of 10 m are right to within {length_error(pct)}"
     return (
@@ -126,7 +126,7 @@ def target_facts(found: Mapping[str, Any]) -> Iterator[Fact]:
     points = found.get("check_points")
     if points is not None:
         level_mm, up_mm = 1000 * points["rmse_horizontal_m"], 1000 * points["rmse_vertical_m"]
-        yield f"{len(points['points'])} check points", f"RMSE {level_mm:.3g} mm level, {up_mm:.3g} mm upwards"
+        yield f"{len(points['points'])} check points", f"RMSE {level_mm:.3g} mm horizontal, {up_mm:.3g} mm vertical"
 
 
 def place_facts(place: Mapping[str, Any] | None) -> Iterator[Fact]:
@@ -158,7 +158,7 @@ def joined_in_words(models: Collection[int], gaps: Sequence[Mapping[str, Any]]) 
 
 
 def not_checked(checked: Collection[str]) -> str:
-    """What a check beforehand had nothing to look at, where that leaves a doubt; empty otherwise."""
+    """What the check of a recording had no data for, where that matters; empty otherwise."""
     if "gyroscope" not in checked:
         return ""
     sentences = []
@@ -166,11 +166,10 @@ def not_checked(checked: Collection[str]) -> str:
         sentences.append("gravity and scale (no accelerometer)")
     if not {"pictures", "pictures far apart", "poses"} & set(checked):
         sentences.append(
-            "whether camera and gyroscope belong together, their axes, unit and clocks (no poses, and no pictures that "
-            "show enough of the same)"
+            "whether camera and gyroscope match: axes, unit and clocks (no poses, and no images that overlap enough)"
         )
     elif "pictures far apart" in checked:
-        sentences.append("stabilisation and focal length (the pictures are too far apart in time)")
+        sentences.append("stabilisation and focal length (the images are too far apart in time)")
     return "; ".join(sentences)
 
 
@@ -193,8 +192,8 @@ def mapped_in_words(mapping: dict[str, Any] | None, colmap_index: int | None) ->
     for closure in [] if mapping is None else mapping["ends"]:
         if closure["model"] == colmap_index:
             agree = f"{100 * closure['agree']:.0f} %"
-            done = "were joined" if closure["joined"] else f"do not fit and stay apart ({agree} of their matches agree)"
-            sentences.append(f"Its ends that meet ({_describe_overlap(closure)}) {done}.")
+            done = "was closed" if closure["joined"] else f"does not fit and stays open ({agree} of its matches agree)"
+            sentences.append(f"The loop ({_describe_overlap(closure)}) {done}.")
     return sentences
 
 
@@ -220,10 +219,10 @@ def outcome_of_model(model: dict[str, Any]) -> dict[str, Any]:
     todo = []
     if verdict == "trusted":
         headline = "The scale can be trusted"
-        summary.append(f"In the metric model, which stands upright, {length_in_words(verdict, pct)}.")
+        summary.append(f"In the metric model, which is aligned with gravity, {length_in_words(verdict, pct)}.")
     else:
         headline = "The scale is rough"
-        summary.append(f"In the metric model, which stands upright, {length_in_words(verdict, pct)}.")
+        summary.append(f"In the metric model, which is aligned with gravity, {length_in_words(verdict, pct)}.")
         # livelier motion narrows the interval; it mends nothing else
         todo = [_MOVE if pct > 100 * TRUSTED_HALF_WIDTH else _CHECK]
         todo += [] if model.get("validation") else [_TARGET]
@@ -241,7 +240,7 @@ def outcome_of_model(model: dict[str, Any]) -> dict[str, Any]:
 
 
 def _refused(model: dict[str, Any]) -> dict[str, Any]:
-    summary = ["The recording does not tell how large things are, so no number is given rather than a wrong one."]
+    summary = ["The recording does not determine the scale, so no number is given rather than a wrong one."]
     todo = [_MOVE, _RAW, _TARGET]
     signals = model.get("signals", {})
     # by the accelerometer: what the camera shows has no unit without a scale
@@ -251,20 +250,18 @@ def _refused(model: dict[str, Any]) -> dict[str, Any]:
         todo = [_RAW, _TARGET]
     elif signals.get("alignment") == "failed":
         summary.append(
-            "Camera and IMU could not be brought together: check the reasons and the two curves of rotation below, "
-            "which should look the same."
+            "Camera and IMU could not be aligned: check the reasons and the two curves of rotation below, which should "
+            "look the same."
         )
         todo = [_RAW, _MOVE, _TARGET]
     elif accel_m_s2 is not None and accel_m_s2 < _LITTLE_M_S2:
         summary.append(
             f"The device hardly sped up or slowed down: its accelerometer measured {digits(accel_m_s2, 2)} m/s² beside "
-            f"gravity, where filming by hand usually has {_USUAL}. It measures no speed, so there was nothing to "
-            "compare with the images."
+            f"gravity, where filming by hand usually has {_USUAL}. Motion at constant speed leaves no trace in "
+            "an accelerometer, so there was nothing to compare with the images."
         )
         todo = [_MOVE, _TARGET]
-    summary.append(
-        f"COLMAP's own model ({model['sparse']}) is complete: its shape is not affected, only its size is unknown."
-    )
+    summary.append(f"COLMAP's own model ({model['sparse']}) is complete: only its size is unknown.")
     return {"verdict": "refused", "headline": "No scale could be found", "summary": summary, "todo": todo}
 
 
@@ -274,5 +271,5 @@ def outcome_of_stop(reason: str, *, findings: bool) -> dict[str, Any]:
         "verdict": "stopped",
         "headline": "Stopped before there was a scale",
         "summary": [reason[:1].upper() + reason[1:]],
-        "todo": ["What was found in the recording is listed below, each with what to do about it."] if findings else [],
+        "todo": ["The findings are listed below, each with what to do about it."] if findings else [],
     }

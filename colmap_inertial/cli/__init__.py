@@ -25,9 +25,9 @@ from colmap_inertial.cli.speech import Speaker, log_on_terminal, print_json
 from colmap_inertial.core.errors import InertialError, exhausted
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, ReferenceOptions
 
-DESCRIPTION = """Metric, gravity-aligned COLMAP models from the gyroscope and accelerometer that filmed along.
+DESCRIPTION = """Metric, gravity-aligned COLMAP models from the gyroscope and accelerometer recorded beside the images.
 
-Begin with `colmap-inertial diagnose CAPTURE`, which says in a minute what a recording can give; then `colmap-inertial
+Begin with `colmap-inertial diagnose CAPTURE`, which checks a recording within a minute; then `colmap-inertial
 reconstruct CAPTURE OUT`.
 
 Exit codes: 0 done (also where there was nothing to do), 1 a check failed, 2 bad input, 3 not observable (scale
@@ -43,7 +43,7 @@ _GROUPS: dict[str, dict[str, type[Speaker]]] = {
     "From a recording to metres": {"diagnose": Diagnose, "reconstruct": Reconstruct, "batch": Batch},
     "With a model that exists": {"scale": Scale, "apply": Apply, "validate": Validate, "view": View, "export": Export},
     "Calibrate a device": {"align": Align, "calibrate-imu": CalibrateImu},
-    "Pictures alone": {"deblur": Deblur, "fuse-apertures": FuseApertures, "fuse-exposures": FuseExposures},
+    "Images only": {"deblur": Deblur, "fuse-apertures": FuseApertures, "fuse-exposures": FuseExposures},
     "Practise": {"simulate": Simulate},
 }
 _COMMANDS: dict[str, type[Speaker]] = {name: cls for group in _GROUPS.values() for name, cls in group.items()}

@@ -13,8 +13,8 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from colmap_inertial.cli.screen import Screen
-from colmap_inertial.cli.speech import Reader, Speaker
-from colmap_inertial.cli.terminal import show_deblurred, show_fused, show_reference, show_remembered, show_result
+from colmap_inertial.cli.speech import ConfiguredCommand, DeviceCommand, Reader
+from colmap_inertial.cli.terminal import show_deblurred, show_fused, show_reference, show_result
 from colmap_inertial.core.errors import InertialError
 from colmap_inertial.core.options import (
     ApertureOptions,
@@ -23,20 +23,18 @@ from colmap_inertial.core.options import (
     ExposureOptions,
     FuseAperturesOptions,
     ProjectOptions,
-    ReadLimits,
-    ReconstructOptions,
     ReferenceOptions,
 )
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reconstruct(Speaker):
+class Reconstruct(DeviceCommand, ConfiguredCommand):
     """Turn images or video with an IMU recording into a COLMAP model in metres, gravity along an axis.
 
     OUT is a COLMAP project in metres: OUT/images, OUT/sparse, and with --dense OUT/dense; beside it are
     OUT/trajectory.tum, OUT/report.html and OUT/result.json. What COLMAP saw and made, in its own units, is in
     OUT/colmap. Without an accepted scale there is no OUT/sparse. Started again after an interruption, or with other
-    options, it makes only what is not there yet or depends on them.
+    options, it runs only the steps that are missing or depend on them.
 
     CAPTURE may be an existing COLMAP project: give --imu, and when its images were taken. Nothing is mapped again, and
     OUT is all of the project in metres. Without an IMU --scale-from takes the metres from a target or a known distance:
@@ -47,41 +45,26 @@ class Reconstruct(Speaker):
 
     capture: Positional[Path]
     """A capture.toml or a folder that holds one; a video or a recorder's folder with the IMU in it (GoPro, phones); an
-    EuRoC/ASL dataset; or a COLMAP project. With --scale-from target or distance also pictures or a video without."""
+    EuRoC/ASL dataset; or a COLMAP project. With --scale-from target or distance also images or a video without
+    IMU."""
     out: Positional[Path]
-    """A new folder for everything that is made, or that of an earlier run on the same capture, which is continued."""
+    """A new folder for the results, or that of an earlier run on the same capture, which is continued."""
     project: Annotated[ProjectOptions, arg(name="")] = dataclasses.field(default_factory=ProjectOptions)
     reference: Annotated[ReferenceOptions, arg(name="")] = dataclasses.field(default_factory=ReferenceOptions)
-    options: Annotated[ReconstructOptions, arg(name="")] = dataclasses.field(default_factory=ReconstructOptions)
-    device: str | None = None
-    """Name of the device, under which calibrations were remembered (default: what the recording says)."""
-    remembered: bool = True
-    """Take what `align` and `calibrate-imu` remembered of the device, where neither --calibration nor the capture says
-    it; never with --deterministic."""
-    config: Path | None = None
-    """TOML file with options, as OUT/config.toml of an earlier run; options given here override it."""
-
-    @property
-    def limits(self) -> ReadLimits:
-        """How large a file may be that is read."""
-        return self.options.limits
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
         from colmap_inertial.checks.diagnose import Diagnosis
         from colmap_inertial.reconstruction.drivers.capture import reconstruct
-        from colmap_inertial.reconstruction.drivers.device_store import remembered_of
         from colmap_inertial.reconstruction.drivers.project import is_project, reconstruct_project
 
         self.check_json(self.capture, self.project.imu, self.project.frame_times)
         if self.reference.scale_from != "imu":
             return self._by_reference()
         options = self.options
-        if self.remembered and not options.deterministic:
-            known = remembered_of(self.project.imu or self.capture, options.calibration, device=self.device)
-            if self.talks:
-                show_remembered(known)
-            options = dataclasses.replace(options, calibration=(*options.calibration, *known.paths))
+        if not options.deterministic:
+            calibration = self.add_remembered(options.calibration, self.project.imu or self.capture)
+            options = dataclasses.replace(options, calibration=calibration)
         with self.progress() as screen:
 
             def findings(diagnosis: Diagnosis) -> None:
@@ -106,7 +89,7 @@ class Reconstruct(Speaker):
         if stopped is not None:
             shown_above = self.talks and code == 3
             print(
-                f"error: {'no scale is accepted, for the reasons above' if shown_above else stopped}", file=sys.stderr
+                f"error: {'no scale was accepted, for the reasons above' if shown_above else stopped}", file=sys.stderr
             )
         return code
 
@@ -136,9 +119,9 @@ class Deblur(Reader):
     """
 
     capture: Positional[Path]
-    """A capture.toml, a folder that holds one, or an EuRoC/ASL dataset; it must know the exposure times."""
+    """A capture.toml, a folder that holds one, or an EuRoC/ASL dataset; with exposure times."""
     out: Positional[Path]
-    """A new folder for everything that is made, or that of an earlier run on the same capture, which is continued."""
+    """A new folder for the results, or that of an earlier run on the same capture, which is continued."""
     method: BlurRemover = "wiener"
     """wiener: a Wiener filter along the path of each pixel. path: along the same path, a filter that expects few and
     strong edges (slower). deepgyro: a network, which also sees what a filter makes of the picture (slower;
@@ -255,7 +238,7 @@ class FuseExposures(Fuser):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Batch(Speaker):
+class Batch(ConfiguredCommand):
     """Reconstruct many captures, each in a process of its own; one that fails does not stop the rest.
 
     MANIFEST is a TOML file with a [[capture]] table for each: path (from the manifest's folder), and optionally name,
@@ -274,14 +257,8 @@ class Batch(Speaker):
     batch: Annotated[BatchOptions, arg(name="")] = dataclasses.field(default_factory=BatchOptions)
     allow_stages: bool = False
     """Import and run the stages that the manifest names: they are code that its author chose."""
-    options: Annotated[ReconstructOptions, arg(name="")] = dataclasses.field(default_factory=ReconstructOptions)
     config: Path | None = None
     """TOML file with options for all captures; options given here override it, the manifest's override both."""
-
-    @property
-    def limits(self) -> ReadLimits:
-        """How large a file may be that is read."""
-        return self.options.limits
 
     def run(self) -> int:
         """Run the command; returns the exit code."""

@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from colmap_inertial.cli.speech import Reader
+from colmap_inertial.cli.speech import DeviceCommand, Reader
 from colmap_inertial.cli.terminal import (
     show_applied,
     show_calibration,
     show_diagnosis,
     show_exported,
     show_imu_calibration,
-    show_remembered,
     show_scale,
     show_validation,
     show_view,
@@ -58,21 +57,17 @@ class SourceReader(Reader):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scale(SourceReader):
+class Scale(DeviceCommand, SourceReader):
     """Metres per unit of an existing model or trajectory, without mapping.
 
     SOURCE is a COLMAP model folder (needs --imu and --frame-times), a trajectory in TUM format (needs --imu), or an
-    InertialScale folder. Exit code 3 when the recording cannot give a scale; the reasons then say why.
+    InertialScale folder. Exit code 3 when the recording does not determine the scale; the reasons say why.
 
     Example: colmap-inertial scale project/sparse/0 --imu imu.csv --frame-times frames.csv --json scale.json
     """
 
     first_s: float | None = None
     """Use only this many seconds from the start of the camera's recording."""
-    device: str | None = None
-    """Name of the device, under which calibrations were remembered (default: what the recording says)."""
-    remembered: bool = True
-    """Take what `align` and `calibrate-imu` remembered of the device, where --calibration does not say it."""
     options: Annotated[ScaleOptions, arg(name="")] = dataclasses.field(default_factory=ScaleOptions)
     config: Path | None = None
     """TOML file as OUT/config.toml of a reconstruction: its [scale] table counts; options given here override it."""
@@ -83,15 +78,9 @@ class Scale(SourceReader):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.reconstruction.drivers.device_store import remembered_of
         from colmap_inertial.reconstruction.drivers.sources import scale_as_json, scale_source
 
-        calibration = self.calibration
-        if self.remembered:
-            known = remembered_of(self.imu or self.source, calibration, device=self.device)
-            if self.talks:
-                show_remembered(known)
-            calibration = (*calibration, *known.paths)
+        calibration = self.add_remembered(self.calibration, self.imu or self.source)
         estimate = scale_source(self.read_from(calibration), self.options, json=self.json_file, first_s=self.first_s)
         self.tell(lambda: show_scale(estimate, self.source), scale_as_json(estimate, calibration), written=True)
         return 3 if estimate.verdict == "refused" else 0
@@ -171,11 +160,11 @@ class Apply(Reader):
                     follow_links=self.follow_links,
                     progress=files,
                 )
-        self.tell(lambda: show_applied(applied), _as_json(applied))
+        self.tell(lambda: show_applied(applied), _describe_applied(applied))
         return 0
 
 
-def _as_json(applied: Applied) -> dict[str, Any]:
+def _describe_applied(applied: Applied) -> dict[str, Any]:
     models = [
         {
             "index": index,
@@ -200,7 +189,7 @@ class Align(SourceReader):
     """Rotation, time offset and gyro bias between the camera and the IMU of one device, from one recording.
 
     Needs no scale, only a camera that turned. The calibration file serves --calibration for later recordings of the
-    same device. Exit code 3 when no time offset is better than the rest.
+    same device. Exit code 3 when no time offset stands out.
 
     Example: colmap-inertial align project/sparse/0 --imu imu.csv --frame-times frames.csv --out phone.json
     """
@@ -208,7 +197,7 @@ class Align(SourceReader):
     out: Path
     """Where to write the calibration (JSON)."""
     remember: str | None = None
-    """Keep the calibration under this name of the device: `reconstruct` and `scale` then take it by themselves."""
+    """Keep the calibration under this name of the device: `reconstruct` and `scale` then use it by themselves."""
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
@@ -232,8 +221,8 @@ class CalibrateImu(Reader):
     fewer, exit code 3. Give the latitude: the gains are no better than the strength of gravity is known.
 
     The calibration file serves --calibration for recordings of the same device, beside that of align; a scale's
-    interval then no longer holds what the accelerometer's gain may be off. A page with what is left over in each rest
-    is written beside it. Calibrate again after a year, or where the device is much warmer or colder.
+    interval then no longer has to allow for an unknown gain of the accelerometer. A page with the residuals of each
+    rest is written beside it. Calibrate again after a year, or where the device is much warmer or colder.
 
     Example: colmap-inertial calibrate-imu rests.csv --latitude-deg 47.4 --height-m 400 --out phone_imu.json
     """
@@ -244,7 +233,7 @@ class CalibrateImu(Reader):
     """Where to write the calibration (JSON); a page of the same name, ending in .html, is put beside it."""
     gravity: Annotated[GravityOptions, arg(name="")] = dataclasses.field(default_factory=GravityOptions)
     remember: str | None = None
-    """Keep the calibration under this name of the device: `reconstruct` and `scale` then take it by themselves."""
+    """Keep the calibration under this name of the device: `reconstruct` and `scale` then use it by themselves."""
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
@@ -305,7 +294,7 @@ class Validate(Reader):
     tolerance: float = 2.0
     """Largest scale error that passes, in per cent."""
     unscaled: bool = False
-    """The model claims no unit: report the factor that makes it metric; always passes."""
+    """The model is not in metres: report the factor that makes it metric; always passes."""
     apply: Path | None = None
     """With --unscaled: a new folder for the model in metres, scaled by the control distances alone."""
     bars: Path | None = None
@@ -337,7 +326,7 @@ class Validate(Reader):
 
 @dataclass(frozen=True, kw_only=True)
 class Export(Reader):
-    """Write a finished model as other programs read it, in metres and with up where it was.
+    """Export a finished model to other programs, in metres and with gravity kept.
 
     Without --for, DIR is one folder for all splatting and NeRF trainers: images/ (undistorted, the principal point in
     the middle), sparse/0 (COLMAP), sparse_pc.ply, transforms.json, export.json. With --for, also the command line with

@@ -10,10 +10,12 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+from tyro.conf import arg
 
 from colmap_inertial.cli.screen import Screen, live_progress
-from colmap_inertial.core.options import ReadLimits
+from colmap_inertial.core.options import ReadLimits, ReconstructOptions
 
 #: ``--json -``.
 _STANDARD_OUTPUT = Path("-")
@@ -112,6 +114,45 @@ class Reader(Speaker):
 
     limits: ReadLimits = field(default_factory=ReadLimits)
     """How large a file may be that is read."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConfiguredCommand(Speaker):
+    """What commands with the options of a reconstruction have besides."""
+
+    options: Annotated[ReconstructOptions, arg(name="")] = field(default_factory=ReconstructOptions)
+    config: Path | None = None
+    """TOML file with options, as OUT/config.toml of an earlier run; options given here override it."""
+
+    @property
+    def limits(self) -> ReadLimits:
+        """How large a file may be that is read."""
+        return self.options.limits
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeviceCommand(Speaker):
+    """What commands have besides that use the calibrations kept of a device."""
+
+    device: str | None = None
+    """Name under which calibrations of the device were kept by --remember (default: what the recording says)."""
+    remembered: bool = True
+    """Use the calibrations that `align` and `calibrate-imu` kept of the device by --remember, where neither
+    --calibration nor the capture gives one; never with --deterministic."""
+
+    def add_remembered(self, calibration: tuple[Path, ...], recording: Path) -> tuple[Path, ...]:
+        """These calibrations, and those kept of the recording's device."""
+        if not self.remembered:
+            return calibration
+        from colmap_inertial.reconstruction.drivers.device_store import remembered_of
+
+        kept = remembered_of(recording, calibration, device=self.device)
+        if self.talks:
+            for path, kind in kept.files:
+                print(
+                    f'{kept.device}: uses the remembered calibration "{kind}", {path} (--no-remembered leaves it out)'
+                )
+        return (*calibration, *kept.paths)
 
 
 def print_json(content: Mapping[str, Any]) -> None:

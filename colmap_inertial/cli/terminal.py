@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
     from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan
     from colmap_inertial.reconstruction.drivers.deblur import DeblurResult
-    from colmap_inertial.reconstruction.drivers.device_store import Remembered
     from colmap_inertial.reconstruction.drivers.reference import Reference
     from colmap_inertial.reconstruction.drivers.result import ModelResult, ReconstructResult
     from colmap_inertial.tools.export.whole import Exported
@@ -59,7 +58,7 @@ def scale_lines(estimate: ScaleEstimate) -> list[Line]:
     from colmap_inertial.checks.words import half_width_pct, length_in_words, scale_facts, sensor_facts
     from colmap_inertial.inertial.scale.parts import parts_in_words
 
-    metres = "no metres: the recording does not tell how large things are"
+    metres = "no metres: the recording does not determine the scale"
     if estimate.metres_per_unit is not None and estimate.ci95 is not None:
         metres = length_in_words(estimate.verdict, half_width_pct(estimate.metres_per_unit, estimate.ci95))
     values = estimate.as_json()
@@ -122,13 +121,7 @@ def show_applied(applied: Applied) -> None:
     _print_panel("Project", lines)
 
 
-def show_remembered(known: Remembered) -> None:
-    """Say which calibrations of an earlier day are used, and how to do without."""
-    for path, kind in known.files:
-        print(f'{known.device}: uses the remembered calibration "{kind}", {path} (--no-remembered leaves it out)')
-
-
-def _remembered_lines(kept: Path | None) -> list[Line]:
+def _describe_remembered(kept: Path | None) -> list[Line]:
     return [] if kept is None else [("remembered", f"{kept}; reconstruct and scale take it by the device's name")]
 
 
@@ -141,7 +134,7 @@ def show_imu_calibration(found: RestCalibration, source: Path, out: Path, kept: 
     colour = {"good": "green", "weak": "yellow"}[found.verdict]
     lines: list[Line] = [("verdict", Text(found.verdict, f"bold {colour}")), *_label_first("reason", found.reasons)]
     lines += [*calibration_facts(found), ("scale", gain_effect(found))]
-    lines += [*_label_first("written", (out, out.with_suffix(".html"))), *_remembered_lines(kept)]
+    lines += [*_label_first("written", (out, out.with_suffix(".html"))), *_describe_remembered(kept)]
     _print_panel(str(source), lines)
 
 
@@ -157,7 +150,7 @@ def show_calibration(calibration: CameraImuCalibration, source: Path, kept: Path
         ("time offset", f"{offset:+.4f} s, +-{offset_ms:.2g} ms (camera time = stamp + offset)"),
         ("gyro bias", f"{bias} rad/s, +-{bias_spread:.2g}"),
     ]
-    _print_panel(str(source), [*lines, *_remembered_lines(kept)])
+    _print_panel(str(source), [*lines, *_describe_remembered(kept)])
 
 
 def show_diagnosis(diagnosis: Diagnosis, source: Path) -> None:
@@ -206,7 +199,7 @@ def imaging_lines(frames: Sequence[FrameRecord], plan: ImagingPlan, rectified: C
 
 def show_nothing_to_do(workspace: Workspace) -> None:
     """Say that an earlier run's result stands."""
-    print(f"nothing to do: kept from the earlier run; {workspace.root} holds the result of this with these options")
+    print(f"nothing to do: kept from the earlier run; {workspace.root} holds the result for these inputs and options")
 
 
 def show_reference(found: Reference) -> None:
@@ -254,8 +247,8 @@ def show_result(result: ReconstructResult, source: Path) -> None:
         _print_panel(f"Model {model.index}{number}", _model_lines(model, result))
     if all(model.sparse_metric is None for model in result.models) and result.workspace.colmap_sparse.is_dir():
         print(
-            f"metres by hand: colmap-inertial reconstruct {shlex.quote(str(result.workspace.colmap))} NEW_FOLDER "
-            "--scale-from target --target ..., or --scale-from distance (--help)"
+            f"metres without the IMU: colmap-inertial reconstruct {shlex.quote(str(result.workspace.colmap))} "
+            "NEW_FOLDER --scale-from target --target ..., or --scale-from distance (--help)"
         )
     print(_describe_layout(result))
     for fragment in result.fragments:
@@ -265,7 +258,9 @@ def show_result(result: ReconstructResult, source: Path) -> None:
         )
     for gap in result.gaps:
         if not gap.joined:
-            print(f"COLMAP's models {gap.first} and {gap.second}, {gap.seconds:.1f} s apart, stay apart: {gap.reason}")
+            print(
+                f"COLMAP's models {gap.first} and {gap.second}, {gap.seconds:.1f} s apart, are not joined: {gap.reason}"
+            )
     print(f"next: {next_command(result, source)}")
 
 
@@ -315,7 +310,7 @@ def _describe_layout(result: ReconstructResult) -> str:
     workspace = result.workspace
     if all(model.sparse_metric is None for model in result.models):
         where = {str(model.sparse) for model in result.models}
-        return f"no scale is accepted, so that nothing here is in metres: COLMAP's own is {', '.join(sorted(where))}"
+        return f"no scale was accepted, so nothing here is in metres; COLMAP's own model: {', '.join(sorted(where))}"
     if result.project_metric is not None:
         return f"{workspace.root} is the whole project in metres"
     made = [path.name for path in (workspace.images, workspace.sparse, workspace.dense) if path.is_dir()]

@@ -82,7 +82,7 @@ class MappingOptions:
     mapper: Literal["incremental", "global"] = "incremental"
     """COLMAP's mapper."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """What finds and matches features; auto: CUDA where pycolmap has it, but for a deterministic run."""
+    """Where features are extracted and matched; auto: CUDA where pycolmap has it, except in deterministic runs."""
     gravity_priors: bool = False
     """Global mapper only: start it from each frame's gravity direction, by the IMU (needs a calibration)."""
     refine_intrinsics: bool | None = None
@@ -100,11 +100,11 @@ class GravityOptions:
     """How strong gravity is where something was recorded: a number, or the place; else what spans the Earth."""
 
     gravity_m_s2: float | None = None
-    """Strength of gravity at the place, known to four digits or better; 9.80665 and 9.81 say nothing of the place."""
+    """Strength of gravity at the place, known to four digits or better; 9.80665 and 9.81 are nominal, not local."""
     latitude_deg: float | None = None
     """Latitude of the place, from which the strength of gravity follows to 0.005 %."""
     height_m: float | None = None
-    """Height of the place above the sea, with --latitude-deg; 1000 m are 0.03 %."""
+    """Height above sea level, with --latitude-deg; 1000 m change gravity by 0.03 %."""
 
     def __post_init__(self) -> None:
         _check("gravity_m_s2", self.gravity_m_s2, 9.7, 9.9, hint=" (it is 9.76 to 9.84 on Earth)")
@@ -139,7 +139,7 @@ class JoinOptions:
     sigma_m: float = 0.1
     """Largest standard deviation of the position after a gap, as seen from before it (m)."""
     sigma_deg: float = 1.0
-    """Largest one of the direction (degrees)."""
+    """Largest standard deviation of the orientation after a gap (degrees)."""
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -188,8 +188,8 @@ class FrameOptions:
     """Which frames are used."""
 
     use: Literal["auto", "all"] | None = None
-    """auto: as many as the motion needs, each the least blurred around. Not given: auto for a video, all pictures of a
-    folder."""
+    """auto: as many frames as the motion needs, each the sharpest of its neighbours. Not given: auto for a video, all
+    images of a folder."""
     min_fps: float = 4.0
     """At least so many frames a second, while the picture moves. The scale's error does not grow down to 4; at 2 it
     doubles, at 1 it is three times as large."""
@@ -223,11 +223,11 @@ class ProjectOptions:
     images: Path | None = None
     """Folder of the project's images (default: images in the project)."""
     keep: tuple[str, ...] = ()
-    """Patterns of paths in it that are copied as they are, such as "old/*"."""
+    """Patterns of paths in the project that are copied as they are, such as "old/*"."""
     link: bool = False
     """Hard links for files that do not change; an edit of one then changes the original, too."""
     follow_links: bool = False
-    """Take what symbolic links out of it lead to into OUT; without, they are refused."""
+    """Copy the targets of symbolic links that lead out of the project into OUT; without, such links are refused."""
 
     def __post_init__(self) -> None:
         ways = (self.frame_times is not None and self.video is None, self.name_times is not None, self.exif_times)
@@ -310,8 +310,8 @@ class ReconstructOptions:
     """How pairs of a short and a long exposure become frames."""
     deblur: DeblurMethod | None = None
     """Undo motion blur by the gyroscope before COLMAP sees a frame. Not given: wiener, where exposure times are known
-    and the pictures bear the gyroscope out. path: along the same path by a filter that expects few and strong edges
-    (slower). deepgyro: by a network (slower; needs the extra `restore`)."""
+    and the images confirm the blur that the gyroscope predicts. path: along the same path by a filter that expects few
+    and strong edges (slower). deepgyro: by a network (slower; needs the extra `restore`)."""
     rolling_shutter: RollingShutterMethod | None = None
     """Undo the rolling shutter by the gyroscope. Not given: rectify, where the readout time is known."""
     mapping: MappingOptions = field(default_factory=MappingOptions)
@@ -319,20 +319,20 @@ class ReconstructOptions:
     scale: ScaleOptions = field(default_factory=ScaleOptions)
     """How metres come from the IMU."""
     join: JoinMethod = "inertial"
-    """inertial: where COLMAP made several models of one recording, bring those into one that what the IMU felt between
-    them places surely enough; off: each stays by itself."""
+    """inertial: where COLMAP made several models of one recording, join those whose relative pose the IMU determines
+    well enough (see --join-options); off: keep them apart."""
     join_options: JoinOptions = field(default_factory=JoinOptions)
     """Up to where they are joined."""
     refine: RefineMethod = "off"
-    """inertial: fit pictures, rolling shutter and IMU together, so that the metric model bends and drifts less; it
-    stays as it is where that predicts observations no better."""
+    """inertial: fit image observations, rolling shutter and IMU together, which reduces bending and drift of the metric
+    model; kept only where it predicts observations better."""
     world: WorldAxes = "z-up"
     """Axes of the metric model: z away from the ground, or y towards it, as COLMAP's own cameras have it."""
     georeference: bool = False
     """Find out where on Earth the model stands, by the positions (GPS) in the video's telemetry or the pictures' EXIF:
     heading and place, never the scale."""
     dense: bool = False
-    """Go on to depth maps (quicker with CUDA), a fused point cloud and a mesh in metres."""
+    """Also compute depth maps (faster with CUDA), a fused point cloud and a mesh, in metres."""
     dense_options: DenseOptions = field(default_factory=DenseOptions)
     """How the dense reconstruction is made."""
     deterministic: bool = False
@@ -343,9 +343,10 @@ class ReconstructOptions:
     """Calibration files of this device: how camera and IMU relate (from `align --out`, used as a prior), the IMU's own
     gains (from `calibrate-imu --out`), or both; each says what it holds."""
     fragments: bool = False
-    """Make metric also what COLMAP made of fewer than 5 images, or of 1 % of those of its largest model."""
+    """Also scale fragments: models of fewer than 5 images, or of less than 1 % of the images of the largest one."""
     force: bool = False
-    """Go on where the check beforehand finds what makes metres meaningless; the verdict is then at most weak."""
+    """Continue where the check of the recording finds an error that makes metres meaningless; the verdict is then at
+    most weak."""
     limits: ReadLimits = field(default_factory=ReadLimits)
     """How large a file may be that is read."""
 

@@ -79,7 +79,7 @@ def gather(
     gaps = done.get("gaps", [])
     if shown and shown[0]["joined_of"]:
         models_joined = [part["colmap_index"] for part in shown[0]["joined_of"]]
-        joined = f"It was joined of {joined_in_words(models_joined, gaps)}."
+        joined = f"It was joined from {joined_in_words(models_joined, gaps)}."
         outcome = {**outcome, "summary": [*outcome["summary"], joined]}
     if shown:
         made = parts_mapped_in_words(done.get("mapping"))
@@ -99,7 +99,7 @@ def gather(
         "gaps": gaps,
         "findings": findings,
         "selection": _selection(done),
-        "recording": None if recording is None else _of_recording(recording),
+        "recording": None if recording is None else _summarise_recording(recording),
         "made": None if recording is None else recording.get("made"),
         "blur": _blur(done, recording, project=project),
         "crops": _crops(out, done),
@@ -118,12 +118,14 @@ def _describe_path(model: Content) -> list[str]:
         length = model.get("scene", {}).get("path_length")
         if model.get("sparse_metric") is None or length is None or length < SIZES.long_path_m:
             return []
-        return [f"Its path is {length:.0f} m long: --refine inertial fits the IMU to it, too, against bends and drift."]
+        return [
+            f"The camera path is {length:.0f} m long: --refine inertial fits it to the IMU, against bending and drift."
+        ]
     percent = [part["percent"] for part in refined_parts(model)]
     if not percent:
         return []
     low, high = (f"{value:+.2f}" for value in (min(percent), max(percent)))
-    return [f"The IMU took drift out of its path: parts of it were stretched by {low} to {high} %."]
+    return [f"The refinement corrected drift of the path: parts of it were stretched by {low} to {high} %."]
 
 
 def refined_parts(model: Content) -> list[Content]:
@@ -156,17 +158,17 @@ def _model(out: Path, model: Content, *, in_full: bool, project: bool) -> Conten
     if scale is None:
         kept["drift"] = _mark_missing("There is no scale whose parts could be compared.")
     else:
-        unknown = _mark_missing("This method does not tell the scale of parts of the recording.")
+        unknown = _mark_missing("This method does not estimate the scale of parts of the recording.")
         kept["drift"] = model.get("drift") or unknown
     kept["validation"] = _validation(out, model, project=project)
     file = model_file(out, model["index"])
     if in_full and file.is_file():
         kept |= read_json(file)
     else:
-        failed = "What it is drawn from was not kept; where that failed, log.txt says why."
+        failed = "Its data were not kept; where writing them failed, log.txt says why."
         why = failed if in_full else f"Only the {SIZES.models} largest models are shown in full."
         kept["scene"], kept["signals"] = _mark_missing(why), _mark_missing(why)
-    kept.setdefault("photogrammetry", _mark_missing("It was not kept: an earlier version made this run."))
+    kept.setdefault("photogrammetry", _mark_missing("Its data were not kept: the run was made by an earlier version."))
     kept["outcome"] = outcome_of_model({**model, "signals": kept["signals"]})
     return kept
 
@@ -192,12 +194,12 @@ def _validation(out: Path, model: Content, *, project: bool) -> Content:
 def _findings(out: Path) -> Content:
     file = out / "diagnosis.json"
     if not file.is_file():
-        return _mark_missing("The recording was not looked at beforehand, or what was found was not kept.")
+        return _mark_missing("The recording was not checked before the reconstruction, or the findings were not kept.")
     found = read_json(file)
     return {"checked": found["checked"], "findings": found["findings"]}
 
 
-def _of_recording(recording: Content) -> Content:
+def _summarise_recording(recording: Content) -> Content:
     frames = {key: value for key, value in recording["frames"].items() if key not in ("names", "t_s", "exposure_s")}
     exposures = [value for value in recording["frames"]["exposure_s"] or [] if value is not None]
     frames["median_exposure_s"] = float(np.median(exposures)) if exposures else None
@@ -232,7 +234,7 @@ def _crops(out: Path, done: Content) -> Content:
     crops = read_json(file)["crops"] if file.is_file() else []
     if not crops:
         if any(frame["action"] == "deblurred" for frame in done["frames"]):
-            return _mark_missing("Of the frames that were looked at before and after, none differs.")
+            return _mark_missing("None of the frames that were compared differs before and after.")
         return _mark_missing("No frame was deblurred, so there is nothing to show before and after.")
     reason = {frame["name"]: frame["reason"] for frame in done["frames"]}
     folder = f"{DATA_FOLDER}/{CROPS_FOLDER}/"

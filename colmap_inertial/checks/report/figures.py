@@ -119,7 +119,9 @@ def rotation_before(rotation: dict[str, Any]) -> Figure | None:
     sides = (("camera", CAMERA), ("gyroscope", IMU))
     speeds_only = rotation["after"] is None and "camera_size" in before
     shown = {key: [before[f"{key}_size"]] if speeds_only else before[key] for key, _ in sides}
-    return _stack_rows(_in_degrees(shown, sides), ["angular speed"] if speeds_only else ["x", "y", "z"], unit="°/s")
+    return _stack_rows(
+        _convert_to_degrees(shown, sides), ["angular speed"] if speeds_only else ["x", "y", "z"], unit="°/s"
+    )
 
 
 def rotation_after(rotation: dict[str, Any]) -> Figure | None:
@@ -128,11 +130,11 @@ def rotation_after(rotation: dict[str, Any]) -> Figure | None:
     if after is None:
         return None
     return _underlay(
-        _stack_rows(_in_degrees(after, (("gyroscope", IMU), ("camera", CAMERA))), ["x", "y", "z"], unit="°/s")
+        _stack_rows(_convert_to_degrees(after, (("gyroscope", IMU), ("camera", CAMERA))), ["x", "y", "z"], unit="°/s")
     )
 
 
-def _in_degrees(
+def _convert_to_degrees(
     record: dict[str, Any], sides: Sequence[tuple[str, str]]
 ) -> list[tuple[str, str, list[dict[str, Any]], str]]:
     return [(name, colour, _scale_lines(record[name], math.degrees(1)), "left") for name, colour in sides]
@@ -285,10 +287,10 @@ def blur(frames: Sequence[dict[str, Any]]) -> Figure:
             points = [(frame["t_s"], round(frame["blur_px"], 2), escape(frame["name"])) for frame in those]
             tip = "%{text}: %{y:.1f} px<extra></extra>"
             data.append(_dots(f"{name} ({len(those)})", points, colour, 0.85, tip))
-    return {"data": data, "layout": _over_time(300, "blur (px)")}
+    return {"data": data, "layout": _make_time_layout(300, "blur (px)")}
 
 
-def _over_time(height: int, title: str) -> Figure:
+def _make_time_layout(height: int, title: str) -> Figure:
     return layout(height, axis(_TIME, zeroline=False), axis(title, rangemode="tozero"))
 
 
@@ -299,7 +301,7 @@ def shutter_over_time(shutter: dict[str, Any]) -> Figure:
         line = {"t_s": shutter["t_s"], "values": shutter[key]}
         tip = f"%{{x:.2f}} s: %{{y:.2f}} px<extra>{name}</extra>"
         data.append(_line(line, name, colour, hovertemplate=tip))
-    return {"data": data, "layout": _over_time(280, "movement (px)")}
+    return {"data": data, "layout": _make_time_layout(280, "movement (px)")}
 
 
 def shutter_field(worst: dict[str, Any]) -> Figure:

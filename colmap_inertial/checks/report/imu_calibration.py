@@ -38,9 +38,9 @@ def calibration_page(found: RestCalibration, *, source: str) -> str:
         verdict=found.verdict,
         reasons=[*found.reasons, gain_effect(found)],
         values=calibration_facts(found),
-        lengths=_dots([("as read", QUIET, middle_s, before, names), corrected], "gravity too long (%)"),
-        corrected=_dots([corrected], "gravity too long (%)"),
-        turns=_dots([turns], "gravity missed after a turn (°)"),
+        lengths=_dots([("as read", QUIET, middle_s, before, names), corrected], "error of gravity's length (%)"),
+        corrected=_dots([corrected], "error of gravity's length (%)"),
+        turns=_dots([turns], "gravity error after a turn (°)"),
         parameters=_parameters(found),
     )
 
@@ -63,14 +63,14 @@ def calibration_facts(found: RestCalibration) -> list[Fact]:
     turns = np.degrees(found.turn_residual_rad[np.isfinite(found.turn_residual_rad)])
     values = [
         ("rests", f"{len(found.rests)} in {calibration.attitudes} attitudes"),
-        ("gravity, as it was read", f"{found.rms_pct(found.before_m_s2):.2g} % rms off"),
-        ("gravity, corrected", f"{found.rms_pct(found.after_m_s2):.2g} % rms off"),
+        ("gravity error, as read", f"{found.rms_pct(found.before_m_s2):.2g} % rms"),
+        ("gravity error, corrected", f"{found.rms_pct(found.after_m_s2):.2g} % rms"),
         ("strength of gravity", f"{calibration.gravity_m_s2:.5f} m/s2"),
     ]
     if calibration.temperature_c is not None:
         values.append(("the sensors' temperature", f"{calibration.temperature_c:.0f} °C"))
     if len(turns) > 0:
-        values.append(("turns miss gravity by", f"{np.sqrt(np.mean(turns**2)):.2g} degrees rms"))
+        values.append(("gravity error after turns", f"{np.sqrt(np.mean(turns**2)):.2g} degrees rms"))
     for name, label in (("accel", "accel."), ("gyro", "gyro")):
         unit = "m/s2" if name == "accel" else "rad/s"
         gains = [f"{100 * getattr(calibration, f'{name}_gain')[i, i]:+.3f}" for i in range(3)]

@@ -94,12 +94,12 @@ def signal_record(
     record["rotation"] = _compare_rotations(trajectory, imu, rates, aligned, start_s)
     no_accel = "The recording has no accelerometer."
     if aligned is None or calibration is None:
-        why = "Camera and IMU could not be brought together, so their {} cannot be compared."
+        why = "Camera and IMU could not be aligned, so their {} cannot be compared."
         # where these stand in the way, nobody tried (scale.estimate_scale)
         problem = no_accel if not imu.has_accel else next(iter(check_units(imu)), None)
         if problem is not None:
             record["alignment"] = "not tried"
-            why = "Camera and IMU were not brought together: " + problem[:1].lower() + problem[1:]
+            why = "Camera and IMU were not aligned: " + problem[:1].lower() + problem[1:]
         record["rotation_spectrum"] = {"missing": why.format("rotations")}
         why = why.format("accelerations") if imu.has_accel else no_accel
         record["acceleration"] = record["acceleration_spectrum"] = {"missing": why}
@@ -250,7 +250,7 @@ class _Accelerations:
         t_s, by_camera, by_imu = self.over(reach)
         both = np.isfinite(by_camera).all(axis=1)
         if both.sum() < 3:
-            return {"missing": "The accelerometer ran along with too few frames for a comparison."}
+            return {"missing": "The accelerometer covers too few frames for a comparison."}
         times = t_s - start_s
         x, y = (a[both] - a[both].mean(axis=0) for a in (by_camera, by_imu))
         power = float(np.sqrt(np.sum(x**2) * np.sum(y**2)))

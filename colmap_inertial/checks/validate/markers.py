@@ -33,7 +33,7 @@ def with_bars(validation: Validation, path: Path) -> Validation:
     FormatError
         For a table that cannot be read, or a marker that was not measured.
     """
-    centres, to_metres = marker_centres(validation), _to_metres(validation)
+    centres, to_metres = marker_centres(validation), _get_metres_per_unit(validation)
     bars = []
     for line, row in _read_rows(path, ("marker_a", "marker_b", "length_m")):
         a, b = (_find_marker(centres, row[key], path, line) for key in ("marker_a", "marker_b"))
@@ -59,7 +59,7 @@ def with_check_points(validation: Validation, path: Path) -> Validation:
     NotObservableError
         For too few points.
     """
-    centres, to_metres = marker_centres(validation), _to_metres(validation)
+    centres, to_metres = marker_centres(validation), _get_metres_per_unit(validation)
     names, known, measured, sigmas = [], [], [], []
     for line, row in _read_rows(path, ("marker", "x", "y", "z")):
         marker = _find_marker(centres, row["marker"], path, line)
@@ -104,7 +104,7 @@ def with_other_target(
         known_m=known_m,
         sigma_m=sigma_m,
         measured=measured,
-        residual_m=measured * _to_metres(validation) - known_m,
+        residual_m=measured * _get_metres_per_unit(validation) - known_m,
     )
     return replace(validation, apart=apart)
 
@@ -151,7 +151,7 @@ def _move_onto(source: Array, target: Array) -> Array:
     return (source - about) @ u @ turn @ vt + onto
 
 
-def _to_metres(validation: Validation) -> float:
+def _get_metres_per_unit(validation: Validation) -> float:
     if not validation.unscaled:
         return 1.0
     return validation.metres_per_unit if validation.control is None else validation.control.metres_per_unit

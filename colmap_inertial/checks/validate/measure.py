@@ -428,7 +428,9 @@ def _collect_rejected(
 def _list_remarks(search: Search, obs: Observations, fit: ScaleFit, views: tuple[ViewResiduals, ...]) -> list[str]:
     out = []
     if len(views) < 5:
-        out.append(f"only {len(views)} views: the interval is wide because errors of the poses are hard to judge")
+        out.append(
+            f"only {len(views)} views: the interval is wide because pose errors are hard to estimate from so few"
+        )
     copies = Counter((s.view, s.part) for s in search.sightings)
     several = len({view for (view, _), count in copies.items() if count > 1})
     if several:
@@ -439,11 +441,11 @@ def _list_remarks(search: Search, obs: Observations, fit: ScaleFit, views: tuple
     sigma_m, length_m = search.target.sigma_m, search.target.length_m
     if sigma_m is None:
         out.append(
-            "the interval does not hold errors of the target itself: measure the print, and say how well you know it "
-            "(+- in the description)"
+            "the interval does not include errors of the target itself: measure the print and state its standard "
+            "deviation (+- in the description)"
         )
     else:
-        out.append(f"the interval holds that the target is known to {100 * sigma_m / length_m:.2g} %")
+        out.append(f"the interval includes the target's own standard deviation of {100 * sigma_m / length_m:.2g} %")
     if len(search.searched) < len(search.views):
         out.append(f"{len(search.views) - len(search.searched)} images were not searched: enough views were found")
     return out

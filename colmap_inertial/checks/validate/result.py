@@ -163,7 +163,7 @@ def _count_directions(ends: Array) -> int:
 
 
 def _describe_proof(longest_m: float, diagonal_m: float | None, share: float | None, directions: int) -> str:
-    checked = f"lengths up to {longest_m:.3g} m are right to what is said here"
+    checked = f"lengths up to {longest_m:.3g} m agree within the errors given here"
     if share is None or diagonal_m is None:
         return checked
     checked += f", in {'one direction' if directions == 1 else f'{directions} directions'}"
@@ -171,8 +171,8 @@ def _describe_proof(longest_m: float, diagonal_m: float | None, share: float | N
         return f"{checked} and over {100 * share:.0f} % of the model's diagonal of {diagonal_m:.3g} m"
     amount = "nothing" if share < FIT.short_share else "little"
     return (
-        f"{checked}; they span {100 * share:.2g} % of the model's diagonal of {diagonal_m:.3g} m, which says {amount} "
-        "of whether it bends or drifts elsewhere"
+        f"{checked}; they span {100 * share:.2g} % of the model's diagonal of {diagonal_m:.3g} m and show {amount} "
+        "of a bend or drift elsewhere"
     )
 
 
@@ -420,7 +420,7 @@ def validation_table(result: Validation) -> Group:
     if result.distances:
         parts.append(_distance_table(result))
     if result.views_rejected:
-        rejected = Table(title="Images not used", title_justify="left")
+        rejected = Table(title="Images left out", title_justify="left")
         rejected.add_column("images", justify="right")
         rejected.add_column("reason")
         for reason, count in Counter(view.reason for view in result.views_rejected).most_common():
