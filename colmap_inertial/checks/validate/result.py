@@ -18,7 +18,7 @@ from colmap_inertial.checks.validate.fit import FIT
 from colmap_inertial.checks.validate.targets import Target
 from colmap_inertial.checks.words import target_facts
 from colmap_inertial.core.arrays import Array, IndexArray
-from colmap_inertial.io.files import as_plain
+from colmap_inertial.io.files import convert_to_plain
 
 if TYPE_CHECKING:
     from rich.console import Group
@@ -399,7 +399,7 @@ class Validation:
                 values["within_tolerance"] = self.within_tolerance
         values["target"] = self.target.spec
         values["views"] = [{"name": v.name, "corners": len(v.corner), "rms_px": v.rms_px} for v in self.views]
-        json: dict[str, Any] = as_plain(values)
+        json: dict[str, Any] = convert_to_plain(values)
         return json
 
 
