@@ -194,7 +194,7 @@ def test_a_refused_scale_has_no_number_and_says_what_to_do(tmp_path):
 @pytest.mark.parametrize(
     ("gone", "anchor", "said"),
     [
-        ("diagnosis.json", "findings", "was not looked at beforehand"),
+        ("diagnosis.json", "findings", "was not checked before the reconstruction"),
         ("report_data/model_0.json", "scene", "were not kept"),
         ("report_data/recording.json", "shutter", "Nothing was done about a rolling shutter"),
     ],
@@ -304,7 +304,7 @@ def test_why_there_is_no_target_and_there_are_no_crops(full, tmp_path):
     result["models"][0]["validation"] = None
     content, _ = report_of_changed(out, result)
     assert "names no target" in content["models"][0]["validation"]["missing"]
-    assert "none differs" in content["crops"]["missing"]
+    assert "differs before and after" in content["crops"]["missing"]
     for frame in result["frames"]:
         frame["action"] = "passed"
     del result["imaging"]
