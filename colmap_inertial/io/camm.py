@@ -17,7 +17,7 @@ from colmap_inertial.core.arrays import Array, Int64Array, UInt8Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.types import FrameLog, ImuRecording, PositionFixes
 from colmap_inertial.io.frame_times import frame_log
-from colmap_inertial.io.imu_text import recording
+from colmap_inertial.io.imu_text import build_recording
 from colmap_inertial.io.mp4 import Movie, Track, has_track, read_movie
 from colmap_inertial.io.samples import Samples, nearest, order_samples
 from colmap_inertial.io.units import DeclaredUnits, Quantity
@@ -65,7 +65,7 @@ def read_camm(path: Path, units: DeclaredUnits) -> ImuRecording:
             found[kind] = order_samples(path, quantity, unit, t_ns, values)
     if _GYRO not in found:
         raise FormatError(path, "its CAMM track holds no gyroscope samples (type 2)")
-    return recording(found[_GYRO], found.get(_ACCEL))
+    return build_recording(found[_GYRO], found.get(_ACCEL))
 
 
 def read_camm_frames(path: Path) -> FrameLog:

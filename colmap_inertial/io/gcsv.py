@@ -18,7 +18,7 @@ import numpy as np
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.types import FrameLog, ImuRecording, ReadoutDirection
 from colmap_inertial.io.files import first_line, read_limits, read_text
-from colmap_inertial.io.imu_text import ordered, recording
+from colmap_inertial.io.imu_text import build_recording, order_rows
 from colmap_inertial.io.samples import Samples
 from colmap_inertial.io.tables import Table, parse_table, too_wide
 from colmap_inertial.io.units import Axes, DeclaredUnits, Quantity
@@ -60,12 +60,12 @@ def read_gcsv(path: Path, units: DeclaredUnits) -> ImuRecording:
         letter = quantity[0]
         values = rows.numbers([names.index(f"{letter}{axis}") for axis in "xyz"])
         values = axes.apply(values * _number(path, header, f"{letter}scale", 1.0))
-        return ordered(rows, quantity, unit, stamps, values)
+        return order_rows(rows, quantity, unit, stamps, values)
 
     gyro = samples("gyro", units.gyro or "rad/s")
     has_accel = all(f"a{axis}" in names for axis in "xyz")
     device = " ".join(header[key][0] for key in ("vendor", "id") if header.get(key, ("",))[0])
-    return recording(gyro, samples("accel", units.accel or "g") if has_accel else None, device=device)
+    return build_recording(gyro, samples("accel", units.accel or "g") if has_accel else None, device=device)
 
 
 def read_gcsv_frames(path: Path) -> FrameLog:

@@ -31,7 +31,7 @@ from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.types import FrameLog, HeightDatum, ImuRecording, PositionFixes
 from colmap_inertial.io.frame_times import frame_log
 from colmap_inertial.io.gpmf import Entry, Stream, entries, read_streams
-from colmap_inertial.io.imu_text import recording
+from colmap_inertial.io.imu_text import build_recording
 from colmap_inertial.io.mp4 import Movie, has_track, read_movie
 from colmap_inertial.io.samples import Samples, nearest, order_samples
 from colmap_inertial.io.units import SENSOR_UNITS, Axes, DeclaredUnits, Quantity, unit_of
@@ -97,7 +97,7 @@ def read_gopro(path: Path, units: DeclaredUnits) -> ImuRecording:
             path, "its telemetry holds no gyroscope (GYRO): HERO5 and later write one; older cameras have none"
         )
     device = _device(telemetry.movie, telemetry.streams["GYRO"])
-    read = recording(found["gyro"], found.get("accel"), device=device)
+    read = build_recording(found["gyro"], found.get("accel"), device=device)
     return replace(read, temperature_c=_temperature_c(telemetry.streams))
 
 

@@ -148,7 +148,7 @@ def read_tables(gyro: SensorTable, accel: SensorTable | None, *, layout: str | N
         Where a table cannot be read, or lacks a column.
     """
     samples = _read_described(gyro, "gyro", layout)
-    return recording(samples, None if accel is None else _read_described(accel, "accel", layout))
+    return build_recording(samples, None if accel is None else _read_described(accel, "accel", layout))
 
 
 def is_inertial_scale(path: Path) -> bool:
@@ -258,8 +258,8 @@ def _read_csv(path: Path, units: DeclaredUnits, noise: ImuNoise | None) -> ImuRe
     gyro_unit, accel_unit = unit("gyro", 3, units.gyro), unit("accel", 3, units.accel)
     t_ns = table.stamps_ns(place["time", 0], unit("time", 1, None))
     numbers = table.numbers([place[sensor, axis] for sensor in ("gyro", "accel") for axis in range(3)])
-    gyro = ordered(table, "gyro", gyro_unit, t_ns, numbers[:, :3])
-    return recording(gyro, ordered(table, "accel", accel_unit, t_ns, numbers[:, 3:]), noise=noise)
+    gyro = order_rows(table, "gyro", gyro_unit, t_ns, numbers[:, :3])
+    return build_recording(gyro, order_rows(table, "accel", accel_unit, t_ns, numbers[:, 3:]), noise=noise)
 
 
 def _read_described(source: SensorTable, quantity: Quantity, layout: str | None) -> Samples:
@@ -272,16 +272,18 @@ def _read_described(source: SensorTable, quantity: Quantity, layout: str | None)
     if source.zero != 0 or source.counts_per_unit != 1:
         values = (values - source.zero) / source.counts_per_unit
     t_ns = table.stamps_ns(table.column(source.time), source.time_unit)
-    return ordered(table, quantity, source.unit, t_ns, values)
+    return order_rows(table, quantity, source.unit, t_ns, values)
 
 
-def ordered(table: Table, quantity: Quantity, unit: str, t_ns: Int64Array, values: Array) -> Samples:
+def order_rows(table: Table, quantity: Quantity, unit: str, t_ns: Int64Array, values: Array) -> Samples:
     """:func:`order_samples` of a table's rows."""
     samples = order_samples(table.path, quantity, unit, t_ns, values, table.line_numbers)
     return replace(samples, repairs=table.repairs + samples.repairs)
 
 
-def recording(gyro: Samples, accel: Samples | None, *, noise: ImuNoise | None = None, device: str = "") -> ImuRecording:
+def build_recording(
+    gyro: Samples, accel: Samples | None, *, noise: ImuNoise | None = None, device: str = ""
+) -> ImuRecording:
     """An :class:`ImuRecording` of ordered samples, its epoch at the first of them."""
     if accel is None:
         accel = Samples(t_ns=np.zeros(0, dtype=np.int64), values=np.zeros((0, 3)), repairs=())

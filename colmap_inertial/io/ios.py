@@ -27,7 +27,7 @@ from colmap_inertial.core.geometry import colmap_px_from_opencv
 from colmap_inertial.core.types import CameraModel, FrameLog, ImuRecording
 from colmap_inertial.io.files import first_line
 from colmap_inertial.io.frame_times import frame_log
-from colmap_inertial.io.imu_text import ordered, recording
+from colmap_inertial.io.imu_text import build_recording, order_rows
 from colmap_inertial.io.mp4 import is_mp4, read_movie
 from colmap_inertial.io.samples import Samples
 from colmap_inertial.io.tables import Table, head_of, members_of, parse_table, read_table, text_of
@@ -54,9 +54,9 @@ def read_stray_scanner(path: Path, units: DeclaredUnits) -> ImuRecording:
     accel = -table.numbers([table.column(f"a_{axis}") for axis in "xyz"])
     length = float(np.nanmedian(np.linalg.norm(accel, axis=1))) if len(accel) else 0.0
     unit = units.accel or ("g" if length < _G_BELOW else "m/s2")
-    return recording(
-        ordered(table, "gyro", units.gyro or "rad/s", t_ns, gyro),
-        ordered(table, "accel", unit, t_ns, accel),
+    return build_recording(
+        order_rows(table, "gyro", units.gyro or "rad/s", t_ns, gyro),
+        order_rows(table, "accel", unit, t_ns, accel),
         device="Stray Scanner",
     )
 
@@ -120,8 +120,8 @@ def read_sensor_logger(path: Path, units: DeclaredUnits) -> ImuRecording:
     if name is None:
         raise FormatError(path, "holds no Gyroscope.csv of Sensor Logger")
     table, t_ns, values = _sensor(path, members, name)
-    gyro = ordered(table, "gyro", units.gyro or "rad/s", t_ns, values)
-    return recording(gyro, _accelerometer(path, members, units), device="Sensor Logger")
+    gyro = order_rows(table, "gyro", units.gyro or "rad/s", t_ns, values)
+    return build_recording(gyro, _accelerometer(path, members, units), device="Sensor Logger")
 
 
 def _accelerometer(path: Path, members: dict[str, str], units: DeclaredUnits) -> Samples | None:
@@ -148,7 +148,7 @@ def _accelerometer(path: Path, members: dict[str, str], units: DeclaredUnits) ->
         values = values + np.stack([np.interp(at, known, column) for column in gravity.T], axis=1)
         unit = "m/s2"
     sign = -1.0 if ios and not standardised else 1.0
-    return ordered(table, "accel", units.accel or unit, t_ns, sign * values)
+    return order_rows(table, "accel", units.accel or unit, t_ns, sign * values)
 
 
 def _platform(path: Path, members: dict[str, str]) -> tuple[bool, bool]:

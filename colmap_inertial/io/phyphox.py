@@ -13,7 +13,7 @@ from pathlib import Path
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.types import ImuRecording
-from colmap_inertial.io.imu_text import ordered, recording
+from colmap_inertial.io.imu_text import build_recording, order_rows
 from colmap_inertial.io.samples import Samples
 from colmap_inertial.io.tables import Table, head_of, members_of, parse_table, text_of
 from colmap_inertial.io.units import DeclaredUnits
@@ -55,7 +55,7 @@ def read_phyphox(path: Path, units: DeclaredUnits) -> ImuRecording:
         raise FormatError(
             path, "its Linear Acceleration is without gravity; record Accelerometer (acceleration with g) instead"
         )
-    return recording(found["gyro"], found.get("accel"), device="phyphox")
+    return build_recording(found["gyro"], found.get("accel"), device="phyphox")
 
 
 def _may_be(name: str) -> bool:
@@ -82,7 +82,7 @@ def _samples(path: Path, member: str, name: str, quantity: str, pattern: str, un
     columns = [_column(table, pattern.format(axis)) for axis in "xyz"]
     values: Array = table.numbers(columns)
     t_ns = table.stamps_ns(_column(table, r"time \(s\)"), "s")
-    return ordered(table, "gyro" if quantity == "gyro" else "accel", unit, t_ns, values)
+    return order_rows(table, "gyro" if quantity == "gyro" else "accel", unit, t_ns, values)
 
 
 def _decimal_comma(text: str) -> bool:

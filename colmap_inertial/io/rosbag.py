@@ -14,7 +14,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError, MissingExtraError
 from colmap_inertial.core.types import ImuRecording
-from colmap_inertial.io.imu_text import recording
+from colmap_inertial.io.imu_text import build_recording
 from colmap_inertial.io.samples import Samples, order_samples
 from colmap_inertial.io.units import SENSOR_NAMES, DeclaredUnits, Quantity
 
@@ -80,7 +80,7 @@ def read_rosbag(path: Path, units: DeclaredUnits) -> ImuRecording:
             found[quantity] = order_samples(path, quantity, unit, t_ns, values)
     if "gyro" not in found:
         raise FormatError(path, f"none of its IMU topics ({', '.join(topics)}) has a gyroscope that moves")
-    return recording(found["gyro"], found.get("accel"))
+    return build_recording(found["gyro"], found.get("accel"))
 
 
 _Series = tuple[Int64Array, Array]

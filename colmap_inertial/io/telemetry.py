@@ -19,7 +19,7 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, MissingExtraError
 from colmap_inertial.core.types import FrameLog, ImuRecording
 from colmap_inertial.io.files import first_line
-from colmap_inertial.io.imu_text import recording
+from colmap_inertial.io.imu_text import build_recording
 from colmap_inertial.io.samples import Samples, order_samples
 from colmap_inertial.io.units import SENSOR_NAMES, Axes, DeclaredUnits, Quantity
 
@@ -63,7 +63,7 @@ def read_telemetry(path: Path, units: DeclaredUnits) -> ImuRecording:
     gyro = _samples(path, found, "gyro", units.gyro)
     if gyro is None:
         raise FormatError(path, f"holds no gyroscope; {camera} writes one where gyro data is switched on")
-    return recording(gyro, _samples(path, found, "accel", units.accel), device=camera)
+    return build_recording(gyro, _samples(path, found, "accel", units.accel), device=camera)
 
 
 def read_telemetry_frames(path: Path) -> FrameLog | None:

@@ -22,7 +22,7 @@ from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.types import FrameLog, ImuRecording
 from colmap_inertial.io.files import read_bytes
 from colmap_inertial.io.frame_times import frame_log
-from colmap_inertial.io.imu_text import recording
+from colmap_inertial.io.imu_text import build_recording
 from colmap_inertial.io.samples import Samples, order_samples
 from colmap_inertial.io.units import DeclaredUnits, Quantity
 
@@ -64,7 +64,7 @@ def read_video_imu_capture(path: Path, units: DeclaredUnits) -> ImuRecording:
     accel = _samples(file, stamps, rows["accel"], "accel", units.accel or "m/s2")
     if gyro is None:
         raise FormatError(file, "holds no gyroscope samples")
-    return recording(gyro, accel)
+    return build_recording(gyro, accel)
 
 
 def read_video_imu_capture_frames(path: Path) -> FrameLog:
