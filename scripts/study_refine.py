@@ -41,7 +41,7 @@ from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, quat_multi
 from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.core.types import CAL, CameraImuCalibration, ImuRecording
 from colmap_inertial.inertial.core.priors import PRIORS
-from colmap_inertial.inertial.refine.motion import moving
+from colmap_inertial.inertial.refine._residuals import moving
 from colmap_inertial.inertial.refine.setup import (
     at_middle_lines,
     make_problem,

@@ -8,7 +8,7 @@ import pytest
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import quat_rotate
-from colmap_inertial.core.gravity import gravity_in_cam, up_in_imu
+from colmap_inertial.core.gyro import gravity_in_cam, up_in_imu
 from colmap_inertial.core.types import FrameTiming, ImuRecording
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.tools.simulate import RecordingOptions, simulate_recording

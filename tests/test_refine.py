@@ -7,9 +7,9 @@ import pytest
 from refine_walk import PINHOLE, known_of, nudged, problem_of, tracks_of, walk
 
 from colmap_inertial.core.errors import NotObservableError
-from colmap_inertial.inertial.refine import _inertial, _seen, judge, setup, solve as solver
+from colmap_inertial.inertial.refine import _residuals, judge, setup, solve as solver
+from colmap_inertial.inertial.refine._residuals import moving
 from colmap_inertial.inertial.refine._system import Order, System
-from colmap_inertial.inertial.refine.motion import moving
 from colmap_inertial.inertial.refine.solve import _evaluate, _plausible, _weighted, factored, held_out, solve
 from colmap_inertial.inertial.refine.values import FreeCamera
 
@@ -40,11 +40,11 @@ def small(request):
 def test_derivatives_of_observations_are_those_of_finite_differences(small):
     _, problem, start, _ = small
     x = nudged(start, np.random.default_rng(0))
-    at = _seen.project(problem, x, problem.observations)
-    by = _seen.derivatives(problem, x, problem.observations, at)
+    at = _residuals.project(problem, x, problem.observations)
+    by = _residuals.derivatives(problem, x, problem.observations, at)
 
     def residual(y):
-        return _seen.project(problem, y, problem.observations).residual
+        return _residuals.project(problem, y, problem.observations).residual
 
     for kind, values in ((0, by.by_frame), (1, by.by_shared), (2, by.by_point)):
         for column in range(values.shape[2]):
@@ -83,7 +83,7 @@ def test_what_derivatives_leave_out_is_a_hundredth_of_a_pixel(small):
     _, problem, start, _ = small
 
     def residual(y):
-        return _seen.project(problem, y, problem.observations).residual
+        return _residuals.project(problem, y, problem.observations).residual
 
     for column in range(9, 15):  # by biases: what a milliradian a second and a hundredth of a m/s2 do
         assert np.abs(slope(residual, start, 0, column)).max() * 1e-3 < 0.02
@@ -95,7 +95,7 @@ def test_derivatives_of_the_imu_are_those_of_finite_differences(small, name):
     x = nudged(start, np.random.default_rng(1))
 
     def rows(y):
-        return _inertial.all_rows(problem, y)[name]
+        return _residuals.all_rows(problem, y)[name]
 
     at = rows(x)
     count = len(at.residual)
@@ -269,7 +269,7 @@ def test_a_recording_of_less_than_half_is_refused():
 def test_points_behind_the_camera_are_no_gain(small):
     _, problem, start, _ = small
     behind = replace(start, points_m=start.points_m - 100.0)
-    assert not _seen.project(problem, behind, problem.observations).seen.all()
+    assert not _residuals.project(problem, behind, problem.observations).seen.all()
     assert _evaluate(problem, behind, problem.observations).cost > _evaluate(problem, start, problem.observations).cost
     assert (
         held_out(problem, behind, problem.observations).mean() > held_out(problem, start, problem.observations).mean()
@@ -297,11 +297,11 @@ def test_every_camera_model_of_colmap_is_differentiated(model):
     problem, start, _ = problem_of(tracks_of(options), options)
     every = FreeCamera(model=problem.cameras[0].model, free=tuple(range(len(params))))
     problem, x = replace(problem, cameras=(every,)), replace(start, intrinsics=np.array(params))
-    at = _seen.project(problem, x, problem.observations)
-    by = _seen.derivatives(problem, x, problem.observations, at)
+    at = _residuals.project(problem, x, problem.observations)
+    by = _residuals.derivatives(problem, x, problem.observations, at)
     for kind, values, columns in ((0, by.by_frame, range(6)), (1, by.by_shared, range(9, 9 + len(params)))):
         for column in columns:
-            expected = slope(lambda y: _seen.project(problem, y, problem.observations).residual, x, kind, column)
+            expected = slope(lambda y: _residuals.project(problem, y, problem.observations).residual, x, kind, column)
             assert np.abs(values[:, :, column] - expected).max() < 1e-4 * (1 + np.abs(expected).max())
 
 
@@ -330,10 +330,10 @@ def test_a_gap_of_the_gyroscope_links_nothing():
 def test_speed_costs_nothing_where_the_imu_says_it(small):
     _, problem, start, _ = small
     fast = replace(start, velocity_m_s=start.velocity_m_s + 30.0)
-    rows = _inertial.state_rows(problem, fast)
+    rows = _residuals.state_rows(problem, fast)
     assert np.all(rows.residual[:, 6:9] == 0.0)
     alone = replace(problem, inertial=replace(problem.inertial, linked=np.zeros_like(problem.inertial.linked)))
-    assert np.all(_inertial.state_rows(alone, fast).residual[:, 6:9] > 2.0)
+    assert np.all(_residuals.state_rows(alone, fast).residual[:, 6:9] > 2.0)
 
 
 def test_an_offset_beyond_the_readings_that_were_looked_up_is_refused(small):
@@ -432,7 +432,7 @@ def test_known_numbers_stay_where_they_are(small):
     problem, start, _ = problem_of(tracks, options, refine_intrinsics=False)
     assert problem.cameras[0].free == ()
     x = solve(problem, start).estimate
-    assert _seen.cameras_of(problem, x)[0].params == tracks.camera.params
+    assert _residuals.cameras_of(problem, x)[0].params == tracks.camera.params
     assert known_of(tracks, options).prior.readout_s == 0.0
 
 

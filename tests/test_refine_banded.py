@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from refine_walk import problem_of, tracks_of, walk
 
-from colmap_inertial.inertial.refine import _banded
-from colmap_inertial.inertial.refine._banded import BandFactor
-from colmap_inertial.inertial.refine.motion import moving
+from colmap_inertial.inertial.refine import _system
+from colmap_inertial.inertial.refine._residuals import moving
+from colmap_inertial.inertial.refine._system import BandFactor
 from colmap_inertial.inertial.refine.solve import factored
 
 
 @pytest.mark.parametrize(("states", "reach"), [(1, 1), (7, 2), (23, 4), (24, 24), (60, 9)])
 def test_solutions_and_marginals_are_those_of_the_dense_inverse(states, reach, monkeypatch):
-    monkeypatch.setattr(_banded, "_LEAST", 12)
+    monkeypatch.setattr(_system, "_LEAST", 12)
     rng, count, width = np.random.default_rng(states), 3 * states, min(3 * reach, 3 * states) - 1
     row, column = np.indices((count, count))
     matrix = np.where(np.abs(row - column) <= width, rng.standard_normal((count, count)), 0.0)

@@ -8,7 +8,7 @@ from refine_walk import PINHOLE, nudged, problem_of, tracks_of, walk
 
 from colmap_inertial.core.geometry import so3_exp, so3_log
 from colmap_inertial.inertial.core.preintegration import SensorErrors, preintegrate
-from colmap_inertial.inertial.refine._inertial import imu_rows
+from colmap_inertial.inertial.refine._residuals import imu_rows
 from colmap_inertial.inertial.refine.solve import factored, solve
 from colmap_inertial.inertial.refine.values import N_STATE
 

@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from refine_walk import problem_of, tracks_of, walk
 
-from colmap_inertial.inertial.refine import levels, setup
-from colmap_inertial.inertial.refine._inertial import imu_rows
-from colmap_inertial.inertial.refine._seen import project
-from colmap_inertial.inertial.refine.levels import with_measured_noise
-from colmap_inertial.inertial.refine.solve import factored, solve
+from colmap_inertial.inertial.refine import setup, solve as solver
+from colmap_inertial.inertial.refine._residuals import imu_rows, project
+from colmap_inertial.inertial.refine.solve import factored, solve, with_measured_noise
 
 TRUE = 2e-3
 
@@ -51,7 +49,7 @@ def test_the_level_is_that_of_the_greatest_likelihood(solved, monkeypatch):
     problem = at_level(replace(problem, inertial=replace(problem.inertial, linked=linked)), 2 * TRUE)
     x = solve(problem, start).estimate
     # nothing was known of it before
-    monkeypatch.setattr(levels, "_SPREAD", 100.0)
+    monkeypatch.setattr(solver, "_LEVEL_SPREAD", 100.0)
     best = found(problem, x)
     share = imu_rows(at_level(problem, best), x).share
 

@@ -16,9 +16,8 @@ from colmap_inertial.inertial.core.arrow import ArrowSystem
 from colmap_inertial.inertial.core.preintegration import SensorErrors, SensorStream, SensorStreams, preintegrate
 from colmap_inertial.inertial.core.priors import PRIORS
 from colmap_inertial.inertial.scale import _residuals as res, _setup, estimate_scale, first_seconds
-from colmap_inertial.inertial.scale._grouping import first_of_groups, group_frames
-from colmap_inertial.inertial.scale._noise import LEVELS, TYPICAL, Expected, roughness
-from colmap_inertial.inertial.scale._setup import prepare
+from colmap_inertial.inertial.scale._noise import LEVELS, TYPICAL, Expected
+from colmap_inertial.inertial.scale._setup import first_of_groups, group_frames, prepare, roughness
 from colmap_inertial.inertial.scale.joint import JointOptions, estimate_joint, fit_path, scale_of
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.motion.align import align_camera_imu

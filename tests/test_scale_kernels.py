@@ -18,7 +18,7 @@ from colmap_inertial.inertial.core.preintegration import (
     SensorStreams,
     preintegrate,
 )
-from colmap_inertial.inertial.scale._drift import chi2_tail
+from colmap_inertial.inertial.scale._fit import chi2_tail
 from colmap_inertial.motion.align import _fit as align_fit
 
 SIZES = [(1, 21, 79, 1), (2, 21, 79, 5), (3, 21, 79, 5), (3, 5, 4, 2), (2, 7, 0, 3), (40, 1, 1, 9), (480, 21, 79, 5)]

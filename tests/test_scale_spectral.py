@@ -8,7 +8,7 @@ import pytest
 
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.geometry import quat_exp, quat_multiply, so3_exp
-from colmap_inertial.inertial.scale import _spectral_fit as spectral_fit
+from colmap_inertial.inertial.scale import spectral as spectral_module
 from colmap_inertial.inertial.scale._spectra import Signals
 from colmap_inertial.inertial.scale.spectral import SpectralOptions, estimate_spectral
 from colmap_inertial.io.calibration import Declared, calibration_prior
@@ -141,14 +141,14 @@ def test_a_jump_of_the_poses_and_missing_frames_are_survived(handheld):
 def test_derivatives_of_the_magnitudes_are_right(handheld):
     signals = Signals.of(handheld.trajectory, timed(handheld.trajectory, handheld.imu, known(handheld)))
     data = signals.spectra(1.2)
-    prior = spectral_fit._prior(known(handheld))
-    state, noise = spectral_fit._linear_start(data, prior, 9.80665)
-    residual, jacobian = spectral_fit._magnitudes(data, noise, prior, state)
+    prior = spectral_module._prior(known(handheld))
+    state, noise = spectral_module._linear_start(data, prior, 9.80665)
+    residual, jacobian = spectral_module._magnitudes(data, noise, prior, state)
     for i, size in enumerate([1e-6, *[1e-6] * 6, 1e-7, 1e-7]):
         step = np.zeros(9)
         step[i] = size
-        ahead, _ = spectral_fit._magnitudes(data, noise, prior, state.moved(step))
-        behind, _ = spectral_fit._magnitudes(data, noise, prior, state.moved(-step))
+        ahead, _ = spectral_module._magnitudes(data, noise, prior, state.moved(step))
+        behind, _ = spectral_module._magnitudes(data, noise, prior, state.moved(-step))
         numeric = (ahead - behind) / (2 * size)
         assert np.allclose(jacobian[:, i], numeric, rtol=1e-3, atol=1e-3 * np.abs(jacobian[:, i]).max())
     assert len(residual) == 3 * len(data.frequency_hz) + 6

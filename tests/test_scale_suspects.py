@@ -15,7 +15,7 @@ from colmap_inertial.inertial.scale import estimate_scale, first_seconds, gravit
 from colmap_inertial.inertial.scale._fit import fit_jointly
 from colmap_inertial.inertial.scale._setup import prepare
 from colmap_inertial.inertial.scale._suspects import Faults, Suspicion, worst
-from colmap_inertial.inertial.scale.parts import CAUSES, parts_in_words
+from colmap_inertial.inertial.scale.verdict import CAUSES, parts_in_words
 from colmap_inertial.motion.align import align_camera_imu
 from colmap_inertial.tools.simulate.motion import MotionOptions
 from colmap_inertial.tools.simulate.recording import RecordingOptions, simulate_recording

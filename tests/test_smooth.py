@@ -28,8 +28,7 @@ from colmap_inertial.motion.smooth import (
     smooth_positions,
     smooth_trajectory,
 )
-from colmap_inertial.motion.smooth._chain import Chain
-from colmap_inertial.motion.smooth._models import constant_acceleration, white_jerk
+from colmap_inertial.motion.smooth._positions import Chain, constant_acceleration, white_jerk
 from colmap_inertial.tools.simulate import ImuOptions, MotionOptions, RecordingOptions, SfmOptions, simulate_recording
 
 #: Gains and misalignments are not part of the smoother's model (they are priced in roughly): left out for exact tests.

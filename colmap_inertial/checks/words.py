@@ -8,8 +8,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
-from colmap_inertial.inertial.scale.parts import parts_in_words
-from colmap_inertial.inertial.scale.verdict import TRUSTED_HALF_WIDTH
+from colmap_inertial.inertial.scale.verdict import TRUSTED_HALF_WIDTH, parts_in_words
 
 #: A label, and the value with its unit.
 Fact = tuple[str, str]

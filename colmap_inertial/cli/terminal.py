@@ -56,7 +56,7 @@ def scale_lines(estimate: ScaleEstimate) -> list[Line]:
     from rich.text import Text
 
     from colmap_inertial.checks.words import half_width_pct, length_in_words, scale_facts, sensor_facts
-    from colmap_inertial.inertial.scale.parts import parts_in_words
+    from colmap_inertial.inertial.scale.verdict import parts_in_words
 
     metres = "no metres: the recording does not determine the scale"
     if estimate.metres_per_unit is not None and estimate.ci95 is not None:

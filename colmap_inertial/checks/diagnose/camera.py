@@ -14,7 +14,7 @@ from colmap_inertial.core.sampling import without_running_mean
 from colmap_inertial.core.types import CameraTrajectory, ImuRecording
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.motion.align import Alignment
-from colmap_inertial.motion.align.acceleration import quick_accelerations
+from colmap_inertial.motion.align.conventions import quick_accelerations
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,17 +8,18 @@ specific force: at rest the accelerometer reads +9.8 m/s2 away from the ground.
 
 from __future__ import annotations
 
-from colmap_inertial.core.types.apertures import Aperture, ApertureRig, SpectralRole
 from colmap_inertial.core.types.estimated import (
     DOWN_IN_WORLD,
     UNDOES,
     AcceptedScale,
+    CameraMotion,
     Gap,
     JoinedPart,
     ScaleDrift,
     ScaleEstimate,
     Similarity,
     SmoothedTrajectory,
+    SolvedMotion,
     Verdict,
 )
 from colmap_inertial.core.types.imu import (
@@ -33,18 +34,21 @@ from colmap_inertial.core.types.imu import (
     ImuNoise,
     ImuRecording,
 )
-from colmap_inertial.core.types.motion import CameraMotion, SolvedMotion
-from colmap_inertial.core.types.positions import HeightDatum, PositionFixes
 from colmap_inertial.core.types.recorded import (
+    Aperture,
+    ApertureRig,
     CameraModel,
     CameraTrajectory,
     Frame,
     FrameLog,
     FrameTiming,
+    HeightDatum,
     Keypoints,
     LengthUnit,
+    PositionFixes,
     Projector,
     ReadoutDirection,
+    SpectralRole,
     Treatment,
 )
 

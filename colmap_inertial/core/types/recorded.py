@@ -1,4 +1,4 @@
-"""What was recorded or reconstructed: frames and their times, cameras, trajectories."""
+"""What was recorded or reconstructed: frames with times, cameras, apertures, trajectories, satellite positions."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array, BoolArray, IndexArray, UInt8Array, UInt16Array
+from colmap_inertial.core.arrays import Array, BoolArray, IndexArray, Int64Array, UInt8Array, UInt16Array
 from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply
 from colmap_inertial.core.validation import check_fields, set_fields
 
@@ -283,3 +283,133 @@ class CameraTrajectory:
             cam_in_world=self.cam_in_world[index],
             pose_cov=None if self.pose_cov is None else self.pose_cov[index],
         )
+
+
+#: What an aperture's filter passes; ``other`` (near infrared, say) takes part in matching and in no colour.
+SpectralRole = Literal["red", "green", "blue", "luminance", "other"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Aperture:
+    """One camera unit of a multi-aperture camera.
+
+    Attributes
+    ----------
+    name
+        Unique in its rig.
+    role
+        What its filter passes.
+    camera
+        Intrinsics.
+    cam_from_rig_xyzw
+        (4,) rotation.
+    cam_in_rig
+        (3,) camera centre, in the rig's ``length_unit``.
+    """
+
+    name: str
+    role: SpectralRole
+    camera: CameraModel
+    cam_from_rig_xyzw: Array
+    cam_in_rig: Array
+
+    def __post_init__(self) -> None:
+        check_fields(self, cam_from_rig_xyzw=(4,), cam_in_rig=(3,))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ApertureRig:
+    """The camera units of a multi-aperture camera.
+
+    Attributes
+    ----------
+    apertures
+        Two or more, at different places. The first one is the reference, through which the fused picture is seen; the
+        second one is its partner, and disparities are shifts between these two.
+    length_unit
+        ``"m"``, or ``"model"`` where the calibration has no scale.
+    """
+
+    apertures: tuple[Aperture, ...]
+    length_unit: LengthUnit = "m"
+
+    def __post_init__(self) -> None:
+        set_fields(self, apertures=tuple(self.apertures))
+        if len(self.apertures) < 2:
+            raise ValueError("a rig needs at least two apertures")
+        if len(set(self.names)) != len(self.apertures):
+            raise ValueError("apertures must have different names")
+        centres = np.stack([aperture.cam_in_rig for aperture in self.apertures])
+        if not np.linalg.norm(centres[1] - centres[0]) > 0:
+            raise ValueError(f"{self.names[0]} and {self.names[1]} are at the same place: no parallax, no disparity")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the apertures, in order."""
+        return tuple(aperture.name for aperture in self.apertures)
+
+    @property
+    def reference(self) -> Aperture:
+        """The aperture through which the fused picture is seen."""
+        return self.apertures[0]
+
+
+#: What heights count from: WGS84's ellipsoid, the sea, or what nobody said.
+HeightDatum = Literal["ellipsoid", "sea", "unknown"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PositionFixes:
+    """Positions of a satellite receiver, WGS84.
+
+    Attributes
+    ----------
+    latitude_deg, longitude_deg
+        (N,) north and east positive.
+    height_m
+        (N,) nan where it is not known.
+    sigma_m
+        (N,) standard deviation of each horizontal coordinate as the receiver states it; nan where it does not.
+    t_ns
+        (N,) when, on the clock of the video that holds them; ``None`` where ``names`` says it.
+    names
+        (N,) of the pictures that hold them; ``None`` where ``t_ns`` says it.
+    height_above
+        What heights count from.
+    source
+        Where they were read, in words.
+    """
+
+    latitude_deg: Array
+    longitude_deg: Array
+    height_m: Array
+    sigma_m: Array
+    t_ns: Int64Array | None = None
+    names: tuple[str, ...] | None = None
+    height_above: HeightDatum = "unknown"
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        check_fields(self, latitude_deg=("N",), longitude_deg=("N",))
+        n = len(self.latitude_deg)
+        if (self.t_ns is None) == (self.names is None):
+            raise ValueError("either times or names")
+        if self.names is not None and len(self.names) != n:
+            raise ValueError("one name for each position")
+        if np.abs(self.latitude_deg).max(initial=0) > 90 or np.abs(self.longitude_deg).max(initial=0) > 360:
+            raise ValueError("latitudes reach from -90 to 90 degrees, longitudes from -180 to 180")
+        for name in ("height_m", "sigma_m"):
+            values = np.array(getattr(self, name), dtype=np.float64)
+            if values.shape != (n,) or np.isinf(values).any():
+                raise ValueError(f"{name}: must be ({n},), finite or nan")
+            values.setflags(write=False)
+            set_fields(self, **{name: values})
+        if self.t_ns is not None:
+            set_fields(self, t_ns=np.asarray(self.t_ns, dtype=np.int64))
+
+    def select(self, index: IndexArray | BoolArray) -> PositionFixes:
+        """Some of them."""
+        names = None if self.names is None else tuple(np.array(self.names, dtype=object)[index])
+        arrays = ("latitude_deg", "longitude_deg", "height_m", "sigma_m")
+        t_ns = None if self.t_ns is None else self.t_ns[index]
+        return replace(self, **{name: getattr(self, name)[index] for name in arrays}, t_ns=t_ns, names=names)

@@ -9,11 +9,10 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.inertial.refine._residuals import Moving, moving
 from colmap_inertial.inertial.refine._system import Factored, Order
-from colmap_inertial.inertial.refine.levels import with_measured_noise
-from colmap_inertial.inertial.refine.motion import Moving, moving
 from colmap_inertial.inertial.refine.setup import at_middle_lines, measured_noise, pictures_alone, with_noise
-from colmap_inertial.inertial.refine.solve import Solution, factored, held_out, solve
+from colmap_inertial.inertial.refine.solve import Solution, factored, held_out, solve, with_measured_noise
 from colmap_inertial.inertial.refine.values import READOUT, Estimate, Observations, Problem
 
 #: Every so many observations of points with at least so many is held out.

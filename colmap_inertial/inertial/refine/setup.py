@@ -17,7 +17,7 @@ from colmap_inertial.core.types import CAL, CameraImuCalibration, CameraModel, F
 from colmap_inertial.imaging.gyro_camera import FrameShutter
 from colmap_inertial.inertial.core.preintegration import SensorErrors, SensorStreams, preintegrate
 from colmap_inertial.inertial.core.priors import PRIORS, gains_cov
-from colmap_inertial.inertial.refine._seen import cameras_of, poses_at, project, turning_around
+from colmap_inertial.inertial.refine._residuals import cameras_of, poses_at, project, turning_around
 from colmap_inertial.inertial.refine.values import (
     CLOCK_RATE,
     FIRST_INTRINSIC,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,9 +15,85 @@ from colmap_inertial.inertial.core.parameters import Estimate, Noise, Prior
 from colmap_inertial.inertial.core.preintegration import Preintegrated
 from colmap_inertial.inertial.core.priors import model_scale_sigma
 from colmap_inertial.inertial.scale import _noise as levels, _residuals as res, _suspects as sus
-from colmap_inertial.inertial.scale._drift import scale_drift
-from colmap_inertial.inertial.scale._grouping import Data
 from colmap_inertial.inertial.scale._noise import Expected, LevelSearch
+from colmap_inertial.inertial.scale._setup import Data
+
+#: Length of a part, and how many there are at most.
+_PART_S, _MOST_PARTS = 10.0, 12
+
+
+def chi2_tail(chi2: float, dof: int) -> float:
+    """Probability that a chi-squared variable is larger: the finite sum for an integer number of degrees of freedom."""
+    half = 0.5 * chi2
+    term, total = (math.exp(-half), 0.0) if dof % 2 == 0 else (0.0, math.erfc(math.sqrt(half)))
+    if dof % 2:
+        term = 2 * math.exp(-half) * math.sqrt(half / math.pi)
+    for order in range(2 + dof % 2, dof + 1, 2):
+        total += term
+        term *= 2 * half / order
+    return total
+
+
+def scale_drift(data: Data, noise: Noise, optimum: _Optimum, inflation: float) -> ScaleDrift:
+    """Scales of parts of the recording, and a test of whether they are the same.
+
+    Each part gets a scale of its own, to first order about the joint fit; all other parameters follow. A deviation of a
+    part's scale stretches the visual path within that part and shifts all that comes after.
+
+    Parameters
+    ----------
+    data, noise, optimum
+        The joint fit.
+    inflation
+        By how much variances are larger than the noise levels say.
+    """
+    x, centre, inverse = optimum.estimate, optimum.groups["centre"], optimum.inverse
+    rhs, rhs_z = optimum.rhs
+    # standard deviation of the parts' scales that is no drift to speak of
+    tolerated_log = model_scale_sigma(calibrated=False)
+    span_s = float(data.t_s[-1] - data.t_s[0])
+    parts = int(np.clip(round(span_s / _PART_S), 2, _MOST_PARTS))
+    edges_s = np.linspace(data.t_s[0], data.t_s[-1], parts + 1)
+    # The fitted path, not the measured one, whose noise would be mistaken for a smaller scale
+    path = x.imu_in_world_m - x.world_from_imu @ (x.cam_from_imu.T @ x.imu_in_cam_m)
+    nodes = np.searchsorted(data.t_s, edges_s[:-1]), np.searchsorted(data.t_s, edges_s[1:])
+    columns = np.zeros((*path.shape, parts))
+    for i, (first, last) in enumerate(zip(*nodes, strict=True)):
+        columns[first:last, :, i] = path[first] - path[first:last]
+        columns[last:, :, i] = path[first] - path[last]
+    weight = np.ones(len(path)) if centre.weight is None else centre.weight
+    columns = (data.centre_shape / noise.centre_m * np.sqrt(weight)[:, None, None]) @ columns
+
+    pulled, pulled_z = np.zeros((len(path), par.N_STATE, parts)), np.zeros((par.N_GLOBALS, parts))
+    centre.pull_back(columns, pulled, pulled_z)
+    states, z = inverse.solve(np.concatenate([rhs, pulled], axis=2), np.concatenate([rhs_z, pulled_z], axis=1))
+    follow = centre.apply(states, z)
+    residual = centre.residual + follow[:, :, 0]
+    information = np.einsum("kiw,kiv->wv", columns, columns - follow[:, :, 1:])
+    score = np.einsum("kiw,ki->w", columns, residual)
+
+    # All parts together are the scale itself, so that only contrasts between parts are known
+    contrasts = np.linalg.qr(np.column_stack([np.ones(parts), np.eye(parts)[:, 1:]]))[0][:, 1:]
+    cov = np.linalg.inv(contrasts.T @ information @ contrasts) * inflation
+    # The columns are those of u, the inverse of the metres per unit
+    log_ratio = (cov / inflation) @ (contrasts.T @ score)
+    tested = np.linalg.inv(cov + tolerated_log**2 * np.eye(parts - 1))
+    chi2 = float(log_ratio @ tested @ log_ratio)
+    middle_s = 0.5 * (edges_s[1:] + edges_s[:-1])
+    slope = contrasts.T @ (middle_s - middle_s.mean())
+    trend_information = float(slope @ tested @ slope)
+    return ScaleDrift(
+        begin_s=edges_s[:-1],
+        end_s=edges_s[1:],
+        log_ratio=contrasts @ log_ratio,
+        sigma_log=np.sqrt(np.diagonal(contrasts @ cov @ contrasts.T)),
+        chi2=chi2,
+        dof=parts - 1,
+        p_value=chi2_tail(chi2, parts - 1),
+        trend_log_per_s=float(slope @ tested @ log_ratio) / trend_information,
+        trend_sigma_log_per_s=trend_information**-0.5,
+    )
+
 
 _MAX_ITERATIONS, _MAX_ROTATION_ITERATIONS = 40, 4
 #: At rest: what the scale would still move by, in its standard deviations.
@@ -125,15 +202,7 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
     level_variance, freedom = search.scale_variance(groups, states[:, :, 3:4], z[:, 3:4])
     states, z = states[:, :, :3], z[:, :3]
     inflation = max(1.0, *(squares / expected for squares, expected in sums.values()))
-    drift = scale_drift(
-        data,
-        x,
-        noise,
-        groups["centre"],
-        (inverse, *at.rhs),
-        inflation=inflation,
-        tolerated_log=model_scale_sigma(calibrated=False),
-    )
+    drift = scale_drift(data, noise, at, inflation)
     return Fit(
         estimate=x,
         noise=noise,

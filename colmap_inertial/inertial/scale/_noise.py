@@ -16,7 +16,7 @@ from colmap_inertial.core.types import JOINT_GYRO_WALK_RAD_S_RTS, TYPICAL_NOISE,
 from colmap_inertial.inertial.core.arrow import Inverse
 from colmap_inertial.inertial.core.factors import Direct, Group
 from colmap_inertial.inertial.core.parameters import Noise
-from colmap_inertial.inertial.scale._grouping import Data
+from colmap_inertial.inertial.scale._setup import Data
 
 Groups = Mapping[str, Group | Direct]
 
@@ -81,22 +81,6 @@ _LARGEST_FIRST, _LARGEST_CHANGE = 3.0, 1.8
 _PATIENCE, _TIRING = 25, 0.6
 #: At rest: the likelihood has no more than this to gain, as standard deviations of the levels (Newton's decrement).
 _AT_REST = 0.5
-
-
-def roughness(t_s: Array, values: Array) -> float:
-    """Density of the white noise that would make samples as rough as they are; more than the noise where they move.
-
-    From third differences, which leave little of a motion that is slow against the samples: 20 times the variance of
-    white noise.
-
-    Parameters
-    ----------
-    t_s, values
-        (N,), (N, 3) samples.
-    """
-    if len(t_s) < 4:
-        return 0.0
-    return float(np.sqrt(np.mean(np.diff(values, 3, axis=0) ** 2) / 20 * np.median(np.diff(t_s))))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,7 +18,7 @@ from colmap_inertial.inertial.core.factors import (
 )
 from colmap_inertial.inertial.core.parameters import Estimate, Noise, Prior
 from colmap_inertial.inertial.core.preintegration import Preintegrated, SensorErrors, preintegrate
-from colmap_inertial.inertial.scale._grouping import Data
+from colmap_inertial.inertial.scale._setup import Data
 
 #: Cauchy scale of the visual residuals, in standard deviations: a normal error loses 4 % of its weight on average.
 ROBUST_SIGMAS = 4.0

@@ -22,8 +22,8 @@ from colmap_inertial.inertial.core.preintegration import (
     SensorStreams,
     preintegrate,
 )
-from colmap_inertial.inertial.scale._grouping import Data
 from colmap_inertial.inertial.scale._residuals import node_stamps
+from colmap_inertial.inertial.scale._setup import Data
 
 #: Squared deviation in standard deviations from which a suspicion counts. 935 clean recordings, real and simulated, had
 #: 23 at most.

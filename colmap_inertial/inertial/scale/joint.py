@@ -34,8 +34,7 @@ from colmap_inertial.inertial.core import parameters as par
 from colmap_inertial.inertial.core.parameters import Prior
 from colmap_inertial.inertial.core.priors import PRIORS, is_calibrated
 from colmap_inertial.inertial.scale._fit import Fit, fit_jointly
-from colmap_inertial.inertial.scale._grouping import Data
-from colmap_inertial.inertial.scale._setup import prepare
+from colmap_inertial.inertial.scale._setup import Data, prepare
 from colmap_inertial.inertial.scale._suspects import Faults, worst
 from colmap_inertial.inertial.scale.verdict import scale_drifts, student_factor, verdict_of
 

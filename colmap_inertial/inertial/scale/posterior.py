@@ -20,8 +20,8 @@ from colmap_inertial.inertial.core import parameters as par
 from colmap_inertial.inertial.core.parameters import Noise
 from colmap_inertial.inertial.core.priors import is_calibrated, model_scale_sigma
 from colmap_inertial.inertial.scale._fit import Fit
-from colmap_inertial.inertial.scale._grouping import Data
 from colmap_inertial.inertial.scale._inputs import align_recording, strength_of_gravity
+from colmap_inertial.inertial.scale._setup import Data
 from colmap_inertial.inertial.scale.joint import JointOptions, fit_path, scale_of
 
 # Columns of a node: rotation (right, body frame), position, velocity, biases of gyroscope and accelerometer.

@@ -18,7 +18,7 @@ from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import IMU_CAL, ImuCalibration, ImuRecording
 from colmap_inertial.inertial.core.priors import KNOWN_GAIN, PRIORS
-from colmap_inertial.inertial.static_calibration._fit import RestFit, RestPriors, fit_rests
+from colmap_inertial.inertial.static_calibration._fit import MISALIGNMENT_SIGMA, RestFit, fit_rests
 from colmap_inertial.inertial.static_calibration._rests import Rests, candidate_rests
 from colmap_inertial.io.units import STANDARD_GRAVITY_M_S2
 
@@ -29,15 +29,6 @@ FULL_ATTITUDES, FEWEST_ATTITUDES = 9, 6
 _GOOD_MISALIGNMENT, _GOOD_GYRO_GAIN = 0.002, 0.003
 #: A threshold is considered where it finds this share of the most attitudes that any finds.
 _MOST_ATTITUDES = 0.9
-#: A misalignment is that of one axis against another, each of which has the prior's.
-_MISALIGNMENT = np.sqrt(2) * PRIORS.accel_gain
-_PRIORS = RestPriors(
-    accel_gain=PRIORS.accel_gain,
-    accel_misalignment=_MISALIGNMENT,
-    accel_bias_m_s2=PRIORS.accel_bias_m_s2,
-    gyro_gain=PRIORS.gyro_gain,
-    gravity_m_s2=PRIORS.gravity_m_s2,
-)
 #: Beyond this many standard deviations beforehand, residuals say that something else moved or shook.
 _NOISY = 8.0
 #: Gains and angles beyond which the two sensors do not belong together.
@@ -116,7 +107,6 @@ def calibrate_imu(
         raise ValueError("the recording was corrected by a calibration already; give the sensor's own readings")
     if not imu.has_accel:
         raise NotObservableError("IMU calibration", "the recording has no accelerometer; record it, too")
-    priors = replace(_PRIORS, gravity_m_s2=gravity_sigma_m_s2)
     with one_blas_thread():
         candidates = candidate_rests(imu)
         most = max((rests.attitudes for rests in candidates), default=0)
@@ -126,9 +116,9 @@ def calibrate_imu(
                 "IMU calibration", f"{rested}, and at least {FEWEST_ATTITUDES} are needed (twelve are good): {_HOW}"
             )
         usable = [r for r in candidates if r.attitudes >= max(FEWEST_ATTITUDES, _MOST_ATTITUDES * most)]
-        alone = [(fit_rests(imu, rests, gravity_m_s2, priors, accel_only=True), rests) for rests in usable]
+        alone = [(fit_rests(imu, rests, gravity_m_s2, gravity_sigma_m_s2, accel_only=True), rests) for rests in usable]
         of_accel, rests = min(alone, key=lambda pair: _residual(*pair))
-        fit = fit_rests(imu, rests, gravity_m_s2, priors)
+        fit = fit_rests(imu, rests, gravity_m_s2, gravity_sigma_m_s2)
     apart = _apart(fit)
     if apart:
         fit = of_accel
@@ -164,7 +154,7 @@ def _calibration(fit: RestFit, rests: Rests, gravity_m_s2: float, device: str) -
         beside = np.array([3, 6, 7])  # yx, zx, zy: the misalignments
         accel_gain.ravel()[beside] = 0.0
         cov[beside, :] = cov[:, beside] = 0.0
-        cov[beside, beside] = _MISALIGNMENT**2
+        cov[beside, beside] = MISALIGNMENT_SIGMA**2
     return ImuCalibration(
         accel_gain=accel_gain,
         accel_bias_m_s2=fit.accel_bias_m_s2,
@@ -201,7 +191,7 @@ def _judged(
     if count < FULL_ATTITUDES:
         weak.append(
             f"{count} attitudes determine gains and biases of the accelerometer, not its misalignments, which stay "
-            f"unknown to {100 * _MISALIGNMENT:.1f} %; from {FULL_ATTITUDES} on, they are determined, too"
+            f"unknown to {100 * MISALIGNMENT_SIGMA:.1f} %; from {FULL_ATTITUDES} on, they are determined, too"
         )
     elif gains[np.tril_indices(3, -1)].max() > _GOOD_MISALIGNMENT:
         weak.append(f"the attitudes leave a misalignment of the accelerometer unknown: {_HOW}")

@@ -11,6 +11,7 @@ from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.sampling import Coverage
 from colmap_inertial.core.types import IMU_CAL, ImuRecording
+from colmap_inertial.inertial.core.priors import PRIORS
 from colmap_inertial.inertial.static_calibration._rests import Rests
 
 #: Entries of the accelerometer's matrix that are fitted, row by row: the frame takes the others.
@@ -25,21 +26,12 @@ _ACCEL_FLOOR_M_S2, _GYRO_FLOOR_RAD_S = 4e-4, 4e-5
 _TURN_SHARE = 5e-5
 #: A turn of fewer samples is none.
 _FEWEST_SAMPLES = 8
+#: A misalignment is that of one axis against another, each of which has the prior's.
+MISALIGNMENT_SIGMA = np.sqrt(2) * PRIORS.accel_gain
 #: How many squared residuals the noise known beforehand is worth, against those of the fit.
 _FREEDOM_BEFORE = 8.0
 #: Steps are small against standard deviations, and factors against themselves.
 _ITERATIONS, _ROUNDS, _SETTLED = 6, 12, 0.01
-
-
-@dataclass(frozen=True, kw_only=True)
-class RestPriors:
-    """Standard deviations beforehand: of each gain, of each misalignment, of biases, and of gravity's strength."""
-
-    accel_gain: float
-    accel_misalignment: float
-    accel_bias_m_s2: float
-    gyro_gain: float
-    gravity_m_s2: float
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -146,7 +138,7 @@ class _Turns:
 
 
 def fit_rests(
-    imu: ImuRecording, rests: Rests, gravity_m_s2: float, priors: RestPriors, *, accel_only: bool = False
+    imu: ImuRecording, rests: Rests, gravity_m_s2: float, gravity_sigma_m_s2: float, *, accel_only: bool = False
 ) -> RestFit:
     """Weighted least squares of accelerometer and gyroscope together, with the directions of gravity in the rests.
 
@@ -160,7 +152,7 @@ def fit_rests(
     state = _State.start(rests, gravity_m_s2)
     factor_a = factor_t = 1.0
     freedom = np.full(2, _FREEDOM_BEFORE)
-    beforehand = _prior_sigma(priors)
+    beforehand = _prior_sigma(gravity_sigma_m_s2)
     prior_sigma = beforehand
     for _ in range(_ROUNDS):
         for _ in range(_ITERATIONS):
@@ -186,10 +178,11 @@ def fit_rests(
     return _result(state, rests, turns, cov, freedom, (factor_a, factor_t), gravity_m_s2)
 
 
-def _prior_sigma(priors: RestPriors) -> Array:
+def _prior_sigma(gravity_sigma_m_s2: float) -> Array:
+    """(19,) standard deviations beforehand, in the order of the columns."""
     sigma = np.empty(_COUNT)
-    sigma[_ACCEL] = np.where(np.isin(_LOWER, [0, 4, 8]), priors.accel_gain, priors.accel_misalignment)
-    sigma[_BIAS], sigma[_GRAVITY], sigma[_GYRO] = priors.accel_bias_m_s2, priors.gravity_m_s2, priors.gyro_gain
+    sigma[_ACCEL] = np.where(np.isin(_LOWER, [0, 4, 8]), PRIORS.accel_gain, MISALIGNMENT_SIGMA)
+    sigma[_BIAS], sigma[_GRAVITY], sigma[_GYRO] = PRIORS.accel_bias_m_s2, gravity_sigma_m_s2, PRIORS.gyro_gain
     return sigma
 
 

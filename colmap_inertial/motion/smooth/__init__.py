@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from colmap_inertial.motion.smooth._acceleration import WorldAcceleration
-from colmap_inertial.motion.smooth._attitude import Attitude, smooth_attitude
+from colmap_inertial.motion.smooth._attitude import Attitude, WorldAcceleration, smooth_attitude
 from colmap_inertial.motion.smooth._positions import PositionSmoother, SmoothOptions, smooth_positions
 from colmap_inertial.motion.smooth._trajectory import smooth_trajectory
 

@@ -18,11 +18,16 @@ from colmap_inertial.core.types import (
     ImuRecording,
     SmoothedTrajectory,
 )
-from colmap_inertial.motion.smooth._acceleration import WorldAcceleration
-from colmap_inertial.motion.smooth._attitude import Attitude, smooth_attitude
-from colmap_inertial.motion.smooth._chain import Chain
-from colmap_inertial.motion.smooth._models import most_likely, runs_of, white_acceleration, white_jerk, worst_outliers
-from colmap_inertial.motion.smooth._positions import SmoothOptions
+from colmap_inertial.motion.smooth._attitude import Attitude, WorldAcceleration, smooth_attitude
+from colmap_inertial.motion.smooth._positions import (
+    Chain,
+    SmoothOptions,
+    most_likely,
+    runs_of,
+    white_acceleration,
+    white_jerk,
+    worst_outliers,
+)
 
 #: Time over which errors of positions from images stay correlated, as features come and go.
 _CORRELATION_S = 0.35

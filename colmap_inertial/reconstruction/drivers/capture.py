@@ -16,7 +16,7 @@ from colmap_inertial.colmap.tsdf import require_mesh_maker
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import FormatError, InertialError
-from colmap_inertial.core.gravity import gravity_in_cam
+from colmap_inertial.core.gyro import gravity_in_cam
 from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.core.types import Frame, PositionFixes
 from colmap_inertial.io.calibration import describe_files

@@ -1,4 +1,7 @@
-"""Residuals of observations, each at its own line's instant, with their derivatives."""
+"""Residuals of the refinement with derivatives: observations (each at its own line's instant), IMU, priors.
+
+Also the camera's position and velocity at a solution, and how they depend on what is solved for.
+"""
 
 from __future__ import annotations
 
@@ -7,15 +10,20 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray, IndexArray, Int64Array
-from colmap_inertial.core.geometry import cross, skew, so3_exp
+from colmap_inertial.core.geometry import cross, skew, so3_exp, so3_log
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.types import CameraModel
-from colmap_inertial.inertial.core.preintegration import SensorStreams
+from colmap_inertial.inertial.core import parameters as par
+from colmap_inertial.inertial.core.factors import imu_group
+from colmap_inertial.inertial.core.preintegration import SensorErrors, SensorStreams, preintegrate
 from colmap_inertial.inertial.refine.values import (
+    ACCEL_BIAS,
     CLOCK_RATE,
     FIRST_INTRINSIC,
+    GYRO_BIAS,
     LEVER,
     N_SEEN,
+    N_STATE,
     OFFSET,
     POSITION,
     READOUT,
@@ -260,3 +268,193 @@ def _by_number(model: CameraModel, place: int, in_cam: Array) -> Array:
         params[place] += sign * step
         ends.append(np.asarray(colmap_camera(replace(model, params=tuple(params))).img_from_cam(in_cam)))
     return (ends[0] - ends[1]) / (2 * step)
+
+
+#: Standard deviations of the first position and heading, which nothing else determines.
+_HELD_M, _HELD_RAD = 1e-5, 1e-6
+#: Of every pose about where it starts: holds a frame that neither points nor the IMU hold.
+_STAYS_M, _STAYS_RAD = 10.0, 1.0
+#: Of a velocity that the IMU does not touch: holds a frame that the IMU did not record.
+_SPEED_M_S = 10.0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Rows:
+    """Residuals over their standard deviations, each of a state, of it and the next, and of what is shared.
+
+    Attributes
+    ----------
+    residual
+        (N, r).
+    here, after
+        (N, r, 15) derivatives by the states ``0 .. N`` and by the ones after them.
+    by_shared
+        (N, r, Q), or ``None`` where it is zero.
+    share
+        (N, r, r) part of the residuals' covariance that is the accelerometer's white noise; ``None`` where there is
+        none.
+    """
+
+    residual: Array
+    here: Array
+    after: Array | None = None
+    by_shared: Array | None = None
+    share: Array | None = None
+
+
+def imu_rows(problem: Problem, x: Estimate) -> Rows:
+    """Rotation, velocity, position between consecutive frames."""
+    inertial = problem.inertial
+    assert inertial is not None
+    errors = SensorErrors(
+        gyro_bias_rad_s=x.gyro_bias_rad_s[:-1],
+        accel_bias_m_s2=x.accel_bias_m_s2[:-1],
+        gyro_gain=x.gyro_gain,
+        accel_gain=x.accel_gain,
+        accel_delay_s=x.accel_delay_s,
+    )
+    pre = preintegrate(inertial.nodes_s, inertial.streams, errors)
+    states = par.InertialStates(
+        world_from_imu=x.world_from_imu,
+        imu_in_world_m=x.imu_in_world_m,
+        velocity_m_s=x.velocity_m_s,
+        gravity_m_s2=x.gravity_m_s2 * inertial.down,
+        accel_gain=x.accel_gain,
+    )
+    group = imu_group(inertial.noise, states, pre)
+    assert group.after is not None and group.by_globals is not None
+    at, start = x.columns, par.IMU_GLOBALS.start
+    by = group.by_globals
+    by_shared = np.zeros((*by.shape[:2], at.count))
+    by_shared[:, :, at.gravity] = by[:, :, par.GRAVITY.start - start : par.GRAVITY.stop - start] @ inertial.down
+    by_shared[:, :, at.accel_delay] = by[:, :, par.ACCEL_DELAY - start]
+    for mine, theirs in ((at.gyro_gain, par.GYRO_GAIN), (at.accel_gain, par.ACCEL_GAIN)):
+        by_shared[:, :, mine] = by[:, :, theirs.start - start : theirs.stop - start]
+    counts = inertial.linked.astype(np.float64)[:, None]
+    assert group.share is not None
+    return Rows(
+        residual=group.residual * counts,
+        here=group.here[:, :, :N_STATE] * counts[:, :, None],
+        after=group.after[:, :, :N_STATE] * counts[:, :, None],
+        by_shared=by_shared * counts[:, :, None],
+        share=group.share * counts[:, :, None],
+    )
+
+
+def walk_rows(problem: Problem, x: Estimate) -> Rows:
+    """Changes of the biases from frame to frame."""
+    inertial = problem.inertial
+    assert inertial is not None
+    root_s = np.sqrt(np.maximum(np.diff(inertial.nodes_s), 1e-3))[:, None]
+    noise, count = inertial.noise, len(root_s)
+    residual, here = np.empty((count, 6)), np.zeros((count, 6, N_STATE))
+    for rows, columns, values, sigma in (
+        (slice(0, 3), GYRO_BIAS, x.gyro_bias_rad_s, noise.gyro_walk_rad_s2_rthz),
+        (slice(3, 6), ACCEL_BIAS, x.accel_bias_m_s2, noise.accel_walk_m_s3_rthz),
+    ):
+        residual[:, rows] = np.diff(values, axis=0) / (sigma * root_s)
+        here[:, rows, columns] = -np.eye(3) / (sigma * root_s[:, :, None])
+    return Rows(residual=residual, here=here, after=-here)
+
+
+def state_rows(problem: Problem, x: Estimate) -> Rows:
+    """What is known of states: next to nothing of poses and speeds; of the first one biases, position and heading."""
+    count, prior = len(x.velocity_m_s), problem.prior
+    residual, here = np.zeros((count, 21)), np.zeros((count, 21, N_STATE))
+    inertial = problem.inertial
+    if inertial is None:  # what pictures do not show stays as it is
+        for columns in (VELOCITY, GYRO_BIAS, ACCEL_BIAS):
+            here[:, columns, columns] = np.eye(3)
+        heading = np.eye(3)
+    else:
+        untouched = ~inertial.touched
+        residual[untouched, VELOCITY] = x.velocity_m_s[untouched] / _SPEED_M_S
+        here[untouched, VELOCITY, VELOCITY] = np.eye(3) / _SPEED_M_S
+        for columns, now, mean, sigma in (
+            (GYRO_BIAS, x.gyro_bias_rad_s, prior.mean.gyro_bias_rad_s, prior.gyro_bias_sigma_rad_s),
+            (ACCEL_BIAS, x.accel_bias_m_s2, prior.mean.accel_bias_m_s2, prior.accel_bias_sigma_m_s2),
+        ):
+            residual[0, columns] = (now[0] - mean[0]) / sigma
+            here[0, columns, columns] = np.eye(3) / sigma
+        heading = np.outer(inertial.down, inertial.down)
+    residual[0, POSITION] = (x.imu_in_world_m[0] - prior.mean.imu_in_world_m[0]) / _HELD_M
+    here[0, POSITION, POSITION] = np.eye(3) / _HELD_M
+    turn = so3_log(prior.mean.world_from_imu.transpose(0, 2, 1) @ x.world_from_imu)
+    by_turn = np.eye(3) + 0.5 * skew(turn)
+    held = heading @ prior.mean.world_from_imu[0] / _HELD_RAD
+    residual[0, THETA], here[0, THETA, THETA] = held @ turn[0], held @ by_turn[0]
+    residual[:, 15:18] = (x.imu_in_world_m - prior.mean.imu_in_world_m) / _STAYS_M
+    here[:, 15:18, POSITION] = np.eye(3) / _STAYS_M
+    residual[:, 18:], here[:, 18:, THETA] = turn / _STAYS_RAD, by_turn / _STAYS_RAD
+    return Rows(residual=residual, here=here)
+
+
+def prior_offset(problem: Problem, x: Estimate) -> Array:
+    """(Q,) shared numbers less their expected values."""
+    mean = problem.prior.mean
+    out = x.shared_numbers() - mean.shared_numbers()
+    out[:3] = so3_log(x.cam_from_imu @ mean.cam_from_imu.T)
+    return out
+
+
+def all_rows(problem: Problem, x: Estimate) -> dict[str, Rows]:
+    """Everything but observations and priors of shared numbers."""
+    if problem.inertial is None:
+        return {"states": state_rows(problem, x)}
+    return {"imu": imu_rows(problem, x), "walk": walk_rows(problem, x), "states": state_rows(problem, x)}
+
+
+_CENTRE, _SPEED = slice(0, 3), slice(3, 6)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Moving:
+    """The camera when the middle lines of F frames were exposed.
+
+    Attributes
+    ----------
+    velocity_m_s
+        (F, 3) of its centre, in the world.
+    by_state
+        (F, 6, 15) derivatives of position and velocity by the frame's own state.
+    by_shared
+        (F, 6, Q) by what is shared.
+    """
+
+    velocity_m_s: Array
+    by_state: Array
+    by_shared: Array
+
+
+def moving(problem: Problem, x: Estimate) -> Moving:
+    """The camera's motion; it is carried on the lever arm about the IMU."""
+    count, at = len(x.velocity_m_s), x.columns
+    frames = np.arange(count)
+    poses = poses_at(problem, x, frames, np.zeros(count))
+    t = poses.since_s[:, None, None]
+    start, now, turn = x.world_from_imu, poses.world_from_imu, poses.turn
+    arm = np.broadcast_to(-x.cam_from_imu.T @ x.imu_in_cam_m, (count, 3))
+    swing = cross(poses.rate, arm)
+    by_state, by_shared = np.zeros((count, 6, N_STATE)), np.zeros((count, 6, at.count))
+    for rows, body, pushed in ((_CENTRE, arm, 0.5 * t**2), (_SPEED, swing, t)):
+        turned = np.einsum("nij,nj->ni", turn, body)
+        by_state[:, rows, THETA] = -start @ (skew(turned) + pushed * skew(poses.force))
+        by_state[:, rows, ACCEL_BIAS] = -pushed * start
+    by_state[:, _CENTRE, POSITION] = np.eye(3)
+    by_state[:, _CENTRE, VELOCITY] = t * np.eye(3)
+    by_state[:, _SPEED, VELOCITY] = np.eye(3)
+    swinging = now @ skew(arm)
+    by_state[:, _SPEED, GYRO_BIAS] = swinging
+    for columns, by_arm in ((LEVER, -x.cam_from_imu.T), (ROTATION, -x.cam_from_imu.T @ skew(x.imu_in_cam_m))):
+        by_shared[:, _CENTRE, columns] = now @ by_arm
+        by_shared[:, _SPEED, columns] = now @ skew(poses.rate) @ by_arm
+    velocity = poses.velocity_m_s + np.einsum("nij,nj->ni", now, swing)
+    if problem.inertial is not None:
+        force = np.einsum("nij,nj->ni", start, poses.force) + x.gravity_m_s2 * problem.inertial.down
+        # that the arm swings faster and faster is nothing within an offset
+        by_time = np.concatenate([velocity, force], axis=1)
+        by_shared[:, :, OFFSET] = -by_time
+        by_shared[:, :, CLOCK_RATE] = -since_middle_s(problem, frames)[:, None] * by_time
+        by_gain = -swinging[:, :, :, None] * problem.inertial.turning.powers[:, 0][:, None, None, :]
+        by_shared[:, _SPEED, at.gyro_gain] = by_gain.reshape(count, 3, 9)
+    return Moving(velocity_m_s=velocity, by_state=by_state, by_shared=by_shared)
