@@ -4,10 +4,10 @@ import zipfile
 
 import pytest
 from cases import loop_over
-from colmap_inertial.io.zipped import head_of, members_of, text_of
 
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.io import zipped
+from colmap_inertial.io import tables
+from colmap_inertial.io.tables import head_of, members_of, text_of
 
 TABLES = {
     "plain.csv": "t,x\n1,2\n",
@@ -64,11 +64,11 @@ def test_a_table_is_read_up_to_the_limit(tmp_path, compression):
     with zipfile.ZipFile(path, "w", compression) as archive:
         archive.writestr("a.csv", "t,x\n" * 100)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(zipped, "_LARGEST_MEMBER", 400)
+        patch.setattr(tables, "_LARGEST_MEMBER", 400)
         assert text_of(path, "a.csv") == "t,x\n" * 100
-        patch.setattr(zipped, "_LARGEST_MEMBER", 399)
+        patch.setattr(tables, "_LARGEST_MEMBER", 399)
         with pytest.raises(FormatError, match=r"a\.zip: its a\.csv unpacks to more than"):
             text_of(path, "a.csv")
     with pytest.raises(FormatError, match=r"its b\.csv cannot be unpacked"):
         text_of(path, "b.csv")
-    assert zipped._LARGEST_MEMBER == 2**31
+    assert tables._LARGEST_MEMBER == 2**31

@@ -26,7 +26,7 @@ from validate_scenes import (
 
 from colmap_inertial.checks.validate import (
     parse_target,
-    search as search_module,
+    place as search_module,
     validate_model,
     validation_table,
     write_overlays,
