@@ -8,9 +8,8 @@ import pytest
 
 from colmap_inertial.core.geometry import matrix_from_quat, quat_from_matrix, so3_exp, so3_log
 from colmap_inertial.inertial.join import joined_model
-from colmap_inertial.inertial.join.judge import Ends, relative_cov, worst
-from colmap_inertial.inertial.join.placement import Placed
-from colmap_inertial.inertial.join.values import ImuLink
+from colmap_inertial.inertial.join.judge import end_images, relative_cov, tie_cov, worst
+from colmap_inertial.inertial.join.placement import ImuLink, Placed
 from colmap_inertial.model.submodels.graph import Placements
 
 PAIR = (2, 0)
@@ -89,11 +88,10 @@ def test_the_poses_on_both_sides_of_a_gap_add_their_own_errors():
         # only the images beside the gap lie there
         centres[t_s < 1.2 if own else t_s > 1.2] += 9.0
         submodels.append(SimpleNamespace(path=path, trajectory=SimpleNamespace(t_s=t_s, cam_in_world=centres)))
-    ends = Ends.of(submodels, ImuLink(first=2, second=0, from_node=1, to_node=0))
-    before, after = (submodels[k].trajectory.t_s[i] for k, i in zip(PAIR, ends.images, strict=True))
+    link = ImuLink(first=2, second=0, from_node=1, to_node=0)
+    before, after = (submodels[k].trajectory.t_s[i] for k, i in zip(PAIR, end_images(submodels, link), strict=True))
     # the last image before the middle of the gap, and the first one behind it
     assert (before, after) == (pytest.approx(1.17), pytest.approx(1.27))
-    assert ends.nodes == (1, 0)
     cov = expected(placed, points)
     for side in range(2):
 
@@ -104,7 +102,7 @@ def test_the_poses_on_both_sides_of_a_gap_add_their_own_errors():
 
         by = slopes(moved, 6)
         cov += by @ roots[side] @ roots[side].T @ by.T
-    assert ends.cov(submodels, placed) == pytest.approx(cov, rel=1e-6, abs=1e-12)
+    assert tie_cov(submodels, placed, link) == pytest.approx(cov, rel=1e-6, abs=1e-12)
 
 
 def test_the_worst_direction_is_the_largest_of_many():
@@ -189,21 +187,21 @@ def test_a_longer_metre_and_a_turned_world_move_a_similarity():
         )
         return parameters(whole, move)
 
-    assert joined_model._by_world(move.translation_m) == pytest.approx(slopes(of, 4), abs=1e-7)
+    assert joined_model._world_jacobian(move.translation_m) == pytest.approx(slopes(of, 4), abs=1e-7)
 
 
 def test_a_scale_s_standard_deviation_becomes_what_is_known_and_never_larger():
     root = np.random.default_rng(5).standard_normal((7, 7))
     cov = root @ root.T
     before = np.sqrt(np.diagonal(cov))
-    narrower = joined_model._with_scale(cov, 0.5 * before[0])
+    narrower = joined_model._reduce_scale_sigma(cov, 0.5 * before[0])
     np.testing.assert_allclose(np.sqrt(np.diagonal(narrower)), before * [0.5, 1, 1, 1, 1, 1, 1])
     # correlations stay
     np.testing.assert_allclose(
         narrower / np.sqrt(np.outer(np.diagonal(narrower), np.diagonal(narrower))), cov / np.outer(before, before)
     )
-    np.testing.assert_array_equal(joined_model._with_scale(cov, 2 * before[0]), cov)
-    assert not joined_model._with_scale(np.zeros((7, 7)), 1.0).any()
+    np.testing.assert_array_equal(joined_model._reduce_scale_sigma(cov, 2 * before[0]), cov)
+    assert not joined_model._reduce_scale_sigma(np.zeros((7, 7)), 1.0).any()
 
 
 def test_what_the_fit_does_not_say_of_a_scale_stays_when_it_is_joined():
@@ -216,4 +214,4 @@ def test_what_the_fit_does_not_say_of_a_scale_stays_when_it_is_joined():
         cov[7, 7] = variance
         sigma = joined_model._sigma_log(model, submodel, replace(placed, cov=cov), 1)
         assert sigma**2 == pytest.approx(left + whole - of_fit)
-    assert joined_model._unmodelled_variance(model, SimpleNamespace(path=SimpleNamespace(scale=(1.0, 1e-3)))) == 0
+    assert joined_model._scale_variance_beside(model, SimpleNamespace(path=SimpleNamespace(scale=(1.0, 1e-3)))) == 0

@@ -11,7 +11,7 @@ from colmap_inertial.core.geometry import so3_exp, so3_log
 from colmap_inertial.inertial.core.priors import PRIORS
 from colmap_inertial.inertial.join import evidence, judge
 from colmap_inertial.inertial.join.evidence import chi2_limit, clocks_differ, mounting_differs, overlaps, times_counted
-from colmap_inertial.inertial.join.values import ImuLink
+from colmap_inertial.inertial.join.placement import ImuLink
 from colmap_inertial.inertial.scale import posterior as post
 
 

@@ -7,9 +7,15 @@ import pytest
 from test_pairing import circle, headings_of, sightings_along, way_along
 
 from colmap_inertial.colmap import loops, relative_track
-from colmap_inertial.colmap.loops import candidates, key_frames, without_contradictions
-from colmap_inertial.colmap.relative_track import DRIFT, RelativeTrack, Sightings, estimate_relative_track, joined
-from colmap_inertial.colmap.two_views import Return, TwoViews
+from colmap_inertial.colmap.loops import LoopSearch, candidates, key_frames
+from colmap_inertial.colmap.relative_track import (
+    DRIFT,
+    Observations,
+    RelativeTrack,
+    estimate_relative_track,
+    link_observations,
+)
+from colmap_inertial.colmap.two_views import LoopPose, TwoViews
 from colmap_inertial.core.geometry import so3_exp
 
 
@@ -72,8 +78,10 @@ def test_what_is_seen_and_how_far_away_it_is():
     point, feature = rng.integers(0, 30, 80), rng.integers(0, 500, 80)
     points = rng.standard_normal((30, 3))
     points[::4] = np.nan
-    sightings = Sightings(frame=frame, point=point, feature=feature, rays=np.zeros((80, 3)))
-    way = RelativeTrack(part=np.zeros(7, int), centre=rng.standard_normal((7, 3)), points=points, sightings=sightings)
+    observations = Observations(frame=frame, point=point, feature=feature, rays=np.zeros((80, 3)))
+    way = RelativeTrack(
+        part=np.zeros(7, int), centre=rng.standard_normal((7, 3)), points=points, observations=observations
+    )
     for k in range(7):
         rows = [m for m in range(80) if frame[m] == k and point[m] % 4]
         features, at = way.seen(k)
@@ -103,7 +111,7 @@ def test_covariances_of_the_track_are_the_scatter_of_tracks_whose_length_walks(s
 
 @pytest.mark.parametrize("most", [800, 3])
 def test_points_of_matches_are_those_of_a_search_through_all_of_them(monkeypatch, most):
-    monkeypatch.setattr(relative_track, "_MOST_SIGHTINGS", most)
+    monkeypatch.setattr(relative_track, "_MOST_OBSERVATIONS", most)
     rng = np.random.default_rng(9)
     # feature of 60 things in each of 6 frames; some matches of neighbours are false
     features = [60, 61, 62, 63, 64, 65]
@@ -123,7 +131,7 @@ def test_points_of_matches_are_those_of_a_search_through_all_of_them(monkeypatch
                 group[member] = both
     groups = {frozenset(one) for one in group.values()}
     expected = {one for one in groups if len(one) >= 3 and len({k for k, _ in one}) == len(one)}
-    frame, feature, point = joined(features, matches)
+    frame, feature, point = link_observations(features, matches)
     assert np.all(np.diff(frame) >= 0) and set(point.tolist()) == set(range(int(point.max()) + 1))
     of_point = [np.flatnonzero(point == p) for p in range(int(point.max()) + 1)]
     found = {frozenset(zip(frame[mine].tolist(), feature[mine].tolist(), strict=True)) for mine in of_point}
@@ -151,10 +159,10 @@ def test_key_frames_and_candidates_are_those_of_a_loop():
 
 
 def test_pairs_beside_a_pair_are_its_neighbours_in_both():
-    assert loops._beside((10, 30), 2, 100, 10) == {
+    assert LoopSearch(None, range(100), None, None, None, 10)._pairs_beside((10, 30), 2) == {
         (8, 28), (8, 30), (8, 32), (10, 28), (10, 32), (12, 28), (12, 30), (12, 32)
     }  # fmt: skip
-    assert loops._beside((0, 11), 1, 13, 11) == {(0, 12), (1, 12)}
+    assert LoopSearch(None, range(13), None, None, None, 11)._pairs_beside((0, 11), 1) == {(0, 12), (1, 12)}
 
 
 def scalar_contradictions(found, headings, way, nearest):
@@ -195,7 +203,7 @@ def test_contradictions_are_those_of_a_loop_over_pairs():
         for _ in range(int(rng.integers(2, 8))):
             i, j = int(rng.integers(0, 12)), int(rng.integers(24, 40))
             wrong = rng.standard_normal(3) * rng.choice([0.02, 0.3, 1.0])
-            found[i, j] = Return(
+            found[i, j] = LoopPose(
                 step=way.centre[j] - way.centre[i] + wrong,
                 start_from_second=headings.start_from_cam[j],
                 ratio=float(np.exp(0.1 * rng.standard_normal())),
@@ -203,7 +211,7 @@ def test_contradictions_are_those_of_a_loop_over_pairs():
                 matches=int(rng.integers(20, 200)),
             )
         expected = scalar_contradictions(found, headings, way, 10)
-        assert without_contradictions(found, headings, way, 10) == expected
+        assert LoopSearch(None, (), headings, way, None, 10).select_consistent(found) == expected
         kept, refused = kept + len(expected), refused + len(found) - len(expected)
     assert kept > 30 and refused > 30
 
@@ -213,19 +221,19 @@ def test_frames_are_surely_apart_where_the_way_between_them_is_longer_than_what_
     count = 300
     centre = np.stack([np.linspace(0, 8, count), np.zeros(count), np.zeros(count)], axis=1)
     one = np.arange(count)
-    sightings = Sightings(frame=one, point=one, feature=one, rays=np.zeros((count, 3)))
+    observations = Observations(frame=one, point=one, feature=one, rays=np.zeros((count, 3)))
     points = centre + np.array([0.0, 0.6, 0.8])
-    way = RelativeTrack(part=np.zeros(count, dtype=int), centre=centre, points=points, sightings=sightings)
+    way = RelativeTrack(part=np.zeros(count, dtype=int), centre=centre, points=points, observations=observations)
     headings = headings_of(np.linspace(0, 5, count), 0.1 * np.arange(count))
     i, j = np.triu_indices(count, 1)
-    apart = loops._away(headings, way, i, j)
+    apart = LoopSearch(None, (), headings, way, None, 10)._surely_apart(i, j)
     cov = way.covariance(i, j, headings.sigma_rad(i, j))
     margin = np.abs(centre[j, 0] - centre[i, 0]) - 2.0 - 3 * np.sqrt(np.einsum("maa->m", cov))
     assert np.array_equal(apart, margin > 0) and 0.1 < apart.mean() < 0.9
     # of another part nothing is known
     split = replace(way, part=(one > count // 2).astype(int))
     other = (i <= count // 2) & (j > count // 2)
-    assert not loops._away(headings, split, i[other], j[other]).any()
+    assert not LoopSearch(None, (), headings, split, None, 10)._surely_apart(i[other], j[other]).any()
 
 
 def test_loops_are_judged_as_one_by_one(monkeypatch):
@@ -234,14 +242,15 @@ def test_loops_are_judged_as_one_by_one(monkeypatch):
     headings, way = headings_of(np.linspace(0, 360, 40), np.arange(40.0)), way_along(circle())
     pairs = [(i, j) for i in range(10) for j in range(25, 40)]
     told, expected = {}, set()
+    search = LoopSearch(None, [f"{k}" for k in range(40)], headings, way, None, 10)
     for i, j in pairs:
-        _, cov = loops._between(way, headings, np.array([i]), np.array([j]))
+        _, cov = search._displacements(np.array([i]), np.array([j]))
         depth = float(rng.uniform(0.3, 2.0))
         total = cov[0] + (0.1 * depth) ** 2 * np.eye(3)
         off = np.linalg.cholesky(total) @ (rng.uniform(0.2, 2.4) * rng.standard_normal(3))
         longer = rng.uniform(0.0, 1.5) * np.sqrt(DRIFT**2 * (j - i) + 0.1**2) * np.sqrt(10.8)
         turned = headings.start_from_cam[j] @ so3_exp(np.array([0.0, 0.6 if rng.random() < 0.2 else 0.0, 0.0]))
-        told[i, j] = Return(
+        told[i, j] = LoopPose(
             step=way.centre[j] - way.centre[i] - off,
             start_from_second=turned,
             ratio=float(np.exp(longer * rng.choice([-1, 1]))),
@@ -259,8 +268,8 @@ def test_loops_are_judged_as_one_by_one(monkeypatch):
     rotations[~verified] = np.nan
     views = TwoViews(first_from_second=rotations, covered=covered)
     monkeypatch.setattr(loops, "compare", lambda database, names: views)
-    monkeypatch.setattr(loops, "returns", lambda database, names, some, way: [told[pair] for pair in some])
-    sound, found = loops._judged(None, [f"{k}" for k in range(40)], headings, way, pairs)
+    monkeypatch.setattr(loops, "localise_frames", lambda database, names, some, way: [told[pair] for pair in some])
+    sound, found = search._judge(pairs)
     assert sound == {pair for pair, good in zip(pairs, verified, strict=True) if good}
     looked_at = {pair for pair, good in zip(pairs, verified & (covered >= 0.5), strict=True) if good}
     assert set(found) == expected & looked_at and len(found) > 20 and len(looked_at - expected) > 20

@@ -73,10 +73,7 @@ def join_models(
             sigma_m, sigma_rad = worst(relative_cov(fitted, placed, middles, (0, k)))
         else:
             # the first one's up and scale are as uncertain as before, at most
-            before = float(first.similarity.cov[0, 0]) ** 0.5
-            by = np.eye(7)
-            by[0, 0] = min(1.0, sigma_log / before) if before > 0 else 1.0
-            cov = by @ first.similarity.cov @ by.T
+            cov = _reduce_scale_sigma(first.similarity.cov, sigma_log)
         about.append(
             JoinedPart(
                 colmap_index=model.colmap_index,
@@ -165,6 +162,14 @@ def _similarity_cov(placed: Placed, k: int, move: Similarity) -> Array:
     by[4:, 1:4] = -skew(arm) @ up
     own = slice(PLACEMENT * k, PLACEMENT * (k + 1))
     return np.asarray(placed.inflation * by @ placed.cov[own, own] @ by.T)
+
+
+def _reduce_scale_sigma(cov: Array, sigma_log: float) -> Array:
+    """A similarity's covariance with a smaller standard deviation of its scale."""
+    before = float(cov[0, 0]) ** 0.5
+    by = np.eye(7)
+    by[0, 0] = min(1.0, sigma_log / before) if before > 0 else 1.0
+    return np.asarray(by @ cov @ by.T)
 
 
 def _world_jacobian(translation_m: Array) -> Array:
