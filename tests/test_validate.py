@@ -170,7 +170,7 @@ def test_each_view_is_numbered_so_that_all_agree(small, monkeypatch, spec):
         return [Detection(part=0, corner=np.argsort(numbers), xy_px=xy)]
 
     monkeypatch.setattr(search_module, "detect", any_start)
-    monkeypatch.setattr(search_module, "_spread", lambda count: list(range(count)))
+    monkeypatch.setattr(search_module, "_spread_evenly", lambda count: list(range(count)))
     monkeypatch.setattr(search_module.Search, "look_closer", lambda self, which: None)
     result = validate_model(small.model(), small.images, target)
     assert result.views_used == 5
