@@ -33,7 +33,7 @@ def torn(monkeypatch, matches, *, nearest=None, parts=None, links=range(15)):
     model = SimpleNamespace(images=dict.fromkeys(NAMES), points=lambda name: np.array(numbers[name]))
     part_of = dict.fromkeys(NAMES, 0) if parts is None else parts
     place = {name: k for k, name in enumerate(NAMES)}
-    return loop_closure._torn_pairs(None, model, place, part_of, {(0, 0): nearest})
+    return loop_closure._find_torn_pairs(None, model, place, part_of, {(0, 0): nearest})
 
 
 @loop_over(
