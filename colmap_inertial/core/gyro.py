@@ -34,7 +34,7 @@ class GyroPath:
     Magnus' series up to its second term (without which coning motion looks like a bias): the error of the integration
     itself is of the fourth order in the step between samples, that of interpolating a rate linearly of the second.
     ``inertial.core.preintegration`` does the same, compiled, on a finer interpolation, with its derivatives; only
-    ``inertial.scale._grouping``, over a sixteenth of a second, and ``io.plausible``, which looks for degrees, make do
+    ``inertial.scale._setup``, over a sixteenth of a second, and ``io.plausible``, which looks for degrees, make do
     with the midpoint rule of order two.
 
     Parameters

@@ -172,7 +172,7 @@ class ScaleEstimate:
     drift
         Whether the scale stays the same along the recording; ``None`` where the method does not tell.
     parts
-        What makes the interval as wide as it is: by cause (``scale.parts.CAUSES``), the standard deviation of the
+        What makes the interval as wide as it is: by cause (``scale.verdict.CAUSES``), the standard deviation of the
         logarithm that it alone would leave. Their squares add up to that of ``sigma_log``. ``None`` where the method
         does not tell.
     noise

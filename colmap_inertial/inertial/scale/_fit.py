@@ -142,7 +142,7 @@ class Fit:
         The same against the prior as it was used in the end, over what chance makes of it: one standard deviation more
         than is to be expected. At least 1.
     variance_parts
-        What the variance of the logarithm of the scale comes from, by the keys of ``parts.CAUSES``.
+        What the variance of the logarithm of the scale comes from, by the keys of ``verdict.CAUSES``.
     suspicions
         What an accelerometer with faults that the model does not have would explain.
     system, rate_rad_s, prior_info

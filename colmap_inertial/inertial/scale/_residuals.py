@@ -165,7 +165,7 @@ def _weighted_group(
     )
 
 
-#: Which cause of the scale's variance (``parts.CAUSES``) the groups of :func:`all_groups` belong to.
+#: Which cause of the scale's variance (``verdict.CAUSES``) the groups of :func:`all_groups` belong to.
 CAUSE_OF_GROUP = {
     "imu": "gyro",
     "gyro_walk": "gyro",
