@@ -6,7 +6,6 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -23,9 +22,9 @@ from colmap_inertial.core.types import CameraTrajectory, FrameTiming
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.imaging.psf import predicted_blur_px
 from colmap_inertial.model import colmap_camera, read_model
-from colmap_inertial.pipeline.stages.deblur import MOST_SMOOTHING_PX, SMOOTHING, DeblurStage
+from colmap_inertial.pipeline.stages import deblur
+from colmap_inertial.pipeline.stages.deblur import SMOOTHING
 from colmap_inertial.reconstruction.drivers.capture import reconstruct
-from colmap_inertial.reconstruction.preparation import plan
 from colmap_inertial.tools.simulate import MotionOptions, SceneRecipe, make_scene, read_truth, write_capture
 
 #: Share of the blur at which any blur is smoothed alike.
@@ -125,11 +124,10 @@ def _run(
     capture: Path, out: Path, options: ReconstructOptions, truth: CameraTrajectory, width_px: float | None
 ) -> dict[str, Any]:
     """Of the largest model, as it is handed on; ``width_px``: smoothing of any blur, in place of the package's."""
-    share, most_px = (SMOOTHING, MOST_SMOOTHING_PX) if width_px is None else (_OF_ANY_BLUR, width_px)
-    stage = partial(DeblurStage, most_smoothing_px=most_px)
+    smoothing = SMOOTHING if width_px is None else replace(SMOOTHING, share=_OF_ANY_BLUR, most_px=width_px)
     begin_s = time.process_time()
     try:
-        with patch.object(plan, "SMOOTHING", share), patch.object(plan, "DeblurStage", stage):
+        with patch.object(deblur, "SMOOTHING", smoothing):
             result = reconstruct(capture, out, options)
     except MappingError:
         return {"registered": 0, "points": 0, "centre_error_pct": float("nan"), "rotation_deg": float("nan")}

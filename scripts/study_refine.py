@@ -55,7 +55,7 @@ from colmap_inertial.inertial.refine.values import Estimate, Problem
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.model import Model
 from colmap_inertial.pipeline.run.context import RunContext
-from colmap_inertial.pipeline.stages.gyro_view import GyroView
+from colmap_inertial.pipeline.stages.imaging_plan import GyroView
 from colmap_inertial.pipeline.stages.metric import MetricStage
 from colmap_inertial.pipeline.stages.readout import ReadoutStage
 from colmap_inertial.pipeline.stages.refine import RefineStage

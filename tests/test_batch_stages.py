@@ -14,7 +14,7 @@ from colmap_inertial.cli import main
 from colmap_inertial.core.errors import FormatError, InertialError
 from colmap_inertial.core.options import StageNames
 from colmap_inertial.pipeline.run.config import config_as_toml
-from colmap_inertial.pipeline.stages.named import load_stages
+from colmap_inertial.pipeline.stages.protocols import load_stages
 from colmap_inertial.tools.batch import BatchCapture, read_manifest, run_batch
 from colmap_inertial.tools.batch.task import CaptureStatus
 

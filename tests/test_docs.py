@@ -41,8 +41,7 @@ from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.io.imu_formats import imu_formats
 from colmap_inertial.pipeline.run.config import config_as_toml
 from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
-from colmap_inertial.pipeline.stages.gyro_view import GyroView
-from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan
+from colmap_inertial.pipeline.stages.imaging_plan import GyroView, ImagingPlan
 from colmap_inertial.reconstruction.drivers.capture import reconstruct
 from colmap_inertial.reconstruction.drivers.result import (
     Fragment,

@@ -40,15 +40,12 @@ from colmap_inertial.model import read_model, write_model
 from colmap_inertial.model.nerf import EXPORT_FORMAT, NOT_METRES, transform_export
 from colmap_inertial.model.project import apply_to_project, undo_project
 from colmap_inertial.model.similarities import plain_factor, undoing
-from colmap_inertial.tools.export.names import flat_names
-from colmap_inertial.tools.export.pictures import _is_plain
-from colmap_inertial.tools.export.pinhole_model import needed_cameras, pinhole_model
-from colmap_inertial.tools.export.points import write_las
-from colmap_inertial.tools.export.source import ExportSource, Picture
+from colmap_inertial.tools.export.formats import write_las
+from colmap_inertial.tools.export.source import ExportSource, Picture, flat_names
 from colmap_inertial.tools.export.targets import TARGETS
 from colmap_inertial.tools.export.transforms import Exposure, with_velocities
-from colmap_inertial.tools.export.undistort import Undistortion
-from colmap_inertial.tools.export.whole import _notes_on, export_model
+from colmap_inertial.tools.export.undistort import Undistortion, needed_cameras, pinhole_model
+from colmap_inertial.tools.export.whole import _is_plain, _notes_on, export_model
 from colmap_inertial.tools.view.sources import ScaleFacts, ViewSource
 
 METRIC = Similarity(

@@ -33,11 +33,10 @@ from colmap_inertial.pipeline.run.progress import silent
 from colmap_inertial.pipeline.run.workspace import Workspace
 from colmap_inertial.pipeline.stages import frame_folder
 from colmap_inertial.pipeline.stages.exposures import ExposureStage
-from colmap_inertial.pipeline.stages.fusers import Fuser
-from colmap_inertial.reconstruction.drivers import capture as driver, fuse_exposures
+from colmap_inertial.pipeline.stages.inputs import Fuser
+from colmap_inertial.reconstruction.drivers import capture as driver, images_alone
 from colmap_inertial.reconstruction.drivers.capture import reconstruct
-from colmap_inertial.reconstruction.drivers.deblur import deblur_capture
-from colmap_inertial.reconstruction.drivers.fuse_exposures import fuse_exposures_captured
+from colmap_inertial.reconstruction.drivers.images_alone import deblur_capture, fuse_exposures_captured
 from colmap_inertial.reconstruction.preparation import plan
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -420,7 +419,7 @@ def stop(stage, done, total, /):
 @pytest.fixture
 def by_average(monkeypatch):
     monkeypatch.setattr(driver, "lsd2_fuser", lambda options: AVERAGE)
-    monkeypatch.setattr(fuse_exposures, "lsd2_fuser", lambda options: AVERAGE)
+    monkeypatch.setattr(images_alone, "lsd2_fuser", lambda options: AVERAGE)
 
 
 def test_reconstruct_fuses_before_it_looks_for_features(written, tmp_path, by_average):
@@ -477,7 +476,7 @@ def test_a_missing_partner_or_network_is_said_before_the_work(capture, tmp_path,
     def missing(*args, **options):
         raise MissingExtraError("restore", "networks run in onnxruntime")
 
-    monkeypatch.setattr("colmap_inertial.pipeline.stages.fusers.load_network", missing)
+    monkeypatch.setattr("colmap_inertial.pipeline.stages.inputs.load_network", missing)
     for command in ("reconstruct", "fuse-exposures"):
         with pytest.raises(SystemExit) as end:
             main([command, str(capture), str(tmp_path / "out")])

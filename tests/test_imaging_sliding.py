@@ -19,8 +19,8 @@ from colmap_inertial.model import colmap_camera
 from colmap_inertial.motion.lateral_flow import FollowedPair, follow_pairs
 from colmap_inertial.pipeline.run.context import Recording, RunContext, prior_calibration
 from colmap_inertial.pipeline.run.progress import silent
-from colmap_inertial.reconstruction.drivers.deblur import deblur_capture
-from colmap_inertial.reconstruction.preparation import plan as imaging, translating as looked_at
+from colmap_inertial.reconstruction.drivers.images_alone import deblur_capture
+from colmap_inertial.reconstruction.preparation import plan as imaging, translation as looked_at
 from colmap_inertial.reconstruction.preparation.plan import Treatments, plan_imaging
 from colmap_inertial.tools.simulate.motion import MARGIN_S, Motion
 

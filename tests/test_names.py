@@ -21,9 +21,8 @@ from colmap_inertial.io.exif import stamps_of_exif
 from colmap_inertial.io.files import check_names, path_in
 from colmap_inertial.model import read_model
 from colmap_inertial.pipeline.run.progress import silent
-from colmap_inertial.pipeline.stages.frame_folder import FramePaths, write_frames
-from colmap_inertial.pipeline.stages.rectified import write_images
-from colmap_inertial.reconstruction.preparation.calibrate import some_frames
+from colmap_inertial.pipeline.stages.frame_folder import FramePaths, write_frames, write_images
+from colmap_inertial.reconstruction.preparation.sampling import some_frames
 from colmap_inertial.tools.batch import read_manifest
 from colmap_inertial.tools.view.sources import find_source
 

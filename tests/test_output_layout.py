@@ -31,17 +31,17 @@ from colmap_inertial.model.similarities import ModelScale, plain_factor
 from colmap_inertial.pipeline.run.workspace import Workspace, places_of
 from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
 from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan
-from colmap_inertial.reconstruction.drivers import deblur
+from colmap_inertial.reconstruction.drivers import images_alone
 from colmap_inertial.reconstruction.drivers.frames import run_images
 from colmap_inertial.reconstruction.drivers.project_output import (
     place_project,
     placed_paths,
     remove_placed,
+    remove_stale_dense,
     require_free_names,
 )
 from colmap_inertial.reconstruction.drivers.reporting import reporting_stops
 from colmap_inertial.reconstruction.drivers.result import ModelResult, ReconstructResult
-from colmap_inertial.reconstruction.drivers.stale_outputs import remove_stale_dense
 
 SCALE = ModelScale(similarity=SIMILARITY, verdict="trusted")
 REFUSED = ModelScale(similarity=None, verdict="refused", reasons=("the camera stood still",))
@@ -127,13 +127,13 @@ def one_moved(inputs):
 
 
 def test_deblurred_images_are_rectified_where_that_is_asked_for(tmp_path, monkeypatch):
-    monkeypatch.setattr(deblur, "run_plan", lambda *_: ImagingPlan())
-    monkeypatch.setattr(deblur, "default_keypoint_stages", one_moved)
+    monkeypatch.setattr(images_alone, "run_plan", lambda *_: ImagingPlan())
+    monkeypatch.setattr(images_alone, "default_keypoint_stages", one_moved)
     capture = copy_scene(tmp_path / "capture", first=3)
     filmed = contents(capture / "frames")
 
     def made(*, rectify):
-        done = deblur.deblur_capture(capture, tmp_path / "out", rectify=rectify)
+        done = images_alone.deblur_capture(capture, tmp_path / "out", rectify=rectify)
         return contents(done.workspace.images), done.workspace.colmap_images
 
     for _ in range(2):  # there and back

@@ -26,7 +26,7 @@ from colmap_inertial.pipeline.run.progress import silent
 from colmap_inertial.pipeline.stages.deblur import DeblurStage
 from colmap_inertial.pipeline.stages.imaging_plan import read_plan, write_plan
 from colmap_inertial.reconstruction.drivers.capture import reconstruct
-from colmap_inertial.reconstruction.drivers.deblur import deblur_capture
+from colmap_inertial.reconstruction.drivers.images_alone import deblur_capture
 from colmap_inertial.reconstruction.preparation import calibrate as first_look, plan as imaging
 from colmap_inertial.reconstruction.preparation.plan import Treatments, plan_imaging, with_stated_exposures
 from colmap_inertial.reconstruction.preparation.selection import part_of
@@ -256,8 +256,8 @@ def test_blur_by_translation_is_known_to_a_fraction_of_a_pixel(scene, plan):
 
 
 def test_a_long_recording_is_surveyed_in_parts(tmp_path, monkeypatch, scene, blurred):
-    monkeypatch.setattr(first_look, "_MOST_IN_PART", 9)
-    monkeypatch.setattr(first_look, "_MODEL_FRAMES", 9)
+    limits = replace(first_look._LIMITS, segment_frames=9, model_frames=9)
+    monkeypatch.setattr(first_look, "_LIMITS", limits)
     plan = planned(parts(blurred), tmp_path)
     assert len(plan.parallaxes) >= 12  # three seconds hardly give a scale
     turning, both = blur_errors(scene, plan)

@@ -17,7 +17,7 @@ from colmap_inertial.checks.validate.result import LengthCheck
 from colmap_inertial.cli.terminal import show_reference
 from colmap_inertial.core.errors import InertialError, NotObservableError, TargetNotFoundError
 from colmap_inertial.core.options import ReferenceOptions
-from colmap_inertial.reconstruction.drivers import no_imu as bare_rooms, reference as rooms
+from colmap_inertial.reconstruction.drivers import reference as rooms
 from colmap_inertial.reconstruction.drivers.reference import Reference, scale_project_by
 
 
@@ -111,9 +111,9 @@ def pictures(tmp_path, project, monkeypatch):
     def written(path):
         path.write_bytes(b"")
 
-    monkeypatch.setattr(bare_rooms, "extract_features", lambda images, cameras, database, *_, **__: written(database))
-    monkeypatch.setattr(bare_rooms, "match_features", lambda features, database, *_: None)
-    monkeypatch.setattr(bare_rooms, "map_images", map_images)
+    monkeypatch.setattr(rooms, "extract_features", lambda images, cameras, database, *_, **__: written(database))
+    monkeypatch.setattr(rooms, "match_features", lambda features, database, *_: None)
+    monkeypatch.setattr(rooms, "map_images", map_images)
     return folder, mapped
 
 

@@ -25,7 +25,7 @@ from colmap_inertial.model import Model
 from colmap_inertial.pipeline.run.context import Recording
 from colmap_inertial.pipeline.run.runner import canonical
 from colmap_inertial.pipeline.stages.defaults import default_model_stages
-from colmap_inertial.pipeline.stages.gyro_view import GyroView
+from colmap_inertial.pipeline.stages.imaging_plan import GyroView
 from colmap_inertial.pipeline.stages.inputs import StageInputs
 from colmap_inertial.pipeline.stages.join import JoinStage
 from colmap_inertial.pipeline.stages.metric import MetricStage

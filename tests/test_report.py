@@ -46,7 +46,7 @@ from colmap_inertial.pipeline.run.context import Recording, RunContext
 from colmap_inertial.pipeline.run.runner import StepRunner
 from colmap_inertial.pipeline.run.session import Session
 from colmap_inertial.pipeline.run.workspace import Workspace
-from colmap_inertial.pipeline.stages.gyro_view import GyroView
+from colmap_inertial.pipeline.stages.imaging_plan import GyroView
 from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage
 from colmap_inertial.reconstruction.drivers.capture import reconstruct
 from colmap_inertial.reconstruction.drivers.project import reconstruct_project

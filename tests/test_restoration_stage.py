@@ -27,7 +27,7 @@ from colmap_inertial.pipeline.stages.deblur import DeblurStage
 from colmap_inertial.pipeline.stages.frame_folder import read_frame_records
 from colmap_inertial.pipeline.stages.imaging_plan import read_plan, write_plan
 from colmap_inertial.reconstruction.drivers.capture import reconstruct
-from colmap_inertial.reconstruction.drivers.deblur import deblur_capture
+from colmap_inertial.reconstruction.drivers.images_alone import deblur_capture
 from colmap_inertial.reconstruction.preparation import plan as imaging
 
 DEEP = replace(QUICK, deblur="deepgyro")

@@ -7,7 +7,7 @@ import pytest
 
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
-from colmap_inertial.pipeline.run import installed
+from colmap_inertial.pipeline.run import session
 from colmap_inertial.reconstruction.drivers.capture import reconstruct
 from colmap_inertial.reconstruction.drivers.project import reconstruct_project
 
@@ -24,23 +24,23 @@ def there(monkeypatch):
                 raise importlib.metadata.PackageNotFoundError(name)
             return known[name]
 
-        monkeypatch.setattr(installed.importlib.metadata, "version", version)
+        monkeypatch.setattr(session.importlib.metadata, "version", version)
 
     return set_to
 
 
 def test_one_package_for_each_module_is_silent(there):
     there(pycolmap="4.0.0", opencv_contrib_python_headless="4.13.0.90")
-    assert installed.conflicts() == []
+    assert session.conflicts() == []
     there(pycolmap_cuda12="4.0.0", opencv_python="4.10.0.84")
-    assert installed.conflicts() == []
+    assert session.conflicts() == []
 
 
 def test_two_packages_that_bring_one_module_are_named_with_what_to_do(there, caplog):
     there(
         pycolmap="4.0.0", pycolmap_cuda12="4.1.0", opencv_contrib_python_headless="4.13.0.90", opencv_python="4.10.0.84"
     )
-    installed.warn_of_conflicts()
+    session.warn_of_conflicts()
     first, second = (record.getMessage() for record in caplog.records)
     assert first == (
         "pycolmap 4.0.0 and pycolmap-cuda12 4.1.0 are installed, and each brings the module pycolmap: the files of the "
@@ -65,5 +65,5 @@ def test_reconstruct_says_so_first(there, caplog, tmp_path):
 
 def test_looking_costs_next_to_nothing():
     start = time.perf_counter()
-    installed.conflicts()
+    session.conflicts()
     assert time.perf_counter() - start < 0.5

@@ -35,12 +35,11 @@ from colmap_inertial.model.similarities import ModelScale, plain_factor, read_si
 from colmap_inertial.pipeline.run.workspace import Workspace
 from colmap_inertial.pipeline.stages import readout
 from colmap_inertial.pipeline.stages.deblur import MOST_SMOOTHING_PX, DeblurStage, smoothing_for
-from colmap_inertial.pipeline.stages.gyro_view import GyroView
-from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan
+from colmap_inertial.pipeline.stages.imaging_plan import GyroView, ImagingPlan
 from colmap_inertial.pipeline.stages.join import JoinStage
-from colmap_inertial.pipeline.stages.metric import MetricStage, gravity_in_model
+from colmap_inertial.pipeline.stages.metric import MetricStage, for_rectified, gravity_in_model
 from colmap_inertial.pipeline.stages.readout import ReadoutStage
-from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage, for_rectified
+from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage
 from colmap_inertial.reconstruction.drivers import models
 from colmap_inertial.reconstruction.drivers.models import Submodels, run_models, run_validation
 from colmap_inertial.reconstruction.drivers.project import _scales

@@ -38,18 +38,16 @@ from colmap_inertial.pipeline.run.session import Session, open_session
 from colmap_inertial.pipeline.run.workspace import Workspace
 from colmap_inertial.pipeline.stages.defaults import default_keypoint_stages
 from colmap_inertial.pipeline.stages.exposures import ExposureStage
-from colmap_inertial.pipeline.stages.frame_folder import FramePaths, FrameRecord, write_frames
-from colmap_inertial.pipeline.stages.fusers import Fuser
-from colmap_inertial.pipeline.stages.gyro_view import GyroView
-from colmap_inertial.pipeline.stages.inputs import StageInputs
-from colmap_inertial.pipeline.stages.rectified import write_images
+from colmap_inertial.pipeline.stages.frame_folder import FramePaths, FrameRecord, write_frames, write_images
+from colmap_inertial.pipeline.stages.imaging_plan import GyroView
+from colmap_inertial.pipeline.stages.inputs import Fuser, StageInputs
 from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage
 from colmap_inertial.reconstruction.drivers import frames as framing, project as existing, project_output
-from colmap_inertial.reconstruction.drivers.frames import run_frames, run_images, run_plan
+from colmap_inertial.reconstruction.drivers.frames import run_frames, run_images
 from colmap_inertial.reconstruction.drivers.sources import check_output
-from colmap_inertial.reconstruction.preparation import calibrate, plan as imaging
+from colmap_inertial.reconstruction.preparation import calibrate, plan as imaging, sampling
 from colmap_inertial.reconstruction.preparation.judge import Looked, below_sky, by_frame
-from colmap_inertial.reconstruction.preparation.plan import Treatments, plan_imaging
+from colmap_inertial.reconstruction.preparation.plan import Treatments, plan_imaging, run_plan
 from colmap_inertial.reconstruction.preparation.preflight import stop_or_doubt
 from colmap_inertial.reconstruction.preparation.selection import part_of
 from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, simulate_recording
@@ -105,7 +103,7 @@ def test_all_that_decides_a_plan_makes_it_again(workspace, change):
 
 def test_another_network_makes_the_plan_again(workspace, monkeypatch):
     def made(checksum):
-        monkeypatch.setattr(framing, "checksum", lambda name: f"{name} {checksum}")
+        monkeypatch.setattr(imaging, "checksum", lambda name: f"{name} {checksum}")
         session = session_in(workspace)
         run_plan(session, recording(timing=replace(TIMING, exposure_s=None)), replace(OFF, deblur="deepgyro"))
         return session.runner.worked
@@ -641,7 +639,7 @@ def test_a_gyroscope_that_few_dips_show_is_borne_out_by_what_stands_below_the_sk
 
 def test_the_middle_of_a_recording_stands_for_it():
     timing = FrameTiming(names=tuple(map(str, range(1000))), t_s=np.arange(1000) / 10)
-    chosen = timing.t_s[calibrate._middle(timing, 0.5, 60)]
+    chosen = timing.t_s[sampling.sample_middle(timing, 0.5, 60)]
     assert len(chosen) == 60 and np.diff(chosen).min() >= 0.5 - 1e-9
     assert 0.5 * (chosen[0] + chosen[-1]) == pytest.approx(50, abs=1)
 

@@ -80,7 +80,7 @@ _followed: dict[tuple[object, ...], VisualRotation] = {}
 @pytest.fixture(scope="module", autouse=True)
 def _followed_once():
     """Pixels of a video that are asked for again are not followed again: the answer is the same, and takes seconds."""
-    follow = choosing.followed
+    follow = choosing.measure_sampled_rotation
 
     def known(capture, timing, camera, indices, progress, *, stage="motion"):
         key = (capture.path, camera.params, timing.pose_t_s().tobytes(), tuple(indices))
@@ -89,7 +89,7 @@ def _followed_once():
         return _followed[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(choosing, "followed", known)
+        patch.setattr(choosing, "measure_sampled_rotation", known)
         yield
 
 
@@ -243,7 +243,7 @@ def of_a_long_recording(
         sigma_rad=np.full(len(turns), noise_rad),
         support=np.full(len(turns), 100),
     )
-    monkeypatch.setattr(choosing, "followed", lambda *_, **__: rotation)
+    monkeypatch.setattr(choosing, "measure_sampled_rotation", lambda *_, **__: rotation)
     stretching = Recording.of(replace(capture, camera=_PINHOLE), imu, timing, calibration_prior())
     clocks = choosing._clocks(replace(stretching, max_offset_s=None), silent)
     predicted, kind = choosing._predicted(clocks, timing)

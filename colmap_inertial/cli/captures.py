@@ -94,9 +94,8 @@ class Reconstruct(DeviceCommand, ConfiguredCommand):
         return code
 
     def _by_reference(self) -> int:
-        from colmap_inertial.reconstruction.drivers.no_imu import reconstruct_by
         from colmap_inertial.reconstruction.drivers.project import is_project
-        from colmap_inertial.reconstruction.drivers.reference import scale_project_by
+        from colmap_inertial.reconstruction.drivers.reference import reconstruct_by, scale_project_by
 
         with self.progress() as screen:
             if is_project(self.capture):
@@ -135,7 +134,7 @@ class Deblur(Reader):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.reconstruction.drivers.deblur import deblur_capture
+        from colmap_inertial.reconstruction.drivers.images_alone import deblur_capture
 
         self.check_json(self.capture)
         with self.progress() as progress:
@@ -189,7 +188,7 @@ class FuseApertures(Fuser):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.reconstruction.drivers.fuse_apertures import fuse_captured
+        from colmap_inertial.reconstruction.drivers.images_alone import fuse_captured
 
         options = FuseAperturesOptions(fusion=self.fusion, refocus=self.refocus, lens_width=self.lens_width)
         self.check_json(self.capture)
@@ -223,7 +222,7 @@ class FuseExposures(Fuser):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.reconstruction.drivers.fuse_exposures import fuse_exposures_captured
+        from colmap_inertial.reconstruction.drivers.images_alone import fuse_exposures_captured
 
         options = ExposureOptions(fusion=self.fusion, device=self.device)
         self.check_json(self.capture)

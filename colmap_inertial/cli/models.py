@@ -237,8 +237,7 @@ class CalibrateImu(Reader):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.reconstruction.drivers.device_store import remember
-        from colmap_inertial.reconstruction.drivers.imu_calibration import calibrate_source
+        from colmap_inertial.reconstruction.drivers.device_store import calibrate_source, remember
 
         self.check_json(self.recording, self.out)
         found = calibrate_source(self.recording, self.out, self.gravity, device=self.remember)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
-from colmap_inertial.checks.diagnose import camera, frames, imu, motion
+from colmap_inertial.checks.diagnose import camera, frames, imu
 from colmap_inertial.checks.diagnose.findings import SEVERITIES, Diagnosis, Finding, FramesInVideo, Recorded, Severity
 from colmap_inertial.core.errors import FormatError, InertialError, TimingError
 from colmap_inertial.core.threads import one_blas_thread
@@ -36,7 +36,7 @@ CHECKS: tuple[Check, ...] = (
     camera.check_even_times,
     camera.check_focal_length,
     camera.check_accelerometer_sign,
-    motion.check_motion_content,
+    imu.check_motion_content,
     frames.check_cut_from_video,
     frames.check_dropped,
     frames.check_repeated,

@@ -132,23 +132,28 @@ def _build(path: Path, cls: type[Options], values: Mapping[str, Any], prefix: st
 def _checked(path: Path, name: str, value: Any, hint: Any) -> Any:
     alternatives = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
     for kind in alternatives:
-        if typing.get_origin(kind) is typing.Literal:
-            if value in typing.get_args(kind):
+        origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+        if origin is typing.Literal:
+            if value in arguments:
                 return value
         elif kind is Path and isinstance(value, str):
-            if "\0" in value:
-                raise FormatError(path, f"{name}: holds a NUL character")
-            return Path(value)
-        elif typing.get_origin(kind) is tuple:
-            of_paths = typing.get_args(kind)[0] is Path
-            items = [value] if of_paths and isinstance(value, str) else value
+            return _checked_path(path, name, value)
+        elif origin is tuple:
+            item_kind = arguments[0]
+            items = [value] if item_kind is Path and isinstance(value, str) else value
             if isinstance(items, list) and all(isinstance(item, str) for item in items):
-                return tuple(_checked(path, name, item, Path) for item in items) if of_paths else tuple(items)
+                return tuple(items if item_kind is str else (_checked_path(path, name, item) for item in items))
         elif kind is float and isinstance(value, (int, float)) and not isinstance(value, bool):
             return float(value)
         elif isinstance(kind, type) and type(value) is kind:
             return value
     raise FormatError(path, f"{name}: {value!r} is not {_describe(alternatives)}")
+
+
+def _checked_path(path: Path, name: str, value: str) -> Path:
+    if "\0" in value:
+        raise FormatError(path, f"{name}: holds a NUL character")
+    return Path(value)
 
 
 def _describe(kinds: tuple[Any, ...]) -> str:

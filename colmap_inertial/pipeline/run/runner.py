@@ -53,6 +53,10 @@ def canonical(value: object) -> object:
         return str(value)
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
+    return _canonical_callable(value)
+
+
+def _canonical_callable(value: object) -> object:
     if isinstance(value, functools.partial):
         return ["partial", canonical(value.func), canonical(value.args), canonical(value.keywords)]
     if isinstance(value, types.FunctionType):

@@ -33,14 +33,26 @@ from colmap_inertial.imaging.restoration import deepgyro, load_network, require_
 from colmap_inertial.imaging.restoration.shipped import checksum
 from colmap_inertial.imaging.wiener import LONGEST_PX, DeblurOptions
 from colmap_inertial.model import colmap_camera
-from colmap_inertial.pipeline.stages.gyro_view import GyroView
-from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan
+from colmap_inertial.pipeline.stages.imaging_plan import GyroView, ImagingPlan
 from colmap_inertial.pipeline.stages.inputs import StageInputs
 
-#: Standard deviation of the Gaussian, in linear light, by which COLMAP sees a deblurred frame smoothed, as a share of
-#: its blur's length, and at most, px: what a filter leaves of noise and ringing grows with the blur, and moves cameras;
-#: of short blur, it leaves detail that gives more points than smoothing does.
-SMOOTHING, MOST_SMOOTHING_PX = 0.06, 1.2
+
+@dataclass(frozen=True, kw_only=True)
+class SmoothingLimits:
+    """How COLMAP sees deblurred frames smoothed."""
+
+    #: Standard deviation of the Gaussian, in linear light, as a share of the blur's length, and at most: what a filter
+    #: leaves of noise and ringing grows with the blur, and moves cameras; of short blur, it leaves detail that gives
+    #: more points than smoothing does.
+    share: float = 0.06
+    most_px: float = 1.2
+    #: A frame of which more than this share stays as it was is not smoothed.
+    kept_share: float = 0.5
+
+
+SMOOTHING = SmoothingLimits()
+
+
 #: Standard deviations by which a frame must bear out the gyroscope by itself, where others do not. With 4, the filter
 #: made some worse; the network, which sees whether the filter's result can be true, is worth using unless a frame
 #: speaks against.
@@ -49,14 +61,12 @@ _CLEAR_SUPPORT: dict[BlurRemover, float] = {
     "path": GATE_LIMITS.clear_support,
     "deepgyro": 0.0,
 }
-#: A frame of which more than this share stays as it was is not smoothed.
-_MOSTLY_KEPT = 0.5
 
 #: Undoes the blur of an image along its path.
 _Remover = Callable[[Any, BlurPath], Any]
 
 
-def smoothing_for(blur_px: float, share: float = SMOOTHING, most_px: float = MOST_SMOOTHING_PX) -> float:
+def smoothing_for(blur_px: float, share: float = SMOOTHING.share, most_px: float = SMOOTHING.most_px) -> float:
     """Standard deviation (px) of the Gaussian by which COLMAP sees a frame smoothed that had so much blur."""
     return min(share * blur_px, most_px)
 
@@ -112,8 +122,8 @@ class DeblurStage:
     gate: GateOptions = field(default_factory=GateOptions)
     drop: bool = True
     method: BlurRemover = "wiener"
-    smoothing: float = SMOOTHING
-    most_smoothing_px: float = MOST_SMOOTHING_PX
+    smoothing: float = SMOOTHING.share
+    most_smoothing_px: float = SMOOTHING.most_px
     weights: str = field(default="", init=False)
     workers: int | None = field(default=None, compare=False)
 
@@ -146,7 +156,8 @@ class DeblurStage:
             gate=GateOptions() if verdict.trusted else GateOptions(min_support=_CLEAR_SUPPORT[plan.method]),
             drop=drop,
             method=plan.method,
-            smoothing=SMOOTHING if smoothing else 0.0,
+            smoothing=SMOOTHING.share if smoothing else 0.0,
+            most_smoothing_px=SMOOTHING.most_px,
         )
 
     def __call__(self, frames: Iterator[Frame], /) -> Iterator[Frame]:
@@ -211,5 +222,5 @@ class DeblurStage:
             path = blur_path(motion, camera, shutter, parallax=parallax, extent_factor=factor)
         out, kept = keep_sharp(image, remove(image, path), blur)
         width_px = smoothing_for(factor * (decision.blur_px or 0.0), self.smoothing, self.most_smoothing_px)
-        smoothing_px = width_px if kept < _MOSTLY_KEPT else 0.0
+        smoothing_px = width_px if kept < SMOOTHING.kept_share else 0.0
         return replace(said(reason, kept, factor, "deblurred"), image=out, smoothing_px=smoothing_px)

@@ -31,9 +31,8 @@ from colmap_inertial.io.files import path_in
 from colmap_inertial.io.frames import image_names
 from colmap_inertial.io.images import read_image
 from colmap_inertial.model import colmap_camera
-from colmap_inertial.pipeline.stages.fusers import Fuser
-from colmap_inertial.pipeline.stages.gyro_view import GyroView
-from colmap_inertial.pipeline.stages.inputs import StageInputs
+from colmap_inertial.pipeline.stages.imaging_plan import GyroView
+from colmap_inertial.pipeline.stages.inputs import Fuser, StageInputs
 
 
 def fuses_pairs(capture: Capture, options: ExposureOptions, *, deblur: str | None) -> bool:

@@ -1,9 +1,9 @@
-"""Frames through the frame stages into the folder that COLMAP reads, with a record of what was done to each."""
+"""Folders of frames: those that COLMAP reads, with a record of each, and those that agree with the model."""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,12 +12,15 @@ import numpy as np
 
 from colmap_inertial.core.arrays import AnyArray
 from colmap_inertial.core.errors import FormatError, InertialError
+from colmap_inertial.core.threads import in_order
 from colmap_inertial.core.types import CameraModel, Frame, Treatment
 from colmap_inertial.imaging.path_filters import smoothed
 from colmap_inertial.io.exif import carry_metadata
 from colmap_inertial.io.files import path_in, read_record, write_record
+from colmap_inertial.io.images import read_image
+from colmap_inertial.model.copying import copy_file
 from colmap_inertial.pipeline.run.progress import Progress
-from colmap_inertial.pipeline.stages.protocols import FrameStage
+from colmap_inertial.pipeline.stages.protocols import FrameStage, KeypointStage
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,3 +225,71 @@ def encode_image(target: Path, image: AnyArray, original: Path | None = None) ->
 def read_frame_records(path: Path) -> tuple[FrameRecord, ...]:
     """The records that :func:`write_frames` wrote."""
     return read_record(path, FrameRecords).frames
+
+
+#: Moves the pixels of a named image as a keypoint stage moves its keypoints.
+ImageMover = Callable[[str, Any], Any]
+
+
+def image_movers(stages: Sequence[KeypointStage]) -> list[ImageMover]:
+    """Those of the keypoint stages that can move pixels, too: by a method ``move_image(name, image)``."""
+    return [stage.move_image for stage in stages if hasattr(stage, "move_image")]
+
+
+def rectifiable(stages: Sequence[KeypointStage], names: Iterable[str]) -> frozenset[str]:
+    """Names of the images that one of the stages can move: where it has a method ``covers(name)``, what that says."""
+    movers = [stage for stage in stages if hasattr(stage, "move_image")]
+    return frozenset(name for name in names if any(_covers(stage, name) for stage in movers))
+
+
+def _covers(stage: object, name: str) -> bool:
+    covers = getattr(stage, "covers", None)
+    return covers is None or bool(covers(name))
+
+
+def write_images(
+    movers: Sequence[ImageMover],
+    names: Sequence[str],
+    rectified: Collection[str],
+    images: Path,
+    target: Path,
+    progress: Progress,
+    unsmoothed: Path | None = None,
+) -> None:
+    """Write the images that COLMAP saw as they are without smoothing, and as a global shutter would have taken them.
+
+    What was not rectified is the same file under a second name (a hard link), or a copy where the file system has none.
+
+    Parameters
+    ----------
+    movers
+        Applied one after the other.
+    names
+        Of all images.
+    rectified
+        Names of those whose keypoints were rectified.
+    images, target
+        Folders of the images that COLMAP saw, and of those that are written.
+    progress
+        Called with ``"images"``.
+    unsmoothed
+        Folder of those images as they are that COLMAP saw smoothed.
+    """
+
+    def work(name: str) -> None:
+        source, out = path_in(images, name), path_in(target, name)
+        if unsmoothed is not None and path_in(unsmoothed, name).is_file():
+            source = path_in(unsmoothed, name)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        if name in rectified:
+            image: Any = read_image(source)
+            for move in movers:
+                image = move(name, image)
+            encode_image(out, image, source)
+        else:
+            copy_file(source, out, link=True)
+
+    target.mkdir(parents=True)
+    progress("images", 0, len(names))
+    for done, _ in enumerate(in_order(work, names, workers=2), start=1):
+        progress("images", done, len(names))

@@ -1,4 +1,4 @@
-"""What is to be done to frames and keypoints before COLMAP sees them, as a value that is written down."""
+"""A recording's gyroscope with its camera and frame times, and the plan of what is done to its frames by it."""
 
 from __future__ import annotations
 
@@ -7,13 +7,58 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.options import BlurRemover
 from colmap_inertial.core.types import CameraImuCalibration, CameraModel, FrameTiming, ImuRecording
 from colmap_inertial.imaging.gate import FrameDecision, RecordingVerdict
+from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.parallax import Parallax
 from colmap_inertial.io.files import read_json, write_json
 from colmap_inertial.pipeline.run.workspace import a_record_of_ours
-from colmap_inertial.pipeline.stages.gyro_view import GyroView
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class GyroView:
+    """A recording's gyroscope, camera and frame times, brought together.
+
+    Attributes
+    ----------
+    imu
+        The recording, as it was read.
+    timing
+        Of all frames.
+    calibration
+        Rotation, time offset with its clock rate, and gyroscope bias.
+    camera
+        Intrinsics.
+    source
+        Where the calibration comes from: ``"capture"``, ``"model"`` (a small one, made beforehand) or ``"pixels"``.
+    notes
+        What there is to say about it, in words.
+    """
+
+    imu: ImuRecording
+    timing: FrameTiming
+    calibration: CameraImuCalibration
+    camera: CameraModel
+    source: str
+    notes: tuple[str, ...] = ()
+
+    def timed(self) -> CameraTimedImu:
+        """The recording on the camera's clock."""
+        return CameraTimedImu.from_recording(self.imu, self.calibration, self.timing.epoch_ns)
+
+    def motion(self) -> GyroCamera:
+        """The gyroscope on the camera's clock."""
+        return GyroCamera.from_timed(self.timed())
+
+    def shutter(self, index: int) -> FrameShutter:
+        """When the lines of one frame are exposed."""
+        return FrameShutter.of(self.timing, index, width=self.camera.width, height=self.camera.height)
+
+    def index(self) -> dict[str, int]:
+        """The place of each frame name."""
+        return {name: i for i, name in enumerate(self.timing.names)}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -19,9 +19,8 @@ from colmap_inertial.inertial.join.placement import FittedSubmodel
 from colmap_inertial.inertial.scale.posterior import FittedPath
 from colmap_inertial.model import Model, has_rigs, trajectory_from_model
 from colmap_inertial.model.submodels.matches import PlacedImages, place_images
-from colmap_inertial.pipeline.stages.inertial import InertialStage
 from colmap_inertial.pipeline.stages.inputs import StageInputs
-from colmap_inertial.pipeline.stages.metric import metric_trajectory
+from colmap_inertial.pipeline.stages.metric import InertialStage, metric_trajectory
 
 if TYPE_CHECKING:
     import pycolmap

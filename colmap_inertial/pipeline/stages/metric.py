@@ -1,18 +1,21 @@
-"""The default model stage: scale and gravity from the IMU; and the smoothed trajectory of what it made."""
+"""Model stages that use the IMU: their base, the one for scale and gravity, and the trajectory that it smooths."""
 
 from __future__ import annotations
 
 import logging
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.geometry import quat_rotate, so3_log
+from colmap_inertial.core.options import ScaleOptions, WorldAxes
 from colmap_inertial.core.types import (
+    CAL,
     CameraImuCalibration,
     CameraMotion,
     CameraTrajectory,
@@ -22,18 +25,85 @@ from colmap_inertial.core.types import (
     SmoothedTrajectory,
 )
 from colmap_inertial.imaging.gyro_camera import GyroCamera
+from colmap_inertial.inertial.scale import estimate_scale
+from colmap_inertial.io.calibration import SIGMAS
 from colmap_inertial.io.files import write_record
 from colmap_inertial.io.trajectories import write_tum
-from colmap_inertial.model import Model, downgraded
+from colmap_inertial.model import Model, downgraded, trajectory_from_model
 from colmap_inertial.motion.smooth import smooth_trajectory
-from colmap_inertial.pipeline.stages.inertial import InertialStage
 from colmap_inertial.pipeline.stages.inputs import StageInputs
 
 log = logging.getLogger(__name__)
 
-#: An angular velocity is the mean over this time, and over so many samples of the gyroscope, on each side of the
-#: instant: one reading has all of its noise, and a hand turns otherwise a few hundredths of a second later.
-_RATE_HALF_S, _LEAST_SAMPLES = 7e-3, 2
+
+@dataclass(frozen=True, kw_only=True)
+class MotionLimits:
+    """How velocities of frames, and the readout of rectified ones, are stated."""
+
+    #: Share of the readout that acts on poses after rectification.
+    readout_share: float = 0.1
+    #: An angular velocity is the mean over this time, and over so many samples of the gyroscope, on each side of the
+    #: instant: one reading has all of its noise, and a hand turns otherwise a few hundredths of a second later.
+    rate_half_s: float = 7e-3
+    rate_samples: int = 2
+
+
+_LIMITS = MotionLimits()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class InertialStage:
+    """A model stage that uses the IMU.
+
+    Attributes
+    ----------
+    imu
+        The recording that ran along.
+    calibration
+        What is known of the camera and the IMU beforehand.
+    options
+        Of the scale estimate.
+    world
+        Where gravity points in the metric model.
+    """
+
+    imu: ImuRecording
+    calibration: CameraImuCalibration | None
+    options: ScaleOptions = field(default_factory=ScaleOptions)
+    world: WorldAxes = "z-up"
+
+    @staticmethod
+    def fields_for(inputs: StageInputs) -> dict[str, Any]:
+        """The fields that all of these stages have, for a run."""
+        recording, options = inputs.recording, inputs.options
+        return {
+            "imu": recording.imu,
+            "calibration": recording.prior,
+            "options": replace(options.scale, max_offset_s=recording.max_offset_s),
+            "world": options.world,
+        }
+
+    @staticmethod
+    def refines_intrinsics(inputs: StageInputs) -> bool:
+        """Whether the cameras may change: as asked for, else where the capture declares none."""
+        asked = inputs.options.mapping.refine_intrinsics
+        return inputs.recording.capture.camera is None if asked is None else asked
+
+    def calibration_of(self, model: Model) -> CameraImuCalibration | None:
+        """What is known of the camera that a model was mapped for; rectified keypoints leave it hardly any readout."""
+        if model.rectified and self.calibration is not None:
+            return for_rectified(self.calibration)
+        return self.calibration
+
+    def estimate_scale(self, model: Model) -> tuple[ScaleEstimate, CameraTrajectory, tuple[str, ...]]:
+        """The scale of a model, with its poses, and notes on images that have no time."""
+        trajectory, notes = trajectory_from_model(model.reconstruction, model.timing)
+        calibration = self.calibration_of(model)
+        return (
+            estimate_scale(trajectory, self.imu, calibration=calibration, options=self.options),
+            trajectory,
+            tuple(notes),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,7 +241,7 @@ def _motion(
     place = {name: i for i, name in enumerate(timing.names)}
     index = np.array([place[name] for name in trajectory.names])
     exposure_s = None if timing.exposure_s is None else timing.exposure_s[index]
-    half_s = max(_RATE_HALF_S, _LEAST_SAMPLES * float(np.median(np.diff(timed.imu.gyro_t_s))))
+    half_s = max(_LIMITS.rate_half_s, _LIMITS.rate_samples * float(np.median(np.diff(timed.imu.gyro_t_s))))
     begin_s, end_s = trajectory.t_s - half_s, trajectory.t_s + half_s
     seen = camera.covers(begin_s, end_s) & np.isfinite(velocity_in_world).all(axis=1)
     before, after = (camera.start_from_cam(t_s[seen]) for t_s in (begin_s, end_s))
@@ -186,3 +256,14 @@ def _motion(
         readout_direction=timing.readout_direction,
         epoch_ns=trajectory.epoch_ns,
     )
+
+
+def for_rectified(calibration: CameraImuCalibration) -> CameraImuCalibration:
+    """The calibration of a camera whose keypoints were rectified: hardly any readout is left.
+
+    Its standard deviation stands for what the camera's translation does within the readout, which stays.
+    """
+    cov = calibration.cov.copy()
+    cov[CAL.READOUT, :] = cov[:, CAL.READOUT] = 0.0
+    cov[CAL.READOUT, CAL.READOUT] = max(SIGMAS.smallest_readout_s, _LIMITS.readout_share * calibration.readout_s) ** 2
+    return replace(calibration, readout_s=0.0, cov=cov)

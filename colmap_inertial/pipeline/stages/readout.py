@@ -14,9 +14,8 @@ from colmap_inertial.core.types import Treatment
 from colmap_inertial.imaging.gyro_camera import FrameShutter
 from colmap_inertial.model import Model
 from colmap_inertial.model.readout import settle_readout
-from colmap_inertial.pipeline.stages.inertial import InertialStage
 from colmap_inertial.pipeline.stages.inputs import StageInputs
-from colmap_inertial.pipeline.stages.metric import smoothed_path
+from colmap_inertial.pipeline.stages.metric import InertialStage, smoothed_path
 
 if TYPE_CHECKING:
     import pycolmap

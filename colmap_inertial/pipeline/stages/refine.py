@@ -30,9 +30,8 @@ from colmap_inertial.inertial.refine.values import FIRST_INTRINSIC, LEVER, OFFSE
 from colmap_inertial.inertial.scale import strength_of_gravity
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.model import Model, has_rigs
-from colmap_inertial.pipeline.stages.inertial import InertialStage
 from colmap_inertial.pipeline.stages.inputs import StageInputs
-from colmap_inertial.pipeline.stages.metric import gravity_in_model
+from colmap_inertial.pipeline.stages.metric import InertialStage, gravity_in_model
 from colmap_inertial.pipeline.stages.protocols import InvertibleStage, find_inverse
 
 if TYPE_CHECKING:

@@ -8,16 +8,12 @@ from typing import Any
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
-from colmap_inertial.core.types import CAL, CameraImuCalibration, CameraModel, Keypoints, Projector, Treatment
+from colmap_inertial.core.types import CameraImuCalibration, CameraModel, Keypoints, Projector, Treatment
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.imaging.rolling_shutter import project_by_lines, rays, rectify_image, rectify_keypoints
-from colmap_inertial.io.calibration import SIGMAS
 from colmap_inertial.model import colmap_camera
-from colmap_inertial.pipeline.stages.gyro_view import GyroView
+from colmap_inertial.pipeline.stages.imaging_plan import GyroView
 from colmap_inertial.pipeline.stages.inputs import StageInputs
-
-#: Share of the readout that acts on poses after rectification.
-_LEFT_SHARE = 0.1
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -94,14 +90,3 @@ class RollingShutterStage:
         if "parts" not in self._ready:
             self._ready["parts"] = self.view.motion(), colmap_camera(self.view.camera), self.view.index()
         return self._ready["parts"]
-
-
-def for_rectified(calibration: CameraImuCalibration) -> CameraImuCalibration:
-    """The calibration of a camera whose keypoints were rectified: hardly any readout is left.
-
-    Its standard deviation stands for what the camera's translation does within the readout, which stays.
-    """
-    cov = calibration.cov.copy()
-    cov[CAL.READOUT, :] = cov[:, CAL.READOUT] = 0.0
-    cov[CAL.READOUT, CAL.READOUT] = max(SIGMAS.smallest_readout_s, _LEFT_SHARE * calibration.readout_s) ** 2
-    return replace(calibration, readout_s=0.0, cov=cov)

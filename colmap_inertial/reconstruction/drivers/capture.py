@@ -26,10 +26,9 @@ from colmap_inertial.io.frames import picture_folders, read_frames
 from colmap_inertial.io.imu import read_raw_capture_imu
 from colmap_inertial.io.plausible import RawImu
 from colmap_inertial.pipeline.run.context import Recording, RunContext, corrected_imu, prior_calibration
-from colmap_inertial.pipeline.run.installed import warn_of_conflicts
 from colmap_inertial.pipeline.run.progress import Progress, silent
 from colmap_inertial.pipeline.run.runner import remove
-from colmap_inertial.pipeline.run.session import Session, open_session
+from colmap_inertial.pipeline.run.session import Session, open_session, warn_of_conflicts
 from colmap_inertial.pipeline.stages.deblur import require_method
 from colmap_inertial.pipeline.stages.defaults import (
     default_frame_stages,
@@ -38,21 +37,18 @@ from colmap_inertial.pipeline.stages.defaults import (
 )
 from colmap_inertial.pipeline.stages.exposures import fuses_pairs
 from colmap_inertial.pipeline.stages.frame_folder import require_frames
-from colmap_inertial.pipeline.stages.fusers import Fuser, lsd2_fuser
-from colmap_inertial.pipeline.stages.inputs import StageInputs
-from colmap_inertial.pipeline.stages.named import Stages
+from colmap_inertial.pipeline.stages.inputs import Fuser, StageInputs, lsd2_fuser
 from colmap_inertial.pipeline.stages.protocols import (
     FrameStage,
     KeypointStage,
     ModelStage,
+    Stages,
     changes_images,
     with_defaults,
 )
 from colmap_inertial.reconstruction.drivers.frames import (
-    ask_for_plan,
     run_frames,
     run_images,
-    run_plan,
     stages_of_refined,
 )
 from colmap_inertial.reconstruction.drivers.georeference import run_georeference
@@ -60,7 +56,7 @@ from colmap_inertial.reconstruction.drivers.models import Submodels, run_dense_m
 from colmap_inertial.reconstruction.drivers.reporting import report_result, reporting_stops, write_recording
 from colmap_inertial.reconstruction.drivers.result import ReconstructResult
 from colmap_inertial.reconstruction.preparation.geolocation import positions_of
-from colmap_inertial.reconstruction.preparation.plan import with_stated_exposures
+from colmap_inertial.reconstruction.preparation.plan import ask_for_plan, run_plan, with_stated_exposures
 from colmap_inertial.reconstruction.preparation.preflight import checked_imu, run_preflight
 from colmap_inertial.reconstruction.preparation.selection import part_of, run_selection
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -32,11 +34,18 @@ from colmap_inertial.reconstruction.preparation.preflight import compare_picture
 T = TypeVar("T")
 
 
-_MANY, _MANY_SPACING_S = 400, 0.03
+@dataclass(frozen=True, kw_only=True)
+class DiagnosisEffort:
+    """How much of a recording ``diagnose`` looks at."""
+
+    #: Frames of a video that are followed by their pixels, and how far apart.
+    frames: int = 400
+    frame_spacing_s: float = 0.03
+    #: Pictures that are looked for in the video they were cut from.
+    pictures_in_video: int = 60
 
 
-#: Pictures that are looked for in the video they were cut from.
-_CUT = 60
+_EFFORT = DiagnosisEffort()
 
 
 def diagnose_source(
@@ -83,46 +92,46 @@ def collect(source: ScaleSource, progress: Progress) -> Recorded:
             return _of_capture(load_capture(path), source.calibration, progress)
         return _recorded(_Reading(), imu=lambda: read_raw_imu(path))
     reading = _Reading()
-    timing: FrameTiming | None = None
+    times = source.frame_times or _times_of_capture(source.imu)
+    timing = None if times is None else reading.attempt(lambda: read_frame_times(times))
     trajectory: CameraTrajectory | None = None
-    read_as = TUM
-    times = source.frame_times
-    if (
-        times is None
-        and source.imu is not None
-        and is_capture(source.imu)
-        and load_capture(source.imu).frames is not None
-    ):
-        times = source.imu
-    if times is not None:
-        timing = reading.attempt(lambda: read_frame_times(times))
-    if inertial_scale:
+    read_as = INERTIAL_SCALE if inertial_scale else COLMAP if path.is_dir() else TUM
+    if read_as is INERTIAL_SCALE:
         trajectory = reading.attempt(lambda: read_inertial_scale_poses(path))
-        read_as = INERTIAL_SCALE
-    elif path.is_dir():
-        read_as = COLMAP
-        only_model(path)
+    elif read_as is TUM:
+        trajectory = reading.attempt(lambda: read_tum(path))
+    else:
+        model = only_model(path)
         if times is None:
             raise FormatError(path, "a COLMAP model has no frame times: give --frame-times, a CSV with name,t_s")
         if timing is not None:
-            known = timing
-            model = only_model(path)
-            trajectory = reading.attempt(lambda: trajectory_from_model(read_model(model), known)[0])
-    else:
-        trajectory = reading.attempt(lambda: read_tum(path))
+            trajectory = reading.attempt(functools.partial(_read_trajectory, model, timing))
     captures = [load_capture(p) for p in (source.imu, source.frame_times, path) if p is not None and is_capture(p)]
-    shared = any(capture.shared_clock for capture in captures)
-    calibration = captures[0].calibration if captures else None
-    calibration = read_for_recording(source.calibration, shared_clock=shared).camera_imu or calibration
     return _recorded(
         reading,
         imu=lambda: read_raw_imu(path if source.imu is None else source.imu),
         timing=timing,
         trajectory=trajectory,
         read_as=read_as,
-        calibration=calibration,
-        max_offset_s=largest_offset_s(shared),
+        **_clock_and_calibration(source.calibration, captures),
     )
+
+
+def _read_trajectory(model: Path, timing: FrameTiming) -> CameraTrajectory:
+    return trajectory_from_model(read_model(model), timing)[0]
+
+
+def _times_of_capture(imu: Path | None) -> Path | None:
+    """The source of the IMU, where it is a capture that also has frames."""
+    return imu if imu is not None and is_capture(imu) and load_capture(imu).frames is not None else None
+
+
+def _clock_and_calibration(files: CalibrationFiles, captures: Sequence[Capture]) -> dict[str, Any]:
+    """The calibration of camera and IMU, from files or else the first capture, and how far apart the clocks may be."""
+    shared = any(capture.shared_clock for capture in captures)
+    stated = captures[0].calibration if captures else None
+    calibration = read_for_recording(files, shared_clock=shared).camera_imu or stated
+    return {"calibration": calibration, "max_offset_s": largest_offset_s(shared)}
 
 
 def _describes_frames(path: Path) -> bool:
@@ -174,13 +183,11 @@ def _of_capture(capture: Capture, calibration: CalibrationFiles, progress: Progr
         known = timing
         rotation = reading.attempt(
             lambda: (
-                follow_video(capture, known, _MANY, _MANY_SPACING_S, progress)
+                follow_video(capture, known, _EFFORT.frames, _EFFORT.frame_spacing_s, progress)
                 or compare_pictures(capture, known, progress)
             )
         )
         in_video = reading.attempt(lambda: _find_in_video(capture, known, progress))
-    # the readings stay the sensor's own: that is what the checks are about
-    prior = read_for_recording(calibration, shared_clock=capture.shared_clock).camera_imu or capture.calibration
     return _recorded(
         reading,
         imu=None if capture.imu is None else lambda: read_raw_capture_imu(capture),
@@ -189,8 +196,8 @@ def _of_capture(capture: Capture, calibration: CalibrationFiles, progress: Progr
         is_capture=True,
         rotation=rotation,
         camera=capture.camera,
-        calibration=prior,
-        max_offset_s=largest_offset_s(capture.shared_clock),
+        # the readings stay the sensor's own: that is what the checks are about
+        **_clock_and_calibration(calibration, [capture]),
         in_video=in_video,
     )
 
@@ -201,7 +208,7 @@ def _find_in_video(capture: Capture, timing: FrameTiming, progress: Progress) ->
         return None
     video = capture.frames.video
     stamps_ns = video_stamps_ns(video)
-    index = np.unique(np.linspace(0, len(timing.names) - 1, _CUT).astype(np.intp))
+    index = np.unique(np.linspace(0, len(timing.names) - 1, _EFFORT.pictures_in_video).astype(np.intp))
     names = [timing.names[i] for i in index]
     match = match_to_video(
         video, capture.frames.folder, names, progress=lambda seen: progress("video", seen, len(stamps_ns))

@@ -1,60 +1,188 @@
-"""The frames of a capture on their way to COLMAP: what is to be done, done, and written down."""
+"""The frames of a capture on their way to COLMAP, and pictures of some of them before and after."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from colmap_inertial.core.options import ReconstructOptions
+import numpy as np
+
+from colmap_inertial.core.arrays import AnyArray, UInt8Array
+from colmap_inertial.core.errors import OutputError
 from colmap_inertial.core.types import CameraModel, Frame
-from colmap_inertial.imaging.restoration.shipped import checksum
-from colmap_inertial.model import read_model
+from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.psf import blur_field
+from colmap_inertial.io.capture import Capture
+from colmap_inertial.io.files import path_in, write_json
+from colmap_inertial.io.images import read_image
+from colmap_inertial.model import colmap_camera, read_model
 from colmap_inertial.pipeline.run.context import Recording
 from colmap_inertial.pipeline.run.session import Session
-from colmap_inertial.pipeline.stages.frame_folder import FramePaths, FrameRecord, read_frame_records, write_frames
-from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan, read_plan, write_plan
+from colmap_inertial.pipeline.stages.frame_folder import (
+    FramePaths,
+    FrameRecord,
+    encode_image,
+    image_movers,
+    read_frame_records,
+    write_frames,
+    write_images,
+)
+from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan
 from colmap_inertial.pipeline.stages.protocols import FrameStage, KeypointStage, refined_stages
-from colmap_inertial.pipeline.stages.rectified import image_movers, write_images
-from colmap_inertial.reconstruction.drivers.contact_sheet import CropKeeper
 from colmap_inertial.reconstruction.drivers.result import ModelResult
-from colmap_inertial.reconstruction.preparation.plan import Treatments, plan_imaging
+from colmap_inertial.reconstruction.preparation.sampling import some_frames
 
 log = logging.getLogger(__name__)
 
 
-def ask_for_plan(
-    options: ReconstructOptions, frame_stages: Sequence[object], keypoint_stages: Sequence[object], *, pairs: bool
-) -> Treatments:
-    """What the options ask for, as far as the default stages are to do it."""
-    return Treatments(
-        deblur=options.deblur,
-        rolling_shutter=options.rolling_shutter,
-        pairs=pairs,
-        frames_by_others=... not in frame_stages,
-        keypoints_by_others=... not in keypoint_stages,
-    )
+_FRAMES, _WIDTH, _HEIGHT, _GAP, _LABEL = 8, 420, 280, 6, 22
+#: Frames that are looked at for the report, and how many of them it shows.
+_CANDIDATES, _SHOWN = 16, 4
+#: Top, left, height and width.
+Part = tuple[int, int, int, int]
+#: Distance of the arrows, px of the crop.
+_ARROWS_PX = 70
 
 
-def run_plan(session: Session, recording: Recording, asked: Treatments) -> ImagingPlan:
-    """What to do to frames and keypoints; where nothing is asked for, nothing is looked at."""
+def write_contact_sheet(path: Path, capture: Capture, plan: ImagingPlan, images: Path, names: Sequence[str]) -> None:
+    """Write a PNG: one row for each of the first frames named; before on the left, after on the right with the
+    method that undid the blur.
 
-    def work(partial: Sequence[Path]) -> None:
-        write_plan(partial[0], plan_imaging(recording, session.context, asked))
+    Parameters
+    ----------
+    path
+        Of the PNG.
+    capture
+        The recording.
+    plan
+        By which it was deblurred.
+    images
+        Folder of the deblurred images.
+    names
+        Of deblurred frames, the most blurred first.
+    """
+    import cv2
 
-    depends = {
-        **recording.identity(),
-        **session.context.identity(),
-        "asked": asked,
-        "weights": checksum("deepgyro") if asked.deblur == "deepgyro" else "",
-    }
-    imaging = session.workspace.imaging
-    session.runner.run("imaging", depends, [imaging], work)
-    plan = read_plan(imaging, recording.imu, recording.timing)
-    log.info("deblurring: %s", plan.deblur_note)
-    log.info("rolling shutter: %s", plan.rolling_shutter_note)
-    return plan
+    view = plan.view
+    if view is None:
+        raise ValueError("nothing was deblurred without a view")
+    index = view.index()
+    motion, camera = view.motion(), colmap_camera(view.camera)
+    rows: dict[str, UInt8Array] = {}
+    for frame in some_frames(capture, view.timing, [index[name] for name in names[:_FRAMES]]):
+        parallax = plan.parallaxes.get(frame.name)
+        field = blur_field(motion, camera, view.shutter(index[frame.name]), parallax=parallax)
+        before, after = _eight_bit(frame.image), _eight_bit(read_image(path_in(images, frame.name)))
+        top, left, height, width = _busiest(before)
+        cut = [picture[top : top + height, left : left + width].copy() for picture in (before, after)]
+        _draw(cut[0], field, top, left)
+        length = float(np.percentile(field.extent_px(), 90))
+        gap = np.full((height, _GAP, 3), 255, np.uint8)
+        label = np.full((_LABEL, 2 * width + _GAP, 3), 255, np.uint8)
+        text = f"{frame.name}   {length:.1f} px   before | {plan.method}"
+        cv2.putText(label, text, (4, _LABEL - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
+        rows[frame.name] = np.concatenate([label, np.concatenate([cut[0], gap, cut[1]], axis=1)])
+    sheet = np.concatenate([rows[name] for name in names[:_FRAMES]])
+    data = cv2.imencode(".png", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))[1]
+    try:
+        path.write_bytes(data.tobytes())
+    except OSError as error:
+        raise OutputError(f"{path} cannot be written: {error.strerror or error}") from error
+
+
+@dataclass(eq=False)
+class CropKeeper:
+    """Keeps parts of some frames as they pass before and after the frame stages, a few however many there are.
+
+    Attributes
+    ----------
+    blur_px
+        By name, the blur of the frames to look at.
+    """
+
+    blur_px: Mapping[str, float]
+    _seen: dict[str, tuple[Part, UInt8Array]] = field(default_factory=dict, init=False)
+    _pairs: dict[str, tuple[UInt8Array, UInt8Array]] = field(default_factory=dict, init=False)
+
+    @classmethod
+    def of(cls, plan: ImagingPlan) -> CropKeeper:
+        """For a plan: frames that are to be deblurred, evenly from the most to the least blurred."""
+        blurred = () if plan.deblur is None else plan.deblur[0]
+        by_blur = sorted((d for d in blurred if d.action == "deblur"), key=lambda d: (-(d.blur_px or 0.0), d.name))
+        some = by_blur[:: -(-len(by_blur) // _CANDIDATES) or 1]
+        return cls(blur_px={decision.name: decision.blur_px or 0.0 for decision in some})
+
+    def before(self, frames: Iterator[Frame], /) -> Iterator[Frame]:
+        """The first stage."""
+        for frame in frames:
+            if frame.name in self.blur_px:
+                picture = _eight_bit(frame.image)
+                part = _busiest(picture)
+                self._seen[frame.name] = part, _cut(picture, part)
+            yield frame
+
+    def after(self, frames: Iterator[Frame], /) -> Iterator[Frame]:
+        """The last stage."""
+        for frame in frames:
+            seen = self._seen.pop(frame.name, None)
+            if seen is not None:
+                part, before = seen
+                after = _cut(_eight_bit(frame.image), part)
+                if before.shape == after.shape and not np.array_equal(before, after):
+                    self._pairs[frame.name] = before, after
+            yield frame
+
+    def write(self, folder: Path) -> None:
+        """Write the most blurred of the frames that were changed: JPEGs, and ``crops.json`` with their names."""
+        folder.mkdir(parents=True)
+        listed = []
+        for number, name in enumerate(sorted(self._pairs, key=lambda name: -self.blur_px[name])[:_SHOWN]):
+            entry: dict[str, object] = {"name": name, "blur_px": self.blur_px[name]}
+            for side, picture in zip(("before", "after"), self._pairs[name], strict=True):
+                entry[side] = f"{number}_{side}.jpg"
+                encode_image(folder / f"{number}_{side}.jpg", picture)
+            listed.append(entry)
+        write_json(folder / "crops.json", {"crops": listed})
+
+
+def _cut(picture: UInt8Array, part: Part) -> UInt8Array:
+    top, left, height, width = part
+    return picture[top : top + height, left : left + width].copy()
+
+
+def _eight_bit(image: AnyArray) -> UInt8Array:
+    """(H, W, 3) with 8 bit."""
+    codes = np.asarray(image if image.dtype == np.uint8 else image >> 8, dtype=np.uint8)
+    return np.repeat(codes[..., None], 3, axis=2) if codes.ndim == 2 else codes
+
+
+def _busiest(image: UInt8Array) -> Part:
+    """Top, left, height and width of the part with the most texture."""
+    import cv2
+
+    height, width = min(_HEIGHT, image.shape[0]), min(_WIDTH, image.shape[1])
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    texture = np.abs(cv2.Laplacian(cv2.GaussianBlur(grey, (0, 0), 2), cv2.CV_32F))
+    sums = cv2.integral(np.minimum(texture, np.percentile(texture, 99)))
+    inside = sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
+    top, left = np.unravel_index(int(np.argmax(inside)), inside.shape)
+    return int(top), int(left), height, width
+
+
+def _draw(crop: UInt8Array, field: BlurField, top: int, left: int) -> None:
+    """The segments along which pixels were smeared."""
+    import cv2
+
+    height, width = crop.shape[:2]
+    for y in range(_ARROWS_PX // 2, height, _ARROWS_PX):
+        for x in range(_ARROWS_PX // 2, width, _ARROWS_PX):
+            row, column = (round((at + offset) / field.step_px) for at, offset in ((y, top), (x, left)))
+            row, column = min(row, field.vector_px.shape[0] - 1), min(column, field.vector_px.shape[1] - 1)
+            dx, dy = 0.5 * field.vector_px[row, column]
+            ends = [(round(float(x + sign * dx)), round(float(y + sign * dy))) for sign in (-1, 1)]
+            cv2.line(crop, ends[0], ends[1], (255, 60, 0), 2, cv2.LINE_AA)
 
 
 def run_frames(

@@ -32,9 +32,9 @@ from colmap_inertial.pipeline.run.runner import fingerprint, remove
 from colmap_inertial.pipeline.run.session import Session
 from colmap_inertial.pipeline.stages.metric import gravity_in_model, metric_trajectory, motion_file, write_trajectory
 from colmap_inertial.pipeline.stages.protocols import JoiningStage, ModelStage, joins_models
+from colmap_inertial.reconstruction.drivers.project_output import remove_stale_dense
 from colmap_inertial.reconstruction.drivers.reporting import write_model_record
 from colmap_inertial.reconstruction.drivers.result import Fragment, ModelResult, ScaledModel
-from colmap_inertial.reconstruction.drivers.stale_outputs import remove_stale_dense
 
 if TYPE_CHECKING:
     import pycolmap

@@ -18,7 +18,13 @@ from colmap_inertial.checks.validate import parse_target
 from colmap_inertial.colmap.tsdf import require_mesh_maker
 from colmap_inertial.core.errors import AlreadyMetricError, FormatError, InertialError, OutputError, TimingError
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
-from colmap_inertial.core.types import CameraTrajectory, FrameTiming, ReadoutDirection
+from colmap_inertial.core.types import (
+    CameraImuCalibration,
+    CameraTrajectory,
+    FrameTiming,
+    ImuRecording,
+    ReadoutDirection,
+)
 from colmap_inertial.io.calibration import calibration_prior, describe_files
 from colmap_inertial.io.capture import Capture, Video, load_capture
 from colmap_inertial.io.exif import read_exposures_s, stamps_of_exif
@@ -42,10 +48,9 @@ from colmap_inertial.model.copying import list_tree
 from colmap_inertial.model.layout import read_layout
 from colmap_inertial.model.similarities import ModelScale, read_similarity
 from colmap_inertial.pipeline.run.context import Recording, RunContext, corrected_imu, prior_calibration
-from colmap_inertial.pipeline.run.installed import warn_of_conflicts
 from colmap_inertial.pipeline.run.progress import Progress, silent
 from colmap_inertial.pipeline.run.runner import fingerprint
-from colmap_inertial.pipeline.run.session import Session, open_session
+from colmap_inertial.pipeline.run.session import Session, open_session, warn_of_conflicts
 from colmap_inertial.pipeline.run.workspace import Workspace
 from colmap_inertial.pipeline.stages.defaults import default_model_stages
 from colmap_inertial.pipeline.stages.inputs import StageInputs
@@ -91,6 +96,15 @@ def _has_model(path: Path) -> bool:
         or (folder.is_dir() and any(p.name.isdigit() and model_format(p) is not None for p in folder.iterdir()))
         for folder in places
     )
+
+
+def _require_model(project: Path) -> None:
+    if not _has_model(project):
+        raise FormatError(
+            project,
+            "holds no COLMAP model (sparse/ or a model folder), and --imu and the like belong to one: leave them out "
+            "for a capture, which describes itself",
+        )
 
 
 def reconstruct_project(
@@ -149,45 +163,30 @@ def _reconstruct(
     findings: Callable[[Diagnosis], None],
 ) -> ReconstructResult:
     warn_of_conflicts()
-    if not _has_model(project):
-        raise FormatError(
-            project,
-            "holds no COLMAP model (sparse/ or a model folder), and --imu and the like belong to one: leave them out "
-            "for a capture, which describes itself",
-        )
+    _require_model(project)
     require_plotly()
     require_mesh_maker(options)
     _check_options(options)
-    given = _given(project, source, options)
-    capture = given.capture
-    raw = checked_imu(given.raw, force=options.force)
-    used = describe_files(options.calibration)
-    prior = prior_calibration(capture, options.calibration)
-    imu = corrected_imu(capture, raw.imu, options.calibration)
-    target = None if capture.target is None else parse_target(capture.target)
+    given = _read_sources(project, source, options)
+    target = None if given.capture.target is None else parse_target(given.capture.target)
     models = _models(project, out, source.keep, follow_links=source.follow_links)
     require_free_names(project, Workspace(out), dense=options.dense)
     pictures = options.dense or source.exif_times or source.video is not None
-    filmed = isinstance(capture.frames, Video)
+    filmed = isinstance(given.capture.frames, Video)
     images = _images(project, source, needed=pictures or (options.georeference and not filmed))
-    read = functools.cache(read_model)
+    context, folders = RunContext.of(options, progress=progress), () if images is None else (images,)
     with (
-        open_session(
-            out,
-            project,
-            options,
-            RunContext.of(options, progress=progress),
-            pictures=() if images is None else (images,),
-        ) as session,
-        reporting_stops(session.workspace, capture),
+        open_session(out, project, options, context, pictures=folders) as session,
+        reporting_stops(session.workspace, given.capture),
     ):
-        workspace = session.workspace
+        read = functools.cache(read_model)
         timing, notes = _run_times(session, given, models, images, read)
-        fixes = positions_of(capture, _registered(models, read), images) if options.georeference else None
-        recording = Recording.of(capture, imu, timing, prior, max_offset_s=options.scale.max_offset_s)
+        fixes = positions_of(given.capture, _registered(models, read), images) if options.georeference else None
+        limit_s = options.scale.max_offset_s
+        recording = Recording.of(given.capture, given.imu, timing, given.prior, max_offset_s=limit_s)
         largest = read(models[max(models, key=lambda n: (num_registered(models[n]), -n))])
-        model = _trajectory(largest, timing)
-        doubts = run_preflight(session, recording, raw, findings, force=options.force, model=model)
+        poses = _trajectory(largest, timing)
+        doubts = run_preflight(session, recording, given.raw, findings, force=options.force, model=poses)
         recording = dataclasses.replace(recording, doubts=doubts)
         inputs = StageInputs(recording=recording, options=_as_mapped(options))
         stages = with_defaults(model_stages, default_model_stages(inputs))
@@ -203,7 +202,7 @@ def _reconstruct(
         if options.dense and images is not None:
             results = run_dense_models(session, results, images, options.dense_options)
         result = ReconstructResult(
-            workspace=workspace,
+            workspace=session.workspace,
             models=results,
             fragments=fragments,
             gaps=gaps,
@@ -211,8 +210,7 @@ def _reconstruct(
             project_metric=metric,
         )
         write_recording(session, recording)
-        result = report_result(session, result, capture, used, project=source)
-    return result
+        return report_result(session, result, given.capture, given.calibration_files, project=source)
 
 
 def _trajectory(model: pycolmap.Reconstruction, timing: FrameTiming) -> CameraTrajectory | Literal["untimed"]:
@@ -255,24 +253,38 @@ class _Given:
     ----------
     capture
         What is known of the recording, in a capture's terms; its frames are those of a capture that was given.
+    raw, imu
+        The IMU as it was recorded, and as its own calibration corrects it.
+    prior
+        Calibration of camera and IMU that is known beforehand.
+    calibration_files
+        What the result says of them.
     """
 
     source: ProjectOptions
     capture: Capture
     raw: RawImu
+    imu: ImuRecording
+    prior: CameraImuCalibration
+    calibration_files: list[dict[str, str]]
 
 
-def _given(project: Path, source: ProjectOptions, options: ReconstructOptions) -> _Given:
+def _require_recording(project: Path, source: ProjectOptions) -> Path:
     if source.imu is None:
         stated = (source.frame_times, source.name_times, source.video, source.exif_times or None)
-        when = "" if any(way is not None for way in stated) else f"; and when its images were taken: {_HOW_TIMES}"
+        when = "" if any(times is not None for times in stated) else f"; and when its images were taken: {_HOW_TIMES}"
         raise FormatError(project, f"is a COLMAP project and needs the recording that ran along: give --imu PATH{when}")
-    times = source.frame_times
-    if times is not None and not times.exists():
-        raise FormatError(times, "no such file or folder")
-    described = [p for p in (source.imu, times) if p is not None and (is_capture(p) or find_recording(p) is not None)]
+    if source.frame_times is not None and not source.frame_times.exists():
+        raise FormatError(source.frame_times, "no such file or folder")
+    return source.imu
+
+
+def _read_sources(project: Path, source: ProjectOptions, options: ReconstructOptions) -> _Given:
+    """Read what was given beside the project, before any work."""
+    imu, times = _require_recording(project, source), source.frame_times
+    described = [p for p in (imu, times) if p is not None and (is_capture(p) or find_recording(p) is not None)]
     captures = [load_capture(path) for path in described]
-    raw = read_raw_capture_imu(captures[0]) if described[:1] == [source.imu] else read_raw_imu(source.imu)
+    raw = read_raw_capture_imu(captures[0]) if described[:1] == [imu] else read_raw_imu(imu)
     capture = captures[0] if captures else Capture(path=project, calibration=calibration_prior())
     frames = next((c.frames for c in captures if c.frames is not None), None)
     own_clock = source.exif_times or (source.video is not None and not isinstance(frames, Video))
@@ -280,9 +292,17 @@ def _given(project: Path, source: ProjectOptions, options: ReconstructOptions) -
     capture = dataclasses.replace(capture, path=project, frames=frames, shared_clock=shared)
     if source.video is not None:
         capture = _with_video(capture, source.video, None if times in described else times)
-    elif times is None and source.name_times is None and not source.exif_times and frames is None:
+    elif frames is None and not (times or source.name_times is not None or source.exif_times):
         raise TimingError(f"{project}: nothing says when its images were taken: {_HOW_TIMES}")
-    return _Given(source=source, capture=capture, raw=raw)
+    raw = checked_imu(raw, force=options.force)
+    return _Given(
+        source=source,
+        capture=capture,
+        raw=raw,
+        calibration_files=describe_files(options.calibration),
+        prior=prior_calibration(capture, options.calibration),
+        imu=corrected_imu(capture, raw.imu, options.calibration),
+    )
 
 
 def _with_video(capture: Capture, video: Path, times: Path | None) -> Capture:

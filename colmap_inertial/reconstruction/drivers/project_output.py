@@ -1,4 +1,4 @@
-"""An existing project in metres, in the output folder itself, beside the result and the report."""
+"""What stands in an output folder beside the result: an existing project in metres, and dense reconstructions."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
+from colmap_inertial.colmap.dense import digest
+from colmap_inertial.colmap.depth_maps import has_depth_maps, model_of
 from colmap_inertial.core.errors import OutputError, OutputExistsError
 from colmap_inertial.core.options import ProjectOptions
 from colmap_inertial.io.files import check_names, path_in, read_json, read_record, write_json, write_record
@@ -166,3 +168,82 @@ def _moves(workspace: Workspace, scratch: Path, folders: Mapping[int, Path]) -> 
         else:
             moves[workspace.root / path.name] = path
     return moves
+
+
+#: In a reconstruction that is set aside: which of its steps are finished.
+_STEPS = ".stages"
+
+
+def withdraw(workspace: Workspace) -> None:
+    """Take away everything metric: there is no accepted scale, or none any more."""
+    remove_stale_dense(workspace, {})
+    remove_placed(workspace)
+    for path in (workspace.sparse, *workspace.trajectories()):
+        remove(path)
+
+
+def remove_stale_dense(workspace: Workspace, models: Mapping[int, Path]) -> None:
+    """Leave no dense reconstruction beside a model that it was not made from.
+
+    One with depth maps, which may have taken hours, is kept in ``earlier/``, and comes back when its model does (as
+    with ``--world`` to and fro); any other of ours is removed. What somebody else made there is left alone.
+
+    Parameters
+    ----------
+    workspace
+        The output folder.
+    models
+        The metric models that are there, by their numbers.
+    """
+    places = [place for place in (workspace.dense, workspace.earlier) if place.is_dir()]
+    if not places or workspace.dense in placed_paths(workspace):  # the project's own goes with its models
+        return
+    digests = {index: digest(model) for index, model in models.items()}
+    for folder in sorted(workspace.dense.glob("*")):
+        made_from, index = model_of(folder), folder.name
+        number = int(index) if index.isdecimal() and index.isascii() else -1
+        if made_from is not None and made_from != digests.get(number):
+            _set_dense_aside(workspace, folder)
+    for number, made_from in digests.items():
+        _restore_dense(workspace, number, made_from)
+    for folder in (workspace.earlier / workspace.dense.name, workspace.earlier, workspace.dense):
+        if folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
+
+
+def _set_dense_aside(workspace: Workspace, folder: Path) -> None:
+    """Keep a dense reconstruction with depth maps in ``earlier/``, with its stamps; remove one without."""
+    steps = list(workspace.stamps.glob(f"dense_{folder.name}_*.json"))
+    if not has_depth_maps(folder):
+        for path in (*steps, workspace.stamps / f"sweep_{folder.name}", folder):
+            remove(path)
+        return
+    (folder / _STEPS).mkdir(exist_ok=True)
+    for step in steps:
+        os.replace(step, folder / _STEPS / step.name)
+    aside = _free_name(workspace.earlier / workspace.dense.name / folder.name)
+    aside.parent.mkdir(parents=True, exist_ok=True)
+    os.replace(folder, aside)
+    log.warning("the depth maps in %s are not of the model that is there now: kept in %s", folder, aside)
+
+
+def _restore_dense(workspace: Workspace, index: int, model_digest: str) -> None:
+    """Put back the dense reconstruction that was made from a model, where there is none, and its stamps."""
+    place = workspace.dense / str(index)
+    kept = (path for path in sorted(workspace.earlier.glob("*/*")) if model_of(path) == model_digest)
+    if not place.exists() and (aside := next(kept, None)) is not None:
+        place.parent.mkdir(exist_ok=True)
+        os.replace(aside, place)
+        log.info("the dense reconstruction in %s is of the model that is there now: %s", aside, place)
+    if (place / _STEPS).is_dir() and model_of(place) == model_digest:
+        for step in (place / _STEPS).glob(f"dense_{index}_*.json"):
+            os.replace(step, workspace.stamps / step.name)
+        remove(place / _STEPS)
+
+
+def _free_name(path: Path) -> Path:
+    """The path, or the first of it with a number behind that is free."""
+    count = 1
+    while (named := path if count == 1 else path.with_name(f"{path.name}-{count}")).exists():
+        count += 1
+    return named

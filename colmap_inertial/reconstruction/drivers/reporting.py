@@ -35,9 +35,9 @@ from colmap_inertial.pipeline.run.session import Session
 from colmap_inertial.pipeline.run.workspace import Workspace
 from colmap_inertial.pipeline.stages.metric import gravity_in_model
 from colmap_inertial.pipeline.stages.protocols import KeypointStage
+from colmap_inertial.reconstruction.drivers.project_output import withdraw
 from colmap_inertial.reconstruction.drivers.result import ReconstructResult, result_as_json
-from colmap_inertial.reconstruction.drivers.stale_outputs import withdraw
-from colmap_inertial.reconstruction.preparation.calibrate import guessed_camera
+from colmap_inertial.reconstruction.preparation.sampling import guessed_camera
 
 log = logging.getLogger(__name__)
 

@@ -11,7 +11,7 @@ import itertools
 import logging
 import math
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,50 +22,64 @@ from colmap_inertial.colmap.mapping import map_images
 from colmap_inertial.colmap.sparse import extract_features, image_pairs, match_features, verify_again
 from colmap_inertial.core.errors import FormatError, MappingError, NotObservableError
 from colmap_inertial.core.options import MappingOptions
-from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import (
     CameraImuCalibration,
     CameraModel,
     CameraTrajectory,
-    Frame,
     FrameTiming,
 )
-from colmap_inertial.io.capture import Capture, ImageFolder
+from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import path_in
-from colmap_inertial.io.frames import read_frames
-from colmap_inertial.io.images import read_image
-from colmap_inertial.model import colmap_camera, find_models, read_model, trajectory_from_model
+from colmap_inertial.model import find_models, read_model, trajectory_from_model
 from colmap_inertial.motion.align import AlignOptions, align_clocks
-from colmap_inertial.motion.flow import FlowOptions, VisualRotation, check_motion, find_stabilisation, measure_rotation
+from colmap_inertial.motion.flow import VisualRotation, check_motion, find_stabilisation
 from colmap_inertial.pipeline.run.context import Recording, RunContext
-from colmap_inertial.pipeline.run.progress import Progress, counted
 from colmap_inertial.pipeline.stages.frame_folder import encode_image, seen_by_colmap
-from colmap_inertial.pipeline.stages.gyro_view import GyroView
+from colmap_inertial.pipeline.stages.imaging_plan import GyroView
 from colmap_inertial.pipeline.stages.protocols import FrameStage
 from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage
+from colmap_inertial.reconstruction.preparation.sampling import (
+    guessed_camera,
+    measure_sampled_rotation,
+    sample_middle,
+    sample_spaced,
+    some_frames,
+)
 
 if TYPE_CHECKING:
     import pycolmap
 
 log = logging.getLogger(__name__)
 
-#: Frames of the small model: at most so many, at least so far apart; and how COLMAP makes it.
-_MODEL_FRAMES, _MODEL_SPACING_S = 60, 0.24
-#: Frames of one small model, where they are to cover a recording: the cost stays linear in its length.
-_MOST_IN_PART = 240
+
+@dataclass(frozen=True, kw_only=True)
+class PreliminaryLimits:
+    """What a calibration before the reconstruction is made of, and how good it must be."""
+
+    #: Frames of the small model: at most so many, at least so far apart.
+    model_frames: int = 60
+    model_spacing_s: float = 0.24
+    #: Frames of one small model, where they are to cover a recording: the cost stays linear in its length.
+    segment_frames: int = 240
+    #: Frames that are followed by their pixels: at most so many, not closer than this.
+    flow_frames: int = 300
+    flow_spacing_s: float = 0.06
+    #: Frames of a video are closer than this.
+    video_step_s: float = 0.13
+    #: A declared calibration that is as good as this needs no search.
+    good_rotation_rad: float = 0.03
+    good_offset_s: float = 0.005
+    #: What is estimated must be as good as this.
+    usable_rotation_rad: float = 0.1
+    usable_offset_s: float = 0.01
+
+
+_LIMITS = PreliminaryLimits()
+
+
 _SMALL = MappingOptions(
     pairing="sequential", overlap=6, max_num_features=1500, first_octave=0, max_image_size=800, refine_intrinsics=None
 )
-#: Frames that are followed by their pixels: at most so many, not closer than this; a video has them closer than that.
-_FLOW_FRAMES, _FLOW_SPACING_S, _VIDEO_STEP_S = 300, 0.06, 0.13
-#: Where a quick look begins at the latest.
-_BEGIN_S = 5.0
-#: A declared calibration that is as good as this needs no search.
-_GOOD_ROTATION_RAD, _GOOD_OFFSET_S = 0.03, 0.005
-#: What is found must be as good as this.
-_USABLE_ROTATION_RAD, _USABLE_OFFSET_S = 0.1, 0.01
-#: COLMAP's guess of a focal length, in longer sides of the image.
-_GUESSED_FOCAL = 1.2
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -83,25 +97,6 @@ class PreliminaryCalibration:
 
     view: GyroView
     models: tuple[pycolmap.Reconstruction, ...] = ()
-
-
-def some_frames(capture: Capture, timing: FrameTiming, indices: Sequence[int]) -> Iterator[Frame]:
-    """Some frames of a capture, in order of time; of a folder, no other is opened."""
-    if not isinstance(capture.frames, ImageFolder):
-        yield from read_frames(capture, only=[timing.names[i] for i in indices])[1]
-        return
-    for i in sorted(indices):
-        image = read_image(path_in(capture.frames.folder, timing.names[i]))
-        yield Frame(name=timing.names[i], image=image, t_s=float(timing.t_s[i]), camera=capture.camera)
-
-
-def guessed_camera(capture: Capture, timing: FrameTiming) -> CameraModel:
-    """The declared intrinsics, or what COLMAP starts from without any."""
-    if capture.camera is not None:
-        return capture.camera
-    height, width = next(some_frames(capture, timing, [0])).image.shape[:2]
-    params = (_GUESSED_FOCAL * max(width, height), width / 2, height / 2)
-    return CameraModel(model="SIMPLE_PINHOLE", width=width, height=height, params=params)
 
 
 def estimate_preliminary_calibration(recording: Recording, context: RunContext) -> PreliminaryCalibration:
@@ -122,11 +117,11 @@ def estimate_preliminary_calibration(recording: Recording, context: RunContext) 
     """
     capture, timing, every, progress = recording.capture, recording.timing, recording.every, context.progress
     camera = guessed_camera(capture, timing)
-    is_video = len(every.t_s) > 1 and float(np.median(np.diff(every.t_s))) <= _VIDEO_STEP_S
+    is_video = len(every.t_s) > 1 and float(np.median(np.diff(every.t_s))) <= _LIMITS.video_step_s
     rotation_rad, offset_s = _sigmas(recording.prior)
-    declared = rotation_rad <= _GOOD_ROTATION_RAD and offset_s <= _GOOD_OFFSET_S
-    along = _middle(every, _FLOW_SPACING_S, _FLOW_FRAMES)
-    rotation = followed(capture, every, camera, along, progress) if is_video else None
+    declared = rotation_rad <= _LIMITS.good_rotation_rad and offset_s <= _LIMITS.good_offset_s
+    along = sample_middle(every, _LIMITS.flow_spacing_s, _LIMITS.flow_frames)
+    rotation = measure_sampled_rotation(capture, every, camera, along, progress) if is_video else None
     found: GyroView | NotObservableError
     models: tuple[pycolmap.Reconstruction, ...] = ()
     if declared:
@@ -137,7 +132,7 @@ def estimate_preliminary_calibration(recording: Recording, context: RunContext) 
     else:
         found, models = _by_model(recording, context)
         if isinstance(found, NotObservableError):
-            rotation = rotation or followed(capture, every, camera, along, progress)
+            rotation = rotation or measure_sampled_rotation(capture, every, camera, along, progress)
             found = _by_pixels(rotation, recording, camera, found)
     if rotation is not None:
         known_s = None if isinstance(found, NotObservableError) else found.motion().offset_s
@@ -155,8 +150,9 @@ def estimate_preliminary_calibration(recording: Recording, context: RunContext) 
 
 def survey_parts(timing: FrameTiming) -> list[list[str]]:
     """Frames all along a recording, not too close together, in parts for small models of their own."""
-    names = [timing.names[i] for i in _spaced(timing, _MODEL_SPACING_S)]
-    return [part.tolist() for part in np.array_split(np.array(names, dtype=object), -(-len(names) // _MOST_IN_PART))]
+    names = [timing.names[i] for i in sample_spaced(timing, _LIMITS.model_spacing_s)]
+    segments = np.array_split(np.array(names, dtype=object), -(-len(names) // _LIMITS.segment_frames))
+    return [segment.tolist() for segment in segments]
 
 
 def survey(
@@ -200,45 +196,6 @@ def _sigmas(calibration: CameraImuCalibration) -> tuple[float, float]:
     return rotation, calibration.clock_sigma_s
 
 
-def _middle(timing: FrameTiming, spacing_s: float, most: int) -> list[int]:
-    """Frames from the middle of a recording, not closer together than asked for."""
-    kept = _spaced(timing, spacing_s)
-    first = max(0, (len(kept) - most) // 2)
-    return kept[first : first + most]
-
-
-def _spaced(timing: FrameTiming, spacing_s: float) -> list[int]:
-    kept = [0]
-    for i, t_s in enumerate(timing.t_s.tolist()):
-        if t_s - timing.t_s[kept[-1]] >= spacing_s:
-            kept.append(i)
-    return kept
-
-
-def near_the_beginning(timing: FrameTiming, spacing_s: float, most: int) -> list[int]:
-    """Frames of a video about so far apart, from a few seconds in at the latest: what lies before is decoded, too."""
-    usual_s = float(np.median(np.diff(timing.t_s))) if len(timing.t_s) > 1 else 0.0
-    kept = _spaced(timing, spacing_s - 0.25 * usual_s)
-    early = int(np.searchsorted(timing.t_s[kept], timing.t_s[0] + _BEGIN_S))
-    first = min(max(0, (len(kept) - most) // 2), early)
-    return kept[first : first + most]
-
-
-def followed(
-    capture: Capture,
-    timing: FrameTiming,
-    camera: CameraModel,
-    indices: Sequence[int],
-    progress: Progress,
-    *,
-    stage: str = "motion",
-) -> VisualRotation:
-    """The rotation between some frames, by their pixels; progress under the name of ``stage``."""
-    frames = counted(some_frames(capture, timing, indices), len(indices), stage, progress)
-    with one_blas_thread():
-        return measure_rotation(frames, colmap_camera(camera), timing, FlowOptions())
-
-
 def _by_pixels(
     rotation: VisualRotation, recording: Recording, camera: CameraModel, instead_of: NotObservableError
 ) -> GyroView | NotObservableError:
@@ -254,7 +211,7 @@ def _aligned(trajectory: CameraTrajectory, recording: Recording, camera: CameraM
     options = AlignOptions(max_offset_s=recording.max_offset_s)
     found = align_clocks(trajectory, recording.imu, prior=recording.prior, options=options)
     rotation_rad, offset_s = _sigmas(found.calibration)
-    if rotation_rad > _USABLE_ROTATION_RAD or offset_s > _USABLE_OFFSET_S:
+    if rotation_rad > _LIMITS.usable_rotation_rad or offset_s > _LIMITS.usable_offset_s:
         raise NotObservableError(
             "camera-IMU calibration",
             f"before the reconstruction it is known to {math.degrees(rotation_rad):.1f} deg and "
@@ -273,8 +230,8 @@ def _by_model(
     Also the models, where they are of all the recording.
     """
     capture, timing = recording.capture, recording.timing
-    indices = _middle(timing, _MODEL_SPACING_S, _MODEL_FRAMES)
-    whole = len(indices) == len(_spaced(timing, _MODEL_SPACING_S))
+    indices = sample_middle(timing, _LIMITS.model_spacing_s, _LIMITS.model_frames)
+    whole = len(indices) == len(sample_spaced(timing, _LIMITS.model_spacing_s))
     names = [timing.names[i] for i in indices]
     rounds = 2 if timing.readout_s else 1
     steps = itertools.count()

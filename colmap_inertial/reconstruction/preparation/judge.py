@@ -20,26 +20,37 @@ from colmap_inertial.imaging.psf import blur_path
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.pipeline.run.progress import Progress, counted
-from colmap_inertial.pipeline.stages.gyro_view import GyroView
-from colmap_inertial.reconstruction.preparation.calibrate import some_frames
+from colmap_inertial.pipeline.stages.imaging_plan import GyroView
+from colmap_inertial.reconstruction.preparation.sampling import some_frames
 
-#: A gyroscope that is borne out by this share of them is trusted for all frames.
-_MOST_OF_THEM = 0.95
-#: Of frames that are mostly sky, this share: of the little that stands below it, the fall of detail scatters by .2.
-_MOST_OF_SKIES = 0.85
-#: A frame whose dip is faint bears the gyroscope out, too, where detail falls along the blur as it would have it, and
-#: no other direction shows a dip this deep.
-_OTHER_SUPPORT = 4.0
-#: Pictures whose tiles tell no more than this share of them would if all were alike are mostly sky. Common ones with
-#: short blur are at .8; 70 % of sky leaves .6.
-_STANDING = 0.7
-#: So many frames that are mostly sky bear the gyroscope out where so large a share of them shows the fall of detail,
-#: and they rather show it than the mirrored one by so many standard deviations of the mean. Right gyroscopes have .7 to
-#: 1 and 3.8 to 5.6, wrong ones .45 and 3.2 at most, not both at once.
-_SKY_FRAMES, _SKY_SHARE, _SKY_SIGMAS = 5, 0.65, 3.0
-#: Where the pictures do not bear the gyroscope out, exposure times may be wrong by a common factor; these are tried.
-#: Twice the blur shows a dip, too, where the right one shows a deeper one.
-_EXPOSURE_FACTORS, _EXPOSURE_SUPPORT = (0.5, 2.0), 10.0
+
+@dataclass(frozen=True, kw_only=True)
+class JudgeLimits:
+    """When frames bear out the gyroscope's blur."""
+
+    #: A gyroscope that is borne out by this share of the frames is trusted for all of them.
+    trusted_share: float = 0.95
+    #: Of frames that are mostly sky, this share: of the little below it, the fall of detail scatters by .2.
+    trusted_share_of_skies: float = 0.85
+    #: A frame whose dip is faint bears the gyroscope out, too, where detail falls along the blur as predicted, and no
+    #: other direction shows a dip this deep.
+    other_support: float = 4.0
+    #: Pictures whose tiles tell no more than this share of them would if all were alike are mostly sky. Common ones
+    #: with short blur are at .8; 70 % of sky leaves .6.
+    standing_share: float = 0.7
+    #: So many frames that are mostly sky bear the gyroscope out where so large a share of them shows the fall of
+    #: detail, and they rather show it than the mirrored one by so many standard deviations of the mean. Right
+    #: gyroscopes have .7 to 1 and 3.8 to 5.6, wrong ones .45 and 3.2 at most, not both at once.
+    sky_frames: int = 5
+    sky_share: float = 0.65
+    sky_sigmas: float = 3.0
+    #: Where the pictures do not bear the gyroscope out, exposure times may be wrong by a common factor; these are
+    #: tried. Twice the blur shows a dip, too, where the right one shows a deeper one.
+    exposure_factors: tuple[float, ...] = (0.5, 2.0)
+    exposure_support: float = 10.0
+
+
+_LIMITS = JudgeLimits()
 
 
 def judge_frames(
@@ -75,7 +86,7 @@ def judge_frames(
 
     looked = look(1.0)
     verdict = judged(looked)
-    factors: tuple[float, ...] = _EXPOSURE_FACTORS
+    factors: tuple[float, ...] = _LIMITS.exposure_factors
     if verdict.trusted is True:
         long_blur = np.median([one.blur_px for one in looked]) >= 2 * GATE_LIMITS.must_show_px
         factors = tuple(factor for factor in factors if factor < 1 and long_blur)
@@ -105,7 +116,7 @@ class Looked:
         if not one.extent_is_plausible:
             return False
         other = float(one.sigmas[:, 2:-1].max())
-        faint = self.share is not None and self.share >= GATE_LIMITS.least_share and other < _OTHER_SUPPORT
+        faint = self.share is not None and self.share >= GATE_LIMITS.least_share and other < _LIMITS.other_support
         return one.support >= GateOptions().min_support or faint
 
     @property
@@ -117,7 +128,7 @@ class Looked:
     def is_mostly_sky(self) -> bool:
         """Whether the few parts that stand out of it would go down among the quiet ones."""
         standing = self.evidence.standing
-        return standing is not None and standing.tiles < _STANDING * self.evidence.tiles
+        return standing is not None and standing.tiles < _LIMITS.standing_share * self.evidence.tiles
 
 
 def _look(
@@ -153,7 +164,7 @@ def _correct_exposures(
         others = look(factor)
         evidence = [one.evidence for one in others]
         found, support = judged(others), _together(evidence)
-        if found.trusted is True and support >= _EXPOSURE_SUPPORT and support > deepest:
+        if found.trusted is True and support >= _LIMITS.exposure_support and support > deepest:
             whole = factor * found.extent_factor
             reason = (
                 f"the images bear out the gyroscope's blur ({support:.0f} standard deviations), but for its extent, "
@@ -175,11 +186,11 @@ def judged(looked: Sequence[Looked]) -> RecordingVerdict:
 def below_sky(verdict: RecordingVerdict, looked: Sequence[Looked]) -> RecordingVerdict:
     """The verdict; or trust, where the frames are mostly sky and what stands below it falls off as it should."""
     gains = np.array([one.gain for one in looked if one.is_mostly_sky and np.isfinite(one.gain)])
-    if verdict.trusted is not False or len(gains) < max(_SKY_FRAMES, len(looked) / 2):
+    if verdict.trusted is not False or len(gains) < max(_LIMITS.sky_frames, len(looked) / 2):
         return verdict
     shown = sum(one.is_mostly_sky and one.shows for one in looked)
     sigmas = float(gains.mean() / max(gains.std(ddof=1) / np.sqrt(len(gains)), 1e-9))
-    if shown < _SKY_SHARE * len(gains) or sigmas < _SKY_SIGMAS:
+    if shown < _LIMITS.sky_share * len(gains) or sigmas < _LIMITS.sky_sigmas:
         return verdict
     reason = f"what stands below the sky bears out the gyroscope's blur ({sigmas:.0f} standard deviations)"
     return replace(verdict, trusted=True, support=sigmas, extent_factor=1.0, reason=reason)
@@ -193,7 +204,7 @@ def by_frame(verdict: RecordingVerdict, looked: Sequence[Looked]) -> RecordingVe
     telling = [one for one in looked if one.evidence.enough and one.blur_px >= GATE_LIMITS.must_show_px]
     shown = sum(one.shows for one in telling)
     skies = 2 * sum(one.is_mostly_sky for one in telling) > len(telling)
-    most = _MOST_OF_SKIES if skies else _MOST_OF_THEM
+    most = _LIMITS.trusted_share_of_skies if skies else _LIMITS.trusted_share
     if verdict.trusted is not True or shown >= most * len(telling):
         return verdict
     reason = (

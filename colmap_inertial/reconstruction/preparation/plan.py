@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import itertools
+import logging
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
 import numpy as np
@@ -11,7 +14,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import InertialError, NotObservableError
-from colmap_inertial.core.options import BlurRemover, DeblurMethod, RollingShutterMethod
+from colmap_inertial.core.options import BlurRemover, DeblurMethod, ReconstructOptions, RollingShutterMethod
 from colmap_inertial.core.types import CameraModel, FrameTiming
 from colmap_inertial.imaging.gate import (
     FrameDecision,
@@ -20,40 +23,53 @@ from colmap_inertial.imaging.gate import (
 )
 from colmap_inertial.imaging.parallax import Parallax
 from colmap_inertial.imaging.psf import predicted_blur_px
+from colmap_inertial.imaging.restoration.shipped import checksum
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.exif import read_exposures_s
 from colmap_inertial.io.files import path_in
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.pipeline.run.context import Recording, RunContext
 from colmap_inertial.pipeline.run.progress import Progress
+from colmap_inertial.pipeline.run.session import Session
 from colmap_inertial.pipeline.stages.deblur import DeblurStage
-from colmap_inertial.pipeline.stages.gyro_view import GyroView
-from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan
-from colmap_inertial.reconstruction.preparation.calibrate import (
-    estimate_preliminary_calibration,
-    guessed_camera,
-    survey,
-    survey_parts,
-)
+from colmap_inertial.pipeline.stages.imaging_plan import GyroView, ImagingPlan, read_plan, write_plan
+from colmap_inertial.reconstruction.preparation.calibrate import estimate_preliminary_calibration, survey, survey_parts
 from colmap_inertial.reconstruction.preparation.judge import judge_frames
-from colmap_inertial.reconstruction.preparation.translating import most_by_sliding_px, translating_segments
-from colmap_inertial.reconstruction.preparation.translation import find_parallaxes
+from colmap_inertial.reconstruction.preparation.sampling import guessed_camera
+from colmap_inertial.reconstruction.preparation.translation import (
+    find_parallaxes,
+    most_by_sliding_px,
+    translating_segments,
+)
 
 if TYPE_CHECKING:
     import pycolmap
 
 
-#: Blur below this cannot be told from the texture: where no frame has more, nothing is deblurred.
-_TELLING_PX = 4.0
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanLimits:
+    """When frames are looked at for deblurring."""
+
+    #: Blur below this cannot be told from the texture: where no frame has more, nothing is deblurred.
+    telling_px: float = 4.0
+    #: How often small models are made, at most, for more of the blurred frames.
+    surveys: int = 4
+    #: While a frame may have been taken: by how many standard deviations of the clocks' offset sooner or later, and
+    #: how long a readout is at most that nobody declared.
+    sure_sigmas: float = 4.0
+    longest_readout_s: float = 0.04
+    #: Frames by which the gyroscope is judged.
+    judged_frames: int = 14
+
+
+_LIMITS = PlanLimits()
+
+
 #: What the note says of methods other than the default.
 _SAID_OF = {"deepgyro": "; the network DeepGyro undoes it", "path": "; the half-quadratic filter undoes it"}
-#: How often small models are made, at most, for more of the blurred frames.
-_SURVEYS = 4
-#: While a frame may have been taken: by how many standard deviations of the clocks' offset sooner or later, and how
-#: long a readout is at most that nobody declared.
-_SURE_SIGMAS, _LONGEST_READOUT_S = 4.0, 0.04
-#: Frames by which the gyroscope is judged.
-_JUDGED_FRAMES = 14
 
 
 def with_stated_exposures(capture: Capture, timing: FrameTiming) -> FrameTiming:
@@ -85,6 +101,44 @@ class Treatments:
     frames_by_others: bool = False
     keypoints_by_others: bool = False
 
+    def by_name(self, *, deblur: bool, rectify: bool) -> bool:
+        """Whether one of these treatments was asked for by name: it is an error where it cannot be done."""
+        named_deblur, named_rectify = self.deblur in get_args(BlurRemover), self.rolling_shutter == "rectify"
+        return (named_deblur and deblur) or (named_rectify and rectify)
+
+
+def ask_for_plan(
+    options: ReconstructOptions, frame_stages: Sequence[object], keypoint_stages: Sequence[object], *, pairs: bool
+) -> Treatments:
+    """What the options ask for, as far as the default stages are to do it."""
+    return Treatments(
+        deblur=options.deblur,
+        rolling_shutter=options.rolling_shutter,
+        pairs=pairs,
+        frames_by_others=... not in frame_stages,
+        keypoints_by_others=... not in keypoint_stages,
+    )
+
+
+def run_plan(session: Session, recording: Recording, asked: Treatments) -> ImagingPlan:
+    """What to do to frames and keypoints; where nothing is asked for, nothing is looked at."""
+
+    def work(partial: Sequence[Path]) -> None:
+        write_plan(partial[0], plan_imaging(recording, session.context, asked))
+
+    depends = {
+        **recording.identity(),
+        **session.context.identity(),
+        "asked": asked,
+        "weights": checksum("deepgyro") if asked.deblur == "deepgyro" else "",
+    }
+    imaging = session.workspace.imaging
+    session.runner.run("imaging", depends, [imaging], work)
+    plan = read_plan(imaging, recording.imu, recording.timing)
+    log.info("deblurring: %s", plan.deblur_note)
+    log.info("rolling shutter: %s", plan.rolling_shutter_note)
+    return plan
+
 
 def plan_imaging(recording: Recording, context: RunContext, asked: Treatments) -> ImagingPlan:
     """Decide what is done to frames and keypoints.
@@ -113,13 +167,11 @@ def plan_imaging(recording: Recording, context: RunContext, asked: Treatments) -
         )
     why_not = _no_deblurring(recording, asked, context.progress)
     no_rectifying = _no_rectifying(timing, asked)
-    source = f" ({capture.readout_source})" if capture.readout_source else ""
-    rectifying = f"keypoints are rectified, readout {1e3 * (timing.readout_s or 0):.1f} ms{source}"
     plan = ImagingPlan(
         method="wiener" if asked.deblur is None or asked.deblur == "off" else asked.deblur,
         rectify=not no_rectifying,
         deblur_note=why_not,
-        rolling_shutter_note=no_rectifying or rectifying,
+        rolling_shutter_note=no_rectifying or _rectified_note(capture, timing),
     )
     if why_not and not plan.rectify and not asked.pairs:
         return plan
@@ -129,11 +181,7 @@ def plan_imaging(recording: Recording, context: RunContext, asked: Treatments) -
     try:
         found = estimate_preliminary_calibration(recording, context)
     except NotObservableError as error:
-        by_name = [
-            asked.deblur in get_args(BlurRemover) and not why_not,
-            asked.rolling_shutter == "rectify" and plan.rectify,
-        ]
-        if any(by_name):
+        if asked.by_name(deblur=not why_not, rectify=plan.rectify):
             raise
         untreated = f"frames stay as they were filmed: {error}"
         return ImagingPlan(
@@ -174,9 +222,14 @@ def _no_rectifying(timing: FrameTiming, asked: Treatments) -> str:
     return "" if timing.readout_s else "global shutter"
 
 
+def _rectified_note(capture: Capture, timing: FrameTiming) -> str:
+    source = f" ({capture.readout_source})" if capture.readout_source else ""
+    return f"keypoints are rectified, readout {1e3 * (timing.readout_s or 0):.1f} ms{source}"
+
+
 def _limit_px(camera: CameraModel) -> float:
     """Blur of which a frame must have more to be looked at and treated, px of the picture as it is."""
-    return max(_TELLING_PX, GateOptions().skip_below_px * max(camera.width, camera.height) / 1920)
+    return max(_LIMITS.telling_px, GateOptions().skip_below_px * max(camera.width, camera.height) / 1920)
 
 
 def _no_deblurring(recording: Recording, asked: Treatments, progress: Progress) -> str:
@@ -209,8 +262,8 @@ def _most_turned_rad(recording: Recording, exposure_s: Array) -> float:
     timing, prior = recording.timing, recording.prior
     timed = CameraTimedImu.from_recording(recording.imu, prior, timing.epoch_ns)
     rate_rad_s, stamps_s = np.linalg.norm(timed.imu.gyro_rad_s, axis=1), timed.gyro_t_s
-    margin_s = _SURE_SIGMAS * prior.clock_sigma_s
-    longest_s = _LONGEST_READOUT_S if timing.readout_s is None else timing.readout_s
+    margin_s = _LIMITS.sure_sigmas * prior.clock_sigma_s
+    longest_s = _LIMITS.longest_readout_s if timing.readout_s is None else timing.readout_s
     # a sample more on each side
     first = np.searchsorted(stamps_s, timing.t_s - margin_s) - 1
     last = np.searchsorted(stamps_s, timing.t_s + longest_s + exposure_s + margin_s, side="right") + 1
@@ -254,48 +307,56 @@ def _deblurring(
     """The plan with what is to be deblurred, by the gyroscope and by what small models tell of the translation.
 
     ``models`` makes them of some frames as filmed, or as a plan has them. Where frames were too blurred for a model,
-    those around them, and the IMU beyond, tell how to deblur them for the next one. ``sliding`` says in which of some
-    parts frames are blurred although the camera does not turn: of these small models are made, too.
+    those around them, and the IMU beyond, tell how to deblur them for the next one. ``sliding`` says in which segments
+    frames are blurred although the camera does not turn: of these small models are made, too.
     """
     decisions = _decisions(view, {})
-    parts, place = survey_parts(view.timing), view.index()
-    begins_s = view.timing.t_s[[place[names[0]] for names in parts]]
-
-    def by_part(names: set[str]) -> dict[int, set[str]]:
-        out: dict[int, set[str]] = {}
-        for name in names:
-            part = int(np.searchsorted(begins_s, view.timing.t_s[place[name]], side="right")) - 1
-            out.setdefault(part, set()).add(name)
-        return out
-
-    lost = by_part(_to_deblur(decisions)) if _blurred(decisions) else {}
-    others = [i for i in range(len(parts)) if i not in lost]
-    lost |= {i: set() for i, slides in zip(others, sliding([parts[i] for i in others]), strict=True) if slides}
-    if not lost:
+    segments = survey_parts(view.timing)
+    turning = set(_by_segment(_to_deblur(decisions), segments, view)) if _blurred(decisions) else set()
+    others = [i for i in range(len(segments)) if i not in turning]
+    pending = turning.union(itertools.compress(others, sliding([segments[i] for i in others])))
+    if not pending:
         return _decided(plan, view, capture, {}, progress)
-    found: dict[int, _Surveyed] = {}
+    surveys: dict[int, _Surveyed] = {}
     treated = None
-    for _ in range(_SURVEYS):
+    for _ in range(_LIMITS.surveys):
         better = False
-        for i in sorted(lost):
-            new = _Surveyed.of(models(parts[i], treated), view)
-            if i not in found or len(new.registered) > len(found[i].registered):
-                found[i], better = new, True
+        for i in sorted(pending):
+            new = _Surveyed.of(models(segments[i], treated), view)
+            if i not in surveys or len(new.registered) > len(surveys[i].registered):
+                surveys[i], better = new, True
         if not better:
             break
-        # of two parts that tell about a frame, its own goes first
-        parallaxes = {name: one for part in found.values() for name, one in part.parallaxes.items()}
-        own = by_part(set(parallaxes))
-        parallaxes |= {n: found[i].parallaxes[n] for i in found for n in own.get(i, ()) if n in found[i].parallaxes}
-        decisions = _decisions(view, parallaxes)
+        parallaxes = _merge_parallaxes(surveys, segments, view)
         treated = _decided(plan, view, capture, parallaxes, progress)
-        registered = {name for part in found.values() for name in part.registered}
-        known = {i: names & set(parts[i]) - registered for i, names in by_part(_to_deblur(decisions)).items()}
-        lost = {i: names for i, names in known.items() if names}
-        if not parallaxes or not lost or treated.deblur is None:
+        blurred = _by_segment(_to_deblur(_decisions(view, parallaxes)), segments, view)
+        registered = {name for surveyed in surveys.values() for name in surveyed.registered}
+        pending = {i for i, names in blurred.items() if names & set(segments[i]) - registered}
+        if not parallaxes or not pending or treated.deblur is None:
             break
     assert treated is not None
     return treated
+
+
+def _by_segment(names: Iterable[str], segments: Sequence[Sequence[str]], view: GyroView) -> dict[int, set[str]]:
+    """Names of frames by the index of the segment whose time they lie in."""
+    place, t_s = view.index(), view.timing.t_s
+    begins_s = t_s[[place[segment[0]] for segment in segments]]
+    out: dict[int, set[str]] = {}
+    for name in names:
+        out.setdefault(int(np.searchsorted(begins_s, t_s[place[name]], side="right")) - 1, set()).add(name)
+    return out
+
+
+def _merge_parallaxes(
+    surveys: Mapping[int, _Surveyed], segments: Sequence[Sequence[str]], view: GyroView
+) -> dict[str, Parallax]:
+    """Parallaxes by frame name; of two segments that have one for a frame, its own goes first."""
+    merged = {name: parallax for surveyed in surveys.values() for name, parallax in surveyed.parallaxes.items()}
+    own = _by_segment(merged, segments, view)
+    for i, surveyed in surveys.items():
+        merged |= {name: surveyed.parallaxes[name] for name in own.get(i, ()) if name in surveyed.parallaxes}
+    return merged
 
 
 @dataclass(frozen=True, eq=False)
@@ -325,8 +386,8 @@ def _decisions(view: GyroView, parallaxes: Mapping[str, Parallax]) -> tuple[Fram
 
 def _blurred(decisions: Sequence[FrameDecision]) -> list[FrameDecision]:
     """The frames by which to judge, the most blurred first."""
-    telling = [d for d in decisions if d.action == "deblur" and (d.blur_px or 0) >= _TELLING_PX]
-    return sorted(telling, key=lambda d: -(d.blur_px or 0))[:_JUDGED_FRAMES]
+    telling = [d for d in decisions if d.action == "deblur" and (d.blur_px or 0) >= _LIMITS.telling_px]
+    return sorted(telling, key=lambda d: -(d.blur_px or 0))[: _LIMITS.judged_frames]
 
 
 def _decided(

@@ -22,10 +22,10 @@ from colmap_inertial.motion.two_view_rotation import measure_two_view_rotations
 from colmap_inertial.pipeline.run.context import Recording
 from colmap_inertial.pipeline.run.progress import Progress, counted
 from colmap_inertial.pipeline.run.session import Session
-from colmap_inertial.reconstruction.preparation.calibrate import (
-    followed,
+from colmap_inertial.reconstruction.preparation.sampling import (
     guessed_camera,
-    near_the_beginning,
+    measure_sampled_rotation,
+    sample_beginning,
     some_frames,
 )
 
@@ -145,8 +145,8 @@ def follow_video(
     """
     if len(timing.t_s) < 2 or float(np.median(np.diff(timing.t_s))) > _VIDEO_STEP_S:
         return None
-    indices = near_the_beginning(timing, spacing_s, most)
-    return followed(capture, timing, guessed_camera(capture, timing), indices, progress)
+    indices = sample_beginning(timing, spacing_s, most)
+    return measure_sampled_rotation(capture, timing, guessed_camera(capture, timing), indices, progress)
 
 
 def compare_pictures(capture: Capture, timing: FrameTiming, progress: Progress) -> VisualRotation | None:

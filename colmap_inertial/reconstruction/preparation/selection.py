@@ -35,21 +35,38 @@ from colmap_inertial.pipeline.run.progress import Progress, counted
 from colmap_inertial.pipeline.run.runner import remove
 from colmap_inertial.pipeline.run.session import Session
 from colmap_inertial.pipeline.run.workspace import a_record_of_ours
-from colmap_inertial.reconstruction.preparation.calibrate import followed, guessed_camera, near_the_beginning
+from colmap_inertial.reconstruction.preparation.sampling import (
+    guessed_camera,
+    measure_sampled_rotation,
+    sample_beginning,
+)
 
 log = logging.getLogger(__name__)
 
 
-#: Of several frames within so much time, the least blurred one is looked at; pictures are looked at in this size.
-_SLOT_S, _LOOKED_PX = 1 / 30, 960
-#: Frames that are followed to find the offset between the clocks: how many, how far apart.
-_FOLLOWED, _FOLLOWED_SPACING_S = 300, 0.06
-#: A rotation and an offset as good as these serve.
-_ROTATION_RAD, _OFFSET_S = 0.1, 0.01
-#: Blur below this, for a picture of 1920 px, cannot be seen.
-_SHARP_PX = 1.0
-#: Exposure is at most this where it is unknown; angular speed is looked at in so many instants of it.
-_USUAL_EXPOSURE_S, _INSTANTS = 1 / 60, 5
+@dataclass(frozen=True, kw_only=True)
+class SelectionLimits:
+    """How frames are ranked before a reconstruction."""
+
+    #: Of several frames within so much time, the least blurred one is looked at.
+    slot_s: float = 1 / 30
+    #: Longer side in which pictures are looked at.
+    looked_px: int = 960
+    #: Frames that are followed to find the offset between the clocks: how many, how far apart.
+    followed_frames: int = 300
+    followed_spacing_s: float = 0.06
+    #: A rotation and an offset as good as these serve.
+    rotation_rad: float = 0.1
+    offset_s: float = 0.01
+    #: Blur below this, for a picture of 1920 px, cannot be seen.
+    sharp_px: float = 1.0
+    #: Exposure is at most this where it is unknown.
+    usual_exposure_s: float = 1 / 60
+    #: Angular speed is looked at in so many instants of an exposure.
+    instants: int = 5
+
+
+_LIMITS = SelectionLimits()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -198,7 +215,7 @@ class _Clocks:
     def usable(self, t_s: Array) -> BoolArray:
         """(N,) at which times the offset is good enough."""
         sigma_s = 0.0 if self.offset_sigma_s is None else self.offset_sigma_s
-        return np.asarray(np.hypot(sigma_s, self.rate_sigma * (t_s - self.middle_s)) <= _OFFSET_S)
+        return np.asarray(np.hypot(sigma_s, self.rate_sigma * (t_s - self.middle_s)) <= _LIMITS.offset_s)
 
 
 def select_frames(recording: Recording, options: FrameOptions, progress: Progress) -> Selection:
@@ -228,15 +245,16 @@ def select_frames(recording: Recording, options: FrameOptions, progress: Progres
         if clocks.motion is not None and clocks.oriented:
             turning = clocks.motion.start_from_cam(pose_t_s)
             turning[~(clocks.motion.covers(pose_t_s, pose_t_s) & clocks.usable(pose_t_s))] = np.nan
+        sharp_px = _LIMITS.sharp_px * max(clocks.camera.width, clocks.camera.height) / 1920
         ranked = Ranked(
             t_s=timing.t_s[looked],
             blur=blur[looked],
             ranking=ranking,
-            sharp_below=_SHARP_PX * max(clocks.camera.width, clocks.camera.height) / 1920 if ranking == "blur" else 0.0,
+            sharp_below=sharp_px if ranking == "blur" else 0.0,
             start_from_cam=turning,
         )
         names = [timing.names[i] for i in looked]
-        pictures = counted(read_reduced(capture, names, _LOOKED_PX), len(names), "selection", progress)
+        pictures = counted(read_reduced(capture, names, _LIMITS.looked_px), len(names), "selection", progress)
         chosen = choose_frames(
             (picture for _, picture in pictures),
             ranked,
@@ -264,8 +282,8 @@ def select_frames(recording: Recording, options: FrameOptions, progress: Progres
 
 def _slots(t_s: Array, blur: Array) -> IndexArray:
     """The frames to look at: every one of a usual video, of a quicker one the least blurred in each slot."""
-    slot = np.floor((t_s - t_s[0]) / _SLOT_S + 0.5).astype(np.int64)
-    if len(t_s) < 2 or float(np.median(np.diff(t_s))) > 0.9 * _SLOT_S:
+    slot = np.floor((t_s - t_s[0]) / _LIMITS.slot_s + 0.5).astype(np.int64)
+    if len(t_s) < 2 or float(np.median(np.diff(t_s))) > 0.9 * _LIMITS.slot_s:
         return np.arange(len(t_s))
     order = np.lexsort((np.arange(len(t_s)), np.where(np.isnan(blur), np.inf, blur), slot))
     first = np.concatenate([[True], np.diff(slot[order]) > 0])
@@ -284,9 +302,9 @@ def _predicted(clocks: _Clocks, timing: FrameTiming) -> tuple[Array, Ranking]:
     exposure_s = timing.exposure_s
     if exposure_s is None:
         step_s = float(np.median(np.diff(timing.t_s))) if len(timing.t_s) > 1 else np.inf
-        exposure_s = np.full(len(timing.t_s), min(_USUAL_EXPOSURE_S, 0.5 * step_s))
+        exposure_s = np.full(len(timing.t_s), min(_LIMITS.usual_exposure_s, 0.5 * step_s))
     span_s = exposure_s + (timing.readout_s or 0.0)
-    at_s = timing.t_s[:, None] + span_s[:, None] * (np.arange(_INSTANTS) + 0.5) / _INSTANTS
+    at_s = timing.t_s[:, None] + span_s[:, None] * (np.arange(_LIMITS.instants) + 0.5) / _LIMITS.instants
     speed = np.linalg.norm(motion.rate_in_cam_rad_s(at_s.ravel()), axis=1).reshape(at_s.shape).mean(axis=1)
     loss = speed if timing.exposure_s is None else speed * exposure_s
     known = motion.covers(timing.t_s, timing.t_s + span_s) & clocks.usable(timing.t_s)
@@ -300,28 +318,28 @@ def _clocks(recording: Recording, progress: Progress) -> _Clocks:
     offset_sigma_s = prior.clock_sigma_s
     known = _Clocks(
         motion=GyroCamera.of(imu, prior, camera_epoch_ns=timing.epoch_ns),
-        oriented=rotation_rad <= _ROTATION_RAD,
+        oriented=rotation_rad <= _LIMITS.rotation_rad,
         camera=camera,
         note=f"the clocks' offset is the capture's, to {1e3 * offset_sigma_s:.0f} ms",
         offset_s=prior.clock_offset_s,
         offset_sigma_s=offset_sigma_s,
         offset_from="capture",
     )
-    if offset_sigma_s <= _OFFSET_S and known.oriented:
+    if offset_sigma_s <= _LIMITS.offset_s and known.oriented:
         return known
     log_of = capture.frame_log
-    if log_of is not None and log_of.in_video_time and capture.shared_clock and offset_sigma_s > _OFFSET_S:
+    if log_of is not None and log_of.in_video_time and capture.shared_clock and offset_sigma_s > _LIMITS.offset_s:
         # the recorder stamped frames and samples by one clock; measured on such files: some milliseconds
-        offset_sigma_s = _OFFSET_S
+        offset_sigma_s = _LIMITS.offset_s
         note = "the recorder stamped frames and gyroscope by one clock"
         known = replace(known, oriented=False, note=note, offset_sigma_s=offset_sigma_s)
     try:
-        indices = near_the_beginning(timing, _FOLLOWED_SPACING_S, _FOLLOWED)
-        rotation = followed(capture, timing, camera, indices, progress, stage="clocks")
+        indices = sample_beginning(timing, _LIMITS.followed_spacing_s, _LIMITS.followed_frames)
+        rotation = measure_sampled_rotation(capture, timing, camera, indices, progress, stage="clocks")
         options = AlignOptions(max_offset_s=recording.max_offset_s)
         aligned = align_clocks(rotation.trajectory(), imu, prior=prior, options=options)
         found, on_rate, rates, rate_sigma = aligned.calibration, imu, "", 0.0
-        if aligned.drifts() or not (capture.shared_clock or offset_sigma_s <= _OFFSET_S):
+        if aligned.drifts() or not (capture.shared_clock or offset_sigma_s <= _LIMITS.offset_s):
             # what one clock stamped has one rate; another is corrected even where it may be zero: what is left of it is
             # then as small as its deviation says
             rate_sigma = aligned.clock_rate_sigma
@@ -333,10 +351,10 @@ def _clocks(recording: Recording, progress: Progress) -> _Clocks:
         found = replace(found, gyro_bias_rad_s=prior.gyro_bias_rad_s)
         motion = GyroCamera.of(on_rate, found, camera_epoch_ns=timing.epoch_ns)
         agreement = check_motion(rotation, motion)
-        if turned > _ROTATION_RAD or sigma_s > _OFFSET_S or agreement.agrees is not True:
+        if turned > _LIMITS.rotation_rad or sigma_s > _LIMITS.offset_s or agreement.agrees is not True:
             raise NotObservableError("clock offset", agreement.reason)
     except NotObservableError as error:
-        if offset_sigma_s <= _OFFSET_S:
+        if offset_sigma_s <= _LIMITS.offset_s:
             return replace(known, oriented=False)
         return _Clocks(
             motion=None, oriented=False, camera=camera, note=f"the clocks' offset is not known beforehand: {error}"

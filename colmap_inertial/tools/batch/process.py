@@ -21,7 +21,7 @@ from colmap_inertial.io.files import locked, reading_within, write_text
 from colmap_inertial.pipeline.run.config import config_as_toml, read_config
 from colmap_inertial.pipeline.run.progress import Progress
 from colmap_inertial.pipeline.run.workspace import Workspace
-from colmap_inertial.pipeline.stages.named import load_stages
+from colmap_inertial.pipeline.stages.protocols import load_stages
 from colmap_inertial.reconstruction.drivers.capture import reconstruct
 from colmap_inertial.reconstruction.drivers.project import is_project, reconstruct_project
 from colmap_inertial.tools.batch.task import (

@@ -1,15 +1,16 @@
-"""What there is to export: the model, its unit and up, its pictures, and how the camera moved."""
+"""What there is to export: the model, its unit and up, its pictures and cameras, and how the camera moved."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from pathlib import Path
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.arrays import Array, UInt8Array
 from colmap_inertial.core.errors import FormatError, NotObservableError
 from colmap_inertial.core.options import ExportImages
 from colmap_inertial.core.types import DOWN_IN_WORLD, CameraMotion, CameraTrajectory
@@ -19,9 +20,13 @@ from colmap_inertial.io.files import path_in, read_json, read_record
 from colmap_inertial.io.frames import read_frame_timing
 from colmap_inertial.io.positions import positions_in_pictures
 from colmap_inertial.model import read_model
+from colmap_inertial.model.nerf import NO_SCALE, NO_UP
 from colmap_inertial.pipeline.run.workspace import Workspace, a_record_of_ours, places_of
 from colmap_inertial.pipeline.stages.metric import motion_file
 from colmap_inertial.reconstruction.preparation.geolocation import on_earth, positions_of, read_georeference
+from colmap_inertial.tools.export.formats import sparse_points
+from colmap_inertial.tools.export.transforms import View
+from colmap_inertial.tools.export.undistort import Undistortion, needed_cameras
 from colmap_inertial.tools.view.sources import ViewSource, find_source
 
 if TYPE_CHECKING:
@@ -231,3 +236,131 @@ def _treated(workspace: Workspace) -> dict[str, tuple[str, bool]]:
     with a_record_of_ours(workspace.result):
         frames = read_json(workspace.result).get("frames", [])
         return {str(f["name"]): (str(f["action"]), bool(f["rectified"])) for f in frames}
+
+
+#: Endings of pictures that stay JPEG; all others become PNG.
+_JPEG = (".jpg", ".jpeg")
+#: Longest stem, so that a number still fits in front of the ending.
+_LONGEST = 100
+
+
+def flat_names(names: Iterable[str]) -> dict[str, str]:
+    """A file name for each image: no folder, no dot but the ending's, unique without regard to case.
+
+    Some trainers cut a name at its first dot, some look at its last part alone, and some file systems take ``A.jpg``
+    and ``a.jpg`` for the same file.
+
+    Parameters
+    ----------
+    names
+        Image names as COLMAP has them; each once.
+
+    Returns
+    -------
+    dict
+        The new name of each, in the order of the names.
+    """
+    found: dict[str, str] = {}
+    taken: set[str] = set()
+    tried: dict[str, int] = {}
+    for name in sorted(names):
+        path = PurePosixPath(name.replace("\\", "/"))
+        suffix = ".jpg" if path.suffix.lower() in _JPEG else ".png"
+        stem = re.sub(r"[^A-Za-z0-9_-]+", "_", "_".join((*path.parts[:-1], path.stem)))[-_LONGEST:]
+        # those of one stem go on counting where the one before stopped
+        candidate, number = stem, tried.get(stem.lower(), 1)
+        while candidate.lower() in taken:
+            number += 1
+            candidate = f"{stem}_{number}"
+        tried[stem.lower()] = number
+        taken.add(candidate.lower())
+        found[name] = candidate + suffix
+    return found
+
+
+#: What says up where gravity is unknown: z, as trainers' viewers have it.
+_Z_UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ExportContent:
+    """What an export is made of.
+
+    Attributes
+    ----------
+    source
+        The model that is exported.
+    names
+        The new name of each image.
+    cameras
+        What becomes of each camera, by its number.
+    views
+        The images, in the order of their new names.
+    xyz, rgb
+        (N, 3) points and colours.
+    on_map
+        Where on Earth the model stands, where that was asked for.
+    pictures
+        By image name, the file that is exported; empty where none are.
+    notes
+        What the user should know; writers add to it.
+    """
+
+    source: ExportSource
+    names: Mapping[str, str]
+    cameras: Mapping[int, Undistortion]
+    views: list[View]
+    xyz: Array
+    rgb: UInt8Array
+    on_map: Georeference | None = None
+    pictures: Mapping[str, Picture] = field(default_factory=dict)
+    notes: list[str]
+
+    @classmethod
+    def of(cls, source: ExportSource, on_map: Georeference | None, *, square: bool) -> ExportContent:
+        """All but the pictures; cameras with ``square`` pixels where that is needed."""
+        model, where = source.model, source.found.folder
+        names = flat_names(model.image(i).name for i in model.reg_image_ids())
+        cameras = {i: Undistortion.of(model.camera(i), where, square=square) for i in needed_cameras(model)}
+        views = [
+            View(
+                name=names[image.name],
+                camera=cameras[image.camera_id].pinhole,
+                cam_from_world_xyzw=np.array(image.cam_from_world().rotation.quat),
+                cam_in_world=np.array(image.projection_center()),
+            )
+            for image in map(model.image, model.reg_image_ids())
+        ]
+        xyz, rgb = sparse_points(model)
+        return cls(
+            source=source,
+            names=names,
+            cameras=cameras,
+            views=sorted(views, key=lambda view: view.name),
+            xyz=xyz,
+            rgb=rgb,
+            on_map=on_map,
+            notes=_notes_on_model(source),
+        )
+
+    @property
+    def is_metric(self) -> bool:
+        """Whether the model is in metres."""
+        return self.source.found.scale.unit == "m"
+
+    @property
+    def up_in_world(self) -> Array:
+        """(3,) unit vector; z where gravity is unknown."""
+        return _Z_UP if self.source.up_in_world is None else self.source.up_in_world
+
+
+def _notes_on_model(source: ExportSource) -> list[str]:
+    """What the user should know of the model."""
+    notes = []
+    if source.found.scale.unit != "m":
+        notes.append(NO_SCALE)
+    if source.up_in_world is None:
+        notes.append(NO_UP)
+    elif float(source.up_in_world @ _Z_UP) < 0.9:
+        notes.append("up is not z in this model (up_in_world says what it is), while most trainers' viewers take z")
+    return notes

@@ -7,19 +7,218 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree
 
+import numpy as np
+
+from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate
 from colmap_inertial.core.options import ExportProgram
-from colmap_inertial.io.files import write_json
+from colmap_inertial.core.types import CameraMotion
+from colmap_inertial.io.files import write_json, write_text
 from colmap_inertial.io.trajectories import write_tum
 from colmap_inertial.model import write_files
-from colmap_inertial.tools.export.cameras import write_bundler, write_metashape
-from colmap_inertial.tools.export.content import ExportContent
-from colmap_inertial.tools.export.exposures import exposures_of
-from colmap_inertial.tools.export.paths import require_pygltflib, smoothed_path, write_cameras, write_gltf
-from colmap_inertial.tools.export.pinhole_model import pinhole_model
-from colmap_inertial.tools.export.points import require_laspy, write_las, write_ply
-from colmap_inertial.tools.export.transforms import Exposure, transforms, with_row_poses, with_velocities
+from colmap_inertial.tools.export.formats import (
+    require_laspy,
+    require_pygltflib,
+    smoothed_path,
+    write_cameras,
+    write_gltf,
+    write_las,
+    write_ply,
+)
+from colmap_inertial.tools.export.source import ExportContent, ExportSource, Picture
+from colmap_inertial.tools.export.transforms import (
+    OPENGL_FROM_CAM,
+    Exposure,
+    View,
+    transforms,
+    with_row_poses,
+    with_velocities,
+)
+from colmap_inertial.tools.export.undistort import Undistortion, pinhole_model
+
+if TYPE_CHECKING:
+    import pycolmap
+
+
+def exposures_of(
+    model: pycolmap.Reconstruction,
+    source: ExportSource,
+    pictures: Mapping[str, Picture],
+    cameras: Mapping[int, Undistortion],
+    notes: list[str],
+) -> dict[str, Exposure]:
+    """Velocity, exposure and readout by image name; images without a velocity are left out.
+
+    The exported picture's rows are those of the filmed one, stretched: its readout is that of as many rows as it shows.
+
+    Parameters
+    ----------
+    model, source
+        What is exported.
+    pictures
+        The exported files: where the rolling shutter was undone there is no readout, where the blur was, no exposure.
+    cameras
+        What became of the cameras.
+    notes
+        Gets what the user should know.
+
+    Raises
+    ------
+    NotObservableError
+        Where no velocity is known, and where lines are read out in another direction than down.
+    """
+    motion = _known_motion(source.motion, pictures)
+    readout_s = motion.readout_s or 0.0
+    if motion.exposure_s is None and any(not picture.sharpened for picture in pictures.values()):
+        notes.append("exposure times are not known and count as 0: blur is not modelled")
+    place = {name: i for i, name in enumerate(motion.names)}
+    found = {}
+    for image in map(model.image, model.reg_image_ids()):
+        index = place.get(image.name)
+        if index is None:
+            continue
+        picture, undistortion = pictures[image.name], cameras[image.camera_id]
+        share, late = _rows(undistortion)
+        exposed = 0.0 if motion.exposure_s is None or picture.sharpened else float(motion.exposure_s[index])
+        left_s = 0.0 if picture.rectified else readout_s
+        rotation = image.cam_from_world().rotation.matrix()
+        found[image.name] = Exposure(
+            velocity_in_cam_m_s=rotation @ motion.velocity_in_world_m_s[index],
+            angular_velocity_in_cam_rad_s=motion.angular_velocity_in_cam_rad_s[index],
+            exposure_s=exposed,
+            readout_s=left_s * share,
+            late_s=left_s * late,
+        )
+    if not found:
+        raise NotObservableError("camera motion", "none of the model's images has a velocity")
+    if motion.exposure_s is not None and len({one.exposure_s for one in found.values()}) > 1:
+        notes.append("exposure times differ between pictures; the program takes one for all, their median")
+    return found
+
+
+def _known_motion(motion: CameraMotion | None, pictures: Mapping[str, Picture]) -> CameraMotion:
+    """The motion, where it is known and a program can be told of the pictures' readout."""
+    if motion is None or not motion.names:
+        raise NotObservableError(
+            "camera motion",
+            "the run kept no velocities: its model has no scale, its gyroscope was silent, or an earlier version made "
+            "it (then start reconstruct again with the same arguments, it adds them)",
+        )
+    as_filmed = any(not picture.rectified for picture in pictures.values())
+    if as_filmed and (motion.readout_s or 0.0) > 0 and motion.readout_direction != "down":
+        raise NotObservableError(
+            "rolling shutter",
+            f"these pictures are read out {motion.readout_direction}, which the program cannot be told; export the "
+            "rectified ones, or turn the pictures",
+        )
+    return motion
+
+
+def _rows(undistortion: Undistortion) -> tuple[float, float]:
+    """How many rows of the filmed picture the new one shows, and how much lower its middle is: shares of its height."""
+    pinhole, height = undistortion.pinhole, undistortion.camera.height
+    middle = [0.5 * pinhole.width, 0.5 * pinhole.height]
+    step = 0.25 * pinhole.height
+    above, at, below = undistortion.source_px(np.array(middle) + np.array([[0.0, -step], [0.0, 0.0], [0.0, step]]))[
+        :, 1
+    ]
+    return float((below - above) * pinhole.height / (2 * step) / height), float(at / height - 0.5)
+
+
+_LOCAL_METRES = (
+    'LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["Local Datum",0],UNIT["metre",1,AUTHORITY["EPSG","9001"]]]'
+)
+
+
+def write_metashape(path: Path, views: list[View], *, metres: bool) -> None:
+    """Write cameras as Agisoft Metashape imports them (File, Import, Import Cameras): XML of version 1.5.
+
+    Its focal length is that of the rows; ``b1`` is what columns have more. Transforms are world_from_camera, x right, y
+    down, z forward, and the chunk's own is none: the world is the model's. Where
+    that is in metres, the chunk says so.
+    """
+    document = ElementTree.Element("document", version="1.5.0")
+    chunk = ElementTree.SubElement(document, "chunk", label="colmap-inertial", enabled="true")
+    cameras = sorted({(view.camera.width, view.camera.height, view.camera.params) for view in views})
+    sensors = ElementTree.SubElement(chunk, "sensors", next_id=str(len(cameras)))
+    for number, (width, height, (fx, fy, _, _)) in enumerate(cameras):
+        size = {"width": str(width), "height": str(height)}
+        sensor = ElementTree.SubElement(sensors, "sensor", id=str(number), label=f"camera {number}", type="frame")
+        ElementTree.SubElement(sensor, "resolution", size)
+        ElementTree.SubElement(sensor, "property", name="fixed", value="true")
+        calibration = ElementTree.SubElement(sensor, "calibration", {"type": "frame", "class": "adjusted"})
+        ElementTree.SubElement(calibration, "resolution", size)
+        values = {"f": fy, "cx": 0.0, "cy": 0.0, "b1": fx - fy, "b2": 0.0, "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
+        for name, value in values.items():
+            ElementTree.SubElement(calibration, name).text = repr(value)
+    components = ElementTree.SubElement(chunk, "components", next_id="1", active_id="0")
+    component = ElementTree.SubElement(components, "component", id="0", label="Component 1")
+    transform = ElementTree.SubElement(component, "transform")
+    for name, numbers in (("rotation", np.eye(3)), ("translation", np.zeros(3)), ("scale", np.ones(1))):
+        ElementTree.SubElement(transform, name, locked="true").text = _text(numbers)
+    shot = ElementTree.SubElement(chunk, "cameras", next_id=str(len(views)), next_group_id="0")
+    for number, view in enumerate(views):
+        camera = view.camera
+        sensor_id = cameras.index((camera.width, camera.height, camera.params))
+        label = view.name.rpartition(".")[0]
+        fields = {"id": str(number), "sensor_id": str(sensor_id), "component_id": "0", "label": label}
+        pose = np.eye(4)
+        pose[:3, :3] = matrix_from_quat(quat_conjugate(view.cam_from_world_xyzw))
+        pose[:3, 3] = view.cam_in_world
+        ElementTree.SubElement(ElementTree.SubElement(shot, "camera", fields), "transform").text = _text(pose)
+    if metres:
+        ElementTree.SubElement(chunk, "reference").text = _LOCAL_METRES
+    ElementTree.indent(document)
+    text = ElementTree.tostring(document, encoding="unicode")
+    write_text(path, f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n')
+
+
+def _text(numbers: Array) -> str:
+    return " ".join(repr(value) for value in numbers.ravel().tolist())
+
+
+def write_bundler(path: Path, listing: Path, views: list[View], model: pycolmap.Reconstruction) -> None:
+    """Write cameras and points as Bundler's ``bundle.out`` (v0.3), and the list of its pictures.
+
+    One focal length, no distortion; cameras look along -z with y up; observations count from the picture's middle,
+    upwards.
+
+    Parameters
+    ----------
+    path, listing
+        The two files.
+    views
+        Of cameras with square pixels.
+    model
+        The pinhole model whose images they are.
+    """
+    place = {view.name: i for i, view in enumerate(views)}
+    number = {image.image_id: place[image.name] for image in model.images.values()}
+    lines = ["# Bundle file v0.3", f"{len(views)} {model.num_points3D()}"]
+    for view in views:
+        rotation = OPENGL_FROM_CAM @ matrix_from_quat(view.cam_from_world_xyzw)
+        rows = [[view.camera.params[0], 0.0, 0.0], *rotation.tolist(), (-rotation @ view.cam_in_world).tolist()]
+        lines += [" ".join(f"{value:.15g}" for value in row) for row in rows]
+    for point_id in sorted(model.points3D):
+        point = model.points3D[point_id]
+        seen = [str(len(point.track.elements))]
+        for element in point.track.elements:
+            image = model.image(element.image_id)
+            camera = views[number[element.image_id]].camera
+            x, y = image.points2D[element.point2D_idx].xy - np.array([0.5 * camera.width, 0.5 * camera.height])
+            seen += [str(number[element.image_id]), str(element.point2D_idx), f"{x:.6g}", f"{-y:.6g}"]
+        lines += [
+            " ".join(f"{value:.15g}" for value in point.xyz),
+            " ".join(str(int(value)) for value in point.color),
+            " ".join(seen),
+        ]
+    write_text(path, "\n".join(lines) + "\n")
+    write_text(listing, "".join(f"images/{view.name} 0 {view.camera.params[0]:.15g}\n" for view in views))
+
 
 #: Content of ``transforms.json`` with how the camera moved.
 _AddMotion = Callable[[dict[str, Any], ExportContent], dict[str, Any]]
