@@ -25,7 +25,7 @@ from colmap_inertial.imaging.path_filters import half_quadratic, path_wiener, sm
 from colmap_inertial.imaging.psf import blur_field, blur_path
 from colmap_inertial.imaging.restoration import Network, deepgyro, load_network
 from colmap_inertial.imaging.wiener import DeblurOptions, deblur
-from colmap_inertial.pipeline.stages.deblur import MOST_SMOOTHING_PX, smoothing_for
+from colmap_inertial.pipeline.stages.deblur import SMOOTHING, smoothing_for
 
 #: Costs are measured at these blurs, px, of a frame of this size.
 COSTS_PX, COST_SIZE = (10.0, 20.0, 40.0), (1920, 1080)
@@ -184,7 +184,7 @@ def cost(take: Take, methods: Sequence[str], repeat: int = 5) -> dict[str, Any]:
             "path": lambda image=image, path=path: half_quadratic(image, path, _ONE),
             "deepgyro": lambda image=image, path=path: deepgyro.deblur(image, path, network=_network()),
         }
-        ms = {"smoothing": _least_ms(lambda image=image: smoothed(image, MOST_SMOOTHING_PX), repeat)}
+        ms = {"smoothing": _least_ms(lambda image=image: smoothed(image, SMOOTHING.most_px), repeat)}
         ms |= {name: _least_ms(work, repeat) for name, work in works.items() if name in ("straight", *methods)}
         ms["finding the path"] = _least_ms(lambda known=known: blur_path(*known), repeat)
         out[f"{wanted_px:g}"] = {

@@ -34,7 +34,7 @@ from colmap_inertial.model.readout import Settled
 from colmap_inertial.model.similarities import ModelScale, plain_factor, read_similarity
 from colmap_inertial.pipeline.run.workspace import Workspace
 from colmap_inertial.pipeline.stages import readout
-from colmap_inertial.pipeline.stages.deblur import MOST_SMOOTHING_PX, DeblurStage, smoothing_for
+from colmap_inertial.pipeline.stages.deblur import SMOOTHING, DeblurStage, smoothing_for
 from colmap_inertial.pipeline.stages.imaging_plan import GyroView, ImagingPlan
 from colmap_inertial.pipeline.stages.join import JoinStage
 from colmap_inertial.pipeline.stages.metric import MetricStage, for_rectified, gravity_in_model
@@ -404,7 +404,7 @@ def test_keypoints_that_were_moved_are_said_to_be_rectified_and_others_are_not()
 
 
 def test_long_blur_is_smoothed_for_features_more_than_short_up_to_a_limit():
-    assert smoothing_for(5) < smoothing_for(10) < smoothing_for(30) == smoothing_for(60) == MOST_SMOOTHING_PX
+    assert smoothing_for(5) < smoothing_for(10) < smoothing_for(30) == smoothing_for(60) == SMOOTHING.most_px
 
 
 @pytest.mark.parametrize(("trusted", "drop", "gone"), [(True, True, True), (None, True, False), (True, False, False)])
