@@ -25,6 +25,7 @@ from colmap_inertial.core.errors import FormatError, InertialError, MissingExtra
 from colmap_inertial.core.options import BatchOptions, ReconstructOptions
 from colmap_inertial.pipeline.run.config import config_as_toml
 from colmap_inertial.reconstruction.drivers.capture import reconstruct
+from colmap_inertial.tools import batch
 from colmap_inertial.tools.batch import BatchCapture, needs_gpu, read_manifest, run_batch
 from colmap_inertial.tools.batch.pools import available_memory, shares_of_this_machine
 from colmap_inertial.tools.batch.task import CaptureStatus, read_status
@@ -213,8 +214,9 @@ def test_one_broken_capture_does_not_stop_the_rest_and_finished_ones_are_not_run
     assert model_bytes(out / "hall") == alone
 
 
-def test_a_killed_process_is_started_again_and_at_last_given_up(capture, tmp_path):
+def test_a_killed_process_is_started_again_and_at_last_given_up(capture, tmp_path, monkeypatch):
     path, alone = capture
+    monkeypatch.setattr(batch, "BATCH_TIMING", batch.BatchTiming(progress_s=0.05))  # steps take tenths of a second
     hall = BatchCapture(name="hall", path=path, options=TINY)
     killed: list[int] = []
 

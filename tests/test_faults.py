@@ -59,7 +59,8 @@ def test_a_fault_leaves_no_half_result_and_is_told_in_a_sentence(whole, tmp_path
 #: left runs out on the way: the refusal at the door does not see it.
 HELD = """
 import mmap, os, resource, sys
-from colmap_inertial.cli import limits, main
+from colmap_inertial.cli import main
+from colmap_inertial.cli import process as limits
 from colmap_inertial.core.threads import usable_processors
 
 kind, left = sys.argv[1], int(sys.argv[2])

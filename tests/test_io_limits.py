@@ -210,7 +210,8 @@ def test_every_command_takes_them(tmp_path, capsys):
     # as in the processes of a batch, which read what their capture is given
     with pytest.raises(FormatError, match="more than 3 columns"):
         reconstruct(scene, out, ReconstructOptions(limits=ReadLimits(table_columns=3)))
-    assert all("limits" in {f.name for f in fields(command)} | set(vars(command)) for command in _COMMANDS.values())
+    for command in _COMMANDS.values():
+        assert hasattr(command, "limits") or "limits" in {f.name for f in fields(command)}
 
 
 @pytest.mark.parametrize("values", [{"megapixels": 0}, {"table_columns": -1}, {"file_gib": 0.0}, {"megapixels": 2000}])

@@ -31,7 +31,7 @@ ROWS = [
 ]
 #: Inside a room, the same. All packages have a place here; modules that have none stand before those that have.
 ROWS_INSIDE = {
-    "core": [("types",), ("gyro", "camera_clock")],
+    "core": [("types",), ("camera_clock",), ("gyro",)],
     "imaging": [("semi_global",), ("plane_sweep", "multi_aperture", "exposure_pairs", "restoration")],
     "model": [("submodels",)],
     "motion": [("flow",), ("two_view_rotation", "shutter", "lateral_flow"), ("align", "smooth")],

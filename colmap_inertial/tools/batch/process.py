@@ -50,13 +50,13 @@ def main() -> None:
     if known is None:
         raise SystemExit(f"{task.status} cannot be read")
     status = known
-    last = 0.0
+    last, shown = 0.0, ""
 
     def progress(stage: str, done: int, total: int, /) -> None:
-        nonlocal last
+        nonlocal last, shown
         now = time.monotonic()
-        if now - last >= 1.0:  # s: a file for every image would be too many
-            last = now
+        if stage != shown or now - last >= 1.0:  # s: a file for every image would be too many
+            last, shown = now, stage
             write_status(task.status, dataclasses.replace(status, stage=stage, steps_done=done, steps=total))
 
     def findings(diagnosis: Diagnosis) -> None:
