@@ -20,7 +20,7 @@ from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.core.types import CameraTrajectory, FrameTiming
 from colmap_inertial.imaging.gyro_camera import GyroCamera
-from colmap_inertial.imaging.psf import predicted_blur_px
+from colmap_inertial.imaging.psf import predict_blur_px
 from colmap_inertial.model import colmap_camera, read_model
 from colmap_inertial.pipeline.stages import deblur
 from colmap_inertial.pipeline.stages.deblur import SMOOTHING
@@ -82,7 +82,7 @@ def with_blur(recipe: SceneRecipe, blur_px: float) -> SceneRecipe:
             exposure_s=np.full(len(scene.names), exposure_s),
             readout_s=recipe.camera.readout_s,
         )
-        predicted = predicted_blur_px(gyro, colmap_camera(model), timing, width=model.width, height=model.height)
+        predicted = predict_blur_px(gyro, colmap_camera(model), timing, width=model.width, height=model.height)
         exposure_s *= blur_px / float(np.median(predicted.px))
     return replace(recipe, camera=replace(recipe.camera, exposure_s=round(exposure_s, 5)))
 

@@ -20,7 +20,7 @@ from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.types import CameraModel, FrameTiming
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
-from colmap_inertial.imaging.psf import blur_field, predicted_blur_px
+from colmap_inertial.imaging.psf import blur_field, predict_blur_px
 from colmap_inertial.imaging.rolling_shutter import spread_nodes
 from colmap_inertial.imaging.transfer import linear_from_srgb, srgb_from_linear
 from colmap_inertial.tools.simulate import Motion, MotionOptions, make_motion
@@ -271,7 +271,7 @@ def _instants(
             exposure_s=np.full(len(t), exposure_s),
             readout_s=READOUT_S,
         )
-        of = predicted_blur_px(gyro, colmap_camera(model), timing, width=model.width, height=model.height).px / blur_px
+        of = predict_blur_px(gyro, colmap_camera(model), timing, width=model.width, height=model.height).px / blur_px
     good = np.flatnonzero(np.abs(of - 1) < 0.1)
     looking = matrix_from_quat(motion.world_from_cam_xyzw(middle[good]))
     cosine = 0.5 * (np.einsum("aij,bij->ab", looking, looking) - 1)

@@ -25,7 +25,7 @@ from turning_world import Moment, Turning, TurningCamera
 
 from colmap_inertial.core.arrays import Float32Array, UInt8Array
 from colmap_inertial.imaging.blur_field import BlurField
-from colmap_inertial.imaging.evidence import blur_evidence, shown_shares
+from colmap_inertial.imaging.evidence import blur_evidence, measure_blur_shares
 from colmap_inertial.imaging.gate import GateOptions, RecordingVerdict, judge_frame, keep_sharp
 from colmap_inertial.imaging.path_filters import smoothed
 from colmap_inertial.imaging.psf import blur_field, blur_path
@@ -72,7 +72,7 @@ WRONG: Mapping[str, Callable[[Turning], Turning]] = {
 }
 
 
-def below_sky(wall: Float32Array, height: int, share: float, seed: int) -> Float32Array:
+def judge_sky(wall: Float32Array, height: int, share: float, seed: int) -> Float32Array:
     """The wall with a horizon so high that this share of a frame of this height is sky."""
     horizon = round(0.5 * wall.shape[0] + (share - 0.5) * height)
     clouds = np.random.default_rng([seed, 31]).standard_normal((6, 9)).astype(np.float32)
@@ -102,7 +102,7 @@ def recording(
         moments = [Moment(t_s=float(t_s + k * INTERVAL_S), exposure_s=0.016, readout_s=READOUT_S) for k in (0, 1)]
         wall = walls[i % len(walls)]
         if sky > 0:
-            wall = below_sky(wall, size[1], sky, seed + i)
+            wall = judge_sky(wall, size[1], sky, seed + i)
         camera = TurningCamera(
             wall=wall, wall_from_world=np.eye(3), turning=turning, size=size, focal_px=FOCAL * size[0]
         )
@@ -128,7 +128,7 @@ def judgement(frames: Sequence[UInt8Array], known: Sequence[Known]) -> Recording
     looked = []
     for frame, one in zip(frames, known, strict=True):
         path = blur_path(*one)
-        share, mirrored = shown_shares(frame, path)
+        share, mirrored = measure_blur_shares(frame, path)
         looked.append(Looked(blur_evidence(frame, path), share, _length_px(path.field()), mirrored))
     return judged(looked)
 

@@ -209,7 +209,7 @@ def test_wrong_gyroscopes_are_wrong_in_their_own_way_and_skies_take_their_share(
     ends = [path.path_px[-1] - path.path_px[0] for path in (right, mirrored)]
     np.testing.assert_allclose(ends[1], -ends[0], atol=0.1 * np.abs(ends[0]).max())
     wall = drawn_walls(1, 2)[0]
-    below = path_false.below_sky(wall, 270, 0.7, seed=1)
+    below = path_false.judge_sky(wall, 270, 0.7, seed=1)
     top = (len(wall) - 270) // 2
     same = np.abs(below - 0.35 * wall).max(axis=1)[top : top + 270] < 1e-6
     assert same.mean() == pytest.approx(0.3, abs=0.01) and not same[:180].any()

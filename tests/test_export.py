@@ -44,7 +44,7 @@ from colmap_inertial.tools.export.formats import write_las
 from colmap_inertial.tools.export.source import ExportSource, Picture, flat_names
 from colmap_inertial.tools.export.targets import TARGETS
 from colmap_inertial.tools.export.transforms import Exposure, with_velocities
-from colmap_inertial.tools.export.undistort import Undistortion, needed_cameras, pinhole_model
+from colmap_inertial.tools.export.undistort import Undistortion, list_needed_cameras, pinhole_model
 from colmap_inertial.tools.export.whole import _is_plain, _notes_on, export_model
 from colmap_inertial.tools.view.sources import ScaleFacts, ViewSource
 
@@ -243,7 +243,7 @@ def test_cameras_of_a_rig_stay_one(tmp_path):
     model.deregister_frame(min(model.reg_frame_ids()))
     images = [model.image(i) for i in model.reg_image_ids()]
     names = {image.name: f"{i}.png" for i, image in enumerate(images)}
-    cameras = {i: Undistortion.of(model.camera(i), tmp_path) for i in needed_cameras(model)}
+    cameras = {i: Undistortion.of(model.camera(i), tmp_path) for i in list_needed_cameras(model)}
     assert set(cameras) == set(model.cameras)
     made = pinhole_model(model, cameras, names)
     made.write_binary(str(tmp_path))

@@ -19,7 +19,7 @@ from colmap_inertial import (
     reconstruct,
     write_calibration,
 )
-from colmap_inertial.pipeline.stages.protocols import with_defaults
+from colmap_inertial.pipeline.stages.protocols import insert_defaults
 
 
 @pytest.fixture(scope="module")
@@ -87,10 +87,10 @@ def test_a_stage_beside_the_defaults_and_one_that_drops_with_a_reason(tmp_path):
 
 
 def test_dots_stand_for_the_defaults_once():
-    assert with_defaults([1, ..., 2], [7, 8]) == [1, 7, 8, 2]
-    assert with_defaults([], [7]) == [] and with_defaults([...], [7]) == [7]
+    assert insert_defaults([1, ..., 2], [7, 8]) == [1, 7, 8, 2]
+    assert insert_defaults([], [7]) == [] and insert_defaults([...], [7]) == [7]
     with pytest.raises(ValueError, match="once"):
-        with_defaults([..., ...], [7])
+        insert_defaults([..., ...], [7])
 
 
 class Joining:
@@ -110,8 +110,8 @@ class JoiningInstead(Joining):
 def test_one_stage_joins_models_and_may_stand_in_for_the_default_one():
     default, own = Joining(), JoiningInstead()
     with pytest.raises(InertialError, match="two model stages join models"):
-        with_defaults([..., Joining()], [default])
-    assert with_defaults([..., own], [7, default]) == [7, own]
+        insert_defaults([..., Joining()], [default])
+    assert insert_defaults([..., own], [7, default]) == [7, own]
 
 
 def test_two_joining_stages_are_refused_before_any_work(capture, tmp_path):

@@ -16,7 +16,13 @@ from colmap_inertial.core.types import CameraModel
 from colmap_inertial.imaging import evidence
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath, middles
-from colmap_inertial.imaging.evidence import BlurEvidence, _weigh_tiles, blur_evidence, shown_share, shown_shares
+from colmap_inertial.imaging.evidence import (
+    BlurEvidence,
+    _weigh_tiles,
+    blur_evidence,
+    measure_blur_share,
+    measure_blur_shares,
+)
 from colmap_inertial.imaging.gate import (
     GATE_LIMITS,
     GateOptions,
@@ -181,7 +187,7 @@ def test_a_sharp_frame_of_white_texture_stays_as_it_is_among_blurred_ones():
     image = np.clip(128 + 40 * np.random.default_rng(0).standard_normal((720, 1280)), 0, 255).astype(np.uint8)
     vectors = np.broadcast_to(np.float32([12.0, 0.0]), (*BlurField.nodes(1280, 720, 16), 2))
     flat = BlurField(width=1280, height=720, vector_px=vectors)
-    assert shown_share(image, flat) is None
+    assert measure_blur_share(image, flat) is None
     gated = deblur_gated(image, flat, recording=trusted)
     assert gated.image is image and "does not show the blur" in gated.reason
 
@@ -205,12 +211,12 @@ def test_tiles_are_weighed_once_for_the_blur_and_its_mirror_image(monkeypatch):
     monkeypatch.setattr(evidence, "_weigh_tiles", lambda spectra: weighed.append(1) or _weigh_tiles(spectra))
     shutter, image = shot(0.98, 12)
     field = predicted(shutter, "none")
-    shown, mirrored = shown_shares(image, field)
+    shown, mirrored = measure_blur_shares(image, field)
     assert len(weighed) == 1
     monkeypatch.undo()
     flipped = replace(field, vector_px=field.vector_px * np.float32([1, -1]))
-    assert shown == shown_share(image, field)
-    assert mirrored == pytest.approx(shown_share(image, flipped), rel=1e-6)
+    assert shown == measure_blur_share(image, field)
+    assert mirrored == pytest.approx(measure_blur_share(image, flipped), rel=1e-6)
 
 
 @pytest.mark.parametrize("blur_px", [6, 12, 25])
@@ -222,17 +228,17 @@ def test_the_share_of_the_blur_that_shows_is_the_textures_and_not_the_sky_s(blur
         cloudless = image.copy()
         noise = 2 * np.random.default_rng(1).standard_normal((2 * HEIGHT // 3, WIDTH, 1))
         cloudless[: len(noise)] = np.rint(170 + noise).astype(np.uint8)
-        shares += [shown_share(image, field), shown_share(cloudless, field)]
+        shares += [measure_blur_share(image, field), measure_blur_share(cloudless, field)]
     blurred, blurred_below_sky, sharp, sharp_below_sky = shares
     assert 0.5 < blurred < 1.3 and 0.5 < blurred_below_sky < 1.3
     assert abs(sharp) < GATE_LIMITS.least_share / 2 and abs(sharp_below_sky) < GATE_LIMITS.least_share / 2
     flat = np.full((HEIGHT, WIDTH), 90, np.uint8)
-    assert shown_share(flat, field) is None
+    assert measure_blur_share(flat, field) is None
     noise = np.random.default_rng(0).normal(128, 6, (HEIGHT, WIDTH)).astype(np.uint8)
-    assert shown_share(noise, field) is None
+    assert measure_blur_share(noise, field) is None
 
 
-def below_sky(image, seed):
+def judge_sky(image, seed):
     """The picture in its own shadow below a bright sky that takes most of it, with noise and JPEG."""
     rng = np.random.default_rng([seed, 7])
     light = 0.6 * (image.mean(axis=2) / 255) ** 2.2
@@ -248,8 +254,8 @@ def test_a_recording_that_is_mostly_sky_bears_its_gyroscope_out_and_no_other():
     for k, t_s in enumerate((0.98, 1.14, 3.58, 3.74, 2.3, 4.6)):
         shutter, image = shot(t_s, 8)
         for error in ("none", "flipped axis"):
-            found[error].append(blur_evidence(below_sky(image, k), predicted(shutter, error)))
-        found["sharp"].append(blur_evidence(below_sky(shot(t_s, 0.2)[1], k), predicted(shutter, "none")))
+            found[error].append(blur_evidence(judge_sky(image, k), predicted(shutter, error)))
+        found["sharp"].append(blur_evidence(judge_sky(shot(t_s, 0.2)[1], k), predicted(shutter, "none")))
     trusted = {error: judge_recording(evidence).trusted for error, evidence in found.items()}
     assert trusted == {"none": True, "flipped axis": False, "sharp": False}
     # all tiles alike, it is not: the sky hides the rest
@@ -281,7 +287,7 @@ def test_curved_blur_is_compared_with_the_curve():
     image = np.rint(255 * np.clip(light + noise, 0, 1)).astype(np.uint8)
     chord = path.field()
     assert path.departure_px() > 3
-    assert shown_share(image, path) > 0.5 > shown_share(image, chord)
+    assert measure_blur_share(image, path) > 0.5 > measure_blur_share(image, chord)
     curved, line = blur_evidence(image, path), blur_evidence(image, chord)
     assert curved.support > 6 and curved.extent_is_plausible and line.support < 2
     trusted = RecordingVerdict(trusted=True, support=9.0, extent_factor=1.0, frames=9, reason="others do")
@@ -292,7 +298,9 @@ def test_curved_blur_is_compared_with_the_curve():
     still = np.rint(255 * sharp).astype(np.uint8)
     across = replace(path, path_px=path.path_px[..., ::-1])
     for picture, other in ((still, path), (image, across)):
-        assert shown_share(picture, other) < GATE_LIMITS.least_share and blur_evidence(picture, other).support < 4
+        assert (
+            measure_blur_share(picture, other) < GATE_LIMITS.least_share and blur_evidence(picture, other).support < 4
+        )
 
 
 def test_a_wrong_extent_is_corrected_and_a_right_one_left_alone():

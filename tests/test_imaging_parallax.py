@@ -13,7 +13,7 @@ from colmap_inertial.core.types import FrameTiming
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.parallax import Parallax, parallax_from_points
-from colmap_inertial.imaging.psf import blur_field, predicted_blur_px
+from colmap_inertial.imaging.psf import blur_field, predict_blur_px
 from colmap_inertial.tools.simulate import MotionOptions, make_motion
 from colmap_inertial.tools.simulate.render import ShutterCamera, colmap_camera
 
@@ -43,7 +43,7 @@ def test_a_still_camera_that_slides_smears_by_its_way_over_the_depth():
         ends = [end / (1 + s * way[2] / 2) for s, end in zip((-1, 1), ends, strict=True)]
         np.testing.assert_allclose(field.vector_px[i, j], (ends[1] - ends[0]) * [fx, fy], atol=2e-3)
     timing = FrameTiming(names=("a", "b"), t_s=np.array([1.0, 1.1]), exposure_s=np.full(2, 0.02), epoch_ns=0)
-    predicted = predicted_blur_px(
+    predicted = predict_blur_px(
         still, colmap_camera(PINHOLE), timing, width=640, height=480, parallaxes={"b": flat(1.5)}
     )
     assert predicted.px[0] < 1e-6

@@ -12,7 +12,7 @@ from colmap_inertial.core.geometry import matrix_from_quat, quat_exp
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.types import CameraModel, FrameTiming, ImuRecording
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
-from colmap_inertial.imaging.psf import blur_field, predicted_blur_px
+from colmap_inertial.imaging.psf import blur_field, predict_blur_px
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.tools.simulate import MotionOptions, make_motion, make_world
 from colmap_inertial.tools.simulate.render import Renderer, ShutterCamera, colmap_camera
@@ -148,7 +148,7 @@ def test_prediction_is_the_90th_percentile_of_the_field_for_thousands_of_frames(
     timing = FrameTiming(
         names=tuple(map(str, range(3000))), t_s=t_s, exposure_s=np.full(3000, 0.015), readout_s=0.02, epoch_ns=0
     )
-    predicted = predicted_blur_px(gyro, colmap_camera(LENS), timing, width=640, height=480)
+    predicted = predict_blur_px(gyro, colmap_camera(LENS), timing, width=640, height=480)
     assert not any(predicted.reasons)
     for k in (10, 700, 2500):
         field = blur_field(gyro, colmap_camera(LENS), FrameShutter.of(timing, k, width=640, height=480))
@@ -160,12 +160,12 @@ def test_what_is_not_known_is_not_predicted():
     gyro, camera = turning([0.1, 0.0, 0.0]), colmap_camera(PINHOLE)
     times = {"names": ("a", "b", "c"), "t_s": [0.2, 1.0, 2.4]}
     timing = FrameTiming(**times, exposure_s=[0.01, 0.01, 0.01])
-    predicted = predicted_blur_px(gyro, camera, timing, width=640, height=480)
+    predicted = predict_blur_px(gyro, camera, timing, width=640, height=480)
     np.testing.assert_array_equal(np.isfinite(predicted.px), [False, True, False])
     assert "does not cover" in predicted.reasons[0] and predicted.reasons[1] == ""
     with pytest.raises(NotObservableError, match="does not cover"):
         blur_field(gyro, camera, FrameShutter.of(timing, 0, width=640, height=480))
-    unknown = predicted_blur_px(gyro, camera, FrameTiming(**times), width=640, height=480)
+    unknown = predict_blur_px(gyro, camera, FrameTiming(**times), width=640, height=480)
     assert np.isnan(unknown.px).all() and "exposure time is unknown" in unknown.reasons[1]
     with pytest.raises(NotObservableError, match="exposure time is unknown"):
         blur_field(gyro, camera, FrameShutter(width=640, height=480, t_s=1.0, exposure_s=None))
@@ -199,7 +199,7 @@ def test_the_gyroscope_must_cover_the_last_line_s_exposure(readout_s):
     gyro, camera = turning([0.1, 0.0, 0.0], span_s=2.0), colmap_camera(PINHOLE)
     # the gyroscope's last sample is at 1.995 + 0.254 s
     timing = FrameTiming(names=("a",), t_s=[2.22], exposure_s=[0.01], readout_s=readout_s)
-    predicted = predicted_blur_px(gyro, camera, timing, width=640, height=480)
+    predicted = predict_blur_px(gyro, camera, timing, width=640, height=480)
     assert np.isfinite(predicted.px[0]) == (readout_s == 0)
     shutter = FrameShutter.of(timing, 0, width=640, height=480)
     if readout_s:

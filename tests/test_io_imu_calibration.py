@@ -28,9 +28,9 @@ from colmap_inertial.io.calibration import (
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.pipeline.run.config import config_as_toml, read_config
-from colmap_inertial.pipeline.run.context import corrected_imu, prior_calibration
+from colmap_inertial.pipeline.run.context import correct_imu, prior_calibration
 from colmap_inertial.reconstruction.drivers import device_store
-from colmap_inertial.reconstruction.drivers.device_store import configuration_folder, remember, remembered_of
+from colmap_inertial.reconstruction.drivers.device_store import configuration_folder, read_remembered, remember
 from colmap_inertial.tools.simulate import RestOptions, simulate_rests
 
 ROOT = Path(__file__).parents[1]
@@ -171,14 +171,14 @@ def test_a_recording_is_corrected_once_by_the_file_or_by_the_capture(both, tmp_p
     capture = load_capture(toml)
     imu = read_imu(toml)
     assert (imu.device, imu.calibration) == ("My phone", None)
-    by_capture = corrected_imu(capture, imu, ())
+    by_capture = correct_imu(capture, imu, ())
     np.testing.assert_allclose(
         by_capture.accel_m_s2, imu.accel_m_s2 @ (np.eye(3) + known().accel_gain).T - known().accel_bias_m_s2
     )
     other = tmp_path / "other.json"
     write_imu_calibration(other, dataclasses.replace(known(), attitudes=20))
-    assert corrected_imu(capture, imu, other).calibration.attitudes == 20
-    assert corrected_imu(dataclasses.replace(capture, imu_calibration=None), imu, both[0]) is imu
+    assert correct_imu(capture, imu, other).calibration.attitudes == 20
+    assert correct_imu(dataclasses.replace(capture, imu_calibration=None), imu, both[0]) is imu
     # the camera may have been aligned with the gyroscope's own axes, which are askew in the accelerometer's
     prior = prior_calibration(capture, both[1])
     askew = 0.5 * (known().gyro_gain - known().gyro_gain.T)
@@ -250,7 +250,7 @@ def test_calibrate_imu_writes_a_file_and_a_page_and_remembers(capsys, tmp_path, 
     np.testing.assert_allclose(found.accel_gain, truth.accel_gain, atol=1e-3)
     page = out.with_suffix(".html").read_text()
     assert "IMU calibration of My phone" in page and "misalignment zy" in page
-    kept = remembered_of(tmp_path / "rests.csv", (), device="my  PHONE")
+    kept = read_remembered(tmp_path / "rests.csv", (), device="my  PHONE")
     assert [kind for _, kind in kept.files] == ["imu"]
     assert kept.paths[0].read_bytes() == out.read_bytes()
     assert run(capsys, *args)[0] == 0  # an earlier result of ours is replaced
@@ -342,10 +342,10 @@ def test_what_a_capture_says_goes_before_what_is_remembered(both, tmp_path, home
         ("[calibration]\ncam_from_imu_xyzw = [0, 0, 0, 1]\n", ["imu"]),
     ):
         toml.write_text(head + table)
-        assert [kind for _, kind in remembered_of(toml, ()).files] == kinds
-        assert remembered_of(toml, both).files == ()
-    assert remembered_of(tmp_path / "imu.csv", ()).files == ()  # nobody said what it is
-    assert remembered_of(tmp_path / "no.csv", ()).files == ()
+        assert [kind for _, kind in read_remembered(toml, ()).files] == kinds
+        assert read_remembered(toml, both).files == ()
+    assert read_remembered(tmp_path / "imu.csv", ()).files == ()  # nobody said what it is
+    assert read_remembered(tmp_path / "no.csv", ()).files == ()
     with pytest.raises(OutputError, match="needs a name"):
         remember("  ", both[0])
 

@@ -18,7 +18,7 @@ from test_pipeline import copy_scene
 from colmap_inertial.cli import _COMMANDS, main
 from colmap_inertial.core.errors import FormatError, InertialError
 from colmap_inertial.core.options import ReadLimits, ReconstructOptions
-from colmap_inertial.core.threads import in_order
+from colmap_inertial.core.threads import map_in_order
 from colmap_inertial.io.files import first_line, read_bytes, read_json, read_limits, read_yaml, reading_within
 from colmap_inertial.io.frame_times import stamps_of_csv
 from colmap_inertial.io.images import _read_size, read_image
@@ -171,7 +171,7 @@ def test_limits_hold_where_they_are_set_and_nowhere_else(large):
                 read()
             # also in the threads that work for the caller
             with pytest.raises(FormatError, match=option):
-                list(in_order(lambda _, read=read: read(), [1], workers=2))
+                list(map_in_order(lambda _, read=read: read(), [1], workers=2))
         assert read_limits() == ReadLimits()
 
 

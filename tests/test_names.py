@@ -10,7 +10,7 @@ import pycolmap
 import pytest
 from cases import loop_over
 
-from colmap_inertial.checks.report.page import embedded_images
+from colmap_inertial.checks.report.page import embed_images
 from colmap_inertial.checks.validate.views import load_views
 from colmap_inertial.colmap.dense import _check_images
 from colmap_inertial.core.errors import FormatError
@@ -112,7 +112,7 @@ def test_tables_and_captures_do_not_lead_out(tmp_path):
     with pytest.raises(FormatError, match="is absolute"):
         stamps_of_exif(tmp_path, ["/etc/hostname"])
     with pytest.raises(FormatError, match="names the file"):
-        embedded_images(tmp_path, ["../x.jpg"])
+        embed_images(tmp_path, ["../x.jpg"])
 
 
 @pytest.mark.parametrize("name", ["../up.png", "out/up.png"])

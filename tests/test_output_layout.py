@@ -14,7 +14,7 @@ from test_io_ply import SIMILARITY
 from test_pipeline import copy_scene
 from test_pipeline_parts import session_in
 
-from colmap_inertial.checks.words import mapped_in_words, parts_mapped_in_words
+from colmap_inertial.checks.words import describe_mapping, parts_mapped_in_words
 from colmap_inertial.cli.terminal import show_result
 from colmap_inertial.colmap import dense as dense_room
 from colmap_inertial.colmap.depth_maps import MadeFrom
@@ -34,8 +34,8 @@ from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan
 from colmap_inertial.reconstruction.drivers import images_alone
 from colmap_inertial.reconstruction.drivers.frames import run_images
 from colmap_inertial.reconstruction.drivers.project_output import (
+    list_placed_paths,
     place_project,
-    placed_paths,
     remove_placed,
     remove_stale_dense,
     require_free_names,
@@ -294,7 +294,7 @@ def test_what_is_gone_comes_again_and_nothing_stays_without_a_scale(placing):
     assert placing()[0] == ["apply"] and "notes.txt" not in placing.names()
     shutil.rmtree(placing.workspace.sparse)
     assert placing(scales=(REFUSED,)) == ([], None)
-    assert placing.names() == set() and placed_paths(placing.workspace) == []
+    assert placing.names() == set() and list_placed_paths(placing.workspace) == []
 
 
 def test_a_run_killed_while_it_places_leaves_nothing_behind_for_the_next(placing, monkeypatch):
@@ -459,7 +459,7 @@ def test_the_screen_and_the_report_say_how_a_model_was_made(workspace, capsys):
     }
     for ends, expected in said.items():
         record = MapRecord(mapper="incremental", models=2, ends=ends)
-        assert " ".join(mapped_in_words(asdict(record), 1)) == expected
+        assert " ".join(describe_mapping(asdict(record), 1)) == expected
         show_result(ReconstructResult(workspace=workspace, models=(model,), seconds={}, mapping=record), Path("here"))
         shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
         assert ("Mapping" in shown) == bool(expected) and expected in shown
@@ -475,4 +475,4 @@ def test_the_screen_and_the_report_say_how_a_model_was_made(workspace, capsys):
     # of all models together, and once
     assert shown.count("in 6 parts.") == 1 and shown.count("(20 % of the matches agree).") == 1
     assert "c.jpg and d.jpg, 7 pairs" in shown and "a.jpg" not in shown
-    assert mapped_in_words(None, 0) == []
+    assert describe_mapping(None, 0) == []

@@ -28,7 +28,7 @@ from colmap_inertial.pipeline.stages.imaging_plan import read_plan, write_plan
 from colmap_inertial.reconstruction.drivers.capture import reconstruct
 from colmap_inertial.reconstruction.drivers.images_alone import deblur_capture
 from colmap_inertial.reconstruction.preparation import calibrate as first_look, plan as imaging
-from colmap_inertial.reconstruction.preparation.plan import Treatments, plan_imaging, with_stated_exposures
+from colmap_inertial.reconstruction.preparation.plan import Treatments, add_stated_exposures, plan_imaging
 from colmap_inertial.reconstruction.preparation.selection import part_of
 from colmap_inertial.reconstruction.preparation.translation import find_parallaxes
 from colmap_inertial.tools.simulate import MotionOptions, make_motion
@@ -223,7 +223,7 @@ def test_a_stopped_run_does_not_deblur_again(tmp_path, blurred, stopped):
 def parts(capture):
     loaded = load_capture(capture)
     timing, _ = read_frames(loaded)
-    timing = with_stated_exposures(loaded, timing)
+    timing = add_stated_exposures(loaded, timing)
     return Recording.of(loaded, read_capture_imu(loaded), timing, prior_calibration(loaded, None))
 
 
@@ -322,7 +322,7 @@ def test_unknown_exposure_leaves_every_frame_and_says_why(tmp_path, blurred):
     text = (capture / "capture.toml").read_text()
     (capture / "capture.toml").write_text(text.replace("exposure_s = 0.03\n", ""))
     loaded = parts(capture).capture
-    timing = with_stated_exposures(loaded, read_frames(loaded)[0])
+    timing = add_stated_exposures(loaded, read_frames(loaded)[0])
     np.testing.assert_allclose(timing.exposure_s, 0.04)  # by EXIF
     for path in (capture / "frames").iterdir():
         path.write_bytes(path.read_bytes().replace(exif(), exif((0, 1))))

@@ -10,7 +10,7 @@ from conftest import write_project
 from test_pipeline_parts import recording_of, session_in
 
 from colmap_inertial.checks.validate import Validation, parse_target
-from colmap_inertial.checks.words import joined_in_words
+from colmap_inertial.checks.words import describe_joined
 from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.core.geometry import quat_exp, quat_multiply, quat_rotate
 from colmap_inertial.core.types import (
@@ -37,7 +37,7 @@ from colmap_inertial.pipeline.stages import readout
 from colmap_inertial.pipeline.stages.deblur import SMOOTHING, DeblurStage, smoothing_for
 from colmap_inertial.pipeline.stages.imaging_plan import GyroView, ImagingPlan
 from colmap_inertial.pipeline.stages.join import JoinStage
-from colmap_inertial.pipeline.stages.metric import MetricStage, for_rectified, gravity_in_model
+from colmap_inertial.pipeline.stages.metric import MetricStage, calibration_of_rectified, gravity_in_model
 from colmap_inertial.pipeline.stages.readout import ReadoutStage
 from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage
 from colmap_inertial.reconstruction.drivers import models
@@ -254,9 +254,9 @@ def test_a_project_that_was_joined_is_not_taken_back(project, tmp_path):
 
 def test_a_joined_model_is_described_by_its_parts_and_its_worst_gap():
     gap = {"first": 0, "second": 2, "joined": True, "seconds": 1.0, "sigma_m": None, "sigma_deg": None}
-    unknown = {joined_in_words([0, 2], gaps) for gaps in ([], [gap])}
+    unknown = {describe_joined([0, 2], gaps) for gaps in ([], [gap])}
     assert len(unknown) == 1 and "2" in unknown.pop()
-    assert "3.0 cm, 0.50 degrees" in joined_in_words([0, 2], [gap | {"sigma_m": 0.03, "sigma_deg": 0.5}])
+    assert "3.0 cm, 0.50 degrees" in describe_joined([0, 2], [gap | {"sigma_m": 0.03, "sigma_deg": 0.5}])
 
 
 def test_no_covariance_is_written_of_a_joined_path(run):
@@ -336,7 +336,7 @@ def test_only_rectified_models_have_lost_their_readout(whole):
     left = stage.calibration_of(replace(model, rectified=True))
     assert left.readout_s == 0 and 0 < left.sigma("readout_s") < 0.1 * 0.03 + 1e-9
     np.testing.assert_array_equal(left.cam_from_imu_xyzw, known.cam_from_imu_xyzw)
-    assert for_rectified(known).readout_s == 0
+    assert calibration_of_rectified(known).readout_s == 0
 
 
 def test_velocities_within_the_readout_are_in_the_model_s_unit(whole, project, monkeypatch):

@@ -21,7 +21,7 @@ from colmap_inertial.colmap.pairing import MatchRecord
 from colmap_inertial.colmap.sparse import KeypointRecords, extract_features, image_pairs, write_gravity_priors
 from colmap_inertial.core.errors import NotObservableError, OutputExistsError
 from colmap_inertial.core.options import MappingOptions, ProjectOptions, ReconstructOptions
-from colmap_inertial.core.threads import in_order
+from colmap_inertial.core.threads import map_in_order
 from colmap_inertial.core.types import CALIBRATION_PARAMETERS, CameraModel, FrameTiming, ImuRecording, Treatment
 from colmap_inertial.imaging.gate import RecordingVerdict
 from colmap_inertial.io.calibration import Declared, calibration_prior, write_calibration
@@ -46,7 +46,7 @@ from colmap_inertial.reconstruction.drivers import frames as framing, project as
 from colmap_inertial.reconstruction.drivers.frames import run_frames, run_images
 from colmap_inertial.reconstruction.drivers.sources import check_output
 from colmap_inertial.reconstruction.preparation import calibrate, plan as imaging, sampling
-from colmap_inertial.reconstruction.preparation.judge import Looked, below_sky, by_frame
+from colmap_inertial.reconstruction.preparation.judge import Looked, judge_each_frame, judge_sky
 from colmap_inertial.reconstruction.preparation.plan import Treatments, plan_imaging, run_plan
 from colmap_inertial.reconstruction.preparation.preflight import stop_or_doubt
 from colmap_inertial.reconstruction.preparation.selection import part_of
@@ -609,17 +609,17 @@ class Shown:
 def test_a_gyroscope_is_trusted_for_all_frames_where_nearly_all_bear_it_out(clear, trusted):
     verdict = RecordingVerdict(trusted=True, support=9.0, extent_factor=1.0, frames=20, reason="")
     clearly, hardly = Looked(Shown(20.0), 0.8, 20.0), Looked(Shown(-1.0), 0.2, 20.0)
-    assert by_frame(verdict, [clearly] * clear + [hardly] * (20 - clear)).trusted is trusted
+    assert judge_each_frame(verdict, [clearly] * clear + [hardly] * (20 - clear)).trusted is trusted
     # a faint dip is none of a wrong gyroscope where detail lacks along the blur, and no other direction has a dip
     faintly, elsewhere = Looked(Shown(1.0), 0.5, 20.0), Looked(Shown(1.0, other=6.0), 0.5, 20.0)
-    assert by_frame(verdict, [clearly] * clear + [faintly] * (20 - clear)).trusted is True
-    assert by_frame(verdict, [clearly] * clear + [elsewhere] * (20 - clear)).trusted is trusted
+    assert judge_each_frame(verdict, [clearly] * clear + [faintly] * (20 - clear)).trusted is True
+    assert judge_each_frame(verdict, [clearly] * clear + [elsewhere] * (20 - clear)).trusted is trusted
     # of a sky, what stands below it must show the gyroscope's direction rather than the mirrored one, in most frames
     below, neither = (Looked(Shown(1.0, other=6.0, standing=40.0), 0.5, 20.0, mirrored) for mirrored in (0.1, 0.4))
-    assert by_frame(verdict, [clearly] * clear + [below] * (20 - clear)).trusted is True
-    assert by_frame(verdict, [clearly] * clear + [neither] * (20 - clear)).trusted is trusted
+    assert judge_each_frame(verdict, [clearly] * clear + [below] * (20 - clear)).trusted is True
+    assert judge_each_frame(verdict, [clearly] * clear + [neither] * (20 - clear)).trusted is trusted
     # short blur tells nothing
-    assert by_frame(verdict, [clearly] * clear + [replace(hardly, blur_px=5.0)] * (20 - clear)).trusted is True
+    assert judge_each_frame(verdict, [clearly] * clear + [replace(hardly, blur_px=5.0)] * (20 - clear)).trusted is True
 
 
 def test_a_gyroscope_that_few_dips_show_is_borne_out_by_what_stands_below_the_sky():
@@ -630,11 +630,11 @@ def test_a_gyroscope_that_few_dips_show_is_borne_out_by_what_stands_below_the_sk
         draws = rng.normal([share, mirrored], 0.1, (count, 2))
         return [Looked(Shown(1.0, standing=standing), a, 6.0, b) for a, b in draws]
 
-    assert below_sky(refused, looked(0.6, 0.0)).trusted is True
+    assert judge_sky(refused, looked(0.6, 0.0)).trusted is True
     wrong = [looked(0.0, 0.6), looked(0.0, 0.0), looked(0.6, 0.6), looked(0.6, 0.0, standing=90.0)]
     for one in (*wrong, looked(0.6, 0.0, count=4), looked(0.6, 0.0)[:5] + looked(-0.6, 0.0)[:5]):
-        assert below_sky(refused, one) is refused
-    assert below_sky(replace(refused, trusted=None), looked(0.6, 0.0)).trusted is None
+        assert judge_sky(refused, one) is refused
+    assert judge_sky(replace(refused, trusted=None), looked(0.6, 0.0)).trusted is None
 
 
 def test_the_middle_of_a_recording_stands_for_it():
@@ -726,7 +726,7 @@ def test_work_that_is_let_go_of_in_one_of_its_own_threads_ends(monkeypatch):
             ended.clear()
         return item
 
-    holder["stream"] = in_order(work, range(5), workers=1)
+    holder["stream"] = map_in_order(work, range(5), workers=1)
     assert next(holder["stream"]) == 0
     ended.set()
     until = time.monotonic() + 10

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from colmap_inertial.core.sampling import Coverage, integral_at, is_gap, without_running_mean
+from colmap_inertial.core.sampling import Coverage, integral_at, is_gap, subtract_running_mean
 
 
 def test_a_gap_is_longer_than_asked_in_seconds_and_in_usual_steps():
@@ -35,7 +35,7 @@ def test_an_integral_is_that_of_straight_lines_between_samples():
 def test_what_is_slow_is_taken_out_and_what_is_quick_stays():
     t_s = np.arange(200) / 100
     slow, quick = 3.0 + 2.0 * t_s, np.where(np.arange(200) % 2, 1.0, -1.0)
-    left = without_running_mean(np.stack([slow, slow + quick], axis=1), 21)
+    left = subtract_running_mean(np.stack([slow, slow + quick], axis=1), 21)
     assert left.shape == (180, 2)
     assert np.abs(left[:, 0]).max() < 1e-12
     assert np.abs(left[:, 1] - quick[10:190]).max() < 0.05

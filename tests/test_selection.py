@@ -16,7 +16,7 @@ from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.options import FrameOptions, MappingOptions, ReconstructOptions
 from colmap_inertial.core.types import CameraModel, FrameTiming
 from colmap_inertial.imaging.gyro_camera import GyroCamera
-from colmap_inertial.imaging.psf import predicted_blur_px
+from colmap_inertial.imaging.psf import predict_blur_px
 from colmap_inertial.imaging.selection import Ranked, WindowLimits, choose_frames
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.io.capture import Capture, load_capture
@@ -253,7 +253,7 @@ def of_a_long_recording(
         cam_from_imu_xyzw=true.cam_from_imu_xyzw,
         offset_s=true.gyro_time_offset_s + recording.epoch_ns * 1e-9,
     )
-    blur = predicted_blur_px(exact, colmap_camera(_PINHOLE), timing, width=1920, height=1080).px
+    blur = predict_blur_px(exact, colmap_camera(_PINHOLE), timing, width=1920, height=1080).px
     # a gyroscope sample is found at the time that the recording without a rate has for it
     found_s = clocks.motion.path.t_s + clocks.motion.offset_s
     true_s = recording.gyro_t_s + exact.offset_s

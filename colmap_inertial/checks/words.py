@@ -145,7 +145,7 @@ def place_facts(place: Mapping[str, Any] | None) -> Iterator[Fact]:
     yield from (("note", note) for note in place["notes"])
 
 
-def joined_in_words(models: Collection[int], gaps: Sequence[Mapping[str, Any]]) -> str:
+def describe_joined(models: Collection[int], gaps: Sequence[Mapping[str, Any]]) -> str:
     """Which of COLMAP's models were joined into one, and how well each gap between them is known."""
     across = [
         f"{gap['seconds']:.1f} s to {100 * gap['sigma_m']:.1f} cm, {gap['sigma_deg']:.2f} degrees"
@@ -185,7 +185,7 @@ def parts_mapped_in_words(mapping: dict[str, Any] | None) -> list[str]:
     return [f"COLMAP mapped the recording in {mapping['parts']} parts.", *apart]
 
 
-def mapped_in_words(mapping: dict[str, Any] | None, colmap_index: int | None) -> list[str]:
+def describe_mapping(mapping: dict[str, Any] | None, colmap_index: int | None) -> list[str]:
     """Which loops of one model were closed; by ``mapping`` of the result."""
     sentences = []
     for closure in [] if mapping is None else mapping["ends"]:

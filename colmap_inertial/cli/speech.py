@@ -144,9 +144,9 @@ class DeviceCommand(Speaker):
         """These calibrations, and those kept of the recording's device."""
         if not self.remembered:
             return calibration
-        from colmap_inertial.reconstruction.drivers.device_store import remembered_of
+        from colmap_inertial.reconstruction.drivers.device_store import read_remembered
 
-        kept = remembered_of(recording, calibration, device=self.device)
+        kept = read_remembered(recording, calibration, device=self.device)
         if self.talks:
             for path, kind in kept.files:
                 print(

@@ -267,14 +267,14 @@ def show_result(result: ReconstructResult, source: Path) -> None:
 def _model_lines(model: ModelResult, result: ReconstructResult) -> Iterator[Line]:
     """What there is to say of one model, as labelled lines."""
     from colmap_inertial.checks.words import (
-        joined_in_words,
-        mapped_in_words,
+        describe_joined,
+        describe_mapping,
         model_facts,
         parts_mapped_in_words,
         place_facts,
         target_facts,
     )
-    from colmap_inertial.reconstruction.drivers.result import measured_as_json
+    from colmap_inertial.reconstruction.drivers.result import measurement_as_json
 
     frames, dense = result.frames, model.dense
     mapping = None if result.mapping is None else asdict(result.mapping)
@@ -284,16 +284,16 @@ def _model_lines(model: ModelResult, result: ReconstructResult) -> Iterator[Line
     if frames:
         yield from imaging_lines(frames, result.imaging, result.keypoints.rectified())
     made = parts_mapped_in_words(mapping) if model is result.models[0] else []
-    made += mapped_in_words(mapping, model.colmap_index)
+    made += describe_mapping(mapping, model.colmap_index)
     if made:
         yield "mapping", " ".join(made)
     if model.parts:
-        yield "joined", joined_in_words([part.colmap_index for part in model.parts], [asdict(g) for g in result.gaps])
+        yield "joined", describe_joined([part.colmap_index for part in model.parts], [asdict(g) for g in result.gaps])
     if isinstance(model.validation, InertialError):
         yield "target", str(model.validation)
     elif model.validation is not None and model.validation.scale_error_pct is not None:
         yield from list(target_facts(model.validation.as_json()))[:2]
-    yield from place_facts(measured_as_json(model.georeference))
+    yield from place_facts(measurement_as_json(model.georeference))
     if dense is not None and not dense.waiting:
         maps = f"{dense.depth_maps} depth maps of {dense.images} images"
         yield "dense", f"{maps}, {dense.points} points, {dense.faces} faces"

@@ -16,7 +16,7 @@ import numpy as np
 from colmap_inertial.colmap.depth_maps import map_file
 from colmap_inertial.core.arrays import UInt8Array
 from colmap_inertial.core.geometry import opencv_px_from_colmap
-from colmap_inertial.core.threads import frames_at_once, in_order
+from colmap_inertial.core.threads import frames_at_once, map_in_order
 from colmap_inertial.imaging.plane_sweep import (
     DepthView,
     Partner,
@@ -70,7 +70,7 @@ class SweptWorkspace:
             self._match(view, threads)
             progress()
         workers = threads or frames_at_once()
-        for _ in in_order(self._confirm, range(len(self.names)), workers=workers):
+        for _ in map_in_order(self._confirm, range(len(self.names)), workers=workers):
             progress()
 
     @property

@@ -95,8 +95,8 @@ class GyroPath:
         A gain error S (the true rate is ``(I + S) rate``) turns the interval from i to j by ``R_j' (G_j - G_i) S``.
         """
         i, since_s, rate = self._locate(query_s)
-        here = matrix_from_quat(self.at(query_s)[0]) @ _by_symmetric(rate)
-        before = self._rotation[i] @ _by_symmetric(self.rate_rad_s[i])
+        here = matrix_from_quat(self.at(query_s)[0]) @ _differentiate_symmetric(rate)
+        before = self._rotation[i] @ _differentiate_symmetric(self.rate_rad_s[i])
         return np.asarray(self._gain_levers[i] + 0.5 * (before + here) * since_s[:, None, None])
 
     @cached_property
@@ -109,7 +109,7 @@ class GyroPath:
 
     @cached_property
     def _gain_levers(self) -> Array:
-        return self._integral(self._rotation @ _by_symmetric(self.rate_rad_s))
+        return self._integral(self._rotation @ _differentiate_symmetric(self.rate_rad_s))
 
     def _integral(self, values: Array) -> Array:
         steps = 0.5 * (values[1:] + values[:-1]) * self._step_s[:, None, None]
@@ -129,7 +129,7 @@ def _turn(rate_before: Array, rate_after: Array, step_s: Array) -> Array:
     return quat_exp(0.5 * step * (rate_before + rate_after) + step**2 / 12 * cross(rate_before, rate_after))
 
 
-def _by_symmetric(rate: Array) -> Array:
+def _differentiate_symmetric(rate: Array) -> Array:
     """(K, 3, 6) derivatives of ``S rate`` by the entries xx, yy, zz, yz, xz, xy of a symmetric matrix S."""
     out = np.zeros((len(rate), 3, 6))
     for axis in range(3):

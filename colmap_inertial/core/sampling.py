@@ -31,7 +31,7 @@ def is_gap(t_s: Array, longer_than_s: float = GAP_S, *, steps: float = 0.0) -> B
     return np.asarray(step_s > max(longer_than_s, steps * float(np.median(step_s)) if steps else 0.0))
 
 
-def at_ceiling(values: Array) -> BoolArray:
+def find_clipped(values: Array) -> BoolArray:
     """(N, k) which samples (N, k) stand at their column's largest or smallest value, where these are far too many.
 
     An end of a natural distribution is rare; one that is cut off is a common reading.
@@ -79,7 +79,7 @@ def integral_at(t_s: Array, values: Array, query_s: Array) -> Array:
     return np.stack([np.interp(query_s, t_s, column) for column in integral.T], axis=-1)
 
 
-def without_running_mean(values: Array, width: int) -> Array:
+def subtract_running_mean(values: Array, width: int) -> Array:
     """What of samples (N, k) changes faster than their running mean over ``width`` of them: (N - width + 1, k)."""
     kernel = np.ones(width) / width
     slow = np.stack([np.convolve(column, kernel, mode="valid") for column in values.T], axis=1)

@@ -44,7 +44,7 @@ def frames_at_once() -> int:
     return min(_MOST_FRAMES, usable_processors())
 
 
-def in_order(work: Callable[[Item], Result], items: Iterable[Item], *, workers: int) -> Iterator[Result]:
+def map_in_order(work: Callable[[Item], Result], items: Iterable[Item], *, workers: int) -> Iterator[Result]:
     """What becomes of items, in their order; ``workers`` are in work at once, and hardly more are held.
 
     What holds for the caller (a context variable) holds for the work.

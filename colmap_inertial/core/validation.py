@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from colmap_inertial.core.arrays import Array
 
 
-def checked_array(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Array:
+def check_array(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Array:
     """A read-only float64 copy of ``value``; ``None`` in ``shape`` means any length.
 
     Raises
@@ -26,13 +26,13 @@ def checked_array(name: str, value: ArrayLike, shape: tuple[int | None, ...]) ->
     return out
 
 
-def checked_field(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Array:
-    """As :func:`checked_array`, and what the end of the name says of it.
+def check_field(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Array:
+    """As :func:`check_array`, and what the end of the name says of it.
 
     Times (``t_s``) increase strictly, quaternions (``xyzw``) have unit norm and are normalised, covariances (``cov``)
     are symmetric with a non-negative diagonal.
     """
-    out = checked_array(name, value, shape)
+    out = check_array(name, value, shape)
     if name.endswith("t_s"):
         check_increasing(name, out)
     elif name.endswith("xyzw"):
@@ -55,7 +55,7 @@ def check_increasing(name: str, t_s: Array) -> None:
 
 
 def check_fields(instance: object, **shapes: tuple[int | str, ...]) -> None:
-    """Replace array fields of a frozen value by what :func:`checked_field` makes of them; an optional ``None`` stays.
+    """Replace array fields of a frozen value by what :func:`check_field` makes of them; an optional ``None`` stays.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def check_fields(instance: object, **shapes: tuple[int | str, ...]) -> None:
         value = getattr(instance, name)
         if value is None and getattr(type(instance), name, ...) is None:
             continue
-        out = checked_field(name, value, tuple(lengths.get(n) if isinstance(n, str) else n for n in shape))
+        out = check_field(name, value, tuple(lengths.get(n) if isinstance(n, str) else n for n in shape))
         lengths |= {letter: n for letter, n in zip(shape, out.shape, strict=True) if isinstance(letter, str)}
         set_fields(instance, **{name: out})
 

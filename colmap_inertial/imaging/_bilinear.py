@@ -22,7 +22,7 @@ def bilinear(grid: AnyArray, rows: Array, columns: Array) -> AnyArray:
     return grid
 
 
-def between_nodes(nodes: AnyArray, at: Array) -> Array:
+def interpolate_nodes(nodes: AnyArray, at: Array) -> Array:
     """Bilinear values at (..., 2) fractional columns and rows of a (Gy, Gx, C) grid; beyond it, the edge's."""
     rows, columns = nodes.shape[:2]
     x, y = np.clip(at[..., 0], 0, columns - 1), np.clip(at[..., 1], 0, rows - 1)

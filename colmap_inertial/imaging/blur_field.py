@@ -38,7 +38,7 @@ class BlurField:
         if self.width <= 0 or self.height <= 0 or self.step_px <= 0:
             raise ValueError("width, height and step_px must be positive")
         nodes = self.nodes(self.width, self.height, self.step_px)
-        object.__setattr__(self, "vector_px", checked_nodes("vector_px", self.vector_px, (*nodes, 2)))
+        object.__setattr__(self, "vector_px", check_nodes("vector_px", self.vector_px, (*nodes, 2)))
         object.__setattr__(self, "cov_px2", spread_cov(self.cov_px2, nodes))
 
     @staticmethod
@@ -77,7 +77,7 @@ class BlurField:
         return (off / whole) ** 0.5 if whole > 0 else 0.0
 
 
-def checked_nodes(name: str, value: AnyArray, shape: tuple[int, ...]) -> AnyArray:
+def check_nodes(name: str, value: AnyArray, shape: tuple[int, ...]) -> AnyArray:
     """A read-only float32 copy of finite values, of a shape."""
     out = np.array(value, dtype=np.float32)
     if out.shape != shape:

@@ -8,7 +8,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import AnyArray, Array, Float32Array
 from colmap_inertial.imaging._bilinear import bilinear
-from colmap_inertial.imaging.blur_field import BlurField, checked_nodes, spread_cov
+from colmap_inertial.imaging.blur_field import BlurField, check_nodes, spread_cov
 
 #: Samples of the exposure; of longer blur, one for each so many pixels.
 SAMPLES, SAMPLE_PX = 17, 2.0
@@ -44,7 +44,7 @@ class BlurPath:
             raise ValueError("width, height and step_px must be positive")
         nodes = BlurField.nodes(self.width, self.height, self.step_px)
         samples = max(2, len(self.path_px))
-        object.__setattr__(self, "path_px", checked_nodes("path_px", self.path_px, (samples, *nodes, 2)))
+        object.__setattr__(self, "path_px", check_nodes("path_px", self.path_px, (samples, *nodes, 2)))
         object.__setattr__(self, "cov_px2", spread_cov(self.cov_px2, nodes))
 
     @classmethod

@@ -210,7 +210,7 @@ def _sum_tiles(values: Array, mirrored: Array, lengths_px: Array, weight: Array)
     )
 
 
-def shown_share(image: UInt8Array | UInt16Array, blur: BlurField | BlurPath) -> float | None:
+def measure_blur_share(image: UInt8Array | UInt16Array, blur: BlurField | BlurPath) -> float | None:
     """How much of the fall of detail that a blur predicts an image has: 1 where it is blurred so, 0 where it is sharp.
 
     At one distance from the origin of a tile's spectrum, blur leaves the directions across it as they were and takes
@@ -224,11 +224,13 @@ def shown_share(image: UInt8Array | UInt16Array, blur: BlurField | BlurPath) -> 
     About 0 also where an image is blurred otherwise: textures decide then, and tiles are many. ``None`` where there is
     too little to tell.
     """
-    return shown_shares(image, blur)[0]
+    return measure_blur_shares(image, blur)[0]
 
 
-def shown_shares(image: UInt8Array | UInt16Array, blur: BlurField | BlurPath) -> tuple[float | None, float | None]:
-    """As `shown_share`, and that of the blur that a gyroscope with one axis flipped would predict."""
+def measure_blur_shares(
+    image: UInt8Array | UInt16Array, blur: BlurField | BlurPath
+) -> tuple[float | None, float | None]:
+    """As `measure_blur_share`, and that of the blur that a gyroscope with one axis flipped would predict."""
     path = BlurPath.straight(blur) if isinstance(blur, BlurField) else blur
     found = _compute_spectra(image, path, _LIMITS.few_tiles)
     if found is None:

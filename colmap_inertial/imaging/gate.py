@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from colmap_inertial.core.arrays import Array, BoolArray, Float32Array
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath
-from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence, shown_share
+from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence, measure_blur_share
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.imaging.psf import PredictedBlur
 from colmap_inertial.imaging.tracking import to_grey
@@ -321,7 +321,7 @@ def judge_frame(
         return None, f"noise and calibration of the gyroscope leave {unsure:.0%} of the blur's length uncertain"
     curve = BlurPath.straight(blur) if path is None else path
     if recording is not None and recording.trusted:
-        share = shown_share(image, curve.times(recording.extent_factor))
+        share = measure_blur_share(image, curve.times(recording.extent_factor))
         if share is not None and share < GATE_LIMITS.least_share:
             return (
                 None,

@@ -14,9 +14,9 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.types import Projector
-from colmap_inertial.core.validation import checked_array
-from colmap_inertial.imaging._bilinear import between_nodes
-from colmap_inertial.imaging.blur_field import BlurField, checked_nodes
+from colmap_inertial.core.validation import check_array
+from colmap_inertial.imaging._bilinear import interpolate_nodes
+from colmap_inertial.imaging.blur_field import BlurField, check_nodes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,9 +61,9 @@ class Parallax:
     inverse_depth: np.ndarray[tuple[int, int], np.dtype[np.float32]]
 
     def __post_init__(self) -> None:
-        velocity = checked_array("velocity_in_cam", self.velocity_in_cam, (3,))
+        velocity = check_array("velocity_in_cam", self.velocity_in_cam, (3,))
         nodes = BlurField.nodes(self.width, self.height, self.step_px)
-        inverse = checked_nodes("inverse_depth", self.inverse_depth, nodes)
+        inverse = check_nodes("inverse_depth", self.inverse_depth, nodes)
         if (inverse < 0).any():
             raise ValueError("inverse_depth: must not be negative")
         object.__setattr__(self, "velocity_in_cam", velocity)
@@ -72,7 +72,7 @@ class Parallax:
     def rate_at(self, x_px: Array, y_px: Array) -> Array:
         """(len(y), len(x), 3) velocity times inverse depth at a grid of image points (COLMAP's coordinates), 1/s."""
         at = (np.stack(np.meshgrid(x_px, y_px), axis=-1) - 0.5) / self.step_px
-        return between_nodes(self.inverse_depth[..., None], at) * self.velocity_in_cam
+        return interpolate_nodes(self.inverse_depth[..., None], at) * self.velocity_in_cam
 
     def as_json(self) -> dict[str, object]:
         """In JSON types; the unit of length becomes the median depth, and four digits are kept."""

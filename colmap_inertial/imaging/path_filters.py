@@ -19,7 +19,7 @@ from colmap_inertial.imaging._cells import Cells
 from colmap_inertial.imaging._tiles import TILING, TiledPaths, Tiling
 from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.transfer import ENCODE_STEPS, decode_table, encode_table, srgb_from_linear
-from colmap_inertial.imaging.wiener import DeblurOptions, require_planes, saturated_code
+from colmap_inertial.imaging.wiener import DeblurOptions, lowest_saturated_code, require_planes
 
 Code = TypeVar("Code", np.uint8, np.uint16)
 
@@ -239,7 +239,7 @@ def _filter_image(
         fade=cells.fade,
         decode=decode_table(image.dtype),
         encode=encode_table(image.dtype),
-        saturated=saturated_code(image.dtype),
+        saturated=lowest_saturated_code(image.dtype),
         threads=threads,
     )
     return result.reshape(image.shape)

@@ -198,7 +198,7 @@ class PredictedBlur:
     reasons: tuple[str, ...]
 
 
-def predicted_blur_px(
+def predict_blur_px(
     motion: GyroCamera,
     camera: Projector,
     timing: FrameTiming,

@@ -116,10 +116,10 @@ def _check_covered(motion: GyroCamera, shutter: FrameShutter) -> None:
 
 def rays(camera: Projector, points: Array) -> Array:
     """(N, 3) directions of (N, 2) pixels in the camera frame, z = 1."""
-    return with_unit_depth(np.asarray(camera.cam_from_img(points))[:, :2])
+    return append_unit_depth(np.asarray(camera.cam_from_img(points))[:, :2])
 
 
-def with_unit_depth(xy: Array) -> Array:
+def append_unit_depth(xy: Array) -> Array:
     """(N, 3) rays at z = 1 of (N, 2)."""
     return np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
 

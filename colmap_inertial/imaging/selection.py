@@ -17,7 +17,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array, Int64Array, UInt8Array
 from colmap_inertial.core.geometry import skew, so3_exp
 from colmap_inertial.core.types import Projector
-from colmap_inertial.imaging.rolling_shutter import with_unit_depth
+from colmap_inertial.imaging.rolling_shutter import append_unit_depth
 from colmap_inertial.imaging.tracking import reduce_image, track_points
 
 #: Why a window was closed. start: the first frames; still: it lasted, and nothing moved; end: the last frames.
@@ -298,7 +298,7 @@ class _Compare:
         known = np.isfinite(rays[0]).all(axis=1) & np.isfinite(rays[1]).all(axis=1)
         if known.sum() < _LIMITS.fewest:
             return np.nan, motion, overlap
-        first, second = (with_unit_depth(r[known]) for r in rays)
+        first, second = (append_unit_depth(r[known]) for r in rays)
         now_from_before = self._start_from_cam[now.place].T @ self._start_from_cam[before.place]
         if not np.isfinite(now_from_before).all():
             now_from_before = _fit_rotation(first, second)

@@ -156,13 +156,13 @@ def _compiled(
         smoothing=table.smoothing,
         decode=decode_table(dtype) if coded else none,
         encode=encode_table(dtype) if coded else none,
-        saturated=saturated_code(dtype) if coded else 0,
+        saturated=lowest_saturated_code(dtype) if coded else 0,
         threads=threads or 0,
         instruction_set=instruction_set,
     )
     return result, seconds
 
 
-def saturated_code(dtype: np.dtype[Any]) -> int:
+def lowest_saturated_code(dtype: np.dtype[Any]) -> int:
     """The first code of an image type that may have been clipped."""
     return int(np.ceil(SATURATED * np.iinfo(dtype).max))

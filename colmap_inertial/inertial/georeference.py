@@ -26,7 +26,7 @@ from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import matrix_from_quat, rotation_between
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import HeightDatum, PositionFixes
-from colmap_inertial.core.validation import checked_array
+from colmap_inertial.core.validation import check_array
 
 #: WGS84: semi-major axis and flattening.
 SEMI_MAJOR_M, FLATTENING = 6378137.0, 1 / 298.257223563
@@ -202,10 +202,10 @@ def georeference_of_json(values: Mapping[str, Any]) -> Georeference:
         longitude_deg=float(origin["longitude_deg"]),
         height_m=float(origin["height_m"]),
         height_above=origin["height_above"],
-        enu_from_world=checked_array("enu_from_world", values["enu_from_world"], (3, 3)),
-        shift_m=checked_array("shift_m", values["shift_m"], (3,)),
-        middle_in_world_m=checked_array("middle_in_world_m", values["middle_in_world_m"], (3,)),
-        cov=checked_array("cov", values["cov"], (4, 4)),
+        enu_from_world=check_array("enu_from_world", values["enu_from_world"], (3, 3)),
+        shift_m=check_array("shift_m", values["shift_m"], (3,)),
+        middle_in_world_m=check_array("middle_in_world_m", values["middle_in_world_m"], (3,)),
+        cov=check_array("cov", values["cov"], (4, 4)),
         used=int(positions["used"]),
         left_out=int(positions["left_out"]),
         source=str(positions["source"]),

@@ -24,10 +24,10 @@ from colmap_inertial.core.geometry import (
     so3_log,
 )
 from colmap_inertial.core.gyro import GyroPath
-from colmap_inertial.core.sampling import without_running_mean
+from colmap_inertial.core.sampling import subtract_running_mean
 from colmap_inertial.core.types import CameraTrajectory, Frame, FrameTiming, ImuRecording, Projector
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
-from colmap_inertial.imaging.rolling_shutter import with_unit_depth
+from colmap_inertial.imaging.rolling_shutter import append_unit_depth
 from colmap_inertial.imaging.tracking import reduce_image, to_grey, track_points
 
 
@@ -343,7 +343,7 @@ def find_stabilisation(rotation: VisualRotation, imu: ImuRecording, *, offset_s:
 
 def _measure_quick_rotation(rate: Array, width: int) -> float:
     """Robust size of what changes faster than the running mean over ``width`` samples."""
-    quick = np.linalg.norm(without_running_mean(rate, width), axis=1)
+    quick = np.linalg.norm(subtract_running_mean(rate, width), axis=1)
     return float(np.sqrt(np.mean(np.sort(quick**2)[: max(1, int(0.98 * len(quick)))])))
 
 
@@ -370,7 +370,7 @@ def _estimate_pair_rotation(
         ok = np.isfinite(rays[0]).all(axis=1) & np.isfinite(rays[1]).all(axis=1)
         if ok.sum() < options.min_support:
             continue
-        first, second = (with_unit_depth(r[ok]) for r in rays)
+        first, second = (append_unit_depth(r[ok]) for r in rays)
         span_s = shutters[1].middle_s(points[1][ok]) - shutters[0].middle_s(points[0][ok])
         # one pixel of the reduced picture as an angle, in the middle of the picture
         centre = 0.5 * size[None]

@@ -19,7 +19,7 @@ from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import cross
 from colmap_inertial.core.types import ReadoutDirection
 from colmap_inertial.imaging.gyro_camera import GyroCamera
-from colmap_inertial.imaging.rolling_shutter import with_unit_depth
+from colmap_inertial.imaging.rolling_shutter import append_unit_depth
 from colmap_inertial.motion.flow import VisualRotation
 
 
@@ -273,7 +273,7 @@ def _compute_residuals(seen: _Corners, motion: GyroCamera, params: Array, moved:
     span_s = np.diff(at_s, axis=1)
     middle_rate = rate.mean(axis=1)
     rays = seen.rays * focal
-    ahead = with_unit_depth(rays[:, 0])
+    ahead = append_unit_depth(rays[:, 0])
     turned = np.einsum("nij,nj->ni", now_from_before, ahead)
     # a little of axes and bias turns it further
     turned = turned + cross(span_s * (bias - cross(np.broadcast_to(axes, middle_rate.shape), middle_rate)), turned)

@@ -16,7 +16,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array, Float32Array
 from colmap_inertial.core.geometry import so3_log
 from colmap_inertial.core.types import Frame, FrameTiming, Projector
-from colmap_inertial.imaging.rolling_shutter import with_unit_depth
+from colmap_inertial.imaging.rolling_shutter import append_unit_depth
 from colmap_inertial.motion.flow import FlowOptions, VisualRotation, reduced
 
 
@@ -157,7 +157,7 @@ def _estimate_rotation(first: _Features, second: _Features) -> tuple[Array, int]
 
 def _fit_pure_rotation(a: Array, b: Array, reach: float) -> tuple[Array, float]:
     """The rotation ``a_from_b`` that turns most rays into each other, and the share that it explains."""
-    a, b = (with_unit_depth(rays) for rays in (a, b))
+    a, b = (append_unit_depth(rays) for rays in (a, b))
     a, b = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (a, b))
     weight = np.ones(len(a))
     for _ in range(10):

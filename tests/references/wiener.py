@@ -28,7 +28,7 @@ def deblur_reference(image: AnyArray, blur: BlurField, options: wiener.DeblurOpt
     table = wiener._table(cells, noise)
     top = np.iinfo(image.dtype).max
     light = decode_table(image.dtype)[planes].astype(np.float64)
-    saturated = planes >= wiener.saturated_code(image.dtype)
+    saturated = planes >= wiener.lowest_saturated_code(image.dtype)
     channels = range(planes.shape[2])
     lost = np.any([lost_light_reference(light[..., c], saturated[..., c], cells) for c in channels], axis=0)
     share = share_reference(lost, cells)

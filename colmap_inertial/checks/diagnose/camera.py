@@ -10,7 +10,7 @@ import numpy as np
 from colmap_inertial.checks.diagnose.findings import UNIT_FACTORS, Finding, Recorded, Severity
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply
-from colmap_inertial.core.sampling import without_running_mean
+from colmap_inertial.core.sampling import subtract_running_mean
 from colmap_inertial.core.types import CameraTrajectory, ImuRecording
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.motion.align import Alignment
@@ -102,7 +102,7 @@ def check_belonging(recorded: Recorded) -> Iterator[Finding]:
             advice="turn the camera about all three axes while recording; clocks and axes cannot be checked without",
         )
         return
-    otherwise = _as_it_would_fit(recorded, imu)
+    otherwise = _find_better_fit(recorded, imu)
     if otherwise is not None:
         yield otherwise
     elif recorded.stabilisation is None or not recorded.stabilisation.stabilised:
@@ -139,7 +139,7 @@ def _never_fits(recorded: Recorded, turning: CameraTrajectory, failed: NotObserv
     )
 
 
-def _as_it_would_fit(recorded: Recorded, imu: ImuRecording) -> Finding | None:
+def _find_better_fit(recorded: Recorded, imu: ImuRecording) -> Finding | None:
     """What makes the gyroscope turn as the camera does: another sign, rate, frame rate, or offset."""
     if isinstance(recorded.align(replace(imu, gyro_rad_s=-imu.gyro_rad_s)), Alignment):
         return _MIRRORED
@@ -396,7 +396,7 @@ def check_focal_length(recorded: Recorded) -> Iterator[Finding]:
         return
     inertial = (motion.turn_rad(rotation.t_s) / dt_s[:, None])[known]
     visual = (rotation.turn_rad / dt_s[:, None])[known]
-    quick_inertial, quick_visual = (without_running_mean(turn, width)[:, :2] for turn in (inertial, visual))
+    quick_inertial, quick_visual = (subtract_running_mean(turn, width)[:, :2] for turn in (inertial, visual))
     energy = float(np.sum(quick_inertial**2))
     if np.sqrt(energy / len(quick_inertial)) < _LIMITS.least_quick_rad_s:
         return

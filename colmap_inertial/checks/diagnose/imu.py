@@ -12,7 +12,7 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.geometry import matrix_from_quat, skew
 from colmap_inertial.core.gyro import GyroPath
-from colmap_inertial.core.sampling import MUCH_CUT, PAUSE_STEPS, at_ceiling, integral_at, is_gap
+from colmap_inertial.core.sampling import MUCH_CUT, PAUSE_STEPS, find_clipped, integral_at, is_gap
 from colmap_inertial.core.types import CameraTrajectory, ImuRecording
 from colmap_inertial.motion.align import Alignment
 
@@ -311,7 +311,7 @@ def check_together(recorded: Recorded) -> Iterator[Finding]:
 def check_cut_off(recorded: Recorded) -> Iterator[Finding]:
     """Readings that end at a ceiling: the motion was faster than the sensor's range."""
     for sensor, _, values in _sensors(recorded.imu):
-        counts = dict(zip("xyz", at_ceiling(values).sum(axis=0).tolist(), strict=True))
+        counts = dict(zip("xyz", find_clipped(values).sum(axis=0).tolist(), strict=True))
         cut = {axis: count for axis, count in counts.items() if count}
         if cut:
             share = sum(cut.values()) / len(values)

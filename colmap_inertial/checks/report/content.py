@@ -12,9 +12,9 @@ import numpy as np
 from colmap_inertial import __version__
 from colmap_inertial.checks.report.series import SIZES, strided
 from colmap_inertial.checks.words import (
+    describe_joined,
+    describe_mapping,
     half_width_pct,
-    joined_in_words,
-    mapped_in_words,
     outcome_of_model,
     outcome_of_stop,
     parts_mapped_in_words,
@@ -79,11 +79,11 @@ def gather(
     gaps = done.get("gaps", [])
     if shown and shown[0]["joined_of"]:
         models_joined = [part["colmap_index"] for part in shown[0]["joined_of"]]
-        joined = f"It was joined from {joined_in_words(models_joined, gaps)}."
+        joined = f"It was joined from {describe_joined(models_joined, gaps)}."
         outcome = {**outcome, "summary": [*outcome["summary"], joined]}
     if shown:
         made = parts_mapped_in_words(done.get("mapping"))
-        made += mapped_in_words(done.get("mapping"), shown[0].get("colmap_index"))
+        made += describe_mapping(done.get("mapping"), shown[0].get("colmap_index"))
         outcome = {**outcome, "summary": [*outcome["summary"], *made, *_describe_path(shown[0])]}
     if len(shown) > 1:
         several = f"There are {len(shown)} separate models. This is model {shown[0]['index']}; the others follow below."
@@ -121,14 +121,14 @@ def _describe_path(model: Content) -> list[str]:
         return [
             f"The camera path is {length:.0f} m long: --refine inertial fits it to the IMU, against bending and drift."
         ]
-    percent = [part["percent"] for part in refined_parts(model)]
+    percent = [part["percent"] for part in find_refined_parts(model)]
     if not percent:
         return []
     low, high = (f"{value:+.2f}" for value in (min(percent), max(percent)))
     return [f"The refinement corrected drift of the path: parts of it were stretched by {low} to {high} %."]
 
 
-def refined_parts(model: Content) -> list[Content]:
+def find_refined_parts(model: Content) -> list[Content]:
     """By how much the refinement stretched the parts of a model's path; empty where it left the model as it was."""
     done = [each for each in model.get("treatments", []) if each["stage"] == "refine" and each["action"]]
     parts: list[Content] = done[-1]["values"].get("drift", []) if done else []

@@ -71,7 +71,7 @@ def render_page(template: str, *, out: Path | None = None, **values: Any) -> str
         return ""
 
     def embedded(paths: Sequence[str], captions: Sequence[str] | None = None) -> list[tuple[str, str]]:
-        return [] if out is None else embedded_images(out, paths, captions)
+        return [] if out is None else embed_images(out, paths, captions)
 
     shared = {"plot": plot, "add_link": add_link, "embedded": embedded, "figures_drawn": figures, "links": links}
     try:
@@ -127,7 +127,7 @@ def _gauge_at(pct: float) -> float:
     return 10.0 + 480.0 * (min(max(math.log10(max(pct, 1e-9)), -1.0), 2.0) + 1) / 3
 
 
-def embedded_images(out: Path, paths: Sequence[str], captions: Sequence[str] | None = None) -> list[tuple[str, str]]:
+def embed_images(out: Path, paths: Sequence[str], captions: Sequence[str] | None = None) -> list[tuple[str, str]]:
     """Caption (by default the file's name) and data URL of each image; those that are gone are left out."""
     named = zip(captions or [Path(path).stem for path in paths], paths, strict=True)
     found = ((caption, _data_url(path_in(out, path))) for caption, path in named)

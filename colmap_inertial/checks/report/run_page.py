@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from colmap_inertial.checks.report import figures
-from colmap_inertial.checks.report.content import refined_parts
+from colmap_inertial.checks.report.content import find_refined_parts
 from colmap_inertial.checks.report.figure_3d import scene_figure
 from colmap_inertial.checks.report.page import render_page
 from colmap_inertial.checks.report.series import SIZES
@@ -68,8 +68,8 @@ def run_page(content: Content, out: Path) -> str:
         return "missing" not in record
 
     helpers: Sequence[Callable[..., Any]] = (
-        *(run_facts, survey_facts, target_facts, intrinsics_rows, readout_rows, written_rows, model_rows, gap_rows),
-        *(drifted_parts, refined_parts, not_checked, scale_drifts, scale_facts, scene_figure),
+        *(run_facts, survey_facts, target_facts, intrinsics_rows, readout_rows, list_outputs, model_rows, gap_rows),
+        *(count_drifted_parts, find_refined_parts, not_checked, scale_drifts, scale_facts, scene_figure),
     )
     return render_page(
         "report.html",
@@ -175,7 +175,7 @@ def readout_rows(models: Sequence[Content]) -> Rows:
     return rows
 
 
-def written_rows(content: Content) -> Rows:
+def list_outputs(content: Content) -> Rows:
     """Each path of the result, and what lies there."""
     paths = [(key, model[key]) for model in content["models"] for key in ("sparse", "sparse_metric", "trajectory")]
     paths.append(("project_metric", content["project_metric"]))
@@ -210,6 +210,6 @@ def gap_rows(gaps: Sequence[Content]) -> Rows:
     ]
 
 
-def drifted_parts(parts: Sequence[Content]) -> int:
+def count_drifted_parts(parts: Sequence[Content]) -> int:
     """How many parts of a path had drifted by more than their 95 % interval."""
     return sum(abs(part["percent"]) > Z95 * part["sigma_percent"] for part in parts)

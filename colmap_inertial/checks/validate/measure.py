@@ -184,8 +184,8 @@ def _measure(
         target=target,
         unscaled=options.unscaled,
         tolerance_pct=options.tolerance_pct,
-        scale_error_pct=None if options.unscaled else _to_per_cent(log_scale),
-        ci95_pct=None if options.unscaled else (_to_per_cent(log_scale - half), _to_per_cent(log_scale + half)),
+        scale_error_pct=None if options.unscaled else _percent_of_log(log_scale),
+        ci95_pct=None if options.unscaled else (_percent_of_log(log_scale - half), _percent_of_log(log_scale + half)),
         metres_per_unit=float(np.exp(-log_scale)),
         metres_per_unit_ci95=(float(np.exp(-log_scale - half)), float(np.exp(-log_scale + half))),
         views_used=len(view_results),
@@ -254,10 +254,10 @@ def _compare_sets(
     difference = check[0].placement.log_scale - control[0].placement.log_scale
     # the two share the poses' errors, which this counts twice
     both = float(np.hypot(check[0].half_width_log(), control[0].half_width_log()))
-    return _to_per_cent(difference), (_to_per_cent(difference - both), _to_per_cent(difference + both))
+    return _percent_of_log(difference), (_percent_of_log(difference - both), _percent_of_log(difference + both))
 
 
-def _to_per_cent(log: float) -> float:
+def _percent_of_log(log: float) -> float:
     return 100 * float(np.expm1(log))
 
 

@@ -15,7 +15,7 @@ from colmap_inertial.core.geometry import matrix_from_quat, rotation_between, sk
 from colmap_inertial.core.options import WorldAxes
 from colmap_inertial.core.types.imu import CameraImuCalibration, ImuCalibration, ImuNoise
 from colmap_inertial.core.types.recorded import LengthUnit, ReadoutDirection
-from colmap_inertial.core.validation import check_fields, check_increasing, checked_field, set_fields
+from colmap_inertial.core.validation import check_field, check_fields, check_increasing, set_fields
 
 Verdict = Literal["trusted", "weak", "refused"]
 
@@ -468,7 +468,7 @@ class SolvedMotion:
 
     def __post_init__(self) -> None:
         for field, shape in (("cam_in_world", (3,)), ("velocity_in_world", (3,)), ("cov", (6, 6))):
-            values = {n: checked_field(f"{n}: {field}", v, shape) for n, v in getattr(self, field).items()}
+            values = {n: check_field(f"{n}: {field}", v, shape) for n, v in getattr(self, field).items()}
             set_fields(self, **{field: values})
 
     def of(self, names: Sequence[str], cam_in_world: Array) -> SolvedMotion:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray, Float32Array
-from colmap_inertial.imaging._bilinear import between_nodes
+from colmap_inertial.imaging._bilinear import interpolate_nodes
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.exposure_pairs._search import OTHER_TURNS_DEG, USUAL_TURNS_DEG, places
 from colmap_inertial.imaging.rolling_shutter import grid_nodes, sampling_maps
@@ -243,7 +243,7 @@ def _correlate(a: Float32Array, b: Float32Array, weights: Float32Array) -> float
 def _guess_mappings(start: Registered, levels: list[_Level], turns_deg: Sequence[float]) -> list[Array]:
     """(3, 3) mappings, px of the full images, from the short one to where the long one may lie: the best few."""
     coarse, finer = levels[0], levels[min(1, len(levels) - 1)]
-    scale = _centred_scale(coarse.scale)
+    scale = _scale_about_corner(coarse.scale)
     found = places(
         coarse.short,
         np.ones_like(coarse.tells),
@@ -288,7 +288,7 @@ def _apply_mapping(mapping: Array, start: Registered, step_px: int) -> Array | N
     # a turn takes corners farther than the middle
     if middle > _LIMITS.farthest * side or reach > (_LIMITS.farthest + _LIMITS.farthest_by_turning) * side:
         return None
-    return np.asarray(step + between_nodes(start.shift_px, target / step_px))
+    return np.asarray(step + interpolate_nodes(start.shift_px, target / step_px))
 
 
 def _refine(start: Registered, guess: Array, levels: list[_Level]) -> Registered:
@@ -328,7 +328,7 @@ def _maximise_correlation(level: _Level, start: Registered, mapping: Array, kind
 
     moved, weights = level.moved(start.shift_px)
     tells = (weights > _LIMITS.tells).astype(np.uint8)
-    scale = _centred_scale(level.scale)
+    scale = _scale_about_corner(level.scale)
     small = scale @ mapping @ np.linalg.inv(scale)
     size = 3 if kind == cv2.MOTION_HOMOGRAPHY else 2
     warp = np.ascontiguousarray((small / small[2, 2])[:size], dtype=np.float32)
@@ -342,7 +342,7 @@ def _maximise_correlation(level: _Level, start: Registered, mapping: Array, kind
     return np.asarray(np.linalg.inv(scale) @ full @ scale)
 
 
-def _centred_scale(scale: float) -> Array:
+def _scale_about_corner(scale: float) -> Array:
     """From OpenCV's pixels of an image to those of one reduced by area: corners stay, not centres of pixels."""
     offset = 0.5 * scale - 0.5
     return np.array([[scale, 0, offset], [0, scale, offset], [0, 0, 1.0]])

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from colmap_inertial.core.arrays import AnyArray, Array, Float32Array
-from colmap_inertial.imaging.exposure_pairs.pair import BRIGHTNESS_LIMITS, Brightness, brightened, to_mean
+from colmap_inertial.imaging.exposure_pairs.pair import BRIGHTNESS_LIMITS, Brightness, average_channels, brightened
 from colmap_inertial.imaging.transfer import decode_table
 
 
@@ -82,7 +82,7 @@ def better_alone(short: AnyArray, long: AnyArray, brightness: Brightness | None)
         max((long <= top // 256).mean(), (long >= np.ceil(BRIGHTNESS_LIMITS.clipped * top)).mean()),
     ]
     shown = [share <= _LIMITS.most_lost for share in lost]
-    noise, blurred = _estimate_errors(to_mean(bright), to_mean(as_it_is))
+    noise, blurred = _estimate_errors(average_channels(bright), average_channels(as_it_is))
     take_long = blurred < noise if shown[0] and shown[1] else not shown[0]
     if take_long:
         return Alone(used="long", image=as_it_is, gain=1.0)

@@ -16,7 +16,7 @@ from colmap_inertial.core.arrays import AnyArray, Array, BoolArray, Float32Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import colmap_px_from_opencv
 from colmap_inertial.core.types import Projector
-from colmap_inertial.imaging._bilinear import between_nodes
+from colmap_inertial.imaging._bilinear import interpolate_nodes
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.exposure_pairs._registration import Registered, register
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
@@ -210,7 +210,7 @@ def blur_seen_from_short(blur: BlurField, shift_px: Array) -> BlurField:
     """
     nodes = grid_nodes(*blur.vector_px.shape[:2])
     shift = np.where(np.isfinite(shift_px), shift_px, 0.0)
-    vectors = between_nodes(blur.vector_px.astype(np.float64), nodes + shift / blur.step_px)
+    vectors = interpolate_nodes(blur.vector_px.astype(np.float64), nodes + shift / blur.step_px)
     # a short line in the short exposure is this matrix times that in the long one
     by_y, by_x = np.gradient(shift / blur.step_px, axis=(0, 1))
     derivative = np.eye(2) + np.stack([by_x, by_y], axis=-1)
@@ -310,7 +310,11 @@ def bring_together(
     clipped = clipped if clipped.ndim == 2 else clipped.any(axis=2)
     bright = np.asarray(long.astype(np.float32) / np.float32(top))
     registered = register(
-        to_mean(brightened(short, brightness)), to_mean(bright), clipped, start_px=shift, step_px=_STEP_PX
+        average_channels(brightened(short, brightness)),
+        average_channels(bright),
+        clipped,
+        start_px=shift,
+        step_px=_STEP_PX,
     )
     blur = None
     if gyro is not None and shift is not None:
@@ -424,7 +428,7 @@ def _measure_squares(image: AnyArray, cell: int) -> _Squares:
     )
 
 
-def to_mean(image: Float32Array) -> Float32Array:
+def average_channels(image: Float32Array) -> Float32Array:
     """(H, W) mean of the channels."""
     return image if image.ndim == 2 else np.asarray(image.mean(axis=2), dtype=np.float32)
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from colmap_inertial.core.arrays import Array, Float32Array, Int32Array, UInt8Array
-from colmap_inertial.core.threads import in_order, usable_processors
+from colmap_inertial.core.threads import map_in_order, usable_processors
 from colmap_inertial.imaging.plane_sweep.pinhole import Pinhole
 from colmap_inertial.imaging.plane_sweep.tiles import Tile, cut_tiles
 from colmap_inertial.imaging.semi_global import Views, match_candidates
@@ -113,7 +113,7 @@ def sweep_depth(
         place = (1 / coarse.astype(np.float64) - sweep.inverse[0]) / (sweep.inverse[1] - sweep.inverse[0])
     tiles = list(cut_tiles(np.where(coarse > 0, place, np.nan), (camera.height, camera.width), len(sweep.inverse)))
     found = np.empty(codes.shape, dtype=np.float32)
-    parts = in_order(sweep.of_tile, tiles, workers=threads or usable_processors())
+    parts = map_in_order(sweep.of_tile, tiles, workers=threads or usable_processors())
     for tile, part in zip(tiles, parts, strict=True):
         found[tile.inner_rows, tile.inner_columns] = part[tile.kept]
     return found

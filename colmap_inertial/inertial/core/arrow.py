@@ -110,7 +110,7 @@ class ArrowSystem:
         factor.selected_inverse(here, beside)
         here *= unit[:, :, None] * unit[:, None, :]
         beside *= unit[:-1, :, None] * unit[1:, None, :]
-        followed = _of_chain(factor, unit, self.border)
+        followed = _solve_chain(factor, unit, self.border)
         return Inverse(unit=unit, factor=factor, here=here, beside=beside, followed=followed, root=root)
 
     def scaling(self, rhs_states: Array) -> tuple[Array, Array]:
@@ -174,10 +174,10 @@ class Inverse:
         """States (K, m, q) and globals (n, q) for q right-hand sides."""
         flat = self.followed.reshape(-1, len(self.root))
         z = self.cov @ (rhs_globals - flat.T @ rhs_states.reshape(len(flat), -1))
-        return _of_chain(self.factor, self.unit, rhs_states) - self.followed @ z, z
+        return _solve_chain(self.factor, self.unit, rhs_states) - self.followed @ z, z
 
 
-def _of_chain(factor: _inertial.ArrowFactor, unit: Array, rhs: Array) -> Array:
+def _solve_chain(factor: _inertial.ArrowFactor, unit: Array, rhs: Array) -> Array:
     """(K, m, q) solution of the chain alone."""
     rest = rhs * unit[:, :, None]
     factor.substitute(rest)

@@ -22,7 +22,7 @@ import numpy as np
 from colmap_inertial._kernels import _inertial
 from colmap_inertial.core.arrays import Array, BoolArray, Int64Array
 from colmap_inertial.core.camera_clock import CameraTimedImu
-from colmap_inertial.core.sampling import at_ceiling, is_gap
+from colmap_inertial.core.sampling import find_clipped, is_gap
 from colmap_inertial.core.types import ImuRecording
 
 #: Integration steps: as the samples come, within these. Steps of 5 instead of 2.5 ms change the scale by 0.003 %.
@@ -126,7 +126,7 @@ def find_saturated(imu: ImuRecording) -> tuple[BoolArray, BoolArray]:
     if imu.calibration is not None:
         # digits that the corrections left behind would make one reading many
         gyro, accel = (np.round(values, 9) for values in imu.calibration.uncorrected(gyro, accel))
-    return np.asarray(at_ceiling(gyro).any(axis=1)), np.asarray(at_ceiling(accel).any(axis=1))
+    return np.asarray(find_clipped(gyro).any(axis=1)), np.asarray(find_clipped(accel).any(axis=1))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

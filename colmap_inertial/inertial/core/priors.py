@@ -62,7 +62,7 @@ def is_calibrated(imu: ImuRecording) -> bool:
     """Whether the accelerometer's gain was corrected by a calibration that knows it well enough, as warm as it was."""
     if imu.calibration is None:
         return False
-    return math.hypot(imu.calibration.gain_sigma, _by_warmth(imu)) <= KNOWN_GAIN
+    return math.hypot(imu.calibration.gain_sigma, _sigma_of_warming(imu)) <= KNOWN_GAIN
 
 
 def gains_cov(imu: ImuRecording) -> Array:
@@ -78,10 +78,10 @@ def gains_cov(imu: ImuRecording) -> Array:
     if imu.calibration is None:
         raise ValueError("the recording was not corrected by a calibration")
     entries = np.r_[IMU_CAL.ACCEL_GAIN, IMU_CAL.GYRO_GAIN]
-    moved = math.hypot(PRIORS.calibrated_gain, _by_warmth(imu))
+    moved = math.hypot(PRIORS.calibrated_gain, _sigma_of_warming(imu))
     return np.asarray(imu.calibration.cov[np.ix_(entries, entries)] + moved**2 * np.eye(len(entries)))
 
 
-def _by_warmth(imu: ImuRecording) -> float:
+def _sigma_of_warming(imu: ImuRecording) -> float:
     """Standard deviation of what a gain changed by since the calibration; 0 where a temperature was not logged."""
     return PRIORS.calibrated_gain_per_k * abs(imu.warmer_k or 0.0)

@@ -17,7 +17,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.camera_clock import CameraTimedImu, epoch_shift_s
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_multiply, quat_rotate
-from colmap_inertial.core.sampling import without_running_mean
+from colmap_inertial.core.sampling import subtract_running_mean
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording
 from colmap_inertial.io.calibration import calibration_prior
@@ -79,7 +79,7 @@ def quick_accelerations(
     width = 4 * half
     if even.sum() < 2 * width - 1:
         return None
-    quick = [without_running_mean(values[even], width) for values in (inertial, visual, arm)]
+    quick = [subtract_running_mean(values[even], width) for values in (inertial, visual, arm)]
     lengths = np.linalg.norm(inertial[even], axis=1)
     return QuickAccelerations(
         inertial_m_s2=quick[0],

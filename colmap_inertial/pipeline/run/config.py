@@ -64,7 +64,7 @@ def read_values(path: Path) -> dict[str, Any]:
         raise FormatError(path, f"is not valid TOML: {error}") from error
 
 
-def with_values(options: Options, values: Mapping[str, Any], path: Path) -> Options:
+def override_options(options: Options, values: Mapping[str, Any], path: Path) -> Options:
     """``options``, where ``values`` (nested as in TOML) go before its own.
 
     Parameters
@@ -78,16 +78,16 @@ def with_values(options: Options, values: Mapping[str, Any], path: Path) -> Opti
         As :func:`read_config`.
     """
     stated = _build(path, type(options), values, "")  # by themselves first: a wrong one is named as it was written
-    plain = _merged(_plain(options), _with_absolute_paths(stated, values, path.parent))
+    plain = _merged(_plain(options), _resolve_paths(stated, values, path.parent))
     return _build(path, type(options), plain, "")
 
 
-def _with_absolute_paths(stated: Any, values: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+def _resolve_paths(stated: Any, values: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     absolute: dict[str, Any] = {}
     for key, value in values.items():
         built = getattr(stated, key)
         if dataclasses.is_dataclass(built):
-            absolute[key] = _with_absolute_paths(built, value, folder)
+            absolute[key] = _resolve_paths(built, value, folder)
         else:
             absolute[key] = _absolute(built, value, folder)
     return absolute
@@ -137,12 +137,12 @@ def _checked(path: Path, name: str, value: Any, hint: Any) -> Any:
             if value in arguments:
                 return value
         elif kind is Path and isinstance(value, str):
-            return _checked_path(path, name, value)
+            return _check_path(path, name, value)
         elif origin is tuple:
             item_kind = arguments[0]
             items = [value] if item_kind is Path and isinstance(value, str) else value
             if isinstance(items, list) and all(isinstance(item, str) for item in items):
-                return tuple(items if item_kind is str else (_checked_path(path, name, item) for item in items))
+                return tuple(items if item_kind is str else (_check_path(path, name, item) for item in items))
         elif kind is float and isinstance(value, (int, float)) and not isinstance(value, bool):
             return float(value)
         elif isinstance(kind, type) and type(value) is kind:
@@ -150,7 +150,7 @@ def _checked(path: Path, name: str, value: Any, hint: Any) -> Any:
     raise FormatError(path, f"{name}: {value!r} is not {_describe(alternatives)}")
 
 
-def _checked_path(path: Path, name: str, value: str) -> Path:
+def _check_path(path: Path, name: str, value: str) -> Path:
     if "\0" in value:
         raise FormatError(path, f"{name}: holds a NUL character")
     return Path(value)

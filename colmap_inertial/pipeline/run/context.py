@@ -95,7 +95,7 @@ def prior_calibration(capture: Capture, given: CalibrationFiles) -> CameraImuCal
     return calibration if of_imu is None else of_imu.loosened(calibration)
 
 
-def corrected_imu(capture: Capture, imu: ImuRecording, given: CalibrationFiles) -> ImuRecording:
+def correct_imu(capture: Capture, imu: ImuRecording, given: CalibrationFiles) -> ImuRecording:
     """The recording as its IMU's own calibration corrects it, from a file or from the capture; else as it is."""
     calibration = read_calibrations(given).imu or capture.imu_calibration
     return imu if calibration is None else calibration.corrected(imu)

@@ -10,7 +10,7 @@ import numpy as np
 
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.options import BlurRemover, DeblurMethod
-from colmap_inertial.core.threads import frames_at_once, in_order, threads_beside
+from colmap_inertial.core.threads import frames_at_once, map_in_order, threads_beside
 from colmap_inertial.core.types import (
     Frame,
     Projector,
@@ -173,7 +173,7 @@ class DeblurStage:
                 return frame
             return self._treated(frame, decision, motion, camera, self.view.shutter(index[frame.name]), remove)
 
-        yield from in_order(treat, frames, workers=workers)
+        yield from map_in_order(treat, frames, workers=workers)
 
     def _remover(self, workers: int) -> _Remover:
         """Undoes the blur of one frame; ``workers`` call it at once."""

@@ -13,7 +13,7 @@ import numpy as np
 from colmap_inertial.core.arrays import AnyArray, Float32Array
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError
 from colmap_inertial.core.options import ExposureOptions
-from colmap_inertial.core.threads import frames_at_once, in_order
+from colmap_inertial.core.threads import frames_at_once, map_in_order
 from colmap_inertial.core.types import Frame, Projector, Treatment
 from colmap_inertial.imaging.exposure_pairs import (
     Brightness,
@@ -185,7 +185,7 @@ class ExposureStage:
         """Fuse the pairs, in order."""
         exposures_s = {} if self.long is None else dict(zip(self.long.names, self.long.exposure_s, strict=True))
         work = partial(self._fused, gyro=self._gyro(), long_exposures_s=exposures_s)
-        for frame, done in in_order(work, frames, workers=self.workers or frames_at_once()):
+        for frame, done in map_in_order(work, frames, workers=self.workers or frames_at_once()):
             if done is None:
                 yield frame
                 continue
@@ -241,7 +241,7 @@ class ExposureStage:
             dark = brightened(frame.image, replace(pair.brightness, gain=1.0))
             light = fuse_mertens([dark, light])
         done = replace(done, fused=True, used="both", reason=_in_words(pair, path))
-        return _with_light(frame, light), done
+        return _replace_light(frame, light), done
 
 
 def _alone(
@@ -257,10 +257,10 @@ def _alone(
     said = replace(done, used=alone.used, reason=f"is {what}, and not fused: {why}")
     if alone.used == "short":
         said = replace(said, gain=alone.gain)
-    return _with_light(frame, alone.image), said
+    return _replace_light(frame, alone.image), said
 
 
-def _with_light(frame: Frame, light: Float32Array) -> Frame:
+def _replace_light(frame: Frame, light: Float32Array) -> Frame:
     top = np.iinfo(frame.image.dtype).max
     image: Any = np.rint(top * np.clip(light, 0, 1)).astype(frame.image.dtype)  # either of two types of pixel
     return replace(frame, image=image)

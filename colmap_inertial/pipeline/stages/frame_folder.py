@@ -12,7 +12,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import AnyArray
 from colmap_inertial.core.errors import FormatError, InertialError
-from colmap_inertial.core.threads import in_order
+from colmap_inertial.core.threads import map_in_order
 from colmap_inertial.core.types import CameraModel, Frame, Treatment
 from colmap_inertial.imaging.path_filters import smoothed
 from colmap_inertial.io.exif import carry_metadata
@@ -176,7 +176,7 @@ def _write(frame: Frame, original: AnyArray | None, paths: FramePaths) -> str:
         itself.parent.mkdir(parents=True, exist_ok=True)
         encode_image(itself, frame.image, source)
     if frame.smoothing_px > 0:
-        encode_image(target, seen_by_colmap(frame), source)
+        encode_image(target, smooth_for_colmap(frame), source)
     elif passed and source is not None:
         shutil.copyfile(source, target)
     else:
@@ -185,7 +185,7 @@ def _write(frame: Frame, original: AnyArray | None, paths: FramePaths) -> str:
     return "passed" if passed else (said or ["changed"])[-1]
 
 
-def seen_by_colmap(frame: Frame) -> AnyArray:
+def smooth_for_colmap(frame: Frame) -> AnyArray:
     """The picture of a frame that features are extracted from."""
     image: Any = frame.image  # either of two types of pixel
     return smoothed(image, frame.smoothing_px) if frame.smoothing_px > 0 else image
@@ -291,5 +291,5 @@ def write_images(
 
     target.mkdir(parents=True)
     progress("images", 0, len(names))
-    for done, _ in enumerate(in_order(work, names, workers=2), start=1):
+    for done, _ in enumerate(map_in_order(work, names, workers=2), start=1):
         progress("images", done, len(names))

@@ -92,7 +92,7 @@ class InertialStage:
     def calibration_of(self, model: Model) -> CameraImuCalibration | None:
         """What is known of the camera that a model was mapped for; rectified keypoints leave it hardly any readout."""
         if model.rectified and self.calibration is not None:
-            return for_rectified(self.calibration)
+            return calibration_of_rectified(self.calibration)
         return self.calibration
 
     def estimate_scale(self, model: Model) -> tuple[ScaleEstimate, CameraTrajectory, tuple[str, ...]]:
@@ -258,7 +258,7 @@ def _motion(
     )
 
 
-def for_rectified(calibration: CameraImuCalibration) -> CameraImuCalibration:
+def calibration_of_rectified(calibration: CameraImuCalibration) -> CameraImuCalibration:
     """The calibration of a camera whose keypoints were rectified: hardly any readout is left.
 
     Its standard deviation stands for what the camera's translation does within the readout, which stays.

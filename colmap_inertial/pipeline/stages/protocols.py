@@ -74,7 +74,7 @@ class JoiningStage(ModelStage, Protocol):
         ...
 
 
-def with_defaults(stages: Sequence[Stage | EllipsisType], defaults: Iterable[Stage]) -> list[Stage]:
+def insert_defaults(stages: Sequence[Stage | EllipsisType], defaults: Iterable[Stage]) -> list[Stage]:
     """A list of stages with the defaults where ``...`` stands, but those that another stage ``replaces``.
 
     Raises
@@ -121,7 +121,7 @@ def _is_invertible(stage: object) -> TypeGuard[InvertibleStage]:
     return hasattr(stage, "as_exposed")
 
 
-def refined_stages(
+def apply_refined_calibration(
     stages: Iterable[KeypointStage], calibration: CameraImuCalibration, readout_s: float, camera: CameraModel
 ) -> list[KeypointStage]:
     """The keypoint stages with what a refinement found, as far as they take it."""

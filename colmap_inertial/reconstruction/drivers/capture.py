@@ -25,7 +25,7 @@ from colmap_inertial.io.files import StrPath, reading_within
 from colmap_inertial.io.frames import picture_folders, read_frames
 from colmap_inertial.io.imu import read_raw_capture_imu
 from colmap_inertial.io.plausible import RawImu
-from colmap_inertial.pipeline.run.context import Recording, RunContext, corrected_imu, prior_calibration
+from colmap_inertial.pipeline.run.context import Recording, RunContext, correct_imu, prior_calibration
 from colmap_inertial.pipeline.run.progress import Progress, silent
 from colmap_inertial.pipeline.run.runner import remove
 from colmap_inertial.pipeline.run.session import Session, open_session, warn_of_conflicts
@@ -44,7 +44,7 @@ from colmap_inertial.pipeline.stages.protocols import (
     ModelStage,
     Stages,
     changes_images,
-    with_defaults,
+    insert_defaults,
 )
 from colmap_inertial.reconstruction.drivers.frames import (
     run_frames,
@@ -56,8 +56,8 @@ from colmap_inertial.reconstruction.drivers.models import Submodels, run_dense_m
 from colmap_inertial.reconstruction.drivers.reporting import report_result, reporting_stops, write_recording
 from colmap_inertial.reconstruction.drivers.result import ReconstructResult
 from colmap_inertial.reconstruction.preparation.geolocation import positions_of
-from colmap_inertial.reconstruction.preparation.plan import ask_for_plan, run_plan, with_stated_exposures
-from colmap_inertial.reconstruction.preparation.preflight import checked_imu, run_preflight
+from colmap_inertial.reconstruction.preparation.plan import add_stated_exposures, ask_for_plan, run_plan
+from colmap_inertial.reconstruction.preparation.preflight import check_imu, run_preflight
 from colmap_inertial.reconstruction.preparation.selection import part_of, run_selection
 
 #: A camera-IMU rotation less certain than this is no basis for gravity directions.
@@ -156,7 +156,7 @@ class _Given:
 def _read(path: Path, options: ReconstructOptions, stages: Stages) -> _Given:
     """Read a capture; what is wrong with it, the options or the stages is said before any work."""
     for kind in (stages.frame, stages.keypoint, stages.model):
-        with_defaults(kind, [])
+        insert_defaults(kind, [])
     if not stages.model:
         raise ValueError("model_stages: one must estimate the scale, such as ... or MetricStage")
     warn_of_conflicts()
@@ -169,15 +169,15 @@ def _read(path: Path, options: ReconstructOptions, stages: Stages) -> _Given:
     pairs = ... in stages.frame and fuses_pairs(capture, options.exposures, deblur=options.deblur)
     fuser = lsd2_fuser(options.exposures) if pairs else None
     capture = capture if pairs else replace(capture, exposures=None)
-    raw = checked_imu(read_raw_capture_imu(capture), force=options.force)
+    raw = check_imu(read_raw_capture_imu(capture), force=options.force)
     target = None if capture.target is None else parse_target(capture.target)
     timing, frames = read_frames(capture)
-    timing = with_stated_exposures(capture, timing)
+    timing = add_stated_exposures(capture, timing)
     require_frames(len(timing.names), of=len(timing.names))
     prior = prior_calibration(capture, options.calibration)
-    imu = corrected_imu(capture, raw.imu, options.calibration)
+    imu = correct_imu(capture, raw.imu, options.calibration)
     recording = Recording.of(capture, imu, timing, prior, max_offset_s=options.scale.max_offset_s)
-    with_defaults(stages.model, default_model_stages(StageInputs(recording=recording, options=options)))
+    insert_defaults(stages.model, default_model_stages(StageInputs(recording=recording, options=options)))
     gravity = _gravity_priors(recording, options)
     check_pair_names(timing.names)
     return _Given(
@@ -236,16 +236,16 @@ def _run(session: Session, given: _Given, options: ReconstructOptions, stages: S
         apertures=workspace.apertures,
         database=workspace.colmap_database,
     )
-    of_frames = with_defaults(stages.frame, default_frame_stages(inputs))
-    of_keypoints = with_defaults(stages.keypoint, default_keypoint_stages(inputs))
+    of_frames = insert_defaults(stages.frame, default_frame_stages(inputs))
+    of_keypoints = insert_defaults(stages.keypoint, default_keypoint_stages(inputs))
     records = run_frames(session, recording, frames, of_frames, workspace.colmap_images, inputs.plan)
     used_timing = part_of(recording.timing, [record.name for record in records if record.used])
     # pairs are chosen by what the capture itself holds: a calibration that is given later maps nothing again
-    plain_imu = corrected_imu(capture, given.raw.imu, None)
+    plain_imu = correct_imu(capture, given.raw.imu, None)
     plain = Recording.of(capture, plain_imu, used_timing, prior_calibration(capture, None))
     keypoints, matching, mapping = run_colmap(session, plain, records, of_keypoints, given.gravity, options)
     rectified = keypoints.rectified()
-    of_models = with_defaults(stages.model, default_model_stages(replace(inputs, keypoint_stages=of_keypoints)))
+    of_models = insert_defaults(stages.model, default_model_stages(replace(inputs, keypoint_stages=of_keypoints)))
     # images agree with the model as it is in the end
     after_models = changes_images(of_models)
     if not after_models:

@@ -83,7 +83,7 @@ def remember(device: str, calibration: Path) -> Path:
     return target
 
 
-def remembered_of(source: Path, given: tuple[Path, ...], *, device: str | None = None) -> Remembered:
+def read_remembered(source: Path, given: tuple[Path, ...], *, device: str | None = None) -> Remembered:
     """What is kept for the device of a recording, of the kinds that were not given.
 
     Parameters

@@ -28,7 +28,7 @@ from colmap_inertial.io.video_match import match_to_video
 from colmap_inertial.model import read_model, trajectory_from_model
 from colmap_inertial.pipeline.run.progress import Progress
 from colmap_inertial.reconstruction.drivers.sources import ScaleSource, check_output, only_model
-from colmap_inertial.reconstruction.preparation.plan import with_stated_exposures
+from colmap_inertial.reconstruction.preparation.plan import add_stated_exposures
 from colmap_inertial.reconstruction.preparation.preflight import compare_pictures, follow_video
 
 T = TypeVar("T")
@@ -89,7 +89,7 @@ def collect(source: ScaleSource, progress: Progress) -> Recorded:
     inertial_scale = path.is_dir() and is_inertial_scale(path)
     if source.imu is None and not inertial_scale:
         if _describes_frames(path):
-            return _of_capture(load_capture(path), source.calibration, progress)
+            return _read_capture(load_capture(path), source.calibration, progress)
         return _recorded(_Reading(), imu=lambda: read_raw_imu(path))
     reading = _Reading()
     times = source.frame_times or _times_of_capture(source.imu)
@@ -174,11 +174,11 @@ def _recorded(
     )
 
 
-def _of_capture(capture: Capture, calibration: CalibrationFiles, progress: Progress) -> Recorded:
+def _read_capture(capture: Capture, calibration: CalibrationFiles, progress: Progress) -> Recorded:
     reading = _Reading()
     timing = rotation = in_video = None
     if capture.frames is not None:
-        timing = reading.attempt(lambda: with_stated_exposures(capture, read_frame_timing(capture)))
+        timing = reading.attempt(lambda: add_stated_exposures(capture, read_frame_timing(capture)))
     if timing is not None:
         known = timing
         rotation = reading.attempt(

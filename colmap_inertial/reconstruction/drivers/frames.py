@@ -30,7 +30,7 @@ from colmap_inertial.pipeline.stages.frame_folder import (
     write_images,
 )
 from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan
-from colmap_inertial.pipeline.stages.protocols import FrameStage, KeypointStage, refined_stages
+from colmap_inertial.pipeline.stages.protocols import FrameStage, KeypointStage, apply_refined_calibration
 from colmap_inertial.reconstruction.drivers.result import ModelResult
 from colmap_inertial.reconstruction.preparation.sampling import some_frames
 
@@ -230,7 +230,7 @@ def stages_of_refined(stages: Sequence[KeypointStage], models: Sequence[ModelRes
         intrinsics = CameraModel(
             model=camera.model.name, width=camera.width, height=camera.height, params=tuple(camera.params)
         )
-        return refined_stages(stages, model.scale.calibration, readout_s, intrinsics)
+        return apply_refined_calibration(stages, model.scale.calibration, readout_s, intrinsics)
     return list(stages)
 
 

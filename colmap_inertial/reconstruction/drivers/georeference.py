@@ -17,7 +17,7 @@ from colmap_inertial.model import read_model, trajectory_from_model
 from colmap_inertial.pipeline.run.runner import remove
 from colmap_inertial.pipeline.run.session import Session
 from colmap_inertial.reconstruction.drivers.result import ModelResult
-from colmap_inertial.reconstruction.preparation.geolocation import cameras_as_json, on_earth
+from colmap_inertial.reconstruction.preparation.geolocation import cameras_as_json, georeference_path
 
 log = logging.getLogger(__name__)
 
@@ -62,7 +62,7 @@ def run_georeference(
         for index, folder in metric.items():
             path, _ = trajectory_from_model(read_model(folder), timing, covariances=False)
             try:
-                found = on_earth(fixes, path, -DOWN_IN_WORLD[world])
+                found = georeference_path(fixes, path, -DOWN_IN_WORLD[world])
             except NotObservableError as error:
                 outcomes.append(_Outcome(index=index, unobservable=error.quantity, hint=error.hint))
                 written.append({"model": index, "error": str(error)})

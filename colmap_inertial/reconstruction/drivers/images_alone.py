@@ -20,7 +20,7 @@ from colmap_inertial.io.files import StrPath, path_in, read_json, structured, wr
 from colmap_inertial.io.frames import image_names, picture_folders, read_frame_timing, read_frames
 from colmap_inertial.io.images import read_image
 from colmap_inertial.io.imu import read_capture_imu
-from colmap_inertial.pipeline.run.context import Recording, RunContext, corrected_imu, prior_calibration
+from colmap_inertial.pipeline.run.context import Recording, RunContext, correct_imu, prior_calibration
 from colmap_inertial.pipeline.run.progress import Progress, silent
 from colmap_inertial.pipeline.run.runner import fingerprint, remove
 from colmap_inertial.pipeline.run.session import Session, open_session
@@ -42,7 +42,7 @@ from colmap_inertial.pipeline.stages.inputs import Fuser, StageInputs, lsd2_fuse
 from colmap_inertial.pipeline.stages.protocols import FrameStage
 from colmap_inertial.reconstruction.drivers.frames import run_frames, run_images, write_contact_sheet
 from colmap_inertial.reconstruction.drivers.result import frame_as_json, imaging_as_json
-from colmap_inertial.reconstruction.preparation.plan import Treatments, run_plan, with_stated_exposures
+from colmap_inertial.reconstruction.preparation.plan import Treatments, add_stated_exposures, run_plan
 
 _SHEET = "sheet.json"
 
@@ -170,12 +170,12 @@ def deblur_capture(
         _require_free_sheet(sheet, Path(out))
     imu = read_capture_imu(loaded)
     timing, frames = read_frames(loaded)
-    timing = with_stated_exposures(loaded, timing)
+    timing = add_stated_exposures(loaded, timing)
     check_pair_names(timing.names)
     options = ReconstructOptions(
         deblur=method, rolling_shutter="rectify" if rectify else "off", calibration=list_paths(calibration)
     )
-    imu = corrected_imu(loaded, imu, calibration)
+    imu = correct_imu(loaded, imu, calibration)
     recording = Recording.of(loaded, imu, timing, prior_calibration(loaded, calibration))
     with _open_session(out, loaded, options, progress, "deblur") as session:
         workspace = session.workspace
@@ -346,14 +346,14 @@ def fuse_exposures_captured(
     fuser = fuser or lsd2_fuser(options)
     long = loaded.exposures.files(names)
     if loaded.frames.times is not None:
-        timing = with_stated_exposures(loaded, read_frame_timing(loaded))
+        timing = add_stated_exposures(loaded, read_frame_timing(loaded))
         names = list(timing.names)
     note = "short and long exposures are fused, aligned by the pixels alone: no gyroscope"
     recording = None
     if timing is None:
         note = note.replace("no gyroscope", "the frames have no times")
     elif loaded.imu is not None:
-        imu = corrected_imu(loaded, read_capture_imu(loaded), calibration)
+        imu = correct_imu(loaded, read_capture_imu(loaded), calibration)
         recording = Recording.of(loaded, imu, timing, prior)
     with _open_session(out, loaded, options, progress, "fuse-exposures") as session:
         plan = ImagingPlan(deblur_note=note)

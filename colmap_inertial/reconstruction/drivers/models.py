@@ -121,7 +121,7 @@ def run_models(
             remove(path)
         for path in workspace.report_data.glob("model_*.json"):
             remove(path)
-        kept, left_out = _without_fragments(found, keep=fragments)
+        kept, left_out = _select_models(found, keep=fragments)
         read_in = (
             Model(
                 reconstruction=submodels.read(found[number]),
@@ -133,7 +133,7 @@ def run_models(
             for number in kept
         )
         place_of = {number: number if numbered else place for place, number in enumerate(kept)}
-        made, gaps = _through_stages(session, recording, stages, read_in, place_of, found, numbered=numbered)
+        made, gaps = _run_stages(session, recording, stages, read_in, place_of, found, numbered=numbered)
         small = [replace(one, sparse=_within(workspace.root, one.sparse)) for one in left_out]
         beside = tuple(
             _within(workspace.root, workspace.sparse / str(part.colmap_index))
@@ -176,7 +176,7 @@ def _forget_where_gone(record: Path, root: Path) -> None:
         remove(record)
 
 
-def _without_fragments(found: Mapping[int, Path], *, keep: bool) -> tuple[list[int], list[Fragment]]:
+def _select_models(found: Mapping[int, Path], *, keep: bool) -> tuple[list[int], list[Fragment]]:
     """COLMAP's numbers of the models to go on with, the largest first; and what is too small."""
     sizes = {number: num_registered(folder) for number, folder in found.items()}
     order = sorted(found, key=lambda number: (-sizes[number], number))
@@ -188,7 +188,7 @@ def _without_fragments(found: Mapping[int, Path], *, keep: bool) -> tuple[list[i
     return kept, left_out
 
 
-def _through_stages(
+def _run_stages(
     session: Session,
     recording: Recording,
     stages: Sequence[ModelStage],

@@ -47,21 +47,21 @@ from colmap_inertial.model import (
 from colmap_inertial.model.copying import list_tree
 from colmap_inertial.model.layout import read_layout
 from colmap_inertial.model.similarities import ModelScale, read_similarity
-from colmap_inertial.pipeline.run.context import Recording, RunContext, corrected_imu, prior_calibration
+from colmap_inertial.pipeline.run.context import Recording, RunContext, correct_imu, prior_calibration
 from colmap_inertial.pipeline.run.progress import Progress, silent
 from colmap_inertial.pipeline.run.runner import fingerprint
 from colmap_inertial.pipeline.run.session import Session, open_session, warn_of_conflicts
 from colmap_inertial.pipeline.run.workspace import Workspace
 from colmap_inertial.pipeline.stages.defaults import default_model_stages
 from colmap_inertial.pipeline.stages.inputs import StageInputs
-from colmap_inertial.pipeline.stages.protocols import ModelStage, with_defaults
+from colmap_inertial.pipeline.stages.protocols import ModelStage, insert_defaults
 from colmap_inertial.reconstruction.drivers.georeference import run_georeference
 from colmap_inertial.reconstruction.drivers.models import Submodels, run_dense_models, run_models, run_validation
 from colmap_inertial.reconstruction.drivers.project_output import place_project, require_free_names
 from colmap_inertial.reconstruction.drivers.reporting import report_result, reporting_stops, write_recording
 from colmap_inertial.reconstruction.drivers.result import Fragment, ModelResult, ReconstructResult
 from colmap_inertial.reconstruction.preparation.geolocation import positions_of
-from colmap_inertial.reconstruction.preparation.preflight import checked_imu, run_preflight
+from colmap_inertial.reconstruction.preparation.preflight import check_imu, run_preflight
 
 if TYPE_CHECKING:
     import pycolmap
@@ -188,8 +188,8 @@ def _reconstruct(
         poses = _trajectory(largest, timing)
         doubts = run_preflight(session, recording, given.raw, findings, force=options.force, model=poses)
         recording = dataclasses.replace(recording, doubts=doubts)
-        inputs = StageInputs(recording=recording, options=_as_mapped(options))
-        stages = with_defaults(model_stages, default_model_stages(inputs))
+        inputs = StageInputs(recording=recording, options=_hold_cameras(options))
+        stages = insert_defaults(model_stages, default_model_stages(inputs))
         submodels = Submodels(folders=models, numbered=True, after=(), read=read)
         results, fragments, gaps = run_models(session, recording, stages, submodels, fragments=options.fragments)
         read.cache_clear()
@@ -221,7 +221,7 @@ def _trajectory(model: pycolmap.Reconstruction, timing: FrameTiming) -> CameraTr
         return "untimed"
 
 
-def _as_mapped(options: ReconstructOptions) -> ReconstructOptions:
+def _hold_cameras(options: ReconstructOptions) -> ReconstructOptions:
     """The options, with a project's cameras held where a refinement is not asked to change them, too."""
     if options.refine == "off" or options.mapping.refine_intrinsics is not None:
         return options
@@ -291,21 +291,21 @@ def _read_sources(project: Path, source: ProjectOptions, options: ReconstructOpt
     shared = any(c.shared_clock for c in captures) and not own_clock
     capture = dataclasses.replace(capture, path=project, frames=frames, shared_clock=shared)
     if source.video is not None:
-        capture = _with_video(capture, source.video, None if times in described else times)
+        capture = _add_video(capture, source.video, None if times in described else times)
     elif frames is None and not (times or source.name_times is not None or source.exif_times):
         raise TimingError(f"{project}: nothing says when its images were taken: {_HOW_TIMES}")
-    raw = checked_imu(raw, force=options.force)
+    raw = check_imu(raw, force=options.force)
     return _Given(
         source=source,
         capture=capture,
         raw=raw,
         calibration_files=describe_files(options.calibration),
         prior=prior_calibration(capture, options.calibration),
-        imu=corrected_imu(capture, raw.imu, options.calibration),
+        imu=correct_imu(capture, raw.imu, options.calibration),
     )
 
 
-def _with_video(capture: Capture, video: Path, times: Path | None) -> Capture:
+def _add_video(capture: Capture, video: Path, times: Path | None) -> Capture:
     """The capture with all frames of a video; what the recorder noted about them counts where it is the recorder's."""
     frames = Video(file=video) if not isinstance(capture.frames, Video) else capture.frames
     if not isinstance(capture.frames, Video) and (recording := find_recording(video)) is not None:

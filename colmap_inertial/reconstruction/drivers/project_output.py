@@ -101,13 +101,13 @@ def place_project(
         "project": fingerprint(project),
         "source": source,
     }
-    if not workspace.placed.is_file() or not all(os.path.lexists(path) for path in placed_paths(workspace)):
+    if not workspace.placed.is_file() or not all(os.path.lexists(path) for path in list_placed_paths(workspace)):
         session.runner.forget("apply")
     session.runner.run("apply", depends, [], work)
     return workspace.root
 
 
-def placed_paths(workspace: Workspace) -> list[Path]:
+def list_placed_paths(workspace: Workspace) -> list[Path]:
     """What came from the project into the folder; a killed run may have left part of it."""
     if not workspace.placed.is_file():
         return []
@@ -120,7 +120,7 @@ def placed_paths(workspace: Workspace) -> list[Path]:
 
 def remove_placed(workspace: Workspace) -> None:
     """Take away what came from the project."""
-    for path in placed_paths(workspace):
+    for path in list_placed_paths(workspace):
         if path.is_symlink():
             path.unlink()
         else:
@@ -196,7 +196,7 @@ def remove_stale_dense(workspace: Workspace, models: Mapping[int, Path]) -> None
         The metric models that are there, by their numbers.
     """
     places = [place for place in (workspace.dense, workspace.earlier) if place.is_dir()]
-    if not places or workspace.dense in placed_paths(workspace):  # the project's own goes with its models
+    if not places or workspace.dense in list_placed_paths(workspace):  # the project's own goes with its models
         return
     digests = {index: digest(model) for index, model in models.items()}
     for folder in sorted(workspace.dense.glob("*")):

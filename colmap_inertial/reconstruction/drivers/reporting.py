@@ -37,7 +37,7 @@ from colmap_inertial.pipeline.stages.metric import gravity_in_model
 from colmap_inertial.pipeline.stages.protocols import KeypointStage
 from colmap_inertial.reconstruction.drivers.project_output import withdraw
 from colmap_inertial.reconstruction.drivers.result import ReconstructResult, result_as_json
-from colmap_inertial.reconstruction.preparation.sampling import guessed_camera
+from colmap_inertial.reconstruction.preparation.sampling import guess_camera
 
 log = logging.getLogger(__name__)
 
@@ -91,7 +91,7 @@ def _shutter_record(
     """By how much keypoints move: of some frames the largest shift, and that of the worst one over the image."""
     if not rectified:
         return None
-    timing, camera = recording.timing, guessed_camera(recording.capture, recording.timing)
+    timing, camera = recording.timing, guess_camera(recording.capture, recording.timing)
     x = (np.arange(_GRID) + 0.5) * camera.width / _GRID
     y = (np.arange(_GRID) + 0.5) * camera.height / _GRID
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

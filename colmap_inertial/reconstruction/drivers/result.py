@@ -228,7 +228,7 @@ def _change(first: CameraImuCalibration, refined: CameraImuCalibration | None) -
     }
 
 
-def measured_as_json(found: Validation | Georeference | InertialError | None) -> dict[str, Any] | None:
+def measurement_as_json(found: Validation | Georeference | InertialError | None) -> dict[str, Any] | None:
     """What was measured in a model, or why it could not be."""
     if found is None:
         return None
@@ -267,8 +267,8 @@ def result_as_json(result: ReconstructResult, capture: Capture) -> dict[str, obj
                 "calibration_change": None
                 if plan.view is None
                 else _change(plan.view.calibration, model.scale.calibration),
-                "validation": measured_as_json(model.validation),
-                "georeference": measured_as_json(model.georeference),
+                "validation": measurement_as_json(model.validation),
+                "georeference": measurement_as_json(model.georeference),
                 "readout_translation": next((t.values for t in model.treatments if t.stage == "readout"), None),
                 "joined_of": [_part_as_json(part) for part in model.parts],
                 "treatments": [asdict(treatment) for treatment in model.treatments],

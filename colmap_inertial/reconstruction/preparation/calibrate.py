@@ -34,12 +34,12 @@ from colmap_inertial.model import find_models, read_model, trajectory_from_model
 from colmap_inertial.motion.align import AlignOptions, align_clocks
 from colmap_inertial.motion.flow import VisualRotation, check_motion, find_stabilisation
 from colmap_inertial.pipeline.run.context import Recording, RunContext
-from colmap_inertial.pipeline.stages.frame_folder import encode_image, seen_by_colmap
+from colmap_inertial.pipeline.stages.frame_folder import encode_image, smooth_for_colmap
 from colmap_inertial.pipeline.stages.imaging_plan import GyroView
 from colmap_inertial.pipeline.stages.protocols import FrameStage
 from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage
 from colmap_inertial.reconstruction.preparation.sampling import (
-    guessed_camera,
+    guess_camera,
     measure_sampled_rotation,
     sample_middle,
     sample_spaced,
@@ -116,7 +116,7 @@ def estimate_preliminary_calibration(recording: Recording, context: RunContext) 
         Where the frames do not turn as the gyroscope does, or were stabilised.
     """
     capture, timing, every, progress = recording.capture, recording.timing, recording.every, context.progress
-    camera = guessed_camera(capture, timing)
+    camera = guess_camera(capture, timing)
     is_video = len(every.t_s) > 1 and float(np.median(np.diff(every.t_s))) <= _LIMITS.video_step_s
     rotation_rad, offset_s = _sigmas(recording.prior)
     declared = rotation_rad <= _LIMITS.good_rotation_rad and offset_s <= _LIMITS.good_offset_s
@@ -130,10 +130,10 @@ def estimate_preliminary_calibration(recording: Recording, context: RunContext) 
             imu=recording.imu, timing=timing, calibration=recording.prior, camera=camera, source="capture", notes=notes
         )
     else:
-        found, models = _by_model(recording, context)
+        found, models = _calibrate_by_model(recording, context)
         if isinstance(found, NotObservableError):
             rotation = rotation or measure_sampled_rotation(capture, every, camera, along, progress)
-            found = _by_pixels(rotation, recording, camera, found)
+            found = _calibrate_by_pixels(rotation, recording, camera, found)
     if rotation is not None:
         known_s = None if isinstance(found, NotObservableError) else found.motion().offset_s
         stabilised = find_stabilisation(rotation, recording.imu, offset_s=known_s)
@@ -196,7 +196,7 @@ def _sigmas(calibration: CameraImuCalibration) -> tuple[float, float]:
     return rotation, calibration.clock_sigma_s
 
 
-def _by_pixels(
+def _calibrate_by_pixels(
     rotation: VisualRotation, recording: Recording, camera: CameraModel, instead_of: NotObservableError
 ) -> GyroView | NotObservableError:
     try:
@@ -222,7 +222,7 @@ def _aligned(trajectory: CameraTrajectory, recording: Recording, camera: CameraM
     )
 
 
-def _by_model(
+def _calibrate_by_model(
     recording: Recording, context: RunContext
 ) -> tuple[GyroView | NotObservableError, tuple[pycolmap.Reconstruction, ...]]:
     """The calibration by a small model; with a rolling shutter, by a second one of rectified keypoints.
@@ -274,7 +274,7 @@ def _image_folder(
     for frame in frames:
         target = path_in(images, frame.name)
         target.parent.mkdir(parents=True, exist_ok=True)
-        encode_image(target, seen_by_colmap(frame))
+        encode_image(target, smooth_for_colmap(frame))
     return images
 
 

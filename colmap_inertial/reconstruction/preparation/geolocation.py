@@ -70,7 +70,9 @@ def located(fixes: PositionFixes, path: CameraTrajectory) -> tuple[PositionFixes
     return fixes.select(here), centres, t_s
 
 
-def on_earth(fixes: PositionFixes, path: CameraTrajectory, up_in_world: Array, *, timed: bool = True) -> Georeference:
+def georeference_path(
+    fixes: PositionFixes, path: CameraTrajectory, up_in_world: Array, *, timed: bool = True
+) -> Georeference:
     """How a metric path stands on Earth; raises :class:`NotObservableError` where the positions leave it open.
 
     ``timed``: whether the path's times are true; without, nothing tells where the camera was a moment before.

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence, shown_shares
+from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence, measure_blur_shares
 from colmap_inertial.imaging.gate import (
     GATE_LIMITS,
     FrameDecision,
@@ -147,7 +147,7 @@ def _look(
     for frame in counted(frames, len(chosen), "blur", progress):
         shutter, parallax = view.shutter(index[frame.name]), parallaxes.get(frame.name)
         path = blur_path(motion, camera, shutter, parallax=parallax, extent_factor=factor)
-        share, mirrored = shown_shares(frame.image, path)
+        share, mirrored = measure_blur_shares(frame.image, path)
         looked.append(Looked(blur_evidence(frame.image, path), share, blur_px[frame.name], mirrored))
     return looked
 
@@ -180,10 +180,10 @@ def _together(evidence: Sequence[BlurEvidence]) -> float:
 
 def judged(looked: Sequence[Looked]) -> RecordingVerdict:
     """What frames say together, and whether nearly each of them does."""
-    return by_frame(below_sky(judge_recording([one.evidence for one in looked]), looked), looked)
+    return judge_each_frame(judge_sky(judge_recording([one.evidence for one in looked]), looked), looked)
 
 
-def below_sky(verdict: RecordingVerdict, looked: Sequence[Looked]) -> RecordingVerdict:
+def judge_sky(verdict: RecordingVerdict, looked: Sequence[Looked]) -> RecordingVerdict:
     """The verdict; or trust, where the frames are mostly sky and what stands below it falls off as it should."""
     gains = np.array([one.gain for one in looked if one.is_mostly_sky and np.isfinite(one.gain)])
     if verdict.trusted is not False or len(gains) < max(_LIMITS.sky_frames, len(looked) / 2):
@@ -196,7 +196,7 @@ def below_sky(verdict: RecordingVerdict, looked: Sequence[Looked]) -> RecordingV
     return replace(verdict, trusted=True, support=sigmas, extent_factor=1.0, reason=reason)
 
 
-def by_frame(verdict: RecordingVerdict, looked: Sequence[Looked]) -> RecordingVerdict:
+def judge_each_frame(verdict: RecordingVerdict, looked: Sequence[Looked]) -> RecordingVerdict:
     """The verdict, unless only some of the frames bear it out: then every frame must do so by itself.
 
     So it is where the camera moves close to things: they blur by translation, too, which no gyroscope feels.

@@ -22,7 +22,7 @@ from colmap_inertial.imaging.gate import (
     decide,
 )
 from colmap_inertial.imaging.parallax import Parallax
-from colmap_inertial.imaging.psf import predicted_blur_px
+from colmap_inertial.imaging.psf import predict_blur_px
 from colmap_inertial.imaging.restoration.shipped import checksum
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.exif import read_exposures_s
@@ -35,7 +35,7 @@ from colmap_inertial.pipeline.stages.deblur import DeblurStage
 from colmap_inertial.pipeline.stages.imaging_plan import GyroView, ImagingPlan, read_plan, write_plan
 from colmap_inertial.reconstruction.preparation.calibrate import estimate_preliminary_calibration, survey, survey_parts
 from colmap_inertial.reconstruction.preparation.judge import judge_frames
-from colmap_inertial.reconstruction.preparation.sampling import guessed_camera
+from colmap_inertial.reconstruction.preparation.sampling import guess_camera
 from colmap_inertial.reconstruction.preparation.translation import (
     find_parallaxes,
     most_by_sliding_px,
@@ -72,7 +72,7 @@ _LIMITS = PlanLimits()
 _SAID_OF = {"deepgyro": "; the network DeepGyro undoes it", "path": "; the half-quadratic filter undoes it"}
 
 
-def with_stated_exposures(capture: Capture, timing: FrameTiming) -> FrameTiming:
+def add_stated_exposures(capture: Capture, timing: FrameTiming) -> FrameTiming:
     """The timing with exposure times from the pictures' EXIF, where nothing else gives them."""
     source = capture.image_folder
     if timing.exposure_s is not None or source is None:
@@ -146,7 +146,7 @@ def plan_imaging(recording: Recording, context: RunContext, asked: Treatments) -
     Parameters
     ----------
     recording
-        See :func:`with_stated_exposures`.
+        See :func:`add_stated_exposures`.
     context
         ``progress`` is called with ``"motion"``, ``"calibration"``, ``"survey"`` and ``"blur"``.
     asked
@@ -171,13 +171,13 @@ def plan_imaging(recording: Recording, context: RunContext, asked: Treatments) -
         method="wiener" if asked.deblur is None or asked.deblur == "off" else asked.deblur,
         rectify=not no_rectifying,
         deblur_note=why_not,
-        rolling_shutter_note=no_rectifying or _rectified_note(capture, timing),
+        rolling_shutter_note=no_rectifying or _describe_rectification(capture, timing),
     )
     if why_not and not plan.rectify and not asked.pairs:
         return plan
     no_gyro = _no_gyro_for_pairs(recording) if asked.pairs else ""
     if not plan.rectify and no_gyro:
-        return replace(plan, deblur_note=_aligned_note(no_gyro))
+        return replace(plan, deblur_note=_describe_fusion(no_gyro))
     try:
         found = estimate_preliminary_calibration(recording, context)
     except NotObservableError as error:
@@ -185,12 +185,12 @@ def plan_imaging(recording: Recording, context: RunContext, asked: Treatments) -
             raise
         untreated = f"frames stay as they were filmed: {error}"
         return ImagingPlan(
-            deblur_note=_aligned_note(str(error)) if asked.pairs else why_not or untreated,
+            deblur_note=_describe_fusion(str(error)) if asked.pairs else why_not or untreated,
             rolling_shutter_note=untreated if plan.rectify else plan.rolling_shutter_note,
         )
     plan = replace(plan, view=found.view)
     if asked.pairs:
-        return replace(plan, deblur_note=_aligned_note(no_gyro))
+        return replace(plan, deblur_note=_describe_fusion(no_gyro))
     if why_not:
         return plan
 
@@ -222,7 +222,7 @@ def _no_rectifying(timing: FrameTiming, asked: Treatments) -> str:
     return "" if timing.readout_s else "global shutter"
 
 
-def _rectified_note(capture: Capture, timing: FrameTiming) -> str:
+def _describe_rectification(capture: Capture, timing: FrameTiming) -> str:
     source = f" ({capture.readout_source})" if capture.readout_source else ""
     return f"keypoints are rectified, readout {1e3 * (timing.readout_s or 0):.1f} ms{source}"
 
@@ -244,7 +244,7 @@ def _no_deblurring(recording: Recording, asked: Treatments, progress: Progress) 
             "frames stay as they were filmed: the exposure time is unknown; give exposure_s under [timing] in "
             "capture.toml, or a column of it in the frame times"
         )
-    camera = guessed_camera(recording.capture, timing)
+    camera = guess_camera(recording.capture, timing)
     most_px = _most_turned_rad(recording, timing.exposure_s) * 1.2 * colmap_camera(camera).mean_focal_length()
     limit_px = _limit_px(camera)
     if most_px >= limit_px:
@@ -290,7 +290,7 @@ def _no_gyro_for_pairs(recording: Recording) -> str:
     return ""
 
 
-def _aligned_note(no_gyro: str) -> str:
+def _describe_fusion(no_gyro: str) -> str:
     return "short and long exposures are fused, aligned by the " + (
         f"pixels alone: {no_gyro}" if no_gyro else "gyroscope and the pixels"
     )
@@ -312,7 +312,7 @@ def _deblurring(
     """
     decisions = _decisions(view, {})
     segments = survey_parts(view.timing)
-    turning = set(_by_segment(_to_deblur(decisions), segments, view)) if _blurred(decisions) else set()
+    turning = set(_group_by_segment(_select_blurred(decisions), segments, view)) if _blurred(decisions) else set()
     others = [i for i in range(len(segments)) if i not in turning]
     pending = turning.union(itertools.compress(others, sliding([segments[i] for i in others])))
     if not pending:
@@ -329,7 +329,7 @@ def _deblurring(
             break
         parallaxes = _merge_parallaxes(surveys, segments, view)
         treated = _decided(plan, view, capture, parallaxes, progress)
-        blurred = _by_segment(_to_deblur(_decisions(view, parallaxes)), segments, view)
+        blurred = _group_by_segment(_select_blurred(_decisions(view, parallaxes)), segments, view)
         registered = {name for surveyed in surveys.values() for name in surveyed.registered}
         pending = {i for i, names in blurred.items() if names & set(segments[i]) - registered}
         if not parallaxes or not pending or treated.deblur is None:
@@ -338,7 +338,7 @@ def _deblurring(
     return treated
 
 
-def _by_segment(names: Iterable[str], segments: Sequence[Sequence[str]], view: GyroView) -> dict[int, set[str]]:
+def _group_by_segment(names: Iterable[str], segments: Sequence[Sequence[str]], view: GyroView) -> dict[int, set[str]]:
     """Names of frames by the index of the segment whose time they lie in."""
     place, t_s = view.index(), view.timing.t_s
     begins_s = t_s[[place[segment[0]] for segment in segments]]
@@ -353,7 +353,7 @@ def _merge_parallaxes(
 ) -> dict[str, Parallax]:
     """Parallaxes by frame name; of two segments that have one for a frame, its own goes first."""
     merged = {name: parallax for surveyed in surveys.values() for name, parallax in surveyed.parallaxes.items()}
-    own = _by_segment(merged, segments, view)
+    own = _group_by_segment(merged, segments, view)
     for i, surveyed in surveys.items():
         merged |= {name: surveyed.parallaxes[name] for name in own.get(i, ()) if name in surveyed.parallaxes}
     return merged
@@ -372,7 +372,7 @@ class _Surveyed:
         return cls(parallaxes=find_parallaxes(models, view), registered=registered)
 
 
-def _to_deblur(decisions: Sequence[FrameDecision]) -> set[str]:
+def _select_blurred(decisions: Sequence[FrameDecision]) -> set[str]:
     return {decision.name for decision in decisions if decision.action == "deblur"}
 
 
@@ -380,7 +380,7 @@ def _decisions(view: GyroView, parallaxes: Mapping[str, Parallax]) -> tuple[Fram
     """What to do with each frame, before any is looked at."""
     width, height = view.camera.width, view.camera.height
     motion, camera = view.motion(), colmap_camera(view.camera)
-    predicted = predicted_blur_px(motion, camera, view.timing, width=width, height=height, parallaxes=parallaxes)
+    predicted = predict_blur_px(motion, camera, view.timing, width=width, height=height, parallaxes=parallaxes)
     return _keeping_ends(decide(predicted, view.timing.t_s, width=width, height=height, motion=motion))
 
 
@@ -401,7 +401,7 @@ def _decided(
         return replace(plan, deblur_note=f"frames stay as they were filmed: the gyroscope predicts {most} of blur")
     verdict = judge_frames(view, capture, chosen, parallaxes, progress)
     note = f"{sum(d.action == 'deblur' for d in decisions)} of {len(decisions)} frames are blurred; {verdict.reason}"
-    used = {name: parallaxes[name] for name in _to_deblur(decisions) if name in parallaxes}
+    used = {name: parallaxes[name] for name in _select_blurred(decisions) if name in parallaxes}
     if used:
         note += f"; the camera's translation is counted in for {len(used)} frames"
     if plan.method in _SAID_OF and verdict.trusted is not False:

@@ -23,7 +23,7 @@ from colmap_inertial.pipeline.run.context import Recording
 from colmap_inertial.pipeline.run.progress import Progress, counted
 from colmap_inertial.pipeline.run.session import Session
 from colmap_inertial.reconstruction.preparation.sampling import (
-    guessed_camera,
+    guess_camera,
     measure_sampled_rotation,
     sample_beginning,
     some_frames,
@@ -40,7 +40,7 @@ _FEW, _FEW_SPACING_S = 90, 0.09
 _COMPARED = 60
 
 
-def checked_imu(raw: RawImu, *, force: bool) -> RawImu:
+def check_imu(raw: RawImu, *, force: bool) -> RawImu:
     """An inertial recording, refused where its numbers are implausible.
 
     Parameters
@@ -146,7 +146,7 @@ def follow_video(
     if len(timing.t_s) < 2 or float(np.median(np.diff(timing.t_s))) > _VIDEO_STEP_S:
         return None
     indices = sample_beginning(timing, spacing_s, most)
-    return measure_sampled_rotation(capture, timing, guessed_camera(capture, timing), indices, progress)
+    return measure_sampled_rotation(capture, timing, guess_camera(capture, timing), indices, progress)
 
 
 def compare_pictures(capture: Capture, timing: FrameTiming, progress: Progress) -> VisualRotation | None:
@@ -156,6 +156,6 @@ def compare_pictures(capture: Capture, timing: FrameTiming, progress: Progress) 
     first = max(0, (len(timing.t_s) - _COMPARED) // 2)
     indices = range(first, min(first + _COMPARED, len(timing.t_s)))
     frames = counted(some_frames(capture, timing, indices), len(indices), "motion", progress)
-    camera = colmap_camera(guessed_camera(capture, timing))
+    camera = colmap_camera(guess_camera(capture, timing))
     with one_blas_thread():
         return measure_two_view_rotations(frames, camera, timing)

@@ -45,7 +45,7 @@ def some_frames(capture: Capture, timing: FrameTiming, indices: Sequence[int]) -
         yield Frame(name=timing.names[i], image=image, t_s=float(timing.t_s[i]), camera=capture.camera)
 
 
-def guessed_camera(capture: Capture, timing: FrameTiming) -> CameraModel:
+def guess_camera(capture: Capture, timing: FrameTiming) -> CameraModel:
     """The declared intrinsics, or what COLMAP starts from without any."""
     if capture.camera is not None:
         return capture.camera

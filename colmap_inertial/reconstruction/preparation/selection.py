@@ -22,7 +22,7 @@ from colmap_inertial.core.options import FrameOptions
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import CameraModel, FrameTiming
 from colmap_inertial.imaging.gyro_camera import GyroCamera
-from colmap_inertial.imaging.psf import predicted_blur_px
+from colmap_inertial.imaging.psf import predict_blur_px
 from colmap_inertial.imaging.selection import Chosen, Ranked, Ranking, WindowLimits, choose_frames
 from colmap_inertial.io.capture import Capture, Video
 from colmap_inertial.io.files import read_json, write_json
@@ -36,7 +36,7 @@ from colmap_inertial.pipeline.run.runner import remove
 from colmap_inertial.pipeline.run.session import Session
 from colmap_inertial.pipeline.run.workspace import a_record_of_ours
 from colmap_inertial.reconstruction.preparation.sampling import (
-    guessed_camera,
+    guess_camera,
     measure_sampled_rotation,
     sample_beginning,
 )
@@ -297,7 +297,7 @@ def _predicted(clocks: _Clocks, timing: FrameTiming) -> tuple[Array, Ranking]:
         return np.full(len(timing.t_s), np.nan), "speed"
     if clocks.oriented and timing.exposure_s is not None:
         width, height = clocks.camera.width, clocks.camera.height
-        blur = predicted_blur_px(motion, colmap_camera(clocks.camera), timing, width=width, height=height).px
+        blur = predict_blur_px(motion, colmap_camera(clocks.camera), timing, width=width, height=height).px
         return np.where(clocks.usable(timing.t_s), blur, np.nan), "blur"
     exposure_s = timing.exposure_s
     if exposure_s is None:
@@ -313,7 +313,7 @@ def _predicted(clocks: _Clocks, timing: FrameTiming) -> tuple[Array, Ranking]:
 
 def _clocks(recording: Recording, progress: Progress) -> _Clocks:
     capture, imu, timing, prior = recording.capture, recording.imu, recording.timing, recording.prior
-    camera = guessed_camera(capture, timing)
+    camera = guess_camera(capture, timing)
     rotation_rad = prior.rotation_sigma_rad
     offset_sigma_s = prior.clock_sigma_s
     known = _Clocks(
@@ -362,7 +362,7 @@ def _clocks(recording: Recording, progress: Progress) -> _Clocks:
     return _Clocks(
         motion=motion,
         oriented=True,
-        camera=camera if capture.camera is not None else _with_focal(camera, agreement.gain),
+        camera=camera if capture.camera is not None else _correct_focal(camera, agreement.gain),
         note=f"the clocks' offset was found by following pixels, to {1e3 * sigma_s:.1f} ms{rates}",
         offset_s=found.clock_offset_s,
         offset_sigma_s=sigma_s,
@@ -372,7 +372,7 @@ def _clocks(recording: Recording, progress: Progress) -> _Clocks:
     )
 
 
-def _with_focal(camera: CameraModel, gain: tuple[float, float, float]) -> CameraModel:
+def _correct_focal(camera: CameraModel, gain: tuple[float, float, float]) -> CameraModel:
     """A guessed camera, with the focal length for which pixels turn as far as the gyroscope felt."""
     known = [g for g in gain[:2] if np.isfinite(g)]
     if not known or not 0.4 < min(known) <= max(known) < 2.5:

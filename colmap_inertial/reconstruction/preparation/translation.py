@@ -28,7 +28,7 @@ from colmap_inertial.motion.lateral_flow import follow_pairs
 from colmap_inertial.pipeline.run.context import Recording
 from colmap_inertial.pipeline.run.progress import Progress, counted
 from colmap_inertial.pipeline.stages.imaging_plan import GyroView
-from colmap_inertial.pipeline.stages.metric import for_rectified, smoothed_path
+from colmap_inertial.pipeline.stages.metric import calibration_of_rectified, smoothed_path
 from colmap_inertial.reconstruction.preparation.sampling import some_frames
 
 if TYPE_CHECKING:
@@ -138,15 +138,15 @@ def find_parallaxes(models: Sequence[pycolmap.Reconstruction], view: GyroView) -
     out: dict[str, tuple[float, Parallax]] = {}
     for model in models:
         if model.num_reg_images() >= _LIMITS.model_images:
-            for name, away_s, parallax in _of_model(model, view):
+            for name, away_s, parallax in _measure_parallax(model, view):
                 if name not in out or away_s < out[name][0]:
                     out[name] = away_s, parallax
     return {name: parallax for name, (_, parallax) in out.items()}
 
 
-def _of_model(model: pycolmap.Reconstruction, view: GyroView) -> Iterator[tuple[str, float, Parallax]]:
+def _measure_parallax(model: pycolmap.Reconstruction, view: GyroView) -> Iterator[tuple[str, float, Parallax]]:
     """Names of frames, how far in time they are from the model's nearest one, and their parallax."""
-    calibration = for_rectified(view.calibration) if view.timing.readout_s else view.calibration
+    calibration = calibration_of_rectified(view.calibration) if view.timing.readout_s else view.calibration
     trajectory, _ = trajectory_from_model(model, view.timing)
     imu = view.timed().imu
     estimate = estimate_scale(trajectory, imu, calibration=calibration, options=ScaleOptions())

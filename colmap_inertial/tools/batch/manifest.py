@@ -11,7 +11,7 @@ from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, StageNames
 from colmap_inertial.io.files import StrPath, check_names
 from colmap_inertial.io.toml_section import Section, read_toml
-from colmap_inertial.pipeline.run.config import read_values, with_values
+from colmap_inertial.pipeline.run.config import override_options, read_values
 
 #: What the batch itself writes into its output folder.
 _RESERVED = ("status", "summary.csv", "summary.json")
@@ -147,12 +147,12 @@ def _capture(manifest: Path, table: Section, options: ReconstructOptions) -> Bat
     name = table.text("name")
     config = table.file("config")
     values = _table(table, "options")
-    project = with_values(ProjectOptions(), _table(table, "project"), manifest)
+    project = override_options(ProjectOptions(), _table(table, "project"), manifest)
     stages = _stages(table)
     table.finish()
     if config is not None:
-        options = with_values(options, read_values(config), config)
-    options = with_values(options, values, manifest)
+        options = override_options(options, read_values(config), config)
+    options = override_options(options, values, manifest)
     if name is None:
         resolved = source.resolve()
         name = resolved.parent.name if resolved.name == "capture.toml" else resolved.stem
@@ -165,7 +165,7 @@ def _capture(manifest: Path, table: Section, options: ReconstructOptions) -> Bat
 def _stages(table: Section) -> StageNames | None:
     values = _table(table, "stages")
     try:
-        return with_values(StageNames(), values, table.path) if "stages" in table else None
+        return override_options(StageNames(), values, table.path) if "stages" in table else None
     except FormatError as error:
         table.fail("stages", error.reason)
 

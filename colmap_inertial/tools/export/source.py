@@ -23,10 +23,10 @@ from colmap_inertial.model import read_model
 from colmap_inertial.model.nerf import NO_SCALE, NO_UP
 from colmap_inertial.pipeline.run.workspace import Workspace, a_record_of_ours, places_of
 from colmap_inertial.pipeline.stages.metric import motion_file
-from colmap_inertial.reconstruction.preparation.geolocation import on_earth, positions_of, read_georeference
+from colmap_inertial.reconstruction.preparation.geolocation import georeference_path, positions_of, read_georeference
 from colmap_inertial.tools.export.formats import sparse_points
 from colmap_inertial.tools.export.transforms import View
-from colmap_inertial.tools.export.undistort import Undistortion, needed_cameras
+from colmap_inertial.tools.export.undistort import Undistortion, list_needed_cameras
 from colmap_inertial.tools.view.sources import ViewSource, find_source
 
 if TYPE_CHECKING:
@@ -169,7 +169,7 @@ def read_source(
     )
 
 
-def placed_on_earth(out: Path, source: ExportSource, capture: Capture | None) -> Georeference:
+def find_georeference(out: Path, source: ExportSource, capture: Capture | None) -> Georeference:
     """Where on Earth a model stands: as its run found it, else by the positions of the capture or of its pictures.
 
     Raises
@@ -194,7 +194,7 @@ def placed_on_earth(out: Path, source: ExportSource, capture: Capture | None) ->
         raise FormatError(source.found.folder, "its pictures are not beside it: give --capture or --image-folder")
     if fixes.names is None and source.motion is None:
         raise FormatError(source.found.folder, "the run kept no times of its images, which positions in a video go by")
-    return on_earth(fixes, path, source.up_in_world, timed=bool(_times(source)))
+    return georeference_path(fixes, path, source.up_in_world, timed=bool(_times(source)))
 
 
 def _path(source: ExportSource) -> CameraTrajectory:
@@ -321,7 +321,7 @@ class ExportContent:
         """All but the pictures; cameras with ``square`` pixels where that is needed."""
         model, where = source.model, source.found.folder
         names = flat_names(model.image(i).name for i in model.reg_image_ids())
-        cameras = {i: Undistortion.of(model.camera(i), where, square=square) for i in needed_cameras(model)}
+        cameras = {i: Undistortion.of(model.camera(i), where, square=square) for i in list_needed_cameras(model)}
         views = [
             View(
                 name=names[image.name],

@@ -71,7 +71,7 @@ def exposures_of(
     NotObservableError
         Where no velocity is known, and where lines are read out in another direction than down.
     """
-    motion = _known_motion(source.motion, pictures)
+    motion = _require_motion(source.motion, pictures)
     readout_s = motion.readout_s or 0.0
     if motion.exposure_s is None and any(not picture.sharpened for picture in pictures.values()):
         notes.append("exposure times are not known and count as 0: blur is not modelled")
@@ -100,7 +100,7 @@ def exposures_of(
     return found
 
 
-def _known_motion(motion: CameraMotion | None, pictures: Mapping[str, Picture]) -> CameraMotion:
+def _require_motion(motion: CameraMotion | None, pictures: Mapping[str, Picture]) -> CameraMotion:
     """The motion, where it is known and a program can be told of the pictures' readout."""
     if motion is None or not motion.names:
         raise NotObservableError(

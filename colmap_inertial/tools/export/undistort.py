@@ -234,7 +234,7 @@ def pinhole_model(
     return made
 
 
-def needed_cameras(model: pycolmap.Reconstruction) -> list[int]:
+def list_needed_cameras(model: pycolmap.Reconstruction) -> list[int]:
     """Numbers of the cameras that registered images have, and of those on the same rigs."""
     import pycolmap
 

@@ -13,7 +13,7 @@ from colmap_inertial import __version__
 from colmap_inertial.core.arrays import AnyArray, UInt8Array
 from colmap_inertial.core.errors import FormatError, OutputError
 from colmap_inertial.core.options import ExportImages, ExportProgram
-from colmap_inertial.core.threads import frames_at_once, in_order
+from colmap_inertial.core.threads import frames_at_once, map_in_order
 from colmap_inertial.inertial.georeference import Georeference
 from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.files import StrPath, write_json
@@ -24,7 +24,7 @@ from colmap_inertial.model.nerf import EXPORT_FORMAT, NOT_METRES
 from colmap_inertial.pipeline.run.progress import Progress, silent
 from colmap_inertial.pipeline.stages.frame_folder import encode_image
 from colmap_inertial.reconstruction.preparation.geolocation import cameras_as_json
-from colmap_inertial.tools.export.source import ExportContent, Picture, placed_on_earth, read_source
+from colmap_inertial.tools.export.source import ExportContent, Picture, find_georeference, read_source
 from colmap_inertial.tools.export.targets import TARGETS, TRAINERS
 from colmap_inertial.tools.export.undistort import Undistortion
 
@@ -82,7 +82,7 @@ def write_pictures(jobs: Iterable[Job], count: int, progress: Progress) -> None:
         For a picture that cannot be read, or whose size is not the camera's.
     """
     progress("export", 0, count)
-    for done, _ in enumerate(in_order(Job.write, jobs, workers=frames_at_once()), start=1):
+    for done, _ in enumerate(map_in_order(Job.write, jobs, workers=frames_at_once()), start=1):
         progress("export", done, count)
 
 
@@ -210,7 +210,7 @@ def export_model(
         out, model=model, image_folder=None if image_folder is None else Path(image_folder), unscaled=unscaled
     )
     filmed = None if capture is None else load_capture(Path(capture))
-    on_map = placed_on_earth(out, source, filmed) if georeference else None
+    on_map = find_georeference(out, source, filmed) if georeference else None
     filmed = filmed if images == "original" else None
     with new_folder(folder, into_empty=True) as partial:
         content = ExportContent.of(source, on_map, square=target.square)
