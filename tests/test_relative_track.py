@@ -111,7 +111,7 @@ def test_covariances_of_the_track_are_the_scatter_of_tracks_whose_length_walks(s
 
 @pytest.mark.parametrize("most", [800, 3])
 def test_points_of_matches_are_those_of_a_search_through_all_of_them(monkeypatch, most):
-    monkeypatch.setattr(relative_track, "_MOST_OBSERVATIONS", most)
+    monkeypatch.setattr(relative_track, "_LIMITS", relative_track.TrackLimits(most_observations=most))
     rng = np.random.default_rng(9)
     # feature of 60 things in each of 6 frames; some matches of neighbours are false
     features = [60, 61, 62, 63, 64, 65]

@@ -38,23 +38,34 @@ from colmap_inertial.pipeline.run.context import Recording
 
 #: Optical axes farther apart than this share next to nothing, or than the field of view, where that is wider.
 APART_DEG = 90.0
-#: A pair is ruled out, and a rotation disagrees, beyond so many standard deviations.
-_SURE_SIGMAS = 3.0
-#: Errors of a gyroscope's gains and of its axes, as ``align`` allows for.
-_GAIN_SIGMA, _AXIS_SIGMA = 0.01, 0.005 / math.sqrt(2)
-#: Standard deviation of the rotation of two views far apart, whose matches may be few or on a plane.
-_TWO_VIEWS_RAD = math.radians(1.5)
-#: Pairs are left out whose planes meet worse than so many times the usual pair's.
-_OUTLIER = 3.0
-#: The bias is less sure than residuals say by this factor: matches of a pair err together.
-_LOOSER = 3.0
-#: Fewer pairs say too little.
-_LEAST_PAIRS = 8
-#: Matches of the usual pair lie about this close to their epipolar lines, or the gyroscope does not suit them: half a
-#: pixel on V1_01; where matches join copies of one thing, two.
-_LARGEST_PX = 1.0
-#: For derivatives: a tenth of a degree in a third of a second.
-_STEP_RAD_S = 5e-3
+
+
+@dataclass(frozen=True, kw_only=True)
+class OrientationLimits:
+    """How uncertain an uncalibrated gyroscope's orientations are."""
+
+    #: A pair is ruled out, and a rotation disagrees, beyond so many standard deviations.
+    sure_sigmas: float = 3.0
+    #: Errors of a gyroscope's gains and of its axes, as ``align`` allows for.
+    gain_sigma: float = 0.01
+    axis_sigma: float = 0.005 / math.sqrt(2)
+    #: Standard deviation of the rotation of two views far apart, whose matches may be few or on a plane.
+    two_views_rad: float = math.radians(1.5)
+    #: Pairs are left out whose planes meet worse than so many times the usual pair's.
+    outlier: float = 3.0
+    #: The bias is less sure than residuals say by this factor: matches of a pair err together.
+    looser: float = 3.0
+    #: Fewer pairs say too little.
+    least_pairs: int = 8
+    #: Matches of the usual pair lie about this close to their epipolar lines, or the gyroscope does not suit them: half
+    #: a pixel on V1_01; where matches join copies of one thing, two.
+    largest_px: float = 1.0
+    #: For derivatives: a tenth of a degree in a third of a second.
+    step_rad_s: float = 5e-3
+
+
+_LIMITS = OrientationLimits()
+
 #: The cross product: of vectors f and g, ``einsum("abc,b,c", _CROSS, f, g)``.
 _CROSS = np.stack([skew(axis) for axis in np.eye(3)], axis=1)
 
@@ -130,7 +141,9 @@ class GyroOrientations:
     def covariance(self, i: IndexArray, j: IndexArray) -> Array:
         """(M, 3, 3) of the rotation vectors between frames i and j, in the frame that all orientations are in."""
         bias = self.bias_lever_s[j] - self.bias_lever_s[i]
-        gain = (self.gain_lever_rad[j] - self.gain_lever_rad[i]) * np.array([*[_GAIN_SIGMA] * 3, *[_AXIS_SIGMA] * 3])
+        gain = (self.gain_lever_rad[j] - self.gain_lever_rad[i]) * np.array(
+            [*[_LIMITS.gain_sigma] * 3, *[_LIMITS.axis_sigma] * 3]
+        )
         dt_s = np.abs(self.t_s[j] - self.t_s[i])
         offset_rad = self.calibration.clock_sigma_s * np.hypot(self.rate_rad_s[i], self.rate_rad_s[j])
         noise = self.density_rad_s_rthz**2 * dt_s + self.walk_rad_s_rts**2 * dt_s**3 / 3 + offset_rad**2
@@ -150,13 +163,13 @@ class GyroOrientations:
         variance = np.einsum("ma,mab,mb->m", about, covariance, about)
         # close to opposite, the axis about which they would come together is any
         variance = np.where(sine < 0.1, np.trace(covariance, axis1=1, axis2=2), variance)
-        return np.asarray(self.known(i, j) & (angle - _SURE_SIGMAS * np.sqrt(variance) > self.apart_rad))
+        return np.asarray(self.known(i, j) & (angle - _LIMITS.sure_sigmas * np.sqrt(variance) > self.apart_rad))
 
     def agree(self, i: IndexArray, j: IndexArray, first_from_second: Array) -> BoolArray:
         """(M,) whether rotations (M, 3, 3) of camera i from j may be true; so where the gyroscope measured nothing."""
         turned = self.start_from_cam[i] @ first_from_second @ np.swapaxes(self.start_from_cam[j], 1, 2)
         off = so3_log(turned)
-        covariance = self.covariance(i, j) + _TWO_VIEWS_RAD**2 * np.eye(3)
+        covariance = self.covariance(i, j) + _LIMITS.two_views_rad**2 * np.eye(3)
         squared = np.sum(off * np.linalg.solve(covariance, off[..., None])[..., 0], axis=1)
         # three numbers: their squares add up to 3 on average, and to this once in a thousand times
         return np.asarray(~self.known(i, j) | (squared < 16.3))
@@ -268,7 +281,7 @@ def estimate_bias_correction(pairs: RayPairs, start_from_cam: Array, bias_lever_
     """
     from scipy.optimize import minimize
 
-    if len(pairs.first) < _LEAST_PAIRS:
+    if len(pairs.first) < _LIMITS.least_pairs:
         raise NotObservableError("gyroscope bias", f"{len(pairs.first)} pairs of neighbouring images are too few")
     before, after = start_from_cam[pairs.first], start_from_cam[pairs.second]
     rays_first = pairs.rays_first @ np.swapaxes(before, 1, 2)
@@ -293,7 +306,7 @@ def estimate_bias_correction(pairs: RayPairs, start_from_cam: Array, bias_lever_
         usual = max(float(np.median(spread(change))), 1e-12)
 
         def cost(x: Array, usual: float = usual) -> float:
-            ratio = spread(x) / (_OUTLIER * usual)
+            ratio = spread(x) / (_LIMITS.outlier * usual)
             return float(np.sum(ratio / (1 + ratio)))
 
         found = minimize(cost, change, method="Nelder-Mead", options={"xatol": 1e-6, "fatol": 1e-6, "maxiter": 400})
@@ -302,14 +315,14 @@ def estimate_bias_correction(pairs: RayPairs, start_from_cam: Array, bias_lever_
             break
     least = spread(change)
     variance = max(float(np.median(least)), 1e-12)
-    weight = pairs.rays_first.shape[1] / (1 + least / (_OUTLIER * variance)) ** 2 / variance
-    if variance > (_LARGEST_PX * pairs.pixel_rad) ** 2:
+    weight = pairs.rays_first.shape[1] / (1 + least / (_LIMITS.outlier * variance)) ** 2 / variance
+    if variance > (_LIMITS.largest_px * pairs.pixel_rad) ** 2:
         raise NotObservableError("gyroscope bias", "matches of neighbouring images suit no bias")
     information = _curvature(lambda x: float(weight @ spread(x)), change)
     values = np.linalg.eigvalsh(information)
     if values[0] <= 0:
         raise NotObservableError("gyroscope bias", "the matches of neighbouring images suit any bias")
-    return change, np.asarray(_LOOSER**2 * np.linalg.inv(information))
+    return change, np.asarray(_LIMITS.looser**2 * np.linalg.inv(information))
 
 
 def _squares(vectors: Array) -> Array:
@@ -319,7 +332,7 @@ def _squares(vectors: Array) -> Array:
 
 def _curvature(squares: Callable[[Array], float], at: Array) -> Array:
     """Half the second derivative of a sum of squares, (3, 3)."""
-    axes = _STEP_RAD_S * np.eye(3)
+    axes = _LIMITS.step_rad_s * np.eye(3)
     middle = squares(at)
     out = np.empty((3, 3))
     for a in range(3):
@@ -329,4 +342,4 @@ def _curvature(squares: Callable[[Array], float], at: Array) -> Array:
             else:
                 p, m = axes[a] + axes[b], axes[a] - axes[b]
                 out[a, b] = (squares(at + p) - squares(at + m) - squares(at - m) + squares(at - p)) / 4
-    return out / (2 * _STEP_RAD_S**2)
+    return out / (2 * _LIMITS.step_rad_s**2)

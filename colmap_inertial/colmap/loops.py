@@ -27,22 +27,35 @@ from colmap_inertial.colmap.two_views import (
 )
 from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 
-#: Frames among which loops are sought are about so far apart, and so many at most.
-_SPACING_S, _MOST_FRAMES = 1.0, 1000
-#: Candidates have at least so many quick matches, and are among the best so many of one of their frames.
-_LEAST_QUICK_MATCHES, _BEST = 6, 3
-#: A loop's matches cover this share of what both pictures show.
-_LEAST_COVERED = 0.5
-#: Places of a loop's frames and lengths by its matches are as sure as this share of how far away its points are.
-_PLACE_SIGMA, _LENGTH_SIGMA = 0.1, 0.1
-#: Frames farther apart than this many times how far away things are show nothing in common.
-_REACH, _SURE_SIGMAS = 2.0, 3.0
-#: Three numbers whose squares add up to more, each over its variance, disagree; one number likewise.
-_AGREE_3, _AGREE_1 = 16.3, 10.8
-#: Of loops that contradict each other, one must have so many times the matches behind it.
-_BY_FAR = 2.0
-#: So many of the pairs of frames beside a candidate must show the same loop.
-_LEAST_WITNESSES = 2
+
+@dataclass(frozen=True, kw_only=True)
+class LoopSearchLimits:
+    """Which images are compared for loops, and when a pair of places is one."""
+
+    #: Frames among which loops are sought are about so far apart, and so many at most.
+    spacing_s: float = 1.0
+    most_frames: int = 1000
+    #: Candidates have at least so many quick matches, and are among the best so many of one of their frames.
+    least_quick_matches: int = 6
+    best: int = 3
+    #: A loop's matches cover this share of what both pictures show.
+    least_covered: float = 0.5
+    #: Places of a loop's frames and lengths by its matches are as sure as this share of how far away its points are.
+    place_sigma: float = 0.1
+    length_sigma: float = 0.1
+    #: Frames farther apart than this many times how far away things are show nothing in common.
+    reach: float = 2.0
+    sure_sigmas: float = 3.0
+    #: Three numbers whose squares add up to more, each over its variance, disagree; one number likewise.
+    agree_3: float = 16.3
+    agree_1: float = 10.8
+    #: Of loops that contradict each other, one must have so many times the matches behind it.
+    by_far: float = 2.0
+    #: So many of the pairs of frames beside a candidate must show the same loop.
+    least_witnesses: int = 2
+
+
+_LIMITS = LoopSearchLimits()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +87,7 @@ class Loops:
 
 def key_frames(t_s: Array) -> IndexArray:
     """Frames about a second apart, or farther in a capture that is very long."""
-    spacing_s = max(_SPACING_S, float(t_s[-1] - t_s[0]) / _MOST_FRAMES)
+    spacing_s = max(_LIMITS.spacing_s, float(t_s[-1] - t_s[0]) / _LIMITS.most_frames)
     kept = [0]
     for i, at_s in enumerate(t_s.tolist()):
         if at_s - t_s[kept[-1]] >= 0.95 * spacing_s:
@@ -87,9 +100,9 @@ def candidates(matches: IndexArray, i: IndexArray, j: IndexArray) -> BoolArray:
     chosen = np.zeros(len(matches), dtype=np.bool_)
     for frame in np.unique(np.concatenate([i, j])):
         own = np.flatnonzero((i == frame) | (j == frame))
-        best = own[np.argsort(-matches[own], kind="stable")[:_BEST]]
+        best = own[np.argsort(-matches[own], kind="stable")[: _LIMITS.best]]
         chosen[best] = True
-    return chosen & (matches >= _LEAST_QUICK_MATCHES)
+    return chosen & (matches >= _LIMITS.least_quick_matches)
 
 
 def split_pairs(pairs: Sequence[FramePair]) -> IndexArray:
@@ -152,7 +165,7 @@ class LoopSearch:
         voted = set(zip(i[chosen].tolist(), j[chosen].tolist(), strict=True))
         a, b = split_pairs(doubtful)
         alike = ~self._surely_apart(a, b)
-        alike[alike] = self.covisibility.count(a[alike], b[alike]) >= _LEAST_QUICK_MATCHES
+        alike[alike] = self.covisibility.count(a[alike], b[alike]) >= _LIMITS.least_quick_matches
         first = sorted(voted.union(itertools.compress(doubtful, alike)))
         match([*neighbours, *first])
         verified, poses = self._judge(first)
@@ -163,7 +176,8 @@ class LoopSearch:
         match(more)
         verified_beside, poses_beside = self._judge(more)
         consistent = self.select_consistent({**poses, **poses_beside})
-        closed = {pair for pair in consistent & set(likely) if len(beside[pair] & consistent) >= _LEAST_WITNESSES}
+        enough = _LIMITS.least_witnesses
+        closed = {pair for pair in consistent & set(likely) if len(beside[pair] & consistent) >= enough}
         closed |= set().union(*(beside[pair] & consistent for pair in closed))
         delete_matches(self.database, name_pairs(self.names, [pair for pair in [*first, *more] if pair not in closed]))
         return Loops(
@@ -191,15 +205,15 @@ class LoopSearch:
         a, b = np.nonzero(np.triu(near, 1))
         early, late = self._displacements(i[a], i[b]), self._displacements(j[a], j[b])
         off = step[a] + ratio[a, None] * late[0] - early[0] - step[b]
-        noise = (_PLACE_SIGMA * np.hypot(depth[a], depth[b])) ** 2
-        noise = noise + (_LENGTH_SIGMA * np.linalg.norm(late[0], axis=1)) ** 2
+        noise = (_LIMITS.place_sigma * np.hypot(depth[a], depth[b])) ** 2
+        noise = noise + (_LIMITS.length_sigma * np.linalg.norm(late[0], axis=1)) ** 2
         covariance = early[1] + ratio[a, None, None] ** 2 * late[1] + noise[:, None, None] * np.eye(3)
-        apart = _squared(off, covariance) > _AGREE_3
+        apart = _squared(off, covariance) > _LIMITS.agree_3
         against = np.zeros((len(pairs), len(pairs)), dtype=np.bool_)
         against[a[apart], b[apart]] = against[b[apart], a[apart]] = True
         behind = (near & ~against) @ matches
         rival = np.max(np.where(against, behind, 0.0), axis=1)
-        return set(itertools.compress(pairs, (behind >= _BY_FAR * rival).tolist()))
+        return set(itertools.compress(pairs, (behind >= _LIMITS.by_far * rival).tolist()))
 
     def _displacements(self, i: IndexArray, j: IndexArray) -> tuple[Array, Array]:
         """(M, 3) displacements from frames i to frames j, in any order, and (M, 3, 3) their covariances."""
@@ -217,7 +231,9 @@ class LoopSearch:
             some = some[~apart[some] & self.track.known(i[some], j[some]) & np.isfinite(depth[i[some]])]
             displacement, covariance = self._displacements(i[some], j[some])
             sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
-            apart[some] = np.linalg.norm(displacement, axis=1) > _REACH * depth[i[some]] + _SURE_SIGMAS * sigma
+            apart[some] = (
+                np.linalg.norm(displacement, axis=1) > _LIMITS.reach * depth[i[some]] + _LIMITS.sure_sigmas * sigma
+            )
         return apart
 
     def _judge(self, pairs: Sequence[FramePair]) -> tuple[set[FramePair], dict[FramePair, LoopPose]]:
@@ -228,7 +244,7 @@ class LoopSearch:
         views = compare(self.database, name_pairs(self.names, pairs))
         verified = np.isfinite(views.first_from_second).all(axis=(1, 2))
         i, j = split_pairs(pairs)
-        likely = verified & (views.covered >= _LEAST_COVERED) & self.track.known(i, j)
+        likely = verified & (views.covered >= _LIMITS.least_covered) & self.track.known(i, j)
         likely[likely] = self.orientations.agree(i[likely], j[likely], views.first_from_second[likely])
         some = list(itertools.compress(pairs, likely))
         localised = localise_frames(self.database, self.names, some, self.track) if some else []
@@ -240,10 +256,10 @@ class LoopSearch:
             first_from_second = self.orientations.start_from_cam[i].swapaxes(1, 2) @ rotations
             displacement, covariance = self._displacements(i, j)
             off = displacement - np.array([pose.step for pose in loops])
-            noise = (_PLACE_SIGMA * np.array([pose.depth for pose in loops])) ** 2
-            longer = np.log([pose.ratio for pose in loops]) ** 2 / (DRIFT**2 * (j - i) + _LENGTH_SIGMA**2)
-            fits = _squared(off, covariance + noise[:, None, None] * np.eye(3)) < _AGREE_3
-            fits &= (longer < _AGREE_1) & self.orientations.agree(i, j, first_from_second)
+            noise = (_LIMITS.place_sigma * np.array([pose.depth for pose in loops])) ** 2
+            longer = np.log([pose.ratio for pose in loops]) ** 2 / (DRIFT**2 * (j - i) + _LIMITS.length_sigma**2)
+            fits = _squared(off, covariance + noise[:, None, None] * np.eye(3)) < _LIMITS.agree_3
+            fits &= (longer < _LIMITS.agree_1) & self.orientations.agree(i, j, first_from_second)
             poses = dict(itertools.compress(poses.items(), fits.tolist()))
         return {pairs[k] for k in np.flatnonzero(verified).tolist()}, poses
 

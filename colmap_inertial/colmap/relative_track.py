@@ -16,18 +16,28 @@ import numpy as np
 from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 from colmap_inertial.core.threads import one_blas_thread
 
-#: A point is known once rays to it are so far apart.
-_PARALLAX_RAD = 0.02
-#: Errors of orientations and matches, as an angle: what is farther off counts less.
-_OFF_RAD = 0.004
-#: A frame is placed by so many points at least, and by this share of those it knows, or the track breaks.
-_LEAST_POINTS, _LEAST_SHARE = 8, 0.25
-#: A frame sees this many points on average at most.
-_MOST_OBSERVATIONS = 800
+
+@dataclass(frozen=True, kw_only=True)
+class TrackLimits:
+    """When two images tell how far a third moved."""
+
+    #: A point is known once rays to it are so far apart.
+    parallax_rad: float = 0.02
+    #: Errors of orientations and matches, as an angle: what is farther off counts less.
+    off_rad: float = 0.004
+    #: A frame is placed by so many points at least, and by this share of those it knows, or the track breaks.
+    least_points: int = 8
+    least_share: float = 0.25
+    #: A frame sees this many points on average at most.
+    most_observations: int = 800
+    #: Rounds of weighting.
+    rounds: int = 4
+
+
+_LIMITS = TrackLimits()
+
 #: How far the logarithm of its length walks from frame to frame.
 DRIFT = 0.02
-#: Rounds of weighting.
-_ROUNDS = 4
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -140,7 +150,7 @@ def link_observations(
     kept = ~np.isin(label[node], twice)
     frame, feature = frame[kept], (node - begin[frame])[kept]
     _, point = np.unique(label[node][kept], return_inverse=True)
-    some = point % max(1, -(-len(point) // (_MOST_OBSERVATIONS * len(features)))) == 0
+    some = point % max(1, -(-len(point) // (_LIMITS.most_observations * len(features)))) == 0
     _, point = np.unique(point[some], return_inverse=True)
     return frame[some], feature[some], point
 
@@ -171,7 +181,7 @@ def estimate_relative_track(observations: Observations, frames: int) -> Relative
         new = np.isnan(first[which, 0])
         first[which[new]] = rays[new]
         wide[which] = np.maximum(wide[which], np.linalg.norm(np.cross(first[which], rays), axis=1))
-        ready = which[wide[which] > _PARALLAX_RAD]
+        ready = which[wide[which] > _LIMITS.parallax_rad]
         points[ready] = np.linalg.solve(square[ready], moment[ready][..., None])[..., 0]
 
     begun, now = 0, 0
@@ -209,16 +219,16 @@ def _find_beginning(observations: Observations, bounds: IndexArray, i: int) -> t
     for j in range(i + 1, min(i + 9, len(bounds) - 1)):
         a, b = slice(bounds[i], bounds[i + 1]), slice(bounds[j], bounds[j + 1])
         _, at_a, at_b = np.intersect1d(observations.point[a], observations.point[b], return_indices=True)
-        if len(at_a) < 2 * _LEAST_POINTS:
+        if len(at_a) < 2 * _LIMITS.least_points:
             return None
         one, two = observations.rays[a][at_a], observations.rays[b][at_b]
         normal = np.cross(one, two)
-        if np.median(np.linalg.norm(normal, axis=1)) < 2 * _PARALLAX_RAD:
+        if np.median(np.linalg.norm(normal, axis=1)) < 2 * _LIMITS.parallax_rad:
             continue
         weight = np.ones(len(normal))
-        for _ in range(_ROUNDS):
+        for _ in range(_LIMITS.rounds):
             direction = np.linalg.eigh((normal * weight[:, None]).T @ normal)[1][:, 0]
-            weight = 1 / (1 + (normal @ direction / _OFF_RAD) ** 2) ** 2
+            weight = 1 / (1 + (normal @ direction / _LIMITS.off_rad) ** 2) ** 2
         # points lie before both
         sign = np.sign(np.sum(weight * np.sum(np.cross(np.tile(direction, (len(one), 1)), two) * normal, axis=1)))
         return j, np.asarray(direction * (sign or 1.0))
@@ -236,12 +246,12 @@ def _locate_frame(points: Array, rays: Array, guess: Array, step: Array) -> tupl
     It is sought near the guess: what hangs twice may have more points that agree on a place elsewhere.
     """
     known = np.isfinite(points[:, 0])
-    if known.sum() < _LEAST_POINTS:
+    if known.sum() < _LIMITS.least_points:
         return None
     at, through, seen = points[known], _project_across(rays[known]), rays[known]
     centre = guess
-    about = max(_OFF_RAD, float(np.linalg.norm(step) / np.median(np.linalg.norm(at - guess, axis=1))) / 2)
-    for scale in np.geomspace(about, _OFF_RAD, _ROUNDS + 1):
+    about = max(_LIMITS.off_rad, float(np.linalg.norm(step) / np.median(np.linalg.norm(at - guess, axis=1))) / 2)
+    for scale in np.geomspace(about, _LIMITS.off_rad, _LIMITS.rounds + 1):
         away = at - centre
         distance = np.maximum(np.linalg.norm(away, axis=1), 1e-9)
         off = np.linalg.norm(np.cross(away / distance[:, None], seen), axis=1)
@@ -249,8 +259,8 @@ def _locate_frame(points: Array, rays: Array, guess: Array, step: Array) -> tupl
         weight = 1 / (1 + (off / scale) ** 2) ** 2 / distance**2
         information = np.einsum("k,kab->ab", weight, through)
         centre = np.linalg.solve(information, np.einsum("k,kab,kb->a", weight, through, at))
-    good = off < 3 * _OFF_RAD
-    if good.sum() < _LEAST_POINTS or good.mean() < _LEAST_SHARE:
+    good = off < 3 * _LIMITS.off_rad
+    if good.sum() < _LIMITS.least_points or good.mean() < _LIMITS.least_share:
         return None
     trusted = np.ones(len(points), dtype=np.bool_)
     trusted[known] = good

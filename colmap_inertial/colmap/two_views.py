@@ -23,21 +23,36 @@ if TYPE_CHECKING:
 #: Places of two frames in time, the earlier one first.
 FramePair = tuple[int, int]
 
-#: A rotation of fewer matches is not believed.
-_LEAST_MATCHES = 30
-#: Matches of a pair that the gyroscope's bias is sought by.
-_RAYS = 100
-#: Points of the track by which a frame is localised, how far off they may lie, and how many of those matched must not.
-_LEAST_PLACED, _PLACED_PX, _PLACED_SHARE = 12, 8.0, 0.7
-#: A picture in cells, and the features that a cell must have for it to count.
-_COLUMNS, _ROWS, _LEAST_FEATURES = 8, 6, 3
-#: Features of each image in the quick comparison, the largest ones.
-_COMPARED_FEATURES = 500
-#: A quick match: the nearest descriptor is nearer than this share of the next one's angle, and than this angle, as in
-#: COLMAP.
-_RATIO, _FARTHEST_RAD = 0.7, 0.7
-#: COLMAP stores descriptors of this length.
-_LENGTH = 512.0
+
+@dataclass(frozen=True, kw_only=True)
+class TwoViewLimits:
+    """When the matches of a pair confirm where its images are."""
+
+    #: A rotation of fewer matches is not believed.
+    least_matches: int = 30
+    #: Matches of a pair that the gyroscope's bias is sought by.
+    rays: int = 100
+    #: A frame is localised by so many points of the track at least.
+    least_placed: int = 12
+    #: How far off they may lie.
+    placed_px: float = 8.0
+    #: The share of those matched that must not be farther off.
+    placed_share: float = 0.7
+    #: A picture in cells, and the features that a cell must have for it to count.
+    columns: int = 8
+    rows: int = 6
+    least_features: int = 3
+    #: Features of each image in the quick comparison, the largest ones.
+    compared_features: int = 500
+    #: A quick match: the nearest descriptor is nearer than this share of the next one's angle, as in COLMAP.
+    ratio: float = 0.7
+    #: And nearer than this angle, as in COLMAP.
+    farthest_rad: float = 0.7
+    #: COLMAP stores descriptors of this length.
+    length: float = 512.0
+
+
+_LIMITS = TwoViewLimits()
 
 
 class Features:
@@ -105,7 +120,7 @@ def compare(database: Path, pairs: Sequence[tuple[str, str]]) -> TwoViews:
         points: dict[str, Array] = {}
         for place, pair in enumerate(pairs):
             views = features.geometry(*pair)
-            if len(views.inlier_matches) < _LEAST_MATCHES:
+            if len(views.inlier_matches) < _LIMITS.least_matches:
                 continue
             for name in pair:
                 if name not in points:
@@ -126,13 +141,14 @@ def _coverage(
     camera: pycolmap.Camera, xy_px: Array, matched: IndexArray, other: pycolmap.Camera, other_from_this: Array
 ) -> float:
     """Share of the picture's cells with features, as far as the other one shows them, that have a match."""
-    scale = np.array([_COLUMNS / camera.width, _ROWS / camera.height])
-    cell = np.clip(np.floor(xy_px * scale), 0, [_COLUMNS - 1, _ROWS - 1]).astype(np.intp) @ np.array([1, _COLUMNS])
-    count = np.bincount(cell, minlength=_COLUMNS * _ROWS)
-    again = np.bincount(cell[matched], minlength=_COLUMNS * _ROWS)
-    row, column = np.divmod(np.arange(_COLUMNS * _ROWS), _COLUMNS)
+    columns, rows = _LIMITS.columns, _LIMITS.rows
+    scale = np.array([columns / camera.width, rows / camera.height])
+    cell = np.clip(np.floor(xy_px * scale), 0, [columns - 1, rows - 1]).astype(np.intp) @ np.array([1, columns])
+    count = np.bincount(cell, minlength=columns * rows)
+    again = np.bincount(cell[matched], minlength=columns * rows)
+    row, column = np.divmod(np.arange(columns * rows), columns)
     middle = (np.stack([column, row], axis=1) + 0.5) / scale
-    asked = (count >= _LEAST_FEATURES) & _is_visible(middle, camera, other, other_from_this)
+    asked = (count >= _LIMITS.least_features) & _is_visible(middle, camera, other, other_from_this)
     return int((asked & (again > 0)).sum()) / max(int(asked.sum()), 1)
 
 
@@ -163,19 +179,22 @@ def read_ray_pairs(database: Path, names: Sequence[str], pairs: Sequence[FramePa
     with open_features(database) as features:
         for pair in pairs:
             matches = features.matches(names[pair[0]], names[pair[1]])
-            if len(matches) < _LEAST_MATCHES:
+            if len(matches) < _LIMITS.least_matches:
                 continue
             for index in pair:
                 if index not in rays:
                     ray = features.rays(names[index])
                     rays[index] = ray / np.linalg.norm(ray, axis=1, keepdims=True)
-            some = matches[np.linspace(0, len(matches) - 1, _RAYS).astype(np.intp)]
+            some = matches[np.linspace(0, len(matches) - 1, _LIMITS.rays).astype(np.intp)]
             of_both = np.stack([rays[pair[0]][some[:, 0]], rays[pair[1]][some[:, 1]]])
             if np.isfinite(of_both).all():
                 kept.append(pair)
                 rays_of_pairs.append(of_both)
         focal_px = float(np.median([camera.mean_focal_length() for camera in features.cameras.values()]))
-    places, stacked = np.array(kept, dtype=np.intp).reshape(-1, 2), np.array(rays_of_pairs).reshape(-1, 2, _RAYS, 3)
+    places, stacked = (
+        np.array(kept, dtype=np.intp).reshape(-1, 2),
+        np.array(rays_of_pairs).reshape(-1, 2, _LIMITS.rays, 3),
+    )
     return RayPairs(
         first=places[:, 0],
         second=places[:, 1],
@@ -192,7 +211,7 @@ def read_observations(
     with open_features(database) as features:
         counts = [features.database.num_keypoints_for_image(features.images[name].image_id) for name in names]
         matches = [(i, j, features.matches(names[i], names[j])) for i, j in pairs]
-        frame, feature, point = link_observations(counts, [of for of in matches if len(of[2]) >= _LEAST_MATCHES])
+        frame, feature, point = link_observations(counts, [of for of in matches if len(of[2]) >= _LIMITS.least_matches])
         rays = np.zeros((len(frame), 3))
         bounds = np.searchsorted(frame, np.arange(len(names) + 1))
         for k, name in enumerate(names):
@@ -235,7 +254,7 @@ def localise_frames(
     import pycolmap
 
     options = pycolmap.AbsolutePoseEstimationOptions()
-    options.ransac.max_error, options.ransac.random_seed = _PLACED_PX, 0
+    options.ransac.max_error, options.ransac.random_seed = _LIMITS.placed_px, 0
     poses: list[LoopPose | None] = []
     with open_features(database) as features:
         for i, j in pairs:
@@ -243,13 +262,15 @@ def localise_frames(
             matches = features.matches(names[i], names[j])
             (of_first, at_first), (of_second, at_second) = track.seen(i), track.seen(j)
             _, seen, place = np.intersect1d(matches[:, 0], of_first, return_indices=True)
-            if len(seen) < _LEAST_PLACED:
+            if len(seen) < _LIMITS.least_placed:
                 continue
             xy_px, points = features.xy_px(names[j])[matches[seen, 1]], at_first[place]
             estimate = pycolmap.estimate_and_refine_absolute_pose(
                 xy_px, points, features.camera(names[j]), estimation_options=options
             )
-            if estimate is None or estimate["num_inliers"] < max(_LEAST_PLACED, _PLACED_SHARE * len(seen)):
+            if estimate is None or estimate["num_inliers"] < max(
+                _LIMITS.least_placed, _LIMITS.placed_share * len(seen)
+            ):
                 continue
             second_from_start = estimate["cam_from_world"]
             centre = -second_from_start.rotation.matrix().T @ second_from_start.translation
@@ -257,7 +278,7 @@ def localise_frames(
             away = np.linalg.norm(points - centre, axis=1)
             _, both, other = np.intersect1d(matches[seen, 1], of_second, return_indices=True)
             usable = fit[both]
-            if usable.sum() < _LEAST_PLACED // 2:
+            if usable.sum() < _LIMITS.least_placed // 2:
                 continue
             there = np.linalg.norm(at_second[other[usable]] - track.centre[j], axis=1)
             poses[-1] = LoopPose(
@@ -309,7 +330,7 @@ class Covisibility:
                 number = features.images[name].image_id
                 keypoints = np.array(features.database.read_keypoints(number), dtype=np.float64).reshape(-1, 6)
                 size = np.hypot(keypoints[:, 2], keypoints[:, 4])
-                largest = np.argsort(-size, kind="stable")[:_COMPARED_FEATURES]
+                largest = np.argsort(-size, kind="stable")[: _LIMITS.compared_features]
                 stored = np.array(features.database.read_descriptors(number).data, dtype=np.uint8).reshape(-1, 128)
                 descriptors.append(stored[largest])
                 places.append(keypoints[largest, :2])
@@ -322,7 +343,7 @@ class Covisibility:
     @property
     def plenty(self) -> BoolArray:
         """(N,) which images have features enough for few matches to mean something."""
-        return np.array([len(own) == _COMPARED_FEATURES for own in self.descriptors], dtype=np.bool_)
+        return np.array([len(own) == _LIMITS.compared_features for own in self.descriptors], dtype=np.bool_)
 
     def count(self, i: IndexArray, j: IndexArray) -> IndexArray:
         """(M,) quick matches of images i and j, (M,) each."""
@@ -337,12 +358,12 @@ def _count_matches(first: UInt8Array, second: UInt8Array) -> int:
     """Mutually nearest descriptors that are clearly nearer than the next."""
     if len(first) < 2 or len(second) < 2:
         return 0
-    cosine = first.astype(np.float32) @ second.astype(np.float32).T / np.float32(_LENGTH**2)
+    cosine = first.astype(np.float32) @ second.astype(np.float32).T / np.float32(_LIMITS.length**2)
     row = np.arange(len(first))
     nearest = cosine.argmax(axis=1)
     best = cosine[row, nearest]
     mutual = cosine.argmax(axis=0)[nearest] == row
     cosine[row, nearest] = -1
-    near = np.flatnonzero(mutual & (best > np.cos(_FARTHEST_RAD)))
+    near = np.flatnonzero(mutual & (best > np.cos(_LIMITS.farthest_rad)))
     angle, next_angle = (np.arccos(np.clip(c, -1, 1)) for c in (best[near], cosine[near].max(axis=1, initial=-1)))
-    return int(np.count_nonzero(angle < _RATIO * next_angle))
+    return int(np.count_nonzero(angle < _LIMITS.ratio * next_angle))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray
@@ -10,9 +12,21 @@ from colmap_inertial.core.arrays import Array, BoolArray
 GAP_S = 0.1
 #: A pause that is worth a word, even where it is shorter than that: so many times the usual step between samples.
 PAUSE_STEPS = 3.5
-#: A reading is cut off where its very largest value comes so often, and so many times as often as any value near it
-#: (in parts of the usual range).
-_CUT_SAMPLES, _CUT_TIMES, _CUT_NEAR = 6, 3, 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClippingLimits:
+    """When readings count as cut off."""
+
+    #: A reading is cut off where its very largest value comes so often, and so many times as often as any value near it
+    #: (in parts of the usual range).
+    cut_samples: int = 6
+    cut_times: int = 3
+    cut_near: float = 0.1
+
+
+_LIMITS = ClippingLimits()
+
 #: Over this share of readings at the end of the range, the motion was lost and not only a knock.
 MUCH_CUT = 0.001
 
@@ -44,14 +58,14 @@ def _column_at_ceiling(values: Array) -> BoolArray:
     levels, counts = np.unique(values, return_counts=True)
     if len(levels) < 3:
         return out
-    reach = _CUT_NEAR * float(np.ptp(np.percentile(values, [1, 99])))
+    reach = _LIMITS.cut_near * float(np.ptp(np.percentile(values, [1, 99])))
     for level in (levels[0], levels[-1]):
         # a rounded reading may stand in the last digit
         slack = 1e-6 * max(abs(float(level)), 1e-9)
         at_end = np.abs(levels - level) <= slack
         near = (np.abs(levels - level) <= reach) & ~at_end
         usual = max(int(counts[near].max(initial=0)), int(counts[[1, -2]][int(level > levels[0])]))
-        if counts[at_end].sum() >= max(_CUT_SAMPLES, _CUT_TIMES * usual):
+        if counts[at_end].sum() >= max(_LIMITS.cut_samples, _LIMITS.cut_times * usual):
             out |= np.abs(values - level) <= slack
     return out
 

@@ -18,12 +18,22 @@ from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.parallax import Parallax
 from colmap_inertial.imaging.rolling_shutter import rays
 
-#: Nodes at which the blur of a frame is predicted, and frames predicted together.
-_PREDICTED_COLUMNS, _PREDICTED_ROWS, _CHUNK = 7, 5, 512
-#: An image that moves with the shutter would be blurred without end; its blur is taken as finite.
-_LEAST_STRETCH = 0.2
-#: By which the camera is turned to find what its errors do.
-_SMALL_TURN_RAD = 1e-4
+
+@dataclass(frozen=True, kw_only=True)
+class PredictionGrid:
+    """Where blur is predicted, and how many exposures at once."""
+
+    #: Nodes at which the blur of a frame is predicted, and frames predicted together.
+    predicted_columns: int = 7
+    predicted_rows: int = 5
+    chunk: int = 512
+    #: An image that moves with the shutter would be blurred without end; its blur is taken as finite.
+    least_stretch: float = 0.2
+    #: By which the camera is turned to find what its errors do.
+    small_turn_rad: float = 1e-4
+
+
+_LIMITS = PredictionGrid()
 
 
 class Camera(Projector, Protocol):
@@ -167,7 +177,7 @@ def blur_path(
     if exposure_s > 0 and step_s.any():
         before, after = (len(since_s) - 1) // 2 - 1, len(since_s) // 2 + 1
         speed = (path[after] - path[before]) / (since_s[after] - since_s[before])
-        stretch = np.maximum(1 + speed @ step_s, _LEAST_STRETCH)
+        stretch = np.maximum(1 + speed @ step_s, _LIMITS.least_stretch)
         path = path - ((path @ step_s) / stretch)[..., None] * speed
     filled = _fill_nodes(np.moveaxis(path, 0, 2).reshape(len(y), len(x), -1)).reshape(len(y), len(x), -1, 2)
     return BlurPath(
@@ -229,10 +239,10 @@ def predict_blur_px(
         readout_s = timing.readout_s or 0.0
         covered = motion.covers(timing.t_s, timing.t_s + timing.exposure_s + readout_s)
         reasons = ["" if inside else _NOT_COVERED for inside in covered]
-        x = (np.arange(_PREDICTED_COLUMNS) + 0.5) * width / _PREDICTED_COLUMNS
-        y = (np.arange(_PREDICTED_ROWS) + 0.5) * height / _PREDICTED_ROWS
+        x = (np.arange(_LIMITS.predicted_columns) + 0.5) * width / _LIMITS.predicted_columns
+        y = (np.arange(_LIMITS.predicted_rows) + 0.5) * height / _LIMITS.predicted_rows
         known = np.flatnonzero(covered)
-        for part in np.split(known, range(_CHUNK, len(known), _CHUNK)):
+        for part in np.split(known, range(_LIMITS.chunk, len(known), _LIMITS.chunk)):
             if len(part):
                 shutter = FrameShutter.of(timing, int(part[0]), width=width, height=height)
                 rates = np.zeros((len(part), len(y), len(x), 3))
@@ -332,7 +342,7 @@ def _compute_vectors(
     with np.errstate(divide="ignore", invalid="ignore"):
         per_s = vector / exposure_s[:, None, None, None]
     stretch = 1 + np.nan_to_num(per_s[..., 0]) * step_x + np.nan_to_num(per_s[..., 1]) * step_y
-    return np.asarray(vector / np.maximum(stretch, _LEAST_STRETCH)[..., None])
+    return np.asarray(vector / np.maximum(stretch, _LIMITS.least_stretch)[..., None])
 
 
 def _compute_vector_cov(motion: GyroCamera, camera: Projector, shutter: FrameShutter, x: Array, y: Array) -> Array:
@@ -340,8 +350,8 @@ def _compute_vector_cov(motion: GyroCamera, camera: Projector, shutter: FrameShu
     grid = _Grid.of(camera, shutter, x, y)
     lever = np.empty((*grid.nodes_px.shape, 3))
     for axis in range(3):
-        turned = grid.directions + _SMALL_TURN_RAD * np.cross(np.eye(3)[axis], grid.directions)
-        lever[..., axis] = (_project(camera, turned) - grid.nodes_px) / _SMALL_TURN_RAD
+        turned = grid.directions + _LIMITS.small_turn_rad * np.cross(np.eye(3)[axis], grid.directions)
+        lever[..., axis] = (_project(camera, turned) - grid.nodes_px) / _LIMITS.small_turn_rad
     turn = motion.turn_cov_rad2(shutter.middle_s(grid.lines_px), shutter.exposure_s or 0.0)
     cov = lever @ (turn[None] if grid.by_column else turn[:, None]) @ np.swapaxes(lever, -1, -2)
     return np.stack([cov[..., 0, 0], cov[..., 0, 1], cov[..., 1, 1]], axis=-1)

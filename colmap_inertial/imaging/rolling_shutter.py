@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
@@ -16,9 +17,18 @@ from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 
 Pixel = TypeVar("Pixel", np.uint8, np.uint16)
 
-#: Each round of the fixed-point iteration gains one to three digits: by how much less the image moves within a
-#: readout than the shutter does.
-_MOST_ROUNDS, _SETTLED_PX = 12, 1e-3
+
+@dataclass(frozen=True, kw_only=True)
+class RectificationLimits:
+    """When the row of a rectified point has settled."""
+
+    #: Each round of the fixed-point iteration gains one to three digits: by how much less the image moves within a
+    #: readout than the shutter does.
+    most_rounds: int = 12
+    settled_px: float = 1e-3
+
+
+_LIMITS = RectificationLimits()
 
 
 def rectify_keypoints(
@@ -149,10 +159,10 @@ def project_by_lines(
     By fixed-point iteration from (N, 2) pixels near them; directions are in the frame of ``GyroCamera.start_from_cam``.
     """
     found = start
-    for _ in range(_MOST_ROUNDS):
+    for _ in range(_LIMITS.most_rounds):
         then = motion.start_from_cam(shutter.middle_s(np.where(np.isfinite(found), found, start)))
         before, found = found, np.asarray(camera.img_from_cam(np.einsum("nji,nj->ni", then, directions)))
-        if not (np.abs(found - before) > _SETTLED_PX).any():
+        if not (np.abs(found - before) > _LIMITS.settled_px).any():
             break
     return found
 

@@ -30,36 +30,52 @@ from colmap_inertial.core.validation import check_array
 
 #: WGS84: semi-major axis and flattening.
 SEMI_MAJOR_M, FLATTENING = 6378137.0, 1 / 298.257223563
+
 _ECCENTRICITY2 = FLATTENING * (2 - FLATTENING)
-#: Sizes of the errors on the grid (standard deviation of each horizontal coordinate), and how long they are alike.
-_WHITE_M = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0)
-_SLOW_M = (0.02, 0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
-_ALIKE_S = (30.0, 100.0, 300.0)
-#: Prior of the slow errors: log-normal about what the receiver states, or about this, by this factor.
-_USUAL_SLOW_M = 2.0
-_SLOW_FACTOR = 2.5
-#: Prior of the time by which positions lag: what flight controllers take for receivers from their logs (.11 to .22 s:
-#: ArduPilot's u-blox driver, PX4's EKF2_GPS_DELAY), and .49 s measured of a GoPro (Race Technology); phones, which
-#: smooth, up to a second.
-_USUAL_DELAY_S, _DELAY_SIGMA_S = 0.3, 0.3
-#: Delays tried first, in standard deviations of the prior, and how many; then more closely where they are, so far to
-#: each side in their own standard deviations.
-_DELAY_SPAN, _DELAYS = (-3.0, 5.0), 33
-_CLOSER, _CLOSER_DELAYS = 5.0, 17
-#: How much larger errors of heights are.
-_VERTICAL = 1.5
-#: More positions than these are thinned out evenly: their errors are alike anyway.
-_MOST = 240
-#: Positions farther off than so many times the usual distance, and than so many metres, are left out.
-_OUTLIER_M = 3.0
-_OUTLIER, _ROUNDS = 5.0, 4
-#: A heading less certain than this says nothing.
-_LEAST_CERTAIN_DEG = 30.0
-#: Lengths of path and positions differ where their ratio is off by so many standard deviations, and by so much.
-_RATIO_SIGMAS, _LEAST_RATIO = 3.0, 0.03
-#: By so much, and the positions are of another path, or stood still.
-_LARGEST_RATIO = 0.5
-_FEWEST = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class GeoreferenceLimits:
+    """How positions of a receiver are fitted, and when the fit decides."""
+
+    #: Sizes of the errors on the grid (standard deviation of each horizontal coordinate), and how long they are alike.
+    white_m: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0)
+    slow_m: tuple[float, ...] = (0.02, 0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
+    alike_s: tuple[float, float, float] = (30.0, 100.0, 300.0)
+    #: Prior of the slow errors: log-normal about what the receiver states, or about this, by this factor.
+    usual_slow_m: float = 2.0
+    slow_factor: float = 2.5
+    #: Prior of the time by which positions lag: what flight controllers take for receivers from their logs (.11 to
+    #: .22 s: ArduPilot's u-blox driver, PX4's EKF2_GPS_DELAY), and .49 s measured of a GoPro (Race Technology); phones,
+    #: which smooth, up to a second.
+    usual_delay_s: float = 0.3
+    delay_sigma_s: float = 0.3
+    #: Delays tried first, in standard deviations of the prior.
+    delay_span: tuple[float, float] = (-3.0, 5.0)
+    #: And how many.
+    delays: int = 33
+    #: Then more closely: so far to each side of the best, in its own standard deviations.
+    closer: float = 5.0
+    closer_delays: int = 17
+    #: How much larger errors of heights are.
+    vertical: float = 1.5
+    #: More positions than these are thinned out evenly: their errors are alike anyway.
+    most: int = 240
+    #: Positions farther off than so many times the usual distance, and than so many metres, are left out.
+    outlier_m: float = 3.0
+    outlier: float = 5.0
+    rounds: int = 4
+    #: A heading less certain than this says nothing.
+    least_certain_deg: float = 30.0
+    #: Lengths of path and positions differ where their ratio is off by so many standard deviations, and by so much.
+    ratio_sigmas: float = 3.0
+    least_ratio: float = 0.03
+    #: By so much, and the positions are of another path, or stood still.
+    largest_ratio: float = 0.5
+    fewest: int = 4
+
+
+_LIMITS = GeoreferenceLimits()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -265,10 +281,12 @@ def georeference(
     NotObservableError
         Where the positions are too few, or leave the heading open.
     """
-    if len(fixes.latitude_deg) < _FEWEST:
-        raise NotObservableError("heading", f"{len(fixes.latitude_deg)} positions are too few: {_FEWEST} are needed")
+    if len(fixes.latitude_deg) < _LIMITS.fewest:
+        raise NotObservableError(
+            "heading", f"{len(fixes.latitude_deg)} positions are too few: {_LIMITS.fewest} are needed"
+        )
     chosen = np.argsort(t_s, kind="stable")
-    chosen = chosen[np.unique(np.linspace(0, len(chosen) - 1, _MOST).round().astype(np.intp))]
+    chosen = chosen[np.unique(np.linspace(0, len(chosen) - 1, _LIMITS.most).round().astype(np.intp))]
     fixes, path_m, t_s = fixes.select(chosen), np.asarray(cam_in_world_m)[chosen], np.asarray(t_s)[chosen]
     origin, enu, heights = _convert_to_enu(fixes)
     level_from_world = _level(up_in_world)
@@ -287,7 +305,7 @@ def georeference(
     middle_level = np.array([fit.middle.real, fit.middle.imag, float(level[good, 2].mean())])
     counted = good & heights
     up_m = float(np.mean(enu[counted, 2] - level[counted, 2])) if counted.any() else 0.0
-    cov[3, 3] = (_VERTICAL**2) * max(fit.cov[1, 1], fit.cov[2, 2]) if counted.any() else 0.0
+    cov[3, 3] = (_LIMITS.vertical**2) * max(fit.cov[1, 1], fit.cov[2, 2]) if counted.any() else 0.0
     turned = np.array([[np.cos(fit.turn), -np.sin(fit.turn), 0], [np.sin(fit.turn), np.cos(fit.turn), 0], [0, 0, 1.0]])
     at = np.array([fit.at.real, fit.at.imag, middle_level[2] + up_m])
     enu_from_world = turned @ level_from_world
@@ -331,7 +349,7 @@ def _require_heading(fit: _Fit, path: ComplexArray) -> None:
     """Refuse a path too short against the errors of the positions."""
     sigma = math.sqrt(fit.cov[0, 0])
     reach_m = float(np.sqrt(np.mean(np.abs(path - path.mean()) ** 2)))
-    if np.degrees(sigma) > _LEAST_CERTAIN_DEG:
+    if np.degrees(sigma) > _LIMITS.least_certain_deg:
         raise NotObservableError(
             "heading",
             f"+-{np.degrees(Z95 * min(sigma, np.pi)):.0f} degrees: the path reaches {reach_m:.1f} m to either side, "
@@ -341,7 +359,7 @@ def _require_heading(fit: _Fit, path: ComplexArray) -> None:
 
 def _require_same_path(fit: _Fit) -> None:
     """Refuse positions whose distances are far from the model's."""
-    if fit.ratio_error > _LARGEST_RATIO:
+    if fit.ratio_error > _LIMITS.largest_ratio:
         raise NotObservableError(
             "heading",
             f"the positions are {fit.ratio:.2f} times as far apart as the model says: they are of another path, or the "
@@ -351,7 +369,7 @@ def _require_same_path(fit: _Fit) -> None:
 
 def _notes(fit: _Fit, height_above: HeightDatum | None) -> Iterator[str]:
     """Sentences for the user on lengths that differ and on what heights count from."""
-    if fit.ratio_error > _LEAST_RATIO:
+    if fit.ratio_error > _LIMITS.least_ratio:
         yield (
             f"the positions are {fit.ratio:.3f} times as far apart as the model says (+-{Z95 * fit.ratio_sigma:.3f}): "
             "one of them is wrong; the model's scale was left as it is"
@@ -386,7 +404,7 @@ class _Fit:
     def ratio_error(self) -> float:
         """Relative difference of the lengths; zero where chance explains it."""
         error = abs(self.ratio - 1)
-        return error if error > _RATIO_SIGMAS * self.ratio_sigma else 0.0
+        return error if error > _LIMITS.ratio_sigmas * self.ratio_sigma else 0.0
 
 
 def _fit_inliers(
@@ -394,7 +412,7 @@ def _fit_inliers(
 ) -> tuple[_Fit, BoolArray]:
     """The fit without outliers, and which positions these are not."""
     good = np.ones(len(target), dtype=bool)
-    for _ in range(_ROUNDS):
+    for _ in range(_LIMITS.rounds):
         kept = good
 
         def paths(delays_s: Array, kept: BoolArray = kept) -> ComplexArray:
@@ -405,8 +423,8 @@ def _fit_inliers(
         level = level_at(fit.delay_s)
         flat = level[:, 0] + 1j * level[:, 1]
         off = np.abs(target - np.exp(1j * fit.turn) * (flat - fit.middle) - fit.at)
-        keep = off < max(_OUTLIER * float(np.median(off)), _OUTLIER_M)
-        if (keep == good).all() or keep.sum() < _FEWEST:
+        keep = off < max(_LIMITS.outlier * float(np.median(off)), _LIMITS.outlier_m)
+        if (keep == good).all() or keep.sum() < _LIMITS.fewest:
             break
         good = keep
     return fit, good
@@ -418,34 +436,34 @@ def _fit_delay(
     """The mean over sizes of errors and delays; ``paths`` gives the path (T, N) by each of T delays."""
     if not lags:
         return _fit(paths(np.zeros(1)), np.zeros(1), target, t_s, stated_m)
-    delays_s = _USUAL_DELAY_S + _DELAY_SIGMA_S * np.linspace(*_DELAY_SPAN, _DELAYS)
-    for _ in range(_ROUNDS):
+    delays_s = _LIMITS.usual_delay_s + _LIMITS.delay_sigma_s * np.linspace(*_LIMITS.delay_span, _LIMITS.delays)
+    for _ in range(_LIMITS.rounds):
         fit = _fit(paths(delays_s), delays_s, target, t_s, stated_m)
         step_s = float(delays_s[1] - delays_s[0])
         if fit.delay_sigma_s >= step_s:
             break
-        half_s = max(_CLOSER * fit.delay_sigma_s, step_s)
-        delays_s = np.linspace(fit.delay_s - half_s, fit.delay_s + half_s, _CLOSER_DELAYS)
+        half_s = max(_LIMITS.closer * fit.delay_sigma_s, step_s)
+        delays_s = np.linspace(fit.delay_s - half_s, fit.delay_s + half_s, _LIMITS.closer_delays)
     return fit
 
 
 def _fit(paths: ComplexArray, delays_s: Array, target: ComplexArray, t_s: Array, stated_m: Array) -> _Fit:
     """The mean over all sizes of errors and the delays given; plane points as complex numbers."""
     stated = stated_m[np.isfinite(stated_m) & (stated_m > 0)]
-    usual_m = float(np.median(stated)) if len(stated) else _USUAL_SLOW_M
+    usual_m = float(np.median(stated)) if len(stated) else _LIMITS.usual_slow_m
     # a receiver that is less sure of some positions than of others is right about that
     relative = np.where(np.isfinite(stated_m) & (stated_m > 0), stated_m / usual_m, 1.0)
     apart_s = np.abs(t_s[:, None] - t_s[None, :])
     middle = complex(paths.mean())
-    about, logs_of_delay = paths - middle, -0.5 * ((delays_s - _USUAL_DELAY_S) / _DELAY_SIGMA_S) ** 2
+    about, logs_of_delay = paths - middle, -0.5 * ((delays_s - _LIMITS.usual_delay_s) / _LIMITS.delay_sigma_s) ** 2
     sizes, found = [], []
-    for alike_s in _ALIKE_S:
+    for alike_s in _LIMITS.alike_s:
         # in units of each position's own error, and in axes in which all sizes are independent
         values, axes = np.linalg.eigh(np.exp(-apart_s / alike_s))
         one, z = axes.T @ (1 / relative), axes.T @ (target / relative)
         p = (about / relative) @ axes
-        for white_m in _WHITE_M:
-            for slow_m in _SLOW_M:
+        for white_m in _LIMITS.white_m:
+            for slow_m in _LIMITS.slow_m:
                 var = white_m**2 + slow_m**2 * np.maximum(values, 0.0)
                 weight = 1 / var
                 total = float(np.sum(weight * one**2))
@@ -456,7 +474,7 @@ def _fit(paths: ComplexArray, delays_s: Array, target: ComplexArray, t_s: Array,
                 turn = np.where(np.abs(along) > 0, along / np.maximum(np.abs(along), 1e-300), 1.0)
                 left = float(np.sum(weight * np.abs(y) ** 2)) + length - 2 * np.abs(along)
                 log = -float(np.sum(np.log(var))) - 0.5 * left - math.log(total) - 0.5 * np.log(length) + logs_of_delay
-                log -= 0.5 * (math.log(slow_m / usual_m) / math.log(_SLOW_FACTOR)) ** 2
+                log -= 0.5 * (math.log(slow_m / usual_m) / math.log(_LIMITS.slow_factor)) ** 2
                 # where the path's middle is; its error and the turn's are not independent
                 at, arm = shift_z - turn * shift_p, -1j * turn * shift_p / np.sqrt(length)
                 sizes.append((white_m, slow_m, alike_s))

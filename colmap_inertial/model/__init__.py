@@ -37,10 +37,20 @@ if TYPE_CHECKING:
 #: Written into every folder whose lengths we have changed; its presence means "already metric".
 TRANSFORM_FILE = "transform.json"
 
-#: Observations of an image that its covariance is computed from: fewer do not tell, more are not needed.
-_FEWEST_OBSERVATIONS, _MOST_OBSERVATIONS = 10, 1000
-#: Keypoints are not better than this.
-_SMALLEST_ERROR_PX = 0.05
+
+@dataclass(frozen=True, kw_only=True)
+class PointLimits:
+    """How many observations a model needs, and how many are looked at."""
+
+    #: Observations of an image that its covariance is computed from: fewer do not tell, more are not needed.
+    fewest_observations: int = 10
+    most_observations: int = 1000
+    #: Keypoints are not better than this.
+    smallest_error_px: float = 0.05
+
+
+_LIMITS = PointLimits()
+
 
 _MODEL_FILES = ("cameras", "images", "points3D")
 
@@ -309,8 +319,8 @@ def _pose_covariances(reconstruction: pycolmap.Reconstruction, images: Sequence[
     for image in images:
         camera = reconstruction.camera(image.camera_id)
         seen = image.get_observation_points2D()
-        seen = seen[:: -(-len(seen) // _MOST_OBSERVATIONS) or 1]
-        if len(seen) < _FEWEST_OBSERVATIONS:
+        seen = seen[:: -(-len(seen) // _LIMITS.most_observations) or 1]
+        if len(seen) < _LIMITS.fewest_observations:
             return None
         pose = image.cam_from_world()
         rotation = pose.rotation.matrix()
@@ -327,7 +337,7 @@ def _pose_covariances(reconstruction: pycolmap.Reconstruction, images: Sequence[
         by_turn, by_place = -cross(by_cam, cam[:, None]).reshape(-1, 3), -by_cam.reshape(-1, 3) @ rotation
         by_pose = camera.mean_focal_length() * np.concatenate([by_turn, by_place], axis=1)
         information = by_pose.T @ (np.repeat(weight, 2)[:, None] * by_pose)
-        variance_px2 = max(level / (2 * np.log(2)), _SMALLEST_ERROR_PX**2)
+        variance_px2 = max(level / (2 * np.log(2)), _LIMITS.smallest_error_px**2)
         try:
             root = np.linalg.inv(np.linalg.cholesky(information))
         except np.linalg.LinAlgError:

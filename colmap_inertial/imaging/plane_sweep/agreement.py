@@ -13,8 +13,17 @@ from colmap_inertial.imaging.plane_sweep.pinhole import ROWS_AT_ONCE, Pinhole
 #: Matrix and offset from a pixel and its depth to another view.
 Transfer = tuple[Array, Array]
 
-#: How far from itself a pixel may come back, and by which share its depth may have changed.
-_WITHIN_PX, _WITHIN_SHARE = 1.0, 0.02
+
+@dataclass(frozen=True, kw_only=True)
+class AgreementLimits:
+    """When depths of two images agree."""
+
+    #: How far from itself a pixel may come back, and by which share its depth may have changed.
+    within_px: float = 1.0
+    within_share: float = 0.02
+
+
+_LIMITS = AgreementLimits()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -48,7 +57,7 @@ def confirm_depth(reference: DepthView, others: Iterable[DepthView]) -> Float32A
         for begin in range(0, len(depth), ROWS_AT_ONCE):
             rows = slice(begin, begin + ROWS_AT_ONCE)
             depth_back = _transfer_there_and_back(depth[rows], begin, other.depth, there, back)
-            agrees = np.abs(depth_back - depth[rows]) <= _WITHIN_SHARE * depth[rows]
+            agrees = np.abs(depth_back - depth[rows]) <= _LIMITS.within_share * depth[rows]
             total[rows] += np.where(agrees, depth_back, 0)
             count[rows] += agrees
     return np.where((count > 1) & (depth > 0), total / count, 0).astype(np.float32)
@@ -67,7 +76,7 @@ def _transfer_there_and_back(
     at = np.where(inside, row, 0).astype(np.intp) * wide + np.where(inside, column, 0).astype(np.intp)
     found = other.ravel()[at]
     x_back, y_back, depth_back = _transfer_pixels(*back, np.where(inside, u, 0), np.where(inside, v, 0), found)
-    near = (x_back - x) ** 2 + (y_back - y) ** 2 <= _WITHIN_PX**2
+    near = (x_back - x) ** 2 + (y_back - y) ** 2 <= _LIMITS.within_px**2
     return np.where(inside & (found > 0) & near, depth_back, np.float32(np.nan))
 
 

@@ -18,20 +18,34 @@ from colmap_inertial.inertial.static_calibration._rests import Rests
 _LOWER = np.array([0, 3, 4, 6, 7, 8])
 #: Columns: lower entries, bias, gravity, the gyroscope's entries; then two for the direction of gravity in each rest.
 _ACCEL, _BIAS, _GRAVITY, _GYRO = slice(0, 6), slice(6, 9), 9, slice(10, 19)
+
 _COUNT = 19
-#: Instability of biases within minutes, each mean: 40 ug and 8 degrees an hour, as good consumer MEMS have.
-_ACCEL_FLOOR_M_S2, _GYRO_FLOOR_RAD_S = 4e-4, 4e-5
-#: Error of a turn's integral beside noise and drift, of its angle: curvature between samples, delays, sensitivity to
-#: acceleration.
-_TURN_SHARE = 5e-5
-#: A turn of fewer samples is none.
-_FEWEST_SAMPLES = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitLimits:
+    """Noise floors and the rounds of the fit."""
+
+    #: Instability of biases within minutes, each mean: 40 ug and 8 degrees an hour, as good consumer MEMS have.
+    accel_floor_m_s2: float = 4e-4
+    gyro_floor_rad_s: float = 4e-5
+    #: Error of a turn's integral beside noise and drift, of its angle: curvature between samples, delays, sensitivity
+    #: to acceleration.
+    turn_share: float = 5e-5
+    #: A turn of fewer samples is none.
+    fewest_samples: int = 8
+    #: How many squared residuals the noise known beforehand is worth, against those of the fit.
+    freedom_before: float = 8.0
+    #: Steps are small against standard deviations, and factors against themselves.
+    iterations: int = 6
+    rounds: int = 12
+    settled: float = 0.01
+
+
+_LIMITS = FitLimits()
+
 #: A misalignment is that of one axis against another, each of which has the prior's.
 MISALIGNMENT_SIGMA = np.sqrt(2) * PRIORS.accel_gain
-#: How many squared residuals the noise known beforehand is worth, against those of the fit.
-_FREEDOM_BEFORE = 8.0
-#: Steps are small against standard deviations, and factors against themselves.
-_ITERATIONS, _ROUNDS, _SETTLED = 6, 12, 0.01
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -97,17 +111,19 @@ class _Turns:
         for i in np.flatnonzero(whole):
             inside = slice(*np.searchsorted(imu.gyro_t_s, [rests.end_s[i], rests.begin_s[i + 1]]))
             rate = imu.gyro_rad_s[inside] - 0.5 * (rests.gyro_rad_s[i] + rests.gyro_rad_s[i + 1])
-            if len(rate) < _FEWEST_SAMPLES:
+            if len(rate) < _LIMITS.fewest_samples:
                 continue
             duration_s = rests.begin_s[i + 1] - rests.end_s[i]
             angle = step_s * float(np.sum(np.linalg.norm(rate, axis=1)))
             walk = rests.gyro_deviation_rad_s * np.sqrt(step_s * duration_s)
-            drift = duration_s * np.hypot(_GYRO_FLOOR_RAD_S, 0.5 * float(np.hypot(*rests.gyro_sigma_rad_s[i : i + 2])))
+            drift = duration_s * np.hypot(
+                _LIMITS.gyro_floor_rad_s, 0.5 * float(np.hypot(*rests.gyro_sigma_rad_s[i : i + 2]))
+            )
             before.append(i)
             sizes.append(len(rate))
             t_s.append(imu.gyro_t_s[inside])
             rates.append(rate)
-            sigmas.append(float(np.linalg.norm([walk, drift, _TURN_SHARE * angle])))
+            sigmas.append(float(np.linalg.norm([walk, drift, _LIMITS.turn_share * angle])))
         edges = np.cumsum(sizes)
         return cls(
             before=np.array(before, dtype=np.intp),
@@ -147,20 +163,20 @@ def fit_rests(
     device that turns out worse than the priors assume widens them, so that they do not pull.
     """
     turns = _Turns.none() if accel_only else _Turns.of(imu, rests)
-    sigma_a = np.hypot(rests.accel_sigma_m_s2, _ACCEL_FLOOR_M_S2)
+    sigma_a = np.hypot(rests.accel_sigma_m_s2, _LIMITS.accel_floor_m_s2)
     sigma_t = turns.sigma_rad
     state = _State.start(rests, gravity_m_s2)
     factor_a = factor_t = 1.0
-    freedom = np.full(2, _FREEDOM_BEFORE)
+    freedom = np.full(2, _LIMITS.freedom_before)
     beforehand = _prior_sigma(gravity_sigma_m_s2)
     prior_sigma = beforehand
-    for _ in range(_ROUNDS):
-        for _ in range(_ITERATIONS):
+    for _ in range(_LIMITS.rounds):
+        for _ in range(_LIMITS.iterations):
             system = _system(state, rests, turns, sigma_a * factor_a, sigma_t * factor_t, gravity_m_s2, prior_sigma)
             cov = np.asarray(np.linalg.inv(system.jacobian.T @ system.jacobian))
             step = cov @ (system.jacobian.T @ system.residual)
             state = state.moved(step)
-            if np.all(np.abs(step) < _SETTLED * np.sqrt(np.diagonal(cov))):
+            if np.all(np.abs(step) < _LIMITS.settled * np.sqrt(np.diagonal(cov))):
                 break
         # Förstner's components of variance: each group's squares against its redundancy
         system = _system(state, rests, turns, sigma_a * factor_a, sigma_t * factor_t, gravity_m_s2, prior_sigma)
@@ -169,11 +185,11 @@ def fit_rests(
         for i, (rows, factor) in enumerate(((system.accel_rows, factor_a), (system.turn_rows, factor_t))):
             jacobian, residual = system.jacobian[rows], system.residual[rows]
             redundancy = max(len(residual) - float(np.einsum("ij,jk,ik->", jacobian, cov, jacobian)), 0.0)
-            freedom[i] = _FREEDOM_BEFORE + redundancy
-            variances.append((_FREEDOM_BEFORE + factor**2 * float(residual @ residual)) / freedom[i])
+            freedom[i] = _LIMITS.freedom_before + redundancy
+            variances.append((_LIMITS.freedom_before + factor**2 * float(residual @ residual)) / freedom[i])
         before, (factor_a, factor_t) = (factor_a, factor_t), np.sqrt(variances)
         prior_sigma = beforehand * _widened(state.errors(gravity_m_s2) / beforehand)
-        if np.allclose(before, (factor_a, factor_t), rtol=_SETTLED):
+        if np.allclose(before, (factor_a, factor_t), rtol=_LIMITS.settled):
             break
     return _result(state, rests, turns, cov, freedom, (factor_a, factor_t), gravity_m_s2)
 
@@ -316,8 +332,8 @@ def _result(
     count = len(rests)
     # by differences, so that a slow walk is not taken for scatter about its mean
     scatter = float(np.sum(np.diff(means, axis=0) ** 2)) / (6 * max(count - 1, 1))
-    known = float(np.mean(rests.gyro_sigma_rad_s**2)) + _GYRO_FLOOR_RAD_S**2
-    spread = (_FREEDOM_BEFORE * known + 3 * (count - 1) * scatter) / (_FREEDOM_BEFORE + 3 * (count - 1))
+    known = float(np.mean(rests.gyro_sigma_rad_s**2)) + _LIMITS.gyro_floor_rad_s**2
+    spread = (_LIMITS.freedom_before * known + 3 * (count - 1) * scatter) / (_LIMITS.freedom_before + 3 * (count - 1))
     full[IMU_CAL.GYRO_BIAS, IMU_CAL.GYRO_BIAS] = np.eye(3) * spread / count
     left = np.linalg.norm(rests.accel_m_s2 @ (np.eye(3) + state.accel_gain).T - state.accel_bias, axis=1)
     angles = np.full(max(count - 1, 0), np.nan)

@@ -10,18 +10,29 @@ from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 from colmap_inertial.core.sampling import Coverage
 from colmap_inertial.core.types import ImuRecording
 
-#: Readings vary over windows of this length; a device that lies lies for longer than the shortest rest, beside that.
-_WINDOW_S, _SHORTEST_REST_S = 1.0, 1.0
-#: How quiet the quietest windows are: this share of them is quieter still.
-_QUIETEST = 0.05
-#: Thresholds that are tried, in standard deviations of the quietest windows.
-_MULTIPLES = (3.0, 4.5, 7.0, 10.0)
-#: Standard deviations (all axes) beyond which a device is held in a hand, however steadily.
-_HELD_M_S2, _HELD_RAD_S = 0.5, 0.03
-#: Means over this time are taken for independent.
-_BLOCK_S = 0.5
-#: Attitudes closer than this count once.
-_SAME_ATTITUDE_RAD = np.radians(15.0)
+
+@dataclass(frozen=True, kw_only=True)
+class RestLimits:
+    """What counts as rest."""
+
+    #: Readings vary over windows of this length.
+    window_s: float = 1.0
+    #: A device that lies lies for longer than this, beside that.
+    shortest_rest_s: float = 1.0
+    #: How quiet the quietest windows are: this share of them is quieter still.
+    quietest: float = 0.05
+    #: Thresholds that are tried, in standard deviations of the quietest windows.
+    multiples: tuple[float, ...] = (3.0, 4.5, 7.0, 10.0)
+    #: Standard deviations (all axes) beyond which a device is held in a hand, however steadily.
+    held_m_s2: float = 0.5
+    held_rad_s: float = 0.03
+    #: Means over this time are taken for independent.
+    block_s: float = 0.5
+    #: Attitudes closer than this count once.
+    same_attitude_rad: float = np.radians(15.0)
+
+
+_LIMITS = RestLimits()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -72,15 +83,15 @@ def candidate_rests(imu: ImuRecording) -> list[Rests]:
         return []
     (t_s, accel_var), (gyro_t_s, gyro_var) = accel, gyro
     gyro_var = np.interp(t_s, gyro_t_s, gyro_var, left=np.inf, right=np.inf)
-    half_s = 0.5 * _WINDOW_S
+    half_s = 0.5 * _LIMITS.window_s
     whole = np.all([Coverage(s).covers(t_s - half_s, t_s + half_s) for s in (imu.accel_t_s, imu.gyro_t_s)], axis=0)
     if not whole.any():
         return []
-    quiet_accel, quiet_gyro = (float(np.quantile(var[whole], _QUIETEST)) for var in (accel_var, gyro_var))
+    quiet_accel, quiet_gyro = (float(np.quantile(var[whole], _LIMITS.quietest)) for var in (accel_var, gyro_var))
     found = []
-    for multiple in _MULTIPLES:
-        still = whole & (accel_var <= min(multiple**2 * quiet_accel, _HELD_M_S2**2))
-        still &= gyro_var <= min(multiple**2 * quiet_gyro, _HELD_RAD_S**2)
+    for multiple in _LIMITS.multiples:
+        still = whole & (accel_var <= min(multiple**2 * quiet_accel, _LIMITS.held_m_s2**2))
+        still &= gyro_var <= min(multiple**2 * quiet_gyro, _LIMITS.held_rad_s**2)
         spans = _spans(t_s, still)
         if len(spans) > 0:
             found.append(_averaged(imu, spans))
@@ -89,7 +100,7 @@ def candidate_rests(imu: ImuRecording) -> list[Rests]:
 
 def _window_variance(t_s: Array, values: Array) -> tuple[Array, Array] | None:
     """Variances over windows, summed over the axes, and the middles of the windows."""
-    width = round(_WINDOW_S / float(np.median(np.diff(t_s))))
+    width = round(_LIMITS.window_s / float(np.median(np.diff(t_s))))
     if not 8 <= width < len(t_s):
         return None
     centred = values - values.mean(axis=0)
@@ -108,7 +119,7 @@ def _spans(t_s: Array, still: BoolArray) -> Array:
     """(K, 2) begin and end of what is still for long enough; the window around it reaches half its length further."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
     spans = np.stack([t_s[edges[::2]], t_s[edges[1::2] - 1]], axis=1)
-    return np.asarray(spans[spans[:, 1] - spans[:, 0] >= _SHORTEST_REST_S])
+    return np.asarray(spans[spans[:, 1] - spans[:, 0] >= _LIMITS.shortest_rest_s])
 
 
 def _averaged(imu: ImuRecording, spans: Array) -> Rests:
@@ -132,7 +143,7 @@ def _means(t_s: Array, values: Array, spans: Array) -> tuple[Array, Array, float
     means, counts, block_squares, squares, freedom, singles = [], [], 0.0, 0.0, 0, 0
     for begin_s, end_s in spans:
         inside = slice(*np.searchsorted(t_s, [begin_s, end_s]))
-        count = int((end_s - begin_s) / _BLOCK_S)
+        count = int((end_s - begin_s) / _LIMITS.block_s)
         block = np.minimum(((t_s[inside] - begin_s) / (end_s - begin_s) * count).astype(int), count - 1)
         size = np.bincount(block, minlength=count)
         sums = np.stack([np.bincount(block, column, count) for column in values[inside].T], axis=1)
@@ -155,7 +166,7 @@ def _attitudes(accel: Array) -> IndexArray:
     number = np.zeros(len(up), dtype=np.intp)
     for i, direction in enumerate(up):
         cosines = np.array([direction @ other for other in known])
-        near = len(known) > 0 and cosines.max() > np.cos(_SAME_ATTITUDE_RAD)
+        near = len(known) > 0 and cosines.max() > np.cos(_LIMITS.same_attitude_rad)
         number[i] = int(np.argmax(cosines)) if near else len(known)
         if not near:
             known.append(direction)

@@ -29,13 +29,24 @@ from colmap_inertial.core.types import (
 )
 from colmap_inertial.motion.smooth._positions import Chain, most_likely, runs_of, worst_outliers
 
-#: Orientations from pictures err independently and, over about this time, together (as features come and go).
-_CORRELATION_S = 0.35
-#: Usual noise of orientations from pictures, rad: a start for the estimate, which may end far away.
-_USUAL_RAD, _SPREAD = 2e-3, 3.0
-#: Variance (rad2) that frees the correction where the gyroscope is silent.
-_FREE = 1e2
-_REACH_S, _OUTLIER_CHI2, _ROUNDS = 0.5, 30.0, 4
+
+@dataclass(frozen=True, kw_only=True)
+class AttitudeLimits:
+    """Usual errors of visual rotations, and when one is an outlier."""
+
+    #: Orientations from pictures err independently and, over about this time, together (as features come and go).
+    correlation_s: float = 0.35
+    #: Usual noise of orientations from pictures, rad: a start for the estimate, which may end far away.
+    usual_rad: float = 2e-3
+    spread: float = 3.0
+    #: Variance (rad2) that frees the correction where the gyroscope is silent.
+    free: float = 1e2
+    reach_s: float = 0.5
+    outlier_chi2: float = 30.0
+    rounds: int = 4
+
+
+_LIMITS = AttitudeLimits()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -100,14 +111,14 @@ def smooth_attitude(trajectory: CameraTrajectory, timed: CameraTimedImu) -> Atti
         density=noise.gyro_density_rad_s_rthz,
         walk=float(np.hypot(noise.gyro_walk_rad_s2_rthz, bias_sigma * rate_rms)),
     )
-    logs = np.log([_USUAL_RAD**2, _USUAL_RAD**2])
-    for attempt in range(_ROUNDS):
+    logs = np.log([_LIMITS.usual_rad**2, _LIMITS.usual_rad**2])
+    for attempt in range(_LIMITS.rounds):
         if attempt < 2:  # once with the worst still in, once without
             run = model.select(runs_of(len(t_s)))
-            logs = most_likely(run.chain, logs, expected=np.log([_USUAL_RAD**2] * 2), spread=_SPREAD)
+            logs = most_likely(run.chain, logs, expected=np.log([_LIMITS.usual_rad**2] * 2), spread=_LIMITS.spread)
         chain = model.chain(logs)
         wrong, jumped = chain.outlier_statistics()
-        left_out, jumps = worst_outliers(t_s, wrong, jumped, limit=_OUTLIER_CHI2, reach=_REACH_S)
+        left_out, jumps = worst_outliers(t_s, wrong, jumped, limit=_LIMITS.outlier_chi2, reach=_LIMITS.reach_s)
         if not (left_out.any() or jumps.any()):
             break
         model = replace(model, left_out=model.left_out | left_out, silent=model.silent | jumps)
@@ -146,11 +157,11 @@ class _Model:
         """Correction, drift rate and correlated error; ``logs`` of the variances of white and correlated error."""
         white, correlated = np.exp(logs)
         dt = np.diff(self.t_s)
-        decay = np.exp(-dt / _CORRELATION_S)
+        decay = np.exp(-dt / _LIMITS.correlation_s)
         transition = np.tile(np.eye(3), (len(dt), 1, 1))
         transition[:, 0, 1], transition[:, 2, 2] = dt, decay
         process = np.zeros((len(dt), 3, 3))
-        process[:, 0, 0] = self.density**2 * dt + self.walk**2 * dt**3 / 3 + _FREE * self.silent
+        process[:, 0, 0] = self.density**2 * dt + self.walk**2 * dt**3 / 3 + _LIMITS.free * self.silent
         process[:, 0, 1] = process[:, 1, 0] = self.walk**2 * dt**2 / 2
         process[:, 1, 1] = self.walk**2 * dt
         process[:, 2, 2] = correlated * (1 - decay**2)
@@ -160,7 +171,7 @@ class _Model:
             drive=np.zeros((len(dt), 3, 3)),
             observed=np.array([1.0, 0.0, 1.0]),
             measured=self.curve,
-            measured_var=np.where(self.left_out, _FREE, white),
+            measured_var=np.where(self.left_out, _LIMITS.free, white),
             initial_information=np.diag([0.0, 1.0 / 0.05**2, 1.0 / correlated]),
         )
 

@@ -247,14 +247,24 @@ def most_likely(chain_of: Callable[[Array], Chain], start: Array, *, expected: A
     return np.asarray(found.x)
 
 
-#: Range of the smoother's time constant in frame intervals. Longer ones than the last would lose the digits of a
-#: double; they would smooth nothing but stillness any further.
-_SHORTEST, _LONGEST = 0.3, 50.0
-#: Neighbours of an outlier within this many time constants suffer from it and are not judged in the same round.
-_REACH = 4.0
-_ROUNDS, _MOST_OUTLIERS = 8, 0.1
-#: Factor on a variance that frees a measurement or a transition; least variance, relative to the path's: rounding.
-_FREE, _LEAST_VAR = 1e8, 1e-20
+@dataclass(frozen=True, kw_only=True)
+class PositionLimits:
+    """How the noise of positions is searched, and when one is an outlier."""
+
+    #: Range of the smoother's time constant in frame intervals. Longer ones than the last would lose the digits of a
+    #: double; they would smooth nothing but stillness any further.
+    shortest: float = 0.3
+    longest: float = 50.0
+    #: Neighbours of an outlier within this many time constants suffer from it and are not judged in the same round.
+    reach: float = 4.0
+    rounds: int = 8
+    most_outliers: float = 0.1
+    #: Factor on a variance that frees a measurement or a transition; least variance, relative to the path's: rounding.
+    free: float = 1e8
+    least_var: float = 1e-20
+
+
+_LIMITS = PositionLimits()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -386,15 +396,15 @@ class _Model:
         """The time constant is where the noise of positions (``var``) and motion meet: white jerk has the density
         ``var / time_constant**6``."""
         dt = np.diff(self.t)
-        process = white_jerk(np.maximum(dt, time_constant / _LONGEST)) * (var / time_constant**6)
-        process[:, 0, 0] += var * _FREE * self.jumps
+        process = white_jerk(np.maximum(dt, time_constant / _LIMITS.longest)) * (var / time_constant**6)
+        process[:, 0, 0] += var * _LIMITS.free * self.jumps
         return Chain(
             transition=constant_acceleration(dt),
             process_cov=process,
             drive=np.zeros((len(dt), 3, 3)),
             observed=np.array([1.0, 0.0, 0.0]),
             measured=self.measured,
-            measured_var=var * np.where(self.left_out, _FREE, self.relative_var),
+            measured_var=var * np.where(self.left_out, _LIMITS.free, self.relative_var),
             initial_information=np.zeros((3, 3)),
         )
 
@@ -405,13 +415,13 @@ class _Model:
         freedom = 3 * max(len(self.t) - 3 - int(self.left_out.sum()) - int(self.jumps.sum()), 1)
 
         def variance(chain: Chain) -> float:
-            return max(chain.energy / freedom, _LEAST_VAR)
+            return max(chain.energy / freedom, _LIMITS.least_var)
 
         def cost(log_constant: float) -> float:
             chain = self.chain(float(np.exp(log_constant)), 1.0)
             return 0.5 * (freedom * np.log(variance(chain)) + 3 * chain.log_determinant)
 
-        bounds = (np.log(_SHORTEST), np.log(_LONGEST))
+        bounds = (np.log(_LIMITS.shortest), np.log(_LIMITS.longest))
         found = minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 0.02})
         constant = float(np.exp(found.x))
         return constant, self.chain(constant, variance(self.chain(constant, 1.0)))
@@ -420,13 +430,13 @@ class _Model:
 def _remove_outliers(model: _Model, limit: float) -> tuple[float, Chain]:
     """Leave out poses, and allow jumps, one neighbourhood at a time, until nothing contradicts the rest."""
     constant, chain = model.most_likely()
-    for _ in range(_ROUNDS):
+    for _ in range(_LIMITS.rounds):
         wrong, jumped = chain.outlier_statistics()
-        left_out, jumps = worst_outliers(model.t, wrong, jumped, limit=limit, reach=_REACH * constant)
+        left_out, jumps = worst_outliers(model.t, wrong, jumped, limit=limit, reach=_LIMITS.reach * constant)
         left_out, jumps = model.left_out | left_out, model.jumps | jumps
         if left_out.sum() + jumps.sum() == model.left_out.sum() + model.jumps.sum():
             break
-        if left_out.sum() + jumps.sum() > _MOST_OUTLIERS * len(model.t):
+        if left_out.sum() + jumps.sum() > _LIMITS.most_outliers * len(model.t):
             break  # not outliers, but noise of another kind
         model = replace(model, left_out=left_out, jumps=jumps)
         constant, chain = model.most_likely()

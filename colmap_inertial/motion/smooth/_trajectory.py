@@ -29,20 +29,32 @@ from colmap_inertial.motion.smooth._positions import (
     worst_outliers,
 )
 
-#: Time over which errors of positions from images stay correlated, as features come and go.
-_CORRELATION_S = 0.35
+
+@dataclass(frozen=True, kw_only=True)
+class TrajectoryLimits:
+    """Usual errors of a model's poses, and when one is an outlier."""
+
+    #: Time over which errors of positions from images stay correlated, as features come and go.
+    correlation_s: float = 0.35
+    #: Correlation time of motion that nothing measures.
+    motion_s: float = 0.2
+    #: Gain and misalignment of IMUs, by their data sheets: motion too quick for the camera is wrong by this much of it.
+    gain_sigma: float = 0.01
+    #: An instant this close to a pose is that of the pose.
+    same_s: float = 1e-6
+    #: Variance (m2) that frees a pose or a transition; how far an outlier makes its neighbours look like outliers.
+    free: float = 1e4
+    reach_s: float = 0.5
+    rounds: int = 5
+    most_outliers: float = 0.1
+
+
+_LIMITS = TrajectoryLimits()
+
 #: Usual standard deviations, as a weak prior of their estimates: white and correlated error of a position (m); white
 #: noise of the accelerometer with all that errs like it (m/s2/sqrt(Hz)); walk of what gravity, bias and tilt leave
 #: (m/s2/sqrt(s)). Natural logarithms of the variances spread by this much around them.
 _USUAL, _SPREAD = np.array([3e-3, 3e-3, 1e-2, 1e-2]), 4.0
-#: Correlation time of motion that nothing measures.
-_MOTION_S = 0.2
-#: Gain and misalignment of IMUs, by their data sheets: motion too quick for the camera is wrong by this much of it.
-_GAIN_SIGMA = 0.01
-#: An instant this close to a pose is that of the pose.
-_SAME_S = 1e-6
-#: Variance (m2) that frees a pose or a transition; how far an outlier makes its neighbours look like outliers.
-_FREE, _REACH_S, _ROUNDS, _MOST_OUTLIERS = 1e4, 0.5, 5, 0.1
 
 
 @one_blas_thread()
@@ -114,7 +126,7 @@ def smooth_trajectory(
         silent=silent,
         left_out=np.zeros(len(t_s), dtype=bool),
         jumps=np.zeros(len(t_s) - 1, dtype=bool),
-        motion_density=2 * _MOTION_S * inertial.variance,
+        motion_density=2 * _LIMITS.motion_s * inertial.variance,
     )
     model, logs = _remove_outliers(model, (options or SmoothOptions()).outlier_chi2)
     if also_at_s is not None:
@@ -131,7 +143,7 @@ def smooth_trajectory(
     turning, centripetal = np.cross(rate, lever), np.cross(rate, np.cross(rate, lever))
     spin = _rate_of_change(attitude, t_s, inertial.step_s)
     cov[:, 2, 2] += _spin_variance(imu, inertial.step_s) * float(lever @ lever)
-    cov[:, 1, 1] += _GAIN_SIGMA**2 * float(np.mean(np.var(states[:, 1], axis=0)))
+    cov[:, 1, 1] += _LIMITS.gain_sigma**2 * float(np.mean(np.var(states[:, 1], axis=0)))
     return SmoothedTrajectory(
         t_s=t_s,
         cam_in_world=states[:, 0] + origin - quat_rotate(world_from_imu, lever),
@@ -158,7 +170,7 @@ def _insert_instants(model: _Model, inertial: WorldAcceleration, also_at_s: Arra
     """The model with states at instants that nothing was measured at."""
     asked = np.unique(np.asarray(also_at_s, dtype=np.float64))
     nearest = np.minimum(np.searchsorted(model.t_s, asked), len(model.t_s) - 1)
-    new = np.minimum(np.abs(model.t_s[nearest] - asked), np.abs(model.t_s[nearest - 1] - asked)) > _SAME_S
+    new = np.minimum(np.abs(model.t_s[nearest] - asked), np.abs(model.t_s[nearest - 1] - asked)) > _LIMITS.same_s
     asked = asked[new & (asked > inertial.t_s[0]) & (asked < inertial.t_s[-1])]
     t_s = np.concatenate([model.t_s, asked])
     order = np.argsort(t_s)
@@ -216,7 +228,7 @@ class _Model:
         """Position, velocity, missing acceleration, correlated error; ``logs`` of the four variances."""
         white, correlated, accel, walk = np.exp(logs)
         dt = np.diff(self.t_s)
-        decay = np.exp(-dt / _CORRELATION_S)
+        decay = np.exp(-dt / _LIMITS.correlation_s)
         transition = np.tile(np.eye(4), (len(dt), 1, 1))
         transition[:, 0, 1] = transition[:, 1, 2] = dt
         transition[:, 0, 2] = 0.5 * dt**2
@@ -225,7 +237,7 @@ class _Model:
         process[:, :3, :3] = walk * white_jerk(dt)
         density = np.where(self.silent, self.motion_density, accel)
         process[:, :2, :2] += density[:, None, None] * white_acceleration(dt)
-        process[:, 0, 0] += _FREE * self.jumps
+        process[:, 0, 0] += _LIMITS.free * self.jumps
         process[:, 3, 3] = correlated * (1 - decay**2)
         drive = np.zeros((len(dt), 4, 3))
         drive[:, 0] = np.diff(self.gained[:, 0], axis=0) - dt[:, None] * self.gained[:-1, 1]
@@ -237,7 +249,7 @@ class _Model:
             drive=drive,
             observed=np.array([1.0, 0.0, 0.0, 1.0]),
             measured=self.measured,
-            measured_var=np.where(self.left_out, _FREE, white),
+            measured_var=np.where(self.left_out, _LIMITS.free, white),
             initial_information=np.diag([0.0, 0.0, 0.0, 1.0 / correlated]),
         )
 
@@ -246,16 +258,16 @@ def _remove_outliers(model: _Model, limit: float) -> tuple[_Model, Array]:
     """The model without the poses and with the jumps that contradict the rest, and its noise."""
     usual = 2 * np.log(_USUAL)
     logs = usual
-    for attempt in range(_ROUNDS):
+    for attempt in range(_LIMITS.rounds):
         if attempt < 2:  # once with the worst still in, once without
             run = model.select(runs_of(len(model.t_s)))
             logs = most_likely(run.chain, logs, expected=usual, spread=_SPREAD)
         chain = model.chain(logs)
         wrong, jumped = chain.outlier_statistics()
-        left_out, jumps = worst_outliers(model.t_s, wrong, jumped, limit=limit, reach=_REACH_S)
+        left_out, jumps = worst_outliers(model.t_s, wrong, jumped, limit=limit, reach=_LIMITS.reach_s)
         left_out, jumps = model.left_out | left_out, model.jumps | jumps
         found = left_out.sum() + jumps.sum()
-        if found == model.left_out.sum() + model.jumps.sum() or found > _MOST_OUTLIERS * len(model.t_s):
+        if found == model.left_out.sum() + model.jumps.sum() or found > _LIMITS.most_outliers * len(model.t_s):
             break
         model = replace(model, left_out=left_out, jumps=jumps)
     return model, logs

@@ -37,13 +37,26 @@ from colmap_inertial.reconstruction.preparation.sampling import some_frames
 log = logging.getLogger(__name__)
 
 
-_FRAMES, _WIDTH, _HEIGHT, _GAP, _LABEL = 8, 420, 280, 6, 22
-#: Frames that are looked at for the report, and how many of them it shows.
-_CANDIDATES, _SHOWN = 16, 4
+@dataclass(frozen=True, kw_only=True)
+class ContactSheet:
+    """Layout of the contact sheet."""
+
+    frames: int = 8
+    width: int = 420
+    height: int = 280
+    gap: int = 6
+    label: int = 22
+    #: Frames that are looked at for the report, and how many of them it shows.
+    candidates: int = 16
+    shown: int = 4
+    #: Distance of the arrows, px of the crop.
+    arrows_px: int = 70
+
+
+_LIMITS = ContactSheet()
+
 #: Top, left, height and width.
 Part = tuple[int, int, int, int]
-#: Distance of the arrows, px of the crop.
-_ARROWS_PX = 70
 
 
 def write_contact_sheet(path: Path, capture: Capture, plan: ImagingPlan, images: Path, names: Sequence[str]) -> None:
@@ -71,7 +84,7 @@ def write_contact_sheet(path: Path, capture: Capture, plan: ImagingPlan, images:
     index = view.index()
     motion, camera = view.motion(), colmap_camera(view.camera)
     rows: dict[str, UInt8Array] = {}
-    for frame in some_frames(capture, view.timing, [index[name] for name in names[:_FRAMES]]):
+    for frame in some_frames(capture, view.timing, [index[name] for name in names[: _LIMITS.frames]]):
         parallax = plan.parallaxes.get(frame.name)
         field = blur_field(motion, camera, view.shutter(index[frame.name]), parallax=parallax)
         before, after = _eight_bit(frame.image), _eight_bit(read_image(path_in(images, frame.name)))
@@ -79,12 +92,12 @@ def write_contact_sheet(path: Path, capture: Capture, plan: ImagingPlan, images:
         cut = [picture[top : top + height, left : left + width].copy() for picture in (before, after)]
         _draw(cut[0], field, top, left)
         length = float(np.percentile(field.extent_px(), 90))
-        gap = np.full((height, _GAP, 3), 255, np.uint8)
-        label = np.full((_LABEL, 2 * width + _GAP, 3), 255, np.uint8)
+        gap = np.full((height, _LIMITS.gap, 3), 255, np.uint8)
+        label = np.full((_LIMITS.label, 2 * width + _LIMITS.gap, 3), 255, np.uint8)
         text = f"{frame.name}   {length:.1f} px   before | {plan.method}"
-        cv2.putText(label, text, (4, _LABEL - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
+        cv2.putText(label, text, (4, _LIMITS.label - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
         rows[frame.name] = np.concatenate([label, np.concatenate([cut[0], gap, cut[1]], axis=1)])
-    sheet = np.concatenate([rows[name] for name in names[:_FRAMES]])
+    sheet = np.concatenate([rows[name] for name in names[: _LIMITS.frames]])
     data = cv2.imencode(".png", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))[1]
     try:
         path.write_bytes(data.tobytes())
@@ -111,7 +124,7 @@ class CropKeeper:
         """For a plan: frames that are to be deblurred, evenly from the most to the least blurred."""
         blurred = () if plan.deblur is None else plan.deblur[0]
         by_blur = sorted((d for d in blurred if d.action == "deblur"), key=lambda d: (-(d.blur_px or 0.0), d.name))
-        some = by_blur[:: -(-len(by_blur) // _CANDIDATES) or 1]
+        some = by_blur[:: -(-len(by_blur) // _LIMITS.candidates) or 1]
         return cls(blur_px={decision.name: decision.blur_px or 0.0 for decision in some})
 
     def before(self, frames: Iterator[Frame], /) -> Iterator[Frame]:
@@ -138,7 +151,7 @@ class CropKeeper:
         """Write the most blurred of the frames that were changed: JPEGs, and ``crops.json`` with their names."""
         folder.mkdir(parents=True)
         listed = []
-        for number, name in enumerate(sorted(self._pairs, key=lambda name: -self.blur_px[name])[:_SHOWN]):
+        for number, name in enumerate(sorted(self._pairs, key=lambda name: -self.blur_px[name])[: _LIMITS.shown]):
             entry: dict[str, object] = {"name": name, "blur_px": self.blur_px[name]}
             for side, picture in zip(("before", "after"), self._pairs[name], strict=True):
                 entry[side] = f"{number}_{side}.jpg"
@@ -162,7 +175,7 @@ def _busiest(image: UInt8Array) -> Part:
     """Top, left, height and width of the part with the most texture."""
     import cv2
 
-    height, width = min(_HEIGHT, image.shape[0]), min(_WIDTH, image.shape[1])
+    height, width = min(_LIMITS.height, image.shape[0]), min(_LIMITS.width, image.shape[1])
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     texture = np.abs(cv2.Laplacian(cv2.GaussianBlur(grey, (0, 0), 2), cv2.CV_32F))
     sums = cv2.integral(np.minimum(texture, np.percentile(texture, 99)))
@@ -176,8 +189,8 @@ def _draw(crop: UInt8Array, field: BlurField, top: int, left: int) -> None:
     import cv2
 
     height, width = crop.shape[:2]
-    for y in range(_ARROWS_PX // 2, height, _ARROWS_PX):
-        for x in range(_ARROWS_PX // 2, width, _ARROWS_PX):
+    for y in range(_LIMITS.arrows_px // 2, height, _LIMITS.arrows_px):
+        for x in range(_LIMITS.arrows_px // 2, width, _LIMITS.arrows_px):
             row, column = (round((at + offset) / field.step_px) for at, offset in ((y, top), (x, left)))
             row, column = min(row, field.vector_px.shape[0] - 1), min(column, field.vector_px.shape[1] - 1)
             dx, dy = 0.5 * field.vector_px[row, column]

@@ -41,8 +41,17 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-#: COLMAP's models of fewer images, or of a smaller share of those of its largest one, are fragments.
-_FEWEST_IMAGES, _LEAST_SHARE = 5, 0.01
+
+@dataclass(frozen=True, kw_only=True)
+class FragmentLimits:
+    """Which of COLMAP's models are too small to go on with."""
+
+    #: COLMAP's models of fewer images, or of a smaller share of those of its largest one, are fragments.
+    fewest_images: int = 5
+    least_share: float = 0.01
+
+
+_LIMITS = FragmentLimits()
 
 
 #: A model that went through the first stages, ``None`` where it was refused before, and what is known of it.
@@ -180,7 +189,7 @@ def _select_models(found: Mapping[int, Path], *, keep: bool) -> tuple[list[int],
     """COLMAP's numbers of the models to go on with, the largest first; and what is too small."""
     sizes = {number: num_registered(folder) for number, folder in found.items()}
     order = sorted(found, key=lambda number: (-sizes[number], number))
-    least = 0.0 if keep else max(_FEWEST_IMAGES, _LEAST_SHARE * sizes[order[0]])
+    least = 0.0 if keep else max(_LIMITS.fewest_images, _LIMITS.least_share * sizes[order[0]])
     kept = [number for number in order if number == order[0] or sizes[number] >= least]
     left_out = [Fragment(colmap_index=n, registered_images=sizes[n], sparse=found[n]) for n in order if n not in kept]
     for fragment in left_out:

@@ -11,6 +11,7 @@ import logging
 import platform
 import time
 from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -41,8 +42,17 @@ from colmap_inertial.reconstruction.preparation.sampling import guess_camera
 
 log = logging.getLogger(__name__)
 
-#: Frames for which the movement by the rolling shutter is computed, and points across an image.
-_SHUTTER_FRAMES, _GRID = 300, 9
+
+@dataclass(frozen=True, kw_only=True)
+class ReportLimits:
+    """How much of a run its report shows."""
+
+    #: Frames for which the movement by the rolling shutter is computed, and points across an image.
+    shutter_frames: int = 300
+    grid: int = 9
+
+
+_LIMITS = ReportLimits()
 
 
 def write_recording(
@@ -92,12 +102,12 @@ def _shutter_record(
     if not rectified:
         return None
     timing, camera = recording.timing, guess_camera(recording.capture, recording.timing)
-    x = (np.arange(_GRID) + 0.5) * camera.width / _GRID
-    y = (np.arange(_GRID) + 0.5) * camera.height / _GRID
+    x = (np.arange(_LIMITS.grid) + 0.5) * camera.width / _LIMITS.grid
+    y = (np.arange(_LIMITS.grid) + 0.5) * camera.height / _LIMITS.grid
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     shifts = []
     those = [i for i, name in enumerate(timing.names) if name in rectified]
-    for i in (those[k] for k in strided(len(those), _SHUTTER_FRAMES).tolist()):
+    for i in (those[k] for k in strided(len(those), _LIMITS.shutter_frames).tolist()):
         moved = Keypoints(name=timing.names[i], xy_px=grid)
         try:
             for stage in stages:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -32,12 +33,20 @@ from colmap_inertial.reconstruction.preparation.sampling import (
 log = logging.getLogger(__name__)
 
 
-#: Frames that are followed by their pixels come at least so often; how many are, before a reconstruction and when
-#: asked to diagnose, and how far apart at least.
-_VIDEO_STEP_S = 0.13
-_FEW, _FEW_SPACING_S = 90, 0.09
-#: Pictures further apart that are compared two by two.
-_COMPARED = 60
+@dataclass(frozen=True, kw_only=True)
+class FollowingLimits:
+    """Which images a check of the recording follows."""
+
+    #: Frames that are followed by their pixels come at least so often; how many are, before a reconstruction and when
+    #: asked to diagnose, and how far apart at least.
+    video_step_s: float = 0.13
+    few: int = 90
+    few_spacing_s: float = 0.09
+    #: Pictures further apart that are compared two by two.
+    compared: int = 60
+
+
+_LIMITS = FollowingLimits()
 
 
 def check_imu(raw: RawImu, *, force: bool) -> RawImu:
@@ -76,7 +85,7 @@ def preflight(
     capture, timing = recording.capture, recording.timing
     rotation = None
     if model is None and (capture.frame_log is None or not capture.frame_log.stabilised):
-        rotation = follow_video(capture, timing, _FEW, _FEW_SPACING_S, progress)
+        rotation = follow_video(capture, timing, _LIMITS.few, _LIMITS.few_spacing_s, progress)
     return diagnose(
         Recorded(
             imu=raw.imu,
@@ -143,7 +152,7 @@ def follow_video(
 
     Of ``most`` frames, at least ``spacing_s`` apart.
     """
-    if len(timing.t_s) < 2 or float(np.median(np.diff(timing.t_s))) > _VIDEO_STEP_S:
+    if len(timing.t_s) < 2 or float(np.median(np.diff(timing.t_s))) > _LIMITS.video_step_s:
         return None
     indices = sample_beginning(timing, spacing_s, most)
     return measure_sampled_rotation(capture, timing, guess_camera(capture, timing), indices, progress)
@@ -153,8 +162,8 @@ def compare_pictures(capture: Capture, timing: FrameTiming, progress: Progress) 
     """The rotation between pictures that are too far apart in time to be followed; ``None`` for fewer than five."""
     if len(timing.t_s) < 5:
         return None
-    first = max(0, (len(timing.t_s) - _COMPARED) // 2)
-    indices = range(first, min(first + _COMPARED, len(timing.t_s)))
+    first = max(0, (len(timing.t_s) - _LIMITS.compared) // 2)
+    indices = range(first, min(first + _LIMITS.compared, len(timing.t_s)))
     frames = counted(some_frames(capture, timing, indices), len(indices), "motion", progress)
     camera = colmap_camera(guess_camera(capture, timing))
     with one_blas_thread():

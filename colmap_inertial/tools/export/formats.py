@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,8 +31,20 @@ _COLUMNS = (
 )
 _PLACE = ("latitude_deg", "longitude_deg", "height_m")
 _GLTF_UP = np.array([0.0, 1.0, 0.0])
-#: Where a drawn camera begins to see, metres.
-_NEAR_M = 0.01
+
+
+@dataclass(frozen=True, kw_only=True)
+class LasLimits:
+    """Resolution and range of LAS coordinates."""
+
+    #: Where a drawn camera begins to see, metres.
+    near_m: float = 0.01
+    #: Step of the integers that LAS keeps coordinates in, model units.
+    las_step: float = 1e-6
+    las_range: int = 2**31 - 1
+
+
+_LIMITS = LasLimits()
 
 
 def smoothed_path(trajectory: Path | None, model: Path) -> CameraTrajectory:
@@ -162,7 +175,7 @@ class _Gltf:
     def camera(self, width: float, height: float) -> int:
         """One that sees so far to both sides together, at a distance of 1."""
         lens = self._gl.Perspective(
-            yfov=float(2 * np.arctan(0.5 * height)), aspectRatio=float(width / height), znear=_NEAR_M
+            yfov=float(2 * np.arctan(0.5 * height)), aspectRatio=float(width / height), znear=_LIMITS.near_m
         )
         self._gltf.cameras.append(self._gl.Camera(type="perspective", perspective=lens))
         return len(self._gltf.cameras) - 1
@@ -214,10 +227,6 @@ class _Gltf:
             )
         )
         return len(self._gltf.accessors) - 1
-
-
-#: Step of the integers that LAS keeps coordinates in, model units.
-_LAS_STEP, _LAS_RANGE = 1e-6, 2**31 - 1
 
 
 def sparse_points(model: pycolmap.Reconstruction) -> tuple[Array, UInt8Array]:
@@ -286,7 +295,7 @@ def write_las(path: Path, xyz: Array, rgb: UInt8Array, on_map: Georeference | No
     # 32-bit integers: the step grows with what is far away
     offset = np.floor(xyz.min(axis=0)) if len(xyz) else np.zeros(3)
     reach = float(np.abs(xyz - offset).max(initial=0.0))
-    header.offsets, header.scales = offset, np.full(3, max(_LAS_STEP, reach / _LAS_RANGE))
+    header.offsets, header.scales = offset, np.full(3, max(_LIMITS.las_step, reach / _LIMITS.las_range))
     las = laspy.LasData(header)
     las.x, las.y, las.z = xyz.T
     las.red, las.green, las.blue = (rgb.astype(np.uint16) * 257).T

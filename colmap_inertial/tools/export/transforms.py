@@ -14,9 +14,20 @@ from colmap_inertial.core.types import CameraModel
 
 #: From COLMAP's camera axes to OpenGL's, and back.
 OPENGL_FROM_CAM = np.diag([1.0, -1.0, -1.0])
-#: Side of the box around 0.5 that the scene is scaled to for instant-ngp, a power of two; it holds the cameras and this
-#: share of the points, with so much room around.
-_BOX, _POINTS_SHARE, _ROOM = 4, 0.98, 1.05
+
+
+@dataclass(frozen=True, kw_only=True)
+class NormalisationLimits:
+    """The box that trainers' scenes are brought into."""
+
+    #: Side of the box around 0.5 that the scene is scaled to for instant-ngp, a power of two.
+    box: int = 4
+    #: It holds the cameras and this share of the points, with so much room around.
+    points_share: float = 0.98
+    room: float = 1.05
+
+
+_LIMITS = NormalisationLimits()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -197,9 +208,9 @@ def _box(cam_in_world: Array, xyz: Array) -> dict[str, object]:
     """instant-ngp's ``scale``, ``offset`` and ``aabb_scale``: ``p' = scale p + offset`` fills the box around 0.5."""
     low, high = cam_in_world.min(axis=0), cam_in_world.max(axis=0)
     if len(xyz):
-        outside = 50 * (1 - _POINTS_SHARE) / 3  # each side of each axis leaves out its part
+        outside = 50 * (1 - _LIMITS.points_share) / 3  # each side of each axis leaves out its part
         low = np.minimum(low, np.percentile(xyz, outside, axis=0))
         high = np.maximum(high, np.percentile(xyz, 100 - outside, axis=0))
-    middle, reach = 0.5 * (low + high), _ROOM * float((high - low).max())
-    scale = _BOX / reach if reach > 0 else 1.0
-    return {"scale": scale, "offset": (0.5 - scale * middle).tolist(), "aabb_scale": _BOX}
+    middle, reach = 0.5 * (low + high), _LIMITS.room * float((high - low).max())
+    scale = _LIMITS.box / reach if reach > 0 else 1.0
+    return {"scale": scale, "offset": (0.5 - scale * middle).tolist(), "aabb_scale": _LIMITS.box}

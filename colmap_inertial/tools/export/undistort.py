@@ -21,14 +21,24 @@ if TYPE_CHECKING:
     import pycolmap
 
 
-#: A side of the new picture is at most this many times the old one's: beyond it a wide lens shows hardly any detail.
-_LARGEST = 1.6
-#: Points of the border that tell how far a picture reaches; how well distorting must undo undistorting there, px.
-_BORDER, _UNDONE_PX = 200, 0.05
-#: Where the new picture shows what the old one does not have, it shrinks by this share, so often.
-_SHRINK, _ROUNDS = 0.01, 90
-#: Distance of the nodes between which the resampling is interpolated, px.
-_STEP_PX = 8
+@dataclass(frozen=True, kw_only=True)
+class UndistortionLimits:
+    """How the undistorted image is searched."""
+
+    #: A side of the new picture is at most this many times the old one's: beyond it a wide lens shows hardly any
+    #: detail.
+    largest: float = 1.6
+    #: Points of the border that tell how far a picture reaches; how well distorting must undo undistorting there, px.
+    border: int = 200
+    undone_px: float = 0.05
+    #: Where the new picture shows what the old one does not have, it shrinks by this share, so often.
+    shrink: float = 0.01
+    rounds: int = 90
+    #: Distance of the nodes between which the resampling is interpolated, px.
+    step_px: int = 8
+
+
+_LIMITS = UndistortionLimits()
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,10 +84,10 @@ class Undistortion:
         if square:
             fx = fy = 0.5 * (fx + fy)
         half = _half_extent(camera)
-        for _ in range(_ROUNDS):
+        for _ in range(_LIMITS.rounds):
             # what is left of a whole pixel by rounding counts as one
             width, height = (
-                int(min(2 * extent * focal + 1e-6, _LARGEST * side))
+                int(min(2 * extent * focal + 1e-6, _LIMITS.largest * side))
                 for extent, focal, side in zip(half, (fx, fy), (camera.width, camera.height), strict=True)
             )
             if width < 1 or height < 1:
@@ -88,13 +98,13 @@ class Undistortion:
             found = cls(camera, pinhole)
             if found.is_inside():
                 return found
-            half = half * (1 - _SHRINK)
+            half = half * (1 - _LIMITS.shrink)
         raise FormatError(where, f"{named}: its lens cannot be undistorted")
 
     def is_inside(self) -> bool:
         """Whether all of the new picture comes from the old one."""
         width, height = self.pinhole.width, self.pinhole.height
-        x, y = np.linspace(0, width, _BORDER // 4), np.linspace(0, height, _BORDER // 4)
+        x, y = np.linspace(0, width, _LIMITS.border // 4), np.linspace(0, height, _LIMITS.border // 4)
         grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
         source = self.source_px(grid)
         size = np.array([self.camera.width, self.camera.height])
@@ -124,11 +134,11 @@ class Undistortion:
         if self.is_same():
             return image
         width, height = self.pinhole.width, self.pinhole.height
-        nodes = _STEP_PX * grid_nodes(*BlurField.nodes(width, height, _STEP_PX))
+        nodes = _LIMITS.step_px * grid_nodes(*BlurField.nodes(width, height, _LIMITS.step_px))
         target = colmap_px_from_opencv(nodes.reshape(-1, 2))
         # a shift between pixels is the same whichever corner they are counted from
         shift = (self.source_px(target) - target).reshape(nodes.shape)
-        maps = sampling_maps(_continued(shift), width, height, _STEP_PX)
+        maps = sampling_maps(_continued(shift), width, height, _LIMITS.step_px)
         out = cv2.remap(image, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(out, dtype=np.uint8)
 
@@ -151,7 +161,7 @@ def _normalised(camera: pycolmap.Camera, xy_px: Array) -> Array:
     ahead = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
     ahead[~np.isfinite(rays).all(axis=1)] = [0.0, 0.0, 1.0]
     back = np.asarray(camera.img_from_cam(ahead), dtype=np.float64)
-    lost = ~(np.abs(back - xy_px).max(axis=1) < _UNDONE_PX)
+    lost = ~(np.abs(back - xy_px).max(axis=1) < _LIMITS.undone_px)
     rays[lost] = np.nan
     return rays
 
@@ -159,7 +169,7 @@ def _normalised(camera: pycolmap.Camera, xy_px: Array) -> Array:
 def _half_extent(camera: pycolmap.Camera) -> Array:
     """(2,) how far the picture reaches at z = 1, to the nearer side of each two."""
     width, height = camera.width, camera.height
-    x, y = np.linspace(0, width, _BORDER), np.linspace(0, height, _BORDER)
+    x, y = np.linspace(0, width, _LIMITS.border), np.linspace(0, height, _LIMITS.border)
     sides = {
         (0, -1.0): np.stack([np.zeros_like(y), y], axis=1),
         (0, 1.0): np.stack([np.full_like(y, width), y], axis=1),
@@ -168,7 +178,7 @@ def _half_extent(camera: pycolmap.Camera) -> Array:
     }
     # where no ray leads to the border, the lens sees further than a pinhole may
     size = np.array([width, height])
-    reach = 0.5 * _LARGEST * size / [camera.focal_length_x, camera.focal_length_y]
+    reach = 0.5 * _LIMITS.largest * size / [camera.focal_length_x, camera.focal_length_y]
     for (axis, sign), border in sides.items():
         rays = sign * _normalised(camera, border)[:, axis]
         rays = rays[np.isfinite(rays) & (rays > 0)]
