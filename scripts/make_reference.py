@@ -14,7 +14,7 @@ import json
 import re
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -184,12 +184,16 @@ def described_in(docstring: str) -> dict[str, str]:
 
 
 def of_class(node: ast.ClassDef, lines: list[str]) -> Iterator[Constant]:
-    """Numeric defaults of a frozen dataclass; none where most of its fields have no default."""
+    """Numeric defaults of a frozen dataclass; none where most of its fields have no default.
+
+    Fields right below one with a comment share it.
+    """
     fields = [one for one in node.body if isinstance(one, ast.AnnAssign)]
     given = [one for one in fields if one.value is not None and has_number(one.value)]
     if 2 * len(given) < len(fields):
         return
     listed = described_in(ast.get_docstring(node) or "")
+    group: Constant | None = None
     for place, one in enumerate(node.body):
         if one not in given:
             continue
@@ -197,8 +201,15 @@ def of_class(node: ast.ClassDef, lines: list[str]) -> Iterator[Constant]:
         text = behind.value.value if isinstance(behind, ast.Expr) and isinstance(behind.value, ast.Constant) else ""
         name = ast.unparse(one.target)
         meaning = (text if isinstance(text, str) else "") or comment_above(lines, one.lineno) or listed.get(name, "")
-        if meaning:
-            yield Constant((f"{node.name}.{name}",), (ast.unparse(one.value),), " ".join(meaning.split()))
+        constant = Constant((f"{node.name}.{name}",), (ast.unparse(one.value),), " ".join(meaning.split()))
+        if group is not None and not meaning and lines[one.lineno - 2].strip():
+            group = replace(group, names=group.names + constant.names, values=group.values + constant.values)
+            continue
+        if group is not None:
+            yield group
+        group = constant if meaning else None
+    if group is not None:
+        yield group
 
 
 def of_assignment(node: ast.Assign | ast.AnnAssign, lines: list[str]) -> Iterator[Constant]:

@@ -30,7 +30,6 @@ from colmap_inertial.core.validation import check_array
 
 #: WGS84: semi-major axis and flattening.
 SEMI_MAJOR_M, FLATTENING = 6378137.0, 1 / 298.257223563
-
 _ECCENTRICITY2 = FLATTENING * (2 - FLATTENING)
 
 
@@ -45,22 +44,17 @@ class GeoreferenceLimits:
     #: Prior of the slow errors: log-normal about what the receiver states, or about this, by this factor.
     usual_slow_m: float = 2.0
     slow_factor: float = 2.5
-    #: Prior of the time by which positions lag: what flight controllers take for receivers from their logs (.11 to
-    #: .22 s: ArduPilot's u-blox driver, PX4's EKF2_GPS_DELAY), and .49 s measured of a GoPro (Race Technology); phones,
-    #: which smooth, up to a second.
+    #: Prior of the delay of positions: flight controllers assume .11 to .22 s (ArduPilot's u-blox driver, PX4's
+    #: EKF2_GPS_DELAY); a GoPro has .49 s (Race Technology); phones, which smooth, up to a second.
     usual_delay_s: float = 0.3
     delay_sigma_s: float = 0.3
-    #: Delays tried first, in standard deviations of the prior.
+    #: Delays tried first, in standard deviations of the prior; then about the best, in its own standard deviations.
     delay_span: tuple[float, float] = (-3.0, 5.0)
-    #: And how many.
     delays: int = 33
-    #: Then more closely: so far to each side of the best, in its own standard deviations.
     closer: float = 5.0
     closer_delays: int = 17
-    #: How much larger errors of heights are.
-    vertical: float = 1.5
-    #: More positions than these are thinned out evenly: their errors are alike anyway.
-    most: int = 240
+    vertical: float = 1.5  #: How much larger errors of heights are.
+    most: int = 240  #: More positions are thinned out evenly: their errors are alike anyway.
     #: Positions farther off than so many times the usual distance, and than so many metres, are left out.
     outlier_m: float = 3.0
     outlier: float = 5.0
