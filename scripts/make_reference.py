@@ -157,7 +157,10 @@ def has_number(node: ast.expr) -> bool:
 
 
 def comment_above(lines: list[str], line: int) -> str:
-    """The ``#:`` comment that ends above a line, which counts from 1."""
+    """The ``#:`` comment beside a line, which counts from 1, or the one that ends above it."""
+    beside = lines[line - 1].partition("#:")[2].strip()
+    if beside:
+        return beside
     above = []
     for text in reversed(lines[: line - 1]):
         if not text.lstrip().startswith("#:"):
