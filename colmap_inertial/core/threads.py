@@ -78,6 +78,8 @@ def one_blas_thread() -> Iterator[None]:
     The estimators multiply many small matrices: there, threads within one product cost more than they save (three
     times the time on two cores).
     """
+    # SciPy brings a BLAS of its own, and only libraries that are loaded can be limited
+    import scipy.linalg  # noqa: F401
     from threadpoolctl import threadpool_limits
 
     with threadpool_limits(limits=1, user_api="blas"):
