@@ -239,7 +239,7 @@ def write_map(file: Path) -> None:
             lines[str(Path(path).relative_to(ROOT / PACKAGE))] = {line: some for line, some in named.items() if some}
         seconds: dict[str, float] = {}
         for case in re.finditer(r'<testcase classname="([^"]*)" name="([^"]*)" time="([^"]*)"', times.read_text()):
-            name = f"{case[1].replace('.', '/')}.py::{re.sub(r'[[].*', '', case[2])}"
+            name = f"{case[1].replace('.', '/')}.py::{case[2].partition('[')[0]}"
             seconds[name] = max(seconds.get(name, 0.0), float(case[3]))
     file.write_text(json.dumps({"lines": lines, "seconds": seconds}))
 
