@@ -14,6 +14,7 @@ from colmap_inertial.core.geometry import matrix_from_quat, so3_exp
 from colmap_inertial.core.types import CameraModel
 from colmap_inertial.io.files import write_json
 from colmap_inertial.model.artefacts import write_map
+from colmap_inertial.pipeline.run.context import RunContext
 from colmap_inertial.tools.simulate import MotionOptions, SceneRecipe, ShutterCamera, develop, make_scene
 from colmap_inertial.tools.simulate.capture import _truth
 
@@ -101,7 +102,7 @@ def test_depths_of_a_simulated_scene(scene):
     fused = folder / "fused.ply"
     fuse_maps(
         folder, names, (fused, folder / "fused.ply.vis"), maker="plane sweep", kind="geometric",
-        scratch=folder / "scratch", num_threads=1,
+        scratch=folder / "scratch", context=RunContext(num_threads=1),
     )  # fmt: skip
     surface = bench.surface_figures(bench.points_of(fused), truth)
     print(surface)

@@ -211,7 +211,7 @@ def test_a_finished_project_is_gone_on_with_by_the_sweep(tmp_path, capsys):
 def test_with_cuda_it_goes_through_in_one_run(box, tmp_path, monkeypatch):
     out, calls = tmp_path / "out", []
 
-    def patch_match(workspace, max_image_size):
+    def patch_match(workspace, max_image_size, settings):
         calls.append(max_image_size)
         # the result file is not there yet, but the scale is in the model
         estimate = json.loads((out / "sparse" / "0" / "transform.json").read_text())["scale"]

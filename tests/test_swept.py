@@ -13,6 +13,7 @@ from colmap_inertial.colmap.depth_maps import MadeFrom, choose_maker, coverage, 
 from colmap_inertial.colmap.sweep_stereo import SweptWorkspace
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.model.artefacts import read_map, write_map
+from colmap_inertial.pipeline.run.context import RunContext
 
 VIEWS = [camera((x, -0.6 + z, 0.3 + z), (5 * z, -6 * x, 20 * x)) for x in (-0.5, -0.2, 0.2, 0.5) for z in (-0.15, 0.15)]
 #: One in a folder; the last one sees nothing that others see.
@@ -117,7 +118,7 @@ def test_exact_depths_of_pixel_centres_are_fused_exactly(workspace, tmp_path):
         cloud = tmp_path / f"{maker}.ply"
         fuse_maps(
             workspace, NAMES[:-1], (cloud, tmp_path / "fused.ply.vis"), maker=maker, kind="geometric",
-            scratch=tmp_path / "scratch", num_threads=1,
+            scratch=tmp_path / "scratch", context=RunContext(num_threads=1),
         )  # fmt: skip
         away[maker] = np.percentile(off_the_walls(vertices(cloud)), 90)
     assert away["plane sweep"] < 1e-4 < 1e-3 < away["patch-match"]

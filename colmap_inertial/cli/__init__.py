@@ -8,6 +8,7 @@ import difflib
 import functools
 import itertools
 import os
+import re
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -60,6 +61,12 @@ _COMMON: dict[str, tuple[str, ...]] = {
     "export": ("program", "images", "model"),
 }
 _HELP = ("-h", "--help")
+#: Options that take several values, and what is said where none follows.
+_LISTS = {
+    "--calibration": "--calibration takes a file, or two: from `align --out`, from `calibrate-imu --out`",
+    "--colmap": "--colmap takes SECTION.option=value, such as Mapper.init_num_trials=100",
+}
+_SETTING = re.compile(r"\w+\.\w+=")
 
 
 def parse(args: Sequence[str]) -> Speaker:
@@ -92,7 +99,7 @@ def parse(args: Sequence[str]) -> Speaker:
         default = _read_default(cls, args) if list(args[:1]) == [name] else None
         settings = subcommand(name) if default is None else subcommand(name, default=default)
         choices.append(Annotated[cls, settings])
-    args = _move_calibrations_last(args)
+    args = _move_lists_last(args)
     command: Any = Union[tuple(choices)]  # noqa: UP007 (built at run time)
     return tyro.cli(command, prog="colmap-inertial", description=DESCRIPTION, args=list(args), config=_CONFIG)
 
@@ -163,23 +170,28 @@ def _suggest_nearest(word: str, known: Iterable[str]) -> str:
     return f"; did you mean {like[0]}?" if like else ""
 
 
-def _move_calibrations_last(args: Sequence[str]) -> list[str]:
-    """The same with what follows ``--calibration`` at the end, where it does not swallow the paths of the command.
+def _move_lists_last(args: Sequence[str]) -> list[str]:
+    """The same with what follows ``--calibration`` and ``--colmap`` at the end, where it swallows no path.
 
-    It takes one file, and a second one where that is another JSON file.
+    The first takes one file, and a second one where that is another JSON file; the other takes settings. Each may be
+    given several times.
     """
-    rest, files, remaining = list[str](), list[str](), list(args)
+    rest, remaining = list[str](), list(args)
+    lists: dict[str, list[str]] = {"--calibration": [], "--colmap": []}
     while remaining:
-        word = remaining.pop(0)
-        if word != "--calibration":
-            rest.append(word)
+        word, equals, value = remaining[0].partition("=")
+        if word not in lists:
+            rest.append(remaining.pop(0))
             continue
+        remaining[:1] = [value] if equals else []
         if not remaining or remaining[0].startswith("--"):
-            raise InertialError("--calibration takes a file, or two: from `align --out`, from `calibrate-imu --out`")
-        files.append(remaining.pop(0))
-        while remaining and remaining[0].lower().endswith(".json"):
-            files.append(remaining.pop(0))
-    return [*rest, "--calibration", *files] if files else rest
+            raise InertialError(_LISTS[word])
+        lists[word].append(remaining.pop(0))
+        while remaining and (
+            remaining[0].lower().endswith(".json") if word == "--calibration" else _SETTING.match(remaining[0])
+        ):
+            lists[word].append(remaining.pop(0))
+    return [*rest, *(one for word, values in lists.items() if values for one in (word, *values))]
 
 
 def _read_default(cls: type[Speaker], args: Sequence[str]) -> Speaker | None:

@@ -19,7 +19,14 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 #: Words for the values of options, where the type alone says too little.
 _VALUES = {Path: "PATH", int: "N", float: "NUMBER", str: "TEXT"}
-_BY_NAME = {"device": "NAME", "remember": "NAME", "target": "TARGET", "model": "N", "keep": "PATTERN"}
+_BY_NAME = {
+    "device": "NAME",
+    "remember": "NAME",
+    "target": "TARGET",
+    "model": "N",
+    "keep": "PATTERN",
+    "colmap": "SECTION.option=value",
+}
 _WIDEST, _NARROWEST, _COLUMN = 100, 40, 28
 
 

@@ -36,6 +36,7 @@ from colmap_inertial.io.files import path_in, read_json, write_json
 from colmap_inertial.io.images import read_image
 from colmap_inertial.io.ply import read_ply_header
 from colmap_inertial.model import TRANSFORM_FILE, read_model
+from colmap_inertial.pipeline.run.context import RunContext
 from colmap_inertial.pipeline.run.runner import fingerprint, remove
 from colmap_inertial.pipeline.run.session import Session
 from colmap_inertial.pipeline.run.workspace import a_record_of_ours
@@ -165,14 +166,17 @@ def _densify(
     """Everything after undistortion."""
     import pycolmap
 
-    runner, num_threads = session.runner, session.context.num_threads
+    runner, context = session.runner, session.context
     folder, names, maker = session.workspace.dense / str(index), prepared.names, prepared.made_from.maps
     before = [f"dense_{index}_undistorted"]
     if maker == "plane sweep":
         _sweep(session, index, prepared, progress)
     elif pycolmap.has_cuda:
         size = prepared.made_from.max_image_size
-        runner.run(f"dense_{index}_depth", {"maps": maker}, [], lambda _: patch_match(folder, size), after=before)
+        decided = {"maps": maker, "settings": prepared.made_from.settings}
+        runner.run(
+            f"dense_{index}_depth", decided, [], lambda _: patch_match(folder, size, context.colmap), after=before
+        )
         progress()
     kind, mapped = find_maps(folder, names)
     result = DenseResult(folder=folder, images=len(names), depth_maps=len(mapped), maps=maker)
@@ -187,13 +191,14 @@ def _densify(
     def fuse(partial: Sequence[Path]) -> None:
         scratch = session.workspace.stamps / "fusion"
         targets = partial[0], partial[1]
-        fuse_maps(folder, mapped, targets, maker=maker, kind=kind, scratch=scratch, num_threads=num_threads)
+        fuse_maps(folder, mapped, targets, maker=maker, kind=kind, scratch=scratch, context=context)
         write_json(partial[2], {"coverage": coverage(folder, mapped, kind)})
 
     maps = [fingerprint(folder / "stereo" / f"{what}_maps") for what in ("depth", "normal")]
     record = session.workspace.stamps / f"dense_{index}_measured.json"
     outputs = [fused, folder / "fused.ply.vis", record]
-    runner.run(f"dense_{index}_fused", {"maps": maps}, outputs, fuse, after=before)
+    made_by: dict[str, object] = {"maps": maps, "colmap": context.colmap.identity("fusion")}
+    runner.run(f"dense_{index}_fused", made_by, outputs, fuse, after=before)
     progress()
     with a_record_of_ours(record):
         covered = float(read_json(record)["coverage"])
@@ -209,20 +214,20 @@ def _densify(
     else:
         depth, trim = _choose_octree(fused, read_model(folder / "sparse"))
         depends = {"depth": depth, "trim": trim}
-        make_mesh = partial(_poisson_mesh, fused, depth=depth, trim=trim, num_threads=num_threads)
+        make_mesh = partial(_poisson_mesh, fused, depth=depth, trim=trim, context=context)
     runner.run(
         f"dense_{index}_mesh", depends, [mesh], lambda outputs: make_mesh(outputs[0]), after=[f"dense_{index}_fused"]
     )
     return replace(result, mesh=mesh, faces=_count_elements(mesh, "face"))
 
 
-def _poisson_mesh(fused: Path, target: Path, *, depth: int, trim: float, num_threads: int) -> None:
+def _poisson_mesh(fused: Path, target: Path, *, depth: int, trim: float, context: RunContext) -> None:
     """Write COLMAP's Poisson surface of a point cloud."""
     import pycolmap
 
     poisson = pycolmap.PoissonMeshingOptions()
-    poisson.depth, poisson.trim, poisson.num_threads = depth, trim, num_threads
-    pycolmap.poisson_meshing(str(fused), str(target), poisson)
+    poisson.depth, poisson.trim, poisson.num_threads = depth, trim, context.num_threads
+    pycolmap.poisson_meshing(str(fused), str(target), context.colmap.apply(poisson))
     if not target.is_file():
         raise OutputError(f"{fused.parent}: COLMAP wrote no mesh; is the disk full?")
 
@@ -233,7 +238,7 @@ def _prepare_model(session: Session, index: int, images: Path, options: DenseOpt
     reconstruction = read_model(model)
     names = tuple(sorted(reconstruction.image(i).name for i in reconstruction.reg_image_ids()))
     _check_images(images, model, reconstruction)
-    made_from, has_maps = choose_maker(folder, digest(model), options.max_image_size)
+    made_from, has_maps = choose_maker(folder, digest(model), options.max_image_size, session.context.colmap)
     return _Prepared(names=names, made_from=made_from, has_maps=has_maps)
 
 

@@ -18,6 +18,8 @@ from colmap_inertial.io.files import path_in, read_json, write_json
 from colmap_inertial.model import read_model
 from colmap_inertial.model.artefacts import check_map, read_map
 from colmap_inertial.model.copying import copy_file
+from colmap_inertial.pipeline.run.colmap_settings import NO_SETTINGS, ColmapSettings
+from colmap_inertial.pipeline.run.context import RunContext
 from colmap_inertial.pipeline.run.runner import remove
 
 Maker = Literal["patch-match", "plane sweep"]
@@ -25,15 +27,18 @@ Maker = Literal["patch-match", "plane sweep"]
 #: Longer side of pictures that the sweep works on where the user names none: its work grows with its cube.
 _SWEPT_SIZE = 1200
 _RECORD = "made_from.json"
+#: Keys of the record that decide patch-match's maps, and what counts where an earlier version did not say.
+_MADE_FROM = (("model", None), ("max_image_size", None), ("settings", ""))
 #: Ends with the process that started it.
 _PATCH_MATCH = """
 import ctypes, signal, sys, zlib
 if sys.platform == "linux":
     ctypes.CDLL(None).prctl(1, signal.SIGKILL)
 import pycolmap
+from colmap_inertial.pipeline.run.colmap_settings import ColmapSettings
 options = pycolmap.PatchMatchOptions()
 options.max_image_size = int(sys.argv[2])
-pycolmap.patch_match_stereo(sys.argv[1], options=options)
+pycolmap.patch_match_stereo(sys.argv[1], options=ColmapSettings(tuple(sys.argv[3:])).apply(options))
 """
 
 
@@ -49,11 +54,14 @@ class MadeFrom:
         Longer side of the undistorted images; ``None`` is as they are.
     maps
         Who makes the maps.
+    settings
+        What the user set of patch-match.
     """
 
     model: str
     max_image_size: int | None
     maps: Maker
+    settings: str = ""
 
     def write(self, folder: Path) -> None:
         """Write it into a workspace that does not say it already."""
@@ -73,7 +81,9 @@ def model_of(folder: Path) -> str | None:
     return str(read_json(record).get("model")) if record.is_file() else None
 
 
-def choose_maker(folder: Path, model: str, max_image_size: int | None) -> tuple[MadeFrom, bool]:
+def choose_maker(
+    folder: Path, model: str, max_image_size: int | None, settings: ColmapSettings = NO_SETTINGS
+) -> tuple[MadeFrom, bool]:
     """Decide who makes a workspace's depth maps, and tell whether some are there.
 
     Whoever began goes on: maps of two makers are never mixed. Maps of patch-match may have taken hours, or came from
@@ -85,7 +95,7 @@ def choose_maker(folder: Path, model: str, max_image_size: int | None) -> tuple[
         The workspace, whether it is there or not.
     model
         Digest of the model.
-    max_image_size
+    max_image_size, settings
         What the user asks for.
 
     Raises
@@ -98,7 +108,7 @@ def choose_maker(folder: Path, model: str, max_image_size: int | None) -> tuple[
     maps = [file for file in (folder / "stereo").glob("*_maps/**/*.bin") if file.is_file()]
     here: Maker = "patch-match" if pycolmap.has_cuda else "plane sweep"
     if not maps:
-        return _plan_maps(model, max_image_size, here), False
+        return _plan_maps(model, max_image_size, here, settings), False
     record = folder / _RECORD
     known = read_json(record) if record.is_file() else {}
     # an earlier version's record does not say: only patch-match made maps then
@@ -109,8 +119,8 @@ def choose_maker(folder: Path, model: str, max_image_size: int | None) -> tuple[
             'them; remove depth_maps and normal_maps, or, where patch-match made them all, write "maps": "patch-match" '
             "there"
         )
-    wanted = _plan_maps(model, max_image_size, maker)
-    if all(known.get(key) == getattr(wanted, key) for key in ("model", "max_image_size")):
+    wanted = _plan_maps(model, max_image_size, maker, settings)
+    if all(known.get(key, default) == getattr(wanted, key) for key, default in _MADE_FROM):
         return wanted, True
     if maker == "patch-match":
         raise OutputExistsError(
@@ -118,12 +128,14 @@ def choose_maker(folder: Path, model: str, max_image_size: int | None) -> tuple[
         )
     for file in maps:
         remove(file)
-    return _plan_maps(model, max_image_size, here), False
+    return _plan_maps(model, max_image_size, here, settings), False
 
 
-def _plan_maps(model: str, max_image_size: int | None, maker: Maker) -> MadeFrom:
-    size = max_image_size or (_SWEPT_SIZE if maker == "plane sweep" else None)
-    return MadeFrom(model=model, max_image_size=size, maps=maker)
+def _plan_maps(model: str, max_image_size: int | None, maker: Maker, settings: ColmapSettings) -> MadeFrom:
+    if maker == "plane sweep":
+        return MadeFrom(model=model, max_image_size=max_image_size or _SWEPT_SIZE, maps=maker)
+    chosen = " ".join(settings.of("stereo"))
+    return MadeFrom(model=model, max_image_size=max_image_size, maps=maker, settings=chosen)
 
 
 def map_file(folder: Path, what: str, name: str, kind: str = "geometric") -> Path:
@@ -131,7 +143,7 @@ def map_file(folder: Path, what: str, name: str, kind: str = "geometric") -> Pat
     return path_in(folder / "stereo" / f"{what}_maps", f"{name}.{kind}.bin")
 
 
-def patch_match(folder: Path, max_image_size: int | None) -> None:
+def patch_match(folder: Path, max_image_size: int | None, settings: ColmapSettings) -> None:
     """COLMAP's patch-match on a dense workspace, in a process of its own: where CUDA fails it ends the process.
 
     Raises
@@ -145,7 +157,7 @@ def patch_match(folder: Path, max_image_size: int | None) -> None:
             check_map(path, 1 if "depth_maps" in path.parts else 3)
         except FormatError:
             remove(path)
-    command = [sys.executable, "-c", _PATCH_MATCH, str(folder), str(max_image_size or -1)]
+    command = [sys.executable, "-c", _PATCH_MATCH, str(folder), str(max_image_size or -1), *settings.of("stereo")]
     done = subprocess.run(command, capture_output=True, text=True, errors="replace")
     if done.returncode:
         message = (done.stderr.strip().splitlines() or ["no message"])[-1]
@@ -194,7 +206,7 @@ def fuse_maps(
     maker: Maker,
     kind: str,
     scratch: Path,
-    num_threads: int,
+    context: RunContext,
 ) -> None:
     """Fuse a workspace's depth maps.
 
@@ -214,8 +226,8 @@ def fuse_maps(
         Whose maps, and which of them.
     scratch
         A folder that may be made and removed.
-    num_threads
-        -1 takes all processors.
+    context
+        How the work is done.
 
     Raises
     ------
@@ -225,7 +237,8 @@ def fuse_maps(
     import pycolmap
 
     options = pycolmap.StereoFusionOptions()
-    options.num_threads = num_threads
+    options.num_threads = context.num_threads
+    options = context.colmap.apply(options)
     seen = folder
     if maker == "plane sweep":
         seen = scratch

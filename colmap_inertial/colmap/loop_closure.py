@@ -21,6 +21,7 @@ from colmap_inertial.core.arrays import Int64Array
 from colmap_inertial.model.submodels.graph import Pair
 from colmap_inertial.model.submodels.matches import LIMITS, Submodel, read_matches
 from colmap_inertial.model.submodels.merging import merge_points
+from colmap_inertial.pipeline.run.colmap_settings import NO_SETTINGS, ColmapSettings
 
 if TYPE_CHECKING:
     import pycolmap
@@ -69,11 +70,14 @@ class MappedCapture:
         Options of the mapper.
     names
         Of images, in order of time.
+    settings
+        What the user set of adjustments of a whole model.
     """
 
     database: Path
     pipeline: pycolmap.IncrementalPipelineOptions
     names: Sequence[str]
+    settings: ColmapSettings = NO_SETTINGS
 
     def cache(self) -> pycolmap.DatabaseCache:
         """The matches that the mapper uses."""
@@ -229,11 +233,11 @@ def _adjust(reconstruction: pycolmap.Reconstruction, capture: MappedCapture) -> 
     pipeline = capture.pipeline
     options = _adjustment(pipeline, reconstruction)
     options.ceres.solver_options.max_num_iterations = CLOSURE.rounds
-    pycolmap.bundle_adjustment(reconstruction, options)
+    pycolmap.bundle_adjustment(reconstruction, capture.settings.apply(options))
     mapper = pycolmap.IncrementalMapper(capture.cache())
     mapper.begin_reconstruction(reconstruction)
     # COLMAP's own loop would answer no signal until its end
-    options = _adjustment(pipeline, reconstruction)
+    options = capture.settings.apply(_adjustment(pipeline, reconstruction))
     mapper.complete_and_merge_tracks(pipeline.get_triangulation())
     mapper.retriangulate(pipeline.get_triangulation())
     for _ in range(pipeline.ba_global_max_refinements):

@@ -107,8 +107,8 @@ def map_images(
     every_pair = matches_every_pair(num_images, options)
     near = _NEIGHBOURS * options.overlap
     if options.mapper == "incremental":
-        pipeline = _incremental_options(options.refine_intrinsics, context)
-        capture = MappedCapture(database=database, pipeline=pipeline, names=in_time)
+        pipeline = incremental_options(options.refine_intrinsics, context)
+        capture = MappedCapture(database=database, pipeline=pipeline, names=in_time, settings=context.colmap)
         if len(in_time) > LONGEST and not every_pair:
             record = _map_in_parts(capture, images, sparse, context, near=near, loops=judged)
         else:
@@ -116,7 +116,7 @@ def map_images(
             record = _map_in_one_go(capture, images, sparse, _counter(context.progress, num_images), nearest=nearest)
     else:
         models = pycolmap.global_mapping(
-            str(database), str(images), str(sparse), options=_global_options(options, context)
+            str(database), str(images), str(sparse), options=global_options(options, context)
         )
         record = MapRecord(mapper="global", models=len(models))
     context.progress("mapping", num_images, num_images)
@@ -179,7 +179,8 @@ def _counter(progress: Progress, total: int, *, of: int | None = None) -> Callab
     return registered
 
 
-def _incremental_options(refine: bool, context: RunContext) -> pycolmap.IncrementalPipelineOptions:
+def incremental_options(refine: bool, context: RunContext) -> pycolmap.IncrementalPipelineOptions:
+    """COLMAP's options of its incremental mapper; whether it refines the cameras."""
     import pycolmap
 
     pipeline = pycolmap.IncrementalPipelineOptions()
@@ -190,10 +191,11 @@ def _incremental_options(refine: bool, context: RunContext) -> pycolmap.Incremen
     pipeline.mapper.abs_pose_refine_extra_params = refine
     if not refine:
         pipeline.ba_global_frames_ratio = pipeline.ba_global_points_ratio = _GLOBAL_RATIO
-    return pipeline
+    return context.colmap.apply(pipeline)
 
 
-def _global_options(options: MappingOptions, context: RunContext) -> pycolmap.GlobalPipelineOptions:
+def global_options(options: MappingOptions, context: RunContext) -> pycolmap.GlobalPipelineOptions:
+    """COLMAP's options of its global mapper."""
     import pycolmap
 
     pipeline = pycolmap.GlobalPipelineOptions()
@@ -201,4 +203,4 @@ def _global_options(options: MappingOptions, context: RunContext) -> pycolmap.Gl
     pipeline.mapper.bundle_adjustment.refine_focal_length = bool(options.refine_intrinsics)
     pipeline.mapper.bundle_adjustment.refine_extra_params = bool(options.refine_intrinsics)
     pipeline.mapper.rotation_averaging.use_gravity = options.gravity_priors
-    return pipeline
+    return context.colmap.apply(pipeline)

@@ -127,7 +127,7 @@ def extract_features(
         groups.setdefault(_intern(camera, groups), []).append(name)
     done = 0
     for camera, names in groups.items():
-        reader = pycolmap.ImageReaderOptions()
+        reader = context.colmap.apply(pycolmap.ImageReaderOptions())
         if camera is not None:
             colmap_camera(camera)  # raises on wrong parameters before any work
             reader.camera_model = camera.model
@@ -153,7 +153,7 @@ def extract_features(
                     image_names=batch,
                     camera_mode=pycolmap.CameraMode.SINGLE,
                     reader_options=reader,
-                    extraction_options=_extraction_options(options, context),
+                    extraction_options=extraction_options(options, context),
                     device=pycolmap.Device(context.device),
                 )
             with _writing(database), pycolmap.Database.open(str(database)) as opened:
@@ -166,7 +166,8 @@ def extract_features(
     return apply_keypoint_stages(database, keypoint_stages)
 
 
-def _extraction_options(options: MappingOptions, context: RunContext) -> pycolmap.FeatureExtractionOptions:
+def extraction_options(options: MappingOptions, context: RunContext) -> pycolmap.FeatureExtractionOptions:
+    """COLMAP's options of extraction."""
     import pycolmap
 
     extraction = pycolmap.FeatureExtractionOptions()
@@ -176,7 +177,26 @@ def _extraction_options(options: MappingOptions, context: RunContext) -> pycolma
         extraction.max_image_size = options.max_image_size
     extraction.sift.max_num_features = options.max_num_features
     extraction.sift.first_octave = options.first_octave
-    return extraction
+    return context.colmap.apply(extraction)
+
+
+def matching_options(context: RunContext) -> pycolmap.FeatureMatchingOptions:
+    """COLMAP's options of matching."""
+    import pycolmap
+
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.use_gpu = context.device == "cuda"
+    matching.num_threads = context.num_threads
+    return context.colmap.apply(matching)
+
+
+def verification_options(context: RunContext) -> pycolmap.TwoViewGeometryOptions:
+    """COLMAP's options of the verification of matches."""
+    import pycolmap
+
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = context.seed
+    return context.colmap.apply(verification)
 
 
 def _intern(camera: CameraModel | None, known: Mapping[CameraModel | None, list[str]]) -> CameraModel | None:
@@ -272,12 +292,7 @@ def match_pairs(
     import pycolmap
 
     total = len(pairs) if total is None else total
-    matching = pycolmap.FeatureMatchingOptions()
-    matching.use_gpu = context.device == "cuda"
-    matching.num_threads = context.num_threads
     pycolmap.set_random_seed(context.seed)
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = context.seed
     lines = [f"{a} {b}" for a, b in pairs]
     with tempfile.TemporaryDirectory() as folder:
         listed = Path(folder) / "pairs.txt"
@@ -289,9 +304,9 @@ def match_pairs(
             with _writing(database):
                 pycolmap.match_image_pairs(
                     str(database),
-                    matching_options=matching,
+                    matching_options=matching_options(context),
                     pairing_options=pycolmap.ImportedPairingOptions(match_list_path=str(listed)),
-                    verification_options=verification,
+                    verification_options=verification_options(context),
                     device=pycolmap.Device(context.device),
                 )
             done += len(batch)

@@ -11,9 +11,9 @@ from colmap_inertial.colmap.mapping import MapRecord, map_images
 from colmap_inertial.colmap.pairing import MatchRecord, match_capture
 from colmap_inertial.colmap.sparse import KeypointRecords, extract_features, write_gravity_priors
 from colmap_inertial.core.arrays import Array
-from colmap_inertial.core.options import ReconstructOptions
+from colmap_inertial.core.options import MappingOptions, ReconstructOptions
 from colmap_inertial.io.files import read_record, write_record
-from colmap_inertial.pipeline.run.context import Recording
+from colmap_inertial.pipeline.run.context import Recording, RunContext
 from colmap_inertial.pipeline.run.session import Session
 from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
 from colmap_inertial.pipeline.stages.protocols import KeypointStage
@@ -61,10 +61,11 @@ def run_colmap(
         write_gravity_priors(partial[0], gravity)
         write_record(partial[1], found)
 
-    extraction = [getattr(mapping, name) for name in ("max_image_size", "max_num_features", "first_octave")]
-    depends = {"extraction": extraction, **context.identity(), "stages": stages, "gravity": gravity}
+    settings = context.colmap.identity
+    depends = {**_identify_extraction(mapping, context), "stages": stages, "gravity": gravity}
     pairing = {
         **depends,
+        "colmap": settings("features", "matches"),
         "pairing": [mapping.pairing, mapping.overlap],
         "gyroscope": [recording.imu, recording.timing, recording.prior, recording.max_offset_s],
     }
@@ -94,9 +95,16 @@ def run_colmap(
         write_record(partial[1], record)
 
     runner.run("matches", pairing, outputs, matches, after=["frames"])
-    runner.run("mapping", {"mapping": mapping}, [workspace.colmap_sparse, workspace.mapped], models, after=["matches"])
+    decided = {"mapping": mapping, "colmap": settings("mapping", "adjustment")}
+    runner.run("mapping", decided, [workspace.colmap_sparse, workspace.mapped], models, after=["matches"])
     return (
         read_record(workspace.keypoints, KeypointRecords),
         read_record(workspace.matches, MatchRecord),
         read_record(workspace.mapped, MapRecord),
     )
+
+
+def _identify_extraction(mapping: MappingOptions, context: RunContext) -> dict[str, object]:
+    """What decides features beside the images."""
+    chosen = [getattr(mapping, name) for name in ("max_image_size", "max_num_features", "first_octave")]
+    return {"extraction": chosen, "colmap": context.colmap.identity("features"), **context.identity()}

@@ -316,6 +316,10 @@ class ReconstructOptions:
     """Undo the rolling shutter by the gyroscope. Not given: rectify, where the readout time is known."""
     mapping: MappingOptions = field(default_factory=MappingOptions)
     """How COLMAP builds the model."""
+    colmap: tuple[str, ...] = ()
+    """Options of COLMAP's own, each as SECTION.option=value, such as Mapper.init_num_trials=100."""
+    colmap_project: Path | None = None
+    """A project.ini of COLMAP: what differs in it from COLMAP's defaults is used; --colmap goes before it."""
     scale: ScaleOptions = field(default_factory=ScaleOptions)
     """How metres come from the IMU."""
     join: JoinMethod = "inertial"

@@ -11,6 +11,7 @@ from colmap_inertial.core.types import CameraImuCalibration, FrameTiming, ImuRec
 from colmap_inertial.io.calibration import CalibrationFiles, largest_offset_s, read_calibrations, read_for_recording
 from colmap_inertial.io.capture import Capture, Video
 from colmap_inertial.io.files import path_in
+from colmap_inertial.pipeline.run.colmap_settings import NO_SETTINGS, ColmapSettings, read_settings
 from colmap_inertial.pipeline.run.progress import Progress, silent
 from colmap_inertial.pipeline.run.runner import fingerprint
 
@@ -115,6 +116,8 @@ class RunContext:
         Of COLMAP.
     device
         What COLMAP finds and matches features on.
+    colmap
+        What the user set of COLMAP's own options.
     progress
         Hears how far it is.
     """
@@ -123,13 +126,15 @@ class RunContext:
     num_threads: int = -1
     seed: int = 0
     device: Device = "cpu"
+    colmap: ColmapSettings = NO_SETTINGS
     progress: Progress = silent
 
     @classmethod
     def of(cls, options: ReconstructOptions, *, device: Device = "cpu", progress: Progress = silent) -> RunContext:
-        """As the options of a reconstruction ask for."""
+        """As the options of a reconstruction ask for; an ``InertialError`` for options that COLMAP does not have."""
         num_threads = 1 if options.deterministic else -1
-        return cls(num_threads=num_threads, seed=options.seed, device=device, progress=progress)
+        settings = read_settings(options.colmap, options.colmap_project)
+        return cls(num_threads=num_threads, seed=options.seed, device=device, colmap=settings, progress=progress)
 
     def reporting(self, progress: Progress) -> RunContext:
         """The same, heard by somebody else."""

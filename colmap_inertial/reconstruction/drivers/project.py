@@ -47,6 +47,7 @@ from colmap_inertial.model import (
 from colmap_inertial.model.copying import list_tree
 from colmap_inertial.model.layout import read_layout
 from colmap_inertial.model.similarities import ModelScale, read_similarity
+from colmap_inertial.pipeline.run.colmap_settings import read_settings
 from colmap_inertial.pipeline.run.context import Recording, RunContext, correct_imu, prior_calibration
 from colmap_inertial.pipeline.run.progress import Progress, silent
 from colmap_inertial.pipeline.run.runner import fingerprint
@@ -238,6 +239,8 @@ def _check_options(options: ReconstructOptions) -> None:
         if getattr(getattr(options, group), f.name) != getattr(getattr(default, group), f.name)
         and not (f.name == "refine_intrinsics" and options.refine != "off")
     ]
+    settings = read_settings(options.colmap, options.colmap_project)
+    named += [f"--colmap {text}" for text in settings.of("features", "matches", "mapping", "adjustment")]
     named += ["--deblur"] if options.deblur not in (None, "off") else []
     named += ["--rolling-shutter"] if options.rolling_shutter not in (None, "off") else []
     if named:

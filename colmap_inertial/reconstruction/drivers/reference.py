@@ -33,6 +33,7 @@ from colmap_inertial.io.mp4 import is_mp4
 from colmap_inertial.model import find_models, read_model
 from colmap_inertial.model.copying import copy_file, new_folder
 from colmap_inertial.model.project import apply_to_project
+from colmap_inertial.pipeline.run.colmap_settings import read_settings
 from colmap_inertial.pipeline.run.context import RunContext
 from colmap_inertial.pipeline.run.progress import Progress, counted, silent
 from colmap_inertial.pipeline.run.session import keep_colmap_quiet
@@ -293,6 +294,8 @@ def reconstruct_by(
     pictures = _pictures(capture)
     names = _names(pictures)
     made_from = {"capture": str(capture.resolve()), "pictures": len(names), **dataclasses.asdict(options.mapping)}
+    if settings := read_settings(options.colmap, options.colmap_project).settings:
+        made_from["colmap"] = list(settings)
     if not _is_mapped(out, made_from):
         with new_folder(out) as work:
             left_out = _map(pictures, names, work / "colmap", options, progress)

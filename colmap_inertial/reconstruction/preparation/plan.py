@@ -28,6 +28,7 @@ from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.exif import read_exposures_s
 from colmap_inertial.io.files import path_in
 from colmap_inertial.model import colmap_camera
+from colmap_inertial.pipeline.run.colmap_settings import NO_SETTINGS
 from colmap_inertial.pipeline.run.context import Recording, RunContext
 from colmap_inertial.pipeline.run.progress import Progress
 from colmap_inertial.pipeline.run.session import Session
@@ -123,8 +124,11 @@ def ask_for_plan(
 def run_plan(session: Session, recording: Recording, asked: Treatments) -> ImagingPlan:
     """What to do to frames and keypoints; where nothing is asked for, nothing is looked at."""
 
+    # the user's settings are for the whole capture, not for small models of parts of it
+    plain = replace(session.context, colmap=NO_SETTINGS)
+
     def work(partial: Sequence[Path]) -> None:
-        write_plan(partial[0], plan_imaging(recording, session.context, asked))
+        write_plan(partial[0], plan_imaging(recording, plain, asked))
 
     depends = {
         **recording.identity(),
