@@ -17,18 +17,23 @@ scale's), and how far the refined centres lie from the poses after one similarit
 import argparse
 import subprocess
 import sys
+import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
+from bench_report import write_report
 from bench_scale import recordings_in
 from bench_whole import euroc_capture
 from check_euroc import check, similarity
+from real_scores import covered, scores
+from real_world import World, film, worlds
 
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.types import CameraTrajectory, FrameTiming
-from colmap_inertial.io.calibration import calibration_prior
+from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.files import read_json
 from colmap_inertial.io.trajectories import read_inertial_scale
 from colmap_inertial.model import Model
@@ -123,6 +128,99 @@ def recording(folder: Path, noise_px: float) -> None:
     )
 
 
+def filmed_window(asked: argparse.Namespace, world: World) -> dict[str, Any]:
+    """One window through scale and refinement."""
+    filmed = film(asked.imu, world)
+    timing = replace(filmed.timing, readout_s=world.readout_s) if asked.declared else filmed.timing
+    prior = calibration_prior(Declared(readout_s=world.readout_s) if asked.declared and world.readout_s else None)
+    model = Model(reconstruction=filmed.model, colmap_index=0, timing=timing)
+    stages = {"imu": filmed.imu, "calibration": prior}
+    model = MetricStage(**stages)(model)
+    out: dict[str, Any] = {"recording": world.recording, "begin_s": world.begin_s, "seed": world.seed}
+    if model.similarity is None:
+        return out | {"said": "; ".join(model.scale.reasons)}
+    out["before"] = scores(model, filmed) | covered(model, filmed)
+    begin_s, processor_s = time.perf_counter(), time.process_time()
+    refined = RefineStage(**stages, refine_intrinsics=True)(model)
+    out["wall_s"], out["cpu_s"] = time.perf_counter() - begin_s, time.process_time() - processor_s
+    said = refined.treatments[-1]
+    out |= {"said": said.reason, "accepted": said.action == "refined", "values": said.values}
+    if out["accepted"]:
+        out["after"] = scores(refined, filmed) | covered(refined, filmed)
+        lever = np.array(said.values["imu_in_cam_m"]) - filmed.imu_in_cam_m
+        out["lever_mm"] = 1e3 * float(np.linalg.norm(lever))
+        out["lever_z"] = (lever / said.values["imu_in_cam_sigma_m"]).tolist()
+        own = said.values.get("size_before")
+        out["own_scale_pct"] = out["after"]["scale_pct"] - (100 * float(np.log(own)) if own else 0.0)
+    return out
+
+
+#: Of the table: columns of scores, and how they are shown.
+COLUMNS = {
+    "path_mm": "6.1f",
+    "over_1_s_mm": "5.1f",
+    "over_5_s_mm": "6.1f",
+    "rotation_deg": "5.2f",
+    "gravity_deg": "5.2f",
+    "drift_pct": "6.2f",
+    "scale_pct": "6.2f",
+    "scale_z": "5.1f",
+    "verdict": "7s",
+    "velocity_mm_s": "5.0f",
+    "position_nees": "6.1f",
+    "velocity_nees": "6.1f",
+}
+
+
+def real_imus(asked: argparse.Namespace) -> None:
+    """Windows of real motion and real IMUs, before and after."""
+    options = {"readout_s": 1e-3 * asked.readout_ms, "loops": asked.loops}
+    found = worlds(asked.imu, asked.length, 6 if asked.quick else asked.windows, **options)
+    results = []
+    print(f"{'':31}" + " ".join(f"{name:>{max(7, len(name))}}" for name in COLUMNS))
+    for world in found:
+        for seed in asked.seeds:
+            one = filmed_window(asked, replace(world, seed=seed))
+            results.append(one)
+            for when in ("before", "after"):
+                if when in one:
+                    told = (f"{one[when][n]:{f}}".rjust(max(7, len(n))) for n, f in COLUMNS.items())
+                    print(f"{world.recording:5} {world.begin_s:6.1f} {seed:2} {when:>6}{'':8}" + " ".join(told))
+            print(
+                f"    own scale {one.get('own_scale_pct', np.nan):+.2f} %, lever {one.get('lever_mm', np.nan):.0f} mm, "
+                f"{one.get('wall_s', 0):.1f} s, {one.get('cpu_s', 0):.1f} s of CPU; {one['said']}",
+                flush=True,
+            )
+    summarise(results)
+    if asked.json:
+        write_report(asked.json, {"windows": results})
+
+
+def summarise(results: list[dict[str, Any]]) -> None:
+    """What all windows come to."""
+    good = [one for one in results if one.get("accepted")]
+    if not good:
+        return
+    ratio = np.array([one["before"]["path_mm"] / one["after"]["path_mm"] for one in good])
+    print(f"accepted {len(good)} of {len(results)}; path {np.median(ratio):.2f} times closer, worst {ratio.min():.2f}")
+    for when in ("before", "after"):
+        of = [one[when] for one in good]
+        scale = np.array([one["scale_pct"] for one in of])
+        trusted = np.array([one["verdict"] == "trusted" for one in of])
+        medians = {name: float(np.median([one[name] for one in of])) for name, f in COLUMNS.items() if f[-1] == "f"}
+        means = {name: float(np.mean([one[name] for one in of])) for name in of[0] if name.endswith(("nees", "inside"))}
+        print(
+            f"{when}: scale {np.sqrt(np.mean(scale**2)):.2f} % rms ({int(trusted.sum())} trusted "
+            f"{np.sqrt(np.mean(scale[trusted] ** 2)):.2f} %), medians "
+            + ", ".join(f"{name} {value:.3g}" for name, value in medians.items())
+            + "; means "
+            + ", ".join(f"{name} {value:.2f}" for name, value in means.items())
+        )
+    own = np.array([one["own_scale_pct"] for one in good])
+    lever = np.concatenate([one["lever_z"] for one in good])
+    print(f"own scale {np.sqrt(np.mean(own**2)):.2f} % rms; lever arm {np.sqrt(np.mean(lever**2)):.2f} sigma rms")
+
+
 def _number(image: pycolmap.Image) -> int:
     return int(image.name)
 
@@ -132,7 +230,18 @@ def main() -> None:
     parser.add_argument("--euroc", type=Path, nargs=2, metavar=("DATASET", "FOLDER"))
     parser.add_argument("--recordings", type=Path)
     parser.add_argument("--noise-px", type=float, default=10.0)
+    parser.add_argument("--imu", type=Path, help="folder of real IMUs with motion capture")
+    parser.add_argument("--windows", type=int, default=100)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--length", type=float, default=30.0, help="of a window, s")
+    parser.add_argument("--readout-ms", type=float, default=0.0)
+    parser.add_argument("--declared", action="store_true", help="the readout is known")
+    parser.add_argument("--loops", action="store_true", help="points are seen again")
+    parser.add_argument("--quick", action="store_true", help="six windows")
+    parser.add_argument("--json", type=Path)
     asked = parser.parse_args()
+    if asked.imu:
+        real_imus(asked)
     if asked.euroc:
         euroc(*asked.euroc)
     if asked.recordings:
