@@ -61,13 +61,17 @@ class World:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Truth:
-    """A camera's true path: ``world_from_cam`` as quaternions, centres, velocities, and unit gravity in that world."""
+    """A camera's true path: ``world_from_cam`` as quaternions, centres, velocities, and unit gravity in that world.
+
+    ``recording_log`` is the error of the scale's logarithm that the IMU has by the true poses.
+    """
 
     t_s: Array
     quat: Array
     centre_m: Array
     velocity_m_s: Array
     down: Array
+    recording_log: float
 
     def at(self, t_s: Array) -> tuple[Array, Array, Array]:
         """(N, 3, 3) rotations, (N, 3) centres and velocities: spherical and Hermite between samples."""
@@ -95,6 +99,7 @@ class Filmed:
     velocity_m_s: Array
     down: Array
     imu_in_cam_m: Array
+    recording_log: float
 
 
 def worlds(folder: Path, length_s: float, most: int, **options: object) -> list[World]:
@@ -149,6 +154,7 @@ def truth_of(folder: Path, recording: str, begin_s: float, length_s: float) -> T
         centre_m=centre + rotation @ cam_in_body_m,
         velocity_m_s=velocity + np.einsum("nij,nj->ni", rotation, np.cross(rate, cam_in_body_m)),
         down=found.gravity_in_world_m_s2 / np.linalg.norm(found.gravity_in_world_m_s2),
+        recording_log=float(np.log(found.accepted.metres_per_unit)),
     )
 
 
@@ -288,6 +294,7 @@ def film(folder: Path, world: World) -> Filmed:
         centre_m=centre,
         velocity_m_s=velocity,
         down=truth.down,
+        recording_log=truth.recording_log,
         imu_in_cam_m=-body_from_cam.T @ cam_in_body_m,
     )
 

@@ -1,5 +1,7 @@
 """The band's factor, against dense algebra."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from refine_walk import problem_of, tracks_of, walk
@@ -7,7 +9,9 @@ from refine_walk import problem_of, tracks_of, walk
 from colmap_inertial.inertial.refine import _system
 from colmap_inertial.inertial.refine._residuals import moving
 from colmap_inertial.inertial.refine._system import BandFactor
+from colmap_inertial.inertial.refine.setup import at_middle_lines
 from colmap_inertial.inertial.refine.solve import factored
+from colmap_inertial.inertial.refine.world import derive_log_size, find_world
 
 
 @pytest.mark.parametrize(("states", "reach"), [(1, 1), (7, 2), (23, 4), (24, 24), (60, 9)])
@@ -39,6 +43,29 @@ def test_a_position_s_covariance_against_the_first_is_that_of_both():
         assert cov[:3, :3] == pytest.approx(expected, rel=1e-5, abs=1e-9)
     at_rest = solved.motion_covs(np.array([0]), by)[0]
     assert np.abs(at_rest[:3]).max() < 1e-9 and at_rest[3, 3] > 0
+
+
+def test_the_world_s_covariance_is_that_of_the_centres_split_by_cause():
+    options = walk(4.0, points_per_m=60.0)
+    problem, start, _ = problem_of(tracks_of(options), options)
+    solved, by = factored(problem, start), moving(problem, start)
+    centres = at_middle_lines(problem, start).cam_in_world
+    found = find_world(problem, start, centres, solved, by)
+    by_size = derive_log_size(centres, np.arange(len(centres))).ravel()
+    expected = by_size @ solved.centres_cov(np.arange(len(centres)), by) @ by_size
+    assert found.cov[0, 0] == pytest.approx(expected, rel=1e-6)
+    assert sum(found.parts.values()) == pytest.approx(expected, rel=1e-6)
+    assert min(found.parts.values()) >= 0
+    # a prior that knows the gains leaves them no part
+    gains, info = start.columns.accel_gain, problem.prior.info.copy()
+    info[gains, gains] *= 1e8
+    known = replace(problem, prior=replace(problem.prior, info=info))
+    solved = factored(known, start)
+    surer = find_world(known, start, centres, solved, moving(known, start))
+    assert surer.parts["accel_gain"] < 1e-6 * found.parts["accel_gain"]
+    assert surer.cov[0, 0] < found.cov[0, 0]
+    # gravity's strength is known by its prior alone in so short a walk
+    assert found.cov[4, 4] == pytest.approx(5e-4**2, rel=0.1)
 
 
 def test_what_is_not_positive_is_refused():

@@ -6,26 +6,26 @@ import numpy as np
 import pytest
 from cases import loop_over
 
-from colmap_inertial.inertial.refine import judge
+from colmap_inertial.inertial.refine import judge, world
 
 
 def test_the_size_of_a_path_and_its_derivative():
     angle = 2 * np.pi * np.arange(12) / 12
     ring = 3.0 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1) + [5, 6, 7]
-    assert judge.size_of(ring) == pytest.approx(3.0)
+    assert world.size_of(ring) == pytest.approx(3.0)
     rng = np.random.default_rng(0)
     centres, part, step = rng.standard_normal((9, 3)), np.array([2, 3, 5, 8]), 1e-6
-    by = judge._by_log_size(centres, part)
+    by = world.derive_log_size(centres, part)
     for i in range(9):
         for axis in range(3):
             sizes = []
             for sign in (1, -1):
                 moved = centres.copy()
                 moved[i, axis] += sign * step
-                sizes.append(np.log(judge.size_of(moved[part])))
+                sizes.append(np.log(world.size_of(moved[part])))
             assert by[i, axis] == pytest.approx((sizes[0] - sizes[1]) / (2 * step), abs=1e-8)
-    assert not judge._by_log_size(centres, part[:1]).any()
-    assert np.isfinite(judge._by_log_size(np.zeros((3, 3)), np.arange(3))).all()
+    assert not world.derive_log_size(centres, part[:1]).any()
+    assert np.isfinite(world.derive_log_size(np.zeros((3, 3)), np.arange(3))).all()
 
 
 def test_errors_in_pixels_are_roots_of_mean_costs():

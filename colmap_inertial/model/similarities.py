@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError
-from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate
+from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_from_matrix
 from colmap_inertial.core.options import WorldAxes
 from colmap_inertial.core.types import UNDOES, ScaleEstimate, Similarity
 from colmap_inertial.io.files import StrPath, read_json
@@ -122,6 +122,18 @@ def undoing(similarity: Similarity) -> Similarity:
         translation_m=-(rotation.T @ similarity.translation_m) / similarity.scale,
         cov=np.zeros((7, 7)),
         provenance=f"{UNDOES}{similarity.provenance}",
+    )
+
+
+def compose(move: Similarity, before: Similarity) -> Similarity:
+    """``move`` after another one, whose provenance it keeps; as an estimate of neither, its covariance is zero."""
+    turn = matrix_from_quat(move.rotation_xyzw)
+    return Similarity(
+        scale=move.scale * before.scale,
+        rotation_xyzw=quat_from_matrix(turn @ matrix_from_quat(before.rotation_xyzw)),
+        translation_m=move.scale * turn @ before.translation_m + move.translation_m,
+        cov=np.zeros((7, 7)),
+        provenance=before.provenance,
     )
 
 

@@ -23,6 +23,7 @@ from colmap_inertial.inertial.join.judge import JoinedGroup, relative_cov, worst
 from colmap_inertial.inertial.join.placement import FittedSubmodel, Placed
 from colmap_inertial.inertial.scale.verdict import TRUSTED_HALF_WIDTH, half_width, verdict_of
 from colmap_inertial.model import Model, transformed
+from colmap_inertial.model.similarities import compose
 from colmap_inertial.model.submodels.graph import PLACEMENT
 from colmap_inertial.model.submodels.matches import PlacedImages
 from colmap_inertial.model.submodels.merging import merge_models, merge_points
@@ -58,8 +59,8 @@ def join_models(
     moves = [_metric_move(placed, k, world) for k in range(len(members))]
     about: list[JoinedPart] = []
     for k, (model, submodel, move) in enumerate(zip(members, fitted, moves, strict=True)):
-        assert model.scale is not None
-        similarity, sigma_log = _after(move, model), _sigma_log(model, submodel, placed, k)
+        assert model.scale is not None and model.similarity is not None
+        similarity, sigma_log = compose(move, model.similarity), _sigma_log(model, submodel, placed, k)
         sigma_m = sigma_rad = 0.0
         if k:
             cov = _similarity_cov(placed, k, move)
@@ -109,20 +110,6 @@ def _metric_move(placed: Placed, k: int, world: WorldAxes) -> Similarity:
     scale, rotation = float(placed.places.scale[k]), up @ placed.places.rotation[k]
     shift = up @ placed.places.translation[k] + placed.origins[0] - scale * rotation @ placed.origins[k]
     return Similarity(scale=scale, rotation_xyzw=quat_from_matrix(rotation), translation_m=shift, cov=np.zeros((7, 7)))
-
-
-def _after(move: Similarity, model: Model) -> Similarity:
-    """From COLMAP's units of a model to the joined world."""
-    before = model.similarity
-    assert before is not None
-    rotation = matrix_from_quat(move.rotation_xyzw) @ matrix_from_quat(before.rotation_xyzw)
-    return Similarity(
-        scale=move.scale * before.scale,
-        rotation_xyzw=quat_from_matrix(rotation),
-        translation_m=move.scale * quat_rotate(move.rotation_xyzw, before.translation_m) + move.translation_m,
-        cov=np.zeros((7, 7)),
-        provenance=before.provenance,
-    )
 
 
 def _merged(

@@ -10,7 +10,7 @@ import numpy as np
 from colmap_inertial._kernels import _inertial
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.inertial.refine._residuals import Derivatives, Moving, Rows
-from colmap_inertial.inertial.refine.values import N_SEEN, N_STATE, POSITION, Observations
+from colmap_inertial.inertial.refine.values import N_SEEN, N_STATE, Observations
 
 #: A block has so many numbers at least, or Python takes longer than the products; of whole states.
 _LEAST = 240
@@ -296,23 +296,26 @@ class Factored:
         pulled = np.add.reduceat(np.einsum("nri,nr->ni", by.by_point, along), observations.first[:-1], axis=0)
         return moved, shared[:, 0], np.einsum("pij,pj->pi", system.inverse, system.pull - pulled)
 
-    def position_sigmas(self, by_position: Array) -> Array:
-        """(k,) standard deviations of numbers with derivatives (k, F, 3) by the frames' positions."""
-        count, frames, _ = by_position.shape
-        sides = np.zeros((count, frames, N_STATE))
-        sides[:, self.order.place, POSITION] = by_position
-        rhs = sides.reshape(count, -1).T
-        states, _ = self.solve(rhs, np.zeros((len(self.corner[0]), count)))
-        return np.sqrt(np.einsum("nk,nk->k", rhs, states))
+    def cov_of(self, by_state: Array, by_shared: Array) -> tuple[Array, Array, Array]:
+        """Covariance of k numbers with derivatives (k, F, 15) by the states and (k, Q) by what is shared.
+
+        Returns
+        -------
+        (k, k) covariance; (F, 15, k) and (Q, k) the covariance of states and of what is shared with the numbers.
+        """
+        sides = np.zeros_like(by_state)
+        sides[:, self.order.place] = by_state
+        rhs = sides.reshape(len(sides), -1).T
+        states, shared = self.solve(rhs, by_shared.T)
+        cov = rhs.T @ states + by_shared @ shared
+        return 0.5 * (cov + cov.T), states.reshape(-1, N_STATE, len(cov))[self.order.place], shared
 
     def centres_cov(self, frames: Int64Array, by: Moving) -> Array:
         """(3 K, 3 K) covariance of the camera's centres in K frames, all together."""
-        count, place = len(frames), self.order.place
-        sides = np.zeros((count, 3, len(place), N_STATE))
-        sides[np.arange(count)[:, None], np.arange(3), place[frames][:, None]] = by.by_state[frames, :3]
-        rhs, rhs_shared = sides.reshape(3 * count, -1).T, by.by_shared[frames, :3].reshape(3 * count, -1).T
-        states, shared = self.solve(rhs, rhs_shared)
-        return np.asarray(rhs.T @ states + rhs_shared.T @ shared)
+        by_state = np.zeros((len(frames), 3, len(self.order.place), N_STATE))
+        by_state[np.arange(len(frames)), :, frames] = by.by_state[frames, :3]
+        count = 3 * len(frames)
+        return self.cov_of(by_state.reshape(count, -1, N_STATE), by.by_shared[frames, :3].reshape(count, -1))[0]
 
     def motion_covs(self, frames: Int64Array, by: Moving) -> Array:
         """(K, 6, 6) covariances of K frames' positions against the first frame's, and velocities."""

@@ -7,13 +7,14 @@ from itertools import pairwise
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
+from colmap_inertial.core.arrays import Array, BoolArray
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.inertial.refine._residuals import Moving, moving
 from colmap_inertial.inertial.refine._system import Factored, Order
 from colmap_inertial.inertial.refine.setup import at_middle_lines, measured_noise, pictures_alone, with_noise
 from colmap_inertial.inertial.refine.solve import Solution, factored, held_out, solve, with_measured_noise
 from colmap_inertial.inertial.refine.values import READOUT, Estimate, Observations, Problem
+from colmap_inertial.inertial.refine.world import FoundWorld, by_centres, derive_log_size, find_world, size_of
 
 #: Every so many observations of points with at least so many is held out.
 _EVERY, _FEWEST = 10, 4
@@ -76,6 +77,8 @@ class Judged:
         White noise of the accelerometer, as the refinement found it; as it was known where it did not come so far.
     shared_cov
         (Q, Q) covariance of what is shared; ``None`` where it is not believed.
+    world
+        How sure its scale and gravity are; ``None`` where it is not believed.
     drift
         How the scale changed along the path; empty where it is not believed.
     velocity_m_s
@@ -101,6 +104,7 @@ class Judged:
     sigma_px: float
     accel_noise_m_s2_rthz: float
     shared_cov: Array | None = None
+    world: FoundWorld | None = None
     drift: tuple[Stretched, ...] = ()
     velocity_m_s: Array
     motion_covs: dict[int, Array] = field(default_factory=dict)
@@ -196,6 +200,7 @@ def _solve_all(judged: Judged, problem: Problem, x: Estimate, t_s: Array) -> Jud
         estimate=final,
         accepted=True,
         shared_cov=cov,
+        world=find_world(problem, final, at_middle_lines(problem, final).cam_in_world, solved, by),
         drift=drift_map(problem, judged.estimate, final, t_s, solved, by),
         velocity_m_s=np.where(moved[:, None], by.velocity_m_s, np.nan),
         motion_covs=dict(zip(chosen.tolist(), solved.motion_covs(chosen, by), strict=True)),
@@ -305,8 +310,8 @@ def drift_map(
     with np.errstate(invalid="ignore"):
         parts = [np.flatnonzero((t_s >= begin_s) & (t_s <= end_s)) for begin_s, end_s in pairwise(edges)]
     whole = size_of(before[timed]) / size_of(after[timed])
-    by_log = np.stack([_by_log_size(after, np.flatnonzero(timed)), *(_by_log_size(after, part) for part in parts)])
-    sigma = solved.position_sigmas(by_log[1:] - by_log[0])
+    by_log = np.stack([derive_log_size(after, part) for part in (np.flatnonzero(timed), *parts)])
+    sigma = np.sqrt(np.diagonal(solved.cov_of(*by_centres(by_log[1:] - by_log[0], by))[0]))
     last = np.array([part[-1] if len(part) else 0 for part in parts])
     end_sigma_m = np.sqrt(np.diagonal(solved.motion_covs(last, by), axis1=1, axis2=2)[:, :3])
     out = []
@@ -323,17 +328,3 @@ def drift_map(
                 )
             )
     return tuple(out)
-
-
-def _by_log_size(centres: Array, part: IndexArray) -> Array:
-    """(F, 3) derivative of the logarithm of a part's size by its centres."""
-    out = np.zeros_like(centres)
-    if len(part) > 1:
-        away = centres[part] - centres[part].mean(axis=0)
-        out[part] = away / max(float(np.sum(away**2)), 1e-12)
-    return out
-
-
-def size_of(centres: Array) -> float:
-    """Root of the mean square distance of (F, 3) points from their middle."""
-    return float(np.sqrt(np.mean(np.sum((centres - centres.mean(axis=0)) ** 2, axis=1))))

@@ -437,15 +437,9 @@ def at_middle_lines(problem: Problem, x: Estimate) -> Written:
 
 
 def written_back(
-    reconstruction: pycolmap.Reconstruction,
-    seen: Seen,
-    problem: Problem,
-    x: Estimate,
-    *,
-    about: Array,
-    scale: float = 1.0,
+    reconstruction: pycolmap.Reconstruction, seen: Seen, problem: Problem, x: Estimate
 ) -> pycolmap.Reconstruction:
-    """A copy of a model with the poses, points, observations and cameras of a solution, stretched about a point.
+    """A copy of a model with the poses, points, observations and cameras of a solution.
 
     Points that fewer than two of its images see were no part of it, and go.
     """
@@ -453,18 +447,17 @@ def written_back(
 
     written = at_middle_lines(problem, x)
     copy = pycolmap.Reconstruction(reconstruction)
-    centres = about + scale * (written.cam_in_world - about)
     for i, (image_id, mine) in enumerate(zip(seen.image_ids, _by_frame(seen), strict=True)):
         rotation = written.cam_from_world[i]
         image = copy.image(image_id)
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ centres[i])
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ written.cam_in_world[i])
         copy.frame(image.frame_id).set_cam_from_world(image.camera_id, pose)
         points2D = image.points2D
         for o in mine:
             points2D[int(seen.place[o])].xy = written.xy_px[o]
     for point_id in set(copy.point3D_ids()) - set(seen.point_ids):
         copy.delete_point3D(point_id)
-    for point_id, xyz in zip(seen.point_ids, about + scale * (x.points_m - about), strict=True):
+    for point_id, xyz in zip(seen.point_ids, x.points_m, strict=True):
         copy.points3D[point_id].xyz = xyz
     for camera_id, camera in zip(seen.camera_ids, cameras_of(problem, x), strict=True):
         copy.camera(camera_id).params = camera.params

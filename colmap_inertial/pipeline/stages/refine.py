@@ -15,11 +15,13 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import quat_from_matrix
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import CAL, CameraImuCalibration, SolvedMotion, Treatment
-from colmap_inertial.inertial.refine.judge import Judged, refine, size_of
+from colmap_inertial.core.types import CAL, CameraImuCalibration, Similarity, SolvedMotion, Treatment
+from colmap_inertial.inertial.core.priors import is_calibrated
+from colmap_inertial.inertial.refine.judge import Judged, refine
 from colmap_inertial.inertial.refine.setup import (
     Known,
     Seen,
+    Written,
     at_middle_lines,
     keypoints_of,
     make_problem,
@@ -27,9 +29,11 @@ from colmap_inertial.inertial.refine.setup import (
     written_back,
 )
 from colmap_inertial.inertial.refine.values import FIRST_INTRINSIC, LEVER, OFFSET, READOUT, ROTATION, Estimate, Problem
+from colmap_inertial.inertial.refine.world import size_of, state_scale
 from colmap_inertial.inertial.scale import strength_of_gravity
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.model import Model, has_rigs
+from colmap_inertial.model.similarities import compose
 from colmap_inertial.pipeline.stages.inputs import StageInputs
 from colmap_inertial.pipeline.stages.metric import InertialStage, gravity_in_model
 from colmap_inertial.pipeline.stages.protocols import InvertibleStage, find_inverse
@@ -53,9 +57,9 @@ _FOCAL_GAP = 0.1
 class RefineStage(InertialStage):
     """Refines a metric model by all of its observations, each at its own line's instant, and the IMU between frames.
 
-    Comes after the scale. The overall size and the direction of gravity stay what the scale estimate made them; the
-    shape changes: paths bend less, and their scale drifts less. The model stays as it is where the refined one
-    predicts observations that were held out no better, or where the IMU contradicts the pictures.
+    Comes after the scale. Paths bend less, and their scale drifts less; size and up become those of the refinement,
+    with their covariance. The model stays as it is where the refined one predicts observations that were held out no
+    better, or where the IMU contradicts the pictures.
 
     Attributes
     ----------
@@ -140,17 +144,28 @@ class RefineStage(InertialStage):
         if not judged.accepted:
             return _said(model, f"left as it is: {judged.reason} ({heard})", **figures)
         x = judged.estimate
-        after = at_middle_lines(problem, x).cam_in_world
-        about, scale = after.mean(axis=0), size_of(seen.cam_in_world) / size_of(after)
-        figures |= {"size_before": scale, "drift": [asdict(part) for part in judged.drift]}
-        figures |= _calibration_figures(judged)
-        reconstruction = written_back(model.reconstruction, seen, problem, x, about=about, scale=scale)
+        figures |= {"drift": [asdict(part) for part in judged.drift]} | _calibration_figures(judged)
         assert model.scale is not None and model.scale.calibration is not None
-        calibration = _refined_calibration(model.scale.calibration, problem, judged)
-        refined = replace(model.scale, calibration=calibration, accel_bias_m_s2=x.accel_bias_m_s2.mean(axis=0))
+        assert model.similarity is not None and judged.world is not None
+        move = _move_of(seen, at_middle_lines(problem, x))
+        calibrated = is_calibrated(self.imu)
+        own, similarity = state_scale(
+            model.scale, model.similarity, move, problem, x, judged.world, calibrated=calibrated
+        )
+        if own.verdict == "refused":
+            return _said(model, f"left as it is: refined, {'; '.join(own.reasons)} ({heard})", **figures)
+        figures["size_before"] = 1 / move.scale
         readout_s = x.readout_s if model.timing.readout_s else None
-        motion = _motion(reconstruction, seen, judged, scale, readout_s=readout_s)
-        done = replace(model, reconstruction=reconstruction, scale=refined, observed_px={}, motion=motion)
+        reconstruction = written_back(model.reconstruction, seen, problem, x)
+        done = replace(
+            model,
+            reconstruction=reconstruction,
+            scale=replace(own, calibration=_refined_calibration(model.scale.calibration, problem, judged)),
+            similarity=similarity,
+            parts=tuple(replace(part, similarity=_moved(part.similarity, move)) for part in model.parts),
+            observed_px={},
+            motion=_motion(reconstruction, seen, judged, readout_s=readout_s),
+        )
         return _said(done, f"refined by the IMU ({heard})", action="refined", **figures)
 
     def _exposed_px(self, model: Model, seen: Seen) -> Array:
@@ -221,18 +236,34 @@ def _said(model: Model, reason: str, *, action: str = "", **values: object) -> M
     return replace(model, treatments=(*model.treatments, done), scale=scale)
 
 
-def _motion(
-    written: pycolmap.Reconstruction, seen: Seen, judged: Judged, scale: float, *, readout_s: float | None
-) -> SolvedMotion:
-    """The camera's motion in the model that is written, which is stretched."""
-    velocity = scale * judged.velocity_m_s
+def _motion(written: pycolmap.Reconstruction, seen: Seen, judged: Judged, *, readout_s: float | None) -> SolvedMotion:
+    """The camera's motion in the model that is written."""
+    velocity = judged.velocity_m_s
     images = (written.image(image_id) for image_id in seen.image_ids)
     return SolvedMotion(
         cam_in_world={image.name: image.projection_center() for image in images},
         velocity_in_world={seen.names[i]: velocity[i] for i in np.flatnonzero(np.isfinite(velocity).all(axis=1))},
-        cov={seen.names[i]: scale**2 * cov for i, cov in judged.motion_covs.items()},
+        cov={seen.names[i]: cov for i, cov in judged.motion_covs.items()},
         readout_s=readout_s,
     )
+
+
+def _move_of(seen: Seen, after: Written) -> Similarity:
+    """From the model before to the refined one: sizes, mean orientation and middles agree."""
+    turns = after.cam_from_world.transpose(0, 2, 1) @ seen.cam_from_world
+    u, _, vt = np.linalg.svd(turns.sum(axis=0))
+    turn = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    scale = size_of(after.cam_in_world) / size_of(seen.cam_in_world)
+    return Similarity(
+        scale=scale,
+        rotation_xyzw=quat_from_matrix(turn),
+        translation_m=after.cam_in_world.mean(axis=0) - scale * turn @ seen.cam_in_world.mean(axis=0),
+        cov=np.zeros((7, 7)),
+    )
+
+
+def _moved(similarity: Similarity, move: Similarity) -> Similarity:
+    return replace(compose(move, similarity), cov=similarity.cov)
 
 
 def _calibration_figures(judged: Judged) -> dict[str, object]:
