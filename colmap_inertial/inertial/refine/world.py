@@ -28,7 +28,8 @@ from colmap_inertial.inertial.scale.verdict import half_width, verdict_of
 from colmap_inertial.model.similarities import compose
 
 # Columns of its covariance.
-SIZE, TURN, STRENGTH, BIAS, COUNT = 0, slice(1, 4), 4, slice(5, 8), 8
+SIZE, TURN, STRENGTH, BIAS = (slice(0, 1), slice(1, 4), slice(4, 5), slice(5, 8))
+COUNT = BIAS.stop
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -113,7 +114,7 @@ def state_scale(
     # heading is free and carries none
     by_world[1:4, TURN] = np.eye(3) - np.outer(down, down)
     by_gravity[1:4, TURN] = x.gravity_m_s2 * turn.T @ skew(down)
-    by_gravity[1:4, STRENGTH], by_gravity[4:, BIAS] = turn.T @ down, np.eye(3)
+    by_gravity[1:4, STRENGTH], by_gravity[4:, BIAS] = (turn.T @ down)[:, None], np.eye(3)
     covs = [by @ world.cov @ by.T for by in (by_world, by_gravity)]
     for cov in covs:
         cov[0, 0] = sigma_log**2
