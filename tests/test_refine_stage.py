@@ -410,7 +410,7 @@ def test_what_predicts_worse_is_not_believed(walked, monkeypatch):
 
 def test_what_takes_too_much_memory_is_left_as_it_is(walked, monkeypatch):
     tracks, model = walked
-    monkeypatch.setattr(judge, "_MOST_BYTES", 100_000)
+    monkeypatch.setattr(judge, "LIMITS", judge.RefineLimits(most_bytes=100_000))
     made, said = refined_by(tracks.imu, model)
     assert "GB" in said.reason
     assert made.reconstruction is model.reconstruction

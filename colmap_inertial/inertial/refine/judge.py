@@ -16,18 +16,28 @@ from colmap_inertial.inertial.refine.solve import Solution, factored, held_out, 
 from colmap_inertial.inertial.refine.values import READOUT, Estimate, Observations, Problem
 from colmap_inertial.inertial.refine.world import FoundWorld, by_centres, derive_log_size, find_world, size_of
 
-#: Every so many observations of points with at least so many is held out.
-_EVERY, _FEWEST = 10, 4
-#: A readout that was not declared is one where it is longer, and so many standard deviations long.
-_LEAST_READOUT_S, _SURE_SIGMA = 1e-3, 3.0
-#: Frames whose covariance is told.
-_MOST_COVS = 400
-#: Length of a part of the path whose drift is told.
-_PART_S = 10.0
-#: Of the normal equations; more would take hours, too.
-_MOST_BYTES = 2_000_000_000
-#: What the IMU costs, over what chance makes of it.
-_LARGEST_CHI2 = 3.0
+
+@dataclass(frozen=True, kw_only=True)
+class RefineLimits:
+    """When a refinement is believed, and how much of it is told."""
+
+    #: Every so many observations of points with at least so many is held out.
+    every: int = 10
+    fewest: int = 4
+    #: A readout that was not declared is one where it is longer, and so many standard deviations long.
+    least_readout_s: float = 1e-3
+    sure_sigma: float = 3.0
+    #: Frames whose covariance is told.
+    most_covs: int = 400
+    #: Length of a part of the path whose drift is told.
+    part_s: float = 10.0
+    #: Of the normal equations; more would take hours, too.
+    most_bytes: int = 2_000_000_000
+    #: What the IMU costs, over what chance makes of it.
+    largest_chi2: float = 3.0
+
+
+LIMITS = RefineLimits()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,7 +144,7 @@ def refine(
         Where it would take too much memory.
     """
     needed = Order.of(problem.observations, len(t_s)).size_bytes
-    if needed > _MOST_BYTES:
+    if needed > LIMITS.most_bytes:
         why = f"frames far apart see the same points, and solving for all at once takes {1e-9 * needed:.1f} GB"
         raise NotObservableError("refinement", why)
     alone = pictures_alone(problem, at_once_px)
@@ -146,7 +156,7 @@ def refine(
     freedom = _freedom(problem)
     chi2 = max(2 * (seen.cost - seen_alone.cost), seen.squares["imu"]) / freedom
     steps = seen_alone.steps + seen.steps
-    if seen.converged and chi2 <= _LARGEST_CHI2:
+    if seen.converged and chi2 <= LIMITS.largest_chi2:
         # a false IMU would find itself noisy: it is judged by what was known before
         problem = _measured(problem, kept, seen.estimate)
         seen = solve(_part(problem, kept), seen.estimate)
@@ -194,7 +204,7 @@ def _solve_all(judged: Judged, problem: Problem, x: Estimate, t_s: Array) -> Jud
     # where the IMU says nothing, the covariance of a velocity is a prior's
     moved = problem.inertial.touched
     informed = np.flatnonzero(np.isfinite(t_s) & moved)
-    chosen = informed[:: -(-len(informed) // _MOST_COVS) or 1]
+    chosen = informed[:: -(-len(informed) // LIMITS.most_covs) or 1]
     return replace(
         judged,
         estimate=final,
@@ -210,9 +220,9 @@ def _solve_all(judged: Judged, problem: Problem, x: Estimate, t_s: Array) -> Jud
 def _chosen(observations: Observations) -> BoolArray:
     """(M,) what is held out: every tenth observation of points that keep three or more."""
     lengths = np.diff(observations.first)
-    often = np.flatnonzero(lengths[observations.point] >= _FEWEST)
+    often = np.flatnonzero(lengths[observations.point] >= LIMITS.fewest)
     out = np.zeros(len(observations.frame), dtype=np.bool_)
-    out[often[_EVERY // 2 :: _EVERY]] = True
+    out[often[LIMITS.every // 2 :: LIMITS.every]] = True
     return out
 
 
@@ -246,7 +256,7 @@ def _readout(problem: Problem, x: Estimate) -> tuple[float, float] | None:
 
 def _rolling(readout: tuple[float, float] | None) -> str:
     """Why a model stays as it is whose images turn out to have a rolling shutter; empty where they have none."""
-    if readout is None or abs(readout[0]) < max(_LEAST_READOUT_S, _SURE_SIGMA * readout[1]):
+    if readout is None or abs(readout[0]) < max(LIMITS.least_readout_s, LIMITS.sure_sigma * readout[1]):
         return ""
     upwards = "" if readout[0] > 0 else ", from the last line to the first"
     return (
@@ -261,7 +271,7 @@ def _doubt(alone: Solution, seen: Solution, chi2: float, change: float, spread: 
         return "pictures alone, which it is compared with, do not come to rest"
     if not seen.converged:
         return "the refinement does not come to rest"
-    if chi2 > _LARGEST_CHI2:
+    if chi2 > LIMITS.largest_chi2:
         return (
             f"the IMU contradicts the pictures ({chi2:.1f} times the squares that its noise explains): check that both "
             "recordings belong together, and the IMU's axes and gains"
@@ -306,7 +316,7 @@ def drift_map(
     before, after = (at_middle_lines(problem, one).cam_in_world for one in (start, x))
     timed = np.isfinite(t_s)
     first_s, last_s = float(t_s[timed].min()), float(t_s[timed].max())
-    edges = np.linspace(first_s, last_s, max(1, round((last_s - first_s) / _PART_S)) + 1).tolist()
+    edges = np.linspace(first_s, last_s, max(1, round((last_s - first_s) / LIMITS.part_s)) + 1).tolist()
     with np.errstate(invalid="ignore"):
         parts = [np.flatnonzero((t_s >= begin_s) & (t_s <= end_s)) for begin_s, end_s in pairwise(edges)]
     whole = size_of(before[timed]) / size_of(after[timed])
