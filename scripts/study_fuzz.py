@@ -2,12 +2,17 @@
 
     python scripts/study_fuzz.py [--mutants 24000] [--seed 0] [--readers NAME ...] [--processes 2]
 
+Three of four mutants change the structure of a file: nodes of JSON and TOML, members and methods of a zip, values and
+tables of SQLite, boxes of MP4, chunks and tags of images, headers of PLY, cells and columns of tables, counts of binary
+records (``tests/fuzz_structure.py``); the others its bytes and lines.
+
 Needs the checkout and the extra ``dev``. Each reader of ``tests/fuzz_readers.py`` works in a process of its own, in
 which it reads one mutant after the other: with at most 1 GB more address space than at its start, and 10 s of processor
 time for each. Prints a table of readers and outcomes: ``read`` (by one of its functions at least); ``refused``, by an
-``InertialError``; ``foreign``, any other exception; ``hung``; ``large``, more memory asked for than there is; ``died``,
-the process ended. Exit code 1 where one of the last four is not 0. A mutant is told by its seed, reader and number:
-``--only NUMBER`` makes one reader's again.
+``InertialError`` of the reader's own words; ``gated``, by the gate of all readers, which had none; ``foreign``, any
+other exception; ``hung``; ``large``, more memory asked for than there is; ``died``, the process ended. Exit code 1
+where one of the last four is not 0. A mutant is told by its seed, reader and number: ``--only NUMBER`` makes one
+reader's again.
 """
 
 import argparse
@@ -35,8 +40,9 @@ from conftest import write_anew
 from fuzz_readers import READERS, Reader, mutant
 
 from colmap_inertial.core.errors import InertialError
+from colmap_inertial.io.files import DAMAGED
 
-OUTCOMES = ("read", "refused", "foreign", "hung", "large", "died")
+OUTCOMES = ("read", "refused", "gated", "foreign", "hung", "large", "died")
 #: Address space beside that of a process that has read a whole file, and processor time for one mutant.
 MOST_BYTES, MOST_S = 1 << 30, 10.0
 
@@ -65,8 +71,8 @@ def outcome(reader: Reader, folder: Path, files: list[tuple[Path, bytes]], key: 
         with contextlib.redirect_stderr(None):
             reader.read(folder)
         return "read", ""
-    except InertialError:
-        return "refused", ""
+    except InertialError as error:
+        return "gated" if getattr(error, "code", "") == DAMAGED else "refused", ""
     except MemoryError:
         return "large", f"{path.name}: {traceback.format_exc()[-600:]}"
     except _Slow:

@@ -14,6 +14,7 @@ import model_project
 import numpy as np
 import report_runs
 import test_io_fuzz
+from fuzz_structure import structural
 from test_io_recorders import FRAME_NS, LAYOUTS, at_one_clock, recorded
 from test_multi_aperture_io import kalibr_text
 
@@ -61,7 +62,11 @@ class Reader:
 
 
 def mutant(data: bytes, rng: np.random.Generator) -> bytes:
-    """A damaged copy: text as ``test_io_fuzz`` has it; of binary files also sizes and measures that cannot be."""
+    """A damaged copy: mostly of its structure; of text as ``test_io_fuzz`` has it; of binary files also of sizes and
+    measures that cannot be."""
+    changed = structural(data, rng) if rng.random() < 0.75 else None
+    if changed is not None:
+        return changed
     if b"\0" in data and rng.random() < 0.6 and len(data) > 8:
         out = bytearray(data)
         for _ in range(rng.integers(1, 4)):

@@ -1,5 +1,6 @@
 """Damaged recordings of cameras and apps: an error of ours that names the file, never a crash, never a hang."""
 
+import resource
 import struct
 import zipfile
 import zlib
@@ -200,14 +201,14 @@ def test_text_that_is_not_utf_8_names_the_line(tmp_path: Path, imu: ImuRecording
     assert "line 21" in refused(path)
 
 
-def test_a_table_said_to_be_larger_than_its_zip_is_refused_without_asking_for_so_much_memory(
-    tmp_path: Path, imu: ImuRecording
-) -> None:
+def test_a_table_said_to_be_larger_than_its_zip_takes_no_more_memory(tmp_path: Path, imu: ImuRecording) -> None:
     path, _ = zipped(tmp_path, imu)
     with zipfile.ZipFile(path) as archive:
         info = next(info for info in archive.infolist() if info.filename.endswith(".csv"))
+    whole = text_of(path, info.filename)
     data = path.read_bytes()
     at = data.index(b"PK\1\2")  # the first entry of the directory; at 20 its compressed size
     path.write_bytes(data[: at + 20] + struct.pack("<I", 2**31 - 2) + data[at + 24 :])
-    with pytest.raises(FormatError, match="larger than the file"):
-        text_of(path, info.filename)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert text_of(path, info.filename) == whole
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB

@@ -1,12 +1,14 @@
 """Tables in a zip are those of the folder that it was unpacked to."""
 
+import resource
 import zipfile
 
 import pytest
 from cases import loop_over
 
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.io import tables
+from colmap_inertial.core.options import ReadLimits
+from colmap_inertial.io.files import reading_within
 from colmap_inertial.io.tables import head_of, members_of, text_of
 
 TABLES = {
@@ -63,12 +65,31 @@ def test_a_table_is_read_up_to_the_limit(tmp_path, compression):
     path = tmp_path / "a.zip"
     with zipfile.ZipFile(path, "w", compression) as archive:
         archive.writestr("a.csv", "t,x\n" * 100)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tables, "_LARGEST_MEMBER", 400)
+    with reading_within(ReadLimits(file_gib=400 / 2**30)):
         assert text_of(path, "a.csv") == "t,x\n" * 100
-        patch.setattr(tables, "_LARGEST_MEMBER", 399)
-        with pytest.raises(FormatError, match=r"a\.zip: its a\.csv unpacks to more than"):
-            text_of(path, "a.csv")
+    told = r"a\.zip: its a\.csv unpacks to more than .* GiB \(--limits.file-gib"
+    with reading_within(ReadLimits(file_gib=399 / 2**30)), pytest.raises(FormatError, match=told):
+        text_of(path, "a.csv")
     with pytest.raises(FormatError, match=r"its b\.csv cannot be unpacked"):
         text_of(path, "b.csv")
-    assert tables._LARGEST_MEMBER == 2**31
+
+
+@pytest.mark.parametrize("line", [b"1,2\n", b"0" * 4000 + b"\n"])
+def test_a_packed_table_out_of_proportion_takes_no_memory(tmp_path, line):
+    path = tmp_path / "bomb.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("a.csv", line * ((200 << 20) // len(line)))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(FormatError, match=r"its a\.csv unpacks to \d+ MB and more, out of proportion to \d+ packed"):
+        text_of(path, "a.csv")
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB
+
+
+@pytest.mark.parametrize("compression", [zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2])
+def test_a_table_is_packed_as_recorders_do(tmp_path, compression):
+    path = tmp_path / "a.zip"
+    with zipfile.ZipFile(path, "w", compression) as archive:
+        archive.writestr("a.csv", "t,x\n1,2\n")
+    assert members_of(path) == {"a.csv": "a.csv"} and head_of(path, "a.csv") == ""
+    with pytest.raises(FormatError, match=r"its a\.csv is packed by method (12|14), not by deflate; unpack it"):
+        text_of(path, "a.csv")

@@ -22,7 +22,7 @@ from colmap_inertial.core.types import (
     CameraImuCalibration,
     ImuCalibration,
 )
-from colmap_inertial.io.files import StrPath, read_json, write_json
+from colmap_inertial.io.files import StrPath, read_json, reader, write_json
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -190,6 +190,7 @@ def write_calibration(path: StrPath, calibration: CameraImuCalibration) -> None:
     _write_fields(Path(path), CAMERA_IMU, calibration, CALIBRATION_PARAMETERS, left_out)
 
 
+@reader("a calibration")
 def read_calibration(path: StrPath) -> CameraImuCalibration:
     """Read a calibration that :func:`write_calibration` (or ``colmap-inertial align``) wrote.
 
@@ -289,6 +290,7 @@ def write_imu_calibration(path: StrPath, calibration: ImuCalibration) -> None:
     _write_fields(Path(path), IMU, calibration, IMU_CALIBRATION_PARAMETERS)
 
 
+@reader("a calibration of an IMU")
 def read_imu_calibration(path: StrPath) -> ImuCalibration:
     """Read a calibration that :func:`write_imu_calibration` (or ``colmap-inertial calibrate-imu``) wrote.
 

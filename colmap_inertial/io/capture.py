@@ -37,7 +37,7 @@ from colmap_inertial.io.capture_tables import (
     read_camera_table,
     read_imu_table,
 )
-from colmap_inertial.io.files import StrPath
+from colmap_inertial.io.files import StrPath, reader
 from colmap_inertial.io.gcsv import is_gcsv, read_gcsv_frames
 from colmap_inertial.io.imu_formats import Recording, find_recording, refuse_video
 from colmap_inertial.io.imu_text import is_inertial_scale
@@ -153,6 +153,7 @@ class Capture:
         return self.frames.folder if isinstance(self.frames, ImageFolder) else None
 
 
+@reader("a capture")
 def load_capture(path: StrPath) -> Capture:
     """Read a capture description.
 

@@ -18,7 +18,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.core.types import HeightDatum
-from colmap_inertial.io.files import path_in, read_bytes
+from colmap_inertial.io.files import path_in, read_bytes, reader, reading
 from colmap_inertial.io.frame_times import FrameStamps, stamps_in_order
 from colmap_inertial.io.images import PNG, jpeg_segments, png_chunks, tiff_entries
 
@@ -48,6 +48,7 @@ class _Type(IntEnum):
     ASCII, SHORT = 2, 3
 
 
+@reader("pictures with times")
 def stamps_of_exif(folder: Path, names: Sequence[str]) -> tuple[FrameStamps, int]:
     """Take each picture's time from DateTimeOriginal and SubSecTimeOriginal of its EXIF.
 
@@ -254,7 +255,8 @@ def read_exposures_s(paths: list[Path]) -> Array | None:
     """(F,) exposure times by the EXIF of JPEG, PNG or TIFF files; ``None`` where one of them does not say."""
     found = []
     for path in paths:
-        exposure_s, _ = exposure_of(read_bytes(path, HEAD_BYTES, what="picture"))
+        with reading(path):
+            exposure_s, _ = exposure_of(read_bytes(path, HEAD_BYTES, what="picture"))
         if exposure_s is None:
             return None
         found.append(exposure_s)

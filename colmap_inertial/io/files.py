@@ -16,7 +16,7 @@ import re
 import secrets
 import stat
 import typing
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
@@ -24,12 +24,15 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from colmap_inertial.core.errors import FormatError, OutputError, OutputExistsError
+from colmap_inertial.core.errors import FormatError, InertialError, OutputError, OutputExistsError, exhausted
 from colmap_inertial.core.options import ReadLimits
 
 if TYPE_CHECKING:
     from cattrs import Converter
 
+
+#: What users may give for a path.
+StrPath = str | os.PathLike[str]
 
 _USUAL = ReadLimits()
 _LIMITS: ContextVar[ReadLimits] = ContextVar("limits", default=_USUAL)
@@ -54,10 +57,57 @@ def reading_within(limits: ReadLimits) -> Iterator[None]:
         _LIMITS.reset(token)
 
 
-_TEMPORARY = re.compile(r"\..+\.\d+-[0-9a-f]{8}\.tmp")
+#: The code of a :class:`FormatError` that the gate made, where a reader had no words of its own.
+DAMAGED = "damaged"
 
-#: What users may give for a path.
-StrPath = str | os.PathLike[str]
+#: What is said of a record of ours that somebody changed.
+CHANGED_RECORD = "was damaged since it was written; remove it and start again"
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+@contextmanager
+def reading(path: StrPath, fault: str = "is damaged") -> Iterator[None]:
+    """The gate of all readers: whatever the content of a file causes is an error that names it.
+
+    Parameters
+    ----------
+    path
+        What is read.
+    fault
+        What the message then says of it.
+
+    Raises
+    ------
+    FormatError
+        With the code :data:`DAMAGED`, for any other exception than our own and those of used up memory or files.
+    """
+    try:
+        yield
+    except InertialError:
+        raise
+    except Exception as error:
+        if exhausted(error) is not None:
+            raise
+        reason = f"{type(error).__name__}: {error}".splitlines()[0][:300]
+        raise FormatError(Path(path), f"{fault} ({reason})", code=DAMAGED) from error
+
+
+def reader(what: str) -> Callable[[F], F]:
+    """Decorator of a function that reads ``what`` its first argument names, through :func:`reading`."""
+
+    def through(read: F) -> F:
+        @functools.wraps(read)
+        def gated(*args: Any, **kwargs: Any) -> Any:
+            with reading(args[0] if args else next(iter(kwargs.values())), f"cannot be read as {what}"):
+                return read(*args, **kwargs)
+
+        return typing.cast(F, gated)
+
+    return through
+
+
+_TEMPORARY = re.compile(r"\..+\.\d+-[0-9a-f]{8}\.tmp")
 
 
 def write_text(path: Path, text: str) -> None:
@@ -175,16 +225,21 @@ def write_json(path: Path, value: object, *, indent: int | None = 2) -> None:
 
 def read_json(path: Path) -> dict[str, Any]:
     """The JSON object in ``path``; a :class:`FormatError` where there is none."""
+    value = read_json_value(path)
+    if not isinstance(value, dict):
+        raise FormatError(path, f"expected a JSON object, found {type(value).__name__}")
+    return value
+
+
+def read_json_value(path: Path) -> Any:
+    """The JSON value in ``path``, of finite numbers; a :class:`FormatError` where there is none."""
     text = read_text(path)
     try:
-        value = json.loads(text, parse_constant=_no_constant)
+        return json.loads(text, parse_constant=_no_constant, parse_float=_finite, parse_int=_modest)
     except json.JSONDecodeError as error:
         raise FormatError(path, f"not valid JSON: {error.msg}", line=error.lineno) from None
     except (ValueError, RecursionError) as error:
         raise FormatError(path, f"not valid JSON: {error}") from None
-    if not isinstance(value, dict):
-        raise FormatError(path, f"expected a JSON object, found {type(value).__name__}")
-    return value
 
 
 def read_text(path: Path) -> str:
@@ -222,29 +277,30 @@ def read_bytes(path: Path, size: int = -1, *, what: str = "file") -> bytes:
         raise FormatError(path, f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
 
 
+#: Files whose size the system does not know, and which may block for ever.
+_KERNEL = ("/proc/", "/sys/")
+
+
 def require_regular(path: Path) -> None:
     """Refuse what never ends or never begins.
 
     Raises
     ------
     FormatError
-        For a device, a pipe or a socket.
+        For a device, a pipe, a socket, or what the kernel makes up as it is read.
     OSError
         Where there is nothing.
     """
     mode = os.stat(path).st_mode
-    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)) or os.path.realpath(path).startswith(_KERNEL):
         raise FormatError(path, "is a device, a pipe or a socket, not a file; copy what it gives into one")
 
 
 def first_line(path: Path) -> str:
     """The beginning of a file's first line, to tell what it is; empty where it cannot be read."""
-    if not path.is_file():
-        return ""
     try:
-        with open(path, encoding="utf-8-sig", errors="replace") as file:
-            return file.readline(1000)
-    except OSError:
+        return read_bytes(path, 1000).decode("utf-8-sig", errors="replace").replace("\r", "\n").partition("\n")[0]
+    except FormatError:
         return ""
 
 
@@ -254,7 +310,17 @@ def convert_to_plain(value: object) -> Any:
 
 
 def _no_constant(name: str) -> float:
-    raise ValueError(f"{name} is not a JSON number")
+    raise ValueError(f"{name[:40]} is not a number that is known here")
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    return number if math.isfinite(number) else _no_constant(text)
+
+
+def _modest(text: str) -> int | float:
+    """A whole number that 64 bits hold."""
+    return int(text) if len(text) < 19 or -(2**63) <= int(text[:99]) < 2**64 else _no_constant(text)
 
 
 def _plain(value: object, where: str) -> object:
@@ -298,10 +364,8 @@ def read_record(path: Path, kind: type[T]) -> T:
         Where the file was changed since.
     """
     values = read_json(path)
-    try:
+    with reading(path, CHANGED_RECORD):
         return structured(kind, values)
-    except Exception as error:  # whatever a changed file makes of a value's own checks
-        raise FormatError(path, f"was damaged since it was written ({error}); remove it and start again") from None
 
 
 def structured(kind: type[T], values: Any) -> T:

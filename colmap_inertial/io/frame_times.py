@@ -14,6 +14,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.core.types import FrameLog, FrameTiming
+from colmap_inertial.io.files import reader
 from colmap_inertial.io.tables import Table, read_table, recognise, split_unit
 from colmap_inertial.io.units import TIME_UNITS_NS, seconds, stamps_ns, unit_of
 
@@ -56,6 +57,7 @@ class FrameStamps:
         )
 
 
+@reader("frame times")
 def stamps_of_csv(path: Path, time_unit: str | None = None) -> FrameStamps:
     """Read ``name,t_s`` (or ``t_ns``, or EuRoC's ``#timestamp [ns],filename``), optionally with ``exposure_s``.
 
@@ -82,6 +84,7 @@ def stamps_of_csv(path: Path, time_unit: str | None = None) -> FrameStamps:
     return stamps_in_order(path, table.text(name_column), t_ns, table.line_numbers, exposure_s)
 
 
+@reader("pictures named by their times")
 def stamps_of_names(folder: Path, names: Sequence[str], unit: str) -> FrameStamps:
     """Take each frame's time from the number in its file name.
 
@@ -154,6 +157,7 @@ def _date_ns(path: Path, pattern: str) -> int:
     return since // datetime.timedelta(microseconds=1) * 1000
 
 
+@reader("frame times")
 def stamps_of_log(path: Path, time_unit: str | None = None) -> Int64Array:
     """Read a recorder's frame times, one row for each frame of its video, in order.
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import UInt8Array, UInt16Array
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.io.files import read_bytes, read_limits
+from colmap_inertial.io.files import read_bytes, read_limits, reader
 
 #: File endings of pictures that both OpenCV and the published builds of pycolmap read (the latter read no WebP).
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".pgm", ".ppm")
@@ -25,6 +25,7 @@ START_OF_SCAN = 0xDA
 _SILENT = 0
 
 
+@reader("a picture")
 def read_image(path: Path) -> UInt8Array | UInt16Array:
     """Decode a picture: (H, W) or (H, W, 3) RGB, in the file's own depth, rows as stored.
 

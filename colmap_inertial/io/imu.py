@@ -13,7 +13,7 @@ from colmap_inertial.core.types import FrameLog, ImuRecording
 from colmap_inertial.io import imu_text
 from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.capture_tables import ImuPath
-from colmap_inertial.io.files import StrPath
+from colmap_inertial.io.files import StrPath, reader, reading
 from colmap_inertial.io.imu_formats import find_imu_format
 from colmap_inertial.io.plausible import RawImu
 from colmap_inertial.io.units import DeclaredUnits
@@ -46,6 +46,7 @@ def read_imu(path: StrPath, *, format: str = "auto") -> ImuRecording:
     return raw.imu
 
 
+@reader("an inertial recording")
 def read_raw_imu(path: Path, *, format: str = "auto") -> RawImu:
     """As :func:`read_imu`, without looking whether the numbers are plausible: for those who look themselves."""
     if format == "capture" or (format == "auto" and is_capture(path)):
@@ -53,6 +54,7 @@ def read_raw_imu(path: Path, *, format: str = "auto") -> RawImu:
     return RawImu(imu=find_imu_format(path, format).read(path, DeclaredUnits()), path=path)
 
 
+@reader("an inertial recording")
 def read_frame_log(path: StrPath, *, format: str = "auto") -> FrameLog | None:
     """What a recording says about the frames of its video: times, exposure, readout, stabilisation, intrinsics.
 
@@ -93,12 +95,14 @@ def read_raw_capture_imu(capture: Capture) -> RawImu:
         )
     if isinstance(source, ImuPath):
         path = accel_path = source.path
-        imu = find_imu_format(path, source.format).read(path, source.units)
+        with reading(path, "cannot be read as an inertial recording"):
+            imu = find_imu_format(path, source.format).read(path, source.units)
     else:
         path = accel_path = source.gyro.file
         if source.accel is not None:
             accel_path = source.accel.file
-        imu = imu_text.read_tables(source.gyro, source.accel)
+        with reading(path, "cannot be read as described"):
+            imu = imu_text.read_tables(source.gyro, source.accel)
     imu = replace(
         imu,
         gyro_rad_s=imu.gyro_rad_s if source.gyro_axes is None else source.gyro_axes.apply(imu.gyro_rad_s),

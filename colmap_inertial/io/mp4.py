@@ -18,7 +18,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Int64Array
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.io.files import require_regular
+from colmap_inertial.io import files
 
 #: Four letters at the start of a file of this family.
 _FIRST_BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
@@ -147,6 +147,7 @@ def has_track(path: Path, entry: str) -> bool:
         return False
 
 
+@files.reader("a video")
 def read_movie(path: Path) -> Movie:
     """Read the index of an MP4 or QuickTime file.
 
@@ -156,7 +157,7 @@ def read_movie(path: Path) -> Movie:
         Where the file is missing, cut off before its index, or damaged; the message names the byte.
     """
     try:
-        require_regular(path)
+        files.require_regular(path)
         with open(path, "rb") as file:
             moov, start = _find_index(path, file)
     except OSError as error:

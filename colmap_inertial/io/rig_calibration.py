@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.geometry import colmap_px_from_opencv, matrix_from_quat
 from colmap_inertial.core.types import LengthUnit
-from colmap_inertial.io.files import read_bytes, read_text, read_yaml
+from colmap_inertial.io.files import read_bytes, read_json_value, read_yaml, reader
 from colmap_inertial.io.sensor_yaml import CAMERA_MODELS, Sheet, is_rotation
 
 Metres = Literal["m", "mm"]
@@ -56,6 +55,7 @@ class RigCalibration:
         return self.cameras[name]
 
 
+@reader("a calibration of cameras")
 def read_rig_calibration(path: Path, *, unit: Metres | None = None) -> RigCalibration:
     """Read a calibration; the format is found by content.
 
@@ -192,10 +192,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
 
 
 def _read_rig_config(path: Path, unit: Metres | None) -> RigCalibration:
-    try:
-        rigs = json.loads(read_text(path))
-    except (ValueError, RecursionError) as error:
-        raise FormatError(path, f"not valid JSON: {error}") from None
+    rigs = read_json_value(path)
     if not (isinstance(rigs, list) and rigs and all(isinstance(rig, dict) for rig in rigs)):
         raise FormatError(path, "not a rig_config.json: expected a list of rigs")
     if len(rigs) > 1:

@@ -7,17 +7,17 @@ from __future__ import annotations
 
 import re
 import zipfile
-import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Literal
+from typing import IO, Literal
 
 import numpy as np
 
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.io.files import first_line, read_limits, read_text
+from colmap_inertial.io.files import first_line, read_limits, read_text, reading
 from colmap_inertial.io.units import SENSOR_UNITS, TIME_UNITS_NS, Quantity, stamps_ns, unit_of
 
 _BLANK_OR_COMMENT = re.compile(r"\n\s*(\n|#|\Z)")
@@ -317,23 +317,33 @@ def _unit(cell: str, text: str | None, allowed: tuple[str, ...]) -> str | None:
     return unit
 
 
-#: An unpacked table larger than this is no recording.
-_LARGEST_MEMBER = 1 << 31
-#: What the standard library raises for damaged archives is not documented as one class.
-_DAMAGED = (OSError, EOFError, KeyError, ValueError, RuntimeError, zipfile.BadZipFile, zlib.error)
+@dataclass(frozen=True, kw_only=True)
+class _Packing:
+    """What a packed table may take, in bytes; real ones take a tenth."""
+
+    #: Of memory for each line beside its text.
+    line: int = 100
+    #: Of memory for each packed byte, and for any table.
+    memory: int = 60
+    memory_anyway: int = 64 << 20
+    #: How much is unpacked at a time.
+    step: int = 1 << 20
+
+
+_PACKING = _Packing()
+#: How recorders pack. Others can ask for gigabytes before the first byte.
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
 def members_of(path: Path) -> dict[str, str]:
     """The tables of a recording: file name to where it lies. A zip may hold them in one folder."""
     if path.is_dir():
         return {file.name: file.name for file in path.glob("*.csv")}
-    try:
-        if not path.is_file() or not zipfile.is_zipfile(path):
-            return {}
-        with zipfile.ZipFile(path) as archive:
-            names = [info.filename for info in archive.infolist() if info.filename.endswith(".csv")]
-    except (OSError, zipfile.BadZipFile, ValueError, NotImplementedError):
-        return {}
+    names: list[str] = []
+    with suppress(FormatError), reading(path):
+        if path.is_file() and zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as archive:
+                names = [info.filename for info in archive.infolist() if info.filename.endswith(".csv")]
     return {PurePosixPath(name).name: name for name in names if len(PurePosixPath(name).parts) <= 2}
 
 
@@ -341,11 +351,9 @@ def head_of(path: Path, member: str) -> str:
     """The first line of a table, or as much of it as a thousand bytes hold; empty where it is damaged."""
     if path.is_dir():
         return first_line(path / member)
-    try:
-        with zipfile.ZipFile(path) as archive, archive.open(member) as file:
-            return file.read(1000).decode("utf-8-sig", errors="replace").partition("\n")[0]
-    except _DAMAGED:
-        return ""
+    with suppress(FormatError), _unpacking(path, member) as (file, _):
+        return file.read(1000).decode("utf-8-sig", errors="replace").partition("\n")[0]
+    return ""
 
 
 def text_of(path: Path, member: str) -> str:
@@ -354,17 +362,37 @@ def text_of(path: Path, member: str) -> str:
     Raises
     ------
     FormatError
-        Where it is damaged, or too large.
+        Where it is damaged, too large, or larger than its packed bytes can honestly make it.
     """
     if path.is_dir():
         return read_text(path / member)
-    try:
-        with zipfile.ZipFile(path) as archive:
-            member_info = archive.getinfo(member)
-            if member_info.compress_size > path.stat().st_size:  # as much memory would be asked for as it says
-                raise FormatError(path, f"its {member} cannot be unpacked: it is said to be larger than the file")
-            if member_info.file_size > _LARGEST_MEMBER:
-                raise FormatError(path, f"its {member} unpacks to more than {_LARGEST_MEMBER >> 30} GiB")
-            return archive.read(member).decode("utf-8-sig", errors="replace")
-    except _DAMAGED as error:
-        raise FormatError(path, f"its {member} cannot be unpacked: {error}") from None
+    largest_gib = read_limits().file_gib
+    with _unpacking(path, member) as (file, packed):
+        parts, size, memory = list[bytes](), 0, 0
+        while part := file.read(_PACKING.step):
+            parts.append(part)
+            size += len(part)
+            memory += len(part) + _PACKING.line * part.count(b"\n")
+            if size > largest_gib * (1 << 30):
+                raise FormatError(path, f"its {member} unpacks to more than {largest_gib:g} GiB (--limits.file-gib)")
+            if memory > _PACKING.memory_anyway + _PACKING.memory * packed:
+                raise FormatError(
+                    path,
+                    f"its {member} unpacks to {size >> 20} MB and more, out of proportion to {packed} packed bytes; if "
+                    "it is meant, unpack it and give the folder",
+                )
+        return b"".join(parts).decode("utf-8-sig", errors="replace")
+
+
+@contextmanager
+def _unpacking(path: Path, member: str) -> Iterator[tuple[IO[bytes], int]]:
+    """A member of a zip, opened, and the bytes that it takes there."""
+    with reading(path, f"its {member} cannot be unpacked"), zipfile.ZipFile(path) as archive:
+        info = archive.getinfo(member)
+        if info.compress_type not in _METHODS:
+            method = info.compress_type
+            raise FormatError(
+                path, f"its {member} is packed by method {method}, not by deflate; unpack it and give the folder"
+            )
+        with archive.open(info) as file:
+            yield file, min(info.compress_size, path.stat().st_size)

@@ -11,12 +11,13 @@ from colmap_inertial.core.arrays import Array, BoolArray
 from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.core.geometry import quat_conjugate, quat_normalize
 from colmap_inertial.core.types import CameraTrajectory, ImuRecording, SmoothedTrajectory
-from colmap_inertial.io.files import write_text
+from colmap_inertial.io.files import reader, write_text
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.io.tables import Table, read_table
 from colmap_inertial.io.units import seconds
 
 
+@reader("a trajectory")
 def read_tum(path: Path) -> CameraTrajectory:
     """Read a trajectory in TUM format.
 
@@ -49,6 +50,7 @@ def write_tum(path: Path, trajectory: CameraTrajectory | SmoothedTrajectory) -> 
     write_text(Path(path), "\n".join(lines) + "\n")
 
 
+@reader("an InertialScale folder")
 def read_inertial_scale(folder: Path) -> tuple[CameraTrajectory, ImuRecording]:
     """Read an InertialScale folder: ``poses.txt``, ``gyroscope.txt``, ``accelerometer.txt``.
 

@@ -27,7 +27,7 @@ from colmap_inertial.core.types import (
     SolvedMotion,
     Treatment,
 )
-from colmap_inertial.io.files import StrPath, check_names, convert_to_plain, read_json, write_json
+from colmap_inertial.io.files import StrPath, check_names, convert_to_plain, read_json, reader, write_json
 from colmap_inertial.model.soundness import check_binary_model, check_values
 
 if TYPE_CHECKING:
@@ -191,6 +191,7 @@ def num_registered(folder: Path) -> int:
         return sum(not line.startswith(b"#") for line in opened) // 2
 
 
+@reader("a COLMAP model")
 def read_model(folder: StrPath, suffix: str | None = None) -> pycolmap.Reconstruction:
     """Read a COLMAP model, binary or text.
 

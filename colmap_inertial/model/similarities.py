@@ -14,7 +14,7 @@ from colmap_inertial.core.errors import FormatError, InertialError, NotObservabl
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_from_matrix
 from colmap_inertial.core.options import WorldAxes
 from colmap_inertial.core.types import UNDOES, ScaleEstimate, Similarity
-from colmap_inertial.io.files import StrPath, read_json
+from colmap_inertial.io.files import StrPath, read_json, reader, reading
 from colmap_inertial.model import similarity_as_json
 
 
@@ -82,6 +82,7 @@ def similarity_from_json(path: Path, fields: Mapping[str, Any]) -> Similarity:
         raise FormatError(path, str(error)) from None
 
 
+@reader("a similarity")
 def read_similarity(path: StrPath) -> Similarity:
     """Read a similarity: a JSON object with ``scale``, ``rotation_xyzw``, ``translation_m``, ``cov``, ``provenance``.
 
@@ -175,27 +176,29 @@ def read_scales(sources: Sequence[str], *, world: WorldAxes = "z-up") -> dict[in
     """
     found: dict[int | None, ModelScale] = {}
     for source in sources:
-        number, equals, name = source.partition("=")
-        if equals and number.isascii() and number.isdigit() and not Path(source).exists():
-            path, index = Path(name), int(number)
-            entries: list[tuple[int | None, Any]] = [(index, read_json(path))]
-        else:
-            path = Path(source)
-            content = read_json(path)
-            models = content.get("models")
-            entries = [(None, content)]
-            if isinstance(models, list):
-                entries = [(_colmap_index(m), m) for m in models]
-                if not all(isinstance(i, int) for i, _ in entries):
-                    raise FormatError(path, "models: each needs an index")
-                found |= _fragments(path, content.get("fragments") or [])
-        for key, fields in entries:
+        for key, scale in _scales_of(source, world):
             if key in found or (None in found) != (key is None and bool(found)):
                 raise InertialError(f"{source}: two scales for one model; give each as NUMBER=FILE")
-            found[key] = _model_scale(path, fields, world)
+            found[key] = scale
     if found and all(scale.similarity is None for scale in found.values()):
         raise NotObservableError("scale", "; ".join(reason for scale in found.values() for reason in scale.reasons))
     return found
+
+
+def _scales_of(source: str, world: WorldAxes) -> list[tuple[int | None, ModelScale]]:
+    """What ``FILE`` or ``NUMBER=FILE`` states."""
+    number, equals, name = source.partition("=")
+    is_numbered = bool(equals) and number.isascii() and number.isdigit() and not Path(source).exists()
+    path = Path(name if is_numbered else source)
+    with reading(path, "cannot be read as a scale estimate"):
+        content = read_json(path)
+        if is_numbered or not isinstance(content.get("models"), list):
+            return [(int(number) if is_numbered else None, _model_scale(path, content, world))]
+        entries = [(_colmap_index(model), model) for model in content["models"]]
+        if not all(isinstance(i, int) for i, _ in entries):
+            raise FormatError(path, "models: each needs an index")
+        fragments = _fragments(path, content.get("fragments") or [])
+        return [*fragments, *((i, _model_scale(path, model, world)) for i, model in entries)]
 
 
 def _colmap_index(fields: Any) -> Any:
@@ -203,15 +206,13 @@ def _colmap_index(fields: Any) -> Any:
     return fields.get("colmap_index", fields.get("index")) if isinstance(fields, dict) else None
 
 
-def _fragments(path: Path, entries: Any) -> dict[int | None, ModelScale]:
+def _fragments(path: Path, entries: Any) -> list[tuple[int | None, ModelScale]]:
     """What a result left out, which keeps its own units."""
-    found: dict[int | None, ModelScale] = {}
-    for entry in entries if isinstance(entries, list) else [None]:
-        number = _colmap_index(entry)
-        if not isinstance(number, int):
-            raise FormatError(path, "fragments: each needs a colmap_index")
-        found[number] = ModelScale(similarity=None, verdict="refused", reasons=("a fragment of few images",))
-    return found
+    numbers = [_colmap_index(entry) for entry in entries] if isinstance(entries, list) else [None]
+    if not all(isinstance(number, int) for number in numbers):
+        raise FormatError(path, "fragments: each needs a colmap_index")
+    left_out = ModelScale(similarity=None, verdict="refused", reasons=("a fragment of few images",))
+    return [(number, left_out) for number in numbers]
 
 
 def _model_scale(path: Path, fields: Any, world: WorldAxes) -> ModelScale:

@@ -69,8 +69,8 @@ from pathlib import Path
 from typing import Any
 
 from colmap_inertial.checks.report.content import gather
-from colmap_inertial.core.errors import FormatError, InertialError
-from colmap_inertial.io.files import StrPath, write_json, write_text
+from colmap_inertial.core.errors import InertialError
+from colmap_inertial.io.files import StrPath, reading, write_json, write_text
 
 
 def write_report(
@@ -104,16 +104,11 @@ def write_report(
     from colmap_inertial.checks.report.run_page import run_page
 
     target = out / "report.html"
-    try:
+    records = "its result.json, diagnosis.json, config.toml or report_data"
+    with reading(out, f"{records} was damaged since it was written"):
         content = gather(out, result=result, stopped=stopped, capture=capture)
         page = run_page(content, out)
-    except (LookupError, TypeError, ValueError, ArithmeticError, AttributeError, RecursionError) as error:
-        told = f"{type(error).__name__}: {error}"
-        raise FormatError(
-            out,
-            f"its result.json, diagnosis.json, config.toml or report_data was damaged since it was written ({told})",
-        ) from error
-    write_json(out / "report.json", content, indent=None)
+        write_json(out / "report.json", content, indent=None)
     write_text(target, page)
     return target
 

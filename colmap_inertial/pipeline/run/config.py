@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.io.files import StrPath, require_regular
+from colmap_inertial.io.files import StrPath, reader, require_regular
 
 Options = TypeVar("Options")
 
@@ -41,6 +41,7 @@ def _plain_item(item: object) -> object:
     return str(item.resolve()) if isinstance(item, Path) else item
 
 
+@reader("options")
 def read_config(path: StrPath, cls: type[Options]) -> Options:
     """Options of type ``cls`` from a TOML file; what it does not name keeps its default.
 

@@ -9,12 +9,13 @@ import logging
 import re
 import shutil
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
 from colmap_inertial.checks.report.content import CROPS_FOLDER, DATA_FOLDER
-from colmap_inertial.core.errors import FormatError, OutputError, OutputExistsError
-from colmap_inertial.io.files import locked, read_json, write_json
+from colmap_inertial.core.errors import OutputError, OutputExistsError
+from colmap_inertial.io.files import CHANGED_RECORD, locked, read_json, reading, write_json
 
 log = logging.getLogger(__name__)
 
@@ -239,13 +240,9 @@ def full_disk_is_an_error(root: Path, advice: str = _MAKE_ROOM) -> Iterator[None
         raise OutputError(f"the disk of {root} is full ({error.strerror}); {advice}") from error
 
 
-@contextlib.contextmanager
-def a_record_of_ours(path: Path) -> Iterator[None]:
+def a_record_of_ours(path: Path) -> AbstractContextManager[None]:
     """While a record of an earlier run is taken apart: what does not fit means that it was changed since."""
-    try:
-        yield
-    except (LookupError, TypeError, ValueError, AttributeError) as error:
-        raise FormatError(path, f"was damaged since it was written ({error}); remove it and start again") from None
+    return reading(path, CHANGED_RECORD)
 
 
 def require_apart(out: Path, pictures: Sequence[Path]) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, StageNames
-from colmap_inertial.io.files import StrPath, check_names
+from colmap_inertial.io.files import StrPath, check_names, reader
 from colmap_inertial.io.toml_section import Section, read_toml
 from colmap_inertial.pipeline.run.config import override_options, read_values
 
@@ -52,6 +52,7 @@ class BatchCapture:
             raise ValueError(f"{self.name!r} is what the batch itself writes; choose another name")
 
 
+@reader("the manifest of a batch")
 def read_manifest(
     path: StrPath, options: ReconstructOptions = ReconstructOptions(), *, allow_stages: bool = False
 ) -> list[BatchCapture]:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
 from colmap_inertial.core.types import CameraModel, ReadoutDirection
+from colmap_inertial.io.files import reader
 from colmap_inertial.io.toml_section import Section, read_toml
 from colmap_inertial.tools.simulate.motion import MotionKind, MotionOptions
 from colmap_inertial.tools.simulate.render import ShutterCamera
@@ -75,6 +76,7 @@ class SceneRecipe:
             raise ValueError("quality goes from 0 to 100, crf from 0 to 51")
 
 
+@reader("a recipe")
 def load_recipe(path: Path) -> SceneRecipe:
     """Read a recipe.
 

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
-from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.types import CAL, CameraImuCalibration, CameraTrajectory
-from colmap_inertial.io.files import read_json
+from colmap_inertial.io.files import read_json, reader
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -37,6 +36,7 @@ class SceneTruth:
     target_corners_m: Array
 
 
+@reader("the truth of a simulated capture")
 def read_truth(path: Path) -> SceneTruth:
     """Read a ``truth.json``.
 
@@ -46,24 +46,21 @@ def read_truth(path: Path) -> SceneTruth:
         Where it is missing, or not one of ours.
     """
     values = read_json(path)
-    try:
-        frames: list[dict[str, Any]] = values["frames"]
-        calibration = values["calibration"]
-        return SceneTruth(
-            trajectory=CameraTrajectory(
-                names=tuple(frame["name"] for frame in frames),
-                t_s=np.array([frame["t_middle_s"] for frame in frames]),
-                cam_from_world_xyzw=np.array([frame["cam_from_world_xyzw"] for frame in frames]),
-                cam_in_world=np.array([frame["cam_in_world_m"] for frame in frames]),
-                length_unit="m",
-            ),
-            calibration=CameraImuCalibration(**calibration, cov=np.zeros((CAL.COUNT, CAL.COUNT))),
-            accel_bias_m_s2=np.array(values["accel_bias_m_s2"], dtype=np.float64),
-            target=values["target"]["spec"],
-            target_corners_m=np.array(values["target"]["corners_in_world_m"], dtype=np.float64),
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise FormatError(path, f"is not the truth of a simulated capture ({error!r})") from None
+    frames: list[dict[str, Any]] = values["frames"]
+    calibration = values["calibration"]
+    return SceneTruth(
+        trajectory=CameraTrajectory(
+            names=tuple(frame["name"] for frame in frames),
+            t_s=np.array([frame["t_middle_s"] for frame in frames]),
+            cam_from_world_xyzw=np.array([frame["cam_from_world_xyzw"] for frame in frames]),
+            cam_in_world=np.array([frame["cam_in_world_m"] for frame in frames]),
+            length_unit="m",
+        ),
+        calibration=CameraImuCalibration(**calibration, cov=np.zeros((CAL.COUNT, CAL.COUNT))),
+        accel_bias_m_s2=np.array(values["accel_bias_m_s2"], dtype=np.float64),
+        target=values["target"]["spec"],
+        target_corners_m=np.array(values["target"]["corners_in_world_m"], dtype=np.float64),
+    )
 
 
 def true_metres_per_unit(names: tuple[str, ...], cam_in_world: Array, truth: CameraTrajectory) -> float:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from colmap_inertial.checks.report.series import strided
 from colmap_inertial.core.arrays import Array, Float32Array, UInt8Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.io.files import reader
 from colmap_inertial.io.ply import Element, read_ply_header
 
 if TYPE_CHECKING:
@@ -89,6 +90,7 @@ def sparse_cloud(reconstruction: pycolmap.Reconstruction, most: int) -> Cloud:
     return Cloud(xyz=xyz, rgb=rgb, total=len(ids), dense=False)
 
 
+@reader("points")
 def dense_cloud(path: Path, most: int) -> Cloud:
     """At most ``most`` points of a PLY file, evenly chosen; only these are read, and shown where they are finite.
 
@@ -107,6 +109,7 @@ def dense_cloud(path: Path, most: int) -> Cloud:
     return Cloud(xyz=xyz, rgb=rgb, total=len(table), dense=True)
 
 
+@reader("a mesh")
 def read_mesh(path: Path, most_faces: int) -> Mesh | None:
     """A PLY file of triangles; ``None`` where it has more than ``most_faces``, or none. Without what is not finite.
 

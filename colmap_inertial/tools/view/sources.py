@@ -14,7 +14,7 @@ from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.geometry import quat_rotate
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import LengthUnit
-from colmap_inertial.io.files import path_in, read_json
+from colmap_inertial.io.files import path_in, read_json, reader
 from colmap_inertial.model import TRANSFORM_FILE, find_models, is_metric, model_format
 from colmap_inertial.model.similarities import similarity_from_json
 from colmap_inertial.pipeline.run.workspace import Workspace, a_record_of_ours, places_of
@@ -129,6 +129,7 @@ class ViewSource:
     stretched: tuple[StretchedPart, ...] = ()
 
 
+@reader("a result or a COLMAP model")
 def find_source(out: Path, index: int | None = None, *, images: Path | None = None) -> ViewSource:
     """Find the model to show.
 
