@@ -25,6 +25,7 @@ from colmap_inertial.cli.process import INTERRUPTED, TERMINATED, Terminated, ans
 from colmap_inertial.cli.speech import Speaker, log_on_terminal, print_json
 from colmap_inertial.core.errors import InertialError, exhausted
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, ReferenceOptions
+from colmap_inertial.core.printing import say
 
 DESCRIPTION = """Metric, gravity-aligned COLMAP models from the gyroscope and accelerometer recorded beside the images.
 
@@ -232,12 +233,13 @@ def _main(args: Sequence[str] | None) -> None:
         require_limits(to_load=True)
         command = parse(args)
     except (InertialError, ValueError) as error:  # options check their own values when they are built
-        print(f"error: {error}", file=sys.stderr)
+        say(f"error: {error}", error=True)
         sys.exit(2)
-    from colmap_inertial.io.files import reading_within
+    from colmap_inertial.io.files import reading_within, require_utf8
 
     try:
         require_limits()
+        require_utf8(*args)
         with contextlib.ExitStack() as around:
             if not isinstance(command, View):  # Ctrl-C is how that one ends
                 around.enter_context(answering_signals())
@@ -249,16 +251,16 @@ def _main(args: Sequence[str] | None) -> None:
         code = error.exit_code
         if command.answers_in_json:
             print_json({"error": str(error), "exit_code": code})
-        print(f"error: {error}", *getattr(error, "__notes__", ()), sep="\n", file=sys.stderr)
+        say("\n".join([f"error: {error}", *getattr(error, "__notes__", ())]), error=True)
     except KeyboardInterrupt as stop:
         resumes = isinstance(command, Reconstruct | Deblur | FuseApertures | FuseExposures | Batch)
         again = "; started again with the same arguments, it continues" if resumes else ""
-        print(f"interrupted{again}", file=sys.stderr)
+        say(f"interrupted{again}", error=True)
         code = TERMINATED if isinstance(stop, Terminated) else INTERRUPTED
     except (MemoryError, OSError, ImportError, RuntimeError) as error:
         reason = exhausted(error)
         if reason is None:
             raise
-        print(f"error: {reason}", file=sys.stderr)
+        say(f"error: {reason}", error=True)
         code = 2
     sys.exit(code)

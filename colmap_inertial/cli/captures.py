@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +24,7 @@ from colmap_inertial.core.options import (
     ProjectOptions,
     ReferenceOptions,
 )
+from colmap_inertial.core.printing import say
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,9 +88,7 @@ class Reconstruct(DeviceCommand, ConfiguredCommand):
         )
         if stopped is not None:
             shown_above = self.talks and code == 3
-            print(
-                f"error: {'no scale was accepted, for the reasons above' if shown_above else stopped}", file=sys.stderr
-            )
+            say(f"error: {'no scale was accepted, for the reasons above' if shown_above else stopped}", error=True)
         return code
 
     def _by_reference(self) -> int:
@@ -299,5 +297,5 @@ class Simulate(Reader):
             capture = write_capture(
                 recipe, self.out, workers=self.workers, progress=lambda done, total: progress("rendering", done, total)
             )
-        self.tell(lambda: print(capture), {"out": self.out, "capture": capture})
+        self.tell(lambda: say(capture), {"out": self.out, "capture": capture})
         return 0

@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from colmap_inertial.core.printing import open_console
+
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress as Bars, TaskID
@@ -190,7 +192,6 @@ def _name_stage(stage: str) -> str:
 @contextlib.contextmanager
 def live_progress(*, quiet: bool, verbose: bool) -> Iterator[Screen]:
     """The screen of a command that takes a while."""
-    from rich.console import Console
     from rich.progress import BarColumn, Progress as Bars, ProgressColumn, SpinnerColumn, Task, TextColumn
     from rich.text import Text
 
@@ -210,7 +211,7 @@ def live_progress(*, quiet: bool, verbose: bool) -> Iterator[Screen]:
             left = "" if task.finished else stage.ends_in(time.monotonic())
             return Text.assemble("clock ", (clock(seconds or 0.0), "progress.elapsed"), f", {left}" if left else "")
 
-    console = Console(stderr=True, quiet=quiet)
+    console = open_console(stderr=True, quiet=quiet)
     columns: tuple[Any, ...] = (
         SpinnerColumn(finished_text=" "),
         TextColumn("{task.description:<13}"),

@@ -16,6 +16,7 @@ from tyro.conf import arg
 
 from colmap_inertial.cli.screen import Screen, live_progress
 from colmap_inertial.core.options import ReadLimits, ReconstructOptions
+from colmap_inertial.core.printing import PrintableFormatter, say
 
 #: ``--json -``.
 _STANDARD_OUTPUT = Path("-")
@@ -149,9 +150,7 @@ class DeviceCommand(Speaker):
         kept = read_remembered(recording, calibration, device=self.device)
         if self.talks:
             for path, kind in kept.files:
-                print(
-                    f'{kept.device}: uses the remembered calibration "{kind}", {path} (--no-remembered leaves it out)'
-                )
+                say(f'{kept.device}: uses the remembered calibration "{kind}", {path} (--no-remembered leaves it out)')
         return (*calibration, *kept.paths)
 
 
@@ -167,7 +166,7 @@ class _StandardError(logging.StreamHandler[Any]):
 
     def __init__(self) -> None:
         super().__init__()
-        self.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s", "%H:%M:%S"))
+        self.setFormatter(PrintableFormatter("%H:%M:%S"))
 
     @property
     def stream(self) -> Any:

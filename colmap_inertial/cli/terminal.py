@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from colmap_inertial.cli.screen import SEVERITY_COLOUR, Screen
 from colmap_inertial.core.errors import InertialError
+from colmap_inertial.core.printing import open_console, say
 
 # Only the annotations need these, and what a command does not load it does not wait for.
 if TYPE_CHECKING:
@@ -79,7 +80,6 @@ def _label_first(label: str, texts: Iterable[object]) -> list[Line]:
 
 
 def _print_panel(title: str, lines: Iterable[Line]) -> None:
-    from rich.console import Console
     from rich.panel import Panel
     from rich.table import Table
     from rich.text import Text
@@ -90,7 +90,7 @@ def _print_panel(title: str, lines: Iterable[Line]) -> None:
     for label, text in lines:
         # not as markup: square brackets of paths and tables are meant
         table.add_row(label[:1].upper() + label[1:], Text(text) if isinstance(text, str) else text)
-    Console().print(Panel(table, title=Text(title), title_align="left", expand=False))
+    open_console().print(Panel(table, title=Text(title), title_align="left", expand=False))
 
 
 def show_scale(estimate: ScaleEstimate, source: Path) -> None:
@@ -155,7 +155,6 @@ def show_calibration(calibration: CameraImuCalibration, source: Path, kept: Path
 
 def show_diagnosis(diagnosis: Diagnosis, source: Path) -> None:
     """Print findings, worst first, and what could not be checked."""
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
@@ -168,19 +167,18 @@ def show_diagnosis(diagnosis: Diagnosis, source: Path) -> None:
     for finding in diagnosis.findings:
         severity = Text(finding.severity, f"bold {SEVERITY_COLOUR[finding.severity]}")
         table.add_row(severity, finding.code, Text(finding.evidence), Text(finding.advice))
-    Console().print(table if diagnosis.findings else Text(f"{title}: nothing found"))
+    open_console().print(table if diagnosis.findings else Text(f"{title}: nothing found"))
     unchecked = not_checked(diagnosis.checked)
     if unchecked:
-        print(f"not checked: {unchecked}")
+        say(f"not checked: {unchecked}")
 
 
 def show_validation(result: Validation) -> None:
     """Print a validation."""
-    from rich.console import Console
 
     from colmap_inertial.checks.validate import validation_table
 
-    Console().print(validation_table(result))
+    open_console().print(validation_table(result))
 
 
 def imaging_lines(frames: Sequence[FrameRecord], plan: ImagingPlan, rectified: Collection[str]) -> list[Line]:
@@ -199,7 +197,7 @@ def imaging_lines(frames: Sequence[FrameRecord], plan: ImagingPlan, rectified: C
 
 def show_nothing_to_do(workspace: Workspace) -> None:
     """Say that an earlier run's result stands."""
-    print(f"nothing to do: kept from the earlier run; {workspace.root} holds the result for these inputs and options")
+    say(f"nothing to do: kept from the earlier run; {workspace.root} holds the result for these inputs and options")
 
 
 def show_reference(found: Reference) -> None:
@@ -214,15 +212,15 @@ def show_reference(found: Reference) -> None:
     lines: list[Line] = [("metres", f"{metres}{', as far as the target reaches' if small else ''}")]
     lines += [("from", found.made_of), *scale_facts(values), *_label_first("note", found.notes)]
     _print_panel("Project", [*lines, ("written", str(found.out))])
-    print(f"next: {shlex.join(['colmap-inertial', 'view', str(found.out)])}")
+    say(f"next: {shlex.join(['colmap-inertial', 'view', str(found.out)])}")
 
 
 def show_fused(lines: Sequence[str], screen: Screen) -> None:
     """Print what became of the pictures of several lenses or exposures."""
     if screen.unchanged:
-        print("nothing to do: kept from the earlier run")
+        say("nothing to do: kept from the earlier run")
     for line in lines:
-        print(line)
+        say(line)
 
 
 def show_deblurred(result: DeblurResult) -> None:
@@ -246,22 +244,22 @@ def show_result(result: ReconstructResult, source: Path) -> None:
         number = "" if model.colmap_index == model.index else f" (COLMAP's {model.colmap_index})"
         _print_panel(f"Model {model.index}{number}", _model_lines(model, result))
     if all(model.sparse_metric is None for model in result.models) and result.workspace.colmap_sparse.is_dir():
-        print(
+        say(
             f"metres without the IMU: colmap-inertial reconstruct {shlex.quote(str(result.workspace.colmap))} "
             "NEW_FOLDER --scale-from target --target ..., or --scale-from distance (--help)"
         )
-    print(_describe_layout(result))
+    say(_describe_layout(result))
     for fragment in result.fragments:
-        print(
+        say(
             f"COLMAP's model {fragment.colmap_index} is a fragment of {fragment.registered_images} images, left out; "
             "--fragments makes it metric, too"
         )
     for gap in result.gaps:
         if not gap.joined:
-            print(
+            say(
                 f"COLMAP's models {gap.first} and {gap.second}, {gap.seconds:.1f} s apart, are not joined: {gap.reason}"
             )
-    print(f"next: {next_command(result, source)}")
+    say(f"next: {next_command(result, source)}")
 
 
 def _model_lines(model: ModelResult, result: ReconstructResult) -> Iterator[Line]:
@@ -337,17 +335,16 @@ def show_exported(made: Exported) -> None:
     _print_panel("Export" if made.program is None else f"Export for {made.program}", lines)
     if made.command:
         # not in the panel, which would break the line that is to be copied
-        print(made.command)
+        say(made.command)
 
 
 def show_view(out: Path, url: str, host: str) -> None:
     """Where a model is shown, and to whom."""
     from colmap_inertial.tools.view.guard import is_loopback
 
-    print(f"{out} is shown at {url} (Ctrl-C ends this)", flush=True)
+    say(f"{out} is shown at {url} (Ctrl-C ends this)")
     if not is_loopback(host):
-        print(
+        say(
             f"listening at {host}: everybody on the network who learns this address sees the model and its images, and "
-            "nothing is encrypted; to look from elsewhere, ssh -L to this machine is safer",
-            flush=True,
+            "nothing is encrypted; to look from elsewhere, ssh -L to this machine is safer"
         )

@@ -37,7 +37,7 @@ from colmap_inertial.io.capture_tables import (
     read_camera_table,
     read_imu_table,
 )
-from colmap_inertial.io.files import StrPath, reader
+from colmap_inertial.io.files import StrPath, reader, require_utf8
 from colmap_inertial.io.gcsv import is_gcsv, read_gcsv_frames
 from colmap_inertial.io.imu_formats import Recording, find_recording, refuse_video
 from colmap_inertial.io.imu_text import is_inertial_scale
@@ -171,6 +171,7 @@ def load_capture(path: StrPath) -> Capture:
         For an unknown key (the nearest known one is named), a value that cannot be, or a folder of no known layout.
     """
     path = Path(path)
+    require_utf8(path)
     if path.is_dir():
         if (path / "capture.toml").is_file():
             return _read_capture_toml(path / "capture.toml")

@@ -26,6 +26,7 @@ import numpy as np
 
 from colmap_inertial.core.errors import FormatError, InertialError, OutputError, OutputExistsError, exhausted
 from colmap_inertial.core.options import ReadLimits
+from colmap_inertial.core.printing import printable
 
 if TYPE_CHECKING:
     from cattrs import Converter
@@ -410,12 +411,22 @@ def check_names(names: Iterable[str], source: Path | str) -> None:
     Raises
     ------
     FormatError
-        For a name that is empty or absolute, that holds ``..`` or NUL, or that is too long.
+        For a name that is empty or absolute, that holds ``..`` or a control character, that is no UTF-8 or too long.
     """
     for name in names:
         fault = _fault(name)
         if fault is not None:
             raise FormatError(source, f"names the file {name[:80]!r}, which {fault}; such names are not followed")
+
+
+def require_utf8(*paths: StrPath) -> None:
+    """Raise :class:`FormatError` for a path that native libraries would end the process for, and JSON cannot hold."""
+    for path in paths:
+        if printable(absolute := os.path.abspath(path)) != absolute:
+            raise FormatError(
+                Path(path),
+                "its name, or a folder's above it, is no UTF-8 or holds a control character; rename it",
+            )
 
 
 def path_in(folder: Path, name: str, source: Path | str | None = None) -> Path:
@@ -448,15 +459,12 @@ def path_in(folder: Path, name: str, source: Path | str | None = None) -> Path:
 def _fault(name: str) -> str | None:
     if not name or not name.strip("./\\ "):
         return "is empty"
-    if "\0" in name:
-        return "holds a NUL character"
     if name.startswith("/") or Path(name).anchor:
         return "is absolute"
     parts = re.split(r"[/\\]", name)
     if ".." in parts:
         return 'leads out of its folder by ".."'
-    try:
-        longest = max(len(os.fsencode(part)) for part in parts)
-    except UnicodeEncodeError:
-        return "no file system can hold"
+    if printable(name) != name or "\n" in name or "\t" in name:
+        return "is no UTF-8, or holds a control character"
+    longest = max(len(part.encode()) for part in parts)
     return f"is longer than {_LONGEST} bytes" if longest > _LONGEST else None

@@ -70,6 +70,7 @@ from typing import Any
 
 from colmap_inertial.checks.report.content import gather
 from colmap_inertial.core.errors import InertialError
+from colmap_inertial.core.printing import printable_values
 from colmap_inertial.io.files import StrPath, reading, write_json, write_text
 
 
@@ -106,7 +107,7 @@ def write_report(
     target = out / "report.html"
     records = "its result.json, diagnosis.json, config.toml or report_data"
     with reading(out, f"{records} was damaged since it was written"):
-        content = gather(out, result=result, stopped=stopped, capture=capture)
+        content = printable_values(gather(out, result=result, stopped=stopped, capture=capture))
         page = run_page(content, out)
         write_json(out / "report.json", content, indent=None)
     write_text(target, page)

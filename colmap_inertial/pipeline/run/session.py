@@ -11,7 +11,15 @@ from pathlib import Path
 
 from colmap_inertial import __version__
 from colmap_inertial.core.errors import InertialError
-from colmap_inertial.io.files import convert_to_plain, read_json, remove_temporaries, write_json, write_text
+from colmap_inertial.core.printing import PrintableFormatter
+from colmap_inertial.io.files import (
+    convert_to_plain,
+    read_json,
+    remove_temporaries,
+    require_utf8,
+    write_json,
+    write_text,
+)
 from colmap_inertial.model import load_pycolmap
 from colmap_inertial.pipeline.run.config import config_as_toml
 from colmap_inertial.pipeline.run.context import RunContext
@@ -95,6 +103,7 @@ def open_session(
     OutputError
         Where it cannot be written, as on a full disk, or lies among the pictures.
     """
+    require_utf8(out, source)
     require_apart(out, pictures)
     workspace = Workspace(out)
     workspace.prepare(source, command)
@@ -119,7 +128,7 @@ def logging_to(path: Path) -> Iterator[None]:
     keep_colmap_quiet()
     logger = logging.getLogger("colmap_inertial")
     handler = logging.FileHandler(path, encoding="utf-8")
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    handler.setFormatter(PrintableFormatter())
     level = logger.level
     logger.addHandler(handler)
     logger.setLevel(logging.INFO)

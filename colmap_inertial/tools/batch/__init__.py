@@ -21,6 +21,7 @@ from pathlib import Path
 
 from colmap_inertial.core.errors import OutputError, OutputExistsError, exhausted
 from colmap_inertial.core.options import BatchOptions, ReconstructOptions, StageNames
+from colmap_inertial.core.printing import cell
 from colmap_inertial.io.files import StrPath, locked, remove_temporaries, write_json, write_text
 from colmap_inertial.pipeline.run.config import config_as_toml
 from colmap_inertial.tools.batch.manifest import BatchCapture, check_unique, read_manifest
@@ -287,7 +288,8 @@ def write_summary(result: BatchResult) -> None:
     text = io.StringIO()
     table = csv.DictWriter(text, _row(CaptureStatus(name="")), lineterminator="\n")
     table.writeheader()
-    table.writerows(_row(capture) for capture in result.captures)
+    for row in map(_row, result.captures):
+        table.writerow({key: cell(value) if isinstance(value, str) else value for key, value in row.items()})
     write_text(result.out / "summary.csv", text.getvalue())
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 
+from colmap_inertial.core.printing import open_console, say
 from colmap_inertial.tools.batch import BatchResult, Watch
 from colmap_inertial.tools.batch.task import CaptureStatus
 
@@ -25,11 +26,10 @@ def _outcome(status: CaptureStatus) -> str:
 @contextlib.contextmanager
 def live_batch(*, quiet: bool = False) -> Iterator[Watch]:
     """A bar for each capture in work on standard error; a line for each that ends."""
-    from rich.console import Console
     from rich.markup import escape
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-    console = Console(stderr=True, quiet=quiet)
+    console = open_console(stderr=True, quiet=quiet)
     clock = (TextColumn("clock"), TimeElapsedColumn())
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), *clock)
     bars = Progress(*columns, console=console, disable=not console.is_terminal)
@@ -63,10 +63,10 @@ def live_batch(*, quiet: bool = False) -> Iterator[Watch]:
 
 def show_batch(result: BatchResult) -> None:
     """Print how many ended how, and where the table is."""
-    from rich.console import Console
-
     counts = {state: sum(c.state == state for c in result.captures) for state in _COLOUR}
     text = ", ".join(f"[{_COLOUR[state]}]{count} {state}[/]" for state, count in counts.items() if count)
     if result.unchanged:
-        print("nothing to do: kept from the earlier run")
-    Console().print(f"{text} of {len(result.captures)}; {result.out / 'summary.csv'}", soft_wrap=True, highlight=False)
+        say("nothing to do: kept from the earlier run")
+    open_console().print(
+        f"{text} of {len(result.captures)}; {result.out / 'summary.csv'}", soft_wrap=True, highlight=False
+    )

@@ -13,6 +13,7 @@ import numpy as np
 from colmap_inertial.core.arrays import AnyArray, Array, UInt8Array
 from colmap_inertial.core.errors import FormatError, MissingExtraError
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_from_matrix, rotation_between
+from colmap_inertial.core.printing import cell
 from colmap_inertial.core.types import CameraMotion, CameraTrajectory
 from colmap_inertial.io.files import write_text
 from colmap_inertial.io.trajectories import read_tum
@@ -90,7 +91,8 @@ def write_cameras(
             both = (*motion.velocity_in_world_m_s[index], *motion.angular_velocity_in_cam_rad_s[index])
             moving = [f"{value:.9g}" for value in both]
         place_on_map = [] if on_map is None else on_map.geodetic(view.cam_in_world[None])[0].tolist()
-        rows.writerow([name, time, *(f"{value:.12g}" for value in pose), *moving, *(f"{v:.12g}" for v in place_on_map)])
+        lengths = [[f"{value:.12g}" for value in values] for values in (pose, place_on_map)]
+        rows.writerow([cell(name), time, *lengths[0], *moving, *lengths[1]])
     write_text(path, text.getvalue())
 
 
