@@ -442,7 +442,7 @@ def test_points_stand_in_order_of_time(small):
 
 def test_the_drift_map_names_what_was_stretched_and_how_sure_it_is(small, monkeypatch):
     _, problem, start, seen = small
-    monkeypatch.setattr(judge, "_PART_S", 1.0)
+    monkeypatch.setattr(judge, "LIMITS", judge.RefineLimits(part_s=1.0))
     half = len(seen.t_s) // 2
     middle = start.imu_in_world_m[half]
     longer = start.imu_in_world_m.copy()
