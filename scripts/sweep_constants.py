@@ -92,6 +92,8 @@ def constants(rooms: tuple[str, ...]) -> Iterator[Constant]:
                 yield Constant(module.__name__, "", name, value)
             elif dataclasses.is_dataclass(value) and getattr(value, "__module__", "") == module.__name__:
                 if isinstance(value, type):
+                    if any(type(other) is value for other in vars(module).values()):
+                        continue  # its instance is listed
                     for field, default in (value.__init__.__kwdefaults__ or {}).items():
                         if _is_number(default):
                             yield Constant(module.__name__, name, field, default)
