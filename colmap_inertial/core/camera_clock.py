@@ -58,7 +58,10 @@ class CameraTimedImu:
         def stretch(t_s: Array) -> Array:
             return np.asarray(fixed_s + (t_s - fixed_s) / (1 - rate))
 
-        note = f"the IMU's clock is {1e6 * rate:+.0f} ppm off the camera's: its stamps were stretched to keep step"
+        note = (
+            f"the IMU's clock is {-1e6 * rate:+.0f} ppm off the camera's, and either may be wrong (suspect a nominal "
+            "frame rate first); the IMU's stamps were stretched to keep step"
+        )
         stretched = replace(
             imu, gyro_t_s=stretch(imu.gyro_t_s), accel_t_s=stretch(imu.accel_t_s), repairs=(*imu.repairs, note)
         )

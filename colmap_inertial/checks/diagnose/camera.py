@@ -230,9 +230,10 @@ def _rate_finding(rate: float) -> Finding:
     return Finding(
         code="clock-rate",
         severity=severity,
-        evidence=f"the camera's clock runs {100 * rate:+.2f} % faster than the IMU's",
-        advice="give times as the recorder stamped them, not a frame number divided by a nominal rate; up to 1 % is "
-        "corrected",
+        evidence=f"the camera's clock runs {100 * rate:+.2f} % faster than the IMU's, and either may be wrong: lengths "
+        "go with the square of time",
+        advice="give frame times as the recorder stamped them, not a frame number divided by a nominal rate; then "
+        "check the stamps of the IMU; up to 1 % is corrected",
         numbers={"rate": rate},
     )
 

@@ -58,6 +58,15 @@ def model_scale_sigma(calibrated: bool) -> float:
     return PRIORS.lens if calibrated else math.hypot(PRIORS.lens, PRIORS.accel_model)
 
 
+def clock_scale_sigma(clock_rate: float) -> float:
+    """What clocks of camera and IMU that run apart leave of a scale, as a standard deviation of its logarithm.
+
+    Metres go with the square of time. The scale holds where the camera's clock is right; it is off by twice the rate
+    where the IMU's is, which is as likely.
+    """
+    return math.sqrt(2) * abs(clock_rate)
+
+
 def is_calibrated(imu: ImuRecording) -> bool:
     """Whether the accelerometer's gain was corrected by a calibration that knows it well enough, as warm as it was."""
     if imu.calibration is None:

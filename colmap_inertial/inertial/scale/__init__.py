@@ -24,7 +24,10 @@ from colmap_inertial.inertial.core.priors import PRIORS
 from colmap_inertial.inertial.scale._inputs import align_recording, gravity_at_latitude_m_s2, strength_of_gravity
 from colmap_inertial.inertial.scale.verdict import verdict_of
 from colmap_inertial.io.plausible import PLAUSIBLE
+from colmap_inertial.io.pose_convention import ARRAYS, PoseConvention
 from colmap_inertial.io.units import STANDARD_GRAVITY_M_S2
+from colmap_inertial.motion.align import AlignOptions
+from colmap_inertial.motion.align.conventions import likely_convention
 
 #: Shorter pauses are not worth a sentence.
 _PAUSE_S = 0.02
@@ -133,6 +136,7 @@ def estimate_scale(
     calibration: CameraImuCalibration | None = None,
     imu_calibration: ImuCalibration | None = None,
     options: ScaleOptions | None = None,
+    read_as: PoseConvention = ARRAYS,
 ) -> ScaleEstimate:
     """Metres per unit of a camera trajectory, from the IMU that was recorded along.
 
@@ -148,6 +152,8 @@ def estimate_scale(
         The IMU's own, by which its readings are corrected. A recording that was corrected before brings its own.
     options
         Method, gravity, range of clock offsets.
+    read_as
+        Convention of the table that the poses were read from, for the words of a refusal.
 
     Returns
     -------
@@ -161,11 +167,19 @@ def estimate_scale(
         calibration = None if calibration is None else imu_calibration.loosened(calibration)
     with one_blas_thread():
         estimate = _estimate_or_refuse(trajectory, imu, calibration, options)
+        search = AlignOptions(max_offset_s=options.max_offset_s)
+        likely = likely_convention(trajectory, imu, read_as=read_as, prior=calibration, options=search)
+    if likely is not None:
+        reasons = (likely.sentence, *estimate.reasons)
+        estimate = ScaleEstimate.refused(options.method, *reasons, calibration=estimate.calibration)
     return replace(estimate, imu_calibration=imu.calibration, runtime_s=time.perf_counter() - begin_s)
 
 
 def _estimate_or_refuse(
-    trajectory: CameraTrajectory, imu: ImuRecording, calibration: CameraImuCalibration | None, options: ScaleOptions
+    trajectory: CameraTrajectory,
+    imu: ImuRecording,
+    calibration: CameraImuCalibration | None,
+    options: ScaleOptions,
 ) -> ScaleEstimate:
     if not imu.has_accel:
         return ScaleEstimate.refused(

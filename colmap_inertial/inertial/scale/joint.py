@@ -32,22 +32,14 @@ from colmap_inertial.core.types import (
 )
 from colmap_inertial.inertial.core import parameters as par
 from colmap_inertial.inertial.core.parameters import Prior
-from colmap_inertial.inertial.core.priors import PRIORS, is_calibrated
+from colmap_inertial.inertial.core.priors import PRIORS, clock_scale_sigma, is_calibrated
 from colmap_inertial.inertial.scale._fit import Fit, fit_jointly
 from colmap_inertial.inertial.scale._setup import Data, prepare
 from colmap_inertial.inertial.scale._suspects import Faults, worst
-from colmap_inertial.inertial.scale.verdict import scale_drifts, student_factor, verdict_of
+from colmap_inertial.inertial.scale.verdict import check_clocks, scale_drifts, student_factor, verdict_of
 
-_LARGEST_BIAS_M_S2 = 2.0
-#: Gains and sines of angles between axes.
-_LARGEST_GAIN = 0.2
-#: The accelerometer's noise between states over the motion's acceleration: 0.02 to 0.1 in good recordings, 0.4 and more
-#: where an axis is mirrored.
-_LARGEST_UNEXPLAINED = 0.25
 #: So many times at most is something wrong with the accelerometer looked for, undone, and the rest fitted again.
 _MOST_FAULTS = 6
-#: Shorter clips say too little about their own noise for a number to be trusted.
-_SHORTEST_TRUSTED_S = 6.0
 #: Real visual errors are not those of the model (alike over .1 to 1 s and longer), which counts the more the shorter a
 #: clip is: standard deviations grow by this over its length. Measured on handheld and flown recordings with motion
 #: capture, cut to 3 to 20 s.
@@ -58,6 +50,30 @@ _RECORD_INSTEAD = (
     "move the camera itself back and forth by 20 cm or more, in several directions and briskly, for 10 s or longer, "
     "while it sees texture; panning, walking straight at one speed and a tripod cannot give a scale"
 )
+
+
+@dataclass(frozen=True, kw_only=True)
+class JudgementLimits:
+    """What decides whether a fit is refused, or doubtful."""
+
+    #: Largest bias of the accelerometer.
+    bias_m_s2: float = 2.0
+    #: Largest of its gains and sines of angles between axes.
+    gain: float = 0.2
+    #: Its noise between states over the motion's acceleration: 0.02 to 0.1 in good recordings, 0.4 and more where an
+    #: axis is mirrored.
+    unexplained: float = 0.25
+    #: Shorter clips say too little about their own noise for a number to be trusted.
+    shortest_s: float = 6.0
+    #: Gravity that reads longer or shorter by this has a reason: in flights, whose motion cannot tell bias from gain,
+    #: clean recordings have 0.1 at most.
+    gravity_excess_m_s2: float = 0.25
+    #: Standard deviations between the gain that the motion shows and the one that would explain gravity: 4.1 at most in
+    #: recordings with a wrong gain, 6.5 and more in 23 of 24 clips of 20 s by a sensor with a bias of .45 m/s2.
+    told_apart: float = 4.5
+
+
+_LIMITS = JudgementLimits()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,14 +192,16 @@ def _judged(
     x = fit.estimate
     squares = sum(s for s, _ in fit.sums.values())
     expected = sum(e for _, e in fit.sums.values())
-    found = scale_of(fit, t_s, calibrated)
+    clock_rate = calibration.clock_rate + x.clock_rate
+    found = scale_of(fit, t_s, calibrated, clock_rate)
     metres_per_unit, sigma_log = found.metres_per_unit, found.sigma_log
     refusals = [*_refusals(fit, t_s), *(wrong if worthless else ())]
     verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, refusals=refusals)
     if verdict == "refused":
         reasons = (*reasons, *(() if worthless else wrong))
     else:
-        verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, [*wrong, *_checks(fit, t_s)])
+        doubts = [*wrong, *check_clocks(clock_rate), *_checks(fit, t_s, found.undecided_gain)]
+        verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, doubts)
     notes: tuple[str, ...] = ()
     if fit.jumped:
         places = "one place" if fit.jumped == 1 else f"{fit.jumped} places"
@@ -214,6 +232,36 @@ def _judged(
     )
 
 
+def undecided_gain(fit: Fit, widened: float) -> tuple[float, float]:
+    """Whether gravity's length may be the accelerometer's gain, which a motion that hardly turns cannot tell from bias.
+
+    Parameters
+    ----------
+    fit, widened
+        The fit, and the factor on its variances.
+
+    Returns
+    -------
+    The gain that would explain gravity's length, and what the logarithm of the scale would change by if it did; zeros
+    where gravity is as long as it should be, or the motion tells the two apart.
+    """
+    x, mean_gain = fit.estimate, np.zeros(par.N_GLOBALS)
+    mean_gain[np.arange(par.ACCEL_GAIN.start, par.ACCEL_GAIN.stop)[::4]] = 1 / 3
+    gravity = float(np.linalg.norm(x.gravity_m_s2))
+    up = -x.gravity_m_s2 / gravity @ x.world_from_imu
+    excess_m_s2 = float(np.mean(up @ x.accel_bias_m_s2 - gravity * np.einsum("ki,ij,kj->k", up, x.accel_gain, up)))
+    variance = float(mean_gain @ fit.cov @ mean_gain)
+    # without the prior, which pulls all three alike
+    information = max(1 / variance - 9 * float(mean_gain @ fit.prior_info @ mean_gain), 1e-9)
+    fitted = -float(np.trace(x.accel_gain)) / 3
+    seen, explaining = fitted / (variance * information), excess_m_s2 / gravity
+    deviations = abs(seen - explaining) * (information / widened) ** 0.5
+    if abs(excess_m_s2) < _LIMITS.gravity_excess_m_s2 or deviations > _LIMITS.told_apart:
+        return 0.0, 0.0
+    by_gain = float(fit.cov[par.SCALE] @ mean_gain) / variance
+    return explaining, by_gain * (explaining - fitted)
+
+
 @dataclass(frozen=True, kw_only=True)
 class FoundScale:
     """What a fit says of the scale.
@@ -224,15 +272,18 @@ class FoundScale:
         As :class:`ScaleEstimate` has them.
     widened
         Factor on variances of the fit: squares beyond their expectation, few degrees of freedom, what no model has.
+    undecided_gain
+        Of an accelerometer whose gravity is too long, 0 of others (:func:`undecided_gain`).
     """
 
     metres_per_unit: float
     sigma_log: float
     parts: dict[str, float]
     widened: float
+    undecided_gain: float
 
 
-def scale_of(fit: Fit, t_s: Array, calibrated: bool) -> FoundScale:
+def scale_of(fit: Fit, t_s: Array, calibrated: bool, clock_rate: float = 0.0) -> FoundScale:
     """The scale and the standard deviation of its logarithm, with what the fit takes for granted put right.
 
     The scale makes residuals orthogonal to the fitted path. That path follows the visual noise with as many degrees of
@@ -255,12 +306,17 @@ def scale_of(fit: Fit, t_s: Array, calibrated: bool) -> FoundScale:
     variances["accel_gain"] *= fit.gain_surprise
     variances["noise_levels"] = (student * _UNIFORM * share) ** 2 + fit.level_variance
     variances["accel_gain"] += 0.0 if calibrated else PRIORS.accel_model**2
+    gain, change = (0.0, 0.0) if calibrated else undecided_gain(fit, widened)
+    # gain or bias, as likely
+    variances["accel_gain"] += change**2 / 2
     variances["lens"] = PRIORS.lens**2
+    variances["clocks"] = clock_scale_sigma(clock_rate) ** 2
     return FoundScale(
         metres_per_unit=fit.estimate.metres_per_unit * float(np.exp(shift)),
         sigma_log=sum(variances.values()) ** 0.5,
         parts={name: variance**0.5 for name, variance in variances.items()},
         widened=widened,
+        undecided_gain=gain,
     )
 
 
@@ -271,13 +327,13 @@ def _refusals(fit: Fit, t_s: Array) -> list[str]:
     if not fit.converged and float(fit.cov[par.SCALE, par.SCALE]) < 0.15**2:
         out.append(f"the fit of camera and IMU does not come to rest: {_RECORD_INSTEAD}")
     bias = float(np.linalg.norm(x.accel_bias_m_s2))
-    if bias > _LARGEST_BIAS_M_S2:
+    if bias > _LIMITS.bias_m_s2:
         out.append(
             f"the accelerometer would have to be off by {bias:.1f} m/s2, more than any working sensor is: check its "
             "unit (m/s2), its sign (at rest it reads +9.8 away from the ground) and its axes"
         )
     gain = float(np.abs(x.accel_gain).max())
-    if gain > _LARGEST_GAIN:
+    if gain > _LIMITS.gain:
         out.append(
             f"the accelerometer's gains or axes would have to be off by {100 * gain:.0f} %, more than those of any "
             "working sensor are: check its unit (m/s2), its sign (at rest it reads +9.8 away from the ground) and its "
@@ -285,7 +341,7 @@ def _refusals(fit: Fit, t_s: Array) -> list[str]:
         )
     # Noise of the accelerometer averaged between states, against the acceleration that it should measure
     unexplained = fit.noise.accel_m_s2(float(np.median(np.diff(t_s))))
-    if unexplained > _LARGEST_UNEXPLAINED * fit.excitation_m_s2:
+    if unexplained > _LIMITS.unexplained * fit.excitation_m_s2:
         out.append(
             f"the accelerometer and the camera's motion disagree by {unexplained:.2f} m/s2, where the motion itself is "
             f"{fit.excitation_m_s2:.2f} m/s2: check the accelerometer's sign and axes and that both recordings belong "
@@ -294,20 +350,26 @@ def _refusals(fit: Fit, t_s: Array) -> list[str]:
     return out
 
 
-def _checks(fit: Fit, t_s: Array) -> list[str]:
+def _checks(fit: Fit, t_s: Array, undecided_gain: float) -> list[str]:
     """Findings that make the number doubtful, in the user's words."""
     out = []
     span_s = float(t_s[-1] - t_s[0])
-    if span_s < _SHORTEST_TRUSTED_S:
+    if span_s < _LIMITS.shortest_s:
         out.append(
             f"the clip is short ({span_s:.1f} s): it says little about its own noise; "
-            f"record {_SHORTEST_TRUSTED_S:.0f} s or more"
+            f"record {_LIMITS.shortest_s:.0f} s or more"
         )
     if fit.gain_chi2 > par.LARGEST_GAIN_CHI2:
         gains = ", ".join(f"{-100 * g:+.1f}" for g in np.diagonal(fit.estimate.accel_gain))
         out.append(
             f"the accelerometer seems to be off in gain by {gains} % on its axes, more than such sensors are, which "
             "is allowed for: check its unit and the strength of gravity, or calibrate it (calibrate-imu)"
+        )
+    elif undecided_gain != 0:
+        out.append(
+            f"the accelerometer reads gravity {100 * undecided_gain:+.1f} % too long, and this motion does not tell "
+            "whether by its gain, which lengths follow, or by its bias: check its unit, turn the camera about all axes "
+            "while it moves, or calibrate it (calibrate-imu)"
         )
     drift = fit.drift
     if scale_drifts(drift.p_value, drift.trend_log_per_s, drift.trend_sigma_log_per_s):

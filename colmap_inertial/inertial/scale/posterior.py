@@ -7,6 +7,7 @@ the errors of all these go together.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +19,7 @@ from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording
 from colmap_inertial.inertial.core import parameters as par
 from colmap_inertial.inertial.core.parameters import Noise
-from colmap_inertial.inertial.core.priors import is_calibrated, model_scale_sigma
+from colmap_inertial.inertial.core.priors import clock_scale_sigma, is_calibrated, model_scale_sigma
 from colmap_inertial.inertial.scale._fit import Fit
 from colmap_inertial.inertial.scale._inputs import align_recording, strength_of_gravity
 from colmap_inertial.inertial.scale._setup import Data
@@ -96,7 +97,7 @@ class FittedPath:
     origin
         (3,) point of the model's world, in its units, that positions count from.
     floor_log
-        What an accelerometer and a lens leave of any scale, as a standard deviation of its logarithm.
+        What an accelerometer, a lens and clocks leave of any scale, as a standard deviation of its logarithm.
     """
 
     origin: Array
@@ -133,11 +134,12 @@ class FittedPath:
                 raise NotObservableError("place", "camera and IMU do not determine its motion") from error
         if faults.values or faults.path_is_smoothed:
             raise NotObservableError("place", "the accelerometer has faults, which count from end to end of a gap")
-        scale = scale_of(fit, data.t_s, is_calibrated(imu))
+        clock_rate = timed.calibration.clock_rate + fit.estimate.clock_rate
+        scale = scale_of(fit, data.t_s, is_calibrated(imu), clock_rate)
         ends = (0, -1)
         return cls(
             origin=data.origin,
-            floor_log=model_scale_sigma(is_calibrated(imu)),
+            floor_log=math.hypot(model_scale_sigma(is_calibrated(imu)), clock_scale_sigma(clock_rate)),
             _data=data,
             _fit=fit,
             _aligned=timed.calibration,

@@ -21,8 +21,9 @@ from colmap_inertial.core.arrays import Array, ComplexArray
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.types import CAL, CameraImuCalibration, CameraTrajectory, ScaleEstimate
+from colmap_inertial.inertial.core.priors import clock_scale_sigma
 from colmap_inertial.inertial.scale._spectra import SHORTEST_S, Signals, Spectra
-from colmap_inertial.inertial.scale.verdict import verdict_of
+from colmap_inertial.inertial.scale.verdict import check_clocks, verdict_of
 
 #: Standard deviation of the accelerometer's bias before anything is known (m/s2).
 _BIAS_SIGMA_M_S2 = 1.0
@@ -117,6 +118,7 @@ def fit_spectra(spectra: Spectra, calibration: CameraImuCalibration, gravity_m_s
     chi2 = float(residual @ residual)
     cov = np.linalg.inv(jacobian.T @ jacobian) * max(1.0, chi2 / dof)
     cov[_SCALE, _SCALE] += _GAIN_SIGMA**2 + _share_variance(data, noise, prior, state)
+    cov[_SCALE, _SCALE] += clock_scale_sigma(calibration.clock_rate) ** 2
     # a gain error of the accelerometer makes a bias of gravity, axes that are not square a tilt
     cov[_BIAS, _BIAS] += (_GAIN_SIGMA * gravity_m_s2) ** 2 * np.eye(3)
     cov[_TILT, _TILT] += _AXIS_SIGMA_RAD**2 * np.eye(2)
@@ -359,7 +361,7 @@ def _checks(
     signals: Signals, calibration: CameraImuCalibration, options: SpectralOptions, fit: SpectralFit
 ) -> tuple[list[str], list[str]]:
     """Findings that lower the verdict, and findings that refuse the scale."""
-    checks, refusals = [], []
+    checks, refusals = check_clocks(calibration.clock_rate), []
     if np.linalg.norm(fit.bias) > _BIAS_LIMIT_M_S2:
         refusals.append(
             f"the accelerometer would have a bias of {np.linalg.norm(fit.bias):.1f} m/s2: check its axes, sign and unit"

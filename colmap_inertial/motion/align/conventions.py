@@ -100,7 +100,7 @@ _ARM_M = 0.1
 _STEADY = 0.975
 #: Share of the quick acceleration that the right centres explain at least. Measured: 0.26 and more; wrong ones 0.11.
 _EXPLAINED = 0.15
-#: Poses that explain this share as they were read need not be compared with others.
+#: Centres that explain this share are right, and so is the accelerometer, however unsteady gravity is.
 _BEYOND_DOUBT = 0.4
 #: Keeps a path of no length from being divided by.
 _NOTHING = 1e-9
@@ -163,7 +163,7 @@ def _difference(read_as: PoseConvention, written_as: PoseConvention) -> str:
 class _Candidate:
     """One convention with its evidence: of the rotations; of acceleration by centres and lever arm, and by this alone.
 
-    It ``fits`` where the centres explain the acceleration beyond doubt, and not its opposite.
+    ``explained`` is the share of the acceleration that the centres explain.
     """
 
     convention: PoseConvention
@@ -171,7 +171,12 @@ class _Candidate:
     acceleration: float = 0.0
     still: float = 0.0
     steadiness: float = 1.0
-    fits: bool = False
+    explained: float = 0.0
+
+    @property
+    def fits(self) -> bool:
+        """Whether the centres explain the acceleration beyond doubt, and gravity is steady."""
+        return self.explained >= _BEYOND_DOUBT and self.steadiness >= _STEADY
 
     @property
     def evidence(self) -> float:
@@ -220,7 +225,7 @@ def likely_convention(
     best = max(candidates, key=lambda one: one.evidence)
     as_read = next((one for one in candidates if one.convention == read_as), None)
     ahead = np.inf if as_read is None else best.evidence - as_read.evidence
-    if ahead < margin or best.steadiness < _STEADY:
+    if ahead < margin or (best.steadiness < _STEADY and best.explained < _BEYOND_DOUBT):
         return None
     if _inverts(read_as, best.convention):
         mirrored = fit(trajectory, replace(imu, gyro_rad_s=-imu.gyro_rad_s))
@@ -295,7 +300,7 @@ def _evaluate_candidate(
         acceleration=-0.5 * components * float(np.log(moving)),
         still=-0.5 * components * float(np.log(still)),
         steadiness=quick.steadiness,
-        fits=positive and moving < (1 - _BEYOND_DOUBT) * still and quick.steadiness >= _STEADY,
+        explained=1 - moving / still if positive else 0.0,
     )
 
 

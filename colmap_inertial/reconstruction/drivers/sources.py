@@ -40,7 +40,7 @@ from colmap_inertial.io.pose_convention import COLMAP, INERTIAL_SCALE, TUM, Pose
 from colmap_inertial.io.trajectories import read_inertial_scale, read_tum
 from colmap_inertial.model import apply_similarity, find_models, is_metric, read_model, trajectory_from_model
 from colmap_inertial.motion.align import AlignOptions, align_camera_imu
-from colmap_inertial.motion.align.conventions import LikelyConvention, likely_convention
+from colmap_inertial.motion.align.conventions import likely_convention
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,17 +221,11 @@ def align_source(source: ScaleSource, out: Path) -> CameraImuCalibration:
 
 
 def _refuse_another_convention(recording: TimedPoses, options: AlignOptions, quantity: str) -> None:
-    likely = _likely_convention(recording, recording.trajectory, options)
+    likely = likely_convention(
+        recording.trajectory, recording.imu, read_as=recording.read_as, prior=recording.calibration, options=options
+    )
     if likely is not None:
         raise NotObservableError(quantity, likely.sentence)
-
-
-def _likely_convention(
-    recording: TimedPoses, trajectory: CameraTrajectory, options: AlignOptions
-) -> LikelyConvention | None:
-    return likely_convention(
-        trajectory, recording.imu, read_as=recording.read_as, prior=recording.calibration, options=options
-    )
 
 
 def scale_source(
@@ -262,11 +256,9 @@ def scale_source(
         trajectory = first_seconds(trajectory, first_s, start_s=recording.start_s)
     limit_s = largest_offset_s(recording.shared_clock, options.max_offset_s)
     options = dataclasses.replace(options, max_offset_s=limit_s)
-    estimate = estimate_scale(trajectory, recording.imu, calibration=recording.calibration, options=options)
-    if estimate.verdict == "refused":
-        likely = _likely_convention(recording, trajectory, AlignOptions(max_offset_s=limit_s))
-        if likely is not None:
-            estimate = dataclasses.replace(estimate, reasons=(likely.sentence, *estimate.reasons))
+    estimate = estimate_scale(
+        trajectory, recording.imu, calibration=recording.calibration, options=options, read_as=recording.read_as
+    )
     notes = (*estimate.notes, *recording.imu.repairs, *recording.notes)
     estimate = dataclasses.replace(estimate, notes=notes)
     if json is not None:

@@ -1,0 +1,163 @@
+#!/usr/bin/env python3
+"""What is said of models, clocks and sensors that are wrong, on real recordings that were altered.
+
+    python scripts/study_model_faults.py FOLDER [--faults clock gain wxyz torn drift stretch moved clean] [--json FILE]
+
+FOLDER holds TUM-VI rooms and EuRoC flights (``real_imu.py``). Clips of 20, 40 and 60 s with errors of 2 mm are altered:
+``clock`` camera stamps 1 % slow or fast; ``gain`` an accelerometer that reads 5 % too much or too little; ``wxyz``
+quaternions in the other order; ``torn`` one end of the path 2, 3 or 5 % larger; ``drift`` a scale that grows by 3 or
+5 % from end to end; ``stretch`` one direction 3 or 5 % longer, volume kept; ``moved`` centres of three cameras alone
+wrong by .1 m. Each row: how many, given, intervals that hold the truth, trusted, of these wrong and wrong by more than
+1.5 times the interval, and how often the fault was named. True metres are those of a torn path's larger part.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from bench_report import write_report
+from real_imu import Window, recorded, windows
+
+from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.quantiles import Z95
+from colmap_inertial.core.threads import one_blas_thread
+from colmap_inertial.core.types import CameraTrajectory, ImuRecording
+from colmap_inertial.inertial.scale import estimate_scale
+
+LENGTHS_S = (20.0, 40.0, 60.0)
+NOISE_M = 0.002
+#: By fault: sizes, and words of a reason or note that names it.
+FAULTS: dict[str, tuple[tuple[float, ...], tuple[str, ...]]] = {
+    "clean": ((0.0,), ("is not the same", "longer along")),
+    "clock": ((0.01, -0.01), ("clocks of camera and IMU",)),
+    "gain": ((0.05, -0.05), ("gain",)),
+    "wxyz": ((1.0,), ("quaternions",)),
+    "torn": ((0.02, 0.03, 0.05), ("is not the same",)),
+    "drift": ((0.03, 0.05), ("is not the same",)),
+    "stretch": ((0.03, 0.05), ("longer along", "is not the same")),
+    "moved": ((0.1,), ("poses jump",)),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Altered:
+    """A window with a fault of some size."""
+
+    window: Window
+    fault: str
+    size: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What was made of it; error and sigma of the logarithm of the scale, None where it was refused."""
+
+    altered: Altered
+    verdict: str
+    error: float | None
+    sigma: float | None
+    said: tuple[str, ...]
+
+    @property
+    def named(self) -> bool:
+        """Whether the fault was named."""
+        return any(words in sentence for words in FAULTS[self.altered.fault][1] for sentence in self.said)
+
+
+def alter(
+    altered: Altered, trajectory: CameraTrajectory, imu: ImuRecording, metres_per_unit: float
+) -> tuple[CameraTrajectory, ImuRecording]:
+    """Put the fault in."""
+    size, t_s, path = altered.size, trajectory.t_s, trajectory.cam_in_world
+    rng = np.random.default_rng([9, altered.window.seed])
+    since = (t_s - t_s[0]) / (t_s[-1] - t_s[0])
+    if altered.fault == "clock":
+        return replace(trajectory, t_s=t_s[0] + (t_s - t_s[0]) * (1 - size)), imu
+    if altered.fault == "gain":
+        return trajectory, replace(imu, accel_m_s2=imu.accel_m_s2 * (1 + size))
+    if altered.fault == "wxyz":
+        return replace(trajectory, cam_from_world_xyzw=np.roll(trajectory.cam_from_world_xyzw, 1, axis=1)), imu
+    if altered.fault == "torn":
+        begin = rng.uniform(0.25, 0.42)
+        end = since < begin if rng.random() < 0.5 else since > 1 - begin
+        path = _grown(path, np.log1p(size) * end)
+    elif altered.fault == "drift":
+        path = _grown(path, size * (since - 0.5))
+    elif altered.fault == "stretch":
+        axis = rng.standard_normal(3)
+        axis /= np.linalg.norm(axis)
+        path = path * (1 + size) ** (-1 / 3)
+        path = path + size * np.outer(path @ axis, axis)
+    elif altered.fault == "moved":
+        path = path.copy()
+        path[rng.choice(len(path), 3, replace=False)] += size / metres_per_unit * rng.standard_normal((3, 3)) / 3**0.5
+    return replace(trajectory, cam_in_world=path), imu
+
+
+def _grown(path: Array, log_scale: Array) -> Array:
+    """The path with steps of another size, none of them a jump."""
+    factor = np.exp(0.5 * (log_scale[1:] + log_scale[:-1]))[:, None]
+    return np.concatenate([path[:1], path[0] + np.cumsum(np.diff(path, axis=0) * factor, axis=0)])
+
+
+@one_blas_thread()
+def run(task: tuple[Path, Altered]) -> Outcome:
+    """Estimate the scale of an altered window and compare."""
+    folder, altered = task
+    trajectory, imu, truth = recorded(folder, altered.window)
+    estimate = estimate_scale(*alter(altered, trajectory, imu, truth))
+    given = estimate.metres_per_unit
+    return Outcome(
+        altered=altered,
+        verdict=estimate.verdict,
+        error=None if given is None else float(np.log(given / truth)),
+        sigma=estimate.sigma_log,
+        said=(*estimate.reasons, *estimate.notes),
+    )
+
+
+def summary(outcomes: Sequence[Outcome]) -> dict[str, float]:
+    """Figures of outcomes."""
+    given = [o for o in outcomes if o.error is not None and o.sigma is not None]
+    ratio = np.array([abs(o.error) / (Z95 * o.sigma) for o in given], dtype=float)
+    trusted = np.array([o.verdict == "trusted" for o in given], dtype=bool)
+    return {
+        "n": len(outcomes),
+        "given": len(given),
+        "inside": int(np.sum(ratio <= 1)),
+        "trusted": int(trusted.sum()),
+        "wrong": int(np.sum(ratio[trusted] > 1)),
+        "far": int(np.sum(ratio[trusted] > 1.5)),
+        "named": sum(o.named for o in outcomes),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--faults", nargs="+", choices=FAULTS, default=list(FAULTS))
+    parser.add_argument("--lengths", nargs="+", type=float, default=LENGTHS_S, help="of clips, s")
+    parser.add_argument("--most", type=int, default=3, help="clips of a length in each recording")
+    parser.add_argument("--seed", type=int, default=0, help="number of the first clip")
+    parser.add_argument("--json", type=Path, help="write every outcome")
+    parser.add_argument("--processes", type=int, default=2)
+    args = parser.parse_args()
+    clips = windows(args.folder, tuple(args.lengths), (NOISE_M,), most=args.most, first=args.seed)
+    every = [Altered(window=w, fault=f, size=s) for f in args.faults for s in FAULTS[f][0] for w in clips]
+    with multiprocessing.Pool(args.processes) as pool:
+        outcomes = pool.map(run, [(args.folder, one) for one in every], chunksize=1)
+    print(f"{'':<24}" + "".join(f"{name:>9}" for name in summary([])))
+    for key in dict.fromkeys((o.altered.fault, o.altered.size, o.altered.window.length_s) for o in outcomes):
+        of = [o for o in outcomes if (o.altered.fault, o.altered.size, o.altered.window.length_s) == key]
+        print(f"{f'{key[0]} {key[1]:g}, {key[2]:g} s':<24}" + "".join(f"{value:9d}" for value in summary(of).values()))
+    if args.json:
+        write_report(args.json, {"outcomes": [asdict(outcome) | {"named": outcome.named} for outcome in outcomes]})
+
+
+if __name__ == "__main__":
+    main()
