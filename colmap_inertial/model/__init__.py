@@ -22,6 +22,7 @@ from colmap_inertial.core.types import (
     CameraTrajectory,
     FrameTiming,
     JoinedPart,
+    RotationConsensus,
     ScaleEstimate,
     Similarity,
     SolvedMotion,
@@ -72,6 +73,8 @@ class Model:
         Whether it was mapped from keypoints without the rolling shutter.
     doubts
         What was found wrong with the recording beforehand; with any of them, no scale is trusted.
+    rotations
+        Which cameras of COLMAP's model agree with the gyroscope, where others were taken from it.
     scale
         What the inertial estimate said; ``None`` before it.
     similarity
@@ -91,6 +94,7 @@ class Model:
     timing: FrameTiming
     rectified: bool = False
     doubts: tuple[str, ...] = ()
+    rotations: RotationConsensus | None = None
     scale: ScaleEstimate | None = None
     similarity: Similarity | None = None
     treatments: tuple[Treatment, ...] = ()

@@ -30,6 +30,7 @@ CHECKS: tuple[Check, ...] = (
     camera.check_stabilisation,
     camera.check_pose_convention,
     camera.check_belonging,
+    camera.check_cameras,
     camera.check_clock_rate,
     camera.check_coverage,
     camera.check_declared_rotation,

@@ -11,9 +11,10 @@ from colmap_inertial.checks.diagnose.findings import UNIT_FACTORS, Finding, Reco
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply
 from colmap_inertial.core.sampling import subtract_running_mean
-from colmap_inertial.core.types import CameraTrajectory, ImuRecording
+from colmap_inertial.core.types import CameraTrajectory, ImuRecording, RotationConsensus
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.motion.align import Alignment
+from colmap_inertial.motion.align.consensus import describe_consensus
 from colmap_inertial.motion.align.conventions import quick_accelerations
 
 
@@ -76,6 +77,12 @@ _MIRRORED = Finding(
 )
 
 
+_MAP_AGAIN = (
+    "look at these images: repeated texture, blur, or something that moved; leave them out, or map again with more "
+    "overlap between images"
+)
+
+
 def check_belonging(recorded: Recorded) -> Iterator[Finding]:
     """Whether at some offset the gyroscope turns as the camera does; if not, whether it would, read otherwise."""
     failed, imu, turning = recorded.aligned, recorded.imu, recorded.turning
@@ -86,6 +93,8 @@ def check_belonging(recorded: Recorded) -> Iterator[Finding]:
             yield _MIRRORED
         return
     if not isinstance(failed, NotObservableError) or imu is None or turning is None:
+        return
+    if isinstance(recorded.consensus, NotObservableError) and recorded.consensus.quantity == "camera rotation":
         return
     if recorded.log is not None and recorded.log.stabilised:
         return
@@ -107,6 +116,27 @@ def check_belonging(recorded: Recorded) -> Iterator[Finding]:
         yield otherwise
     elif recorded.stabilisation is None or not recorded.stabilisation.stabilised:
         yield _never_fits(recorded, turning, failed)
+
+
+def check_cameras(recorded: Recorded) -> Iterator[Finding]:
+    """Whether cameras of a reconstruction contradict the gyroscope."""
+    found = recorded.consensus
+    if isinstance(found, NotObservableError) and found.quantity == "camera rotation":
+        yield Finding(code="cameras-turned", severity="error", evidence=found.hint, advice=_MAP_AGAIN)
+    if isinstance(found, RotationConsensus) and not found.kept.all():
+        yield Finding(
+            code="cameras-turned",
+            severity="warning",
+            evidence="; ".join(describe_consensus(found)),
+            advice=_MAP_AGAIN,
+            numbers={
+                "wrong": float(len(found.wrong)),
+                "seams": float(len(found.seams)),
+                "left_out": float(np.sum(~found.kept)),
+                "judged": float(np.sum(found.judged)),
+                "median_deg": float(np.median(found.deviation_deg[found.judged & found.kept])),
+            },
+        )
 
 
 def _never_fits(recorded: Recorded, turning: CameraTrajectory, failed: NotObservableError) -> Finding:

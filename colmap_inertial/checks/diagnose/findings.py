@@ -20,11 +20,13 @@ from colmap_inertial.core.types import (
     FrameLog,
     FrameTiming,
     ImuRecording,
+    RotationConsensus,
 )
 from colmap_inertial.io.plausible import RawImu
 from colmap_inertial.io.pose_convention import ARRAYS, PoseConvention
 from colmap_inertial.io.units import Axes
 from colmap_inertial.motion.align import Alignment, AlignOptions, align_clocks
+from colmap_inertial.motion.align.consensus import align_by_consensus
 from colmap_inertial.motion.align.conventions import LikelyConvention, likely_convention
 from colmap_inertial.motion.flow import Stabilisation, VisualRotation, find_stabilisation
 
@@ -194,8 +196,26 @@ class Recorded:
         return self.rotation is not None and len(self.rotation.t_s) > 1 and self.rotation.step_s <= FOLLOWED_S
 
     @cached_property
+    def consensus(self) -> RotationConsensus | NotObservableError | None:
+        """Which cameras of a reconstruction agree with the gyroscope; ``None`` where one of them is missing."""
+        if self.imu is None or self.trajectory is None:
+            return None
+        options = AlignOptions(max_offset_s=self.max_offset_s)
+        try:
+            return align_by_consensus(self.trajectory, self.imu, prior=self.calibration, options=options)[1]
+        except NotObservableError as error:
+            return error
+
+    @cached_property
     def turning(self) -> CameraTrajectory | None:
-        """The camera's rotation: of the reconstruction, else of the pixels."""
+        """The camera's rotation: of the reconstruction, else of the pixels.
+
+        Where its cameras cannot be aligned all together, of those that agree with the gyroscope.
+        """
+        found, imu, poses = self.consensus, self.imu, self.trajectory
+        if imu is not None and poses is not None and isinstance(found, RotationConsensus) and not found.kept.all():
+            together = self._align(poses, imu, self.max_offset_s)
+            return poses if isinstance(together, Alignment) else poses.select(found.kept)
         if self.trajectory is not None or self.rotation is None:
             return self.trajectory
         try:
@@ -228,12 +248,10 @@ class Recorded:
     @cached_property
     def likely_convention(self) -> LikelyConvention | None:
         """By which other convention the poses fit the IMU; ``None`` where they fit as read, or by none."""
-        if self.imu is None or self.trajectory is None:
+        if self.imu is None or self.trajectory is None or self.turning is None:
             return None
         options = AlignOptions(max_offset_s=self.max_offset_s)
-        return likely_convention(
-            self.trajectory, self.imu, read_as=self.read_as, prior=self.calibration, options=options
-        )
+        return likely_convention(self.turning, self.imu, read_as=self.read_as, prior=self.calibration, options=options)
 
     def offset_s(self, camera_epoch_ns: int) -> float | None:
         """Camera time since that epoch = gyroscope time since its own + this; ``None`` where it was not found."""
@@ -246,12 +264,17 @@ class Recorded:
         """The same with another reading of the gyroscope, or at any offset of the clocks."""
         if self.turning is None:
             return None
-        options = AlignOptions(max_offset_s=None if any_offset else self.max_offset_s)
+        return self._align(self.turning, imu, None if any_offset else self.max_offset_s)
+
+    def _align(
+        self, turning: CameraTrajectory, imu: ImuRecording, max_offset_s: float | None
+    ) -> Alignment | NotObservableError:
+        options = AlignOptions(max_offset_s=max_offset_s)
         if self.trajectory is None:
             # the camera's translation is in the pixels' motion, and no gyroscope explains it
             options = replace(options, min_explained=PIXELS_EXPLAINED)
         try:
-            return align_clocks(self.turning, imu, prior=self.calibration, options=options)
+            return align_clocks(turning, imu, prior=self.calibration, options=options)
         except NotObservableError as error:
             return error
 

@@ -8,6 +8,7 @@ specific force: at rest the accelerometer reads +9.8 m/s2 away from the ground.
 
 from __future__ import annotations
 
+from colmap_inertial.core.types.consensus import RotationConsensus, Seam, WrongCamera
 from colmap_inertial.core.types.estimated import (
     DOWN_IN_WORLD,
     UNDOES,
@@ -82,12 +83,15 @@ __all__ = [
     "PositionFixes",
     "Projector",
     "ReadoutDirection",
+    "RotationConsensus",
     "ScaleDrift",
     "ScaleEstimate",
+    "Seam",
     "Similarity",
     "SmoothedTrajectory",
     "SolvedMotion",
     "SpectralRole",
     "Treatment",
     "Verdict",
+    "WrongCamera",
 ]

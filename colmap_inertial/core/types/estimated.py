@@ -13,6 +13,7 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import matrix_from_quat, rotation_between, skew
 from colmap_inertial.core.options import WorldAxes
+from colmap_inertial.core.types.consensus import RotationConsensus
 from colmap_inertial.core.types.imu import CameraImuCalibration, ImuCalibration, ImuNoise
 from colmap_inertial.core.types.recorded import LengthUnit, ReadoutDirection
 from colmap_inertial.core.validation import check_field, check_fields, check_increasing, set_fields
@@ -177,6 +178,9 @@ class ScaleEstimate:
         does not tell.
     noise
         Of the IMU, as the fit found it in the recording; ``None`` where the method does not tell.
+    rotations
+        Which cameras agree with the gyroscope; the estimate rests on those of the largest part. ``None`` where they
+        were not compared.
     method
         ``"spectral"`` or ``"joint"``; ``"none"`` where nothing could be estimated.
     """
@@ -198,6 +202,7 @@ class ScaleEstimate:
     drift: ScaleDrift | None = None
     parts: Mapping[str, float] | None = None
     noise: ImuNoise | None = None
+    rotations: RotationConsensus | None = None
     runtime_s: float = 0.0
     notes: tuple[str, ...] = ()
 
@@ -261,6 +266,7 @@ class ScaleEstimate:
             "excitation_m_s2": self.excitation_m_s2,
             "drift": None if self.drift is None else self.drift.as_json(self.metres_per_unit),
             "parts": None if self.parts is None else dict(self.parts),
+            "rotations": None if self.rotations is None else self.rotations.as_json(),
             "method": self.method,
             "runtime_s": self.runtime_s,
         }

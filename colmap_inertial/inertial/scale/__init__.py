@@ -27,6 +27,7 @@ from colmap_inertial.io.plausible import PLAUSIBLE
 from colmap_inertial.io.pose_convention import ARRAYS, PoseConvention
 from colmap_inertial.io.units import STANDARD_GRAVITY_M_S2
 from colmap_inertial.motion.align import AlignOptions
+from colmap_inertial.motion.align.consensus import describe_consensus
 from colmap_inertial.motion.align.conventions import likely_convention
 
 #: Shorter pauses are not worth a sentence.
@@ -190,14 +191,16 @@ def _estimate_or_refuse(
     if problems:
         return ScaleEstimate.refused(options.method, *problems)
     try:
-        timed = align_recording(trajectory, imu, calibration, options)
+        timed, consensus = align_recording(trajectory, imu, calibration, options)
+        trajectory = trajectory.select(consensus.kept)
         stretched = timed.imu.repairs[len(imu.repairs) :]
         estimate = _estimate(trajectory, timed, options)
         return replace(
             estimate,
             # also where there is no scale: it says what was found of camera and IMU
             calibration=timed.calibration if estimate.calibration is None else estimate.calibration,
-            notes=(*estimate.notes, *stretched, *remarks(trajectory, timed)),
+            rotations=consensus,
+            notes=(*estimate.notes, *stretched, *describe_consensus(consensus), *remarks(trajectory, timed)),
         )
     except NotObservableError as error:
         return ScaleEstimate.refused(options.method, f"{error.quantity}: {error.hint}")

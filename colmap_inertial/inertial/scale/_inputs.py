@@ -10,10 +10,12 @@ from colmap_inertial.core.types import (
     CameraImuCalibration,
     CameraTrajectory,
     ImuRecording,
+    RotationConsensus,
 )
 from colmap_inertial.inertial.core.priors import PRIORS
 from colmap_inertial.io.units import STANDARD_GRAVITY_M_S2
-from colmap_inertial.motion.align import AlignOptions, align_clocks
+from colmap_inertial.motion.align import AlignOptions
+from colmap_inertial.motion.align.consensus import align_by_consensus
 
 
 def gravity_at_latitude_m_s2(latitude_deg: float, height_m: float = 0.0) -> float:
@@ -58,9 +60,9 @@ def strength_of_gravity(options: GravityOptions) -> tuple[float, float]:
 
 def align_recording(
     trajectory: CameraTrajectory, imu: ImuRecording, calibration: CameraImuCalibration | None, options: ScaleOptions
-) -> CameraTimedImu:
-    """Align a recording with the camera, from a calibration that may be wide."""
-    alignment = align_clocks(
+) -> tuple[CameraTimedImu, RotationConsensus]:
+    """Align a recording with the camera, from a calibration that may be wide; and which cameras agree with it."""
+    alignment, consensus = align_by_consensus(
         trajectory, imu, prior=calibration, options=AlignOptions(max_offset_s=options.max_offset_s)
     )
-    return CameraTimedImu.from_recording(imu, alignment.settled(), trajectory.epoch_ns)
+    return CameraTimedImu.from_recording(imu, alignment.settled(), trajectory.epoch_ns), consensus

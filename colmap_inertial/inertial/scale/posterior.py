@@ -127,7 +127,8 @@ class FittedPath:
         strength, sigma = strength_of_gravity(options)
         known = JointOptions(gravity_m_s2=strength, gravity_sigma_m_s2=sigma)
         with one_blas_thread():
-            timed = align_recording(trajectory, imu, calibration, options)
+            timed, consensus = align_recording(trajectory, imu, calibration, options)
+            trajectory = trajectory.select(consensus.kept)
             try:
                 data, fit, faults = fit_path(trajectory, timed, known)
             except np.linalg.LinAlgError as error:

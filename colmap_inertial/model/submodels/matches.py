@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import logging
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -57,11 +57,12 @@ LIMITS = MatchLimits()
 
 
 class Submodel:
-    """A model's images by name, and what they see."""
+    """A model's images by name, or some of them, and what they see."""
 
-    def __init__(self, model: pycolmap.Reconstruction) -> None:
+    def __init__(self, model: pycolmap.Reconstruction, names: Collection[str] | None = None) -> None:
         self.model = model
-        self.images = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
+        images = map(model.image, model.reg_image_ids())
+        self.images = {image.name: image for image in images if names is None or image.name in names}
         self._points: dict[str, Int64Array] = {}
 
     def points(self, name: str) -> Int64Array:
@@ -221,8 +222,12 @@ def place_images(
         views = between.get((min(a, b), max(a, b)), [])
         if a > b:
             views = [(second, first, features[:, ::-1]) for first, second, features in views]
-        if placed := _localise(submodels[a], submodels[b], views):
-            names, beside, poses, points = zip(*placed, strict=True)
+        if placed := localise(submodels[a], submodels[b], views):
+            names, beside, poses, seen = zip(*placed, strict=True)
+            points = []
+            for name, agree in zip(names, seen, strict=True):
+                of_own = submodels[b].points(name)[agree[:, 0]]
+                points.append(np.stack([agree[:, 1], of_own], axis=1)[of_own >= 0])
             out.append(
                 PlacedImages(
                     first=numbers[a],
@@ -237,10 +242,13 @@ def place_images(
     return out
 
 
-def _localise(
+def localise(
     there: Submodel, own: Submodel, views: Sequence[View]
 ) -> list[tuple[str, str, pycolmap.Rigid3d, Int64Array]]:
-    """Of images of ``own``: name, image that matches best, pose, and pairs of points (there, own) that are the same."""
+    """Of images of ``own``: name, image that matches best, pose, and the keypoints with points of ``there`` that agree.
+
+    ``views`` are matches of images, ``there`` first.
+    """
     seen: dict[str, list[Int64Array]] = defaultdict(list)
     best: dict[str, Counter[str]] = defaultdict(Counter)
     for other, name, features in views:
@@ -256,9 +264,7 @@ def _localise(
         couples = couples[np.argsort(order)]  # as they were read: RANSAC draws by their order
         pose, agree = _estimate_pose(there, own, name, couples)
         if pose is not None:
-            of_own = own.points(name)[agree[:, 0]]
-            points = np.stack([agree[:, 1], of_own], axis=1)[of_own >= 0]
-            out.append((name, best[name].most_common(1)[0][0], pose, points))
+            out.append((name, best[name].most_common(1)[0][0], pose, agree))
     return out
 
 

@@ -20,6 +20,7 @@ from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.motion.align._clock_search import (
+    TRIMMED,
     ClockFit,
     explained_at,
     intervals_of,
@@ -128,6 +129,25 @@ def align_clocks(
     return refine_alignment(trajectory.select(keep), imu, start, prior, clock_rate=rate)
 
 
+def align_trimmed(
+    trajectory: CameraTrajectory,
+    imu: ImuRecording,
+    *,
+    prior: CameraImuCalibration | None = None,
+    options: AlignOptions | None = None,
+) -> CameraImuCalibration | None:
+    """Where to begin where some poses are wrong: the search of :func:`align_clocks` by the rotations that fit best.
+
+    ``None`` where no offset is clearly better than the rest by 85 % of the intervals, nor by 70 %.
+    """
+    search = _search(trajectory, imu, prior, options)
+    for share in TRIMMED.shares:
+        start = search.whole(trajectory, share)
+        if isinstance(start, ClockFit):
+            return start.applied(search.prior, epoch_shift_s(imu, trajectory.epoch_ns))
+    return None
+
+
 def coarse_fit(
     trajectory: CameraTrajectory,
     imu: ImuRecording,
@@ -188,13 +208,19 @@ class _Search:
     prior: CameraImuCalibration
     options: AlignOptions
 
-    def whole(self, trajectory: CameraTrajectory) -> ClockFit | NotObservableError:
-        """The coarse fit, or the reason why there is none."""
-        intervals = intervals_of(trajectory, _SPACING_S)
+    def whole(self, trajectory: CameraTrajectory, share: float = 1.0) -> ClockFit | NotObservableError:
+        """The coarse fit of a share of the intervals, or the reason why there is none."""
+        intervals = intervals_of(trajectory, _SPACING_S if share == 1 else TRIMMED.spacing_s)
+        spaced = intervals_of(trajectory, _CHECK_SPACING_S)
         rotation_known, options = self.prior.rotation_sigma_rad < 0.2, self.options
         for held in (None, self.prior.cam_from_imu_xyzw) if rotation_known else (None,):
             fits = search_offsets(
-                intervals, self.path, self.offsets_s, min_overlap=options.min_overlap, cam_from_imu_xyzw=held
+                intervals,
+                self.path,
+                self.offsets_s,
+                min_overlap=options.min_overlap,
+                cam_from_imu_xyzw=held,
+                share=share,
             )
             if not fits:
                 return NotObservableError(
@@ -204,7 +230,7 @@ class _Search:
                 )
             best = fits[0]
             rival = max([0.0, *(fit.log_likelihood for fit in fits[1:])])
-            explained = explained_at(intervals_of(trajectory, _CHECK_SPACING_S), self.path, best.offset_s, held)
+            explained = explained_at(spaced, self.path, best.offset_s, held, share)
             if best.log_likelihood - rival >= options.min_log_likelihood and explained >= options.min_explained:
                 return best
         seconds = intervals_of(trajectory, _SHORTEST_S)
@@ -249,4 +275,12 @@ class _Search:
         return replace(found[0][1], offset_s=at_zero_s + rate * middle_s), rate
 
 
-__all__ = ["OFFSET_UNKNOWN_FROM_S", "AlignOptions", "Alignment", "align_camera_imu", "align_clocks", "coarse_fit"]
+__all__ = [
+    "OFFSET_UNKNOWN_FROM_S",
+    "AlignOptions",
+    "Alignment",
+    "align_camera_imu",
+    "align_clocks",
+    "align_trimmed",
+    "coarse_fit",
+]

@@ -5,18 +5,21 @@ each interval between frames into the camera's. With ``E`` the energy of the cam
 the fit leaves of it and ``n`` the effective number of independent components, ``n/2 log(E / S)`` is the log-likelihood
 gained over two recordings that have nothing to do with each other. It is negative for most wrong offsets, because the
 gyroscope's gain is known to be one; and it grows with the overlap, so that short chance overlaps do not win.
+
+Poses that are wrong would spoil least squares. Least trimmed squares (Rousseeuw and Van Driessen 2006) fit the share of
+the intervals that fits best, and judge an offset by this share alone.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray, ComplexArray, IndexArray
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_from_matrix, quat_log, quat_multiply
 from colmap_inertial.core.gyro import GyroPath
-from colmap_inertial.core.types import CameraTrajectory
+from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory
 
 #: Frames this close together sample the rotation densely enough to be correlated on a grid.
 DENSE_S = 0.25
@@ -29,6 +32,21 @@ _SCAN_INTERVALS, _SCAN_FEWEST, _SCAN_BUDGET, _COMPARED_INTERVALS = 128, 40, 2_00
 _PEAKS, _PEAK_DISTANCE_S = 4, 0.5
 #: Longest rotation of one interval that still has a reliable rotation vector (the sign flips at pi).
 _MAX_TURN_RAD = 2.6
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrimmedLimits:
+    """Least trimmed squares, where all intervals together fail."""
+
+    #: Shares of the intervals that are believed, one after the other.
+    shares: tuple[float, ...] = (0.85, 0.7)
+    #: Least length of an interval: in a shorter one, the noise of poses hides what is wrong.
+    spacing_s: float = 0.25
+    #: Concentration steps: each refits the intervals that fitted best.
+    concentrations: int = 4
+
+
+TRIMMED = TrimmedLimits()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -80,6 +98,14 @@ class ClockFit:
     cam_from_imu_xyzw: Array
     gyro_bias_rad_s: Array
 
+    def applied(self, prior: CameraImuCalibration, shift_s: float) -> CameraImuCalibration:
+        """A calibration with what was fitted; ``shift_s`` is that of the two epochs (``epoch_shift_s``)."""
+        return replace(
+            prior.replace_clock_offset(self.offset_s - shift_s),
+            cam_from_imu_xyzw=self.cam_from_imu_xyzw,
+            gyro_bias_rad_s=self.gyro_bias_rad_s,
+        )
+
 
 def spaced_frames(t_s: Array, spacing_s: float) -> IndexArray:
     """Indices of frames at least ``spacing_s`` apart (to within half a frame interval); sparse frames all stay."""
@@ -109,6 +135,7 @@ def search_offsets(
     *,
     min_overlap: float,
     cam_from_imu_xyzw: Array | None = None,
+    share: float = 1.0,
 ) -> list[ClockFit]:
     """The best fit and its competitors: peaks of the log-likelihood over the offset, best first.
 
@@ -124,6 +151,8 @@ def search_offsets(
         Smallest overlap as a fraction of the shorter recording.
     cam_from_imu_xyzw
         Fixes the rotation; without it, it is fitted anew at each offset.
+    share
+        Of the intervals that are fitted at each offset, by least trimmed squares.
 
     Returns
     -------
@@ -132,26 +161,28 @@ def search_offsets(
     rotation = None if cam_from_imu_xyzw is None else matrix_from_quat(cam_from_imu_xyzw)
     intervals = _without_jumps(intervals, path)
     dense = intervals.dt_s <= DENSE_S
-    if dense.any() and intervals.dt_s[dense].sum() > 0.5 * intervals.dt_s.sum():
+    if share == 1 and dense.any() and intervals.dt_s[dense].sum() > 0.5 * intervals.dt_s.sum():
         intervals, step_s = intervals.select(dense), _GRID_S
         offset_s, gain, per_second = _correlate(intervals, path, min_overlap, rotation)
     else:
         step_s = _SCAN_S
-        offset_s, gain, per_second = _scan(intervals, path, offsets_s, min_overlap, rotation)
+        offset_s, gain, per_second = _scan(intervals, path, offsets_s, min_overlap, rotation, share)
     inside = (offset_s >= offsets_s[0] - step_s) & (offset_s <= offsets_s[1] + step_s) & np.isfinite(gain)
     offset_s, gain = offset_s[inside], gain[inside]
     compared = intervals.select(_evenly(len(intervals), _COMPARED_INTERVALS))
     fits = []
     for peak in _peaks(offset_s, gain):
         nearby = np.clip(offset_s[peak] + step_s * np.linspace(-1, 1, 9), *offsets_s)
-        fits.append(_closest(compared, path, nearby, per_second * intervals.dt_s.sum(), rotation))
+        fits.append(_closest(compared, path, nearby, per_second * intervals.dt_s.sum(), rotation, share))
     return sorted(fits, key=lambda fit: -fit.log_likelihood)
 
 
-def explained_at(intervals: Intervals, path: GyroPath, offset_s: float, cam_from_imu_xyzw: Array | None) -> float:
+def explained_at(
+    intervals: Intervals, path: GyroPath, offset_s: float, cam_from_imu_xyzw: Array | None, share: float = 1.0
+) -> float:
     """Fraction of the camera's rotation that the gyroscope explains at one offset."""
     rotation = None if cam_from_imu_xyzw is None else matrix_from_quat(cam_from_imu_xyzw)
-    return _closest(_without_jumps(intervals, path), path, np.array([offset_s]), 1.0, rotation).explained
+    return _closest(_without_jumps(intervals, path), path, np.array([offset_s]), 1.0, rotation, share).explained
 
 
 def _evenly(count: int, wanted: int) -> IndexArray:
@@ -262,7 +293,12 @@ def _redundancy(visual: Array, inertial: Array) -> float:
 
 
 def _scan(
-    intervals: Intervals, path: GyroPath, offsets_s: tuple[float, float], min_overlap: float, rotation: Array | None
+    intervals: Intervals,
+    path: GyroPath,
+    offsets_s: tuple[float, float],
+    min_overlap: float,
+    rotation: Array | None,
+    share: float,
 ) -> tuple[Array, Array, float]:
     """Gain at a range of offsets, for sparse frames, from the rotations over the very intervals."""
     grid = np.arange(path.t_s[0], path.t_s[-1], _SCAN_S)
@@ -289,9 +325,8 @@ def _scan(
         i, j = np.clip(i, 0, len(grid) - 1), np.clip(j, 0, len(grid) - 1)
         inertial = quat_log(quat_multiply(quat_conjugate(attitude[i]), attitude[j]))
         covered_s = np.sum(inside * some.dt_s, axis=1)
-        cross, energy_v, energy_g, _ = _moments(some, inertial, inside)
-        left = energy_v + energy_g - 2 * _agreement(cross, rotation)
-        value = _gain(energy_v, left, 3 * effective * covered_s / some.dt_s.sum())
+        energy, left, _ = _fit(some, inertial, inside, rotation, share)
+        value = _gain(energy, left, 3 * effective * share * covered_s / some.dt_s.sum())
         gain[at] = np.where((covered_s >= needed_s) & (covered_s > 0), value, np.nan)
     return offset_s, gain, float(3 * _effective_intervals(intervals) / intervals.dt_s.sum())
 
@@ -304,6 +339,47 @@ def _effective_intervals(intervals: Intervals) -> float:
     reach = min(6, len(dt_s) // 4 + 1)
     correlations = [float(np.mean(np.sum(scaled[k:] * scaled[:-k], axis=1))) / energy for k in range(1, reach)]
     return float(dt_s.sum() ** 2 / np.sum(dt_s**2) / (1 + 2 * np.sum(np.square(correlations))))
+
+
+def _fit(
+    intervals: Intervals, inertial_rad: Array, inside: BoolArray, rotation: Array | None, share: float
+) -> tuple[Array, Array, tuple[Array, Array, Array]]:
+    """Energy of the intervals (L,) and what the best rotation and common rate leave of it, for L offsets.
+
+    Of a share of the intervals, the energy is that of the smallest rotations: what any fit could leave at most. Also
+    returns what :func:`_moments` does of those that were fitted: cross moments and common rates.
+    """
+    if share == 1:
+        cross, energy, energy_g, (rate_v, rate_g) = _moments(intervals, inertial_rad, inside)
+        return energy, energy + energy_g - 2 * _agreement(cross, rotation), (cross, rate_v, rate_g)
+    dt_s = intervals.dt_s
+    wanted = np.maximum(np.round(share * inside.sum(axis=1)), 1).astype(np.intp)
+
+    def smallest(squares: Array) -> tuple[BoolArray, Array]:
+        squares = np.where(inside, squares / dt_s, np.inf)
+        ordered = np.sort(squares, axis=1)
+        kept = inside & (squares <= np.take_along_axis(ordered, wanted[:, None] - 1, axis=1))
+        return kept, np.sum(np.where(kept, squares, 0.0), axis=1)
+
+    usual = np.median(intervals.turn_rad / dt_s[:, None], axis=0)
+    energy = smallest(np.sum((intervals.turn_rad - dt_s[:, None] * usual) ** 2, axis=1)[None])[1]
+    # lengths of the rotations tell which intervals can fit, whatever the rotation between camera and IMU
+    lengths = np.linalg.norm(intervals.turn_rad, axis=1) - np.linalg.norm(inertial_rad, axis=2)
+    kept, left = smallest(lengths**2)
+    for _ in range(TRIMMED.concentrations):
+        cross, _, _, (rate_v, rate_g) = _moments(intervals, inertial_rad, kept)
+        fitted = _best_rotation(cross) if rotation is None else rotation[None]
+        visual = intervals.turn_rad - dt_s[:, None] * rate_v[:, None, :]
+        inertial = (inertial_rad - dt_s[:, None] * rate_g[:, None, :]) @ np.swapaxes(fitted, 1, 2)
+        kept, left = smallest(np.sum((visual - inertial) ** 2, axis=2))
+    return energy, left, (cross, rate_v, rate_g)
+
+
+def _best_rotation(cross: Array) -> Array:
+    """(L, 3, 3) rotations ``R`` of the largest ``tr(R' cross)``."""
+    u, _, vt = np.linalg.svd(cross)
+    u[:, :, 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
+    return np.asarray(u @ vt)
 
 
 def _moments(
@@ -347,7 +423,7 @@ def _peaks(offset_s: Array, gain: Array) -> list[int]:
 
 
 def _closest(
-    intervals: Intervals, path: GyroPath, offset_s: Array, effective: float, rotation: Array | None
+    intervals: Intervals, path: GyroPath, offset_s: Array, effective: float, rotation: Array | None, share: float
 ) -> ClockFit:
     """The best of a few neighbouring offsets, with its rotation and bias."""
     inertial, inside = [], []
@@ -355,18 +431,16 @@ def _closest(
         inertial.append(path.turn_rad(intervals.begin_s - offset, intervals.end_s - offset))
         inside.append(path.covers(intervals.begin_s - offset, intervals.end_s - offset))
     mask = np.stack(inside)
-    cross, energy_v, energy_g, (rate_v, rate_g) = _moments(intervals, np.stack(inertial), mask)
-    left = energy_v + energy_g - 2 * _agreement(cross, rotation)
+    energy, left, (cross, rate_v, rate_g) = _fit(intervals, np.stack(inertial), mask, rotation, share)
     covered = np.sum(mask * intervals.dt_s, axis=1) / intervals.dt_s.sum()
-    gain = _gain(energy_v, left, effective * covered)
+    gain = _gain(energy, left, effective * share * covered)
     best = int(np.argmax(gain))
     if rotation is None:
-        u, _, vt = np.linalg.svd(cross[best])
-        rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+        rotation = _best_rotation(cross[best : best + 1])[0]
     return ClockFit(
         offset_s=float(offset_s[best]),
         log_likelihood=float(gain[best]),
-        explained=float(1 - left[best] / max(energy_v[best], 1e-15)),
+        explained=float(1 - left[best] / max(energy[best], 1e-15)),
         cam_from_imu_xyzw=quat_from_matrix(rotation),
         gyro_bias_rad_s=rate_g[best] - rotation.T @ rate_v[best],
     )

@@ -279,12 +279,7 @@ def _evaluate_candidate(
 ) -> _Candidate:
     quick = None
     if imu.has_accel:
-        calibration = replace(
-            prior.replace_clock_offset(fit.offset_s - epoch_shift_s(imu, read.epoch_ns)),
-            cam_from_imu_xyzw=fit.cam_from_imu_xyzw,
-            gyro_bias_rad_s=fit.gyro_bias_rad_s,
-        )
-        quick = quick_accelerations(read, imu, calibration)
+        quick = quick_accelerations(read, imu, fit.applied(prior, epoch_shift_s(imu, read.epoch_ns)))
     if quick is None:
         return _Candidate(convention=convention, rotation=fit.log_likelihood)
     # one independent vector in each window

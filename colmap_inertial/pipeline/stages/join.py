@@ -6,7 +6,6 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from colmap_inertial.core.errors import NotObservableError, TimingError
@@ -41,20 +40,16 @@ class JoinStage(InertialStage):
     ----------
     limits
         Up to where gaps are closed.
-    database
-        COLMAP's, of the models: matches between images of two of them tie these, too.
     """
 
     limits: JoinOptions = field(default_factory=JoinOptions)
-    #: a run with other matches has other models
-    database: Path | None = field(default=None, compare=False)
 
     @classmethod
     def for_run(cls, inputs: StageInputs) -> JoinStage | None:
         """The stage of a run, where models are to be joined."""
         if inputs.options.join == "off":
             return None
-        return cls(**cls.fields_for(inputs), limits=inputs.options.join_options, database=inputs.database)
+        return cls(**cls.fields_for(inputs), limits=inputs.options.join_options)
 
     def __call__(self, model: Model, /) -> Model:
         """One model by itself: it stays as it is."""

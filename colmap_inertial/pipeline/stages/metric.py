@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,18 +21,25 @@ from colmap_inertial.core.types import (
     CameraMotion,
     CameraTrajectory,
     ImuRecording,
+    RotationConsensus,
     ScaleEstimate,
     Similarity,
     SmoothedTrajectory,
+    Treatment,
 )
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.inertial.scale import estimate_scale
 from colmap_inertial.io.calibration import SIGMAS
 from colmap_inertial.io.files import write_record
 from colmap_inertial.io.trajectories import write_tum
-from colmap_inertial.model import Model, downgraded, trajectory_from_model
+from colmap_inertial.model import Model, downgraded, has_rigs, trajectory_from_model
+from colmap_inertial.model.submodels.registration import deregister_images, register_again
+from colmap_inertial.motion.align.consensus import describe_consensus
 from colmap_inertial.motion.smooth import smooth_trajectory
 from colmap_inertial.pipeline.stages.inputs import StageInputs
+
+if TYPE_CHECKING:
+    import pycolmap
 
 log = logging.getLogger(__name__)
 
@@ -65,12 +73,16 @@ class InertialStage:
         Of the scale estimate.
     world
         Where gravity points in the metric model.
+    database
+        COLMAP's, of the models: its matches register images again, and tie models.
     """
 
     imu: ImuRecording
     calibration: CameraImuCalibration | None
     options: ScaleOptions = field(default_factory=ScaleOptions)
     world: WorldAxes = "z-up"
+    #: a run with other matches has other models
+    database: Path | None = field(default=None, compare=False)
 
     @staticmethod
     def fields_for(inputs: StageInputs) -> dict[str, Any]:
@@ -81,6 +93,7 @@ class InertialStage:
             "calibration": recording.prior,
             "options": replace(options.scale, max_offset_s=recording.max_offset_s),
             "world": options.world,
+            "database": inputs.database,
         }
 
     @staticmethod
@@ -95,15 +108,64 @@ class InertialStage:
             return calibration_of_rectified(self.calibration)
         return self.calibration
 
-    def estimate_scale(self, model: Model) -> tuple[ScaleEstimate, CameraTrajectory, tuple[str, ...]]:
-        """The scale of a model, with its poses, and notes on images that have no time."""
+    def estimate_scale(self, model: Model) -> tuple[Model, ScaleEstimate, CameraTrajectory]:
+        """The model without cameras that contradict the gyroscope, its scale, and the poses that this rests on.
+
+        Cameras that are wrong by themselves are registered again first, where COLMAP's matches place them; those that
+        agree then stay. Where the scale is refused, the model is as it was.
+        """
+        estimate, trajectory = self._estimate(model)
+        found = estimate.rotations
+        if found is not None and not found.kept.all() and estimate.verdict != "refused":
+            reconstruction, again = self._register_again(model, found)
+            if again:
+                second, poses = self._estimate(replace(model, reconstruction=reconstruction))
+                if second.rotations is not None and second.verdict != "refused":
+                    estimate, trajectory, found = second, poses, found.updated(second.rotations)
+            kept = {name for name, kept in zip(found.names, found.kept, strict=True) if kept}
+            trajectory = trajectory.select(np.array([name in kept for name in trajectory.names]))
+            model = _without_left_out(model, reconstruction, found, [name for name in again if name in kept])
+        if model.rotations is not None and estimate.rotations is not None:
+            said = describe_consensus(estimate.rotations)
+            notes = (*(note for note in estimate.notes if note not in said), *describe_consensus(model.rotations))
+            estimate = replace(estimate, rotations=model.rotations, notes=notes)
+        return model, estimate, trajectory
+
+    def _estimate(self, model: Model) -> tuple[ScaleEstimate, CameraTrajectory]:
+        """The scale of a model as it is, and its poses; notes name images that have no time."""
         trajectory, notes = trajectory_from_model(model.reconstruction, model.timing)
-        calibration = self.calibration_of(model)
-        return (
-            estimate_scale(trajectory, self.imu, calibration=calibration, options=self.options),
-            trajectory,
-            tuple(notes),
-        )
+        estimate = estimate_scale(trajectory, self.imu, calibration=self.calibration_of(model), options=self.options)
+        return replace(estimate, notes=(*estimate.notes, *notes)), trajectory
+
+    def _register_again(
+        self, model: Model, found: RotationConsensus
+    ) -> tuple[pycolmap.Reconstruction, tuple[str, ...]]:
+        """A model with its wrong cameras where matches place them, and which these are."""
+        wrong = {one.name for one in found.wrong}
+        if not wrong or self.database is None or not self.database.is_file() or has_rigs(model.reconstruction):
+            return model.reconstruction, ()
+        return register_again(model.reconstruction, wrong, self.database)
+
+
+def _without_left_out(
+    model: Model, reconstruction: pycolmap.Reconstruction, found: RotationConsensus, again: Sequence[str]
+) -> Model:
+    """A model of the images that agree with the gyroscope; some of them may have been registered again."""
+    left_out = [name for name, kept in zip(found.names, found.kept, strict=True) if not kept]
+    sentences = list(describe_consensus(found))
+    if again:
+        sentences.append(f"registered again, and right now: {', '.join(again)}")
+    reason = "; ".join(sentences)
+    log.info("model %d: %s", model.colmap_index, reason)
+    done = Treatment(
+        stage="rotations", reason=reason, action="left out", values={"left_out": left_out, "registered_again": again}
+    )
+    return replace(
+        model,
+        reconstruction=deregister_images(reconstruction, left_out),
+        rotations=found,
+        treatments=(*model.treatments, done),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,8 +182,8 @@ class MetricStage(InertialStage):
 
     def __call__(self, model: Model, /) -> Model:
         """Estimate and apply the scale."""
-        estimate, _, notes = self.estimate_scale(model)
-        estimate = replace(estimate, notes=(*estimate.notes, *self.imu.repairs, *notes))
+        model, estimate, _ = self.estimate_scale(model)
+        estimate = replace(estimate, notes=(*estimate.notes, *self.imu.repairs))
         estimate = downgraded(estimate, model.doubts)
         if estimate.verdict == "refused":
             return model.scaled(estimate, None)

@@ -56,8 +56,8 @@ class ReadoutStage(InertialStage):
         """Adjust the model."""
         if not model.rectified:
             return model
+        model, estimate, trajectory = self.estimate_scale(model)
         reconstruction = model.reconstruction
-        estimate, trajectory, _ = self.estimate_scale(model)
         if estimate.metres_per_unit is None or estimate.gravity_in_world_m_s2 is None:
             return model
         metric = replace(

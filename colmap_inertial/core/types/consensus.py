@@ -1,0 +1,124 @@
+"""Which cameras of a reconstruction agree with the gyroscope."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
+from colmap_inertial.core.validation import check_fields, set_fields
+
+
+@dataclass(frozen=True, kw_only=True)
+class WrongCamera:
+    """A camera whose rotation contradicts the gyroscope.
+
+    Attributes
+    ----------
+    name
+        Of its image.
+    deviation_deg
+        How far it is turned against the cameras around it.
+    """
+
+    name: str
+    deviation_deg: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Seam:
+    """Where the cameras after are turned, all alike, against those before.
+
+    Attributes
+    ----------
+    before, name
+        The images on either side.
+    turn_deg
+        By how much.
+    """
+
+    before: str
+    name: str
+    turn_deg: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RotationConsensus:
+    """Rotations of a reconstruction against the gyroscope's.
+
+    Attributes
+    ----------
+    names
+        (F,) images.
+    judged
+        (F,) those that the gyroscope recorded.
+    deviation_deg
+        (F,) how far each camera is turned against those around it; 0 where it was not judged.
+    part
+        (F,) which cameras form one rigid model: 0 is the largest part, -1 a wrong camera.
+    ref_from_part_xyzw
+        (P, 4) rotations of the world that bring parts into agreement with the largest.
+    """
+
+    names: tuple[str, ...]
+    judged: BoolArray
+    deviation_deg: Array
+    part: IndexArray
+    ref_from_part_xyzw: Array
+
+    def __post_init__(self) -> None:
+        check_fields(self, deviation_deg=("F",), ref_from_part_xyzw=("P", 4))
+        set_fields(self, names=tuple(self.names), part=np.asarray(self.part), judged=np.asarray(self.judged))
+        if not len(self.names) == len(self.judged) == len(self.deviation_deg) == len(self.part):
+            raise ValueError("one deviation and one part for each camera")
+
+    @property
+    def kept(self) -> BoolArray:
+        """(F,) cameras of the largest part."""
+        return np.asarray(self.part == 0)
+
+    @property
+    def wrong(self) -> tuple[WrongCamera, ...]:
+        """Cameras that contradict the gyroscope by themselves."""
+        return tuple(
+            WrongCamera(name=self.names[i], deviation_deg=float(self.deviation_deg[i]))
+            for i in np.flatnonzero(self.part < 0)
+        )
+
+    @property
+    def seams(self) -> tuple[Seam, ...]:
+        """Where one part ends and another begins."""
+        placed = np.flatnonzero(self.part >= 0)
+        out = []
+        for i, j in pairwise(placed.tolist()):
+            if self.part[i] != self.part[j]:
+                a, b = (self.ref_from_part_xyzw[self.part[k]] for k in (i, j))
+                turn_deg = 2 * np.degrees(np.arccos(min(1.0, abs(float(a @ b)))))
+                out.append(Seam(before=self.names[i], name=self.names[j], turn_deg=float(turn_deg)))
+        return tuple(out)
+
+    def updated(self, later: RotationConsensus) -> RotationConsensus:
+        """What is known once some of the cameras were registered again; those that are not in it stay wrong."""
+        place = {name: i for i, name in enumerate(later.names)}
+        at = np.array([place.get(name, -1) for name in self.names])
+        return RotationConsensus(
+            names=self.names,
+            judged=np.where(at >= 0, later.judged[at], self.judged),
+            deviation_deg=np.where(at >= 0, later.deviation_deg[at], self.deviation_deg),
+            part=np.where(at >= 0, later.part[at], self.part),
+            ref_from_part_xyzw=later.ref_from_part_xyzw,
+        )
+
+    def as_json(self) -> dict[str, object]:
+        """The findings in JSON types."""
+        judged = self.deviation_deg[self.judged & self.kept]
+        return {
+            "judged": int(self.judged.sum()),
+            "unjudged": int((~self.judged).sum()),
+            "median_deg": float(np.median(judged)) if len(judged) else None,
+            "wrong": [{"name": one.name, "deg": one.deviation_deg} for one in self.wrong],
+            "seams": [{"before": one.before, "name": one.name, "deg": one.turn_deg} for one in self.seams],
+            "left_out": [name for name, kept in zip(self.names, self.kept, strict=True) if not kept],
+        }

@@ -1,0 +1,137 @@
+"""Projects in which cameras are wrong, through ``reconstruct`` and ``diagnose``: a part costs that part."""
+
+import json
+import shutil
+from itertools import pairwise
+
+import numpy as np
+import pycolmap
+import pytest
+from box_project import shared_box
+
+from colmap_inertial.core.options import ProjectOptions
+from colmap_inertial.model import read_model
+from colmap_inertial.model.submodels.registration import deregister_images, register_again
+from colmap_inertial.reconstruction.drivers.diagnosis import diagnose_source
+from colmap_inertial.reconstruction.drivers.project import reconstruct_project
+from colmap_inertial.reconstruction.drivers.sources import ScaleSource
+
+
+@pytest.fixture(scope="module")
+def box(tmp_path_factory):
+    """Tests must not change it."""
+    return shared_box(tmp_path_factory)
+
+
+def turned(model, names, deg, *, about=None):
+    """Cameras turned, each by itself about its centre, or all as one about a point of the world; moved, too."""
+    rng = np.random.default_rng(4)
+    axis = rng.standard_normal(3)
+    turn = pycolmap.Rotation3d(np.radians(deg) * axis / np.linalg.norm(axis))
+    for image in [model.image(i) for i in sorted(model.reg_image_ids()) if model.image(i).name in names]:
+        pose = image.cam_from_world()
+        if about is None:
+            pose = pycolmap.Rigid3d(turn, rng.standard_normal(3)) * pose
+        else:
+            world = pycolmap.Rigid3d(turn, about - turn.matrix() @ about + 0.3)
+            pose = pose * world
+        model.frame(image.frame_id).set_cam_from_world(image.camera_id, pose)
+    return model
+
+
+def altered(box, folder, names, deg, **how):
+    project = shutil.copytree(box.root, folder)
+    sparse = project / "sparse" / "0"
+    turned(read_model(sparse), names, deg, **how).write_binary(str(sparse))
+    return project
+
+
+def reconstructed(box, project, out):
+    """The only model of ``result.json``, checked for the truth."""
+    reconstruct_project(project, out, ProjectOptions(imu=box.imu, frame_times=box.frame_times))
+    (model,) = json.loads((out / "result.json").read_text())["models"]
+    low, high = model["ci95"]
+    assert low < box.recording.truth.metres_per_unit < high
+    return model
+
+
+def database_of(model, path, reach=4):
+    """COLMAP's database of a model: what images of one another's neighbourhood see alike."""
+    with pycolmap.Database.open(str(path)) as database:
+        for camera in model.cameras.values():
+            database.write_camera(camera, use_camera_id=True)
+        for rig in model.rigs.values():
+            database.write_rig(rig, use_rig_id=True)
+        for frame in model.frames.values():
+            database.write_frame(frame, use_frame_id=True)
+        numbers = sorted(model.reg_image_ids())
+        seen = {}
+        for i in numbers:
+            image = model.image(i)
+            database.write_image(image, use_image_id=True)
+            database.write_keypoints(i, np.array([p.xy for p in image.points2D], dtype=np.float32))
+            seen[i] = {p.point3D_id: k for k, p in enumerate(image.points2D) if p.has_point3D()}
+        for k, i in enumerate(numbers):
+            for j in numbers[k + 1 : k + 1 + reach]:
+                both = sorted(seen[i].keys() & seen[j].keys())
+                geometry = pycolmap.TwoViewGeometry()
+                geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+                geometry.inlier_matches = np.array([[seen[i][p], seen[j][p]] for p in both], dtype=np.uint32)
+                database.write_two_view_geometry(i, j, geometry)
+    return path
+
+
+@pytest.mark.parametrize("wrong", [[60], [3, 61, 90]])
+def test_wrong_cameras_leave_the_metric_model_and_are_listed(box, tmp_path, wrong):
+    names = [box.names[i] for i in wrong]
+    project = altered(box, tmp_path / "project", names, 54)
+    before = (project / "sparse" / "0" / "images.bin").read_bytes()
+    model = reconstructed(box, project, tmp_path / "out")
+    assert [one["name"] for one in model["rotations"]["wrong"]] == model["rotations"]["left_out"] == names
+    assert [one["deg"] for one in model["rotations"]["wrong"]] == pytest.approx([54] * len(names), abs=1)
+    metric = read_model(tmp_path / "out" / "sparse" / "0")
+    assert {image.name for image in metric.images.values()} == set(box.names) - set(names)
+    assert (project / "sparse" / "0" / "images.bin").read_bytes() == before
+    assert len(read_model(project / "sparse" / "0").images) == 120
+    assert names[0] in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_of_a_torn_model_the_largest_part_is_kept(box, tmp_path):
+    names = box.names[30:60]
+    project = altered(box, tmp_path / "project", names, 25, about=np.zeros(3))
+    model = reconstructed(box, project, tmp_path / "out")
+    assert [seam["name"] for seam in model["rotations"]["seams"]] == [box.names[30], box.names[60]]
+    assert model["rotations"]["left_out"] == names
+
+
+def test_diagnose_names_the_wrong_cameras(box, tmp_path):
+    project = altered(box, tmp_path / "project", [box.names[60]], 54)
+    source = ScaleSource(source=project / "sparse" / "0", imu=box.imu, frame_times=box.frame_times)
+    (finding,) = [one for one in diagnose_source(source).findings if one.code == "cameras-turned"]
+    assert finding.severity == "warning"
+    assert box.names[60] in finding.evidence
+    assert finding.numbers["wrong"] == 1
+
+
+def test_a_wrong_camera_is_registered_again_by_its_matches(box, tmp_path):
+    sound = read_model(box.root / "sparse" / "0")
+    database = database_of(sound, tmp_path / "database.db")
+    names = [box.names[60], box.names[61]]
+    wrong = turned(pycolmap.Reconstruction(sound), names, 54)
+    placed, again = register_again(wrong, names, database)
+    assert again == tuple(names)
+    assert wrong.num_reg_images() == placed.num_reg_images() == 120
+    for name in names:
+        pose, truth = (model.find_image_with_name(name).cam_from_world() for model in (placed, sound))
+        assert np.degrees((pose * truth.inverse()).rotation.angle()) < 0.5
+    seen = [placed.find_image_with_name(name).num_points3D for name in names]
+    assert min(seen) > 50
+    assert placed.compute_mean_reprojection_error() == pytest.approx(sound.compute_mean_reprojection_error(), rel=0.1)
+
+
+def test_deregistered_images_leave_the_original_as_it_is(box):
+    model = read_model(box.root / "sparse" / "0")
+    rest = deregister_images(model, box.names[:3])
+    assert (model.num_reg_images(), rest.num_reg_images()) == (120, 117)
+    assert all(point.track.length() >= 2 for point in rest.points3D.values())
+    assert all(a < b for a, b in pairwise(sorted(rest.reg_image_ids())))
