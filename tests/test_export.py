@@ -619,6 +619,10 @@ def test_what_was_deblurred_is_taken_out_of_the_capture_where_it_is_named(rollin
     for folder in copy.rglob("images"):
         for name in blurred:
             cv2.imwrite(str(folder / name), np.zeros((300, 400, 3), np.uint8))
+    with pytest.raises(FormatError, match="is not as its run wrote it: start that again"):
+        export_model(copy, tmp_path / "kept", "3dgs-deblur", images="original")
+    for step in ("frames", "images"):
+        (copy / ".stages" / f"{step}.json").unlink()
     made = export_model(copy, tmp_path / "kept", "3dgs-deblur", images="original")
     assert any("3 pictures are deblurred" in note for note in made.notes)
     assert cv2.imread(str(tmp_path / "kept" / "images" / blurred[0])).max() == 0

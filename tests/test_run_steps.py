@@ -2,10 +2,13 @@
 
 import contextlib
 import itertools
+import json
 import os
+import shutil
 import threading
 import time
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
@@ -19,7 +22,7 @@ from colmap_inertial.colmap import steps
 from colmap_inertial.colmap.mapping import MapRecord, map_images
 from colmap_inertial.colmap.pairing import MatchRecord
 from colmap_inertial.colmap.sparse import KeypointRecords, extract_features, image_pairs, write_gravity_priors
-from colmap_inertial.core.errors import NotObservableError, OutputExistsError
+from colmap_inertial.core.errors import FormatError, NotObservableError, OutputExistsError
 from colmap_inertial.core.options import MappingOptions, ProjectOptions, ReconstructOptions
 from colmap_inertial.core.threads import map_in_order
 from colmap_inertial.core.types import CALIBRATION_PARAMETERS, CameraModel, FrameTiming, ImuRecording, Treatment
@@ -35,7 +38,7 @@ from colmap_inertial.pipeline.run.context import Recording, RunContext, prior_ca
 from colmap_inertial.pipeline.run.progress import silent
 from colmap_inertial.pipeline.run.runner import StepRunner, fingerprint
 from colmap_inertial.pipeline.run.session import Session, open_session
-from colmap_inertial.pipeline.run.workspace import Workspace
+from colmap_inertial.pipeline.run.workspace import Workspace, refuse_links
 from colmap_inertial.pipeline.stages.defaults import default_keypoint_stages
 from colmap_inertial.pipeline.stages.exposures import ExposureStage
 from colmap_inertial.pipeline.stages.frame_folder import FramePaths, FrameRecord, write_frames, write_images
@@ -243,6 +246,132 @@ def test_a_step_that_writes_something_more_makes_again_what_follows(workspace):
         return runner.worked
 
     assert [made("a"), made("a"), made("a", "b")] == [["first", "second"], [], ["first", "second"]]
+
+
+@pytest.mark.parametrize("damage", ["delete", "cut", "overwrite"])
+def test_a_lost_file_makes_its_step_again_and_what_depends_on_it_where_it_comes_out_otherwise(workspace, damage):
+    texts = {"a": "a text", "c": "a text of its own"}
+
+    def made():
+        runner = StepRunner(workspace)
+        folder, aside = workspace.root / "folder", workspace.root / "c.txt"
+
+        def first(partial):
+            partial[0].mkdir()
+            (partial[0] / "a.txt").write_text(texts["a"])
+            aside.write_text(texts["c"])
+
+        runner.run("first", {}, [folder], first, beside=lambda: [aside])
+        read = workspace.root / "b.txt"
+        runner.run(
+            "second",
+            {},
+            [read],
+            lambda partial: partial[0].write_text((folder / "a.txt").read_text()),
+            after=["first"],
+        )
+        runner.run("third", {}, [], lambda partial: None)
+        return runner.worked
+
+    def lose(name):
+        path = workspace.root / name
+        if damage == "delete":
+            path.unlink()
+        else:
+            path.write_text("a t" if damage == "cut" else path.read_text().upper())
+
+    assert [made(), made()] == [["first", "second", "third"], []]
+    for name, again in (("folder/a.txt", "first"), ("c.txt", "first"), ("b.txt", "second")):
+        lose(name)
+        assert [made(), made()] == [[again], []]
+    lose("folder/a.txt")
+    texts["a"] = "no text"
+    assert made() == ["first", "second"]
+    assert (workspace.root / "b.txt").read_text() == "no text"
+
+
+def test_links_and_copies_of_what_a_step_wrote_are_no_damage(workspace, tmp_path):
+    def made():
+        runner = StepRunner(workspace)
+        runner.run("a", {}, [workspace.root / "a.txt"], lambda partial: partial[0].write_text("x"))
+        return runner.worked
+
+    assert made() == ["a"]
+    (tmp_path / "link").hardlink_to(workspace.root / "a.txt")
+    assert made() == []
+    shutil.copytree(workspace.root, tmp_path / "copy")
+    shutil.rmtree(workspace.root)
+    shutil.copytree(tmp_path / "copy", workspace.root)
+    assert made() == []
+
+
+def test_how_often_a_database_was_opened_is_no_damage(tmp_path):
+    with contextlib.closing(pycolmap.Database.open(str(tmp_path / "database.db"))):
+        pass
+    before = [str(path) for path in fingerprint(tmp_path)[0][3:]]
+    with contextlib.closing(pycolmap.Database.open(str(tmp_path / "database.db"))):
+        pass
+    assert [str(path) for path in fingerprint(tmp_path)[0][3:]] == before
+
+
+@pytest.mark.parametrize("name", ["colmap", "log.txt", ".stages/lock", "images/1.jpg"])
+def test_a_folder_with_a_link_in_it_is_not_gone_on_with(workspace, tmp_path, name):
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (workspace.root / name).parent.mkdir(exist_ok=True)
+    (workspace.root / name).symlink_to(outside)
+    with (
+        pytest.raises(FormatError, match=r"is a link to .*outside; links in an output folder are not followed"),
+        open_session(workspace.root, tmp_path / "capture.toml", ReconstructOptions(), pictures=()),
+    ):
+        pass
+    assert not any(outside.iterdir())
+    (workspace.root / name).unlink()
+    os.mkfifo(workspace.root / "pipe")
+    with pytest.raises(FormatError, match=r"a device, a pipe or a socket"):
+        refuse_links(workspace.root)
+
+
+def test_links_of_a_project_may_stay_and_the_folder_itself_may_be_one(workspace, tmp_path):
+    (workspace.root / "mesh").mkdir()
+    (workspace.root / "mesh" / "latest.ply").symlink_to("fused.ply")
+    with pytest.raises(FormatError, match="is a link"):
+        refuse_links(workspace.root)
+    workspace.placed.write_text(json.dumps({"paths": ["mesh"]}))
+    (tmp_path / "link").symlink_to(workspace.root)
+    refuse_links(tmp_path / "link")
+    (workspace.root / "mesh" / "other.ply").symlink_to(tmp_path)
+    with pytest.raises(FormatError, match="is a link"):
+        refuse_links(tmp_path / "link")
+
+
+def test_what_says_whose_folder_it_is_was_damaged(workspace, tmp_path):
+    workspace.owner.write_text("{")
+    with pytest.raises(OutputExistsError, match="choose another folder, or remove this one"):
+        workspace.prepare(tmp_path / "capture.toml", "reconstruct")
+
+
+def test_small_models_of_a_killed_run_go_with_the_next_one(workspace, tmp_path):
+    (workspace.stamps / "tmpx1y2z3ab" / "0").mkdir(parents=True)
+    with open_session(workspace.root, tmp_path / "capture.toml", ReconstructOptions(), pictures=()):
+        assert not list(workspace.stamps.glob("tmp*"))
+
+
+def test_however_a_capture_is_spelt_its_steps_are_kept(workspace, tmp_path, monkeypatch):
+    timing, _ = frames_of(tmp_path / "in")
+
+    def made(folder):
+        capture = Capture(path=folder, calibration=calibration_prior(), frames=ImageFolder(folder=folder / "in"))
+        filmed = Recording.of(capture, IMU, timing, capture.calibration)
+        session = session_in(workspace)
+        run_frames(session, filmed, frames_of(tmp_path / f"filmed {next(count)}")[1], [], workspace.images)
+        return session.runner.worked
+
+    count = itertools.count()
+    assert made(tmp_path) == ["frames"]
+    for folder in ("in", ".stages"):
+        monkeypatch.chdir(tmp_path / folder if folder == "in" else workspace.stamps)
+        assert made(Path(os.path.relpath(tmp_path))) == []
 
 
 def test_a_session_is_alone_in_its_folder_and_another_configuration_undoes_the_result(tmp_path):

@@ -174,9 +174,8 @@ def _densify(
     elif pycolmap.has_cuda:
         size = prepared.made_from.max_image_size
         decided = {"maps": maker, "settings": prepared.made_from.settings}
-        runner.run(
-            f"dense_{index}_depth", decided, [], lambda _: patch_match(folder, size, context.colmap), after=before
-        )
+        step, maps_of, colmap = f"dense_{index}_depth", partial(_map_folders, folder), context.colmap
+        runner.run(step, decided, [], lambda _: patch_match(folder, size, colmap), after=before, beside=maps_of)
         progress()
     kind, mapped = find_maps(folder, names)
     result = DenseResult(folder=folder, images=len(names), depth_maps=len(mapped), maps=maker)
@@ -194,7 +193,7 @@ def _densify(
         fuse_maps(folder, mapped, targets, maker=maker, kind=kind, scratch=scratch, context=context)
         write_json(partial[2], {"coverage": coverage(folder, mapped, kind)})
 
-    maps = [fingerprint(folder / "stereo" / f"{what}_maps") for what in ("depth", "normal")]
+    maps = [fingerprint(place) for place in _map_folders(folder)]
     record = session.workspace.stamps / f"dense_{index}_measured.json"
     outputs = [fused, folder / "fused.ply.vis", record]
     made_by: dict[str, object] = {"maps": maps, "colmap": context.colmap.identity("fusion")}
@@ -246,8 +245,6 @@ def _sweep(session: Session, index: int, prepared: _Prepared, progress: Callable
     """Depth maps by our own sweep; those that a run made that was cut off are kept."""
     folder, stamps = session.workspace.dense / str(index), session.workspace.stamps
     record, raw = stamps / f"dense_{index}_depth_maps.json", stamps / f"sweep_{index}"
-    if record.is_file() and not all(map_file(folder, "depth", n).is_file() for n in read_json(record).get("names", [])):
-        record.unlink()  # somebody removed them
 
     def work(partial: Sequence[Path]) -> None:
         swept = SweptWorkspace(folder, raw)
@@ -258,7 +255,12 @@ def _sweep(session: Session, index: int, prepared: _Prepared, progress: Callable
         remove(raw)
 
     depends = {"maps": prepared.made_from.maps}
-    session.runner.run(f"dense_{index}_depth", depends, [record], work, after=[f"dense_{index}_undistorted"])
+    after, step = [f"dense_{index}_undistorted"], f"dense_{index}_depth"
+    session.runner.run(step, depends, [record], work, after=after, beside=partial(_map_folders, folder))
+
+
+def _map_folders(folder: Path) -> list[Path]:
+    return [folder / "stereo" / f"{what}_maps" for what in ("depth", "normal")]
 
 
 def _undistort(session: Session, index: int, images: Path, prepared: _Prepared) -> None:

@@ -294,7 +294,7 @@ def match_pairs(
     total = len(pairs) if total is None else total
     pycolmap.set_random_seed(context.seed)
     lines = [f"{a} {b}" for a, b in pairs]
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(dir=context.scratch) as folder:
         listed = Path(folder) / "pairs.txt"
         # how quickly it goes is seen already where some are matched
         for batch in growing_batches(lines, first=_MATCHING_BATCH if done else _FIRST_MATCHING_BATCH):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import enum
 import functools
@@ -13,15 +14,15 @@ import shutil
 import time
 import types
 import uuid
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from colmap_inertial import __version__
 from colmap_inertial.core.errors import FormatError, InertialError
-from colmap_inertial.io.files import read_json, write_json
+from colmap_inertial.io.files import read_record, write_record
 from colmap_inertial.pipeline.run.progress import HearsSteps, Progress, silent
 from colmap_inertial.pipeline.run.workspace import Workspace
 
@@ -50,7 +51,7 @@ def canonical(value: object) -> object:
     if isinstance(value, (set, frozenset)):
         return sorted((canonical(v) for v in value), key=repr)
     if isinstance(value, Path):
-        return str(value)
+        return str(value.resolve())  # however it was spelt
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     return _canonical_callable(value)
@@ -121,24 +122,114 @@ def _digest(path: Path, size: int, _mtime_ns: int, _ctime_ns: int) -> str:
     digest = hashlib.blake2b(digest_size=16)
     try:
         with open(path, "rb") as file:
-            if size <= _READ_BYTES:
-                digest.update(file.read(_READ_BYTES))
-            else:
-                pieces = _READ_BYTES // _PIECE_BYTES
-                for i in range(pieces):
-                    file.seek(i * (size - _PIECE_BYTES) // (pieces - 1))
-                    digest.update(file.read(_PIECE_BYTES))
+            pieces = 1 if size <= _READ_BYTES else _READ_BYTES // _PIECE_BYTES
+            for i in range(pieces):
+                file.seek(i * (size - _PIECE_BYTES) // max(1, pieces - 1))
+                piece = file.read(_READ_BYTES // pieces)
+                if i == 0 and piece.startswith(b"SQLite format 3"):
+                    # how often the database was opened to write: COLMAP does so also where it only reads
+                    piece = piece[:24] + piece[28:92] + piece[100:]
+                digest.update(piece)
     except OSError as error:
         raise FormatError(path, f"cannot be read: {error.strerror or error}") from None
     return digest.hexdigest()
 
 
+@dataclass(frozen=True, kw_only=True)
+class _File:
+    """A file or folder that a step wrote, as it was then.
+
+    Path in the output folder, size, change of the inode, and what it is: digest of a file, target of a link.
+    """
+
+    name: str
+    size: int
+    changed_ns: int
+    digest: str
+
+    @classmethod
+    def of(cls, root: Path, path: Path) -> _File:
+        stat, name = path.lstat(), path.relative_to(root).as_posix()
+        if path.is_symlink():
+            digest = f"link to {path.readlink()}"
+        elif path.is_dir():
+            return cls(name=name, size=0, changed_ns=0, digest="folder")
+        else:
+            digest = _content(path, stat)
+        return cls(name=name, size=stat.st_size, changed_ns=stat.st_ctime_ns, digest=digest)
+
+    def now(self, root: Path) -> _File | None:
+        """The same as it is now; ``None`` where it is missing or damaged.
+
+        Its content is read only where something happened to the inode.
+        """
+        path = root / self.name
+        try:
+            stat = path.lstat()
+            same = (stat.st_size, stat.st_ctime_ns) == (self.size, self.changed_ns)
+            found = self if same else _File.of(root, path)
+        except (OSError, FormatError):
+            return None
+        return found if (found.size, found.digest) == (self.size, self.digest) else None
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Stamp:
+    """The record of a finished step: what decided its output, how long it took, and every file that it wrote."""
+
+    key: str
+    seconds: float
+    inner: dict[str, float]
+    files: tuple[_File, ...]
+
+    def lost(self, root: Path) -> str:
+        """The first of its files that is missing or damaged; empty where there is none."""
+        return next((file.name for file in self.files if file.now(root) is None), "")
+
+
+def _files_in(root: Path, paths: Iterable[Path]) -> tuple[_File, ...]:
+    """Some files and folders, which need not be there, and the files in them."""
+    found = {path for path in paths if os.path.lexists(path)}
+    for folder in [path for path in found if path.is_dir() and not path.is_symlink()]:
+        for here, folders, names in os.walk(folder):
+            found |= {Path(here, name) for name in (*folders, *names)}
+    return tuple(_File.of(root, path) for path in sorted(found))
+
+
+def find_loss(workspace: Workspace, steps: Iterable[str]) -> str:
+    """The first file of finished steps that is missing or damaged; empty where there is none."""
+    stamps = filter(None, (_read_stamp(workspace.stamps / f"{step}.json") for step in steps))
+    return next(filter(None, (stamp.lost(workspace.root) for stamp in stamps)), "")
+
+
+@contextlib.contextmanager
+def explaining_losses(workspace: Workspace) -> Iterator[None]:
+    """Have a complaint about an output folder say what its run would make again."""
+    try:
+        yield
+    except FormatError as error:
+        lost = find_loss(workspace, (path.stem for path in workspace.stamps.glob("*.json")))
+        if not lost:
+            raise
+        advice = f"{error}; {lost} is missing or damaged since its run wrote it: start that again, it is made again"
+        raise FormatError(workspace.root, advice) from None
+
+
+def find_change(workspace: Workspace, paths: Iterable[Path]) -> Path | None:
+    """The first of some files that is not as a step wrote it."""
+    stamps = filter(None, map(_read_stamp, workspace.stamps.glob("*.json")))
+    known = {file.name: file for stamp in stamps for file in stamp.files}
+    root, inside = workspace.root, (path for path in paths if path.is_relative_to(workspace.root))
+    found = ((path, known.get(path.relative_to(root).as_posix())) for path in inside)
+    return next((path for path, file in found if file is not None and file.now(root) is None), None)
+
+
 class StepRunner:
     """Runs steps in order and skips those whose inputs and options are those of an earlier, finished run.
 
-    A step's key hashes its options, its inputs, what it writes and the keys of the steps that it takes the output of,
-    so that a change anywhere makes again what depends on it, and nothing else. A folder's existence proves nothing:
-    only a stamp with the right key does.
+    A step's key hashes its options, its inputs, what it writes and the keys and outputs of the steps that it takes the
+    output of, so that a change anywhere makes again what depends on it, and nothing else. A folder's existence proves
+    nothing: only a stamp does that has the right key, and whose files are all as the step wrote them.
 
     Attributes
     ----------
@@ -163,6 +254,11 @@ class StepRunner:
         """Have a step made again: what it made is gone."""
         (self._workspace.stamps / f"{name}.json").unlink(missing_ok=True)
 
+    def record(self, name: str, paths: Iterable[Path]) -> None:
+        """Remember files that are made with every result."""
+        files = _files_in(self._workspace.root, paths)
+        write_record(self._workspace.stamps / f"{name}.json", _Stamp(key="", seconds=0.0, inner={}, files=files))
+
     def run(
         self,
         name: str,
@@ -171,6 +267,7 @@ class StepRunner:
         work: Callable[[list[Path]], None],
         *,
         after: Sequence[str] = (),
+        beside: Callable[[], Iterable[Path]] = tuple,
     ) -> None:
         """Run ``work`` unless its stamp holds.
 
@@ -187,15 +284,18 @@ class StepRunner:
             own, whose time is not counted twice.
         after
             Steps whose output it takes.
+        beside
+            What else it has written, by names of its own: files and folders that must stay as they are, too.
         """
+        root, stamp = self._workspace.root, self._workspace.stamps / f"{name}.json"
         upstream = [self._keys[step] for step in after]
         written = [path.name for path in outputs]
         text = json.dumps([name, __version__, upstream, canonical(depends), written], sort_keys=True)
-        key = self._keys[name] = hashlib.sha256(text.encode()).hexdigest()
-        stamp = self._workspace.stamps / f"{name}.json"
+        key = hashlib.sha256(text.encode()).hexdigest()
         done = _read_stamp(stamp)
-        if done is not None and done["key"] == key and all(path.exists() for path in outputs):
-            self.seconds |= {**done.get("inner", {}), name: done["seconds"]}
+        if done is not None and done.key == key and self._stands(name, done):
+            self.seconds |= {**done.inner, name: done.seconds}
+            self._depend_on(name, done)
             log.info("%s: finished in an earlier run, kept", name)
             if self._heard_by is not None:
                 self._heard_by.kept(name)
@@ -222,15 +322,35 @@ class StepRunner:
             os.replace(source, target)
         inner = {step: self.seconds[step] for step in self.worked[begun:]}
         self.seconds[name] = time.perf_counter() - start - sum(inner.values())
-        write_json(stamp, {"key": key, "seconds": self.seconds[name], "inner": inner})
+        files = _files_in(root, [*outputs, *beside()])
+        done = _Stamp(key=key, seconds=self.seconds[name], inner=inner, files=files)
+        write_record(stamp, done)
+        self._depend_on(name, done)
         log.info("%s: finished in %.1f s", name, self.seconds[name])
 
+    def settle(self) -> None:
+        """Have the records say how files are at the end, as later steps may have linked them or opened a database."""
+        for name in self._keys:
+            path = self._workspace.stamps / f"{name}.json"
+            if (stamp := _read_stamp(path)) is not None:
+                files = tuple(file.now(self._workspace.root) or file for file in stamp.files)
+                write_record(path, dataclasses.replace(stamp, files=files))
 
-def _read_stamp(stamp: Path) -> dict[str, Any] | None:
-    if not stamp.is_file():
-        return None
+    def _stands(self, name: str, done: _Stamp) -> bool:
+        lost = done.lost(self._workspace.root)
+        if lost:
+            log.warning("%s: made again, as %s is missing or damaged", name, lost)
+        return not lost
+
+    def _depend_on(self, name: str, stamp: _Stamp) -> None:
+        """Have later steps depend on what a step wrote."""
+        text = json.dumps([stamp.key, [(file.name, file.size, file.digest) for file in stamp.files]])
+        self._keys[name] = hashlib.sha256(text.encode()).hexdigest()
+
+
+def _read_stamp(stamp: Path) -> _Stamp | None:
     try:
-        return read_json(stamp)
+        return read_record(stamp, _Stamp)
     except FormatError:
         return None
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from colmap_inertial import __version__
-from colmap_inertial.core.errors import InertialError
+from colmap_inertial.core.errors import FormatError, InertialError
 from colmap_inertial.core.printing import PrintableFormatter
 from colmap_inertial.io.files import (
     convert_to_plain,
@@ -24,7 +24,7 @@ from colmap_inertial.model import load_pycolmap
 from colmap_inertial.pipeline.run.config import config_as_toml
 from colmap_inertial.pipeline.run.context import RunContext
 from colmap_inertial.pipeline.run.progress import Progress
-from colmap_inertial.pipeline.run.runner import StepRunner
+from colmap_inertial.pipeline.run.runner import StepRunner, find_loss, remove
 from colmap_inertial.pipeline.run.workspace import Workspace, require_apart
 
 log = logging.getLogger(__name__)
@@ -55,15 +55,19 @@ class Session:
 
     def stands(self, content: Mapping[str, object]) -> bool:
         """Whether an earlier run's ``result.json`` says this already, and nothing had to be made again."""
-        if self.runner.worked or not self.workspace.result.is_file():
+        if self.runner.worked or find_loss(self.workspace, ["report"]):
             return False
-        known = read_json(self.workspace.result)
+        try:
+            known = read_json(self.workspace.result)
+        except FormatError:
+            return False
         return {**known, "seconds": {}} == convert_to_plain({**content, "seconds": {}})
 
     def finish(self, content: Mapping[str, object]) -> bool:
         """Write ``result.json``, whose presence says that the run is finished; returns whether it stood already."""
         unchanged = self.stands(content)
         if not unchanged:
+            self.runner.settle()
             write_json(self.workspace.result, content)
         log.info("nothing to do" if unchanged else "finished")
         return unchanged
@@ -111,10 +115,12 @@ def open_session(
         stack.enter_context(workspace.locked())
         workspace.open(source, command)
         remove_temporaries(workspace.root, workspace.stamps, workspace.report_data)
+        for folder in workspace.stamps.glob("tmp*"):  # small models of a run that was killed
+            remove(folder)
         stack.enter_context(logging_to(workspace.log))
         log.info("colmap-inertial %s: %s -> %s", __version__, source, out)
         config = config_as_toml(options)
-        if not workspace.config.is_file() or workspace.config.read_text(encoding="utf-8") != config:
+        if not workspace.config.is_file() or workspace.config.read_bytes() != config.encode():
             workspace.unfinish()
             write_text(workspace.config, config)
         context = context or RunContext()

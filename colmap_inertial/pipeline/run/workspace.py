@@ -6,15 +6,17 @@ import contextlib
 import errno
 import fnmatch
 import logging
+import os
 import re
 import shutil
+import stat
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
 from colmap_inertial.checks.report.content import CROPS_FOLDER, DATA_FOLDER
-from colmap_inertial.core.errors import OutputError, OutputExistsError
+from colmap_inertial.core.errors import FormatError, OutputError, OutputExistsError
 from colmap_inertial.io.files import CHANGED_RECORD, locked, read_json, reading, write_json
 
 log = logging.getLogger(__name__)
@@ -150,9 +152,15 @@ class Workspace:
         """
         if self.root.exists() and not self.root.is_dir():
             raise OutputExistsError(f"{self.root} is a file; choose another output folder")
+        refuse_links(self.root)
         identity: dict[str, str | int] = {"capture": str(source.resolve()), "command": command, "layout": _LAYOUT}
         if self.owner.is_file():
-            known = read_json(self.owner)
+            try:
+                known = read_json(self.owner)
+            except FormatError as error:
+                raise OutputExistsError(
+                    f"{error}; it says what {self.root} is for: choose another folder, or remove this one"
+                ) from None
             if known.get("layout") != _LAYOUT:
                 raise OutputExistsError(
                     f"{self.root} holds a run of another version, which laid its folders out otherwise: choose another "
@@ -190,6 +198,36 @@ class Workspace:
         busy = f"another run is at work in {self.root}; wait for it or choose another folder"
         with full_disk_is_an_error(self.root), locked(self.lock, busy):
             yield
+
+
+def refuse_links(root: Path) -> None:
+    """Refuse an output folder with links or special files in it: it may be a stranger's, and lead anywhere.
+
+    It may be a link itself. Those of an existing project that came along stay in the folder, and are no harm.
+
+    Raises
+    ------
+    FormatError
+        For the first one.
+    """
+    placed, top = Workspace(root).placed, os.path.realpath(root)
+    for folder, folders, names in os.walk(root):
+        for name in sorted(folders + names):
+            path = Path(folder, name)
+            mode = path.lstat().st_mode
+            if stat.S_ISDIR(mode) or stat.S_ISREG(mode):
+                continue
+            if not stat.S_ISLNK(mode):
+                raise FormatError(path, "is a device, a pipe or a socket in an output folder: remove it")
+            inside = os.path.commonpath((top, os.path.realpath(path))) == top
+            own = inside and placed.is_file() and not placed.is_symlink() and read_json(placed).get("paths", [])
+            relative = path.relative_to(root)
+            if not own or not any(relative.is_relative_to(str(one)) for one in own):
+                raise FormatError(
+                    path,
+                    f"is a link to {path.readlink()}; links in an output folder are not followed: remove it, or put "
+                    "the file or folder itself there",
+                )
 
 
 @dataclass(frozen=True, kw_only=True)

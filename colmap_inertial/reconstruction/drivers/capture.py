@@ -214,6 +214,7 @@ def _reconstruct(
         result = _run(session, given, options, stages)
         result = report_result(session, result, capture, used_calibration)
         remove(session.workspace.colmap_features)
+        session.runner.forget("features")
     return result
 
 

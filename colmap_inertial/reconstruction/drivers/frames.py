@@ -223,7 +223,7 @@ def run_frames(
         "inputs": recording.inputs(),
         "stages": stages,
         "kept": {} if kept is None else kept.blur_px,
-        "images": images.relative_to(workspace.root),
+        "images": images.relative_to(workspace.root).as_posix(),
     }
     crops = [] if kept is None else [workspace.crops]
     session.runner.run("frames", depends, [images, workspace.frames, workspace.unsmoothed, *crops], work)

@@ -60,8 +60,8 @@ def _finish(session: Session, capture: Capture, content: Mapping[str, object]) -
     return session.finish(
         {
             "versions": {"colmap_inertial": __version__},
-            "capture": str(capture.path),
-            "source": None if source is None else str(source),
+            "capture": str(capture.path.resolve()),
+            "source": None if source is None else str(source.resolve()),
             **content,
             "seconds": session.runner.seconds,
         }
@@ -212,7 +212,9 @@ def deblur_capture(
 def _require_free_sheet(sheet: Path, out: Path) -> None:
     """Raise where a contact sheet cannot be written; the one of an earlier run in the same folder is written over."""
     record = Workspace(out).stamps / _SHEET
-    ours = record.is_file() and read_json(record).get("sheet") == str(sheet.resolve())
+    ours = False
+    with contextlib.suppress(FormatError):
+        ours = read_json(record).get("sheet") == str(sheet.resolve())
     if sheet.exists() and not ours:
         raise OutputExistsError(f"{sheet} exists; choose another name for the contact sheet")
     if not sheet.parent.is_dir():

@@ -5,12 +5,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 from colmap_inertial.checks.validate import Target, Validation, validate_model, write_overlays
 from colmap_inertial.colmap.dense import run_dense
-from colmap_inertial.core.errors import FormatError, NotObservableError, TargetNotFoundError, TimingError
+from colmap_inertial.core.errors import NotObservableError, TargetNotFoundError, TimingError
 from colmap_inertial.core.options import DenseOptions
 from colmap_inertial.core.types import Gap, JoinedPart, ScaleEstimate
 from colmap_inertial.io.files import read_record, write_record
@@ -30,7 +31,7 @@ from colmap_inertial.model.similarities import undoing
 from colmap_inertial.pipeline.run.context import Recording
 from colmap_inertial.pipeline.run.runner import fingerprint, remove
 from colmap_inertial.pipeline.run.session import Session
-from colmap_inertial.pipeline.stages.metric import gravity_in_model, metric_trajectory, motion_file, write_trajectory
+from colmap_inertial.pipeline.stages.metric import gravity_in_model, metric_trajectory, write_trajectory
 from colmap_inertial.pipeline.stages.protocols import JoiningStage, ModelStage, joins_models
 from colmap_inertial.reconstruction.drivers.project_output import remove_stale_dense
 from colmap_inertial.reconstruction.drivers.reporting import write_model_record
@@ -60,12 +61,11 @@ _Begun: TypeAlias = "tuple[ScaledModel, Model | None]"
 
 @dataclass(frozen=True, kw_only=True)
 class _Made:
-    """What the model stages made of all models; the folders of parts of joined ones are ``beside`` theirs."""
+    """What the model stages made of all models."""
 
     models: tuple[ScaledModel, ...]
     fragments: tuple[Fragment, ...]
     gaps: tuple[Gap, ...] = ()
-    beside: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -144,13 +144,10 @@ def run_models(
         place_of = {number: number if numbered else place for place, number in enumerate(kept)}
         made, gaps = _run_stages(session, recording, stages, read_in, place_of, found, numbered=numbered)
         small = [replace(one, sparse=_within(workspace.root, one.sparse)) for one in left_out]
-        beside = tuple(
-            _within(workspace.root, workspace.sparse / str(part.colmap_index))
-            for one in made
-            if numbered
-            for part in _others(one)
-        )
-        write_record(partial[0], _Made(models=tuple(made), fragments=tuple(small), gaps=gaps, beside=beside))
+        write_record(partial[0], _Made(models=tuple(made), fragments=tuple(small), gaps=gaps))
+
+    def beside() -> Iterable[Path]:
+        return [workspace.sparse, *workspace.trajectories(), *workspace.report_data.glob("model_*.json")]
 
     depends = {
         "recording": {name: getattr(recording, name) for name in ("imu", "timing", "doubts")},
@@ -160,29 +157,13 @@ def run_models(
         "numbered": numbered,
         "found": [] if submodels.after else [fingerprint(folder) for folder in found.values()],
     }
-    _forget_where_gone(record, workspace.root)
-    session.runner.run("metric", depends, [record], work, after=submodels.after)
+    session.runner.run("metric", depends, [record], work, after=submodels.after, beside=beside)
     said = read_record(record, _Made)
     models = tuple(
         ModelResult(**{f.name: getattr(one, f.name) for f in fields(one)}).within(workspace.root) for one in said.models
     )
     remove_stale_dense(workspace, {one.index: one.sparse_metric for one in models if one.sparse_metric is not None})
     return models, tuple(replace(one, sparse=workspace.root / one.sparse) for one in said.fragments), said.gaps
-
-
-def _forget_where_gone(record: Path, root: Path) -> None:
-    """A record of models of which something is no longer there counts for nothing."""
-    if not record.is_file():
-        return
-    try:
-        said = read_record(record, _Made)
-    except FormatError:
-        said = _Made(models=(), fragments=())
-    models, paths = said.models, list(said.beside)
-    paths += [path for one in models for path in (one.sparse_metric, one.trajectory) if path is not None]
-    paths += [motion_file(one.trajectory) for one in models if one.trajectory is not None]
-    if not models or not all((root / path).exists() for path in paths):
-        remove(record)
 
 
 def _select_models(found: Mapping[int, Path], *, keep: bool) -> tuple[list[int], list[Fragment]]:
@@ -399,11 +380,10 @@ def run_validation(
                 write_record(partial[0], _Checked(found=found))
 
         record = session.workspace.stamps / f"validated_{model.index}.json"
-        if record.is_file() and not pictures.is_dir() and read_record(record, _Checked).found is not None:
-            remove(record)  # the pictures went while there was no such model or target
         after = ["metric", *session.runner.of("frames", "images")]
         depends = {"target": target.spec, "images": [] if len(after) > 1 else fingerprint(images)}
-        session.runner.run(f"validation_{model.index}", depends, [record], work, after=after)
+        step = f"validation_{model.index}"
+        session.runner.run(step, depends, [record], work, after=after, beside=partial(list, [pictures]))
         check = read_record(record, _Checked).outcome()
         said = f"scale error {check.scale_error_pct:+.3f} %" if isinstance(check, Validation) else str(check)
         log.info("model %d: %s against %s", model.index, said, target.spec)

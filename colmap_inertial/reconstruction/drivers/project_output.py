@@ -101,9 +101,7 @@ def place_project(
         "project": fingerprint(project),
         "source": source,
     }
-    if not workspace.placed.is_file() or not all(os.path.lexists(path) for path in list_placed_paths(workspace)):
-        session.runner.forget("apply")
-    session.runner.run("apply", depends, [], work)
+    session.runner.run("apply", depends, [], work, beside=lambda: [workspace.placed, *list_placed_paths(workspace)])
     return workspace.root
 
 

@@ -186,9 +186,11 @@ def report_result(
         return dataclasses.replace(result, report=report, unchanged=True)
     with _failures_logged("the report"):
         # what a stopped run left there must not stand for this one
-        for old in (workspace.report, workspace.report.with_suffix(".json")):
+        pages = workspace.report, workspace.report.with_suffix(".json")
+        for old in pages:
             remove(old)
         result = dataclasses.replace(result, report=write_report(workspace.root, result=content))
+        session.runner.record("report", pages)
     session.finish(content)
     return result
 

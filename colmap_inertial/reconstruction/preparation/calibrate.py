@@ -302,7 +302,9 @@ def _small_models(
         match_features(features, database, pairs, context)
     else:
         verify_again(matched / "database.db", database, pairs, stages, context)
-    map_images(database, images, sparse, replace(_SMALL, refine_intrinsics=capture.camera is None), context)
+    # COLMAP's mapper adds up in another order with several threads, and the rest of a run would follow it
+    alone = replace(context, num_threads=1)
+    map_images(database, images, sparse, replace(_SMALL, refine_intrinsics=capture.camera is None), alone)
     models = [read_model(folder) for folder in find_models(sparse).values()]
     return tuple(sorted(models, key=lambda model: -int(model.num_reg_images())))
 

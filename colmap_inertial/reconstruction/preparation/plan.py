@@ -405,7 +405,7 @@ def _decided(
         return replace(plan, deblur_note=f"frames stay as they were filmed: the gyroscope predicts {most} of blur")
     verdict = judge_frames(view, capture, chosen, parallaxes, progress)
     note = f"{sum(d.action == 'deblur' for d in decisions)} of {len(decisions)} frames are blurred; {verdict.reason}"
-    used = {name: parallaxes[name] for name in _select_blurred(decisions) if name in parallaxes}
+    used = {name: parallaxes[name] for name in sorted(_select_blurred(decisions)) if name in parallaxes}
     if used:
         note += f"; the camera's translation is counted in for {len(used)} frames"
     if plan.method in _SAID_OF and verdict.trusted is not False:

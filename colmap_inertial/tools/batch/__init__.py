@@ -24,6 +24,7 @@ from colmap_inertial.core.options import BatchOptions, ReconstructOptions, Stage
 from colmap_inertial.core.printing import cell
 from colmap_inertial.io.files import StrPath, locked, remove_temporaries, write_json, write_text
 from colmap_inertial.pipeline.run.config import config_as_toml
+from colmap_inertial.pipeline.run.workspace import refuse_links
 from colmap_inertial.tools.batch.manifest import BatchCapture, check_unique, read_manifest
 from colmap_inertial.tools.batch.pools import Pending, dask_pool, local_pool, shares_of_this_machine
 from colmap_inertial.tools.batch.task import (
@@ -174,6 +175,7 @@ def _owned(out: Path) -> Iterator[str]:
     status = out / "status"
     if out.exists() and not (out.is_dir() and (status.is_dir() or not any(out.iterdir()))):
         raise OutputExistsError(f"{out} is no batch's folder; choose a new one")
+    refuse_links(out)
     busy = f"another batch is at work in {out}; wait for it or choose another folder"
     with contextlib.ExitStack() as held:
         try:

@@ -24,6 +24,7 @@ from colmap_inertial.core.errors import FormatError, InertialError, OutputError,
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, StageNames
 from colmap_inertial.io.files import read_json, write_json
 from colmap_inertial.pipeline.run.config import read_config
+from colmap_inertial.pipeline.run.runner import find_loss
 from colmap_inertial.pipeline.run.workspace import Workspace
 
 State = Literal["waiting", "running", "done", "failed", "interrupted"]
@@ -168,8 +169,12 @@ def find_earlier_end(task: CaptureTask) -> CaptureStatus | None:
         return None
     status = CaptureStatus(name=task.name) if known is None else known
     try:
-        result, job = read_json(workspace.result), read_config(task.config, Job)
-        if result.get("waiting"):
+        job = read_config(task.config, Job)
+        try:
+            result = read_json(workspace.result)
+        except FormatError:
+            return None  # damaged: it is made again
+        if result.get("waiting") or find_loss(workspace, [*result.get("seconds", ()), "report"]):
             return None
         made_from = Path(str(read_json(workspace.stamps / "capture.json").get("capture")))
         project = result.get("project", _plain(ProjectOptions()))

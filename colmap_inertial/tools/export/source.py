@@ -21,6 +21,7 @@ from colmap_inertial.io.frames import read_frame_timing
 from colmap_inertial.io.positions import positions_in_pictures
 from colmap_inertial.model import read_model
 from colmap_inertial.model.nerf import NO_SCALE, NO_UP
+from colmap_inertial.pipeline.run.runner import explaining_losses, find_change
 from colmap_inertial.pipeline.run.workspace import Workspace, a_record_of_ours, places_of
 from colmap_inertial.pipeline.stages.metric import motion_file
 from colmap_inertial.reconstruction.preparation.geolocation import georeference_path, positions_of, read_georeference
@@ -94,7 +95,7 @@ class ExportSource:
         Raises
         ------
         FormatError
-            Where one is missing.
+            Where one is missing, or is not as the run wrote it.
         """
         places = places_of(out)
         folders = self.found.images if kind == "rectified" else (places.seen, *self.found.images)
@@ -112,7 +113,15 @@ class ExportSource:
             for name in changed:
                 bent = self.treated[name][1]
                 filmed[name] = Picture(path=capture.path, filmed=True, agrees=not bent)
-        return {name: filmed.get(name) or self._picture(places.rectified, folders, name) for name in names}
+        found = {name: filmed.get(name) or self._picture(places.rectified, folders, name) for name in names}
+        changed_since = find_change(Workspace(out), (picture.path for picture in found.values()))
+        if changed_since is not None:
+            raise FormatError(
+                changed_since,
+                "is not as its run wrote it: start that again, it makes it again; or say where the pictures are: "
+                "--image-folder",
+            )
+        return found
 
     def _picture(self, rectified: Path, folders: tuple[Path, ...], name: str) -> Picture:
         paths = (path_in(folder, name, self.found.folder) for folder in folders if folder.is_dir())
@@ -151,22 +160,23 @@ def read_source(
     NotObservableError
         Where the model has no scale.
     """
-    found = find_source(out, model, images=image_folder)
-    if found.scale.unit != "m" and not unscaled:
-        why = "; ".join(found.scale.reasons) or "this model was never given one"
-        raise NotObservableError("scale", f"{why}; --unscaled exports it in its own units")
-    reconstruction = read_model(found.folder)
-    down, motion = found.down_in_world, None
-    if found.scale.unit == "m" and found.trajectory is not None and motion_file(found.trajectory).is_file():
-        motion = read_record(motion_file(found.trajectory), CameraMotion)
-    return ExportSource(
-        found=found,
-        model=reconstruction,
-        up_in_world=_up(found, reconstruction),
-        gravity_in_world_m_s2=down,
-        motion=motion,
-        treated=_treated(Workspace(out)),
-    )
+    with explaining_losses(Workspace(out)):
+        found = find_source(out, model, images=image_folder)
+        if found.scale.unit != "m" and not unscaled:
+            why = "; ".join(found.scale.reasons) or "this model was never given one"
+            raise NotObservableError("scale", f"{why}; --unscaled exports it in its own units")
+        reconstruction = read_model(found.folder)
+        down, motion = found.down_in_world, None
+        if found.scale.unit == "m" and found.trajectory is not None and motion_file(found.trajectory).is_file():
+            motion = read_record(motion_file(found.trajectory), CameraMotion)
+        return ExportSource(
+            found=found,
+            model=reconstruction,
+            up_in_world=_up(found, reconstruction),
+            gravity_in_world_m_s2=down,
+            motion=motion,
+            treated=_treated(Workspace(out)),
+        )
 
 
 def find_georeference(out: Path, source: ExportSource, capture: Capture | None) -> Georeference:

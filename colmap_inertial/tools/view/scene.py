@@ -14,6 +14,8 @@ from colmap_inertial.core.types import DOWN_IN_WORLD
 from colmap_inertial.io.files import path_in
 from colmap_inertial.io.trajectories import read_tum
 from colmap_inertial.model import read_model
+from colmap_inertial.pipeline.run.runner import explaining_losses
+from colmap_inertial.pipeline.run.workspace import Workspace
 from colmap_inertial.tools.view.clouds import Cloud, Mesh, centre_and_reach, dense_cloud, read_mesh, sparse_cloud
 from colmap_inertial.tools.view.measure import round_length
 from colmap_inertial.tools.view.sources import KnownDistance, ScaleFacts, TargetFacts, ViewSource, find_source
@@ -193,8 +195,9 @@ def load_scene(out: Path, *, model: int | None = None, images: Path | None = Non
     """
     if max_points < 1:
         raise ValueError(f"max_points must be positive, not {max_points}")
-    source = find_source(Path(out), model, images=images)
-    reconstruction = read_model(source.folder)
+    with explaining_losses(Workspace(Path(out))):
+        source = find_source(Path(out), model, images=images)
+        reconstruction = read_model(source.folder)
     cameras = _cameras(reconstruction)
     if source.fused is not None and source.fused.is_file():
         cloud = dense_cloud(source.fused, max_points)

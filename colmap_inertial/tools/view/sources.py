@@ -17,7 +17,7 @@ from colmap_inertial.core.types import LengthUnit
 from colmap_inertial.io.files import path_in, read_json, reader
 from colmap_inertial.model import TRANSFORM_FILE, find_models, is_metric, model_format
 from colmap_inertial.model.similarities import similarity_from_json
-from colmap_inertial.pipeline.run.workspace import Workspace, a_record_of_ours, places_of
+from colmap_inertial.pipeline.run.workspace import Workspace, a_record_of_ours, places_of, refuse_links
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -154,6 +154,8 @@ def find_source(out: Path, index: int | None = None, *, images: Path | None = No
         raise FormatError(images, "no such folder of images")
     given = () if images is None else (images,)
     workspace = Workspace(out)
+    if workspace.result.is_file() or workspace.stamps.is_dir():
+        refuse_links(out)
     if workspace.result.is_file() and model_format(out) is None:
         return _find_in_result(workspace, index, given)
     if workspace.stamps.is_dir():
@@ -165,7 +167,12 @@ def find_source(out: Path, index: int | None = None, *, images: Path | None = No
 
 def _find_in_result(workspace: Workspace, index: int | None, given: tuple[Path, ...]) -> ViewSource:
     root = workspace.root
-    record = read_json(workspace.result)
+    try:
+        record = read_json(workspace.result)
+    except FormatError as error:
+        raise FormatError(
+            root, f"its result is damaged ({error}); start its run again, which writes it again"
+        ) from None
     with a_record_of_ours(workspace.result):
         models = {int(m["index"]): m for m in record.get("models", [])}
         if not models:
@@ -175,9 +182,11 @@ def _find_in_result(workspace: Workspace, index: int | None, given: tuple[Path, 
         fields = models[chosen]
         metric = fields["sparse_metric"] is not None
         place = str(fields["sparse_metric"] if metric else fields["sparse"])
-        # of an existing project, COLMAP's own model lies where the user's project is; it is only read
-        elsewhere = not metric and record.get("project") is not None and Path(place).is_absolute()
-        folder = Path(place) if elsewhere else path_in(root, place, workspace.result)
+        if Path(place).is_absolute():
+            raise FormatError(
+                root, f"has no model of its own, as its scale was refused: give the project that it is of ({place})"
+            )
+        folder = path_in(root, place, workspace.result)
         scale = _estimated(fields, "m" if metric else "model")
         gravity = fields["gravity_in_world_m_s2"]
         down = None if gravity is None else np.array(gravity, dtype=np.float64).reshape(3)
@@ -194,7 +203,7 @@ def _find_in_result(workspace: Workspace, index: int | None, given: tuple[Path, 
             others=tuple(models),
             scale=scale,
             down_in_world=down,
-            images=(*given, *places_of(root).images, *_image_folders(folder)),
+            images=(*given, *places_of(root).images, *(f for f in _image_folders(folder) if root in f.parents)),
             fused=path_in(root, fused, workspace.result) if fused else None,
             mesh=path_in(root, mesh, workspace.result) if mesh else None,
             trajectory=path_in(root, path_file, workspace.result) if path_file else None,
@@ -233,14 +242,19 @@ def _find_in_project(out: Path, index: int | None, given: tuple[Path, ...]) -> V
         ci95 = (1 / factor, factor) if sigma > 0 else None
         scale = replace(scale, unit="m", metres_per_unit=similarity.scale, relative_ci95=ci95)
         on_axis = bool(similarity.cov[1:4, 1:4].any())
-    single = len(models) == 1
+    single, beside = len(models) == 1, _image_folders(folder)
+    linked = [one for one in beside if _leads_out(out, one)]
+    if linked and not given:
+        raise FormatError(
+            linked[0], f"is a link out of the project; give {linked[0].resolve()} as --images (export: --image-folder)"
+        )
     return ViewSource(
         folder=folder,
         index=chosen,
         others=tuple(models),
         scale=scale,
         gravity_on_axis=on_axis,
-        images=(*given, *_image_folders(folder)),
+        images=(*given, *(one for one in beside if one not in linked)),
         fused=_beside(out, chosen, single, "fused.ply"),
         mesh=_beside(out, chosen, single, "meshed-tsdf.ply") or _beside(out, chosen, single, "meshed-poisson.ply"),
     )
@@ -305,6 +319,12 @@ def _target(fields: Mapping[str, Any]) -> TargetFacts | None:
 def _image_folders(folder: Path) -> list[Path]:
     """Where COLMAP's projects have the images of a model."""
     return [place / "images" for place in (folder, *folder.absolute().parents[:3])]
+
+
+def _leads_out(out: Path, folder: Path) -> bool:
+    """Whether a folder in a project is a link out of it: that may be a stranger's, and the images there one's own."""
+    top = out.resolve()
+    return folder.parent.resolve().is_relative_to(top) and not folder.resolve().is_relative_to(top)
 
 
 def _beside(out: Path, index: int, single: bool, name: str) -> Path | None:
