@@ -13,7 +13,7 @@ import pytest
 from box_project import pictures, shared_box, with_exif, write_model, write_video
 
 from colmap_inertial.cli import main
-from colmap_inertial.core.errors import FormatError, InertialError, TimingError
+from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError, TimingError
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.io import sensor_yaml, video_match
@@ -308,7 +308,9 @@ def test_a_refused_project_is_named_from_anywhere(box, tmp_path, monkeypatch):
     monkeypatch.chdir(box.root.parent)
     out = tmp_path / "out"
     source = ProjectOptions(imu=described, images=Path(box.root.name) / "images")
-    result = reconstruct_project(Path(box.root.name), out, source)
+    with pytest.raises(NotObservableError, match="a gyroscope alone"):
+        reconstruct_project(Path(box.root.name), tmp_path / "stopped", source)
+    result = reconstruct_project(Path(box.root.name), out, source, ReconstructOptions(force=True))
     assert result.models[0].scale.verdict == "refused"
     stored = json.loads((out / "result.json").read_text())
     assert stored["models"][0]["sparse"] == str(box.root / "sparse" / "0")

@@ -68,6 +68,8 @@ class Scale(DeviceCommand, SourceReader):
 
     first_s: float | None = None
     """Use only this many seconds from the start of the camera's recording."""
+    force: bool = False
+    """Go on where `diagnose` finds an error; the scale is weak at most."""
     options: Annotated[ScaleOptions, arg(name="")] = dataclasses.field(default_factory=ScaleOptions)
     config: Path | None = None
     """TOML file as OUT/config.toml of a reconstruction: its [scale] table counts; options given here override it."""
@@ -81,7 +83,8 @@ class Scale(DeviceCommand, SourceReader):
         from colmap_inertial.reconstruction.drivers.sources import scale_as_json, scale_source
 
         calibration = self.add_remembered(self.calibration, self.imu or self.source)
-        estimate = scale_source(self.read_from(calibration), self.options, json=self.json_file, first_s=self.first_s)
+        source = self.read_from(calibration)
+        estimate = scale_source(source, self.options, json=self.json_file, first_s=self.first_s, force=self.force)
         self.tell(lambda: show_scale(estimate, self.source), scale_as_json(estimate, calibration), written=True)
         return 3 if estimate.verdict == "refused" else 0
 

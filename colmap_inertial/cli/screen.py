@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 _STAGES = {
     "rendering": "Rendering",
     "video": "Video frames",
+    "check": "Recording check",
     "motion": "Camera motion",
     "clocks": "Clocks",
     "selection": "Selection",

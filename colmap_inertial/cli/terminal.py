@@ -41,10 +41,9 @@ def next_command(result: ReconstructResult, source: Path) -> str:
     from colmap_inertial.checks.validate import Validation
 
     out, best = result.workspace.root, result.models[0]
-    if all(model.sparse_metric is None for model in result.models):
-        return shlex.join(["colmap-inertial", "diagnose", str(source)])
-    if isinstance(best.validation, Validation) and not best.validation.within_tolerance:
-        return shlex.join(["colmap-inertial", "diagnose", str(source)])
+    unfit = isinstance(best.validation, Validation) and not best.validation.within_tolerance
+    if unfit or all(model.sparse_metric is None for model in result.models):
+        return f"read {result.workspace.report}: why, and what to record or to mend"
     if best.scale.verdict == "weak" and best.validation is None and best.sparse_metric is not None:
         images = result.workspace.images
         words = ["colmap-inertial", "validate", str(best.sparse_metric), "--images", str(images), "--target"]

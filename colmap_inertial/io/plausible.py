@@ -176,6 +176,8 @@ class PlausibleReadings:
 
 PLAUSIBLE = PlausibleReadings()
 
+_COUNTS = "for raw counts zero and counts_per_unit, by the sensor's data sheet, in capture.toml"
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RawImu:
@@ -319,7 +321,7 @@ def check_gravity(lengths_m_s2: Array, path: Path) -> None:
         )
     raise FormatError(
         path,
-        f"{found}: the unit is wrong, or these are raw counts; set unit under [imu.accel]",
+        f"{found}: the unit is wrong, or these are raw counts; set unit under [imu.accel], and {_COUNTS}",
         code="accel-unit",
     )
 
@@ -330,11 +332,19 @@ def check_rates(gyro_rad_s: Array, path: Path) -> None:
     largest = float(np.abs(gyro_rad_s).max())
     if largest <= PLAUSIBLE.largest_rate_rad_s and median <= PLAUSIBLE.largest_median_rate_rad_s:
         return
+    found = (
+        f"the gyroscope reads up to {largest:.4g} rad/s, half of the time above {median:.3g} (a hand reaches about 5, "
+        f"a sensor ends at {PLAUSIBLE.largest_rate_rad_s:g})"
+    )
+    if pi / 180 * largest > PLAUSIBLE.largest_rate_rad_s or pi / 180 * median > PLAUSIBLE.largest_median_rate_rad_s:
+        raise FormatError(
+            path,
+            f"{found}, too much for deg/s, too: these are raw counts; set unit under [imu.gyro], and {_COUNTS}",
+            code="gyro-unit",
+        )
     raise FormatError(
         path,
-        f"the gyroscope reads up to {largest:.4g} rad/s, half of the time above {median:.3g} (a hand reaches about 5, "
-        f"a sensor ends at {PLAUSIBLE.largest_rate_rad_s:g}): the numbers are in deg/s; "
-        'set unit = "deg/s" under [imu.gyro] in capture.toml',
+        f'{found}: the numbers are in deg/s; set unit = "deg/s" under [imu.gyro] in capture.toml',
         code="gyro-in-deg",
     )
 

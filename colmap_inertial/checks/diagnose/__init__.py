@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
-from colmap_inertial.checks.diagnose import camera, frames, imu
+from colmap_inertial.checks.diagnose import camera, clocks, frames, imu
 from colmap_inertial.checks.diagnose.findings import SEVERITIES, Diagnosis, Finding, FramesInVideo, Recorded, Severity
 from colmap_inertial.core.errors import FormatError, InertialError, TimingError
 from colmap_inertial.core.threads import one_blas_thread
@@ -29,12 +29,14 @@ CHECKS: tuple[Check, ...] = (
     imu.check_delay,
     camera.check_stabilisation,
     camera.check_pose_convention,
+    clocks.check_time_unit,
     camera.check_belonging,
     camera.check_cameras,
-    camera.check_clock_rate,
-    camera.check_coverage,
+    camera.check_gyro_gain,
+    clocks.check_clock_rate,
+    clocks.check_coverage,
     camera.check_declared_rotation,
-    camera.check_even_times,
+    clocks.check_even_times,
     camera.check_focal_length,
     camera.check_accelerometer_sign,
     imu.check_motion_content,

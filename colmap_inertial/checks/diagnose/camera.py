@@ -7,7 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from colmap_inertial.checks.diagnose.findings import UNIT_FACTORS, Finding, Recorded, Severity
+from colmap_inertial.checks.diagnose.clocks import (
+    frame_rate_finding,
+    offset_finding,
+    rate_finding,
+    wrong_time_unit,
+)
+from colmap_inertial.checks.diagnose.findings import UNIT_FACTORS, Finding, Recorded
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply
 from colmap_inertial.core.sampling import subtract_running_mean
@@ -22,10 +28,6 @@ from colmap_inertial.motion.align.conventions import quick_accelerations
 class CameraCheckLimits:
     """When the camera and the gyroscope do not belong together."""
 
-    #: Clock rates: phones keep within 1e-4, action cameras within 1 %; the scale is corrected for what is found.
-    rate: float = 0.003
-    wrong_rate: float = 0.012
-    wrong_frame_rate: float = 0.1
     #: Intervals over which rotations are compared, and how strong the axis must be that turns the wrong way.
     interval_s: float = 0.1
     mirror_share: float = 0.03
@@ -33,23 +35,15 @@ class CameraCheckLimits:
     #: for one another (24, 25, 30, 50, 60 and half or double of them), as the IMU's seconds per second of frames.
     tried_rates: tuple[float, ...] = (0.02, -0.02, 0.03, -0.03, 0.04, -0.04)
     tried_frame_rates: tuple[float, ...] = (0.8, 1.25, 5 / 6, 1.2, 0.5, 2.0, 0.6, 5 / 3)
+    #: A rate that is further off is that of another frame rate.
+    wrong_frame_rate: float = 0.1
     #: Of pictures far apart so many pairs must have been compared for a gyroscope not to belong to them.
     enough_pairs: int = 12
     #: A recording that is shorter may simply not have turned enough.
     enough_s: float = 8.0
-    #: The IMU may miss so many frames, and this share of them; below the last, too little is left.
-    slack_frames: float = 2.0
-    slack_share: float = 0.03
-    least_covered: float = 0.25
     #: A camera-IMU rotation known better than the first, and off by more than the second, is declared wrongly.
     known_rotation_rad: float = 0.2
     other_rotation_rad: float = 0.35
-    #: Parts whose offsets are compared, how far they may be off, and how sharp a part's best offset must be.
-    part_s: float = 3.0
-    part_reach_s: float = 0.4
-    part_step_s: float = 0.01
-    uneven_s: float = 0.05
-    part_explained: float = 0.6
     #: Quick rotation in the picture per rotation measured; translation is slow against it, and makes it a little less
     #: (0.92 to 0.95 in rendered orbits about a desk, 1.00 before a far wall). A standard deviation above the third
     #: tells nothing.
@@ -57,6 +51,10 @@ class CameraCheckLimits:
     usual_gain: tuple[float, float] = (0.88, 1.08)
     gain_sigma: float = 0.05
     least_quick_rad_s: float = 0.03
+    #: What a gyroscope measures per rotation of the camera: consumer sensors keep within 3 %, a focal length of another
+    #: video mode or a wrong factor does not.
+    gyro_gain: tuple[float, float] = (0.85, 1.15)
+    gain_interval_s: float = 0.5
     #: The correlation of visual and inertial acceleration that tells its sign.
     opposite: float = -0.3
 
@@ -64,13 +62,12 @@ class CameraCheckLimits:
 _LIMITS = CameraCheckLimits()
 
 #: What is wrong with a gyroscope's own numbers keeps it from fitting the camera: it is named once.
-_OF_THE_GYROSCOPE = frozenset({*UNIT_FACTORS, "sensors-exchanged", "dead-sensor", "dead-axis"})
+_OF_THE_GYROSCOPE = frozenset({*UNIT_FACTORS, "gyro-unit", "sensors-exchanged", "dead-sensor", "dead-axis"})
 
 
 _MIRRORED = Finding(
     code="gyro-mirrored",
     severity="error",
-    stops=True,
     evidence="the gyroscope fits the camera's rotation better when it is mirrored",
     advice='give the axes of both sensors in capture.toml, for example axes = "-x,y,z" and mirrored = true under '
     "[imu.gyro] and [imu.accel]",
@@ -92,7 +89,7 @@ def check_belonging(recorded: Recorded) -> Iterator[Finding]:
         if _is_mirrored(turning, imu, failed):
             yield _MIRRORED
         return
-    if not isinstance(failed, NotObservableError) or imu is None or turning is None:
+    if not isinstance(failed, NotObservableError) or imu is None or turning is None or wrong_time_unit(recorded):
         return
     if isinstance(recorded.consensus, NotObservableError) and recorded.consensus.quantity == "camera rotation":
         return
@@ -107,7 +104,7 @@ def check_belonging(recorded: Recorded) -> Iterator[Finding]:
         yield Finding(
             code="rotation-too-little",
             severity="warning",
-            evidence=failed.hint,
+            evidence=failed.hint.split(":")[0],
             advice="turn the camera about all three axes while recording; clocks and axes cannot be checked without",
         )
         return
@@ -162,9 +159,9 @@ def _never_fits(recorded: Recorded, turning: CameraTrajectory, failed: NotObserv
     return Finding(
         code="imu-does-not-fit",
         severity="error",
-        stops=True,
-        evidence=failed.hint.split(":")[0],
-        advice="check that this IMU recording belongs to these images, and the gyroscope's columns, axes and unit",
+        evidence=f"{failed.hint.split(':')[0]}; {recorded.clocks}",
+        advice="check that this IMU recording belongs to these images, both time stamps and their units, and the "
+        "gyroscope's columns, axes and unit",
         numbers={"seconds": span_s},
     )
 
@@ -173,6 +170,9 @@ def _find_better_fit(recorded: Recorded, imu: ImuRecording) -> Finding | None:
     """What makes the gyroscope turn as the camera does: another sign, rate, frame rate, or offset."""
     if isinstance(recorded.align(replace(imu, gyro_rad_s=-imu.gyro_rad_s)), Alignment):
         return _MIRRORED
+    elsewhere = recorded.align(imu, any_offset=True)
+    if isinstance(elsewhere, Alignment):
+        return offset_finding(recorded, elsewhere.calibration.clock_offset_s)
     begin_s = imu.gyro_t_s[0]
     for tried in (*(1 + rate for rate in _LIMITS.tried_rates), *_LIMITS.tried_frame_rates):
         # a frame of the same motion lasts longer, so that it turns slower
@@ -180,23 +180,39 @@ def _find_better_fit(recorded: Recorded, imu: ImuRecording) -> Finding | None:
         found = recorded.align(slower)
         if isinstance(found, Alignment):
             rate = tried * (1 + found.calibration.clock_rate)
-            return _rate_finding(rate - 1) if abs(tried - 1) < _LIMITS.wrong_frame_rate else _frame_rate_finding(rate)
-    if recorded.max_offset_s is None:
-        return None
-    found = recorded.align(imu, any_offset=True)
-    if not isinstance(found, Alignment):
-        return None
-    offset_s = found.calibration.clock_offset_s
-    return Finding(
-        code="clock-offset",
-        severity="error",
-        stops=True,
-        evidence=f"camera and gyroscope fit where their stamps are {offset_s:+.3f} s apart, which one clock does not "
-        "allow",
-        advice="leave out shared_clock = true under [timing] in capture.toml, or correct the stamps; a known offset "
-        "goes under [calibration]",
-        numbers={"offset_s": offset_s},
-    )
+            return rate_finding(rate - 1) if abs(tried - 1) < _LIMITS.wrong_frame_rate else frame_rate_finding(rate)
+    return None
+
+
+def check_gyro_gain(recorded: Recorded) -> Iterator[Finding]:
+    """A gyroscope that measures far more, or less, than the camera turned: no sensor's gain is that far off."""
+    aligned, imu, turning = recorded.aligned, recorded.imu, recorded.turning
+    if not isinstance(aligned, Alignment) or imu is None or turning is None:
+        return
+    # pixels that are followed lack the slow rotation, and guessed intrinsics scale what they show
+    if recorded.is_dense or (recorded.trajectory is None and recorded.camera is None):
+        return
+    motion = GyroCamera.of(imu, aligned.calibration, camera_epoch_ns=turning.epoch_ns)
+    poses = turning.select(np.unique(turning.t_s // _LIMITS.gain_interval_s, return_index=True)[1])
+    t_s = poses.t_s - aligned.calibration.drift_s(poses.t_s)
+    usable = motion.covers(t_s[:-1], t_s[1:])
+    inertial, visual = motion.turn_rad(t_s)[usable], poses.turn_rad()[usable]
+    common = float(np.sum(inertial * visual))
+    if len(visual) < _LIMITS.enough_pairs or common <= 0:
+        return
+    # noise of the images lowers the first, noise of the gyroscope raises the second
+    least, most = common / float(np.sum(visual**2)), float(np.sum(inertial**2)) / common
+    if least > _LIMITS.gyro_gain[1] or most < _LIMITS.gyro_gain[0]:
+        gain = (least * most) ** 0.5
+        yield Finding(
+            code="gyro-gain",
+            severity="error",
+            evidence=f"the gyroscope measures {gain:.2f} times the rotation that the images show; sensors are right to "
+            "a few per cent",
+            advice="check the gyroscope's unit and counts_per_unit in capture.toml, and the focal length under "
+            "[camera]; calibrate-imu measures the gain",
+            numbers={"gain": gain},
+        )
 
 
 def _unit_finding(code: str) -> Finding:
@@ -212,7 +228,6 @@ def _unit_finding(code: str) -> Finding:
     return Finding(
         code=code,
         severity="error",
-        stops=True,
         evidence=found,
         advice=f'set unit = "{unit}" under [imu.gyro] in capture.toml',
         numbers={"gain": 1 / factor},
@@ -226,7 +241,6 @@ def check_pose_convention(recorded: Recorded) -> Iterator[Finding]:
         yield Finding(
             code="pose-convention",
             severity="error",
-            stops=True,
             evidence=likely.found,
             advice=likely.advice,
             numbers={"log_likelihood": likely.log_likelihood} if np.isfinite(likely.log_likelihood) else {},
@@ -248,66 +262,6 @@ def _is_mirrored(turning: CameraTrajectory, imu: ImuRecording, aligned: Alignmen
     return bool(np.linalg.det(cross) < 0 and singular[2] > _LIMITS.mirror_share * singular[0])
 
 
-def check_clock_rate(recorded: Recorded) -> Iterator[Finding]:
-    """A camera's clock that runs faster or slower than the IMU's."""
-    aligned = recorded.aligned
-    if isinstance(aligned, Alignment) and aligned.drifts(faster_than=_LIMITS.rate):
-        yield _rate_finding(aligned.calibration.clock_rate)
-
-
-def _rate_finding(rate: float) -> Finding:
-    severity: Severity = "error" if abs(rate) > _LIMITS.wrong_rate else "warning"
-    return Finding(
-        code="clock-rate",
-        severity=severity,
-        evidence=f"the camera's clock runs {100 * rate:+.2f} % faster than the IMU's, and either may be wrong: lengths "
-        "go with the square of time",
-        advice="give frame times as the recorder stamped them, not a frame number divided by a nominal rate; then "
-        "check the stamps of the IMU; up to 1 % is corrected",
-        numbers={"rate": rate},
-    )
-
-
-def _frame_rate_finding(rate: float) -> Finding:
-    """Frame times by a wrong frame rate; ``rate`` is how many seconds of frames the IMU's second is."""
-    return Finding(
-        code="frame-rate",
-        severity="error",
-        stops=True,
-        evidence=f"the frames fit the gyroscope if {rate:.3g} times as many come in a second as are stated: they were "
-        "timed by another frame rate than they were filmed with",
-        advice="give the video itself as [video], or times as the recorder stamped them",
-        numbers={"rate": rate},
-    )
-
-
-def check_coverage(recorded: Recorded) -> Iterator[Finding]:
-    """An IMU that was started late or stopped early."""
-    imu = recorded.imu
-    frames = recorded.timing or recorded.trajectory
-    if imu is None or frames is None or len(frames.t_s) < 3:
-        return
-    sensors = [imu.gyro_t_s, imu.accel_t_s] if imu.has_accel else [imu.gyro_t_s]
-    begin_s, end_s = max(t_s[0] for t_s in sensors), min(t_s[-1] for t_s in sensors)
-    span_s = float(frames.t_s[-1] - frames.t_s[0])
-    slack_s = max(_LIMITS.slack_frames * float(np.median(np.diff(frames.t_s))), _LIMITS.slack_share * span_s)
-    shift_s = recorded.offset_s(frames.epoch_ns)
-    if shift_s is not None:
-        missed_s = max(begin_s + shift_s - frames.t_s[0], 0) + max(frames.t_s[-1] - end_s - shift_s, 0)
-    else:
-        missed_s = span_s - (end_s - begin_s)
-    if missed_s <= slack_s:
-        return
-    share = float(np.clip(1 - missed_s / span_s, 0, 1))
-    yield Finding(
-        code="imu-too-short",
-        severity="error" if share < _LIMITS.least_covered else "warning",
-        evidence=f"the IMU runs along with {100 * share:.0f} % of {span_s:.1f} s of frames",
-        advice="start the IMU before the video and stop it after; the scale rests on what both recorded",
-        numbers={"share": share, "frames_s": span_s, "imu_s": float(end_s - begin_s)},
-    )
-
-
 def check_stabilisation(recorded: Recorded) -> Iterator[Finding]:
     """A picture that was turned against its lens no longer belongs to the gyroscope."""
     advice = "switch stabilisation off in the camera and record again; the scale of such a video is wrong"
@@ -316,7 +270,6 @@ def check_stabilisation(recorded: Recorded) -> Iterator[Finding]:
         yield Finding(
             code="stabilised",
             severity="error",
-            stops=True,
             evidence=f"the recorder says that the video was stabilised in the camera ({said})",
             advice=advice,
         )
@@ -327,7 +280,6 @@ def check_stabilisation(recorded: Recorded) -> Iterator[Finding]:
         yield Finding(
             code="stabilised",
             severity="error",
-            stops=True,
             evidence=f"the pictures hold {100 * told.share:.0f} % of the quick rotation that the gyroscope measured: "
             "the video was stabilised in the camera",
             advice=advice,
@@ -354,62 +306,6 @@ def check_declared_rotation(recorded: Recorded) -> Iterator[Finding]:
             "orientation: cut them without (ffmpeg -noautorotate)",
             numbers={"angle_deg": float(np.degrees(angle))},
         )
-
-
-def check_even_times(recorded: Recorded) -> Iterator[Finding]:
-    """Frame times that drift to and fro against the gyroscope, as those counted from a frame rate do."""
-    aligned, imu, turning = recorded.aligned, recorded.imu, recorded.turning
-    if not isinstance(aligned, Alignment) or imu is None or turning is None:
-        return
-    if float(np.median(np.diff(turning.t_s))) > _LIMITS.part_reach_s / 2:
-        return
-    motion = GyroCamera.of(imu, aligned.calibration, camera_epoch_ns=turning.epoch_ns)
-    middles, offsets = [], []
-    count = int(np.ptp(turning.t_s) / _LIMITS.part_s)
-    for begin_s in turning.t_s[0] + _LIMITS.part_s * np.arange(count):
-        inside = np.flatnonzero((turning.t_s >= begin_s) & (turning.t_s < begin_s + _LIMITS.part_s))
-        middle_s = begin_s + 0.5 * _LIMITS.part_s
-        drift_s = float(aligned.calibration.drift_s(middle_s))
-        found = _part_offset_s(turning.select(inside), motion, drift_s)
-        if found is not None:
-            middles.append(middle_s)
-            offsets.append(found)
-    if len(offsets) < 3:
-        return
-    off = np.array(offsets)
-    off -= np.median(off)
-    worst = int(np.argmax(np.abs(off)))
-    if abs(off[worst]) > _LIMITS.uneven_s:
-        yield Finding(
-            code="frame-times-uneven",
-            severity="error",
-            evidence=f"against the gyroscope, frame times wander by {1e3 * np.ptp(off):.0f} ms; worst "
-            f"{middles[worst] - turning.t_s[0]:.0f} s after the first frame",
-            advice="time frames by the video's presentation stamps or the recorder's own times, never by counting; "
-            "frames that were dropped or repeated must not shift the rest",
-            numbers={"wander_s": float(np.ptp(off)), "parts": float(len(off))},
-        )
-
-
-def _part_offset_s(part: CameraTrajectory, motion: GyroCamera, drift_s: float) -> float | None:
-    """What must be added to a part's offset so that the gyroscope explains it best."""
-    if len(part) < 8:
-        return None
-    visual = part.turn_rad()
-    shifts = np.arange(-_LIMITS.part_reach_s, _LIMITS.part_reach_s + 1e-9, _LIMITS.part_step_s)
-    left = np.full(len(shifts), np.inf)
-    t_s = part.t_s - drift_s - shifts[:, None]
-    covered = motion.covers(t_s[:, 0], t_s[:, -1])
-    difference = visual - motion.turn_rad(t_s[covered])
-    spread = difference - difference.mean(axis=1, keepdims=True)
-    left[covered] = np.median(np.sum(spread**2, axis=2), axis=1)
-    best = int(np.argmin(left))
-    energy = float(np.median(np.sum((visual - visual.mean(axis=0)) ** 2, axis=1)))
-    if best in (0, len(left) - 1) or not np.isfinite(left[best - 1 : best + 2]).all():
-        return None
-    if left[best] > (1 - _LIMITS.part_explained) * energy:
-        return None
-    return float(shifts[best])
 
 
 def check_focal_length(recorded: Recorded) -> Iterator[Finding]:

@@ -22,6 +22,7 @@ from colmap_inertial.core.types import (
     ImuRecording,
     RotationConsensus,
 )
+from colmap_inertial.io.calibration import reset_for_recording
 from colmap_inertial.io.plausible import RawImu
 from colmap_inertial.io.pose_convention import ARRAYS, PoseConvention
 from colmap_inertial.io.units import Axes
@@ -50,8 +51,6 @@ class Finding:
         The same in numbers; units are in the names.
     advice
         What to do.
-    stops
-        Whether it makes a reconstruction in metres meaningless, so that one stops before the work; an error only.
     """
 
     code: str
@@ -59,11 +58,11 @@ class Finding:
     evidence: str
     advice: str
     numbers: Mapping[str, float] = field(default_factory=dict)
-    stops: bool = False
 
-    def __post_init__(self) -> None:
-        if self.stops and self.severity != "error":
-            raise ValueError(f"{self.code}: only an error can stop a reconstruction")
+    @property
+    def sentence(self) -> str:
+        """What was found, and what to do."""
+        return f"{self.evidence}; {self.advice}"
 
     def as_json(self) -> dict[str, object]:
         return {
@@ -96,8 +95,8 @@ class Diagnosis:
 
     @property
     def stopping(self) -> tuple[Finding, ...]:
-        """Those that stop a reconstruction."""
-        return tuple(finding for finding in self.findings if finding.stops)
+        """Those that stop a reconstruction: every error, as it makes a scale wrong or impossible."""
+        return tuple(finding for finding in self.findings if finding.severity == "error")
 
     @property
     def codes(self) -> frozenset[str]:
@@ -137,6 +136,31 @@ class FramesInVideo:
     quarter_turns: int
     container_turn_deg: int
     doubtful: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Clocks:
+    """How long frames and gyroscope run by their own stamps, and how often they come."""
+
+    frames_s: float
+    frame_hz: float
+    imu_s: float
+    imu_hz: float
+
+    def __str__(self) -> str:
+        return (
+            f"the frames span {self.frames_s:.4g} s at {self.frame_hz:.3g} Hz, "
+            f"the gyroscope {self.imu_s:.4g} s at {self.imu_hz:.3g} Hz"
+        )
+
+    @property
+    def unit_factor(self) -> float | None:
+        """Power of 1000 by which the frames' span is too long (or short) for the gyroscope's; ``None`` for none."""
+        ratio = self.frames_s / self.imu_s
+        power = round(float(np.log10(ratio)) / 3)
+        if power == 0 or not 1 / UNIT_SPREAD < ratio / 1000.0**power < UNIT_SPREAD:
+            return None
+        return 1000.0**power
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -214,7 +238,7 @@ class Recorded:
         """
         found, imu, poses = self.consensus, self.imu, self.trajectory
         if imu is not None and poses is not None and isinstance(found, RotationConsensus) and not found.kept.all():
-            together = self._align(poses, imu, self.max_offset_s)
+            together = self._align(poses, imu, self.calibration, self.max_offset_s)
             return poses if isinstance(together, Alignment) else poses.select(found.kept)
         if self.trajectory is not None or self.rotation is None:
             return self.trajectory
@@ -246,6 +270,19 @@ class Recorded:
         return None
 
     @cached_property
+    def clocks(self) -> Clocks | None:
+        """Spans and rates of frames and gyroscope; ``None`` where one of them is missing."""
+        frames = self.timing or self.trajectory
+        if self.imu is None or frames is None or len(frames.t_s) < 3:
+            return None
+        return Clocks(
+            frames_s=float(np.ptp(frames.t_s)),
+            frame_hz=float(1 / np.median(np.diff(frames.t_s))),
+            imu_s=float(np.ptp(self.imu.gyro_t_s)),
+            imu_hz=float(1 / np.median(np.diff(self.imu.gyro_t_s))),
+        )
+
+    @cached_property
     def likely_convention(self) -> LikelyConvention | None:
         """By which other convention the poses fit the IMU; ``None`` where they fit as read, or by none."""
         if self.imu is None or self.trajectory is None or self.turning is None:
@@ -264,17 +301,27 @@ class Recorded:
         """The same with another reading of the gyroscope, or at any offset of the clocks."""
         if self.turning is None:
             return None
-        return self._align(self.turning, imu, None if any_offset else self.max_offset_s)
+        if self.clocks is not None and (self.clocks.unit_factor or 0) > 1:
+            # hours of offsets to search, for frames that mostly have no gyroscope beside them
+            return NotObservableError("time offset", str(self.clocks))
+        known = self.calibration
+        if any_offset and known is not None:
+            known = reset_for_recording(known)
+        return self._align(self.turning, imu, known, None if any_offset else self.max_offset_s)
 
     def _align(
-        self, turning: CameraTrajectory, imu: ImuRecording, max_offset_s: float | None
+        self,
+        turning: CameraTrajectory,
+        imu: ImuRecording,
+        prior: CameraImuCalibration | None,
+        max_offset_s: float | None,
     ) -> Alignment | NotObservableError:
         options = AlignOptions(max_offset_s=max_offset_s)
         if self.trajectory is None:
             # the camera's translation is in the pixels' motion, and no gyroscope explains it
             options = replace(options, min_explained=PIXELS_EXPLAINED)
         try:
-            return align_clocks(turning, imu, prior=self.calibration, options=options)
+            return align_clocks(turning, imu, prior=prior, options=options)
         except NotObservableError as error:
             return error
 
@@ -283,5 +330,7 @@ class Recorded:
 PIXELS_EXPLAINED = 0.5
 #: Numbers of a gyroscope times this are rad/s, where they were in the other unit than they were declared in.
 UNIT_FACTORS = {"gyro-in-deg": np.pi / 180, "gyro-not-in-deg": 180 / np.pi}
+#: Frames and gyroscope of one recording last about equally long: to within this factor, where a unit is wrong.
+UNIT_SPREAD = 5.0
 #: Pictures closer together than this (median) are followed; those further apart are compared two by two.
 FOLLOWED_S = 0.15

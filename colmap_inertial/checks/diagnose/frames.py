@@ -91,6 +91,9 @@ def check_exposure(recorded: Recorded) -> Iterator[Finding]:
     timing, imu = recorded.timing, recorded.imu
     if timing is None or timing.exposure_s is None or imu is None:
         return
+    # rates in another unit tell no blur
+    if recorded.implausible or recorded.wrong_unit is not None:
+        return
     rate = np.linalg.norm(imu.gyro_rad_s - np.median(imu.gyro_rad_s, axis=0), axis=1)
     shift_s = recorded.offset_s(timing.epoch_ns)
     if shift_s is not None:

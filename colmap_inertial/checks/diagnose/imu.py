@@ -160,17 +160,12 @@ def check_plausibility(recorded: Recorded) -> Iterator[Finding]:
         yield refusal(problem)
 
 
-#: Refusals (``io.plausible``) that make a reconstruction in metres meaningless.
-_STOPPING_REFUSALS = ("gravity-removed", "gyro-in-deg", "gyro-not-in-deg")
-
-
 def refusal(error: FormatError) -> Finding:
     """A reader's refusal, whose sentence gives what was found, then what to do."""
     evidence, _, advice = error.reason.partition(": ")
     return Finding(
         code=error.code,
         severity="error",
-        stops=error.code in _STOPPING_REFUSALS,
         evidence=evidence,
         advice=advice or "correct it in the file or in capture.toml",
     )

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
-
-from colmap_inertial.checks.diagnose import Diagnosis, FramesInVideo, Recorded, diagnose, unreadable
+from colmap_inertial.checks.diagnose import Diagnosis, Recorded, diagnose, unreadable
 from colmap_inertial.core.errors import FormatError, InertialError, TimingError
 from colmap_inertial.core.types import CameraTrajectory, FrameTiming
 from colmap_inertial.io.calibration import CalibrationFiles, largest_offset_s, read_for_recording
-from colmap_inertial.io.capture import Capture, ImageFolder, load_capture
+from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.files import write_json
 from colmap_inertial.io.frames import read_frame_times, read_frame_timing
 from colmap_inertial.io.imu import is_capture, read_raw_capture_imu, read_raw_imu
@@ -23,29 +20,13 @@ from colmap_inertial.io.imu_text import is_inertial_scale
 from colmap_inertial.io.plausible import RawImu
 from colmap_inertial.io.pose_convention import ARRAYS, COLMAP, INERTIAL_SCALE, TUM, PoseConvention
 from colmap_inertial.io.trajectories import read_inertial_scale_poses, read_tum
-from colmap_inertial.io.video import decode_grey, video_stamps_ns
-from colmap_inertial.io.video_match import match_to_video
 from colmap_inertial.model import read_model, trajectory_from_model
 from colmap_inertial.pipeline.run.progress import Progress
 from colmap_inertial.reconstruction.drivers.sources import ScaleSource, check_output, only_model
 from colmap_inertial.reconstruction.preparation.plan import add_stated_exposures
-from colmap_inertial.reconstruction.preparation.preflight import compare_pictures, follow_video
+from colmap_inertial.reconstruction.preparation.preflight import find_in_video, measure_images
 
 T = TypeVar("T")
-
-
-@dataclass(frozen=True, kw_only=True)
-class DiagnosisEffort:
-    """How much of a recording ``diagnose`` looks at."""
-
-    #: Frames of a video that are followed by their pixels, and how far apart.
-    frames: int = 400
-    frame_spacing_s: float = 0.03
-    #: Pictures that are looked for in the video they were cut from.
-    pictures_in_video: int = 60
-
-
-_EFFORT = DiagnosisEffort()
 
 
 def diagnose_source(
@@ -60,7 +41,7 @@ def diagnose_source(
     json
         Where to write the findings.
     progress
-        Called with ``"motion"`` and ``"video"``.
+        Called with ``"check"`` and ``"video"``.
 
     Raises
     ------
@@ -181,13 +162,8 @@ def _read_capture(capture: Capture, calibration: CalibrationFiles, progress: Pro
         timing = reading.attempt(lambda: add_stated_exposures(capture, read_frame_timing(capture)))
     if timing is not None:
         known = timing
-        rotation = reading.attempt(
-            lambda: (
-                follow_video(capture, known, _EFFORT.frames, _EFFORT.frame_spacing_s, progress)
-                or compare_pictures(capture, known, progress)
-            )
-        )
-        in_video = reading.attempt(lambda: _find_in_video(capture, known, progress))
+        rotation = reading.attempt(lambda: measure_images(capture, known, progress))
+        in_video = reading.attempt(lambda: find_in_video(capture, known, progress))
     return _recorded(
         reading,
         imu=None if capture.imu is None else lambda: read_raw_capture_imu(capture),
@@ -199,27 +175,4 @@ def _read_capture(capture: Capture, calibration: CalibrationFiles, progress: Pro
         # the readings stay the sensor's own: that is what the checks are about
         **_clock_and_calibration(calibration, [capture]),
         in_video=in_video,
-    )
-
-
-def _find_in_video(capture: Capture, timing: FrameTiming, progress: Progress) -> FramesInVideo | None:
-    """Some of a capture's pictures in the video that they were cut from."""
-    if not isinstance(capture.frames, ImageFolder) or capture.frames.video is None:
-        return None
-    video = capture.frames.video
-    stamps_ns = video_stamps_ns(video)
-    index = np.unique(np.linspace(0, len(timing.names) - 1, _EFFORT.pictures_in_video).astype(np.intp))
-    names = [timing.names[i] for i in index]
-    match = match_to_video(
-        video, capture.frames.folder, names, progress=lambda seen: progress("video", seen, len(stamps_ns))
-    )
-    stated_ns = {timing.names[i]: timing.epoch_ns + round(float(timing.t_s[i]) * 1e9) for i in index}
-    found = [name for name in names if name in match.t_ns]
-    return FramesInVideo(
-        stated_ns=np.array([stated_ns[name] for name in found], dtype=np.int64),
-        found_ns=np.array([match.t_ns[name] for name in found], dtype=np.int64),
-        video_start_ns=int(stamps_ns[0]),
-        quarter_turns=match.quarter_turns,
-        container_turn_deg=next(decode_grey(video))[1],
-        doubtful=len(match.doubtful),
     )

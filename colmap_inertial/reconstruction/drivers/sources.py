@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from colmap_inertial.checks.diagnose import Recorded, diagnose
 from colmap_inertial.checks.validate import (
     Target,
     Validation,
@@ -38,7 +39,14 @@ from colmap_inertial.io.imu import is_capture, read_imu
 from colmap_inertial.io.imu_text import is_inertial_scale
 from colmap_inertial.io.pose_convention import COLMAP, INERTIAL_SCALE, TUM, PoseConvention
 from colmap_inertial.io.trajectories import read_inertial_scale, read_tum
-from colmap_inertial.model import apply_similarity, find_models, is_metric, read_model, trajectory_from_model
+from colmap_inertial.model import (
+    apply_similarity,
+    downgraded,
+    find_models,
+    is_metric,
+    read_model,
+    trajectory_from_model,
+)
 from colmap_inertial.motion.align import AlignOptions, align_camera_imu
 from colmap_inertial.motion.align.conventions import likely_convention
 
@@ -234,6 +242,7 @@ def scale_source(
     *,
     json: Path | None = None,
     first_s: float | None = None,
+    force: bool = False,
 ) -> ScaleEstimate:
     """Estimate the scale of an existing model or trajectory.
 
@@ -247,6 +256,8 @@ def scale_source(
         Where to write it, also when the scale is refused.
     first_s
         Use only the first seconds of the camera's recording, for the alignment too.
+    force
+        Estimate it also where ``diagnose`` finds an error; it is weak at most.
     """
     if json is not None:
         check_output(json, [source.source, source.imu, source.frame_times, *list_paths(source.calibration)])
@@ -256,9 +267,23 @@ def scale_source(
         trajectory = first_seconds(trajectory, first_s, start_s=recording.start_s)
     limit_s = largest_offset_s(recording.shared_clock, options.max_offset_s)
     options = dataclasses.replace(options, max_offset_s=limit_s)
-    estimate = estimate_scale(
-        trajectory, recording.imu, calibration=recording.calibration, options=options, read_as=recording.read_as
+    told = diagnose(
+        Recorded(
+            imu=recording.imu,
+            trajectory=trajectory,
+            read_as=recording.read_as,
+            calibration=recording.calibration,
+            max_offset_s=limit_s,
+        )
     )
+    doubts = tuple(finding.sentence for finding in told.stopping)
+    if doubts and not force:
+        estimate = ScaleEstimate.refused("none", *doubts)
+    else:
+        estimate = estimate_scale(
+            trajectory, recording.imu, calibration=recording.calibration, options=options, read_as=recording.read_as
+        )
+        estimate = downgraded(estimate, doubts)
     notes = (*estimate.notes, *recording.imu.repairs, *recording.notes)
     estimate = dataclasses.replace(estimate, notes=notes)
     if json is not None:

@@ -1,0 +1,194 @@
+"""The stamps of frames against those of the IMU: units, offset, rate, and how much of the frames the IMU covers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from colmap_inertial.checks.diagnose.findings import Finding, Recorded, Severity
+from colmap_inertial.core.types import CameraTrajectory
+from colmap_inertial.imaging.gyro_camera import GyroCamera
+from colmap_inertial.motion.align import Alignment
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClockCheckLimits:
+    """When the clocks of camera and IMU do not keep step."""
+
+    #: Clock rates: phones keep within 1e-4, action cameras within 1 %; the scale is corrected for what is found.
+    rate: float = 0.003
+    wrong_rate: float = 0.012
+    #: The IMU may miss so many frames, and this share of them; below the last, too little is left.
+    slack_frames: float = 2.0
+    slack_share: float = 0.03
+    least_covered: float = 0.25
+    #: Parts whose offsets are compared, how far they may be off, and how sharp a part's best offset must be.
+    part_s: float = 3.0
+    part_reach_s: float = 0.4
+    part_step_s: float = 0.01
+    uneven_s: float = 0.05
+    part_explained: float = 0.6
+
+
+_LIMITS = ClockCheckLimits()
+
+
+def offset_finding(recorded: Recorded, offset_s: float) -> Finding:
+    """Clocks that are further apart than was stated."""
+    if recorded.max_offset_s is not None:
+        stated = f"which one clock (up to {recorded.max_offset_s:g} s apart) does not allow"
+    else:
+        stated = "which the time offset that was given excludes"
+    return Finding(
+        code="clock-offset",
+        severity="error",
+        evidence=f"camera and gyroscope fit where their stamps are {offset_s:+.3f} s apart, {stated}; "
+        f"{recorded.clocks}",
+        advice="leave out shared_clock = true under [timing] in capture.toml (and any time offset), or correct the "
+        "stamps; a known offset goes under [calibration]",
+        numbers={"offset_s": offset_s},
+    )
+
+
+def check_time_unit(recorded: Recorded) -> Iterator[Finding]:
+    """Stamps of frames that are a thousand times those of the gyroscope, or a thousandth: another unit."""
+    clocks = recorded.clocks
+    if clocks is None or not wrong_time_unit(recorded):
+        return
+    assert clocks.unit_factor is not None
+    factor = clocks.unit_factor
+    yield Finding(
+        code="time-unit",
+        severity="error",
+        evidence=f"{clocks}: the frames' times are {factor:g} times too {'long' if factor > 1 else 'short'}, and are "
+        f"in {_TIME_UNITS.get(factor, 'another unit')} where seconds were read",
+        advice="name the unit of the frames' times: name,t_s or t_ms, t_us, t_ns in the CSV's header, or time_unit in "
+        "capture.toml",
+        numbers={"frames_s": clocks.frames_s, "imu_s": clocks.imu_s, "factor": factor},
+    )
+
+
+_TIME_UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
+
+
+def wrong_time_unit(recorded: Recorded) -> bool:
+    """Whether the spans tell of another unit, and no alignment contradicts."""
+    clocks = recorded.clocks
+    return clocks is not None and clocks.unit_factor is not None and not isinstance(recorded.aligned, Alignment)
+
+
+def check_clock_rate(recorded: Recorded) -> Iterator[Finding]:
+    """A camera's clock that runs faster or slower than the IMU's."""
+    aligned = recorded.aligned
+    if isinstance(aligned, Alignment) and aligned.drifts(faster_than=_LIMITS.rate):
+        yield rate_finding(aligned.calibration.clock_rate)
+
+
+def rate_finding(rate: float) -> Finding:
+    severity: Severity = "error" if abs(rate) > _LIMITS.wrong_rate else "warning"
+    return Finding(
+        code="clock-rate",
+        severity=severity,
+        evidence=f"the camera's clock runs {100 * rate:+.2f} % faster than the IMU's, and either may be wrong: lengths "
+        "go with the square of time",
+        advice="give frame times as the recorder stamped them, not a frame number divided by a nominal rate; then "
+        "check the stamps of the IMU; up to 1 % is corrected",
+        numbers={"rate": rate},
+    )
+
+
+def frame_rate_finding(rate: float) -> Finding:
+    """Frame times by a wrong frame rate; ``rate`` is how many seconds of frames the IMU's second is."""
+    return Finding(
+        code="frame-rate",
+        severity="error",
+        evidence=f"the frames fit the gyroscope if {rate:.3g} times as many come in a second as are stated: they were "
+        "timed by another frame rate than they were filmed with",
+        advice="give the video itself as [video], or times as the recorder stamped them",
+        numbers={"rate": rate},
+    )
+
+
+def check_coverage(recorded: Recorded) -> Iterator[Finding]:
+    """An IMU that was started late or stopped early."""
+    imu = recorded.imu
+    frames = recorded.timing or recorded.trajectory
+    if imu is None or frames is None or len(frames.t_s) < 3 or wrong_time_unit(recorded):
+        return
+    sensors = [imu.gyro_t_s, imu.accel_t_s] if imu.has_accel else [imu.gyro_t_s]
+    begin_s, end_s = max(t_s[0] for t_s in sensors), min(t_s[-1] for t_s in sensors)
+    span_s = float(frames.t_s[-1] - frames.t_s[0])
+    slack_s = max(_LIMITS.slack_frames * float(np.median(np.diff(frames.t_s))), _LIMITS.slack_share * span_s)
+    shift_s = recorded.offset_s(frames.epoch_ns)
+    if shift_s is not None:
+        missed_s = max(begin_s + shift_s - frames.t_s[0], 0) + max(frames.t_s[-1] - end_s - shift_s, 0)
+    else:
+        missed_s = span_s - (end_s - begin_s)
+    if missed_s <= slack_s:
+        return
+    share = float(np.clip(1 - missed_s / span_s, 0, 1))
+    yield Finding(
+        code="imu-too-short",
+        severity="error" if share < _LIMITS.least_covered else "warning",
+        evidence=f"the IMU runs along with {100 * share:.0f} % of {span_s:.1f} s of frames",
+        advice="start the IMU before the video and stop it after; the scale rests on what both recorded",
+        numbers={"share": share, "frames_s": span_s, "imu_s": float(end_s - begin_s)},
+    )
+
+
+def check_even_times(recorded: Recorded) -> Iterator[Finding]:
+    """Frame times that drift to and fro against the gyroscope, as those counted from a frame rate do."""
+    aligned, imu, turning = recorded.aligned, recorded.imu, recorded.turning
+    if not isinstance(aligned, Alignment) or imu is None or turning is None:
+        return
+    if float(np.median(np.diff(turning.t_s))) > _LIMITS.part_reach_s / 2:
+        return
+    motion = GyroCamera.of(imu, aligned.calibration, camera_epoch_ns=turning.epoch_ns)
+    middles, offsets = [], []
+    count = int(np.ptp(turning.t_s) / _LIMITS.part_s)
+    for begin_s in turning.t_s[0] + _LIMITS.part_s * np.arange(count):
+        inside = np.flatnonzero((turning.t_s >= begin_s) & (turning.t_s < begin_s + _LIMITS.part_s))
+        middle_s = begin_s + 0.5 * _LIMITS.part_s
+        drift_s = float(aligned.calibration.drift_s(middle_s))
+        found = _part_offset_s(turning.select(inside), motion, drift_s)
+        if found is not None:
+            middles.append(middle_s)
+            offsets.append(found)
+    if len(offsets) < 3:
+        return
+    off = np.array(offsets)
+    off -= np.median(off)
+    worst = int(np.argmax(np.abs(off)))
+    if abs(off[worst]) > _LIMITS.uneven_s:
+        yield Finding(
+            code="frame-times-uneven",
+            severity="error",
+            evidence=f"against the gyroscope, frame times wander by {1e3 * np.ptp(off):.0f} ms; worst "
+            f"{middles[worst] - turning.t_s[0]:.0f} s after the first frame",
+            advice="time frames by the video's presentation stamps or the recorder's own times, never by counting; "
+            "frames that were dropped or repeated must not shift the rest",
+            numbers={"wander_s": float(np.ptp(off)), "parts": float(len(off))},
+        )
+
+
+def _part_offset_s(part: CameraTrajectory, motion: GyroCamera, drift_s: float) -> float | None:
+    """What must be added to a part's offset so that the gyroscope explains it best."""
+    if len(part) < 8:
+        return None
+    visual = part.turn_rad()
+    shifts = np.arange(-_LIMITS.part_reach_s, _LIMITS.part_reach_s + 1e-9, _LIMITS.part_step_s)
+    left = np.full(len(shifts), np.inf)
+    t_s = part.t_s - drift_s - shifts[:, None]
+    covered = motion.covers(t_s[:, 0], t_s[:, -1])
+    difference = visual - motion.turn_rad(t_s[covered])
+    spread = difference - difference.mean(axis=1, keepdims=True)
+    left[covered] = np.median(np.sum(spread**2, axis=2), axis=1)
+    best = int(np.argmin(left))
+    energy = float(np.median(np.sum((visual - visual.mean(axis=0)) ** 2, axis=1)))
+    if best in (0, len(left) - 1) or not np.isfinite(left[best - 1 : best + 2]).all():
+        return None
+    if left[best] > (1 - _LIMITS.part_explained) * energy:
+        return None
+    return float(shifts[best])
