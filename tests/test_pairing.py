@@ -252,7 +252,7 @@ def search_of(headings, way, names=(), covisibility=None):
     )
 
 
-def closing(monkeypatch, seen, votes, *, centre=None, said=None, also=()):
+def closing(monkeypatch, seen, votes, *, centre=None, said=None, also=(), given=()):
     """Close loops among 40 frames a second apart, of which ``seen`` gives rotation and coverage of verified pairs.
 
     What the matches say of where the second frame is: ``said``, or as it is on the way through ``centre``.
@@ -289,7 +289,7 @@ def closing(monkeypatch, seen, votes, *, centre=None, said=None, also=()):
     monkeypatch.setattr(loops, "localise_frames", returned)
     monkeypatch.setattr(loops, "delete_matches", lambda database, pairs: forgotten.extend(pairs))
     search = search_of(headings, way, names, Counted())
-    found = search.close_loops(matched.extend, doubtful=also, neighbours=[(0, 1)])
+    found = search.close_loops(matched.extend, doubtful=also, neighbours=[(0, 1)], given=given)
     assert matched[0] == (0, 1) and len(set(matched)) == len(matched) == found.candidates + 1
     return found, forgotten
 
@@ -298,6 +298,21 @@ def test_a_place_that_is_seen_again_closes_a_loop(monkeypatch):
     again = {(a, b) for a in range(3) for b in range(37, 40)}
     found, _ = closing(monkeypatch, lambda a, b: (0, 0.9) if (a, b) in again else None, lambda a, b: 20 * (b - a > 36))
     assert set(found.closed) <= again and len(found.closed) >= 6
+
+
+def test_loops_of_others_need_no_votes_and_are_judged(monkeypatch):
+    again = [(a, b) for a in range(3) for b in range(37, 40)]
+    copies = [(a, b) for a in (5, 6) for b in (25, 26)]
+    found, forgotten = closing(
+        monkeypatch, lambda a, b: (0 if b > 30 else 60, 0.9), lambda a, b: 0, given=[*again, *copies]
+    )
+    assert set(again) <= set(found.closed) and not set(copies) & set(found.closed)
+    assert {(f"{a:04}", f"{b:04}") for a, b in copies} <= set(forgotten)
+    # one alone is not believed where nothing beside it can be matched
+    found, forgotten = closing(
+        monkeypatch, lambda a, b: (0, 0.9) if (a, b) == (0, 39) else None, lambda a, b: 0, given=[(0, 39)]
+    )
+    assert found.closed == () and ("0000", "0039") in forgotten
 
 
 def test_neighbours_that_may_be_copies_stay_where_they_pass_as_loops(monkeypatch):

@@ -9,7 +9,7 @@ ICRA 2018), only those with by far the most matches behind them stay.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -144,6 +144,7 @@ class LoopSearch:
         *,
         doubtful: Sequence[FramePair],
         neighbours: Sequence[FramePair],
+        given: Sequence[FramePair] = (),
     ) -> Loops:
         """Match pairs that may close a loop; the matches of those that are not accepted leave the database again.
 
@@ -156,13 +157,16 @@ class LoopSearch:
         neighbours
             Pairs that are matched and not judged; in one go with candidates, as COLMAP indexes the features of all
             images anew each time.
+        given
+            Pairs that somebody else matched as loops: candidates without quick matches, which bear each other out.
         """
         keys = key_frames(self.orientations.t_s)
         i, j = keys[np.stack(np.triu_indices(len(keys), 1))]
         i, j = (frames[j - i >= self.nearest] for frames in (i, j))
         i, j = (frames[~apart] for apart in [self._surely_apart(i, j)] for frames in (i, j))
         chosen = candidates(self.covisibility.count(i, j), i, j)
-        voted = set(zip(i[chosen].tolist(), j[chosen].tolist(), strict=True))
+        possible = set(itertools.compress(given, ~self._surely_apart(*split_pairs(given))))
+        voted = possible.union(zip(i[chosen].tolist(), j[chosen].tolist(), strict=True))
         a, b = split_pairs(doubtful)
         alike = ~self._surely_apart(a, b)
         alike[alike] = self.covisibility.count(a[alike], b[alike]) >= _LIMITS.least_quick_matches
@@ -171,7 +175,7 @@ class LoopSearch:
         verified, poses = self._judge(first)
         likely = sorted(poses)
         step = max(1, int(np.median(np.diff(keys))) // 2) if len(keys) > 1 else 1
-        beside = {pair: self._pairs_beside(pair, step) for pair in likely}
+        beside = {pair: self._pairs_beside(pair, step) | _within(step, pair, possible) for pair in likely}
         more = sorted(set().union(*(beside[pair] for pair in likely if pair in voted)) - set(first))
         match(more)
         verified_beside, poses_beside = self._judge(more)
@@ -179,7 +183,9 @@ class LoopSearch:
         enough = _LIMITS.least_witnesses
         closed = {pair for pair in consistent & set(likely) if len(beside[pair] & consistent) >= enough}
         closed |= set().union(*(beside[pair] & consistent for pair in closed))
-        delete_matches(self.database, name_pairs(self.names, [pair for pair in [*first, *more] if pair not in closed]))
+        delete_matches(
+            self.database, name_pairs(self.names, [pair for pair in [*first, *more, *given] if pair not in closed])
+        )
         return Loops(
             compared=len(i),
             candidates=len(first) + len(more),
@@ -268,6 +274,11 @@ class LoopSearch:
         i, j = pair
         moved = {(i + a * step, j + b * step) for a in (-1, 0, 1) for b in (-1, 0, 1)} - {pair}
         return {(a, b) for a, b in moved if a >= 0 and b < len(self.names) and b - a >= self.nearest}
+
+
+def _within(step: int, pair: FramePair, others: Set[FramePair]) -> set[FramePair]:
+    """Those of other pairs whose frames lie no farther than ``step`` from a pair's."""
+    return {one for one in others - {pair} if max(abs(one[0] - pair[0]), abs(one[1] - pair[1])) <= step}
 
 
 def _squared(off: Array, covariance: Array) -> Array:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import logging
 import shutil
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
+from colmap_inertial.colmap.given_database import can_match, read_matched_pairs
 from colmap_inertial.colmap.gyro_orientations import GyroOrientations, estimate_gyro_orientations
 from colmap_inertial.colmap.loops import LoopSearch, name_pairs, split_pairs
 from colmap_inertial.colmap.relative_track import RelativeTrack, estimate_relative_track
@@ -18,6 +20,7 @@ from colmap_inertial.colmap.two_views import (
     Covisibility,
     FramePair,
     count_verified,
+    delete_matches,
     read_observations,
     read_ray_pairs,
     read_rotations_rad,
@@ -54,6 +57,8 @@ class MatchRecord:
         ``"exhaustive"`` or ``"sequential"``.
     images, pairs
         How many there are, and pairs by the pairing.
+    given
+        Pairs that a given database has matches of.
     far
         Pairs of neighbours far apart in time that were left out, or matched only as candidates for loops: loops are
         sought in their place, where the gyroscope can be used.
@@ -83,6 +88,7 @@ class MatchRecord:
     pairing: str
     images: int
     pairs: int
+    given: int = 0
     far: int = 0
     apart: int = 0
     unlike: int = 0
@@ -94,6 +100,70 @@ class MatchRecord:
     verified: int
     gyroscope: str
     heading_sigma_deg: float | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Pairs:
+    """Pairs of a capture's images: those of the pairing, and those that a given database has matches of.
+
+    Attributes
+    ----------
+    i, j
+        (M,) places in time, the earlier ones first.
+    given
+        Pairs that have matches already.
+    only_given
+        Whether no others can be matched, for want of descriptors.
+    every
+        Whether every pair is there.
+    near
+        Pairs of images no more places apart are neighbours.
+    """
+
+    i: IndexArray
+    j: IndexArray
+    given: Set[FramePair]
+    only_given: bool
+    every: bool
+    near: int
+
+    @classmethod
+    def of(cls, database: Path, names: Sequence[str], options: MappingOptions) -> _Pairs:
+        place = {name: k for k, name in enumerate(names)}
+        pairs = [(place[a], place[b]) for a, b in image_pairs(names, options)]
+        given = read_matched_pairs(database, names)
+        i, j = split_pairs([*pairs, *sorted(given.difference(pairs))])
+        only_given = bool(given) and not can_match(database)
+        every, near = matches_every_pair(len(names), options), _NEAR * options.overlap
+        return cls(i=i, j=j, given=given, only_given=only_given, every=every, near=near)
+
+    @property
+    def count(self) -> int:
+        return len(self.i)
+
+    @cached_property
+    def is_given(self) -> BoolArray:
+        return np.array([pair in self.given for pair in self.where(np.ones(self.count, np.bool_))], dtype=np.bool_)
+
+    @cached_property
+    def close(self) -> BoolArray:
+        """(M,) those that are matched first; of all others, ``far`` ones may be loops, and the rest are neighbours."""
+        return np.isin(self.j - self.i, _CLOSE) & (self.is_given | (not self.only_given))
+
+    @cached_property
+    def far(self) -> BoolArray:
+        return ~np.isin(self.j - self.i, _CLOSE) & (self.j - self.i > self.near) & (not self.every)
+
+    @property
+    def rest(self) -> BoolArray:
+        return ~self.close & ~self.far
+
+    def where(self, which: BoolArray) -> list[FramePair]:
+        return list(zip(self.i[which].tolist(), self.j[which].tolist(), strict=True))
+
+    def may_match(self, pair: FramePair) -> bool:
+        """Whether a pair has matches, or can be matched."""
+        return not self.only_given or pair in self.given
 
 
 def match_capture(
@@ -122,20 +192,15 @@ def match_capture(
     """
     shutil.copyfile(features, database)
     names = recording.timing.names
-    pairs = image_pairs(names, options)
-    every_pair = matches_every_pair(len(names), options)
-    place = {name: k for k, name in enumerate(names)}
-    i, j = split_pairs([(place[a], place[b]) for a, b in pairs])
-    is_close, near = np.isin(j - i, _CLOSE), _NEAR * options.overlap
-    far = ~is_close & (j - i > near) & (not every_pair)
-    rest = ~is_close & ~far
-    close = _list_pairs(i, j, is_close)
-    match_pairs(database, name_pairs(names, close), context, total=len(pairs))
+    pairs = _Pairs.of(database, names, options)
+    close = pairs.where(pairs.close)
+    match_pairs(database, name_pairs(names, close), context, total=pairs.count)
     matched = len(close)
 
     def match(more: Sequence[FramePair]) -> None:
         nonlocal matched
-        total = max(len(pairs), matched + len(more))
+        more = [pair for pair in more if pairs.may_match(pair)]
+        total = max(pairs.count, matched + len(more))
         match_pairs(database, name_pairs(names, more), context, done=total - len(more), total=total)
         matched += len(more)
 
@@ -145,25 +210,28 @@ def match_capture(
         orientations = _estimate_orientations(database, recording, close, camera)
     except NotObservableError as error:
         note = f"not used: {error}"
-        match(_list_pairs(i, j, rest))
+        match(pairs.where(pairs.rest | (pairs.far & pairs.is_given)))
     else:
         note = "the frames turn as the gyroscope does"
         sigma_deg = _largest_sigma_deg(orientations)
         covisibility = Covisibility.of(database, names)
-        near_pairs, counts = _exclude_pairs(orientations, covisibility if every_pair else None, (i[rest], j[rest]))
-        if every_pair:
+        near_pairs, counts = _exclude_pairs(orientations, covisibility if pairs.every else None, pairs)
+        loops = pairs.where(pairs.far & pairs.is_given)
+        delete_matches(database, name_pairs(names, sorted(pairs.given - {*close, *near_pairs, *loops})))
+        if pairs.every:
             match(near_pairs)
         else:
             track = _estimate_track(database, names, close, orientations)
-            search = LoopSearch(database, names, orientations, track, covisibility, near + 1)
-            doubtful = _list_pairs(i, j, far & (j - i <= _NEAR * near))
-            counts |= search.close_loops(match, doubtful=doubtful, neighbours=near_pairs).counts()
+            search = LoopSearch(database, names, orientations, track, covisibility, pairs.near + 1)
+            doubtful = pairs.where(pairs.far & (pairs.j - pairs.i <= _NEAR * pairs.near) & ~pairs.is_given)
+            counts |= search.close_loops(match, doubtful=doubtful, neighbours=near_pairs, given=loops).counts()
     record = MatchRecord(
         device=context.device,
-        pairing="exhaustive" if every_pair else "sequential",
+        pairing="exhaustive" if pairs.every else "sequential",
         images=len(names),
-        pairs=len(pairs),
-        far=int(far.sum()),
+        pairs=pairs.count,
+        given=len(pairs.given),
+        far=int(pairs.far.sum()),
         matched=matched,
         verified=count_verified(database),
         gyroscope=note,
@@ -191,19 +259,19 @@ def _estimate_track(
 
 
 def _exclude_pairs(
-    orientations: GyroOrientations, covisibility: Covisibility | None, pairs: tuple[IndexArray, IndexArray]
+    orientations: GyroOrientations, covisibility: Covisibility | None, pairs: _Pairs
 ) -> tuple[list[FramePair], dict[str, int]]:
-    """Pairs that the gyroscope and, where given, a quick comparison do not exclude; how many these exclude."""
-    i, j = pairs
-    apart = orientations.see_nothing_in_common(i, j)
-    unlike = np.zeros(len(i), dtype=np.bool_)
+    """Neighbours that the gyroscope and a quick comparison do not exclude; how many these exclude.
+
+    There is no quick comparison where there is no ``covisibility``, and of pairs that are matched already.
+    """
+    i, j = pairs.i, pairs.j
+    apart, unlike = np.zeros((2, pairs.count), dtype=np.bool_)
+    apart[pairs.rest] = orientations.see_nothing_in_common(i[pairs.rest], j[pairs.rest])
     if covisibility is not None:
-        unlike[~apart] = covisibility.are_unlike(i[~apart], j[~apart], _LEAST_QUICK_MATCHES)
-    return _list_pairs(i, j, ~apart & ~unlike), {"apart": int(apart.sum()), "unlike": int(unlike.sum())}
-
-
-def _list_pairs(i: IndexArray, j: IndexArray, which: BoolArray) -> list[FramePair]:
-    return list(zip(i[which].tolist(), j[which].tolist(), strict=True))
+        asked = pairs.rest & ~apart & ~pairs.is_given
+        unlike[asked] = covisibility.are_unlike(i[asked], j[asked], _LEAST_QUICK_MATCHES)
+    return pairs.where(pairs.rest & ~apart & ~unlike), {"apart": int(apart.sum()), "unlike": int(unlike.sum())}
 
 
 def _largest_sigma_deg(orientations: GyroOrientations) -> float:

@@ -37,7 +37,7 @@ _PAIR_BYTES = 100_000
 
 
 @contextlib.contextmanager
-def _writing(database: Path) -> Iterator[None]:
+def writing_database(database: Path) -> Iterator[None]:
     """Turn COLMAP's complaint that it cannot open a database of ours into one that says why that is.
 
     Raises
@@ -122,6 +122,27 @@ def extract_features(
     import pycolmap
 
     pycolmap.set_random_seed(context.seed)
+    for batch, reader in register_images(images, cameras, database, context):
+        require_room(database.parent, len(batch) * options.max_num_features * _FEATURE_BYTES)
+        with writing_database(database):
+            pycolmap.extract_features(
+                str(database),
+                str(images),
+                image_names=batch,
+                camera_mode=pycolmap.CameraMode.SINGLE,
+                reader_options=reader,
+                extraction_options=extraction_options(options, context),
+                device=pycolmap.Device(context.device),
+            )
+    return apply_keypoint_stages(database, keypoint_stages)
+
+
+def register_images(
+    images: Path, cameras: Mapping[str, CameraModel | None], database: Path, context: RunContext
+) -> Iterator[tuple[list[str], pycolmap.ImageReaderOptions]]:
+    """Enter images and their cameras into a database, a batch at a time; each with the options to read its images."""
+    import pycolmap
+
     groups: dict[CameraModel | None, list[str]] = {}
     for name, camera in cameras.items():
         groups.setdefault(_intern(camera, groups), []).append(name)
@@ -135,8 +156,7 @@ def extract_features(
         for k in range(0, len(names), _EXTRACTION_BATCH):
             batch = sorted(names)[k : k + _EXTRACTION_BATCH]
             context.progress("features", done, len(cameras))
-            require_room(database.parent, len(batch) * options.max_num_features * _FEATURE_BYTES)
-            with _writing(database):
+            with writing_database(database):
                 # in their order, and not in that in which threads come to their ends: COLMAP numbers them as they come,
                 # and begins its model by the numbers
                 pycolmap.Database.open(str(database)).close()
@@ -147,23 +167,14 @@ def extract_features(
                     camera_mode=pycolmap.CameraMode.SINGLE,
                     options=reader,
                 )
-                pycolmap.extract_features(
-                    str(database),
-                    str(images),
-                    image_names=batch,
-                    camera_mode=pycolmap.CameraMode.SINGLE,
-                    reader_options=reader,
-                    extraction_options=extraction_options(options, context),
-                    device=pycolmap.Device(context.device),
-                )
-            with _writing(database), pycolmap.Database.open(str(database)) as opened:
+            yield batch, reader
+            with writing_database(database), pycolmap.Database.open(str(database)) as opened:
                 first = opened.read_image_with_name(batch[0])
                 if first is None:
                     raise MappingError(f"COLMAP could not read {images / batch[0]}")
                 reader.existing_camera_id = first.camera_id
             done += len(batch)
     context.progress("features", done, len(cameras))
-    return apply_keypoint_stages(database, keypoint_stages)
 
 
 def extraction_options(options: MappingOptions, context: RunContext) -> pycolmap.FeatureExtractionOptions:
@@ -233,14 +244,14 @@ class KeypointRecords:
         return frozenset(record.name for record in self.images if record.rectified)
 
 
-def apply_keypoint_stages(database: Path, stages: Sequence[KeypointStage]) -> KeypointRecords:
-    """Let stages move all keypoints of a database, and record what they did."""
+def apply_keypoint_stages(database: Path, stages: Sequence[KeypointStage], *, store: bool = True) -> KeypointRecords:
+    """Let stages move all keypoints of a database, and record what they did; unless ``store``, only record it."""
     import pycolmap
 
     if not stages:
         return KeypointRecords()
     records = []
-    with _writing(database), pycolmap.Database.open(str(database)) as opened:
+    with writing_database(database), pycolmap.Database.open(str(database)) as opened:
         for image in opened.read_all_images():
             stored = np.array(opened.read_keypoints(image.image_id))
             keypoints = Keypoints(name=image.name, xy_px=stored[:, :2].astype(np.float64))
@@ -250,7 +261,8 @@ def apply_keypoint_stages(database: Path, stages: Sequence[KeypointStage]) -> Ke
                     raise ValueError(f"keypoint stage {stage!r} must keep names, number and order of keypoints")
                 keypoints = moved
             stored[:, :2] = keypoints.xy_px
-            opened.update_keypoints(image.image_id, stored)
+            if store:
+                opened.update_keypoints(image.image_id, stored)
             records.append(
                 KeypointRecord(name=keypoints.name, rectified=keypoints.rectified, treatments=keypoints.treatments)
             )
@@ -280,7 +292,7 @@ def verify_again(
 
     shutil.copyfile(matched, database)
     apply_keypoint_stages(database, keypoint_stages)
-    with _writing(database), pycolmap.Database.open(str(database)) as opened:
+    with writing_database(database), pycolmap.Database.open(str(database)) as opened:
         opened.clear_two_view_geometries()
     match_pairs(database, pairs, context)
 
@@ -301,7 +313,7 @@ def match_pairs(
             context.progress("matches", done, total)
             require_room(database.parent, len(batch) * _PAIR_BYTES)
             listed.write_text("\n".join(batch) + "\n")
-            with _writing(database):
+            with writing_database(database):
                 pycolmap.match_image_pairs(
                     str(database),
                     matching_options=matching_options(context),
@@ -319,7 +331,7 @@ def write_gravity_priors(database: Path, gravity_in_cam: Mapping[str, Array]) ->
 
     if not gravity_in_cam:
         return
-    with _writing(database), pycolmap.Database.open(str(database)) as opened:
+    with writing_database(database), pycolmap.Database.open(str(database)) as opened:
         for image in opened.read_all_images():
             direction = gravity_in_cam.get(image.name)
             if direction is not None:

@@ -7,13 +7,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from colmap_inertial.colmap.given_database import import_features, read_given
 from colmap_inertial.colmap.mapping import MapRecord, map_images
 from colmap_inertial.colmap.pairing import MatchRecord, match_capture
 from colmap_inertial.colmap.sparse import KeypointRecords, extract_features, write_gravity_priors
 from colmap_inertial.core.arrays import Array
-from colmap_inertial.core.options import MappingOptions, ReconstructOptions
+from colmap_inertial.core.options import ReconstructOptions
+from colmap_inertial.core.types import CameraModel
 from colmap_inertial.io.files import read_record, write_record
 from colmap_inertial.pipeline.run.context import Recording, RunContext
+from colmap_inertial.pipeline.run.runner import fingerprint
 from colmap_inertial.pipeline.run.session import Session
 from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
 from colmap_inertial.pipeline.stages.protocols import KeypointStage
@@ -55,14 +58,12 @@ def run_colmap(
     cameras = {record.name: record.camera for record in records if record.used}
 
     def features(partial: Sequence[Path]) -> None:
-        found = extract_features(
-            workspace.colmap_images, cameras, partial[0], mapping, keypoint_stages=stages, context=context
-        )
+        found = _find_features(workspace.colmap_images, cameras, partial[0], stages, options, context)
         write_gravity_priors(partial[0], gravity)
         write_record(partial[1], found)
 
     settings = context.colmap.identity
-    depends = {**_identify_extraction(mapping, context), "stages": stages, "gravity": gravity}
+    depends = {**_identify_extraction(options, context), "stages": stages, "gravity": gravity}
     pairing = {
         **depends,
         "colmap": settings("features", "matches"),
@@ -104,7 +105,32 @@ def run_colmap(
     )
 
 
-def _identify_extraction(mapping: MappingOptions, context: RunContext) -> dict[str, object]:
+def _find_features(
+    images: Path,
+    cameras: Mapping[str, CameraModel | None],
+    database: Path,
+    stages: Sequence[KeypointStage],
+    options: ReconstructOptions,
+    context: RunContext,
+) -> KeypointRecords:
+    """Features of the images into a new database: found here, or those of a database that is given."""
+    if options.database is None:
+        return extract_features(images, cameras, database, options.mapping, keypoint_stages=stages, context=context)
+    given, rectified = read_given(options.database), options.database_images == "rectified"
+    return import_features(
+        given, images, cameras, database, keypoint_stages=stages, rectified=rectified, context=context
+    )
+
+
+def _identify_extraction(options: ReconstructOptions, context: RunContext) -> dict[str, object]:
     """What decides features beside the images."""
-    chosen = [getattr(mapping, name) for name in ("max_image_size", "max_num_features", "first_octave")]
-    return {"extraction": chosen, "colmap": context.colmap.identity("features"), **context.identity()}
+    chosen: list[object] = [options.database_images]
+    if options.database is None:
+        names = ("max_image_size", "max_num_features", "first_octave")
+        chosen = [getattr(options.mapping, name) for name in names]
+    return {
+        "extraction": chosen,
+        "database": None if options.database is None else fingerprint(options.database),
+        "colmap": context.colmap.identity("features"),
+        **context.identity(),
+    }

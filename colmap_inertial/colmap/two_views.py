@@ -328,10 +328,13 @@ class Covisibility:
         with open_features(database) as features:
             for name in names:
                 number = features.images[name].image_id
-                keypoints = np.array(features.database.read_keypoints(number), dtype=np.float64).reshape(-1, 6)
-                size = np.hypot(keypoints[:, 2], keypoints[:, 4])
+                keypoints = np.array(features.database.read_keypoints(number), dtype=np.float64)
+                stored = np.array(features.database.read_descriptors(number).data, dtype=np.uint8)
+                if stored.shape != (len(keypoints), 128):  # others' descriptors are not compared
+                    keypoints, stored = keypoints[:0], stored[:0].reshape(0, 128)
+                # COLMAP keeps an affine shape; others may keep a scale, or nothing beside the place
+                size = np.linalg.norm(keypoints[:, 2::2], axis=1)
                 largest = np.argsort(-size, kind="stable")[: _LIMITS.compared_features]
-                stored = np.array(features.database.read_descriptors(number).data, dtype=np.uint8).reshape(-1, 128)
                 descriptors.append(stored[largest])
                 places.append(keypoints[largest, :2])
         return cls(descriptors=tuple(descriptors), xy_px=tuple(places))

@@ -320,6 +320,12 @@ class ReconstructOptions:
     """Options of COLMAP's own, each as SECTION.option=value, such as Mapper.init_num_trials=100."""
     colmap_project: Path | None = None
     """A project.ini of COLMAP: what differs in it from COLMAP's defaults is used; --colmap goes before it."""
+    database: Path | None = None
+    """A COLMAP database of the capture's images, which is used as far as it goes: keypoints of any kind, matches,
+    verified pairs. It is only read."""
+    database_images: Literal["filmed", "rectified"] | None = None
+    """With --database, where the rolling shutter is corrected: whether its keypoints are those of images as filmed
+    (deblurred or not), or of images that `deblur --rectify` wrote."""
     scale: ScaleOptions = field(default_factory=ScaleOptions)
     """How metres come from the IMU."""
     join: JoinMethod = "inertial"

@@ -10,6 +10,7 @@ from types import EllipsisType
 from colmap_inertial.checks.diagnose import Diagnosis
 from colmap_inertial.checks.report import require_plotly
 from colmap_inertial.checks.validate import Target, parse_target
+from colmap_inertial.colmap.given_database import read_given
 from colmap_inertial.colmap.sparse import check_pair_names, mapping_device
 from colmap_inertial.colmap.steps import run_colmap
 from colmap_inertial.colmap.tsdf import require_mesh_maker
@@ -171,7 +172,13 @@ def _read(path: Path, options: ReconstructOptions, stages: Stages) -> _Given:
     capture = capture if pairs else replace(capture, exposures=None)
     raw = check_imu(read_raw_capture_imu(capture), force=options.force)
     target = None if capture.target is None else parse_target(capture.target)
+    given = None if options.database is None else read_given(options.database)
     timing, frames = read_frames(capture)
+    if given is not None:
+        timing = part_of(timing, given.names_in_time(timing.names))
+        first = next(read_frames(capture, only=timing.names[:1])[1])
+        given.require_size(first.name, first.image.shape[1], first.image.shape[0])
+        _, frames = read_frames(capture, only=timing.names)
     timing = add_stated_exposures(capture, timing)
     require_frames(len(timing.names), of=len(timing.names))
     prior = prior_calibration(capture, options.calibration)
@@ -222,7 +229,9 @@ def _run(session: Session, given: _Given, options: ReconstructOptions, stages: S
     """The steps of a run, from the choice of frames to the dense reconstruction."""
     workspace, capture = session.workspace, given.capture
     recording, frames, timing = given.recording, given.frames, given.recording.timing
-    selection = run_selection(session, recording, options.frames)
+    # whoever made a database chose its frames
+    choice = options.frames if options.database is None else replace(options.frames, use="all")
+    selection = run_selection(session, recording, choice)
     if len(selection.names) < len(timing.names):
         recording = recording.using(part_of(timing, selection.names))
         _, frames = read_frames(capture, only=selection.names)
@@ -239,6 +248,7 @@ def _run(session: Session, given: _Given, options: ReconstructOptions, stages: S
     )
     of_frames = insert_defaults(stages.frame, default_frame_stages(inputs))
     of_keypoints = insert_defaults(stages.keypoint, default_keypoint_stages(inputs))
+    _require_known_images(options, of_keypoints)
     records = run_frames(session, recording, frames, of_frames, workspace.colmap_images, inputs.plan)
     used_timing = part_of(recording.timing, [record.name for record in records if record.used])
     # pairs are chosen by what the capture itself holds: a calibration that is given later maps nothing again
@@ -274,6 +284,16 @@ def _run(session: Session, given: _Given, options: ReconstructOptions, stages: S
         selection=selection,
         seconds=session.runner.seconds,
     )
+
+
+def _require_known_images(options: ReconstructOptions, stages: Sequence[KeypointStage]) -> None:
+    """Ask which images a given database is of, where keypoints are corrected."""
+    if options.database is not None and stages and options.database_images is None:
+        raise InertialError(
+            "--database: the rolling shutter is corrected here. Say --database-images filmed where its keypoints were "
+            "found in images as filmed, rectified where in those of `deblur --rectify`; or leave the correction out "
+            "with --rolling-shutter off"
+        )
 
 
 def _gravity_priors(recording: Recording, options: ReconstructOptions) -> Mapping[str, Array]:

@@ -241,6 +241,7 @@ def _check_options(options: ReconstructOptions) -> None:
     ]
     settings = read_settings(options.colmap, options.colmap_project)
     named += [f"--colmap {text}" for text in settings.of("features", "matches", "mapping", "adjustment")]
+    named += ["--database"] if options.database is not None else []
     named += ["--deblur"] if options.deblur not in (None, "off") else []
     named += ["--rolling-shutter"] if options.rolling_shutter not in (None, "off") else []
     if named:

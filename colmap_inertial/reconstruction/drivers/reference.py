@@ -286,6 +286,8 @@ def reconstruct_by(
     """
     capture, out = Path(capture), Path(out)
     check_reference(reference)
+    if options.database is not None:
+        raise InertialError("--database goes with a capture whose metres come from the IMU; leave it out")
     if any("," in end for end in reference.between or ()):
         raise InertialError(
             "--between with points needs the model that they are of: map first (with a target or two markers), or give "
