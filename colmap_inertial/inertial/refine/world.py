@@ -100,7 +100,8 @@ def state_scale(
     assert inertial is not None
     first, similarity = before.accepted, compose(move, source)
     metres_per_unit = first.metres_per_unit * move.scale
-    variances = world.parts | {"lens": PRIORS.lens**2}
+    # what the refinement does not see: the lens, and which of two clocks is wrong
+    variances = world.parts | {"lens": PRIORS.lens**2, "clocks": (before.parts or {}).get("clocks", 0.0) ** 2}
     if not calibrated:
         variances["accel_gain"] += PRIORS.accel_model**2
     sigma_log = sum(variances.values()) ** 0.5
