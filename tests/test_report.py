@@ -150,7 +150,7 @@ def test_every_section_that_has_data_is_there_and_every_figure_has_its_place(ful
     ]
     places = [attrs["data-figure"] for tag, attrs in page.tags if attrs.get("class") == "plot" and tag == "div"]
     assert places == list(page.figures())
-    assert len(places) == 17
+    assert len(places) == 18
     assert sum(tag == "img" for tag, _ in page.tags) == 3 * 2 + 4
 
 

@@ -54,7 +54,8 @@ upright), ``points_in_model``, ``points`` (``xyz`` as three lists, ``rgb``), ``p
 
 - ``rotation``: ``same_clock_origin``; ``before``: ``camera`` (camera axes) and ``gyroscope`` (its own axes), three
   lines each, rad/s (with ``camera_size`` and ``gyroscope_size`` where they could not be aligned); ``after``: both in
-  camera axes and on the camera's clock, ``rms_difference_rad_s``, ``rms_rate_rad_s``; or ``null``
+  camera axes and on the camera's clock, ``rms_difference_rad_s``, ``rms_rate_rad_s``; or ``null``; ``deviation_deg``:
+  how far each camera of COLMAP's model is turned against those around it, by the gyroscope; or ``null``
 - ``acceleration``: ``camera`` (``camera_unit``) and ``accelerometer`` (m/s2), three lines each: two horizontal
   directions and up, of the IMU's place, without gravity and bias, by second differences averaged over
   ``averaged_over_s``; ``correlation``, ``rms_camera``, ``rms_accelerometer_m_s2``; or missing

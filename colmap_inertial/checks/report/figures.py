@@ -134,6 +134,12 @@ def rotation_after(rotation: dict[str, Any]) -> Figure | None:
     )
 
 
+def deviations(rotation: dict[str, Any]) -> Figure | None:
+    """How far each camera is turned against those around it, by the gyroscope; wrong ones stand out."""
+    line = rotation.get("deviation_deg")
+    return None if line is None else _stack_rows([("camera", CAMERA, [line], "left")], ["deviation"], unit="°")
+
+
 def _convert_to_degrees(
     record: dict[str, Any], sides: Sequence[tuple[str, str]]
 ) -> list[tuple[str, str, list[dict[str, Any]], str]]:

@@ -92,6 +92,10 @@ def signal_record(
         timed = CameraTimedImu.from_recording(imu, calibration, trajectory.epoch_ns)
         imu, aligned = timed.imu, GyroCamera.from_timed(timed)
     record["rotation"] = _compare_rotations(trajectory, imu, rates, aligned, start_s)
+    if estimate.rotations is not None:
+        found = estimate.rotations
+        deviation = np.where(found.judged, found.deviation_deg, np.nan)
+        record["rotation"]["deviation_deg"] = thinned(found.t_s - start_s, deviation)
     no_accel = "The recording has no accelerometer."
     if aligned is None or calibration is None:
         why = "Camera and IMU could not be aligned, so their {} cannot be compared."
@@ -150,6 +154,7 @@ def _compare_rotations(
     near = (raw_s >= before_s[0] - 2) & (raw_s <= before_s[-1] + 2)
     record: Record = {
         "same_clock_origin": bool(overlap),
+        "deviation_deg": None,
         "before": {
             "camera": [thinned(before_s, column) for column in rates.rate_rad_s.T],
             "gyroscope": [thinned(raw_s[near], column[near]) for column in raw.T] if near.sum() > 1 else [],

@@ -52,6 +52,8 @@ class RotationConsensus:
     ----------
     names
         (F,) images.
+    t_s
+        (F,) their times, camera clock.
     judged
         (F,) those that the gyroscope recorded.
     deviation_deg
@@ -63,15 +65,16 @@ class RotationConsensus:
     """
 
     names: tuple[str, ...]
+    t_s: Array
     judged: BoolArray
     deviation_deg: Array
     part: IndexArray
     ref_from_part_xyzw: Array
 
     def __post_init__(self) -> None:
-        check_fields(self, deviation_deg=("F",), ref_from_part_xyzw=("P", 4))
+        check_fields(self, t_s=("F",), deviation_deg=("F",), ref_from_part_xyzw=("P", 4))
         set_fields(self, names=tuple(self.names), part=np.asarray(self.part), judged=np.asarray(self.judged))
-        if not len(self.names) == len(self.judged) == len(self.deviation_deg) == len(self.part):
+        if not len(self.names) == len(self.judged) == len(self.t_s) == len(self.part):
             raise ValueError("one deviation and one part for each camera")
 
     @property
@@ -105,6 +108,7 @@ class RotationConsensus:
         at = np.array([place.get(name, -1) for name in self.names])
         return RotationConsensus(
             names=self.names,
+            t_s=self.t_s,
             judged=np.where(at >= 0, later.judged[at], self.judged),
             deviation_deg=np.where(at >= 0, later.deviation_deg[at], self.deviation_deg),
             part=np.where(at >= 0, later.part[at], self.part),

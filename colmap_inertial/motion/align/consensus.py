@@ -187,6 +187,7 @@ def judge_rotations(
         part[i] = part[placed[np.argmin(np.abs(t_s[placed] - t_s[i]))]] if len(placed) else 0
     return RotationConsensus(
         names=trajectory.names,
+        t_s=trajectory.t_s,
         judged=judged,
         deviation_deg=deviation,
         part=part,
