@@ -9,12 +9,14 @@ import pycolmap
 import pytest
 from box_project import shared_box
 
-from colmap_inertial.core.options import ProjectOptions
+from colmap_inertial.core.options import ProjectOptions, ScaleOptions
 from colmap_inertial.model import read_model
+from colmap_inertial.model.project import apply_to_project
+from colmap_inertial.model.similarities import read_scales
 from colmap_inertial.model.submodels.registration import deregister_images, register_again
 from colmap_inertial.reconstruction.drivers.diagnosis import diagnose_source
 from colmap_inertial.reconstruction.drivers.project import reconstruct_project
-from colmap_inertial.reconstruction.drivers.sources import ScaleSource
+from colmap_inertial.reconstruction.drivers.sources import ScaleSource, scale_source
 
 
 @pytest.fixture(scope="module")
@@ -135,3 +137,16 @@ def test_deregistered_images_leave_the_original_as_it_is(box):
     assert (model.num_reg_images(), rest.num_reg_images()) == (120, 117)
     assert all(point.track.length() >= 2 for point in rest.points3D.values())
     assert all(a < b for a, b in pairwise(sorted(rest.reg_image_ids())))
+
+
+def test_apply_leaves_the_same_images_out(box, tmp_path):
+    name = box.names[60]
+    project = altered(box, tmp_path / "project", [name], 54)
+    source = ScaleSource(source=project / "sparse" / "0", imu=box.imu, frame_times=box.frame_times)
+    estimate = scale_source(source, ScaleOptions(), json=tmp_path / "scale.json")
+    low, high = estimate.ci95
+    assert low < box.recording.truth.metres_per_unit < high
+    applied = apply_to_project(project, tmp_path / "metric", read_scales([str(tmp_path / "scale.json")]))
+    metric = read_model(tmp_path / "metric" / "sparse" / "0")
+    assert {image.name for image in metric.images.values()} == set(box.names) - {name}
+    assert any(name in note for note in applied.notes)

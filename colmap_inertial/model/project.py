@@ -35,6 +35,7 @@ from colmap_inertial.model.layout import WRITERS, Layout, foreign_kind, kind_of,
 from colmap_inertial.model.nerf import cameras_are_those_of
 from colmap_inertial.model.similarities import ModelScale, require_not_joined, similarity_from_json, undoing
 from colmap_inertial.model.soundness import check_binary_model
+from colmap_inertial.model.submodels.registration import deregister_images
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -309,6 +310,12 @@ class _Work:
                 counted = ", ".join(f"{count} {suffix}" for suffix, count in sorted(self._foreign.items()))
                 self._notes.append(f"copied in their old units, as their formats are not transformed: {counted}")
             submodels = plan.layout.submodels
+            for index, scale in plan.by_model.items():
+                if scale.left_out and scale.similarity is not None:
+                    self._notes.append(
+                        f"{submodels[index]}: {len(scale.left_out)} images contradict the gyroscope and were left out: "
+                        f"{', '.join(scale.left_out[:5])}{' ...' if len(scale.left_out) > 5 else ''}"
+                    )
             applied = Applied(
                 out=self._out,
                 models={i: (str(submodels[i]), s) for i, s in plan.by_model.items() if i not in plan.left_out},
@@ -379,6 +386,9 @@ class _Work:
         similarity = plan.one_for_all or plan.by_model[index].similarity
         for suffix in model_formats(source):
             model = read_model(source, suffix)
+            left_out = plan.by_model[index].left_out
+            if left_out and similarity is not None:
+                model = deregister_images(model, left_out)
             if similarity is None:
                 for path in model_files(source, suffix):
                     copy_file(path, target / path.name)

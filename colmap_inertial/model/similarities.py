@@ -30,18 +30,22 @@ class ModelScale:
         Of the scale estimate; ``None`` and empty where the user gave the similarity.
     joined_of
         The sub-models whose images it holds as well since it was joined of them; empty where it is one by itself.
+    left_out
+        Images that are not in the metric model, as they contradict the gyroscope.
     """
 
     similarity: Similarity | None
     verdict: str | None = None
     reasons: tuple[str, ...] = ()
     joined_of: tuple[int, ...] = ()
+    left_out: tuple[str, ...] = ()
 
     def as_json(self) -> dict[str, object]:
         """The fields in JSON types."""
         similarity = None if self.similarity is None else similarity_as_json(self.similarity)
         joined = {"joined_of": list(self.joined_of)} if self.joined_of else {}
-        return {"verdict": self.verdict, "reasons": list(self.reasons), "similarity": similarity, **joined}
+        left_out = {"left_out": list(self.left_out)} if self.left_out else {}
+        return {"verdict": self.verdict, "reasons": list(self.reasons), "similarity": similarity, **joined, **left_out}
 
 
 def similarity_from_json(path: Path, fields: Mapping[str, Any]) -> Similarity:
@@ -245,4 +249,13 @@ def _model_scale(path: Path, fields: Any, world: WorldAxes) -> ModelScale:
             raise FormatError(path, "gravity_in_world_m_s2 is missing: give the number with --factor to scale alone")
         provenance = f"inertial scale, method {estimate.method}, {estimate.verdict}, from {path.name}"
         similarity = Similarity.from_scale(estimate, world=world, provenance=provenance)
-    return ModelScale(similarity=similarity, verdict=estimate.verdict, reasons=estimate.reasons)
+    left_out = () if similarity is None else _left_out(path, fields.get("rotations"))
+    return ModelScale(similarity=similarity, verdict=estimate.verdict, reasons=estimate.reasons, left_out=left_out)
+
+
+def _left_out(path: Path, rotations: Any) -> tuple[str, ...]:
+    """Images that an estimate left out; none where it was made before cameras were compared."""
+    names = [] if rotations is None else rotations.get("left_out") if isinstance(rotations, dict) else None
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise FormatError(path, "rotations: left_out must be a list of image names")
+    return tuple(names)

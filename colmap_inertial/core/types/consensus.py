@@ -83,6 +83,11 @@ class RotationConsensus:
         return np.asarray(self.part == 0)
 
     @property
+    def left_out(self) -> tuple[str, ...]:
+        """Images of all other cameras."""
+        return tuple(name for name, kept in zip(self.names, self.kept, strict=True) if not kept)
+
+    @property
     def wrong(self) -> tuple[WrongCamera, ...]:
         """Cameras that contradict the gyroscope by themselves."""
         return tuple(
@@ -124,5 +129,5 @@ class RotationConsensus:
             "median_deg": float(np.median(judged)) if len(judged) else None,
             "wrong": [{"name": one.name, "deg": one.deviation_deg} for one in self.wrong],
             "seams": [{"before": one.before, "name": one.name, "deg": one.turn_deg} for one in self.seams],
-            "left_out": [name for name, kept in zip(self.names, self.kept, strict=True) if not kept],
+            "left_out": list(self.left_out),
         }

@@ -122,9 +122,9 @@ class InertialStage:
                 second, poses = self._estimate(replace(model, reconstruction=reconstruction))
                 if second.rotations is not None and second.verdict != "refused":
                     estimate, trajectory, found = second, poses, found.updated(second.rotations)
-            kept = {name for name, kept in zip(found.names, found.kept, strict=True) if kept}
-            trajectory = trajectory.select(np.array([name in kept for name in trajectory.names]))
-            model = _without_left_out(model, reconstruction, found, [name for name in again if name in kept])
+            left_out = set(found.left_out)
+            trajectory = trajectory.select(np.array([name not in left_out for name in trajectory.names]))
+            model = _without_left_out(model, reconstruction, found, [name for name in again if name not in left_out])
         if model.rotations is not None and estimate.rotations is not None:
             said = describe_consensus(estimate.rotations)
             notes = (*(note for note in estimate.notes if note not in said), *describe_consensus(model.rotations))
@@ -151,18 +151,20 @@ def _without_left_out(
     model: Model, reconstruction: pycolmap.Reconstruction, found: RotationConsensus, again: Sequence[str]
 ) -> Model:
     """A model of the images that agree with the gyroscope; some of them may have been registered again."""
-    left_out = [name for name, kept in zip(found.names, found.kept, strict=True) if not kept]
     sentences = list(describe_consensus(found))
     if again:
         sentences.append(f"registered again, and right now: {', '.join(again)}")
     reason = "; ".join(sentences)
     log.info("model %d: %s", model.colmap_index, reason)
     done = Treatment(
-        stage="rotations", reason=reason, action="left out", values={"left_out": left_out, "registered_again": again}
+        stage="rotations",
+        reason=reason,
+        action="left out" if found.left_out else "registered again",
+        values={"left_out": found.left_out, "registered_again": again},
     )
     return replace(
         model,
-        reconstruction=deregister_images(reconstruction, left_out),
+        reconstruction=deregister_images(reconstruction, found.left_out),
         rotations=found,
         treatments=(*model.treatments, done),
     )

@@ -484,6 +484,7 @@ def _scales(results: Sequence[ModelResult], fragments: Sequence[Fragment]) -> di
             verdict=result.scale.verdict,
             reasons=result.scale.reasons,
             joined_of=tuple(part.colmap_index for part in result.parts),
+            left_out=() if result.scale.rotations is None else result.scale.rotations.left_out,
         )
         for part in result.parts:
             if part.colmap_index != result.colmap_index:

@@ -32,6 +32,7 @@ from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import path_in
 from colmap_inertial.model import find_models, read_model, trajectory_from_model
 from colmap_inertial.motion.align import AlignOptions, align_clocks
+from colmap_inertial.motion.align.consensus import align_by_consensus
 from colmap_inertial.motion.flow import VisualRotation, check_motion, find_stabilisation
 from colmap_inertial.pipeline.run.context import Recording, RunContext
 from colmap_inertial.pipeline.stages.frame_folder import encode_image, smooth_for_colmap
@@ -209,7 +210,10 @@ def _calibrate_by_pixels(
 
 def _aligned(trajectory: CameraTrajectory, recording: Recording, camera: CameraModel, source: str) -> GyroView:
     options = AlignOptions(max_offset_s=recording.max_offset_s)
-    found = align_clocks(trajectory, recording.imu, prior=recording.prior, options=options)
+    if source == "pixels":
+        found = align_clocks(trajectory, recording.imu, prior=recording.prior, options=options)
+    else:
+        found, _ = align_by_consensus(trajectory, recording.imu, prior=recording.prior, options=options)
     rotation_rad, offset_s = _sigmas(found.calibration)
     if rotation_rad > _LIMITS.usable_rotation_rad or offset_s > _LIMITS.usable_offset_s:
         raise NotObservableError(

@@ -153,6 +153,8 @@ def _measure_parallax(model: pycolmap.Reconstruction, view: GyroView) -> Iterato
     if estimate.metres_per_unit is None or estimate.gravity_in_world_m_s2 is None:
         log.info("no blur by translation: %s", "; ".join(estimate.reasons))
         return
+    if estimate.rotations is not None:
+        trajectory = trajectory.select(estimate.rotations.kept)
     metric = dataclasses.replace(
         trajectory, cam_in_world=trajectory.cam_in_world * estimate.metres_per_unit, length_unit="m", pose_cov=None
     )
