@@ -10,10 +10,10 @@ import pytest
 from box_project import shared_box
 
 from colmap_inertial.core.options import ProjectOptions, ScaleOptions
-from colmap_inertial.model import read_model
+from colmap_inertial.model import deregister_images, read_model
 from colmap_inertial.model.project import apply_to_project
 from colmap_inertial.model.similarities import read_scales
-from colmap_inertial.model.submodels.registration import deregister_images, register_again
+from colmap_inertial.model.submodels.registration import register_again
 from colmap_inertial.reconstruction.drivers.diagnosis import diagnose_source
 from colmap_inertial.reconstruction.drivers.project import reconstruct_project
 from colmap_inertial.reconstruction.drivers.sources import ScaleSource, scale_source

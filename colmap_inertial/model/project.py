@@ -21,6 +21,7 @@ from colmap_inertial.core.types import Similarity
 from colmap_inertial.io.files import StrPath, read_json, write_json
 from colmap_inertial.model import (
     TRANSFORM_FILE,
+    deregister_images,
     is_metric,
     model_files,
     model_formats,
@@ -35,7 +36,6 @@ from colmap_inertial.model.layout import WRITERS, Layout, foreign_kind, kind_of,
 from colmap_inertial.model.nerf import cameras_are_those_of
 from colmap_inertial.model.similarities import ModelScale, require_not_joined, similarity_from_json, undoing
 from colmap_inertial.model.soundness import check_binary_model
-from colmap_inertial.model.submodels.registration import deregister_images
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -83,15 +83,13 @@ _MAP_AGAIN = (
 def check_belonging(recorded: Recorded) -> Iterator[Finding]:
     """Whether at some offset the gyroscope turns as the camera does; if not, whether it would, read otherwise."""
     failed, imu, turning = recorded.aligned, recorded.imu, recorded.turning
-    if recorded.likely_convention is not None:
+    if recorded.lacks_majority or recorded.likely_convention is not None:
         return
     if isinstance(failed, Alignment) and imu is not None and turning is not None:
         if _is_mirrored(turning, imu, failed):
             yield _MIRRORED
         return
     if not isinstance(failed, NotObservableError) or imu is None or turning is None or wrong_time_unit(recorded):
-        return
-    if isinstance(recorded.consensus, NotObservableError) and recorded.consensus.quantity == "camera rotation":
         return
     if recorded.log is not None and recorded.log.stabilised:
         return
@@ -118,7 +116,7 @@ def check_belonging(recorded: Recorded) -> Iterator[Finding]:
 def check_cameras(recorded: Recorded) -> Iterator[Finding]:
     """Whether cameras of a reconstruction contradict the gyroscope."""
     found = recorded.consensus
-    if isinstance(found, NotObservableError) and found.quantity == "camera rotation":
+    if isinstance(found, NotObservableError) and recorded.lacks_majority:
         yield Finding(code="cameras-turned", severity="error", evidence=found.hint, advice=_MAP_AGAIN)
     if isinstance(found, RotationConsensus) and not found.kept.all():
         yield Finding(

@@ -230,6 +230,11 @@ class Recorded:
         except NotObservableError as error:
             return error
 
+    @property
+    def lacks_majority(self) -> bool:
+        """Whether it is open which cameras of a reconstruction are right."""
+        return isinstance(self.consensus, NotObservableError) and self.consensus.quantity == "camera rotation"
+
     @cached_property
     def turning(self) -> CameraTrajectory | None:
         """The camera's rotation: of the reconstruction, else of the pixels.
