@@ -22,6 +22,8 @@ from colmap_inertial.pipeline.stages.metric import gravity_in_model, metric_traj
 
 #: Over so many seconds errors of the shape are told.
 SPANS_S = (1.0, 5.0)
+#: What the truth's positions err by.
+TRUTH_M = 5e-4
 #: 95 % quantile of chi-square with three degrees of freedom.
 CHI2_95 = 7.815
 
@@ -72,11 +74,11 @@ def covered(model: Model, filmed: Filmed) -> dict[str, float]:
         write_trajectory(path, model, metric_trajectory(poses), filmed.imu)
         written, motion = read_tum(path), read_record(motion_file(path), CameraMotion)
         with np.load(path.with_name("trajectory_cov.npz")) as file:
-            told_s, cov = file["t_s"], file["cov"]
+            told_s, cov, turned = file["t_s"], file["cov"], file["rotation_cov"]
     gravity = gravity_in_model(model)
     assert gravity is not None
     rotation = matrix_from_quat(written.cam_from_world_xyzw).transpose(0, 2, 1)
-    _, position, turn = held(rotation, written.cam_in_world, filmed, gravity / np.linalg.norm(gravity))
+    off, position, turn = held(rotation, written.cam_in_world, filmed, gravity / np.linalg.norm(gravity))
     place = {round(1e4 * t): i for i, t in enumerate(filmed.timing.t_s.tolist())}
     of_cov = np.array([place[round(1e4 * t)] for t in told_s.tolist()])
     of_motion = np.array([place[round(1e4 * t)] for t in motion.t_s.tolist()])
@@ -84,7 +86,11 @@ def covered(model: Model, filmed: Filmed) -> dict[str, float]:
     velocity[of_motion] = motion.velocity_in_world_m_s - filmed.velocity_m_s[of_motion] @ turn.T
     known = (of_cov > 0) & np.isfinite(velocity[of_cov]).all(axis=1)
     at, cov = of_cov[known], cov[known]
-    squares = {"position": nees(position[at], cov[:, :3, :3]), "velocity": nees(velocity[at], cov[:, 3:6, 3:6])}
+    squares = {
+        "position": nees(position[at], cov[:, :3, :3] + TRUTH_M**2 * np.eye(3)),
+        "velocity": nees(velocity[at], cov[:, 3:6, 3:6]),
+        "rotation": nees(off[at], turned[known]),
+    }
     out = {"velocity_mm_s": _rms_mm(velocity[of_motion])}
     for name, one in squares.items():
         out |= {f"{name}_nees": float(np.mean(one)), f"{name}_inside": float(np.mean(3 * one < CHI2_95))}

@@ -174,6 +174,7 @@ COLUMNS = {
     "velocity_mm_s": "5.0f",
     "position_nees": "6.1f",
     "velocity_nees": "6.1f",
+    "rotation_nees": "6.1f",
 }
 
 

@@ -7,9 +7,11 @@ import pytest
 from refine_walk import PINHOLE, known_of, nudged, problem_of, tracks_of, walk
 
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.geometry import so3_log
 from colmap_inertial.inertial.refine import _residuals, judge, setup, solve as solver
 from colmap_inertial.inertial.refine._residuals import moving
 from colmap_inertial.inertial.refine._system import Order, System
+from colmap_inertial.inertial.refine.motion import find_motion_covs
 from colmap_inertial.inertial.refine.solve import _evaluate, _plausible, _weighted, factored, held_out, solve
 from colmap_inertial.inertial.refine.values import FreeCamera
 
@@ -56,11 +58,13 @@ def test_derivatives_of_the_camera_s_motion_are_those_of_finite_differences(smal
     _, problem, start, _ = small
     x = replace(nudged(start, np.random.default_rng(3)), offset_s=4e-3)
     x = replace(x, imu_in_cam_m=np.array([0.05, -0.08, 0.02]))
-    by, centres = moving(problem, x), setup.at_middle_lines(problem, x).cam_in_world
+    by, now = moving(problem, x), setup.at_middle_lines(problem, x)
+    centres, turn = now.cam_in_world, now.cam_from_world
 
     def motion(y):
-        written = setup.at_middle_lines(problem, y).cam_in_world
-        return np.concatenate([written, moving(problem, y).velocity_m_s], axis=1)
+        written = setup.at_middle_lines(problem, y)
+        turned = so3_log(written.cam_from_world.transpose(0, 2, 1) @ turn)
+        return np.concatenate([written.cam_in_world, moving(problem, y).velocity_m_s, turned], axis=1)
 
     assert motion(x)[:, :3] == pytest.approx(centres)
     for kind, values in ((0, by.by_state), (1, by.by_shared)):
@@ -456,11 +460,11 @@ def test_the_drift_map_names_what_was_stretched_and_how_sure_it_is(small, monkey
     n, shared = solved.solved.shape[0], start.columns.count
     cov = np.concatenate(solved.solve(np.eye(n, n + shared), np.eye(shared, n + shared, n)))
     first, last = 15 * solved.order.place[[0, -1]]
-    jacobian = np.zeros((6, n + shared))
+    jacobian = np.zeros((9, n + shared))
     jacobian[:, last : last + 15], jacobian[:, n:] = by.by_state[-1], by.by_shared[-1]
     jacobian[:3, first : first + 15] -= by.by_state[0, :3]
     jacobian[:3, n:] -= by.by_shared[0, :3]
-    (found,) = solved.motion_covs(np.array([len(seen.t_s) - 1]), by)
+    (found,) = find_motion_covs(np.array([len(seen.t_s) - 1]), solved, by)
     assert found == pytest.approx(jacobian @ cov @ jacobian.T, rel=1e-5, abs=1e-12)
     assert np.array(parts[-1].end_sigma_m) == pytest.approx(np.sqrt(np.diagonal(found)[:3]), rel=1e-9)
     assert 0 < parts[0].sigma_percent < 50

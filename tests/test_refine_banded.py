@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from refine_walk import problem_of, tracks_of, walk
 
+from colmap_inertial.core.geometry import so3_log
 from colmap_inertial.inertial.refine import _system
-from colmap_inertial.inertial.refine._residuals import moving
+from colmap_inertial.inertial.refine._residuals import moving, project
 from colmap_inertial.inertial.refine._system import BandFactor
-from colmap_inertial.inertial.refine.setup import at_middle_lines
-from colmap_inertial.inertial.refine.solve import factored
+from colmap_inertial.inertial.refine.motion import find_drift, find_motion_covs
+from colmap_inertial.inertial.refine.setup import at_middle_lines, make_pictures, read_seen
+from colmap_inertial.inertial.refine.solve import factored, solve
 from colmap_inertial.inertial.refine.world import derive_log_size, find_world
 
 
@@ -38,10 +40,10 @@ def test_a_position_s_covariance_against_the_first_is_that_of_both():
     solved, by = factored(problem, start), moving(problem, start)
     frames = np.array([4, 9])
     both = solved.centres_cov(np.array([0, *frames]), by).reshape(3, 3, 3, 3)
-    for i, cov in enumerate(solved.motion_covs(frames, by), start=1):
+    for i, cov in enumerate(find_motion_covs(frames, solved, by), start=1):
         expected = both[i, :, i] + both[0, :, 0] - both[i, :, 0] - both[0, :, i]
         assert cov[:3, :3] == pytest.approx(expected, rel=1e-5, abs=1e-9)
-    at_rest = solved.motion_covs(np.array([0]), by)[0]
+    at_rest = find_motion_covs(np.array([0]), solved, by)[0]
     assert np.abs(at_rest[:3]).max() < 1e-9 and at_rest[3, 3] > 0
 
 
@@ -66,6 +68,36 @@ def test_the_world_s_covariance_is_that_of_the_centres_split_by_cause():
     assert surer.cov[0, 0] < found.cov[0, 0]
     # gravity's strength is known by its prior alone in so short a walk
     assert found.cov[4, 4] == pytest.approx(5e-4**2, rel=0.1)
+
+
+def test_a_path_of_pictures_is_as_unsure_as_models_of_other_noise_differ():
+    """Bundle adjustments of one scene by other noise, brought to the true size, up and heading, scatter so."""
+    options = walk(6.0, points_per_m=250.0)
+    tracks = tracks_of(options)
+    seen = read_seen(tracks.reconstruction(), tracks.timing)
+    down = np.array([0.0, 0.0, -1.0])
+    problem, start = make_pictures(seen)
+    problem, rng, errors = replace(problem, sigma_px=options.noise_px), np.random.default_rng(0), []
+    perfect = problem.observations.xy_px + project(problem, start, problem.observations).residual
+    for _ in range(20):
+        noisy = perfect + options.noise_px * rng.standard_normal(perfect.shape)
+        drawn = replace(problem, observations=replace(problem.observations, xy_px=noisy))
+        made = at_middle_lines(drawn, solve(drawn, start).estimate)
+        rotation, centre = made.cam_from_world.transpose(0, 2, 1), made.cam_in_world
+        true, at = seen.cam_from_world.transpose(0, 2, 1), seen.cam_in_world
+        size = np.sum(derive_log_size(at, np.arange(len(at))) * (centre - at))
+        turns = so3_log(rotation @ true.transpose(0, 2, 1))
+        up = turns.mean(axis=0)
+        turn = up - down * (down @ up) + down * (down @ turns[0])
+        away = at - at[0]
+        position = centre - centre[0] - away - size * away - np.cross(turn, away)
+        errors.append(np.concatenate([position, turns - turn], axis=1))
+    scatter = np.mean(np.square(errors), axis=0)
+    told = np.diagonal(find_drift(seen, down).cov, axis1=1, axis2=2)
+    assert not told[0, :3].any() and told[0, 5] == pytest.approx(0, abs=1e-12)
+    ratio = scatter[3:] / told[3:]
+    assert np.median(ratio) == pytest.approx(1, abs=0.35)
+    assert ratio.max() < 5 and ratio.min() > 0.1
 
 
 def test_what_is_not_positive_is_refused():

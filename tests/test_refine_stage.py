@@ -13,7 +13,7 @@ from colmap_inertial import read_model, reconstruct_project
 from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, so3_log
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.core.types import CameraMotion, Similarity
-from colmap_inertial.inertial.core.priors import PRIORS
+from colmap_inertial.inertial.core.priors import PRIORS, model_scale_sigma
 from colmap_inertial.inertial.refine import judge
 from colmap_inertial.inertial.refine.solve import held_out, solve
 from colmap_inertial.inertial.refine.values import ROTATION
@@ -563,7 +563,11 @@ def test_an_existing_project_is_refined(walked, tmp_path):
     sigma_m = np.sqrt(np.trace(stored["cov"][:, :3, :3], axis1=1, axis2=2))
     assert sigma_m[0] < 1e-3 < 10 * sigma_m[-1] and sigma_m[-1] > 2 * sigma_m[10]
     last = said["values"]["drift"][-1]["end_sigma_m"]
-    assert np.sqrt(np.diagonal(stored["cov"][-1])[:3]) == pytest.approx(np.array(last), rel=1e-6)
+    # with what a lens and an accelerometer that nobody calibrated leave of any scale
+    along = model_scale_sigma(False) * (path.cam_in_world[-1] - path.cam_in_world[0])
+    assert np.diagonal(stored["cov"][-1])[:3] == pytest.approx(np.array(last) ** 2 + along**2, rel=1e-6)
+    assert stored["rotation_cov"].shape == (len(tracks.timing.names), 3, 3)
+    assert str(stored["relative_to"]) == "first image"
     motion = read_record(tmp_path / "out" / "trajectory_motion.json", CameraMotion)
     assert motion.names == tracks.timing.names
     speed, true = (

@@ -461,8 +461,8 @@ class SolvedMotion:
     velocity_in_world
         By image name, (3,) of the camera's centre, in units a second; of images whose velocity is known.
     cov
-        By image name, (6, 6) covariance of its position against the first one's, and of its velocity: of all images, or
-        of some.
+        By image name, (9, 9) covariance of its position against the first one's, of its velocity and of its rotation
+        (world, left; the first one's heading): of all images, or of some.
     readout_s
         Of the pictures as they were filmed; ``None`` where it was not solved for.
     """
@@ -473,7 +473,7 @@ class SolvedMotion:
     readout_s: float | None = None
 
     def __post_init__(self) -> None:
-        for field, shape in (("cam_in_world", (3,)), ("velocity_in_world", (3,)), ("cov", (6, 6))):
+        for field, shape in (("cam_in_world", (3,)), ("velocity_in_world", (3,)), ("cov", (9, 9))):
             values = {n: check_field(f"{n}: {field}", v, shape) for n, v in getattr(self, field).items()}
             set_fields(self, **{field: values})
 

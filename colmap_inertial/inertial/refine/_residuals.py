@@ -366,6 +366,12 @@ def state_rows(problem: Problem, x: Estimate) -> Rows:
         for columns in (VELOCITY, GYRO_BIAS, ACCEL_BIAS):
             here[:, columns, columns] = np.eye(3)
         heading = np.eye(3)
+        # of their scale nothing is known: the farthest frame stays as far away as it is
+        away = prior.mean.imu_in_world_m - prior.mean.imu_in_world_m[0]
+        far = int(np.argmax(np.sum(away**2, axis=1)))
+        along = away[far] / (_HELD_M * max(float(np.linalg.norm(away[far])), 1e-12))
+        residual[far, POSITION.start] = along @ (x.imu_in_world_m[far] - prior.mean.imu_in_world_m[far])
+        here[far, POSITION.start, POSITION] = along
     else:
         untouched = ~inertial.touched
         residual[untouched, VELOCITY] = x.velocity_m_s[untouched] / _SPEED_M_S
@@ -404,7 +410,9 @@ def all_rows(problem: Problem, x: Estimate) -> dict[str, Rows]:
     return {"imu": imu_rows(problem, x), "walk": walk_rows(problem, x), "states": state_rows(problem, x)}
 
 
-_CENTRE, _SPEED = slice(0, 3), slice(3, 6)
+#: Rows of :class:`Moving`.
+CENTRE, SPEED, TURN = slice(0, 3), slice(3, 6), slice(6, 9)
+N_MOVING = TURN.stop
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -416,9 +424,9 @@ class Moving:
     velocity_m_s
         (F, 3) of its centre, in the world.
     by_state
-        (F, 6, 15) derivatives of position and velocity by the frame's own state.
+        (F, 9, 15) derivatives of position, velocity and rotation (world, left) by the frame's own state.
     by_shared
-        (F, 6, Q) by what is shared.
+        (F, 9, Q) by what is shared.
     """
 
     velocity_m_s: Array
@@ -435,26 +443,28 @@ def moving(problem: Problem, x: Estimate) -> Moving:
     start, now, turn = x.world_from_imu, poses.world_from_imu, poses.turn
     arm = np.broadcast_to(-x.cam_from_imu.T @ x.imu_in_cam_m, (count, 3))
     swing = cross(poses.rate, arm)
-    by_state, by_shared = np.zeros((count, 6, N_STATE)), np.zeros((count, 6, at.count))
-    for rows, body, pushed in ((_CENTRE, arm, 0.5 * t**2), (_SPEED, swing, t)):
+    by_state, by_shared = np.zeros((count, N_MOVING, N_STATE)), np.zeros((count, N_MOVING, at.count))
+    for rows, body, pushed in ((CENTRE, arm, 0.5 * t**2), (SPEED, swing, t)):
         turned = np.einsum("nij,nj->ni", turn, body)
         by_state[:, rows, THETA] = -start @ (skew(turned) + pushed * skew(poses.force))
         by_state[:, rows, ACCEL_BIAS] = -pushed * start
-    by_state[:, _CENTRE, POSITION] = np.eye(3)
-    by_state[:, _CENTRE, VELOCITY] = t * np.eye(3)
-    by_state[:, _SPEED, VELOCITY] = np.eye(3)
+    by_state[:, CENTRE, POSITION] = np.eye(3)
+    by_state[:, CENTRE, VELOCITY] = t * np.eye(3)
+    by_state[:, SPEED, VELOCITY] = np.eye(3)
+    by_state[:, TURN, THETA], by_shared[:, TURN, ROTATION] = start, -now @ x.cam_from_imu.T
     swinging = now @ skew(arm)
-    by_state[:, _SPEED, GYRO_BIAS] = swinging
+    by_state[:, SPEED, GYRO_BIAS] = swinging
     for columns, by_arm in ((LEVER, -x.cam_from_imu.T), (ROTATION, -x.cam_from_imu.T @ skew(x.imu_in_cam_m))):
-        by_shared[:, _CENTRE, columns] = now @ by_arm
-        by_shared[:, _SPEED, columns] = now @ skew(poses.rate) @ by_arm
+        by_shared[:, CENTRE, columns] = now @ by_arm
+        by_shared[:, SPEED, columns] = now @ skew(poses.rate) @ by_arm
     velocity = poses.velocity_m_s + np.einsum("nij,nj->ni", now, swing)
     if problem.inertial is not None:
         force = np.einsum("nij,nj->ni", start, poses.force) + x.gravity_m_s2 * problem.inertial.down
         # that the arm swings faster and faster is nothing within an offset
-        by_time = np.concatenate([velocity, force], axis=1)
+        turning = np.einsum("nij,nj->ni", now, poses.rate)
+        by_time = np.concatenate([velocity, force, turning], axis=1)
         by_shared[:, :, OFFSET] = -by_time
         by_shared[:, :, CLOCK_RATE] = -since_middle_s(problem, frames)[:, None] * by_time
         by_gain = -swinging[:, :, :, None] * problem.inertial.turning.powers[:, 0][:, None, None, :]
-        by_shared[:, _SPEED, at.gyro_gain] = by_gain.reshape(count, 3, 9)
+        by_shared[:, SPEED, at.gyro_gain] = by_gain.reshape(count, 3, 9)
     return Moving(velocity_m_s=velocity, by_state=by_state, by_shared=by_shared)

@@ -317,32 +317,21 @@ class Factored:
         count = 3 * len(frames)
         return self.cov_of(by_state.reshape(count, -1, N_STATE), by.by_shared[frames, :3].reshape(count, -1))[0]
 
-    def motion_covs(self, frames: Int64Array, by: Moving) -> Array:
-        """(K, 6, 6) covariances of K frames' positions against the first frame's, and velocities."""
+    def with_frames(self, frames: Int64Array, by: Moving, by_state: Array, by_shared: Array) -> Array:
+        """(K, 9 + k, 9 + k) covariances of K frames' motion, each together with k numbers as in :meth:`cov_of`."""
         from scipy.linalg import cho_solve
 
-        place, shared = self.order.place, len(self.corner[0])
-        at, first = place[frames], N_STATE * place[0]
-        unit = np.zeros((len(self.solved), N_STATE))
-        unit[first : first + N_STATE] = np.eye(N_STATE)
-        beside = self.states.solve(unit).reshape(-1, N_STATE, N_STATE)
-        here, start = by.by_state[frames], by.by_state[0, :3]
-        cov = here @ self.states.marginals(N_STATE)[at] @ here.transpose(0, 2, 1)
-        across = here @ beside[at] @ start.T
-        cov[:, :, :3] -= across
-        cov[:, :3] -= across.transpose(0, 2, 1)
-        cov[:, :3, :3] += start @ beside[place[0]] @ start.T
-        followed = self.solved.reshape(-1, N_STATE, shared)
-        left = by.by_shared[frames] - here @ followed[at]
-        left[:, :3] -= by.by_shared[0, :3] - start @ followed[place[0]]
-        flat = left.reshape(-1, shared)
-        cov += left @ np.asarray(cho_solve(self.corner, flat.T, check_finite=False)).T.reshape(left.shape).transpose(
-            0, 2, 1
-        )
-        # against itself, the first one is sure, and not but for rounding
-        cov[frames == 0, :3] = 0.0
-        cov[frames == 0, :, :3] = 0.0
-        return np.asarray(0.5 * (cov + cov.transpose(0, 2, 1)))
+        place, shared = self.order.place[frames], len(self.corner[0])
+        others, states, followed = self.cov_of(by_state, by_shared)
+        here = by.by_state[frames]
+        left = by.by_shared[frames] - here @ self.solved.reshape(-1, N_STATE, shared)[place]
+        solved = np.asarray(cho_solve(self.corner, left.reshape(-1, shared).T, check_finite=False))
+        own = here @ self.states.marginals(N_STATE)[place] @ here.transpose(0, 2, 1)
+        own += left @ solved.T.reshape(left.shape).transpose(0, 2, 1)
+        across = here @ states[frames] + by.by_shared[frames] @ followed
+        beside = np.broadcast_to(others, (len(frames), *others.shape))
+        upper = np.concatenate([own, across], axis=2)
+        return np.concatenate([upper, np.concatenate([across.transpose(0, 2, 1), beside], axis=2)], axis=1)
 
     def shared_cov(self) -> Array:
         """(Q, Q) covariance of what is shared."""

@@ -11,6 +11,7 @@ from colmap_inertial.core.arrays import Array, BoolArray
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.inertial.refine._residuals import Moving, moving
 from colmap_inertial.inertial.refine._system import Factored, Order
+from colmap_inertial.inertial.refine.motion import find_motion_covs
 from colmap_inertial.inertial.refine.setup import at_middle_lines, measured_noise, pictures_alone, with_noise
 from colmap_inertial.inertial.refine.solve import Solution, factored, held_out, solve, with_measured_noise
 from colmap_inertial.inertial.refine.values import READOUT, Estimate, Observations, Problem
@@ -94,8 +95,8 @@ class Judged:
     velocity_m_s
         (F, 3) of the camera's centre in the world; nan where the IMU says nothing of it, and where it is not believed.
     motion_covs
-        (6, 6) covariances of position against the first frame's and of velocity, by frames: all, or evenly chosen
-        ones.
+        (9, 9) covariances of position against the first frame's, velocity and rotation, by frames: all, or evenly
+        chosen ones.
     readout
         One that was not declared (s), and its standard deviation; ``None`` where it was, or nothing was found.
     steps
@@ -213,7 +214,7 @@ def _solve_all(judged: Judged, problem: Problem, x: Estimate, t_s: Array) -> Jud
         world=find_world(problem, final, at_middle_lines(problem, final).cam_in_world, solved, by),
         drift=drift_map(problem, judged.estimate, final, t_s, solved, by),
         velocity_m_s=np.where(moved[:, None], by.velocity_m_s, np.nan),
-        motion_covs=dict(zip(chosen.tolist(), solved.motion_covs(chosen, by), strict=True)),
+        motion_covs=dict(zip(chosen.tolist(), find_motion_covs(chosen, solved, by), strict=True)),
     )
 
 
@@ -323,7 +324,7 @@ def drift_map(
     by_log = np.stack([derive_log_size(after, part) for part in (np.flatnonzero(timed), *parts)])
     sigma = np.sqrt(np.diagonal(solved.cov_of(*by_centres(by_log[1:] - by_log[0], by))[0]))
     last = np.array([part[-1] if len(part) else 0 for part in parts])
-    end_sigma_m = np.sqrt(np.diagonal(solved.motion_covs(last, by), axis1=1, axis2=2)[:, :3])
+    end_sigma_m = np.sqrt(np.diagonal(find_motion_covs(last, solved, by), axis1=1, axis2=2)[:, :3])
     out = []
     for i, (part, (begin_s, end_s)) in enumerate(zip(parts, pairwise(edges), strict=True)):
         sizes = [size_of(centres[part]) if len(part) > 1 else 0.0 for centres in (before, after)]

@@ -48,6 +48,8 @@ _LEAST_PX = 0.05
 _QUANTILE = 0.75
 #: Cameras more than this are not estimated: each picture has its own.
 _MOST_FREE_CAMERAS = 4
+#: Points this much nearer or farther than a path is long are left out of its covariance.
+_EXTREME = 1e4
 #: Frames farther apart say nothing of each other through the IMU.
 _LONGEST_STEP_S = 10.0
 
@@ -342,6 +344,63 @@ def _information(start: Estimate, known: Known, imu: ImuRecording, timing: Frame
         here = np.r_[at.accel_gain, at.gyro_gain]
         info[np.ix_(here, here)] = np.linalg.inv(gains_cov(imu))
     return info
+
+
+def make_pictures(seen: Seen) -> tuple[Problem, Estimate]:
+    """The problem of pictures alone, as a global shutter sees them, cameras free; and the model as its estimate.
+
+    The IMU stands where the camera does, as nothing is known of it. Points that lie in a camera, or at infinity, are
+    left out: beside them, rounding hides what the others tell.
+    """
+    seen = _without_extremes(seen)
+    cameras = tuple(FreeCamera(model=camera, free=_free_numbers(camera)) for camera in seen.cameras)
+    if len(cameras) > _MOST_FREE_CAMERAS:
+        cameras = tuple(replace(camera, free=()) for camera in cameras)
+    still, none = np.zeros_like(seen.cam_in_world), np.zeros((3, 3))
+    x = Estimate(
+        world_from_imu=seen.cam_from_world.transpose(0, 2, 1),
+        imu_in_world_m=seen.cam_in_world,
+        velocity_m_s=still,
+        gyro_bias_rad_s=still,
+        accel_bias_m_s2=still,
+        points_m=seen.points,
+        cam_from_imu=np.eye(3),
+        imu_in_cam_m=np.zeros(3),
+        offset_s=0.0,
+        clock_rate=0.0,
+        readout_s=0.0,
+        intrinsics=np.array([camera.model.params[i] for camera in cameras for i in camera.free]),
+        accel_delay_s=0.0,
+        gyro_gain=none,
+        accel_gain=none,
+        gravity_m_s2=0.0,
+    )
+    # what pictures do not tell counts as known
+    sigma = np.full(x.columns.count, 1e-4)
+    sigma[FIRST_INTRINSIC : x.columns.seen.stop] = _INTRINSIC_SHARE * np.maximum(np.abs(x.intrinsics), 1.0)
+    prior = Prior(mean=x, info=np.diag(sigma**-2), gyro_bias_sigma_rad_s=1.0, accel_bias_sigma_m_s2=1.0)
+    problem = Problem(
+        observations=seen.observations,
+        cameras=cameras,
+        camera_of=seen.camera_of,
+        inertial=None,
+        prior=prior,
+        sigma_px=1.0,
+    )
+    return problem, x
+
+
+def _without_extremes(seen: Seen) -> Seen:
+    """A model without points that are extremely near to one of their cameras, or far, by the path's extent."""
+    one = seen.observations
+    away = seen.points[one.point] - seen.cam_in_world[one.frame]
+    depth = np.einsum("ni,ni->n", seen.cam_from_world[one.frame, 2], away)
+    extent = float(np.linalg.norm(np.ptp(seen.cam_in_world, axis=0)))
+    wrong = (depth < extent / _EXTREME) | (depth > extent * _EXTREME)
+    kept = np.bincount(one.point, wrong, minlength=len(seen.points)) == 0
+    mine = kept[one.point]
+    observations = replace(one.select(mine), point=np.cumsum(kept)[one.point[mine]] - 1)
+    return replace(seen, points=seen.points[kept], observations=observations)
 
 
 def pictures_alone(problem: Problem, xy_px: Array) -> Problem:

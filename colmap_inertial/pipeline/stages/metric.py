@@ -28,6 +28,8 @@ from colmap_inertial.core.types import (
     Treatment,
 )
 from colmap_inertial.imaging.gyro_camera import GyroCamera
+from colmap_inertial.inertial.refine.motion import find_drift
+from colmap_inertial.inertial.refine.setup import read_seen
 from colmap_inertial.inertial.scale import estimate_scale
 from colmap_inertial.io.calibration import SIGMAS
 from colmap_inertial.io.files import write_record
@@ -243,10 +245,10 @@ def write_trajectory(path: Path, model: Model, trajectory: CameraTrajectory, imu
     Parameters
     ----------
     path
-        ``trajectory*.tum``; the covariance goes to ``trajectory*_cov.npz`` with ``t_s`` (T,) and ``cov`` (T, 9, 9) of
-        position, velocity and acceleration; of a refined model (K, 6, 6) of position against the first one's and of
-        velocity, at 400 of them at most; none of a joined one that was not refined. Velocities by frame go to
-        :func:`motion_file`.
+        ``trajectory*.tum``; the covariance goes to ``trajectory*_cov.npz`` with ``t_s`` (T,), ``cov`` (T, 9, 9) of
+        position, velocity and acceleration, of a refined model (K, 6, 6) of position and velocity, at 400 images at
+        most; ``rotation_cov`` (T, 3, 3), world, left; and what positions and rotations are ``relative_to``. None of a
+        joined one that was not refined. Velocities by frame go to :func:`motion_file`.
     model
         A model that a stage made metric.
     trajectory
@@ -263,8 +265,8 @@ def write_trajectory(path: Path, model: Model, trajectory: CameraTrajectory, imu
         solved = model.motion.of(trajectory.names, trajectory.cam_in_world)
         write_tum(path, trajectory)
         told = [i for i, name in enumerate(trajectory.names) if name in solved.cov]
-        covs = np.array([solved.cov[trajectory.names[i]] for i in told]).reshape(-1, 6, 6)
-        _write_covariance(target, trajectory.t_s[told] + trajectory.epoch_ns * 1e-9, covs)
+        cov = np.array([solved.cov[trajectory.names[i]] for i in told]).reshape(-1, 9, 9)
+        _write_covariance(target, trajectory.t_s[told] + trajectory.epoch_ns * 1e-9, cov[:, :6, :6], cov[:, 6:, 6:])
         unknown = np.full(3, np.nan)
         velocity = np.array([solved.velocity_in_world.get(name, unknown) for name in trajectory.names])
     else:
@@ -276,13 +278,41 @@ def write_trajectory(path: Path, model: Model, trajectory: CameraTrajectory, imu
             log.info("%s: no covariance of a joined path is written; result.json has that of each part", path.name)
             target.unlink(missing_ok=True)
         else:
-            _write_covariance(target, smoothed.t_s + smoothed.epoch_ns * 1e-9, smoothed.cov)
+            cov, rotation = _with_drift(model, smoothed, gravity)
+            _write_covariance(target, smoothed.t_s + smoothed.epoch_ns * 1e-9, cov, rotation)
     write_record(motion_file(path), _motion(model, trajectory, velocity, imu, estimate.calibration))
 
 
-def _write_covariance(target: Path, t_s: Array, cov: Array) -> None:
+def _with_drift(model: Model, smoothed: SmoothedTrajectory, gravity: Array) -> tuple[Array, Array | None]:
+    """(T, 9, 9) of position against the first image, velocity, acceleration, and (T, 3, 3) of rotation.
+
+    What smoothing leaves is far less than what pictures bend a path by. Where that is too much work, or pictures do not
+    determine it, the smoother's own covariance, and none of rotations.
+    """
+    assert model.similarity is not None
+    seen = read_seen(model.reconstruction, model.timing)
+    timed = np.isfinite(seen.t_s)
+    try:
+        drift = None if has_rigs(model.reconstruction) else find_drift(seen, gravity / np.linalg.norm(gravity))
+    except np.linalg.LinAlgError:
+        drift = None
+    if drift is None or int(timed.sum()) != len(smoothed.t_s):
+        return smoothed.cov, None
+    velocity = np.zeros_like(seen.cam_in_world)
+    local = np.zeros((len(velocity), 3, 3))
+    velocity[timed], local[timed] = smoothed.velocity_in_world, smoothed.cov[:, 3:6, 3:6]
+    motion = drift.motion_covs(model.similarity.cov, velocity, local)[timed]
+    cov = np.zeros_like(smoothed.cov)
+    cov[:, :6, :6], cov[:, 6:, 6:] = motion[:, :6, :6], smoothed.cov[:, 6:, 6:]
+    return cov, motion[:, 6:, 6:]
+
+
+def _write_covariance(target: Path, t_s: Array, cov: Array, rotation: Array | None) -> None:
     partial = target.with_name(f"{target.stem}.partial.npz")
-    np.savez_compressed(partial, t_s=t_s, cov=cov)
+    values = {"t_s": t_s, "cov": cov, "relative_to": np.array("neighbouring images")}
+    if rotation is not None:
+        values |= {"rotation_cov": rotation, "relative_to": np.array("first image")}
+    np.savez_compressed(partial, allow_pickle=False, **values)
     os.replace(partial, target)
 
 

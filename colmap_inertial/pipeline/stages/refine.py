@@ -16,8 +16,9 @@ from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import quat_from_matrix
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import CAL, CameraImuCalibration, Similarity, SolvedMotion, Treatment
-from colmap_inertial.inertial.core.priors import is_calibrated
+from colmap_inertial.inertial.core.priors import is_calibrated, model_scale_sigma
 from colmap_inertial.inertial.refine.judge import Judged, refine
+from colmap_inertial.inertial.refine.motion import add_scale
 from colmap_inertial.inertial.refine.setup import (
     Known,
     Seen,
@@ -44,8 +45,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 #: What is written of a refined model, as a number: raised with its layout, so that a run goes on from no older one.
-#: 2: ``trajectory*_cov.npz`` has positions and velocities, not positions alone.
-_WRITES = 2
+#: 3: the refinement's own scale; covariances of rotations.
+_WRITES = 3
 _FEWEST_IMAGES, _FEWEST_POINTS = 10, 50
 #: One camera comes back to settings that it had before in fewer of its images than this.
 _MOST_RETURNS = 0.1
@@ -147,7 +148,8 @@ class RefineStage(InertialStage):
         figures |= {"drift": [asdict(part) for part in judged.drift]} | _calibration_figures(judged)
         assert model.scale is not None and model.scale.calibration is not None
         assert model.similarity is not None and judged.world is not None
-        move = _move_of(seen, at_middle_lines(problem, x))
+        written = at_middle_lines(problem, x)
+        move = _move_of(seen, written)
         calibrated = is_calibrated(self.imu)
         own, similarity = state_scale(
             model.scale, model.similarity, move, problem, x, judged.world, calibrated=calibrated
@@ -164,7 +166,7 @@ class RefineStage(InertialStage):
             similarity=similarity,
             parts=tuple(replace(part, similarity=_moved(part.similarity, move)) for part in model.parts),
             observed_px={},
-            motion=_motion(reconstruction, seen, judged, readout_s=readout_s),
+            motion=_motion(seen, written.cam_in_world, judged, calibrated=calibrated, readout_s=readout_s),
         )
         return _said(done, f"refined by the IMU ({heard})", action="refined", **figures)
 
@@ -236,14 +238,19 @@ def _said(model: Model, reason: str, *, action: str = "", **values: object) -> M
     return replace(model, treatments=(*model.treatments, done), scale=scale)
 
 
-def _motion(written: pycolmap.Reconstruction, seen: Seen, judged: Judged, *, readout_s: float | None) -> SolvedMotion:
-    """The camera's motion in the model that is written."""
-    velocity = judged.velocity_m_s
-    images = (written.image(image_id) for image_id in seen.image_ids)
+def _motion(seen: Seen, centres: Array, judged: Judged, *, calibrated: bool, readout_s: float | None) -> SolvedMotion:
+    """The camera's motion in the model that is written; with what lens and accelerometer leave of its scale."""
+    velocity, told = judged.velocity_m_s, np.array(list(judged.motion_covs), dtype=np.int64)
+    covs = add_scale(
+        np.array(list(judged.motion_covs.values())).reshape(-1, 9, 9),
+        model_scale_sigma(calibrated) ** 2,
+        centres[told] - centres[0],
+        velocity[told],
+    )
     return SolvedMotion(
-        cam_in_world={image.name: image.projection_center() for image in images},
+        cam_in_world=dict(zip(seen.names, centres, strict=True)),
         velocity_in_world={seen.names[i]: velocity[i] for i in np.flatnonzero(np.isfinite(velocity).all(axis=1))},
-        cov={seen.names[i]: cov for i, cov in judged.motion_covs.items()},
+        cov={seen.names[i]: cov for i, cov in zip(told.tolist(), covs, strict=True)},
         readout_s=readout_s,
     )
 

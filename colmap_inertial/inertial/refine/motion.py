@@ -1,0 +1,136 @@
+"""Covariances of camera paths against the first image: of a refined path, and of one that pictures and a scale made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from colmap_inertial.core.arrays import Array, Int64Array
+from colmap_inertial.core.geometry import skew
+from colmap_inertial.inertial.refine._residuals import CENTRE, N_MOVING, SPEED, TURN, Moving, moving
+from colmap_inertial.inertial.refine._system import Factored, Order
+from colmap_inertial.inertial.refine.setup import Seen, make_pictures, measured_noise, with_noise
+from colmap_inertial.inertial.refine.solve import factored
+from colmap_inertial.inertial.refine.values import N_STATE
+from colmap_inertial.inertial.refine.world import by_centres, by_mean_turn, derive_log_size
+
+#: Normal equations of pictures alone, for a covariance: more take longer than a scale is worth.
+_MOST_BYTES = 300_000_000
+
+
+def find_motion_covs(frames: Int64Array, solved: Factored, by: Moving) -> Array:
+    """(K, 9, 9) covariances of K frames' positions against the first frame's, of velocities, and of rotations.
+
+    Rotations are along the world's axes, from the left; heading is that of the first frame.
+    """
+    by_state = np.zeros((3, len(by.by_state), N_STATE))
+    by_state[:, 0] = by.by_state[0, CENTRE]
+    both = solved.with_frames(frames, by, by_state, by.by_shared[0, CENTRE])
+    minus = np.eye(N_MOVING, N_MOVING + 3)
+    minus[CENTRE, N_MOVING:] = -np.eye(3)
+    cov = minus @ both @ minus.T
+    # against itself, the first one is sure, and not but for rounding
+    cov[frames == 0, CENTRE] = 0.0
+    cov[frames == 0, :, CENTRE] = 0.0
+    return np.asarray(0.5 * (cov + cov.transpose(0, 2, 1)))
+
+
+def add_scale(cov: Array, variance_log: float, centre_m: Array, velocity_m_s: Array) -> Array:
+    """(K, 9, 9) the same with an error of scale of its own; ``centre_m`` (K, 3) counts from the first frame."""
+    along = np.concatenate([centre_m, velocity_m_s, np.zeros_like(centre_m)], axis=1)
+    return cov + variance_log * along[:, :, None] * along[:, None, :]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PictureDrift:
+    """How a path that pictures alone made may be bent.
+
+    Attributes
+    ----------
+    names
+        (F,) of the images.
+    cam_in_world
+        (F, 3) their centres.
+    cov
+        (F, 6, 6) of position and rotation (world, left) against the first one's position and heading, once the path's
+        size and up are right.
+    """
+
+    names: tuple[str, ...]
+    cam_in_world: Array
+    cov: Array
+
+    def motion_covs(self, similarity_cov: Array, velocity_m_s: Array, local: Array) -> Array:
+        """(F, 9, 9) covariances of position, velocity and rotation with drift, scale and gravity in them.
+
+        Parameters
+        ----------
+        similarity_cov
+            (7, 7) as in :class:`~colmap_inertial.core.types.Similarity`.
+        velocity_m_s
+            (F, 3).
+        local
+            (F, 3, 3) covariance of the velocity beside the path's drift.
+        """
+        centre_m = self.cam_in_world - self.cam_in_world[0]
+        count = len(centre_m)
+        by_drift, by_similarity = np.zeros((count, N_MOVING, 6)), np.zeros((count, N_MOVING, 4))
+        by_drift[:, CENTRE, :3] = by_drift[:, TURN, 3:] = np.eye(3)
+        # what is turned moves elsewhere
+        by_drift[:, SPEED, 3:] = -skew(velocity_m_s)
+        by_similarity[:, CENTRE] = np.concatenate([centre_m[:, :, None], -skew(centre_m)], axis=2)
+        by_similarity[:, SPEED] = np.concatenate([velocity_m_s[:, :, None], -skew(velocity_m_s)], axis=2)
+        by_similarity[:, TURN, 1:] = np.eye(3)
+        cov = by_drift @ self.cov @ by_drift.transpose(0, 2, 1)
+        cov += by_similarity @ similarity_cov[:4, :4] @ by_similarity.transpose(0, 2, 1)
+        cov[:, SPEED, SPEED] += local
+        return np.asarray(0.5 * (cov + cov.transpose(0, 2, 1)))
+
+
+def find_drift(seen: Seen, down: Array) -> PictureDrift | None:
+    """How surely pictures alone know the shape of a metric path; ``None`` where that is too much work.
+
+    Parameters
+    ----------
+    seen
+        The model.
+    down
+        (3,) unit vector of gravity in its world.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        Where pictures do not determine it.
+    """
+    problem, x = make_pictures(seen)
+    if Order.of(problem.observations, len(seen.names)).size_bytes > _MOST_BYTES:
+        return None
+    problem = with_noise(problem, measured_noise(problem, x))
+    solved, by = factored(problem, x), moving(problem, x)
+    return PictureDrift(names=seen.names, cam_in_world=seen.cam_in_world, cov=_drift_covs(seen, down, solved, by))
+
+
+def _drift_covs(seen: Seen, down: Array, solved: Factored, by: Moving) -> Array:
+    """(F, 6, 6) of position and rotation, with the first's position and heading, and the whole's size and up."""
+    count, shared = len(seen.names), by.by_shared.shape[2]
+    by_state, by_shared = np.zeros((10, count, N_STATE)), np.zeros((10, shared))
+    size = derive_log_size(seen.cam_in_world, np.arange(count))[None]
+    by_state[:1], by_shared[:1] = by_centres(size, by)
+    by_state[1:4], by_shared[1:4] = by_mean_turn(by)
+    for at, rows in ((slice(4, 7), CENTRE), (slice(7, 10), TURN)):
+        by_state[at, 0], by_shared[at] = by.by_state[0, rows], by.by_shared[0, rows]
+    both = solved.with_frames(np.arange(count), by, by_state, by_shared)
+    away = seen.cam_in_world - seen.cam_in_world[0]
+    along = np.outer(down, down)
+    out = np.zeros((count, 6, both.shape[1]))
+    out[:, :3, CENTRE] = out[:, 3:, TURN] = np.eye(3)
+    size_at, turn_at, centre_at, first_at = (
+        slice(N_MOVING + a, N_MOVING + b) for a, b in ((0, 1), (1, 4), (4, 7), (7, 10))
+    )
+    out[:, :3, centre_at], out[:, :3, size_at] = -np.eye(3), -away[:, :, None]
+    out[:, 3:, turn_at], out[:, 3:, first_at] = along - np.eye(3), -along
+    out[:, :3, turn_at], out[:, :3, first_at] = skew(away) @ (np.eye(3) - along), skew(away) @ along
+    cov = out @ both @ out.transpose(0, 2, 1)
+    cov[0, :3] = cov[0, :, :3] = 0.0
+    return np.asarray(0.5 * (cov + cov.transpose(0, 2, 1)))
