@@ -42,13 +42,11 @@ from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.core.types import CAL, CameraImuCalibration, ImuRecording
 from colmap_inertial.inertial.core.priors import PRIORS
 from colmap_inertial.inertial.refine._residuals import moving
+from colmap_inertial.inertial.refine.pictures import measured_noise, pictures_alone, with_noise
 from colmap_inertial.inertial.refine.setup import (
     at_middle_lines,
     make_problem,
-    measured_noise,
-    pictures_alone,
     read_seen,
-    with_noise,
 )
 from colmap_inertial.inertial.refine.solve import factored, solve
 from colmap_inertial.inertial.refine.values import Estimate, Problem

@@ -8,7 +8,7 @@ from refine_walk import PINHOLE, known_of, nudged, problem_of, tracks_of, walk
 
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import so3_log
-from colmap_inertial.inertial.refine import _residuals, judge, setup, solve as solver
+from colmap_inertial.inertial.refine import _residuals, judge, pictures, setup, solve as solver
 from colmap_inertial.inertial.refine._residuals import moving
 from colmap_inertial.inertial.refine._system import Order, System
 from colmap_inertial.inertial.refine.motion import find_motion_covs
@@ -251,7 +251,7 @@ def test_frames_that_hardly_see_anything_stop_nothing(small, fewest):
     problem = replace(problem, inertial=replace(problem.inertial, linked=linked))
     rng = np.random.default_rng(4)
     off = nudged(start, rng)
-    alone = solve(setup.pictures_alone(problem, problem.observations.xy_px), off)
+    alone = solve(pictures.pictures_alone(problem, problem.observations.xy_px), off)
     whole = solve(problem, off)
     assert alone.converged
     assert whole.converged

@@ -11,7 +11,8 @@ from colmap_inertial.inertial.refine import _system
 from colmap_inertial.inertial.refine._residuals import moving, project
 from colmap_inertial.inertial.refine._system import BandFactor
 from colmap_inertial.inertial.refine.motion import find_drift, find_motion_covs
-from colmap_inertial.inertial.refine.setup import at_middle_lines, make_pictures, read_seen
+from colmap_inertial.inertial.refine.pictures import make_pictures
+from colmap_inertial.inertial.refine.setup import at_middle_lines, read_seen
 from colmap_inertial.inertial.refine.solve import factored, solve
 from colmap_inertial.inertial.refine.world import derive_log_size, find_world
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from refine_walk import problem_of, tracks_of, walk
 
-from colmap_inertial.inertial.refine import setup, solve as solver
+from colmap_inertial.inertial.refine import pictures, solve as solver
 from colmap_inertial.inertial.refine._residuals import imu_rows, project
 from colmap_inertial.inertial.refine.solve import factored, solve, with_measured_noise
 
@@ -69,14 +69,14 @@ def test_observations_weigh_as_much_as_they_tell(solved, times):
     from scipy.special import exp1
 
     problem, start = solved
-    alone = setup.pictures_alone(problem, problem.observations.xy_px)
+    alone = pictures.pictures_alone(problem, problem.observations.xy_px)
     x = solve(alone, start).estimate
     # of normal errors and a loss of scale k standard deviations, half the squares over the scale's are exponential
     sigma_px = times * 0.5
     scaled = replace(
         alone, observations=replace(alone.observations, xy_px=_with_noise(alone, x, sigma_px)), robust_px=1.0
     )
-    noise = setup.measured_noise(scaled, x)
+    noise = pictures.measured_noise(scaled, x)
     k = 0.5 * (noise.robust_px / noise.sigma_px) ** 2
     weight = k * np.exp(k) * exp1(k)
     slope = k * (1 - weight)
@@ -92,8 +92,8 @@ def test_observations_weigh_as_much_as_they_tell(solved, times):
 def test_noise_is_measured_beside_what_was_fitted_to_it():
     options = walk(6.0, points_per_m=80.0)
     problem, start, _ = problem_of(tracks_of(options), options)
-    alone = setup.pictures_alone(problem, problem.observations.xy_px)
-    assert setup.measured_noise(alone, solve(alone, start).estimate).sigma_px == pytest.approx(0.5, rel=0.03)
+    alone = pictures.pictures_alone(problem, problem.observations.xy_px)
+    assert pictures.measured_noise(alone, solve(alone, start).estimate).sigma_px == pytest.approx(0.5, rel=0.03)
 
 
 def _with_noise(problem, x, sigma_px):

@@ -12,7 +12,8 @@ from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.inertial.refine._residuals import Moving, moving
 from colmap_inertial.inertial.refine._system import Factored, Order
 from colmap_inertial.inertial.refine.motion import find_motion_covs
-from colmap_inertial.inertial.refine.setup import at_middle_lines, measured_noise, pictures_alone, with_noise
+from colmap_inertial.inertial.refine.pictures import measured_noise, pictures_alone, with_noise
+from colmap_inertial.inertial.refine.setup import at_middle_lines
 from colmap_inertial.inertial.refine.solve import Solution, factored, held_out, solve, with_measured_noise
 from colmap_inertial.inertial.refine.values import READOUT, Estimate, Observations, Problem
 from colmap_inertial.inertial.refine.world import FoundWorld, by_centres, derive_log_size, find_world, size_of

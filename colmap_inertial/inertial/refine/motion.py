@@ -10,7 +10,8 @@ from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.geometry import skew
 from colmap_inertial.inertial.refine._residuals import CENTRE, N_MOVING, SPEED, TURN, Moving, moving
 from colmap_inertial.inertial.refine._system import Factored, Order
-from colmap_inertial.inertial.refine.setup import Seen, make_pictures, measured_noise, with_noise
+from colmap_inertial.inertial.refine.pictures import make_pictures, measured_noise, with_noise
+from colmap_inertial.inertial.refine.setup import Seen
 from colmap_inertial.inertial.refine.solve import factored
 from colmap_inertial.inertial.refine.values import N_STATE
 from colmap_inertial.inertial.refine.world import by_centres, by_mean_turn, derive_log_size
