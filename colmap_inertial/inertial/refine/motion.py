@@ -90,7 +90,7 @@ class PictureDrift:
 
 
 def find_drift(seen: Seen, down: Array) -> PictureDrift | None:
-    """How surely pictures alone know the shape of a metric path; ``None`` where that is too much work.
+    """How surely pictures alone know the shape of a metric path; ``None`` without points, or where it is too much work.
 
     Parameters
     ----------
@@ -105,6 +105,8 @@ def find_drift(seen: Seen, down: Array) -> PictureDrift | None:
         Where pictures do not determine it.
     """
     problem, x = make_pictures(seen)
+    if not len(problem.observations.point):
+        return None
     if Order.of(problem.observations, len(seen.names)).size_bytes > _MOST_BYTES:
         return None
     problem = with_noise(problem, measured_noise(problem, x))
