@@ -45,26 +45,6 @@ def test_what_the_imu_adds_is_counted(links, nodes, expected):
 
 
 @loop_over(
-    ("readout", "rolling"),
-    [
-        (None, False),
-        ((1.01e-3, 3e-4), True),
-        ((0.99e-3, 1e-5), False),
-        ((1.0e-3, 1e-5), True),
-        ((-20e-3, 1e-3), True),
-        ((6.1e-3, 2e-3), True),
-        ((5.9e-3, 2e-3), False),
-    ],
-)
-def test_a_readout_is_one_where_it_is_long_and_sure(readout, rolling):
-    words = judge._rolling(readout)
-    assert bool(words) == rolling
-    if rolling:
-        assert f"{1e3 * abs(readout[0]):.1f} +- {1e3 * readout[1]:.1f} ms" in words
-        assert ("from the last line to the first" in words) == (readout[0] < 0)
-
-
-@loop_over(
     ("alone", "seen", "chi2", "change", "words"),
     [
         (True, True, 3.0, -0.1, ""),

@@ -282,22 +282,35 @@ def test_a_rolling_shutter_is_part_of_it(rolled):
     assert not made.observed_px
 
 
-def test_a_model_whose_images_still_have_the_rolling_shutter_is_left_as_it_is(rolled):
-    tracks, _, known, model = rolled
-    made, said = refined_by(tracks.imu, replace(model, rectified=False), calibration=known)
-    assert "still have the rolling shutter" in said.reason
-    assert made.reconstruction is model.reconstruction
-
-
-def test_a_readout_that_was_not_declared_is_found_and_told(rolled):
-    tracks, _, _, _ = rolled
-    timing = replace(tracks.timing, readout_s=None)
-    model = Model(reconstruction=adjusted(tracks.reconstruction()), colmap_index=0, timing=timing)
-    model = MetricStage(imu=tracks.imu, calibration=UNKNOWN)(model)
-    made, said = refined_by(tracks.imu, model)
+@pytest.mark.parametrize("declared", [True, False])
+def test_a_readout_is_refined_with_where_images_keep_their_rolling_shutter(rolled, declared):
+    """Known or found; keypoints stay as they are."""
+    tracks, _, known, _ = rolled
+    timing = replace(tracks.timing, readout_s=0.025 if declared else None)
+    start = Model(reconstruction=adjusted(tracks.reconstruction()), colmap_index=0, timing=timing)
+    calibration = known if declared else UNKNOWN
+    model = MetricStage(imu=tracks.imu, calibration=calibration)(start)
+    made, said = refined_by(tracks.imu, model, calibration=calibration)
+    assert said.action == "refined"
     assert said.values["readout_s"] == pytest.approx(0.025, rel=0.03)
-    assert "declare the readout, which is 2" in said.reason
-    assert said.action == "" and made.reconstruction is model.reconstruction
+    assert "images and keypoints keep their rolling shutter of 2" in said.reason
+    assert made.motion.readout_s == said.values["readout_s"]
+    truth = tracks.motion.cam_in_world_m(tracks.timing.pose_t_s())
+    assert error_of(centres_of(made.reconstruction), truth) < 0.5 * error_of(centres_of(start.reconstruction), truth)
+    for image_id in made.reconstruction.reg_image_ids():
+        before, after = (
+            np.array([p.xy for p in one.image(image_id).points2D])
+            for one in (start.reconstruction, made.reconstruction)
+        )
+        assert np.array_equal(before, after)
+
+
+@pytest.mark.parametrize("found", [(1.5e-3, 0.49e-3), (0.9e-3, 1e-5), (-5e-3, 2e-3)])
+def test_a_readout_that_predicts_nothing_better_is_none(walked, monkeypatch, found):
+    tracks, model = walked
+    monkeypatch.setattr(judge, "_readout", lambda *_: found)
+    _, said = refined_by(tracks.imu, model)
+    assert said.action == "refined" and said.values["readout_s"] == 0 and "rolling" not in said.reason
 
 
 def test_a_global_shutter_needs_no_declaration(walked):
@@ -305,7 +318,7 @@ def test_a_global_shutter_needs_no_declaration(walked):
     assert model.timing.readout_s is None
     made, said = refined_by(tracks.imu, model)
     assert said.action == "refined"
-    assert abs(said.values["readout_s"]) < 1e-3
+    assert said.values["readout_s"] == 0
     # what fewer than two images see is no part of it
     lonely = pycolmap.Reconstruction(model.reconstruction)
     point_id = min(lonely.point3D_ids())
@@ -418,7 +431,8 @@ def test_what_takes_too_much_memory_is_left_as_it_is(walked, monkeypatch):
 
 def test_what_does_not_come_to_rest_is_not_believed(walked, monkeypatch):
     tracks, model = walked
-    whys = ("pictures alone", "the refinement does not", "the refinement does not", "with all observations")
+    # pictures alone, the refinement, without a readout, with the noise measured, and with all observations
+    whys = ("pictures alone", *3 * ("the refinement does not",), "with all observations")
     for restless, why in enumerate(whys):
         count = iter(range(len(whys)))
 

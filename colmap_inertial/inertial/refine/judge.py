@@ -13,7 +13,7 @@ from colmap_inertial.inertial.refine._residuals import Moving, moving
 from colmap_inertial.inertial.refine._system import Factored, Order
 from colmap_inertial.inertial.refine.motion import find_motion_covs
 from colmap_inertial.inertial.refine.pictures import measured_noise, pictures_alone, with_noise
-from colmap_inertial.inertial.refine.setup import at_middle_lines
+from colmap_inertial.inertial.refine.setup import NO_READOUT_S, at_middle_lines
 from colmap_inertial.inertial.refine.solve import Solution, factored, held_out, solve, with_measured_noise
 from colmap_inertial.inertial.refine.values import READOUT, Estimate, Observations, Problem
 from colmap_inertial.inertial.refine.world import FoundWorld, by_centres, derive_log_size, find_world, size_of
@@ -26,9 +26,11 @@ class RefineLimits:
     #: Every so many observations of points with at least so many is held out.
     every: int = 10
     fewest: int = 4
-    #: A readout that was not declared is one where it is longer, and so many standard deviations long.
+    #: A readout that was not declared is one where it is longer, so many standard deviations long, and predicts
+    #: observations that were held out better by so many.
     least_readout_s: float = 1e-3
     sure_sigma: float = 3.0
+    better_sigma: float = 2.0
     #: Frames whose covariance is told.
     most_covs: int = 400
     #: Length of a part of the path whose drift is told.
@@ -99,7 +101,7 @@ class Judged:
         (9, 9) covariances of position against the first frame's, velocity and rotation, by frames: all, or evenly
         chosen ones.
     readout
-        One that was not declared (s), and its standard deviation; ``None`` where it was, or nothing was found.
+        One that was not declared (s), and its standard deviation; ``None`` where it was, or there is none.
     steps
         Of all solutions.
     """
@@ -138,7 +140,7 @@ def refine(
     t_s
         (F,) times of the frames; nan without one.
     readout_declared
-        Otherwise the images were not rectified: where they turn out to have one, the model stays as it is.
+        Otherwise images have none, unless one is found that predicts what was held out better.
 
     Raises
     ------
@@ -158,6 +160,10 @@ def refine(
     freedom = _freedom(problem)
     chi2 = max(2 * (seen.cost - seen_alone.cost), seen.squares["imu"]) / freedom
     steps = seen_alone.steps + seen.steps
+    readout = None
+    if seen.converged and not readout_declared:
+        readout, problem, seen = _test_readout(problem, kept, seen)
+        steps += seen.steps
     if seen.converged and chi2 <= LIMITS.largest_chi2:
         # a false IMU would find itself noisy: it is judged by what was known before
         problem = _measured(problem, kept, seen.estimate)
@@ -168,8 +174,7 @@ def refine(
     change, count = after - before, len(before)
     mean = float(change.mean()) if count else 0.0
     spread = float(change.std(ddof=1) / count**0.5) if count > 1 else np.inf
-    readout = None if readout_declared or not seen.converged else _readout(_part(problem, kept), seen.estimate)
-    reason = _rolling(readout) or _doubt(seen_alone, seen, chi2, mean, spread) or _too_late(problem, seen.estimate)
+    reason = _doubt(seen_alone, seen, chi2, mean, spread) or _too_late(problem, seen.estimate)
     assert problem.inertial is not None
     judged = Judged(
         estimate=start,
@@ -256,15 +261,28 @@ def _readout(problem: Problem, x: Estimate) -> tuple[float, float] | None:
     return x.readout_s, float(cov[READOUT, READOUT]) ** 0.5
 
 
-def _rolling(readout: tuple[float, float] | None) -> str:
-    """Why a model stays as it is whose images turn out to have a rolling shutter; empty where they have none."""
-    if readout is None or abs(readout[0]) < max(LIMITS.least_readout_s, LIMITS.sure_sigma * readout[1]):
-        return ""
-    upwards = "" if readout[0] > 0 else ", from the last line to the first"
-    return (
-        "its images have a rolling shutter, and would not agree with the refined poses: declare the readout, which is "
-        f"{1e3 * abs(readout[0]):.1f} +- {1e3 * readout[1]:.1f} ms{upwards}"
+def _test_readout(
+    problem: Problem, kept: BoolArray, seen: Solution
+) -> tuple[tuple[float, float] | None, Problem, Solution]:
+    """A readout that nobody declared, with the problem and its solution; without one, those of a global shutter."""
+    observations = problem.observations
+    info, free = problem.prior.info.copy(), np.arange(len(problem.prior.info)) != READOUT
+    info[READOUT] = info[:, READOUT] = np.where(free, 0.0, NO_READOUT_S**-2)
+    still = replace(
+        problem,
+        observations=replace(observations, line=np.zeros_like(observations.line)),
+        prior=replace(problem.prior, info=info, mean=replace(problem.prior.mean, readout_s=0.0)),
     )
+    without = solve(_part(still, kept), replace(seen.estimate, readout_s=0.0))
+    found = _readout(_part(problem, kept), seen.estimate)
+    if found is None or abs(found[0]) < max(LIMITS.least_readout_s, LIMITS.sure_sigma * found[1]):
+        return None, still, without
+    better = held_out(still, without.estimate, still.observations.select(~kept)) - held_out(
+        problem, seen.estimate, observations.select(~kept)
+    )
+    if len(better) < 2 or better.mean() < LIMITS.better_sigma * better.std(ddof=1) / len(better) ** 0.5:
+        return None, still, without
+    return found, problem, seen
 
 
 def _doubt(alone: Solution, seen: Solution, chi2: float, change: float, spread: float) -> str:

@@ -11,7 +11,7 @@ from colmap_inertial.inertial.refine._residuals import project
 from colmap_inertial.inertial.refine.setup import Seen, free_cameras, intrinsics_of
 from colmap_inertial.inertial.refine.values import FIRST_INTRINSIC, Estimate, Prior, Problem
 
-#: Points this much nearer or farther than a path is long are left out of its covariance.
+#: Points this much nearer or farther than a path is long are left out.
 _EXTREME = 1e4
 #: No observation is better.
 _LEAST_PX = 0.05
@@ -23,10 +23,9 @@ _QUANTILE = 0.75
 def make_pictures(seen: Seen) -> tuple[Problem, Estimate]:
     """The problem of pictures alone, as a global shutter sees them, cameras free; and the model as its estimate.
 
-    The IMU stands where the camera does, as nothing is known of it. Points that lie in a camera, or at infinity, are
-    left out: beside them, rounding hides what the others tell.
+    The IMU stands where the camera does, as nothing is known of it.
     """
-    seen = _without_extremes(seen)
+    seen = without_extremes(seen)
     cameras = free_cameras(seen, True)
     intrinsics, spread = intrinsics_of(cameras)
     still, none = np.zeros_like(seen.cam_in_world), np.zeros((3, 3))
@@ -63,8 +62,11 @@ def make_pictures(seen: Seen) -> tuple[Problem, Estimate]:
     return problem, x
 
 
-def _without_extremes(seen: Seen) -> Seen:
-    """A model without points that are extremely near to one of their cameras, or far, by the path's extent."""
+def without_extremes(seen: Seen) -> Seen:
+    """A model without points that are extremely near to one of their cameras, or far, by the path's extent.
+
+    Beside their observations, rounding hides what the others tell.
+    """
     one = seen.observations
     away = seen.points[one.point] - seen.cam_in_world[one.frame]
     depth = np.einsum("ni,ni->n", seen.cam_from_world[one.frame, 2], away)
@@ -73,7 +75,13 @@ def _without_extremes(seen: Seen) -> Seen:
     kept = np.bincount(one.point, wrong, minlength=len(seen.points)) == 0
     mine = kept[one.point]
     observations = replace(one.select(mine), point=np.cumsum(kept)[one.point[mine]] - 1)
-    return replace(seen, points=seen.points[kept], observations=observations)
+    return replace(
+        seen,
+        point_ids=tuple(np.array(seen.point_ids)[kept].tolist()),
+        points=seen.points[kept],
+        observations=observations,
+        place=seen.place[mine],
+    )
 
 
 def pictures_alone(problem: Problem, xy_px: Array) -> Problem:

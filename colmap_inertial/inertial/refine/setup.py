@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 #: Standard deviations of what the first guess leaves of the rotation, the offset and a camera's numbers: wide.
 _ROTATION_RAD, _OFFSET_S, _INTRINSIC_SHARE = 0.05, 0.02, 0.1
 #: Of a readout that is none.
-_NO_READOUT_S = 1e-9
+NO_READOUT_S = 1e-9
 #: Readings are looked up as far beyond the readout around a node; one that is not declared is hardly longer than this.
 _MARGIN_S, _LONGEST_READOUT_S = 0.01, 0.04
 #: Cameras more than this are not estimated: each picture has its own.
@@ -339,7 +339,7 @@ def _information(start: Estimate, known: Known, imu: ImuRecording, timing: Frame
     sigma[ROTATION], sigma[OFFSET] = _ROTATION_RAD, _OFFSET_S
     sigma[LEVER] = np.maximum(np.sqrt(variance[CAL.LEVER_ARM]), 1e-6)
     sigma[CLOCK_RATE] = PRIORS.clock_rate
-    sigma[READOUT] = np.sqrt(variance[CAL.READOUT]) if timing.readout_s != 0 else _NO_READOUT_S
+    sigma[READOUT] = np.sqrt(variance[CAL.READOUT]) if timing.readout_s != 0 else NO_READOUT_S
     sigma[FIRST_INTRINSIC : at.seen.stop] = _INTRINSIC_SHARE * np.maximum(np.abs(start.intrinsics), 1.0)
     sigma[at.accel_delay] = np.sqrt(max(variance[gyro] + variance[accel] - 2 * cov[gyro, accel], 1e-8))
     sigma[at.gyro_gain], sigma[at.accel_gain] = PRIORS.gyro_gain, PRIORS.accel_gain
@@ -386,9 +386,11 @@ def at_middle_lines(problem: Problem, x: Estimate) -> Written:
 
 
 def written_back(
-    reconstruction: pycolmap.Reconstruction, seen: Seen, problem: Problem, x: Estimate
+    reconstruction: pycolmap.Reconstruction, seen: Seen, problem: Problem, x: Estimate, *, rectified: bool = True
 ) -> pycolmap.Reconstruction:
     """A copy of a model with the poses, points, observations and cameras of a solution.
+
+    Observations are as a global shutter would have made them; as they were, where images are not ``rectified``.
 
     Points that fewer than two of its images see were no part of it, and go.
     """
@@ -402,7 +404,7 @@ def written_back(
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ written.cam_in_world[i])
         copy.frame(image.frame_id).set_cam_from_world(image.camera_id, pose)
         points2D = image.points2D
-        for o in mine:
+        for o in mine if rectified else ():
             points2D[int(seen.place[o])].xy = written.xy_px[o]
     for point_id in set(copy.point3D_ids()) - set(seen.point_ids):
         copy.delete_point3D(point_id)

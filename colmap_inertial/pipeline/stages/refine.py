@@ -19,6 +19,7 @@ from colmap_inertial.core.types import CAL, CameraImuCalibration, Similarity, So
 from colmap_inertial.inertial.core.priors import is_calibrated, model_scale_sigma
 from colmap_inertial.inertial.refine.judge import Judged, refine
 from colmap_inertial.inertial.refine.motion import add_scale
+from colmap_inertial.inertial.refine.pictures import without_extremes
 from colmap_inertial.inertial.refine.setup import (
     Known,
     Seen,
@@ -118,8 +119,6 @@ class RefineStage(InertialStage):
             return f"it has fewer than {_FEWEST_POINTS} points"
         if has_rigs(reconstruction) or _alternate(model):
             return "several cameras took its images, and each has its own place beside the IMU"
-        if model.timing.readout_s and not model.rectified:
-            return "its images still have the rolling shutter, and would not agree with the refined poses"
         if estimate.parts is not None and estimate.parts.get("accel_faults"):
             return "the accelerometer has faults, which its scale undid and the refinement would not"
         if model.rectified and self.shutter is None:
@@ -127,7 +126,7 @@ class RefineStage(InertialStage):
         return ""
 
     def _refined(self, model: Model) -> Model:
-        seen = read_seen(model.reconstruction, model.timing)
+        seen = without_extremes(read_seen(model.reconstruction, model.timing))
         problem, start = make_problem(seen, model.timing, self.imu, self._known(model), self._exposed_px(model, seen))
         declared = model.timing.readout_s is not None
         judged = refine(problem, start, seen.observations.xy_px, seen.t_s, readout_declared=declared)
@@ -157,8 +156,10 @@ class RefineStage(InertialStage):
         if own.verdict == "refused":
             return _said(model, f"left as it is: refined, {'; '.join(own.reasons)} ({heard})", **figures)
         figures["size_before"] = 1 / move.scale
-        readout_s = x.readout_s if model.timing.readout_s else None
-        reconstruction = written_back(model.reconstruction, seen, problem, x)
+        # a motion's readout has the direction that was declared
+        readout_s = x.readout_s if model.timing.readout_s or (judged.readout and x.readout_s > 0) else None
+        rolling = not model.rectified and bool(model.timing.readout_s or judged.readout)
+        reconstruction = written_back(model.reconstruction, seen, problem, x, rectified=not rolling)
         done = replace(
             model,
             reconstruction=reconstruction,
@@ -168,7 +169,7 @@ class RefineStage(InertialStage):
             observed_px={},
             motion=_motion(seen, written.cam_in_world, judged, calibrated=calibrated, readout_s=readout_s),
         )
-        return _said(done, f"refined by the IMU ({heard})", action="refined", **figures)
+        return _said(done, f"refined by the IMU ({heard}){_rolling(x, rolling)}", action="refined", **figures)
 
     def _exposed_px(self, model: Model, seen: Seen) -> Array:
         """(M, 2) observations in the pictures as they were exposed."""
@@ -236,6 +237,17 @@ def _said(model: Model, reason: str, *, action: str = "", **values: object) -> M
     if scale is not None and model.similarity is not None:
         scale = replace(scale, notes=(*scale.notes, f"the model was {reason}"))
     return replace(model, treatments=(*model.treatments, done), scale=scale)
+
+
+def _rolling(x: Estimate, rolling: bool) -> str:
+    """What is said of pictures that keep their rolling shutter."""
+    if not rolling:
+        return ""
+    upwards = "" if x.readout_s > 0 else " from the last line to the first"
+    return (
+        f"; poses are those of the middle line: images and keypoints keep their rolling shutter of "
+        f"{1e3 * abs(x.readout_s):.1f} ms{upwards}"
+    )
 
 
 def _motion(seen: Seen, centres: Array, judged: Judged, *, calibrated: bool, readout_s: float | None) -> SolvedMotion:
