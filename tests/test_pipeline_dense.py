@@ -237,12 +237,13 @@ def test_with_cuda_it_goes_through_in_one_run(box, tmp_path, monkeypatch):
 
 
 def test_half_written_depth_maps_are_made_again(unfinished, box, monkeypatch):
-    torn = unfinished / "dense" / "0" / "stereo" / "depth_maps" / f"{box.names[0]}.geometric.bin"
-    torn.write_bytes(b"96&72&1&" + bytes(100))
+    name = f"dense/0/stereo/depth_maps/{box.names[0]}.geometric.bin"
+    (unfinished / name).write_bytes(b"96&72&1&" + bytes(100))
 
     def run_colmap(command, **_):
-        assert not torn.exists()
-        cast_depth_maps(box, unfinished)
+        beside = unfinished / ".stages" / "next"  # as no mesh was asked for before
+        assert beside.is_dir() and not (beside / name).exists()
+        cast_depth_maps(box, beside)
         return subprocess.CompletedProcess(command, 0, "", "")
 
     monkeypatch.setattr(pycolmap, "has_cuda", True)

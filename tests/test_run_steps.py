@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from test_pipeline import contents
 from test_pipeline_parts import frames_of, recording_of, session_in
 
 from colmap_inertial.checks.diagnose import Recorded, diagnose
@@ -22,7 +23,7 @@ from colmap_inertial.colmap import steps
 from colmap_inertial.colmap.mapping import MapRecord, map_images
 from colmap_inertial.colmap.pairing import MatchRecord
 from colmap_inertial.colmap.sparse import KeypointRecords, extract_features, image_pairs, write_gravity_priors
-from colmap_inertial.core.errors import FormatError, NotObservableError, OutputExistsError
+from colmap_inertial.core.errors import FormatError, NotObservableError, OutputError, OutputExistsError
 from colmap_inertial.core.options import MappingOptions, ProjectOptions, ReconstructOptions
 from colmap_inertial.core.threads import map_in_order
 from colmap_inertial.core.types import CALIBRATION_PARAMETERS, CameraModel, FrameTiming, ImuRecording, Treatment
@@ -36,6 +37,7 @@ from colmap_inertial.model import TRANSFORM_FILE
 from colmap_inertial.model.similarities import ModelScale, plain_factor
 from colmap_inertial.pipeline.run.context import Recording, RunContext, prior_calibration
 from colmap_inertial.pipeline.run.progress import silent
+from colmap_inertial.pipeline.run.replacing import replace_result
 from colmap_inertial.pipeline.run.runner import StepRunner, fingerprint
 from colmap_inertial.pipeline.run.session import Session, open_session
 from colmap_inertial.pipeline.run.workspace import Workspace, refuse_links
@@ -345,6 +347,33 @@ def test_links_of_a_project_may_stay_and_the_folder_itself_may_be_one(workspace,
         refuse_links(tmp_path / "link")
 
 
+@pytest.mark.parametrize("moves", range(8))
+def test_a_replacement_that_was_killed_is_finished_by_the_next_run(workspace, moves, monkeypatch):
+    beside = Workspace(workspace.stamps / "next")
+    for root, text, own in ((workspace, "old", "gone"), (beside, "new", "come")):
+        root.stamps.mkdir(parents=True, exist_ok=True)
+        for path in (root.result, root.config, root.images, root.root / own, root.stamps / f"{own}.json"):
+            path.write_text(json.dumps(text))
+    whole = {"come", "come.json", "config.toml", "images", "result.json"}
+    renames, rename = itertools.count(), os.replace
+
+    def interrupted(source, target):
+        if "next" in Path(source).parts and next(renames) == moves:
+            raise KeyboardInterrupt
+        rename(source, target)
+
+    with monkeypatch.context() as patched, contextlib.suppress(KeyboardInterrupt):
+        patched.setattr(os, "replace", interrupted)
+        replace_result(workspace)
+    replace_result(workspace)
+    there = {path.name: path for path in workspace.root.rglob("*") if path.is_file()}
+    assert set(there) == whole
+    assert not (workspace.root / "gone").exists() and not beside.root.exists()
+    assert {path.read_text() for path in workspace.root.rglob("*") if path.is_file() and path.name in whole} == {
+        '"new"'
+    }
+
+
 def test_what_says_whose_folder_it_is_was_damaged(workspace, tmp_path):
     workspace.owner.write_text("{")
     with pytest.raises(OutputExistsError, match="choose another folder, or remove this one"):
@@ -374,10 +403,10 @@ def test_however_a_capture_is_spelt_its_steps_are_kept(workspace, tmp_path, monk
         assert made(Path(os.path.relpath(tmp_path))) == []
 
 
-def test_a_session_is_alone_in_its_folder_and_another_configuration_undoes_the_result(tmp_path):
-    def session(seed=0):
+def test_a_session_is_alone_in_its_folder_and_another_configuration_keeps_the_result_until_its_own_is_whole(tmp_path):
+    def session(seed=0, recording=(1, ...)):
         options = replace(ReconstructOptions(), seed=seed)
-        return open_session(tmp_path / "out", tmp_path / "capture.toml", options, pictures=())
+        return open_session(tmp_path / "out", tmp_path / "capture.toml", options, pictures=(), decides=recording)
 
     with session() as first:
         with pytest.raises(OutputExistsError, match="another run is at work"), session():
@@ -385,8 +414,36 @@ def test_a_session_is_alone_in_its_folder_and_another_configuration_undoes_the_r
         first.finish({})
     with session() as again:
         assert again.finish({})
+    earlier = contents(tmp_path / "out")
+
+    def write(session, text):
+        target = session.workspace.images
+        session.runner.run("frames", {"text": text}, [target], lambda partial: partial[0].write_text(text))
+        return session.in_place(target)
+
+    for fault in (KeyboardInterrupt, OutputError):
+        with pytest.raises(fault), session(seed=1) as other:
+            assert not other.workspace.result.exists()
+            assert write(other, "new") == tmp_path / "out" / "images"
+            raise fault("stopped")
+        found = contents(tmp_path / "out")
+        assert {name: found[name] for name in earlier if name != "log.txt"} == {
+            name: data for name, data in earlier.items() if name != "log.txt"
+        }
+        assert not (tmp_path / "out" / "images").exists()
+    with session() as again:
+        assert again.finish({}) and not (again.workspace.stamps / "next").exists()
     with session(seed=1) as other:
-        assert not other.workspace.result.exists() and not other.finish({})
+        write(other, "new")
+        assert not other.finish({})
+    out = Workspace(tmp_path / "out")
+    assert out.images.read_text() == "new" and out.result.is_file() and b"seed = 1" in out.config.read_bytes()
+    assert {path.name for path in out.stamps.iterdir()} == {"capture.json", "frames.json", "inputs.json", "lock"}
+    with session(seed=1) as same:
+        write(same, "new")
+        assert same.finish({}) and not same.runner.worked
+    with session(seed=1, recording=(2, ...)) as other:
+        assert other.workspace.root == out.stamps / "next"
 
 
 def test_dropped_frames_are_not_written_and_say_why(tmp_path):

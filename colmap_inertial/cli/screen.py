@@ -151,6 +151,10 @@ class Screen:
         self._outputs[step] = tuple(outputs)
         self._say_kept()
 
+    def noted(self, sentence: str, /) -> None:
+        """Why something is made again."""
+        self._console.print(sentence, soft_wrap=not self._console.is_terminal, markup=False, highlight=False)
+
     def _say_kept(self) -> None:
         if self._kept:
             names = ", ".join(_name_stage(stage).lower() for stage in self._kept)

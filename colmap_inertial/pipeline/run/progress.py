@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Protocol, TypeVar, runtime_checkable
 
 Item = TypeVar("Item")
+
+log = logging.getLogger(__name__)
 
 
 class Progress(Protocol):
@@ -24,6 +27,16 @@ class HearsSteps(Protocol):
 
     def began(self, step: str, outputs: Sequence[Path], /) -> None:
         """A step begins, which writes these files and folders."""
+
+    def noted(self, sentence: str, /) -> None:
+        """Why something is made again."""
+
+
+def tell(progress: Progress, sentence: str) -> None:
+    """Say why something is made again: in the log, and to a receiver that hears of steps."""
+    log.info("%s", sentence)
+    if isinstance(progress, HearsSteps):
+        progress.noted(sentence)
 
 
 def silent(stage: str, done: int, total: int, /) -> None:

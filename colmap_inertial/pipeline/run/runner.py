@@ -23,7 +23,7 @@ import numpy as np
 from colmap_inertial import __version__
 from colmap_inertial.core.errors import FormatError, InertialError
 from colmap_inertial.io.files import read_record, write_record
-from colmap_inertial.pipeline.run.progress import HearsSteps, Progress, silent
+from colmap_inertial.pipeline.run.progress import HearsSteps, Progress, silent, tell
 from colmap_inertial.pipeline.run.workspace import Workspace
 
 log = logging.getLogger(__name__)
@@ -54,7 +54,14 @@ def canonical(value: object) -> object:
         return str(value.resolve())  # however it was spelt
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
+    if value is ...:
+        return "..."
     return _canonical_callable(value)
+
+
+def hash_values(*values: object) -> str:
+    """What tells values from others."""
+    return hashlib.sha256(json.dumps(canonical(values), sort_keys=True).encode()).hexdigest()
 
 
 def _canonical_callable(value: object) -> object:
@@ -196,10 +203,15 @@ def _files_in(root: Path, paths: Iterable[Path]) -> tuple[_File, ...]:
     return tuple(_File.of(root, path) for path in sorted(found))
 
 
-def find_loss(workspace: Workspace, steps: Iterable[str]) -> str:
-    """The first file of finished steps that is missing or damaged; empty where there is none."""
+def find_loss(workspace: Workspace, steps: Iterable[str], *, but: Iterable[Path] = ()) -> str:
+    """The first file of finished steps that is missing or damaged; empty where there is none.
+
+    Folders ``but`` may be gone as a whole.
+    """
+    gone = tuple(path.relative_to(workspace.root).as_posix() for path in but if not path.exists())
     stamps = filter(None, (_read_stamp(workspace.stamps / f"{step}.json") for step in steps))
-    return next(filter(None, (stamp.lost(workspace.root) for stamp in stamps)), "")
+    files = (file for stamp in stamps for file in stamp.files if not file.name.startswith(gone))
+    return next((file.name for file in files if file.now(workspace.root) is None), "")
 
 
 @contextlib.contextmanager
@@ -241,6 +253,7 @@ class StepRunner:
 
     def __init__(self, workspace: Workspace, heard_by: Progress = silent) -> None:
         self._workspace = workspace
+        self._progress = heard_by
         self._heard_by = heard_by if isinstance(heard_by, HearsSteps) else None
         self._keys: dict[str, str] = {}
         self.seconds: dict[str, float] = {}
@@ -291,6 +304,7 @@ class StepRunner:
         upstream = [self._keys[step] for step in after]
         written = [path.name for path in outputs]
         text = json.dumps([name, __version__, upstream, canonical(depends), written], sort_keys=True)
+        text = text.replace(json.dumps(f"{root.resolve()}{os.sep}")[1:-1], "")  # wherever the folder is
         key = hashlib.sha256(text.encode()).hexdigest()
         done = _read_stamp(stamp)
         if done is not None and done.key == key and self._stands(name, done):
@@ -339,7 +353,7 @@ class StepRunner:
     def _stands(self, name: str, done: _Stamp) -> bool:
         lost = done.lost(self._workspace.root)
         if lost:
-            log.warning("%s: made again, as %s is missing or damaged", name, lost)
+            tell(self._progress, f"{name.replace('_', ' ')}: made again, as {lost} is missing or damaged")
         return not lost
 
     def _depend_on(self, name: str, stamp: _Stamp) -> None:

@@ -8,6 +8,7 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 from colmap_inertial import __version__
 from colmap_inertial.core.errors import FormatError, InertialError
@@ -23,11 +24,22 @@ from colmap_inertial.io.files import (
 from colmap_inertial.model import load_pycolmap
 from colmap_inertial.pipeline.run.config import config_as_toml
 from colmap_inertial.pipeline.run.context import RunContext
-from colmap_inertial.pipeline.run.progress import Progress
-from colmap_inertial.pipeline.run.runner import StepRunner, find_loss, remove
+from colmap_inertial.pipeline.run.progress import Progress, tell
+from colmap_inertial.pipeline.run.replacing import (
+    changed_options,
+    drop_beside,
+    is_finished,
+    is_made_of,
+    moved,
+    place_beside,
+    replace_result,
+)
+from colmap_inertial.pipeline.run.runner import StepRunner, find_loss, hash_values, remove
 from colmap_inertial.pipeline.run.workspace import Workspace, require_apart
 
 log = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -42,11 +54,18 @@ class Session:
         Does the steps, or keeps them from an earlier run.
     context
         How the work is done.
+    out
+        The folder that was asked for, where that is another one until the end.
     """
 
     workspace: Workspace
     runner: StepRunner
     context: RunContext
+    out: Path | None = None
+
+    def in_place(self, value: T) -> T:
+        """What a run made, with its paths as they are after the end."""
+        return value if self.out is None else moved(value, self.workspace.root, self.out)
 
     @property
     def progress(self) -> Progress:
@@ -81,6 +100,7 @@ def open_session(
     context: RunContext | None = None,
     *,
     pictures: Sequence[Path],
+    decides: object = None,
     command: str = "reconstruct",
 ) -> Iterator[Session]:
     """A session in ``out``: locked, its options written down, its log kept.
@@ -97,6 +117,8 @@ def open_session(
         How the work is done; defaults serve. ``scratch`` becomes a folder in ``out``.
     pictures
         Folders that pictures are read from; ``out`` may not lie in one.
+    decides
+        What decides the result beside the options: the recording, and stages that were given.
     command
         What is done; one folder is for one command.
 
@@ -115,17 +137,45 @@ def open_session(
         stack.enter_context(workspace.locked())
         workspace.open(source, command)
         remove_temporaries(workspace.root, workspace.stamps, workspace.report_data)
-        for folder in workspace.stamps.glob("tmp*"):  # small models of a run that was killed
-            remove(folder)
+        replace_result(workspace)
+        for steps in workspace.stamps, workspace.stamps / "next" / workspace.stamps.name:
+            for folder in steps.glob("tmp*"):  # small models of a run that was killed
+                remove(folder)
         stack.enter_context(logging_to(workspace.log))
         log.info("colmap-inertial %s: %s -> %s", __version__, source, out)
-        config = config_as_toml(options)
-        if not workspace.config.is_file() or workspace.config.read_bytes() != config.encode():
-            workspace.unfinish()
-            write_text(workspace.config, config)
-        context = context or RunContext()
-        runner = StepRunner(workspace, context.progress)
-        yield Session(workspace=workspace, runner=runner, context=replace(context, scratch=workspace.stamps))
+        context, config, inputs = context or RunContext(), config_as_toml(options), hash_values(decides)
+        beside = workspace
+        if is_finished(workspace) and not is_made_of(workspace, config, inputs):
+            stack.enter_context(_earlier_result_stays(out))
+            changes = (
+                "; ".join(changed_options(workspace.config, config)) or "the recording or what is made of it changed"
+            )
+            tell(context.progress, f"{changes}: the result in {out} stays until the new one is whole")
+            beside = place_beside(workspace, config, inputs)
+            beside.open(source, command)
+        else:
+            drop_beside(workspace)
+        if not is_made_of(beside, config, inputs):
+            beside.unfinish()
+            write_text(beside.config, config)
+            write_json(beside.inputs, {"inputs": inputs})
+        runner = StepRunner(beside, context.progress)
+        yield Session(
+            workspace=beside,
+            runner=runner,
+            context=replace(context, scratch=beside.stamps),
+            out=None if beside is workspace else out,
+        )
+        replace_result(workspace)
+
+
+@contextlib.contextmanager
+def _earlier_result_stays(out: Path) -> Iterator[None]:
+    try:
+        yield
+    except InertialError as error:
+        error.add_note(f"the earlier result in {out} stays as it was")
+        raise
 
 
 @contextlib.contextmanager

@@ -96,6 +96,8 @@ class Workspace:
     """One JSON for each finished step."""
     stage_names = _Inside(".stages/stage_names.toml")
     """Which stages it is made with, where a batch named them."""
+    inputs = _Inside(".stages/inputs.json")
+    """What tells the recording that the result is made of from others."""
     lock = _Inside(".stages/lock")
     """Held by the run that is at work in the folder."""
     unsmoothed = _Inside(".stages/unsmoothed")

@@ -211,8 +211,9 @@ def _reconstruct(
     capture, used_calibration = given.capture, describe_files(options.calibration)
     device = mapping_device(options.mapping, deterministic=options.deterministic)
     context = RunContext.of(options, device=device, progress=progress)
+    decides, pictures = (given.recording.identity(), stages), picture_folders(capture)
     with (
-        open_session(out, capture.path, options, context, pictures=picture_folders(capture)) as session,
+        open_session(out, capture.path, options, context, pictures=pictures, decides=decides) as session,
         reporting_stops(session.workspace, capture),
     ):
         write_recording(session, given.recording)  # a run that stops reports it, too
@@ -222,7 +223,7 @@ def _reconstruct(
         result = report_result(session, result, capture, used_calibration)
         remove(session.workspace.colmap_features)
         session.runner.forget("features")
-    return result
+    return session.in_place(result)
 
 
 def _run(session: Session, given: _Given, options: ReconstructOptions, stages: Stages) -> ReconstructResult:

@@ -226,7 +226,8 @@ def run_frames(
         "images": images.relative_to(workspace.root).as_posix(),
     }
     crops = [] if kept is None else [workspace.crops]
-    session.runner.run("frames", depends, [images, workspace.frames, workspace.unsmoothed, *crops], work)
+    outputs, depths = [images, workspace.frames, workspace.unsmoothed, *crops], [workspace.apertures]
+    session.runner.run("frames", depends, outputs, work, beside=lambda: depths)
     return read_frame_records(workspace.frames)
 
 

@@ -48,10 +48,10 @@ _SHEET = "sheet.json"
 
 
 def _open_session(
-    out: StrPath, capture: Capture, options: object, progress: Progress, command: str
+    out: StrPath, capture: Capture, options: object, progress: Progress, command: str, decides: object
 ) -> contextlib.AbstractContextManager[Session]:
     context, pictures = RunContext(progress=progress), picture_folders(capture)
-    return open_session(Path(out), capture.path, options, context, pictures=pictures, command=command)
+    return open_session(Path(out), capture.path, options, context, pictures=pictures, decides=decides, command=command)
 
 
 def _finish(session: Session, capture: Capture, content: Mapping[str, object]) -> bool:
@@ -177,7 +177,7 @@ def deblur_capture(
     )
     imu = correct_imu(loaded, imu, calibration)
     recording = Recording.of(loaded, imu, timing, prior_calibration(loaded, calibration))
-    with _open_session(out, loaded, options, progress, "deblur") as session:
+    with _open_session(out, loaded, options, progress, "deblur", recording.identity()) as session:
         workspace = session.workspace
         plan = run_plan(session, recording, Treatments(deblur=method, rolling_shutter=options.rolling_shutter))
         inputs = StageInputs(recording=recording, options=options, plan=plan, maps=False)
@@ -199,7 +199,7 @@ def deblur_capture(
             "frames": [frame_as_json(record, plan, rectified) for record in records],
         }
         unchanged = _finish(session, loaded, content)
-        return DeblurResult(
+        made = DeblurResult(
             workspace=workspace,
             frames=records,
             imaging=plan,
@@ -207,6 +207,7 @@ def deblur_capture(
             unchanged=unchanged,
             rectified=rectified,
         )
+        return session.in_place(made)
 
 
 def _require_free_sheet(sheet: Path, out: Path) -> None:
@@ -288,17 +289,19 @@ def fuse_captured(
                 encode_image(target, image, path_in(folder, frame.name))
             yield replace(frame, image=fused.image)
 
-    with _open_session(out, loaded, options, progress, "fuse-apertures") as session:
+    inputs = [
+        fingerprint(path) for path in (*(path_in(folder, name) for name in names), *loaded.apertures.files(names))
+    ]
+    with _open_session(out, loaded, options, progress, "fuse-apertures", (loaded, inputs)) as session:
         root = session.workspace.root
         for kind in {"disparity", "depth", "refocused"} - set(kinds):
             remove(root / kind)
         frames = (Frame(name=name, image=read_image(path_in(folder, name)), t_s=0.0) for name in names)
-        inputs = [*(path_in(folder, name) for name in names), *loaded.apertures.files(names)]
-        depends = {"capture": loaded, "options": options, "inputs": [fingerprint(path) for path in inputs]}
+        depends = {"capture": loaded, "options": options, "inputs": inputs}
         outputs = [root / kind for kind in kinds]
         records = _run_fusion(session, folder, frames, names, lambda to: partial(fuse_into, to), depends, outputs)
         _finish(session, loaded, {"frames": [record.name for record in records]})
-        return tuple(session.workspace.images / name for name in names)
+        return session.in_place(tuple(session.workspace.images / name for name in names))
 
 
 def fuse_exposures_captured(
@@ -357,7 +360,9 @@ def fuse_exposures_captured(
     elif loaded.imu is not None:
         imu = correct_imu(loaded, read_capture_imu(loaded), calibration)
         recording = Recording.of(loaded, imu, timing, prior)
-    with _open_session(out, loaded, options, progress, "fuse-exposures") as session:
+    inputs = [fingerprint(path) for path in (*(path_in(folder, name) for name in names), *long)]
+    decides = loaded, timing, prior, inputs, fuser.identity
+    with _open_session(out, loaded, options, progress, "fuse-exposures", decides) as session:
         plan = ImagingPlan(deblur_note=note)
         if recording is not None:
             plan = run_plan(session, recording, Treatments(deblur="off", rolling_shutter="off", pairs=True))
@@ -372,7 +377,7 @@ def fuse_exposures_captured(
             "capture": loaded,
             "timing": timing,
             "stage": stage,
-            "inputs": [fingerprint(path) for path in (*(path_in(folder, name) for name in names), *long)],
+            "inputs": inputs,
         }
         frames = _frames(loaded, timing, names)
         records = _run_fusion(session, folder, frames, names, lambda _: stage, depends)

@@ -176,8 +176,9 @@ def _reconstruct(
     filmed = isinstance(given.capture.frames, Video)
     images = _images(project, source, needed=pictures or (options.georeference and not filmed))
     context, folders = RunContext.of(options, progress=progress), () if images is None else (images,)
+    decides = given.source, given.capture, given.imu, given.prior, fingerprint(project), model_stages
     with (
-        open_session(out, project, options, context, pictures=folders) as session,
+        open_session(out, project, options, context, pictures=folders, decides=decides) as session,
         reporting_stops(session.workspace, given.capture),
     ):
         read = functools.cache(read_model)
@@ -211,7 +212,7 @@ def _reconstruct(
             project_metric=metric,
         )
         write_recording(session, recording)
-        return report_result(session, result, given.capture, given.calibration_files, project=source)
+        return session.in_place(report_result(session, result, given.capture, given.calibration_files, project=source))
 
 
 def _trajectory(model: pycolmap.Reconstruction, timing: FrameTiming) -> CameraTrajectory | Literal["untimed"]:

@@ -190,7 +190,7 @@ def report_result(
         for old in pages:
             remove(old)
         result = dataclasses.replace(result, report=write_report(workspace.root, result=content))
-        session.runner.record("report", pages)
+        session.runner.record("report", [*pages, workspace.diagnosis])
     session.finish(content)
     return result
 

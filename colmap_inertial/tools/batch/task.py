@@ -170,11 +170,11 @@ def find_earlier_end(task: CaptureTask) -> CaptureStatus | None:
     status = CaptureStatus(name=task.name) if known is None else known
     try:
         job = read_config(task.config, Job)
-        try:
-            result = read_json(workspace.result)
-        except FormatError:
-            return None  # damaged: it is made again
-        if result.get("waiting") or find_loss(workspace, [*result.get("seconds", ()), "report"]):
+    except FormatError as error:
+        return failed(status, str(error), error.exit_code)
+    try:
+        result, may_go = read_json(workspace.result), (workspace.images, workspace.colmap)
+        if result.get("waiting") or find_loss(workspace, [*result.get("seconds", ()), "report"], but=may_go):
             return None
         made_from = Path(str(read_json(workspace.stamps / "capture.json").get("capture")))
         project = result.get("project", _plain(ProjectOptions()))
@@ -189,8 +189,8 @@ def find_earlier_end(task: CaptureTask) -> CaptureStatus | None:
             text = f"{task.out} holds the result of another {other}; remove it or choose another folder"
             return failed(status, text, FormatError.exit_code)
         return read_end(status, workspace.result)
-    except FormatError as error:
-        return failed(status, str(error), error.exit_code)
+    except FormatError:
+        return None  # damaged: the run makes it again, or says what to do
 
 
 def read_stage_names(workspace: Workspace) -> StageNames:
