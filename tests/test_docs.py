@@ -483,6 +483,21 @@ def test_the_examples_in_python_run(examples):
     assert (folder / "project_metric" / "sparse" / "0").is_dir()
 
 
+def test_the_notebook_runs_from_a_capture_to_a_distance(examples, monkeypatch):
+    folder, values = examples
+    monkeypatch.chdir(folder)
+    cells = json.loads((DOCS / "measure.ipynb").read_text())["cells"]
+    known: dict[str, object] = {"capture": "capture", "out": "out", "options": values["options"]}
+    for cell in cells:
+        if cell["cell_type"] == "code" and "parameters" not in cell["metadata"].get("tags", ()):
+            exec(compile("".join(cell["source"]), f"measure.ipynb {cell['id']}", "exec"), known)
+    assert known["result"].unchanged and 0.01 < known["length_m"] < 5
+    for value in (known["imu"], known["result"], known["model"], known["model"].scale, known["model"].validation):
+        lines = repr(value).splitlines()
+        assert len(lines) <= 20 and max(map(len, lines)) <= 140
+        assert value is None or value._repr_html_().startswith("<table>")
+
+
 def test_every_example_in_python_compiles():
     for where, text in every("python"):
         compile(text, where, "exec")

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
+from colmap_inertial.core.choices import CheckedOptions
+
 #: How blur is undone.
 BlurRemover = Literal["wiener", "path", "deepgyro"]
 DeblurMethod = Literal["off", "wiener", "path", "deepgyro"]
@@ -48,7 +50,7 @@ def _check(
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReadLimits:
+class ReadLimits(CheckedOptions):
     """How large a file may be that is read: above any camera's and recorder's, below what takes all memory."""
 
     megapixels: float = 250
@@ -59,6 +61,7 @@ class ReadLimits:
     """Texts, tables and pictures in larger files (GiB) are not read."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for f in fields(self):
             _check(f"limits.{f.name}", getattr(self, f.name))
         if self.megapixels > 1073:
@@ -66,7 +69,7 @@ class ReadLimits:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MappingOptions:
+class MappingOptions(CheckedOptions):
     """How COLMAP builds the model."""
 
     pairing: Literal["auto", "exhaustive", "sequential"] = "auto"
@@ -89,6 +92,7 @@ class MappingOptions:
     """Let bundle adjustment change the camera. Not given: only where the capture declares none."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         _check("mapping.overlap", self.overlap, 1)
         _check("mapping.max_image_size", self.max_image_size, 64)
         _check("mapping.max_num_features", self.max_num_features, 50)
@@ -96,7 +100,7 @@ class MappingOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class GravityOptions:
+class GravityOptions(CheckedOptions):
     """How strong gravity is where something was recorded: a number, or the place; else what spans the Earth."""
 
     gravity_m_s2: float | None = None
@@ -107,6 +111,7 @@ class GravityOptions:
     """Height above sea level, with --latitude-deg; 1000 m change gravity by 0.03 %."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         _check("gravity_m_s2", self.gravity_m_s2, 9.7, 9.9, hint=" (it is 9.76 to 9.84 on Earth)")
         if self.gravity_m_s2 is not None and self.latitude_deg is not None:
             raise ValueError("--gravity-m-s2 and --latitude-deg both set the strength of gravity; give one of them")
@@ -133,7 +138,7 @@ class ScaleOptions(GravityOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class JoinOptions:
+class JoinOptions(CheckedOptions):
     """Up to where separate models are joined by the IMU: standard deviations, along the worst direction."""
 
     sigma_m: float = 0.1
@@ -142,12 +147,13 @@ class JoinOptions:
     """Largest standard deviation of the orientation after a gap (degrees)."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for f in fields(self):
             _check(f"join_options.{f.name}", getattr(self, f.name))
 
 
 @dataclass(frozen=True, kw_only=True)
-class ValidateOptions:
+class ValidateOptions(CheckedOptions):
     """How to validate a model."""
 
     unscaled: bool = False
@@ -163,13 +169,14 @@ class ValidateOptions:
     """Seed of the search for views that agree."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         _check("tolerance_pct", self.tolerance_pct)
         _check("max_views", self.max_views, 2)
         _check("max_residual_px", self.max_residual_px)
 
 
 @dataclass(frozen=True, kw_only=True)
-class DenseOptions:
+class DenseOptions(CheckedOptions):
     """How the dense reconstruction is made."""
 
     max_image_size: int | None = None
@@ -180,11 +187,12 @@ class DenseOptions:
     five times as fast, open where little was seen."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         _check("dense_options.max_image_size", self.max_image_size, 64)
 
 
 @dataclass(frozen=True, kw_only=True)
-class FrameOptions:
+class FrameOptions(CheckedOptions):
     """Which frames are used."""
 
     use: Literal["auto", "all"] | None = None
@@ -197,6 +205,7 @@ class FrameOptions:
     """At most so many frames a second."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not 0 < self.min_fps <= self.max_fps:
             raise ValueError(
                 f"frames.min_fps must be above 0 and not above frames.max_fps, not {self.min_fps:g} and "
@@ -205,7 +214,7 @@ class FrameOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ProjectOptions:
+class ProjectOptions(CheckedOptions):
     """An existing COLMAP project in place of a capture: the recording that ran along, and when images were taken."""
 
     imu: Path | None = None
@@ -230,6 +239,7 @@ class ProjectOptions:
     """Copy the targets of symbolic links that lead out of the project into OUT; without, such links are refused."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         ways = (self.frame_times is not None and self.video is None, self.name_times is not None, self.exif_times)
         if sum((*ways, self.video is not None)) > 1:
             raise ValueError(
@@ -238,7 +248,7 @@ class ProjectOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReferenceOptions:
+class ReferenceOptions(CheckedOptions):
     """Where the metres of a project come from, and what is known of its size."""
 
     scale_from: Literal["imu", "target", "distance"] = "imu"
@@ -253,13 +263,14 @@ class ReferenceOptions:
     4.20+-0.01."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         given = [name for name in ("target", "between", "distance") if getattr(self, name) is not None]
         if self.scale_from == "imu" and given:
             raise ValueError(f"--{given[0]} goes with --scale-from target or --scale-from distance")
 
 
 @dataclass(frozen=True, kw_only=True)
-class ApertureOptions:
+class ApertureOptions(CheckedOptions):
     """How the pictures of a multi-aperture camera are fused."""
 
     cost: Literal["census", "mutual-information"] = "census"
@@ -280,6 +291,7 @@ class ApertureOptions:
     """Threads for one exposure; as many as the process may use where absent."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.disparity_px is not None and not self.disparity_px[0] < self.disparity_px[1]:
             raise ValueError(f"disparity_px: must be a lower and a higher limit, not {self.disparity_px}")
         _check("step_px", self.step_px, 0.1, 2)
@@ -287,7 +299,7 @@ class ApertureOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExposureOptions:
+class ExposureOptions(CheckedOptions):
     """How pairs of a short and a long exposure become frames."""
 
     fuse: bool = True
@@ -299,7 +311,7 @@ class ExposureOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReconstructOptions:
+class ReconstructOptions(CheckedOptions):
     """Everything that decides the result of a reconstruction, beside the capture itself."""
 
     frames: FrameOptions = field(default_factory=FrameOptions)
@@ -361,10 +373,11 @@ class ReconstructOptions:
     """How large a file may be that is read."""
 
     def __post_init__(self) -> None:
-        _check("seed", self.seed, 0, 2**31 - 1)
         given: Any = self.calibration
-        if given is None or isinstance(given, str | Path):  # one file may be given by itself
-            object.__setattr__(self, "calibration", () if given is None else (Path(given),))
+        if given is None:
+            object.__setattr__(self, "calibration", ())
+        super().__post_init__()
+        _check("seed", self.seed, 0, 2**31 - 1)
 
 
 #: How a list of stage names spells ``...``, the default stages.
@@ -372,7 +385,7 @@ DEFAULT_STAGES = "..."
 
 
 @dataclass(frozen=True, kw_only=True)
-class StageNames:
+class StageNames(CheckedOptions):
     """The hooks of a reconstruction by name, for processes that import them themselves.
 
     A name ``package.module:name`` (the second part may be dotted) is that of a stage itself: a function, or an
@@ -387,6 +400,7 @@ class StageNames:
     """Model stages."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for f in fields(self):
             names: tuple[str, ...] = getattr(self, f.name)
             for name in names:
@@ -409,7 +423,7 @@ def _check_stage_name(kind: str, name: str) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BatchOptions:
+class BatchOptions(CheckedOptions):
     """Who works on the captures of a batch."""
 
     workers: int | None = None
@@ -420,6 +434,7 @@ class BatchOptions:
     """How often a capture is started in all, where its process or its worker is killed."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         _check("workers", self.workers, 1)
         if self.workers is not None and self.scheduler is not None:
             raise ValueError("--workers are those of this machine; with --scheduler, the cluster has its own")
@@ -427,7 +442,7 @@ class BatchOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FuseAperturesOptions:
+class FuseAperturesOptions(CheckedOptions):
     """What is made of the pictures of a multi-aperture camera."""
 
     fusion: ApertureOptions = field(default_factory=ApertureOptions)
@@ -438,5 +453,6 @@ class FuseAperturesOptions:
     """Width of the lens that refocused pictures show, in distances between the reference and its partner."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         _check("refocus", self.refocus)
         _check("lens_width", self.lens_width)

@@ -7,6 +7,9 @@ from numpy.typing import ArrayLike
 
 from colmap_inertial.core.arrays import Array
 
+#: Times that span more (100 days) are in another unit than seconds.
+LONGEST_S = 100 * 86400.0
+
 
 def check_array(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Array:
     """A read-only float64 copy of ``value``; ``None`` in ``shape`` means any length.
@@ -16,14 +19,22 @@ def check_array(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> A
     ValueError
         For another shape, and for values that are not finite; the message begins with ``name``.
     """
-    out = np.array(value, dtype=np.float64)
-    if out.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, out.shape, strict=True)):
+    try:
+        out = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}: is no array of numbers ({error})") from None
+    if not _fits(out.shape, shape):
         wanted = tuple("N" if n is None else n for n in shape)
-        raise ValueError(f"{name}: shape {out.shape}, expected {wanted}")
+        turned = "; transpose it" if _fits(out.T.shape, shape) else ""
+        raise ValueError(f"{name}: shape {out.shape}, expected {wanted}{turned}")
     if not np.isfinite(out).all():
         raise ValueError(f"{name}: contains values that are not finite")
     out.setflags(write=False)
     return out
+
+
+def _fits(found: tuple[int, ...], shape: tuple[int | None, ...]) -> bool:
+    return len(found) == len(shape) and all(n is None or n == m for n, m in zip(shape, found, strict=True))
 
 
 def check_field(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Array:
@@ -49,9 +60,14 @@ def check_field(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> A
 
 
 def check_increasing(name: str, t_s: Array) -> None:
-    """Raise ``ValueError`` unless times increase strictly."""
+    """Raise ``ValueError`` unless times increase strictly, and are seconds: no recording lasts for months."""
     if np.any(np.diff(t_s) <= 0):
         raise ValueError(f"{name}: times must increase strictly")
+    if len(t_s) > 1 and t_s[-1] - t_s[0] > LONGEST_S:
+        raise ValueError(
+            f"{name}: spans {t_s[-1] - t_s[0]:.3g}, in seconds {(t_s[-1] - t_s[0]) / 86400:.3g} days; give seconds, "
+            "not nanoseconds, microseconds or milliseconds (the first stamp as epoch_ns, where there is one)"
+        )
 
 
 def check_fields(instance: object, **shapes: tuple[int | str, ...]) -> None:

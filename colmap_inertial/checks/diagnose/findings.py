@@ -13,6 +13,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Int64Array
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError
+from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.types import (
     CameraImuCalibration,
     CameraModel,
@@ -74,6 +75,7 @@ class Finding:
         }
 
 
+@prints_in_lines
 @dataclass(frozen=True, kw_only=True)
 class Diagnosis:
     """Everything that was found, worst first.

@@ -18,6 +18,7 @@ from colmap_inertial.checks.validate.fit import FIT
 from colmap_inertial.checks.validate.targets import Target
 from colmap_inertial.checks.words import target_facts
 from colmap_inertial.core.arrays import Array, IndexArray
+from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.io.files import convert_to_plain
 
 if TYPE_CHECKING:
@@ -309,6 +310,7 @@ class CheckPoints:
     sigma_m: float | None
 
 
+@prints_in_lines
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Validation:
     """Size of a reconstruction against a target of known size.

@@ -13,6 +13,7 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import matrix_from_quat, rotation_between, skew
 from colmap_inertial.core.options import WorldAxes
+from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.types.consensus import RotationConsensus
 from colmap_inertial.core.types.imu import CameraImuCalibration, ImuCalibration, ImuNoise
 from colmap_inertial.core.types.recorded import LengthUnit, ReadoutDirection
@@ -27,6 +28,7 @@ DOWN_IN_WORLD = {"z-up": np.array([0.0, 0.0, -1.0]), "y-down": np.array([0.0, 1.
 UNDOES = "undoes: "
 
 
+@prints_in_lines
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SmoothedTrajectory:
     """Positions, velocities and accelerations with their covariance.
@@ -140,6 +142,7 @@ class AcceptedScale:
     ci95: tuple[float, float]
 
 
+@prints_in_lines
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScaleEstimate:
     """Metres per model unit, with its uncertainty and a verdict.

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.validation import check_fields
 
 #: Order of the parameters in ``CameraImuCalibration.cov``. The rotation error is in the camera frame, on the left:
@@ -33,6 +34,7 @@ class CAL:
     COUNT = 12
 
 
+@prints_in_lines
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CameraImuCalibration:
     """How the camera and the IMU of one device relate.
@@ -152,6 +154,9 @@ TYPICAL_NOISE = ImuNoise(
 JOINT_GYRO_WALK_RAD_S_RTS = 1e-4
 
 
+#: Samples of an IMU that are further apart are stamped in another unit than seconds.
+SLOWEST_S = 3.0
+
 _ENTRIES = tuple(f"{row}{column}" for row in "xyz" for column in "xyz")
 
 #: Order of the parameters in ``ImuCalibration.cov``; matrices row by row.
@@ -171,6 +176,7 @@ class IMU_CAL:
     COUNT = 24
 
 
+@prints_in_lines
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ImuCalibration:
     """What the readings of an IMU have to be corrected by, found where it lay still in several attitudes.
@@ -281,6 +287,7 @@ class ImuCalibration:
         return np.asarray(gyro @ undo_gyro), np.asarray(accel @ undo_accel)
 
 
+@prints_in_lines
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ImuRecording:
     """Gyroscope and accelerometer samples of one recording.
@@ -323,6 +330,10 @@ class ImuRecording:
         check_fields(self, gyro_t_s=("N",), accel_t_s=("M",), gyro_rad_s=("N", 3), accel_m_s2=("M", 3))
         if len(self.gyro_t_s) < 2 or len(self.accel_t_s) == 1:
             raise ValueError("an ImuRecording needs at least two samples of each sensor (or none of the accelerometer)")
+        for name in ("gyro_t_s", "accel_t_s"):
+            step_s = float(np.median(np.diff(getattr(self, name)))) if len(getattr(self, name)) else 0.0
+            if step_s > SLOWEST_S:
+                raise ValueError(f"{name}: samples lie {step_s:.3g} s apart, which no IMU does; give seconds")
         if self.temperature_c is not None and not np.isfinite(self.temperature_c):
             raise ValueError("temperature_c must be finite")
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray, IndexArray, Int64Array, UInt8Array, UInt16Array
 from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply
+from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.validation import check_fields, set_fields
 
 LengthUnit = Literal["model", "m"]
@@ -138,6 +139,7 @@ class Keypoints:
         check_fields(self, xy_px=("N", 2))
 
 
+@prints_in_lines
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FrameTiming:
     """When each frame was exposed, on the camera's clock.
@@ -232,6 +234,7 @@ class FrameLog:
             raise ValueError("readout_s must be from 0 to 1 second")
 
 
+@prints_in_lines
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CameraTrajectory:
     """Camera poses of a reconstruction with their times.

@@ -15,6 +15,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import IMU_CAL, ImuCalibration, ImuRecording
 from colmap_inertial.inertial.core.priors import KNOWN_GAIN, PRIORS
@@ -40,6 +41,7 @@ _HOW = (
 )
 
 
+@prints_in_lines
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RestCalibration:
     """A calibration by rests, and what it rests on.

@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import tomllib
-import types
 import typing
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
+from colmap_inertial.core.choices import check_value
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.io.files import StrPath, reader, require_regular
 
@@ -123,47 +123,8 @@ def _build(path: Path, cls: type[Options], values: Mapping[str, Any], prefix: st
                 raise FormatError(path, f"{prefix}{key} is a table of options")
             built[key] = _build(path, typing.cast(type, hint_type), value, f"{prefix}{key}.")
         else:
-            built[key] = _checked(path, f"{prefix}{key}", value, hint_type)
+            built[key] = value
     try:
-        return cls(**built)
+        return cls(**{key: check_value(f"{prefix}{key}", value, hints[key]) for key, value in built.items()})
     except ValueError as error:
         raise FormatError(path, str(error)) from error
-
-
-def _checked(path: Path, name: str, value: Any, hint: Any) -> Any:
-    alternatives = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
-    for kind in alternatives:
-        origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-        if origin is typing.Literal:
-            if value in arguments:
-                return value
-        elif kind is Path and isinstance(value, str):
-            return _check_path(path, name, value)
-        elif origin is tuple:
-            item_kind = arguments[0]
-            items = [value] if item_kind is Path and isinstance(value, str) else value
-            if isinstance(items, list) and all(isinstance(item, str) for item in items):
-                return tuple(items if item_kind is str else (_check_path(path, name, item) for item in items))
-        elif kind is float and isinstance(value, (int, float)) and not isinstance(value, bool):
-            return float(value)
-        elif isinstance(kind, type) and type(value) is kind:
-            return value
-    raise FormatError(path, f"{name}: {value!r} is not {_describe(alternatives)}")
-
-
-def _check_path(path: Path, name: str, value: str) -> Path:
-    if "\0" in value:
-        raise FormatError(path, f"{name}: holds a NUL character")
-    return Path(value)
-
-
-def _describe(kinds: tuple[Any, ...]) -> str:
-    words = []
-    for kind in kinds:
-        if typing.get_origin(kind) is typing.Literal:
-            words.append("one of " + ", ".join(map(repr, typing.get_args(kind))))
-        elif typing.get_origin(kind) is tuple:
-            words.append("a list of texts")
-        elif kind is not type(None):
-            words.append(f"a {getattr(kind, '__name__', kind)}")
-    return " or ".join(words)

@@ -16,6 +16,7 @@ from colmap_inertial.colmap.steps import run_colmap
 from colmap_inertial.colmap.tsdf import require_mesh_maker
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.camera_clock import CameraTimedImu
+from colmap_inertial.core.choices import check_kind
 from colmap_inertial.core.errors import FormatError, InertialError
 from colmap_inertial.core.gyro import gravity_in_cam
 from colmap_inertial.core.options import ReconstructOptions
@@ -115,6 +116,7 @@ def reconstruct(
         When the recording cannot give metres, as a stabilised video (``options.force`` goes on); when deblurring or
         rectifying was asked for by name, and the gyroscope does not belong to the pixels.
     """
+    check_kind("options", options, ReconstructOptions)
     stages = Stages(frame=tuple(frame_stages), keypoint=tuple(keypoint_stages), model=tuple(model_stages))
     with reading_within(options.limits):
         return _reconstruct(Path(capture), Path(out), options, stages, progress, findings)

@@ -12,6 +12,7 @@ from colmap_inertial import __version__
 from colmap_inertial.colmap.sparse import check_pair_names
 from colmap_inertial.core.errors import FormatError, InertialError, OutputError, OutputExistsError
 from colmap_inertial.core.options import BlurRemover, ExposureOptions, FuseAperturesOptions, ReconstructOptions
+from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.types import Frame, FrameTiming
 from colmap_inertial.imaging.multi_aperture import refocus, require_colours
 from colmap_inertial.io.calibration import CalibrationFiles, list_paths
@@ -94,6 +95,7 @@ def _run_fusion(
     return read_frame_records(workspace.frames)
 
 
+@prints_in_lines
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DeblurResult:
     """What ``deblur_capture`` made; the same as ``result.json``.

@@ -16,6 +16,7 @@ from colmap_inertial.checks.diagnose import Diagnosis
 from colmap_inertial.checks.report import require_plotly
 from colmap_inertial.checks.validate import parse_target
 from colmap_inertial.colmap.tsdf import require_mesh_maker
+from colmap_inertial.core.choices import check_kind
 from colmap_inertial.core.errors import AlreadyMetricError, FormatError, InertialError, OutputError, TimingError
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.core.types import (
@@ -150,6 +151,8 @@ def reconstruct_project(
     NotObservableError
         When the recording cannot give metres (``options.force`` goes on).
     """
+    check_kind("source", source, ProjectOptions, options=ReconstructOptions)
+    check_kind("options", options, ReconstructOptions, source=ProjectOptions)
     with reading_within(options.limits):
         return _reconstruct(Path(project), Path(out), source, options, model_stages, progress, findings)
 

@@ -17,6 +17,7 @@ from colmap_inertial.colmap.pairing import MatchRecord
 from colmap_inertial.colmap.sparse import KeypointRecords
 from colmap_inertial.core.errors import InertialError, NotObservableError
 from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply
+from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.types import CameraImuCalibration, Gap, JoinedPart, ScaleEstimate, Treatment
 from colmap_inertial.inertial.georeference import Georeference
 from colmap_inertial.io.capture import Capture
@@ -63,6 +64,7 @@ class ScaledModel:
     parts: tuple[JoinedPart, ...] = ()
 
 
+@prints_in_lines
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ModelResult(ScaledModel):
     """What became of one of COLMAP's models.
@@ -106,6 +108,7 @@ class Fragment:
     sparse: Path
 
 
+@prints_in_lines
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ReconstructResult:
     """What ``reconstruct`` made; the same as ``result.json``.

@@ -19,9 +19,11 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from colmap_inertial.core.choices import check_kind
 from colmap_inertial.core.errors import OutputError, OutputExistsError, exhausted
 from colmap_inertial.core.options import BatchOptions, ReconstructOptions, StageNames
 from colmap_inertial.core.printing import cell
+from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.io.files import StrPath, locked, remove_temporaries, write_json, write_text
 from colmap_inertial.pipeline.run.config import config_as_toml
 from colmap_inertial.pipeline.run.workspace import refuse_links
@@ -56,6 +58,7 @@ BATCH_TIMING = BatchTiming()
 Watch = Callable[[CaptureStatus], None]
 
 
+@prints_in_lines
 @dataclass(frozen=True, kw_only=True)
 class BatchResult:
     """How a batch ended; the same as ``summary.json``.
@@ -133,6 +136,8 @@ def run_batch(
     MissingExtraError
         For a scheduler without Dask.
     """
+    check_kind("options", options, ReconstructOptions, batch=BatchOptions, stages=StageNames)
+    check_kind("batch", batch, BatchOptions, options=ReconstructOptions)
     out = Path(out)
     if isinstance(captures, str | os.PathLike):
         captures = read_manifest(captures, options, allow_stages=allow_stages)

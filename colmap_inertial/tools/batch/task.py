@@ -22,6 +22,7 @@ from typing import Any, Literal
 
 from colmap_inertial.core.errors import FormatError, InertialError, OutputError, TargetNotFoundError
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, StageNames
+from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.io.files import read_json, write_json
 from colmap_inertial.pipeline.run.config import read_config
 from colmap_inertial.pipeline.run.runner import find_loss
@@ -83,6 +84,7 @@ class CaptureTask:
     gpu: bool = False
 
 
+@prints_in_lines
 @dataclass(frozen=True, kw_only=True)
 class CaptureStatus:
     """What became of one capture; the same as its status file.

@@ -13,6 +13,7 @@ from colmap_inertial import __version__
 from colmap_inertial.core.arrays import AnyArray, UInt8Array
 from colmap_inertial.core.errors import FormatError, OutputError
 from colmap_inertial.core.options import ExportImages, ExportProgram
+from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.threads import frames_at_once, map_in_order
 from colmap_inertial.inertial.georeference import Georeference
 from colmap_inertial.io.capture import Capture, load_capture
@@ -103,6 +104,7 @@ def _is_plain(source: Path, target: Path, image: AnyArray) -> bool:
     return b"Exif" not in head and b"eXIf" not in head  # in JPEG, in PNG
 
 
+@prints_in_lines
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Exported:
     """What :func:`export_model` wrote; ``export.json`` says the same.

@@ -1,0 +1,81 @@
+"""What is wrong with options and arrays is said where they enter."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from colmap_inertial import (
+    BatchOptions,
+    CameraTrajectory,
+    ImuRecording,
+    MappingOptions,
+    ProjectOptions,
+    ReconstructOptions,
+    ScaleOptions,
+    reconstruct,
+    reconstruct_project,
+    run_batch,
+)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ReconstructOptions(world="zup"), r"world: 'zup' is not one of .*; did you mean 'z-up'"),
+        (lambda: ReconstructOptions(deblur="weiner"), "did you mean 'wiener'"),
+        (lambda: ReconstructOptions(dense="yes"), "dense: 'yes' is not a bool"),
+        (lambda: ReconstructOptions(scale=MappingOptions()), "scale: a MappingOptions is not a ScaleOptions"),
+        (lambda: MappingOptions(overlap=2.5), "overlap: 2.5 is not a int"),
+        (lambda: MappingOptions(gravity_priors=1), "gravity_priors: 1 is not a bool"),
+        (lambda: ScaleOptions(max_offset_s="1"), "max_offset_s: '1' is not a float"),
+        (lambda: ScaleOptions(latitude_deg=100), "from -90 to 90"),
+    ],
+)
+def test_an_option_is_refused_where_it_is_given(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_values_become_what_their_annotation_says():
+    options = ReconstructOptions(calibration="a.json", seed=np.int64(3), colmap=["Mapper.x=1"])
+    assert options.calibration == (Path("a.json"),) and type(options.seed) is int and options.colmap == ("Mapper.x=1",)
+    assert ProjectOptions(imu="imu.csv").imu == Path("imu.csv")
+    assert ScaleOptions(max_offset_s=1).max_offset_s == 1.0
+
+
+def test_options_in_the_place_of_others_are_refused_before_the_work(tmp_path):
+    with pytest.raises(TypeError, match="give it as batch="):
+        run_batch([], tmp_path / "out", BatchOptions())
+    with pytest.raises(TypeError, match="options must be a ReconstructOptions, not a ScaleOptions"):
+        reconstruct(tmp_path, tmp_path / "out", ScaleOptions())
+    with pytest.raises(TypeError, match="give it as options="):
+        reconstruct_project(tmp_path, tmp_path / "out", ReconstructOptions())
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("t_s", "rates", "message"),
+    [
+        (np.arange(9) * 5e6, np.zeros((9, 3)), "gyro_t_s: spans 4e.07.*give seconds, not nanoseconds"),
+        (np.arange(9) * 5.0, np.zeros((9, 3)), "samples lie 5 s apart"),
+        (np.arange(9) * 5e-3, np.zeros((3, 9)), r"gyro_rad_s: shape \(3, 9\), expected \(9, 3\); transpose it"),
+        (np.arange(9)[::-1], np.zeros((9, 3)), "times must increase"),
+        (["a"] * 9, np.zeros((9, 3)), "gyro_t_s: is no array of numbers"),
+        (np.arange(9) * 5e-3, np.full((9, 3), np.nan), "not finite"),
+    ],
+)
+def test_an_array_is_refused_where_it_is_given(t_s, rates, message):
+    with pytest.raises(ValueError, match=message):
+        ImuRecording(gyro_t_s=t_s, gyro_rad_s=rates, accel_t_s=np.arange(9) * 5e-3, accel_m_s2=np.zeros((9, 3)))
+
+
+def test_poses_in_nanoseconds_are_refused_before_memory_is_asked_for():
+    t_s = 1.4e18 + np.arange(9) * 1e8
+    with pytest.raises(ValueError, match="t_s: spans"):
+        CameraTrajectory(
+            names=tuple("abcdefghi"),
+            t_s=np.concatenate([t_s[:-1], t_s[-1:] + 1e9 * 3600]),
+            cam_from_world_xyzw=np.tile([0, 0, 0, 1.0], (9, 1)),
+            cam_in_world=np.zeros((9, 3)),
+        )
