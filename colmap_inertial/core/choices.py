@@ -6,8 +6,8 @@ import difflib
 import numbers
 import types
 import typing
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 
@@ -37,26 +37,43 @@ def check_value(name: str, value: Any, hint: Any) -> Any:
     """
     kinds = typing.get_args(hint) if typing.get_origin(hint) in (types.UnionType, typing.Union) else (hint,)
     for kind in kinds:
-        origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-        if origin is typing.Literal:
-            if any(value is choice or (isinstance(value, str) and value == choice) for choice in arguments):
-                return value
-        elif kind is Path:
-            if isinstance(value, str | Path):
-                if "\0" in str(value):
-                    raise ValueError(f"{name}: holds a NUL character")
-                return Path(value)
-        elif origin is tuple:
-            items = [value] if arguments[0] is Path and isinstance(value, str | Path) else value
-            if isinstance(items, list | tuple) and (arguments[-1] is ... or len(items) == len(arguments)):
-                of_items = arguments if arguments[-1] is not ... else arguments[:1] * len(items)
-                return tuple(check_value(name, item, of) for item, of in zip(items, of_items, strict=True))
-        elif kind in (int, float):
-            if isinstance(value, numbers.Integral if kind is int else numbers.Real) and not isinstance(value, bool):
-                return kind(value)
-        elif isinstance(value, kind):
-            return value
+        if typing.get_origin(kind) is tuple:
+            items = [value] if _is_path(typing.get_args(kind)[0]) and _is_pathlike(value) else value
+            hints = _hints_of_items(kind, items)
+            if hints is not None:
+                return tuple(check_value(name, item, of) for item, of in zip(items, hints, strict=True))
+        elif _allows(kind, value):
+            if _is_path(kind) and "\0" in str(value):
+                raise ValueError(f"{name}: holds a NUL character")
+            return kind(value) if kind in (int, float) or _is_path(kind) else value
     raise ValueError(f"{name}: {_shorten(value)} is not {_describe(kinds)}{_suggest(value, kinds)}")
+
+
+def _is_path(kind: Any) -> bool:
+    return hasattr(kind, "__fspath__")
+
+
+def _is_pathlike(value: object) -> bool:
+    return isinstance(value, str) or hasattr(value, "__fspath__")
+
+
+def _hints_of_items(kind: Any, items: object) -> Sequence[Any] | None:
+    """The annotations of a tuple's items; ``None`` where there are no items, or too many."""
+    hints = typing.get_args(kind)
+    if not isinstance(items, list | tuple):
+        return None
+    if hints[-1] is ...:
+        return hints[:1] * len(items)
+    return hints if len(items) == len(hints) else None
+
+
+def _allows(kind: Any, value: object) -> bool:
+    if typing.get_origin(kind) is typing.Literal:
+        return any(type(value) is type(choice) and value == choice for choice in typing.get_args(kind))
+    if kind in (int, float):
+        wanted = numbers.Integral if kind is int else numbers.Real
+        return isinstance(value, wanted) and not isinstance(value, bool)
+    return _is_pathlike(value) if _is_path(kind) else isinstance(value, kind)
 
 
 def check_kind(name: str, value: object, kind: type, **elsewhere: type) -> None:

@@ -25,7 +25,6 @@ from colmap_inertial.core.arrays import Array, BoolArray, ComplexArray
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import matrix_from_quat, rotation_between
 from colmap_inertial.core.quantiles import Z95
-from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.types import HeightDatum, PositionFixes
 from colmap_inertial.core.validation import check_array
 
@@ -73,7 +72,6 @@ class GeoreferenceLimits:
 _LIMITS = GeoreferenceLimits()
 
 
-@prints_in_lines
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Georeference:
     """How a metric model stands on Earth.

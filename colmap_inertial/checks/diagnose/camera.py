@@ -89,11 +89,7 @@ def check_belonging(recorded: Recorded) -> Iterator[Finding]:
         if _is_mirrored(turning, imu, failed):
             yield _MIRRORED
         return
-    if not isinstance(failed, NotObservableError) or imu is None or turning is None or wrong_time_unit(recorded):
-        return
-    if recorded.log is not None and recorded.log.stabilised:
-        return
-    if any(problem.code in _OF_THE_GYROSCOPE for problem in recorded.implausible):
+    if not isinstance(failed, NotObservableError) or imu is None or turning is None or _is_explained(recorded):
         return
     if recorded.wrong_unit is not None:
         yield _unit_finding(recorded.wrong_unit)
@@ -111,6 +107,15 @@ def check_belonging(recorded: Recorded) -> Iterator[Finding]:
         yield otherwise
     elif recorded.stabilisation is None or not recorded.stabilisation.stabilised:
         yield _never_fits(recorded, turning, failed)
+
+
+def _is_explained(recorded: Recorded) -> bool:
+    """Whether another finding says why the gyroscope does not fit."""
+    return (
+        wrong_time_unit(recorded)
+        or (recorded.log is not None and bool(recorded.log.stabilised))
+        or any(problem.code in _OF_THE_GYROSCOPE for problem in recorded.implausible)
+    )
 
 
 def check_cameras(recorded: Recorded) -> Iterator[Finding]:
