@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import datetime
+import fnmatch
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -15,15 +17,22 @@ from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.core.types import FrameLog, FrameTiming
 from colmap_inertial.io.files import reader
+from colmap_inertial.io.images import SUFFIXES
 from colmap_inertial.io.tables import Table, read_table, recognise, split_unit
 from colmap_inertial.io.units import TIME_UNITS_NS, seconds, stamps_ns, unit_of
 
 _NAME_COLUMNS = {"name", "filename", "file", "image", "imagename", "frame"}
 _EXPOSURE_COLUMNS = {"exposure", "exposuretime"}
+#: Images of a rig are of one moment up to here: at 1 m/s and 1 rad/s, 1 mm and 1 mrad.
+_SAME_MOMENT_NS = 1_000_000
 _HOW = (
     'give a CSV with the header "name,t_s" (or t_ms, t_us, t_ns) and one row for each frame, or put the times into the '
     'file names and set times = "name" with time_unit under [images] in capture.toml'
 )
+
+
+#: No image stands for others.
+NO_RIGS: Mapping[str, str] = MappingProxyType({})
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -36,14 +45,30 @@ class FrameStamps:
         (F,) start of exposure of row 0.
     exposure_s
         (F,) where known.
+    source
+        Where they come from.
     """
 
     names: tuple[str, ...]
     t_ns: Int64Array
     exposure_s: Array | None = None
+    source: Path | None = None
 
     def timing(self, *, exposure_s: float | None = None, readout_s: float | None = None) -> FrameTiming:
-        """As a :class:`FrameTiming`; ``exposure_s`` fills in where the stamps bring none."""
+        """As a :class:`FrameTiming`; ``exposure_s`` fills in where the stamps bring none.
+
+        Raises
+        ------
+        TimingError
+            Where two frames have one time.
+        """
+        same = np.flatnonzero(np.diff(self.t_ns) == 0)
+        if len(same):
+            raise TimingError(
+                f"{self.source}: the frames {self.names[same[0]]} and {self.names[same[0] + 1]} have the same time. "
+                "Images of several cameras may share one where COLMAP's model holds the cameras as a rig; else give "
+                "the times of one camera's images"
+            )
         exposures = self.exposure_s
         if exposures is None and exposure_s is not None:
             exposures = np.full(len(self.names), exposure_s)
@@ -54,6 +79,41 @@ class FrameStamps:
             exposure_s=exposures,
             readout_s=readout_s,
             epoch_ns=epoch_ns,
+        )
+
+    def one_per_frame(self, first_of: Mapping[str, str]) -> FrameStamps:
+        """With one image for each frame of a rig.
+
+        Parameters
+        ----------
+        first_of
+            By image name, the image that stands for its frame; other images are left out. Empty where there is no rig.
+
+        Raises
+        ------
+        TimingError
+            Where images of a frame were taken at different times.
+        """
+        if not first_of:
+            return self
+        places: dict[str, list[int]] = {}
+        for place, name in enumerate(self.names):
+            if name in first_of:
+                places.setdefault(first_of[name], []).append(place)
+        for own in places.values():
+            apart_ns = int(self.t_ns[own[-1]] - self.t_ns[own[0]])
+            if apart_ns > _SAME_MOMENT_NS:
+                raise TimingError(
+                    f"{self.source}: {self.names[own[0]]} and {self.names[own[-1]]} are of one frame of a rig, but "
+                    f"their times are {apart_ns / 1e6:.3g} ms apart. COLMAP's rig has one pose for both: give them one "
+                    "time, or map cameras that are not synchronised without a rig"
+                )
+        kept = sorted(next((p for p in own if self.names[p] == first), own[0]) for first, own in places.items())
+        return FrameStamps(
+            names=tuple(self.names[place] for place in kept),
+            t_ns=self.t_ns[kept],
+            exposure_s=None if self.exposure_s is None else self.exposure_s[kept],
+            source=self.source,
         )
 
 
@@ -69,7 +129,7 @@ def stamps_of_csv(path: Path, time_unit: str | None = None) -> FrameStamps:
     Raises
     ------
     FormatError, TimingError
-        Where columns or the unit are missing, a name comes twice, or two frames have one time.
+        Where columns or the unit are missing, or a name comes twice.
     """
     table = read_table(path)
     if table.header is None:
@@ -117,17 +177,24 @@ def stamps_of_pattern(folder: Path, names: Sequence[str], pattern: str) -> Frame
     Parameters
     ----------
     names
-        File names; the folder and the ending do not count.
+        File names; the ending does not count.
     pattern
         A unit (s, ms, us, ns): the longest number is the time. Or a name with the unit in braces where the number
         stands and ``*`` where anything may, as ``cam0_{ns}_*``. Or a date as ``strptime`` has it, with a fraction of
-        the second, as ``PXL_%Y%m%d_%H%M%S%f``.
+        the second, as ``PXL_%Y%m%d_%H%M%S%f``. With a folder, as in ``cam0/{ns}``, images elsewhere get no time.
 
     Raises
     ------
     TimingError
         For a pattern that is none of these, and a name that does not fit it.
     """
+    within, _, pattern = pattern.rpartition("/")
+    if within:
+        names = [name for name in names if fnmatch.fnmatchcase(Path(name).parent.as_posix(), within)]
+        if not names:
+            raise TimingError(f"{folder}: no image lies in a folder {within!r}, as --name-times has it")
+    if Path(pattern).suffix.lower() in SUFFIXES:
+        pattern = pattern[: pattern.rindex(".")]
     if pattern in TIME_UNITS_NS:
         return stamps_of_names(folder, names, pattern)
     units = re.findall(r"\{(\w+)\}", pattern)
@@ -231,7 +298,7 @@ def stamps_in_order(
     line_numbers: Int64Array | None = None,
     exposure_s: Array | None = None,
 ) -> FrameStamps:
-    """Stamps sorted by time; a name or time that comes twice is an error of ``path``."""
+    """Stamps sorted by time; a name that comes twice is an error of ``path``."""
     seen: dict[str, int] = {}
     for i, name in enumerate(names):
         line = None if line_numbers is None else int(line_numbers[i])
@@ -243,7 +310,5 @@ def stamps_in_order(
     order = np.argsort(t_ns, kind="stable")
     t_ns = t_ns[order]
     names = [names[i] for i in order]
-    same = np.flatnonzero(np.diff(t_ns) == 0)
-    if len(same):
-        raise TimingError(f"{path}: the frames {names[same[0]]} and {names[same[0] + 1]} have the same time")
-    return FrameStamps(names=tuple(names), t_ns=t_ns, exposure_s=None if exposure_s is None else exposure_s[order])
+    exposures = None if exposure_s is None else exposure_s[order]
+    return FrameStamps(names=tuple(names), t_ns=t_ns, exposure_s=exposures, source=path)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.core.types import Frame, FrameLog, FrameTiming
 from colmap_inertial.io.capture import Capture, ImageFolder, Video, load_capture
 from colmap_inertial.io.files import StrPath, path_in
-from colmap_inertial.io.frame_times import FrameStamps, stamps_of_csv, stamps_of_log, stamps_of_names
+from colmap_inertial.io.frame_times import NO_RIGS, FrameStamps, stamps_of_csv, stamps_of_log, stamps_of_names
 from colmap_inertial.io.images import SUFFIXES, grey_8bit, read_image
 from colmap_inertial.io.video import decode_reduced, decode_video, frame_name, reduced, video_stamps_ns
 
@@ -82,21 +82,26 @@ def _places(timing: FrameTiming, only: Collection[str] | None) -> IndexArray:
     return np.array([i for i, name in enumerate(timing.names) if name in wanted], dtype=np.intp)
 
 
-def read_frame_timing(capture: Capture | Path) -> FrameTiming:
-    """When the frames of a capture were exposed, without decoding any; see :func:`read_frames`."""
+def read_frame_timing(capture: Capture | Path, first_of: Mapping[str, str] = NO_RIGS) -> FrameTiming:
+    """When the frames of a capture were exposed, without decoding any; see :func:`read_frames`.
+
+    ``first_of`` names the image that stands for each frame of a rig (:meth:`FrameStamps.one_per_frame`).
+    """
     if isinstance(capture, Path):
         capture = load_capture(capture)
     match capture.frames:
         case ImageFolder():
-            return _timing(capture, _image_stamps(capture.frames))
+            return _timing(capture, _image_stamps(capture.frames).one_per_frame(first_of))
         case Video():
             return _timing(capture, _video_frames(capture.frames, capture.frame_log)[0])
         case None:
             raise FormatError(capture.path, "describes no frames; add [images] or [video]")
 
 
-def read_frame_times(path: StrPath) -> FrameTiming:
+def read_frame_times(path: StrPath, first_of: Mapping[str, str] = NO_RIGS) -> FrameTiming:
     """Frame times from a CSV (``name,t_s`` or ``name,t_ns``; optionally ``exposure_s``), or those of a capture.
+
+    ``first_of`` names the image that stands for each frame of a rig (:meth:`FrameStamps.one_per_frame`).
 
     Raises
     ------
@@ -105,8 +110,8 @@ def read_frame_times(path: StrPath) -> FrameTiming:
     """
     path = Path(path)
     if path.is_dir() or path.suffix.lower() == ".toml":
-        return read_frame_timing(load_capture(path))
-    return stamps_of_csv(path).timing()
+        return read_frame_timing(load_capture(path), first_of)
+    return stamps_of_csv(path).one_per_frame(first_of).timing()
 
 
 def picture_folders(capture: Capture) -> tuple[Path, ...]:
@@ -146,6 +151,7 @@ def _image_stamps(source: ImageFolder) -> FrameStamps:
         names=tuple(name for name in stamps.names if name in present),
         t_ns=stamps.t_ns[keep],
         exposure_s=None if stamps.exposure_s is None else stamps.exposure_s[keep],
+        source=stamps.source,
     )
 
 

@@ -30,6 +30,7 @@ from colmap_inertial.core.types import (
     Treatment,
 )
 from colmap_inertial.io.files import StrPath, check_names, convert_to_plain, read_json, reader, write_json
+from colmap_inertial.model.rigs import PosedFrame, posed_frames
 from colmap_inertial.model.soundness import check_binary_model, check_values
 
 if TYPE_CHECKING:
@@ -284,72 +285,91 @@ def trajectory_from_model(
         When fewer than two images have a time.
     """
     t_of = dict(zip(timing.names, timing.pose_t_s(), strict=True))
-    images = [reconstruction.image(i) for i in reconstruction.reg_image_ids()]
-    timed = sorted((image for image in images if image.name in t_of), key=lambda image: float(t_of[image.name]))
+    frames = posed_frames(reconstruction)
+    named = [(next((image.name for image in frame.images if image.name in t_of), ""), frame) for frame in frames]
+    timed = sorted(((name, frame) for name, frame in named if name), key=lambda one: float(t_of[one[0]]))
     if len(timed) < 2:
-        example = images[0].name if images else "none"
+        example = frames[0].images[0].name if frames else "none"
         raise TimingError(
-            f"{len(timed)} of the model's {len(images)} images have a frame time; "
+            f"{len(timed)} of the model's {len(frames)} images have a frame time; "
             f"names must agree (the model has {example!r}, the frame times {timing.names[0]!r})"
         )
-    poses = [image.cam_from_world() for image in timed]
     notes: tuple[str, ...] = ()
-    if len(timed) < len(images):
+    if len(timed) < len(frames):
         notes = (
-            f"{len(images) - len(timed)} of the model's {len(images)} images have no frame time and were left out",
+            f"{len(frames) - len(timed)} of the model's {len(frames)} images have no frame time and were left out",
         )
+    posed = [frame for _, frame in timed]
     trajectory = CameraTrajectory(
-        names=tuple(image.name for image in timed),
-        t_s=np.array([t_of[image.name] for image in timed]),
-        cam_from_world_xyzw=np.array([pose.rotation.quat for pose in poses]),
-        cam_in_world=np.array([image.projection_center() for image in timed]),
+        names=tuple(name for name, _ in timed),
+        t_s=np.array([t_of[name] for name, _ in timed]),
+        cam_from_world_xyzw=np.array([frame.pose.rotation.quat for frame in posed]),
+        cam_in_world=np.array([frame.centre() for frame in posed]),
         epoch_ns=timing.epoch_ns,
-        pose_cov=_pose_covariances(reconstruction, timed) if covariances else None,
+        pose_cov=_pose_covariances(reconstruction, posed) if covariances else None,
     )
     return trajectory, notes
 
 
-def _pose_covariances(reconstruction: pycolmap.Reconstruction, images: Sequence[pycolmap.Image]) -> Array | None:
+def _pose_covariances(reconstruction: pycolmap.Reconstruction, frames: Sequence[PosedFrame]) -> Array | None:
     """(F, 6, 6) covariances of the poses given the points, in the terms of ``CameraTrajectory.pose_cov``.
 
-    What an image's own observations say about its pose: the error that a pose does not share with its neighbours,
+    What a frame's own observations say about its pose: the error that a pose does not share with its neighbours,
     which see the same points. (The covariance from bundle adjustment also holds what they share, and the gauge.)
+    Cameras of a rig are taken as they are placed in it.
 
     Returns
     -------
-    ``None`` where an image's observations do not determine its pose.
+    ``None`` where a frame's observations do not determine its pose.
     """
     covariances = []
     # to ask for each observation's point by itself would take longer than all the rest
     place = {number: point.xyz for number, point in reconstruction.points3D.items()}
-    for image in images:
-        camera = reconstruction.camera(image.camera_id)
-        seen = image.get_observation_points2D()
-        seen = seen[:: -(-len(seen) // _LIMITS.most_observations) or 1]
-        if len(seen) < _LIMITS.fewest_observations:
+    for frame in frames:
+        seen = sum(len(image.get_observation_points2D()) for image in frame.images)
+        if seen < _LIMITS.fewest_observations:
             return None
-        pose = image.cam_from_world()
-        rotation = pose.rotation.matrix()
-        world = np.array([place[point.point3D_id] for point in seen])
-        cam = world @ rotation.T + pose.translation
-        error_px = camera.img_from_cam(cam) - np.array([point.xy for point in seen])
-        squares = np.sum(error_px**2, axis=1)
-        level = float(np.nanmedian(squares))
-        # Of normal errors, the median of the squares' sum is 2 ln 2 variances; COLMAP's own weights are robust, too
-        weight = np.where(np.isfinite(squares), 1 / (1 + squares / max(2 * level, 1e-12)), 0.0)
-        by_cam = np.zeros((len(seen), 2, 3))
-        by_cam[:, 0, 0] = by_cam[:, 1, 1] = 1 / cam[:, 2]
-        by_cam[:, :, 2] = -cam[:, :2] / cam[:, 2:] ** 2
-        by_turn, by_place = -cross(by_cam, cam[:, None]).reshape(-1, 3), -by_cam.reshape(-1, 3) @ rotation
-        by_pose = camera.mean_focal_length() * np.concatenate([by_turn, by_place], axis=1)
-        information = by_pose.T @ (np.repeat(weight, 2)[:, None] * by_pose)
-        variance_px2 = max(level / (2 * np.log(2)), _LIMITS.smallest_error_px**2)
+        told = [
+            _pose_information(reconstruction.camera(image.camera_id), image, frame.pose, place)
+            for image in frame.images
+            if image.num_points3D
+        ]
+        variance_px2 = told[0][1]
         try:
-            root = np.linalg.inv(np.linalg.cholesky(information))
+            root = np.linalg.inv(np.linalg.cholesky(sum(variance_px2 / own_px2 * one for one, own_px2 in told)))
         except np.linalg.LinAlgError:
             return None
         covariances.append(variance_px2 * (root.T @ root))
     return np.array(covariances)
+
+
+def _pose_information(
+    camera: pycolmap.Camera, image: pycolmap.Image, pose: pycolmap.Rigid3d, place: Mapping[int, Array]
+) -> tuple[Array, float]:
+    """(6, 6) what an image's observations of points, (3,) ``place`` each, say about the pose of its frame.
+
+    For observations of 1 px; and their variance (px²).
+    """
+    seen = image.get_observation_points2D()
+    seen = seen[:: -(-len(seen) // _LIMITS.most_observations) or 1]
+    own = image.cam_from_world()
+    world = np.array([place[point.point3D_id] for point in seen])
+    cam = world @ own.rotation.matrix().T + own.translation
+    error_px = camera.img_from_cam(cam) - np.array([point.xy for point in seen])
+    squares = np.sum(error_px**2, axis=1)
+    level = float(np.nanmedian(squares))
+    # Of normal errors, the median of the squares' sum is 2 ln 2 variances; COLMAP's own weights are robust, too
+    weight = np.where(np.isfinite(squares), 1 / (1 + squares / max(2 * level, 1e-12)), 0.0)
+    by_cam = np.zeros((len(seen), 2, 3))
+    by_cam[:, 0, 0] = by_cam[:, 1, 1] = 1 / cam[:, 2]
+    by_cam[:, :, 2] = -cam[:, :2] / cam[:, 2:] ** 2
+    if not image.is_ref_in_frame():
+        by_cam = by_cam @ (own.rotation.matrix() @ pose.rotation.matrix().T)
+        cam = world @ pose.rotation.matrix().T + pose.translation
+    by_turn, by_place = -cross(by_cam, cam[:, None]).reshape(-1, 3), -by_cam.reshape(-1, 3) @ pose.rotation.matrix()
+    by_pose = camera.mean_focal_length() * np.concatenate([by_turn, by_place], axis=1)
+    information = np.asarray(by_pose.T @ (np.repeat(weight, 2)[:, None] * by_pose))
+    return information, max(level / (2 * np.log(2)), _LIMITS.smallest_error_px**2)
 
 
 def similarity_as_json(similarity: Similarity) -> dict[str, object]:
@@ -392,12 +412,6 @@ def apply_similarity(source: StrPath, target: StrPath, similarity: Similarity) -
     if target.exists():
         raise OutputExistsError(f"{target} exists already; choose another folder or remove it")
     write_model(transformed(read_model(source), similarity), target, similarity, suffix=model_format(source))
-
-
-def has_rigs(reconstruction: pycolmap.Reconstruction) -> bool:
-    """Whether any of the registered frames is of a rig of several cameras."""
-    frames = map(reconstruction.frame, reconstruction.reg_frame_ids())
-    return any(reconstruction.rig(number).num_sensors() > 1 for number in {frame.rig_id for frame in frames})
 
 
 def transformed(reconstruction: pycolmap.Reconstruction, similarity: Similarity) -> pycolmap.Reconstruction:

@@ -15,6 +15,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.imaging.gyro_camera import FrameShutter
+from colmap_inertial.model.rigs import has_rigs
 
 if TYPE_CHECKING:
     import pycolmap
@@ -134,13 +135,13 @@ def intrinsics_sigma(reconstruction: pycolmap.Reconstruction) -> dict[int, Array
     Returns
     -------
     (P,) in the order of the camera's parameters, NaN for the principal point, which is held, as COLMAP does. Poses and
-    points are unknowns beside them (COLMAP's covariance of a bundle adjustment). Empty for very large models, and where
-    the covariance does not exist.
+    points are unknowns beside them (COLMAP's covariance of a bundle adjustment). Empty for very large models, for rigs,
+    which COLMAP's covariance does not take, and where the covariance does not exist.
     """
     import pycolmap
 
     image_ids = sorted(reconstruction.reg_image_ids())
-    if not 3 <= len(image_ids) <= _MOST_IMAGES:
+    if not 3 <= len(image_ids) <= _MOST_IMAGES or has_rigs(reconstruction):
         return {}
     noise_px = _noise_px(reconstruction)
     if noise_px is None:

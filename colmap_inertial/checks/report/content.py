@@ -153,6 +153,7 @@ def _model(out: Path, model: Content, *, in_full: bool, project: bool) -> Conten
     scale, ci95 = model["metres_per_unit"], model["ci95"]
     kept = {key: value for key, value in model.items() if key not in _NOT_SHOWN}
     kept.setdefault("joined_of", [])
+    kept.setdefault("rig", [])
     kept.setdefault("notes", [])  # earlier runs had all of it among the reasons
     kept["half_width_pct"] = None if scale is None else half_width_pct(scale, ci95)
     if scale is None:

@@ -99,6 +99,9 @@ def run_facts(content: Content) -> Iterator[Fact]:
             yield "camera path", f"{digits(path, 3)} {_unit(model['scene'])}"
         if model["excitation_m_s2"] is not None and model["metres_per_unit"] is not None:
             yield "camera acceleration", f"{digits(model['excitation_m_s2'], 2)} m/s²"
+        for sensor in model["rig"]:
+            length = f"{digits(1000 * sensor['baseline_m'], 4)} mm"
+            yield "rig", f"camera {sensor['camera_id']} is {length} from camera {sensor['reference_id']}"
         yield "how the scale was found", _METHODS.get(model["method"]) or str(model["method"])
         yield from sensor_facts(model)
     if selection is not None:

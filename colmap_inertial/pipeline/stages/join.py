@@ -16,7 +16,8 @@ from colmap_inertial.inertial.join.joined_model import join_models
 from colmap_inertial.inertial.join.judge import join_submodels
 from colmap_inertial.inertial.join.placement import FittedSubmodel
 from colmap_inertial.inertial.scale.posterior import FittedPath
-from colmap_inertial.model import Model, has_rigs, trajectory_from_model
+from colmap_inertial.model import Model, trajectory_from_model
+from colmap_inertial.model.rigs import has_rigs
 from colmap_inertial.model.submodels.matches import PlacedImages, place_images
 from colmap_inertial.pipeline.stages.inputs import StageInputs
 from colmap_inertial.pipeline.stages.metric import InertialStage, metric_trajectory

@@ -34,7 +34,8 @@ from colmap_inertial.inertial.refine.values import FIRST_INTRINSIC, LEVER, OFFSE
 from colmap_inertial.inertial.refine.world import size_of, state_scale
 from colmap_inertial.inertial.scale import strength_of_gravity
 from colmap_inertial.io.calibration import calibration_prior
-from colmap_inertial.model import Model, has_rigs
+from colmap_inertial.model import Model
+from colmap_inertial.model.rigs import has_rigs
 from colmap_inertial.model.similarities import compose
 from colmap_inertial.pipeline.stages.inputs import StageInputs
 from colmap_inertial.pipeline.stages.metric import InertialStage, gravity_in_model

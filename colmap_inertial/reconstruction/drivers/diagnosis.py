@@ -21,6 +21,7 @@ from colmap_inertial.io.plausible import RawImu
 from colmap_inertial.io.pose_convention import ARRAYS, COLMAP, INERTIAL_SCALE, TUM, PoseConvention
 from colmap_inertial.io.trajectories import read_inertial_scale_poses, read_tum
 from colmap_inertial.model import read_model, trajectory_from_model
+from colmap_inertial.model.rigs import frames_of_rigs
 from colmap_inertial.pipeline.run.progress import Progress
 from colmap_inertial.reconstruction.drivers.sources import ScaleSource, check_output, only_model
 from colmap_inertial.reconstruction.preparation.plan import add_stated_exposures
@@ -74,7 +75,7 @@ def collect(source: ScaleSource, progress: Progress) -> Recorded:
         return _recorded(_Reading(), imu=lambda: read_raw_imu(path))
     reading = _Reading()
     times = source.frame_times or _times_of_capture(source.imu)
-    timing = None if times is None else reading.attempt(lambda: read_frame_times(times))
+    timing = None if times is None else reading.attempt(lambda: _read_times(times, path))
     trajectory: CameraTrajectory | None = None
     read_as = INERTIAL_SCALE if inertial_scale else COLMAP if path.is_dir() else TUM
     if read_as is INERTIAL_SCALE:
@@ -96,6 +97,11 @@ def collect(source: ScaleSource, progress: Progress) -> Recorded:
         read_as=read_as,
         **_clock_and_calibration(source.calibration, captures),
     )
+
+
+def _read_times(times: Path, source: Path) -> FrameTiming:
+    is_model = source.is_dir() and not is_inertial_scale(source)
+    return read_frame_times(times, frames_of_rigs([read_model(only_model(source))] if is_model else ()))
 
 
 def _read_trajectory(model: Path, timing: FrameTiming) -> CameraTrajectory:

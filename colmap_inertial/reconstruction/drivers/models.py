@@ -27,6 +27,7 @@ from colmap_inertial.model import (
     transformed,
     write_model,
 )
+from colmap_inertial.model.rigs import rig_sensors
 from colmap_inertial.model.similarities import undoing
 from colmap_inertial.pipeline.run.context import Recording
 from colmap_inertial.pipeline.run.runner import fingerprint, remove
@@ -298,7 +299,8 @@ def _placed(session: Session, recording: Recording, one: ScaledModel, model: Mod
         suffix = model_format(workspace.root / one.sparse) or ".bin"
         write_model(model.reconstruction, target, model.similarity, suffix=suffix)
         poses = metric_trajectory(poses)
-        one = replace(one, sparse_metric=_within(workspace.root, target))
+        rig = rig_sensors(model.reconstruction)
+        one = replace(one, sparse_metric=_within(workspace.root, target), rig=rig)
         if scale.calibration is not None and gravity_in_model(model) is not None:
             trajectory = workspace.trajectory(one.index, first=not any(workspace.root.glob("trajectory*.tum")))
             write_trajectory(trajectory, model, poses, recording.imu)

@@ -6,7 +6,7 @@ import dataclasses
 import fnmatch
 import functools
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import EllipsisType
@@ -47,6 +47,7 @@ from colmap_inertial.model import (
 )
 from colmap_inertial.model.copying import list_tree
 from colmap_inertial.model.layout import read_layout
+from colmap_inertial.model.rigs import frames_of_rigs
 from colmap_inertial.model.similarities import ModelScale, read_similarity
 from colmap_inertial.pipeline.run.colmap_settings import read_settings
 from colmap_inertial.pipeline.run.context import Recording, RunContext, correct_imu, prior_calibration
@@ -374,7 +375,8 @@ def _run_times(
     """When the images were taken, and what the user should know about that."""
 
     def work(partial: Sequence[Path]) -> None:
-        timing, notes = _times(given, _registered(models, read), images, session.progress)
+        first_of = frames_of_rigs(read(folder) for folder in models.values())
+        timing, notes = _times(given, _registered(models, read), first_of, images, session.progress)
         write_record(partial[0], _Times(timing=timing, notes=notes))
 
     frames = given.capture.frames
@@ -398,7 +400,7 @@ def _registered(models: dict[int, Path], read: Callable[[Path], pycolmap.Reconst
 
 
 def _times(
-    given: _Given, names: Sequence[str], images: Path | None, progress: Progress
+    given: _Given, names: Sequence[str], first_of: Mapping[str, str], images: Path | None, progress: Progress
 ) -> tuple[FrameTiming, tuple[str, ...]]:
     source, capture = given.source, given.capture
     notes: tuple[str, ...] = ()
@@ -408,19 +410,19 @@ def _times(
     elif source.exif_times:
         assert images is not None
         stamps, digits = stamps_of_exif(images, names)
-        timing = _timing(capture, stamps)
+        timing = _timing(capture, stamps.one_per_frame(first_of))
         if digits < _FINE_DIGITS:
             notes = (f"EXIF gives the frames' times to 1/{10**digits} s only",)
     elif source.name_times is not None:
-        timing = _timing(capture, stamps_of_pattern(images or Path(), names, source.name_times))
+        timing = _timing(capture, stamps_of_pattern(images or Path(), names, source.name_times).one_per_frame(first_of))
     elif source.frame_times is not None:
-        timing = read_frame_times(source.frame_times)
+        timing = read_frame_times(source.frame_times, first_of)
         if timing.readout_s is None:
             timing = dataclasses.replace(
                 timing, readout_s=capture.readout_s, readout_direction=capture.readout_direction
             )
     else:
-        timing = read_frame_timing(capture)
+        timing = read_frame_timing(capture, first_of)
     # an exposure that the pictures state belongs to the frames; one that they do not is no reason to stop
     if timing.exposure_s is None and images is not None:
         paths = [path_in(images, name) for name in timing.names]

@@ -22,6 +22,7 @@ from colmap_inertial.core.types import CameraImuCalibration, Gap, JoinedPart, Sc
 from colmap_inertial.inertial.georeference import Georeference
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.model import similarity_as_json
+from colmap_inertial.model.rigs import RigSensor
 from colmap_inertial.pipeline.run.workspace import Workspace
 from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
 from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan
@@ -51,6 +52,8 @@ class ScaledModel:
         What the stages said.
     parts
         What it was joined of; empty where it is one of COLMAP's models.
+    rig
+        Where the cameras of rigs are, in metres; empty without rigs.
     """
 
     index: int
@@ -62,6 +65,7 @@ class ScaledModel:
     trajectory: Path | None = None
     treatments: tuple[Treatment, ...] = ()
     parts: tuple[JoinedPart, ...] = ()
+    rig: tuple[RigSensor, ...] = ()
 
 
 @prints_in_lines
@@ -274,6 +278,7 @@ def result_as_json(result: ReconstructResult, capture: Capture) -> dict[str, obj
                 "georeference": measurement_as_json(model.georeference),
                 "readout_translation": next((t.values for t in model.treatments if t.stage == "readout"), None),
                 "joined_of": [_part_as_json(part) for part in model.parts],
+                "rig": [asdict(sensor) for sensor in model.rig],
                 "treatments": [asdict(treatment) for treatment in model.treatments],
                 "dense": model.dense and model.dense.as_json(root),
             }

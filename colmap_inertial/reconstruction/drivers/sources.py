@@ -47,6 +47,7 @@ from colmap_inertial.model import (
     read_model,
     trajectory_from_model,
 )
+from colmap_inertial.model.rigs import frames_of_rigs
 from colmap_inertial.motion.align import AlignOptions, align_camera_imu
 from colmap_inertial.motion.align.conventions import likely_convention
 
@@ -112,9 +113,10 @@ def load_source(source: ScaleSource) -> TimedPoses:
     elif path.is_dir():
         times = source.frame_times or source.imu
         assert times is not None
-        timing = read_frame_times(times)
         folder = only_model(path)
-        trajectory, notes = trajectory_from_model(read_model(folder), timing)
+        model = read_model(folder)
+        timing = read_frame_times(times, frames_of_rigs([model]))
+        trajectory, notes = trajectory_from_model(model, timing)
         read_as = COLMAP
         start_s = float(timing.pose_t_s()[0])
         if is_metric(folder):
