@@ -9,13 +9,15 @@ import pytest
 from colmap_inertial.cli import parse
 from colmap_inertial.colmap.loop_closure import MappedCapture, _adjustment
 from colmap_inertial.colmap.mapping import global_options, incremental_options
-from colmap_inertial.colmap.sparse import extraction_options, matching_options, verification_options
+from colmap_inertial.colmap.sparse import extraction_options, matching_options, require_features, verification_options
 from colmap_inertial.core.errors import FormatError, InertialError
 from colmap_inertial.core.options import MappingOptions, ReconstructOptions
 from colmap_inertial.pipeline.run.colmap_settings import _SECTIONS, ColmapSettings, read_settings
 from colmap_inertial.pipeline.run.config import config_as_toml, read_config
 from colmap_inertial.pipeline.run.context import RunContext
+from colmap_inertial.reconstruction.drivers.capture import reconstruct
 
+SCENE = Path(__file__).parents[1] / "example_scenes" / "desk"
 PAGE = Path(__file__).parents[1] / "docs" / "colmap.md"
 
 
@@ -176,3 +178,31 @@ def test_the_page_lists_what_is_set_against_colmap_s_defaults():
     assert {name: value for name, value in listed().items() if not name.startswith("Bundle")} == set_by_us
     pipeline = incremental_options(True, context)
     assert changed("Mapper", pipeline).keys() <= {"Mapper.num_threads", "Mapper.random_seed"}
+
+
+def test_learned_features_need_onnx_and_files_that_are_there(tmp_path, monkeypatch):
+    options = ReconstructOptions(mapping=MappingOptions(features="aliked"))
+    require_features(RunContext())
+    if not hasattr(pycolmap.FeatureExtractionOptions(), "aliked"):
+        with pytest.raises(InertialError, match=r"built without ONNX.*--database"):
+            require_features(RunContext.of(options))
+        with pytest.raises(InertialError, match="built without ONNX"):
+            reconstruct(SCENE, tmp_path / "out", options)
+        assert not (tmp_path / "out").exists()
+    monkeypatch.setattr(pycolmap, "FeatureExtractionOptions", type("Built", (), {"aliked": None}))
+    network = tmp_path / "network.onnx"
+    network.write_bytes(b"")
+    first = f"AlikedExtraction.n16rot_model_path={network}"
+    context = RunContext(features="aliked", colmap=ColmapSettings((first,)))
+    with pytest.raises(
+        InertialError, match=r"nothing is downloaded; .*by --colmap AlikedMatching\.lightglue_model_path=FILE$"
+    ):
+        require_features(context)
+    both = ColmapSettings((first, f"AlikedMatching.lightglue_model_path={network}"))
+    require_features(RunContext(features="aliked", colmap=both))
+
+
+def test_learned_features_are_extracted_and_matched_as_such():
+    context = RunContext(features="aliked")
+    assert extraction_options(MappingOptions(), context).type == pycolmap.FeatureExtractorType.ALIKED_N16ROT
+    assert matching_options(context).type == pycolmap.FeatureMatcherType.ALIKED_LIGHTGLUE

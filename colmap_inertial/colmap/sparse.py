@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 #: Up to this many images every pair is matched; above it, neighbours in time.
 _EXHAUSTIVE_UP_TO = 150
 _EXTRACTION_BATCH = 16
+_ALIKED_FILES = ("AlikedExtraction.n16rot_model_path", "AlikedMatching.lightglue_model_path")
 #: Each batch indexes its images' features anew, an image as dear as a pair; the first are small, so that one sees soon
 #: how quickly it goes.
 _FIRST_MATCHING_BATCH, _MATCHING_BATCH = 100, 1600
@@ -70,6 +71,30 @@ def mapping_device(options: MappingOptions, *, deterministic: bool) -> Literal["
     if options.device == "cuda" and not pycolmap.has_cuda:
         raise InertialError("--mapping.device cuda: this pycolmap has none; install pycolmap-cuda12, or leave it out")
     return options.device
+
+
+def require_features(context: RunContext) -> None:
+    """Say before any work where the features that are asked for cannot be found.
+
+    Raises
+    ------
+    InertialError
+        Where pycolmap has no ONNX, or the files of the networks are not named: COLMAP would download them.
+    """
+    import pycolmap
+
+    if context.features == "sift":
+        return
+    if not hasattr(pycolmap.FeatureExtractionOptions(), "aliked"):
+        raise InertialError(
+            "--mapping.features aliked: this pycolmap is built without ONNX, as the published wheels are; find and "
+            "match features with a COLMAP that has it, and give its database with --database"
+        )
+    named = dict(text.split("=", 1) for text in context.colmap.settings)
+    missing = [name for name in _ALIKED_FILES if not Path(named.get(name, "")).is_file()]
+    if missing:
+        files = " and ".join(f"--colmap {name}=FILE" for name in missing)
+        raise InertialError(f"--mapping.features aliked: nothing is downloaded; give the networks by {files}")
 
 
 def check_pair_names(names: Sequence[str]) -> None:
@@ -188,6 +213,8 @@ def extraction_options(options: MappingOptions, context: RunContext) -> pycolmap
         extraction.max_image_size = options.max_image_size
     extraction.sift.max_num_features = options.max_num_features
     extraction.sift.first_octave = options.first_octave
+    if context.features == "aliked":
+        extraction.type = pycolmap.FeatureExtractorType.ALIKED_N16ROT
     return context.colmap.apply(extraction)
 
 
@@ -198,6 +225,8 @@ def matching_options(context: RunContext) -> pycolmap.FeatureMatchingOptions:
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = context.device == "cuda"
     matching.num_threads = context.num_threads
+    if context.features == "aliked":
+        matching.type = pycolmap.FeatureMatcherType.ALIKED_LIGHTGLUE
     return context.colmap.apply(matching)
 
 

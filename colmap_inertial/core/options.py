@@ -82,6 +82,9 @@ class MappingOptions(CheckedOptions):
     """SIFT features per image."""
     first_octave: int = -1
     """SIFT: -1 starts at twice the image size (COLMAP's default), 0 at the image size (three times faster)."""
+    features: Literal["sift", "aliked"] = "sift"
+    """What is found and matched. aliked (experimental): learned features with LightGlue, where pycolmap is built with
+    ONNX; other features come by --database."""
     mapper: Literal["incremental", "global"] = "incremental"
     """COLMAP's mapper."""
     device: Literal["auto", "cpu", "cuda"] = "auto"

@@ -95,7 +95,7 @@ _DECIDED = {
     "num_threads": "--deterministic decides",
     "random_seed": "--seed decides",
     "use_gpu": "--mapping.device decides",
-    "type": "SIFT is what is extracted and matched",
+    "type": "--mapping.features decides",
     "skip_geometric_verification": "pairs are judged by their verified matches",
     **dict.fromkeys(
         ("single_camera", "single_camera_per_folder", "single_camera_per_image", "existing_camera_id"),

@@ -17,6 +17,7 @@ from colmap_inertial.pipeline.run.runner import fingerprint
 
 #: What COLMAP finds and matches features on.
 Device = Literal["cpu", "cuda"]
+Features = Literal["sift", "aliked"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -116,6 +117,8 @@ class RunContext:
         Of COLMAP.
     device
         What COLMAP finds and matches features on.
+    features
+        What COLMAP finds and matches.
     colmap
         What the user set of COLMAP's own options.
     progress
@@ -126,6 +129,7 @@ class RunContext:
     num_threads: int = -1
     seed: int = 0
     device: Device = "cpu"
+    features: Features = "sift"
     colmap: ColmapSettings = NO_SETTINGS
     progress: Progress = silent
 
@@ -134,7 +138,14 @@ class RunContext:
         """As the options of a reconstruction ask for; an ``InertialError`` for options that COLMAP does not have."""
         num_threads = 1 if options.deterministic else -1
         settings = read_settings(options.colmap, options.colmap_project)
-        return cls(num_threads=num_threads, seed=options.seed, device=device, colmap=settings, progress=progress)
+        return cls(
+            num_threads=num_threads,
+            seed=options.seed,
+            device=device,
+            features=options.mapping.features,
+            colmap=settings,
+            progress=progress,
+        )
 
     def reporting(self, progress: Progress) -> RunContext:
         """The same, heard by somebody else."""
@@ -142,4 +153,4 @@ class RunContext:
 
     def identity(self) -> dict[str, object]:
         """What decides a result: not who listens, nor where."""
-        return {"num_threads": self.num_threads, "seed": self.seed, "device": self.device}
+        return {name: getattr(self, name) for name in ("num_threads", "seed", "device", "features")}

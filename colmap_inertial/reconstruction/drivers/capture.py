@@ -11,7 +11,7 @@ from colmap_inertial.checks.diagnose import Diagnosis
 from colmap_inertial.checks.report import require_plotly
 from colmap_inertial.checks.validate import Target, parse_target
 from colmap_inertial.colmap.given_database import read_given
-from colmap_inertial.colmap.sparse import check_pair_names, mapping_device
+from colmap_inertial.colmap.sparse import check_pair_names, mapping_device, require_features
 from colmap_inertial.colmap.steps import run_colmap
 from colmap_inertial.colmap.tsdf import require_mesh_maker
 from colmap_inertial.core.arrays import Array
@@ -213,6 +213,7 @@ def _reconstruct(
     capture, used_calibration = given.capture, describe_files(options.calibration)
     device = mapping_device(options.mapping, deterministic=options.deterministic)
     context = RunContext.of(options, device=device, progress=progress)
+    require_features(context)
     decides, pictures = (given.recording.identity(), stages), picture_folders(capture)
     with (
         open_session(out, capture.path, options, context, pictures=pictures, decides=decides) as session,

@@ -19,6 +19,7 @@ from colmap_inertial.colmap.sparse import (
     image_pairs,
     mapping_device,
     match_features,
+    require_features,
 )
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError, OutputExistsError
@@ -381,6 +382,7 @@ def _map(
     images, sparse = project / "images", project / "sparse"
     device = mapping_device(mapping, deterministic=options.deterministic)
     context = dataclasses.replace(RunContext.of(options, device=device, progress=progress), scratch=project)
+    require_features(context)
     for _ in counted(_written(capture, names, images), len(names), "frames", progress):
         pass
     features, database = project / "features.db", project / "database.db"

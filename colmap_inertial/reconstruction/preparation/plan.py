@@ -125,7 +125,7 @@ def run_plan(session: Session, recording: Recording, asked: Treatments) -> Imagi
     """What to do to frames and keypoints; where nothing is asked for, nothing is looked at."""
 
     # the user's settings are for the whole capture, not for small models of parts of it
-    plain = replace(session.context, colmap=NO_SETTINGS)
+    plain = replace(session.context, features="sift", colmap=NO_SETTINGS)
 
     def work(partial: Sequence[Path]) -> None:
         write_plan(partial[0], plan_imaging(recording, plain, asked))
