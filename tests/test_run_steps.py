@@ -341,6 +341,9 @@ def test_links_of_a_project_may_stay_and_the_folder_itself_may_be_one(workspace,
         refuse_links(workspace.root)
     workspace.placed.write_text(json.dumps({"paths": ["mesh"]}))
     (tmp_path / "link").symlink_to(workspace.root)
+    ready = workspace.stamps / "next" / "mesh"  # of a run that was killed
+    ready.mkdir(parents=True)
+    (ready / "latest.ply").symlink_to("fused.ply")
     refuse_links(tmp_path / "link")
     (workspace.root / "mesh" / "other.ply").symlink_to(tmp_path)
     with pytest.raises(FormatError, match="is a link"):

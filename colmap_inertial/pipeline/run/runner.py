@@ -371,7 +371,7 @@ def _read_stamp(stamp: Path) -> _Stamp | None:
 
 def remove(path: Path) -> None:
     """Remove a file or folder of our own, if it is there, with the side files of an SQLite database."""
-    if path.is_dir():
+    if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
         for suffix in ("", "-journal", "-wal", "-shm"):

@@ -212,24 +212,34 @@ def refuse_links(root: Path) -> None:
     FormatError
         For the first one.
     """
-    placed, top = Workspace(root).placed, os.path.realpath(root)
+    workspace, top = Workspace(root), os.path.realpath(root)
     for folder, folders, names in os.walk(root):
         for name in sorted(folders + names):
             path = Path(folder, name)
-            mode = path.lstat().st_mode
+            try:
+                mode = path.lstat().st_mode
+            except FileNotFoundError:
+                continue  # a run at work took it away
             if stat.S_ISDIR(mode) or stat.S_ISREG(mode):
                 continue
             if not stat.S_ISLNK(mode):
                 raise FormatError(path, "is a device, a pipe or a socket in an output folder: remove it")
             inside = os.path.commonpath((top, os.path.realpath(path))) == top
-            own = inside and placed.is_file() and not placed.is_symlink() and read_json(placed).get("paths", [])
-            relative = path.relative_to(root)
-            if not own or not any(relative.is_relative_to(str(one)) for one in own):
+            if not inside or not any(path.is_relative_to(place) for place in _places_of_links(workspace)):
                 raise FormatError(
                     path,
                     f"is a link to {path.readlink()}; links in an output folder are not followed: remove it, or put "
                     "the file or folder itself there",
                 )
+
+
+def _places_of_links(workspace: Workspace) -> list[Path]:
+    """Where links of an existing project may be: as they came, and where a run that was killed made them ready."""
+    names: Sequence[object] = ()
+    if workspace.placed.is_file() and not workspace.placed.is_symlink():
+        names = read_json(workspace.placed).get("paths", ())
+    ready = (workspace.stamps / name for name in ("project", "next", "replaced"))
+    return [*(workspace.root / str(name) for name in names), *(path for path in ready if not path.is_symlink())]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -119,10 +119,7 @@ def list_placed_paths(workspace: Workspace) -> list[Path]:
 def remove_placed(workspace: Workspace) -> None:
     """Take away what came from the project."""
     for path in list_placed_paths(workspace):
-        if path.is_symlink():
-            path.unlink()
-        else:
-            remove(path)
+        remove(path)
     workspace.placed.unlink(missing_ok=True)
 
 
