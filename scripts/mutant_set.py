@@ -522,14 +522,14 @@ MUTANTS = (
         ("model",),
     ),
     Mutant(
-        "model/__init__.py",
+        "model/pose_covariances.py",
         "-cross(by_cam, cam[:, None])",
         "cross(by_cam, cam[:, None])",
         "sign of how errors of rotation and centre go together",
         ("model",),
     ),
     Mutant(
-        "model/__init__.py",
+        "model/pose_covariances.py",
         "variance_px2 * (root.T @ root)",
         "variance_px2 * (root @ root.T)",
         "the covariance of a pose by the wrong triangular product",
@@ -936,8 +936,8 @@ MUTANTS = (
     ),
     Mutant(
         "pipeline/run/context.py",
-        'return {"num_threads": self.num_threads, "seed": self.seed, "device": self.device}',
-        'return {"num_threads": self.num_threads, "device": self.device}',
+        'for name in ("num_threads", "seed", "device", "features")',
+        'for name in ("num_threads", "device", "features")',
         "another seed does not make anything again",
         ("run_steps",),
     ),
@@ -1041,7 +1041,7 @@ MUTANTS = (
     ),
     Mutant(
         "pipeline/run/session.py",
-        "            workspace.unfinish()\n",
+        "            beside.unfinish()\n",
         "",
         "result.json stays beside another configuration",
         ("run_steps",),
@@ -1090,8 +1090,8 @@ MUTANTS = (
     ),
     Mutant(
         "pipeline/stages/metric.py",
-        "_write_covariance(target, smoothed.t_s + smoothed.epoch_ns * 1e-9, smoothed.cov)",
-        "_write_covariance(target, smoothed.t_s, smoothed.cov)",
+        "_write_covariance(target, smoothed.t_s + smoothed.epoch_ns * 1e-9, cov, rotation)",
+        "_write_covariance(target, smoothed.t_s, cov, rotation)",
         "covariances of a path are stamped by another clock than its poses",
         ("run_models",),
     ),
@@ -1880,7 +1880,7 @@ MUTANTS = (
         ("refine_banded::test_solutions_and_marginals_are_those_of_the_dense_inverse",),
     ),
     Mutant(
-        "inertial/refine/setup.py",
+        "inertial/refine/pictures.py",
         "weighed_px=max(_LEAST_PX, sigma_px * float(np.sqrt(variance / slope))),",
         "weighed_px=sigma_px,",
         "observations weigh less than they tell",
@@ -1905,8 +1905,8 @@ MUTANTS = (
     ),
     Mutant(
         "inertial/refine/_residuals.py",
-        "    by_state[:, _SPEED, GYRO_BIAS] = swinging",
-        "    by_state[:, _SPEED, GYRO_BIAS] = -swinging",
+        "    by_state[:, SPEED, GYRO_BIAS] = swinging",
+        "    by_state[:, SPEED, GYRO_BIAS] = -swinging",
         "sign of what the gyroscope's bias does to the camera's velocity",
         ("refine::test_derivatives_of_the_camera_s_motion_are_those_of_finite_differences",),
     ),
@@ -1958,13 +1958,6 @@ MUTANTS = (
         "<= 1 + np.linalg.norm(solved)",
         "what was solved holds of images that a stage moved since",
         ("refine_stage::test_images_beyond_the_recording_have_no_covariance_of_motion",),
-    ),
-    Mutant(
-        "inertial/refine/setup.py",
-        "centres = about + scale * (written.cam_in_world - about)",
-        "centres = written.cam_in_world",
-        "cameras are not stretched with the points",
-        ("refine::test_the_model_that_is_written_is_the_one_that_was_found",),
     ),
     Mutant(
         "imaging/exposure_pairs/_search.py",
@@ -2059,8 +2052,8 @@ MUTANTS = (
     ),
     Mutant(
         "inertial/refine/judge.py",
-        "abs(readout[0]) < max(",
-        "abs(readout[0]) < 1e6 * max(",
+        "abs(found[0]) < max(",
+        "abs(found[0]) < 1e6 * max(",
         "a model is refined whose images turn out to have a rolling shutter",
         ("refine_stage::test_a_readout_that_was_not_declared_is_found_and_told",),
     ),
@@ -2072,7 +2065,7 @@ MUTANTS = (
         ("join::test_models_become_one_with_every_observation_once",),
     ),
     Mutant(
-        "inertial/join/joined_model.py",
+        "model/similarities.py",
         "scale=move.scale * before.scale,",
         "scale=before.scale,",
         "what is said to be applied to a part lacks its own scale's correction",

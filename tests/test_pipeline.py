@@ -58,7 +58,7 @@ def finished(tmp_path_factory):
     stages = []
     result = reconstruct(capture, root / "out", FINE, progress=lambda stage, done, total: stages.append((stage, done)))
     assert contents(capture) == before
-    assert list(dict(stages)) == ["frames", "features", "matches", "mapping", "images", "metric", "validation"]
+    assert list(dict(stages)) == ["check", "frames", "features", "matches", "mapping", "images", "metric", "validation"]
     return capture, root / "out", result
 
 
