@@ -144,6 +144,14 @@ def test_a_flipped_axis_is_told_from_the_way_between_frames(scene, rotation):
     assert check_motion(rotation, replace(gyro, offset_s=100.0)).agrees is None
 
 
+def test_one_pair_that_was_measured_wrongly_flips_no_axis(scene, rotation):
+    turn = rotation.turn_rad.copy()
+    turn[5] = [0.5, -2.0, 0.4]
+    found = check_motion(replace(rotation, turn_rad=turn), scene.gyro())
+    assert found.agrees and found.explained > 0.98
+    np.testing.assert_allclose(found.gain, 1, atol=0.08)
+
+
 def test_memory_does_not_grow_with_the_number_of_frames(film):
     frames, timing = film
 

@@ -99,3 +99,16 @@ def subtract_running_mean(values: Array, width: int) -> Array:
     slow = np.stack([np.convolve(column, kernel, mode="valid") for column in values.T], axis=1)
     start = (width - 1) // 2
     return np.asarray(values[start : start + len(slow)] - slow)
+
+
+def fit_robust_slope(x: Array, y: Array) -> float:
+    """``y`` per ``x`` of (N,) samples, some of which may be wrong.
+
+    By least absolute deviations (a weighted median), then by least squares of what agrees to three standard deviations.
+    """
+    order = np.argsort(y / np.where(x == 0, np.inf, x))
+    weight = np.cumsum(np.abs(x[order]))
+    middle = order[np.searchsorted(weight, 0.5 * weight[-1])]
+    left = np.abs(y - y[middle] / x[middle] * x)
+    agree = left <= 3 * float(np.median(left)) / 0.6745
+    return float(y[agree] @ x[agree] / (x[agree] @ x[agree]))

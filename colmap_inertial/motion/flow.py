@@ -24,7 +24,7 @@ from colmap_inertial.core.geometry import (
     so3_log,
 )
 from colmap_inertial.core.gyro import GyroPath
-from colmap_inertial.core.sampling import subtract_running_mean
+from colmap_inertial.core.sampling import fit_robust_slope, subtract_running_mean
 from colmap_inertial.core.types import CameraTrajectory, Frame, FrameTiming, ImuRecording, Projector
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.rolling_shutter import append_unit_depth
@@ -284,7 +284,7 @@ def check_motion(rotation: VisualRotation, motion: GyroCamera) -> MotionCheck:
     gain = []
     for axis in range(3):
         x, y = inertial[:, axis], visual[:, axis]
-        gain.append(float(y @ x / (x @ x)) if np.sqrt(np.mean(x**2)) > _LIMITS.rotated_sigmas * sigma else float("nan"))
+        gain.append(fit_robust_slope(x, y) if np.sqrt(np.mean(x**2)) > _LIMITS.rotated_sigmas * sigma else float("nan"))
     flipped = ["xyz"[axis] for axis in range(3) if gain[axis] < -0.3]
     reason = f"the gyroscope explains {100 * max(explained, 0):.0f} % of the rotation between frames"
     if flipped:
