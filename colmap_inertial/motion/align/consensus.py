@@ -183,8 +183,11 @@ def judge_rotations(
     judged = part != -2
     # those that were not judged go with the nearest in time that belong somewhere
     placed = np.flatnonzero(part >= 0)
-    for i in np.flatnonzero(~judged):
-        part[i] = part[placed[np.argmin(np.abs(t_s[placed] - t_s[i]))]] if len(placed) else 0
+    if len(placed):
+        nearest = np.rint(np.interp(t_s[~judged], t_s[placed], np.arange(len(placed)))).astype(np.intp)
+        part[~judged] = part[placed[nearest]]
+    else:
+        part[~judged] = 0
     return RotationConsensus(
         names=trajectory.names,
         t_s=trajectory.t_s,
@@ -318,22 +321,28 @@ def _place_short_runs(
 
 
 def _deviations_deg(cameras: _Recorded, number: IndexArray) -> Array:
-    """How far each camera is turned against its part's next four, or against the nearest part's, where it has none."""
+    """How far each camera is turned against the next four of its part; a wrong one, against the nearest five placed."""
     d, out = cameras.world_from_start, np.zeros(len(number))
     placed = np.flatnonzero(number >= 0)
-    for i in range(len(number)):
-        others = placed[number[placed] == number[i]] if number[i] >= 0 else placed
-        others = others[others != i]
-        if len(others):
-            at = int(np.searchsorted(others, i))
-            sides = (others[max(at - 2, 0) : at + 2],) if number[i] >= 0 else (others[:at][-5:], others[at:][:5])
-            out[i] = min(_apart_deg(d, side, [i]) for side in sides if len(side))
+    if not len(placed):
+        return out
+    for part in np.unique(number):
+        own = np.flatnonzero(number == part)
+        if part >= 0:
+            at = np.abs(np.arange(len(own))[:, None] + [-2, -1, 1, 2])
+            sides = [own[np.minimum(at, 2 * (len(own) - 1) - at)]]  # beyond an end, those before it
+        else:
+            at = np.searchsorted(placed, own)[:, None]
+            reach = np.arange(LIMITS.beside)
+            sides = [placed[np.clip(at + beside, 0, len(placed) - 1)] for beside in (reach, -1 - reach)]
+        out[own] = np.min([_angles_deg(_mean(d[side]), d[own]) for side in sides], axis=0)
     return out
 
 
 def _mean(q: Array) -> Array:
-    """The mean of rotations that are alike."""
-    return quat_normalize(np.sum(q * np.where(q @ q[0] < 0, -1.0, 1.0)[:, None], axis=0))
+    """(..., 4) means of (..., K, 4) rotations that are alike."""
+    alike = np.where(np.sum(q * q[..., :1, :], axis=-1, keepdims=True) < 0, -1.0, 1.0)
+    return quat_normalize(np.sum(q * alike, axis=-2))
 
 
 def _apart_deg(q: Array, some: IndexArray, others: IndexArray | Sequence[int]) -> float:
