@@ -9,6 +9,7 @@ import pycolmap
 import pytest
 from box_project import shared_box
 
+from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply
 from colmap_inertial.core.options import ProjectOptions, ScaleOptions
 from colmap_inertial.model import deregister_images, read_model
 from colmap_inertial.model.project import apply_to_project
@@ -16,7 +17,7 @@ from colmap_inertial.model.similarities import read_scales
 from colmap_inertial.model.submodels.registration import register_again
 from colmap_inertial.reconstruction.drivers.diagnosis import diagnose_source
 from colmap_inertial.reconstruction.drivers.project import reconstruct_project
-from colmap_inertial.reconstruction.drivers.sources import ScaleSource, scale_source
+from colmap_inertial.reconstruction.drivers.sources import ScaleSource, align_source, scale_source
 
 
 @pytest.fixture(scope="module")
@@ -137,6 +138,15 @@ def test_deregistered_images_leave_the_original_as_it_is(box):
     assert (model.num_reg_images(), rest.num_reg_images()) == (120, 117)
     assert all(point.track.length() >= 2 for point in rest.points3D.values())
     assert all(a < b for a, b in pairwise(sorted(rest.reg_image_ids())))
+
+
+def test_the_alignment_of_a_project_goes_by_its_sound_cameras(box, tmp_path):
+    project = altered(box, tmp_path / "project", [box.names[i] for i in (5, 40, 90)], 54)
+    source = ScaleSource(source=project / "sparse" / "0", imu=box.imu, frame_times=box.frame_times)
+    found = align_source(source, tmp_path / "calibration.json")
+    truth = box.recording.truth.calibration
+    between = quat_multiply(found.cam_from_imu_xyzw, quat_conjugate(truth.cam_from_imu_xyzw))
+    assert np.degrees(np.linalg.norm(quat_log(between))) < 0.5
 
 
 def test_apply_leaves_the_same_images_out(box, tmp_path):

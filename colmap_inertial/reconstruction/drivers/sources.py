@@ -48,7 +48,8 @@ from colmap_inertial.model import (
     trajectory_from_model,
 )
 from colmap_inertial.model.rigs import frames_of_rigs
-from colmap_inertial.motion.align import AlignOptions, align_camera_imu
+from colmap_inertial.motion.align import AlignOptions
+from colmap_inertial.motion.align.consensus import align_by_consensus
 from colmap_inertial.motion.align.conventions import likely_convention
 
 
@@ -214,18 +215,22 @@ def align_source(source: ScaleSource, out: Path) -> CameraImuCalibration:
     Raises
     ------
     NotObservableError
-        Where no offset between the clocks is better than the rest, or the camera hardly turned. Poses that fit by
+        Where no offset between the clocks is better than the rest, the camera hardly turned, or most cameras do not
+        agree with the gyroscope. Poses that fit by
         another convention are named, also where their rotations alone would do.
     """
     check_output(out, [source.source, source.imu, source.frame_times])
     recording = load_source(source)
     options = AlignOptions(max_offset_s=largest_offset_s(recording.shared_clock))
     try:
-        found = align_camera_imu(recording.trajectory, recording.imu, prior=recording.calibration, options=options)
+        aligned, _ = align_by_consensus(
+            recording.trajectory, recording.imu, prior=recording.calibration, options=options
+        )
     except NotObservableError as error:
         _refuse_another_convention(recording, options, error.quantity)
         raise
     _refuse_another_convention(recording, options, "rotation")
+    found = dataclasses.replace(aligned.calibration, clock_rate=0.0, clock_middle_s=0.0)
     write_calibration(out, found)
     return found
 
