@@ -11,7 +11,8 @@ from box_project import shared_box
 
 from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply
 from colmap_inertial.core.options import ProjectOptions, ScaleOptions
-from colmap_inertial.model import deregister_images, read_model
+from colmap_inertial.model import read_model
+from colmap_inertial.model.deregistration import deregister_images
 from colmap_inertial.model.project import apply_to_project
 from colmap_inertial.model.similarities import read_scales
 from colmap_inertial.model.submodels.registration import register_again

@@ -21,7 +21,6 @@ from colmap_inertial.core.types import Similarity
 from colmap_inertial.io.files import StrPath, read_json, write_json
 from colmap_inertial.model import (
     TRANSFORM_FILE,
-    deregister_images,
     is_metric,
     model_files,
     model_formats,
@@ -32,6 +31,7 @@ from colmap_inertial.model import (
 )
 from colmap_inertial.model.copying import begin_writing, copy_file, list_tree, new_folder
 from colmap_inertial.model.database import SHARED_MEMORY, SIDE_FILES, is_database, transform_database
+from colmap_inertial.model.deregistration import deregister_images
 from colmap_inertial.model.layout import WRITERS, Layout, foreign_kind, kind_of, read_layout
 from colmap_inertial.model.nerf import cameras_are_those_of
 from colmap_inertial.model.similarities import ModelScale, require_not_joined, similarity_from_json, undoing

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from colmap_inertial.model import deregister_images, forget_unregistered
+from colmap_inertial.model.deregistration import deregister_images, forget_unregistered
 from colmap_inertial.model.submodels.matches import Submodel, localise, matches_between
 
 if TYPE_CHECKING:

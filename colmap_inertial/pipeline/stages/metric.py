@@ -34,7 +34,8 @@ from colmap_inertial.inertial.scale import estimate_scale
 from colmap_inertial.io.calibration import SIGMAS
 from colmap_inertial.io.files import write_record
 from colmap_inertial.io.trajectories import write_tum
-from colmap_inertial.model import Model, deregister_images, downgraded, trajectory_from_model
+from colmap_inertial.model import Model, downgraded, trajectory_from_model
+from colmap_inertial.model.deregistration import deregister_images
 from colmap_inertial.model.rigs import has_rigs
 from colmap_inertial.model.submodels.registration import register_again
 from colmap_inertial.motion.align.consensus import describe_consensus
