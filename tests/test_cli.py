@@ -37,7 +37,7 @@ def run(capsys, *args):
     ],
 )
 def test_help_teaches(capsys, command):
-    code, out, _ = run(capsys, *command, "--help")
+    code, out, _ = run(capsys, *command, "--help-all" if command else "--help")
     assert code == 0
     assert "usage: colmap-inertial" in out
     if command:
@@ -70,7 +70,7 @@ def test_what_is_mistyped_is_named_also_where_something_is_missing(capsys, args,
 @loop_over("command", _COMMANDS)
 def test_every_option_of_the_help_is_known(capsys, monkeypatch, command):
     monkeypatch.setenv("COLUMNS", "80")
-    _, out, _ = run(capsys, command, "--help")
+    _, out, _ = run(capsys, command, "--help-all")
     rows = re.findall(r"^  (--[a-z].*?)(?:  |$)", out, re.MULTILINE)
     shown = {option for row in rows for option in re.findall(r"--[a-z][a-z.0-9-]*", row)}
     assert shown and shown <= set(_options(command))
@@ -87,13 +87,13 @@ def test_help_mentions_version_and_completion_and_no_none_to_type(capsys, monkey
     _, out, _ = run(capsys, "--help")
     assert "--version" in out and "--tyro-print-completion" in out
     for command in _COMMANDS:
-        _, out, _ = run(capsys, command, "--help")
+        _, out, _ = run(capsys, command, "--help-all")
         assert "{None}" not in out and "Default:" not in out and "default: None" not in out
         assert max(map(len, out.splitlines())) <= int(columns)
 
 
 def test_common_options_come_first_and_those_of_all_commands_are_the_same(capsys):
-    _, out, _ = run(capsys, "reconstruct", "--help")
+    _, out, _ = run(capsys, "reconstruct", "--help-all")
     places = [out.index(f"\n  {option}") for option in ("--dense", "--imu", "--json", "--mapping.pairing")]
     places += [out.index(f"\n  {option}") for option in ("--apertures.cost", "--limits.megapixels")]
     assert places == sorted(places)

@@ -23,7 +23,7 @@ TASKS = [
 @loop_over(("task", "command", "name", "words"), TASKS, ids=[task for task, *_ in TASKS])
 def test_the_help_solves_it(task, command, name, words, monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "80")
-    code, out, _ = run(capsys, *([command] if command else []), "--help")
+    code, out, _ = run(capsys, *([command, "--help-all"] if command else ["--help"]))
     assert code == 0
     found = re.search(rf"^  {re.escape(name)}(?![\w.-])", out, re.MULTILINE)
     assert found is not None
@@ -35,8 +35,18 @@ def test_each_page_begins_with_what_it_does_and_an_example(capsys):
     from colmap_inertial.cli import _COMMANDS
 
     for command in _COMMANDS:
-        _, out, _ = run(capsys, command, "--help")
+        _, out, _ = run(capsys, command, "--help-all")
         paragraphs = out.split("\n\n")
         assert paragraphs[0].startswith(f"usage: colmap-inertial {command}")
         assert paragraphs[1].endswith(".") and "Example: colmap-inertial" in out
         assert out.index("Arguments:") < out.index("Of every command:")
+
+
+@pytest.mark.parametrize(
+    "command", ["reconstruct", "batch", "scale", "validate", "diagnose", "deblur", "export", "view"]
+)
+def test_the_common_options_fit_one_screen(command, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    code, out, _ = run(capsys, command, "--help")
+    assert code == 0 and len(out.splitlines()) <= 45
+    assert "--help-all" in out and "--limits" not in out

@@ -179,7 +179,7 @@ def test_each_view_is_numbered_so_that_all_agree(small, monkeypatch, spec):
 
 
 def test_a_wrong_board_size_is_not_found_and_the_right_one_is_suggested(small):
-    with pytest.raises(TargetNotFoundError, match="9x6 inner corners is visible") as caught:
+    with pytest.raises(TargetNotFoundError, match="9x6 inner corners is in more") as caught:
         validate_model(reconstruction(SMALL, small.poses[:2]), small.images, parse_target("checkerboard:8x6:0.03"))
     assert caught.value.exit_code == 5
 

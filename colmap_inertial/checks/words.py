@@ -96,7 +96,8 @@ def target_facts(found: Mapping[str, Any]) -> Iterator[Fact]:
     yield "target", found["target"]
     if found["scale_error_pct"] is not None:
         low, high = found["ci95_pct"]
-        place = "within" if found["within_tolerance"] else "outside"
+        off = abs(found["scale_error_pct"]) > found["tolerance_pct"]
+        place = "outside" if off else "within" if found["within_tolerance"] else "not proved to be within"
         error = f"{found['scale_error_pct']:+.3f} % (95 %: {low:+.3f} to {high:+.3f})"
         yield "scale error", f"{error}, {place} {found['tolerance_pct']:g} %"
     low, high = found["metres_per_unit_ci95"]

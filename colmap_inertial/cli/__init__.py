@@ -61,7 +61,7 @@ _COMMON: dict[str, tuple[str, ...]] = {
     "apply": ("scale", "factor", "sim3", "undo", "world"),
     "export": ("program", "images", "model"),
 }
-_HELP = ("-h", "--help")
+_HELP, _HELP_ALL = ("-h", "--help"), "--help-all"
 #: Options that take several values, and what is said where none follows.
 _LISTS = {
     "--calibration": "--calibration takes a file, or two: from `align --out`, from `calibrate-imu --out`",
@@ -86,12 +86,13 @@ def parse(args: Sequence[str]) -> Speaker:
         print_overview(DESCRIPTION, _GROUPS)
         sys.exit(0 if args else 2)
     name = args[0].replace("_", "-")
-    if name in _COMMANDS and any(word in _HELP for word in args[1:]):
+    if name in _COMMANDS and any(word in (*_HELP, _HELP_ALL) for word in args[1:]):
         titles = {
             ProjectOptions: "An existing COLMAP project in place of a capture",
             ReferenceOptions: "Metres without an IMU",
         }
-        print_help(name, _COMMANDS[name], _COMMON.get(name, ()), titles, Speaker)
+        common, everything = _COMMON.get(name, ()), _HELP_ALL in args[1:]
+        print_help(name, _COMMANDS[name], common, titles, Speaker, everything=everything)
         sys.exit(0)
     args = [*args[:1], *_expand_options(args)]
     _require_known(args)

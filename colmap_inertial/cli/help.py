@@ -27,7 +27,7 @@ _BY_NAME = {
     "keep": "PATTERN",
     "colmap": "SECTION.option=value",
 }
-_WIDEST, _NARROWEST, _COLUMN = 100, 40, 28
+_WIDEST, _NARROWEST, _COLUMN, _LONG = 100, 40, 28, 120
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,9 +148,15 @@ def _read_texts(cls: type[Any]) -> dict[str, str]:
 
 
 def print_help(
-    name: str, cls: type[Any], common: Sequence[str], titles: Mapping[type[Any], str], everywhere: type[Any]
+    name: str,
+    cls: type[Any],
+    common: Sequence[str],
+    titles: Mapping[type[Any], str],
+    everywhere: type[Any],
+    *,
+    everything: bool = False,
 ) -> None:
-    """Print one command's page.
+    """Print one command's page: its common options on one screen, or ``everything`` by topic.
 
     Parameters
     ----------
@@ -167,10 +173,25 @@ def print_help(
     sections = _sort_into_sections(options_of(cls), common, titles, everywhere)
     arguments = "".join(f" {argument.names[0]}" for argument in sections[_ARGUMENTS])
     page.line(f"usage: colmap-inertial {name}{arguments} [OPTIONS]")
-    for paragraph in inspect.cleandoc(cls.__doc__ or "").split("\n\n"):
+    paragraphs = inspect.cleandoc(cls.__doc__ or "").split("\n\n")
+    rest = [title for title in sections if sections[title] and title not in (_ARGUMENTS, _OPTIONS, _EVERYWHERE)]
+    if not everything and rest:
+        paragraphs = [paragraphs[0], paragraphs[-1]] if sections[_OPTIONS] else paragraphs
+        sections = {
+            title: [dataclasses.replace(option, text=_cut_to_sentence(option.text)) for option in found]
+            for title, found in sections.items()
+            if title not in rest
+        }
+    for paragraph in paragraphs:
         page.paragraph(paragraph)
+    pages = [("-h, --help", "The common options."), ("--help-all", "All options, by topic.")]
     for title, options in sections.items():
-        page.group(title, options, more=[("-h, --help", "This page.")] if title == _EVERYWHERE else ())
+        page.group(title, options, more=pages if title == _EVERYWHERE else ())
+
+
+def _cut_to_sentence(text: str) -> str:
+    """The first sentence of a long text."""
+    return text if len(text) <= _LONG else text.partition(". ")[0].rstrip(".") + "."
 
 
 _ARGUMENTS, _OPTIONS, _REST, _EVERYWHERE = "Arguments", "Options", "Less common", "Of every command"

@@ -36,6 +36,8 @@ def answering_signals() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
+    import pycolmap  # noqa: F401 (loading it replaces the handler of SIGTERM by one that prints a stack)
+
     here, there = socket.socketpair()
     there.setblocking(False)
     old_fd = signal.set_wakeup_fd(there.fileno(), warn_on_full_buffer=False)
@@ -65,8 +67,11 @@ def _answer(signals: socket.socket) -> None:
                 continue
             came += 1
             if came == 1:
+                line = "\r\033[2K" if sys.stderr.isatty() else "\n"  # in place of a bar
                 print(
-                    "\nstopping, which may take some seconds (Ctrl-C again ends at once)", file=sys.stderr, flush=True
+                    f"{line}stopping, which may take some seconds (Ctrl-C again ends at once)",
+                    file=sys.stderr,
+                    flush=True,
                 )
             else:
                 if sys.stderr.isatty():

@@ -214,7 +214,7 @@ def live_progress(*, quiet: bool, verbose: bool) -> Iterator[Screen]:
             stage: Stage = task.fields["stage"]
             seconds = task.finished_time if task.finished_time is not None else task.elapsed
             left = "" if task.finished else stage.ends_in(time.monotonic())
-            return Text.assemble("clock ", (clock(seconds or 0.0), "progress.elapsed"), f", {left}" if left else "")
+            return Text.assemble("took ", (clock(seconds or 0.0), "progress.elapsed"), f", {left}" if left else "")
 
     console = open_console(stderr=True, quiet=quiet)
     columns: tuple[Any, ...] = (

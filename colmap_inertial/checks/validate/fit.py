@@ -26,6 +26,8 @@ from colmap_inertial.core.geometry import skew, so3_exp
 class FitLimits:
     """The size of the target and its interval."""
 
+    #: Two images agree on many a wrong board; a result of fewer is not proved.
+    enough_views: int = 3
     #: Corners beyond so many standard deviations do not belong.
     outlier_sigma: float = 5.0
     #: Views whose residuals are so many times those of the others do not belong.

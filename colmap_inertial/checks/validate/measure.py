@@ -20,6 +20,7 @@ from colmap_inertial.checks.validate.place import (
     explain_failure,
     median_residual_px,
     observe,
+    require_no_likelier_board,
 )
 from colmap_inertial.checks.validate.result import (
     Corner,
@@ -96,7 +97,10 @@ def validate_model(
     search = Search(views, target, options, progress)
     search.run(images)
     placed = search.place()
-    if sum(len(p.chosen) for p in placed.values()) < PLACEMENT.enough_views and target.kind == "checkerboard":
+    count = sum(len(p.chosen) for p in placed.values())
+    if count < min(PLACEMENT.enough_views, 0.5 * len(search.searched)):
+        require_no_likelier_board(search, count)
+    if count < PLACEMENT.enough_views and target.kind == "checkerboard":
         seen = {s.view for s in search.sightings}
         search.look_closer([v for v in search.searched if v not in seen][: PLACEMENT.most_thorough_views])
         placed = search.place()

@@ -20,7 +20,7 @@ import numpy as np
 from colmap_inertial.checks.validate.detect import DETECTION, detect, other_checkerboard
 from colmap_inertial.checks.validate.fit import settle
 from colmap_inertial.checks.validate.observations import Observations, Placement, linearise
-from colmap_inertial.checks.validate.targets import Target
+from colmap_inertial.checks.validate.targets import Target, parse_target
 from colmap_inertial.checks.validate.views import Sighting, View, sight
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, NotObservableError, TargetNotFoundError
@@ -376,6 +376,10 @@ def _spread_evenly(count: int) -> list[int]:
     return [i for i in reverse if i < count]
 
 
+#: What is miscounted in columns and rows: squares for corners first, then lines.
+_MISCOUNTED = ((-1, -1), (1, 1), (0, -1), (-1, 0), (1, 0), (0, 1))
+
+
 def explain_failure(search: Search, images: Path) -> Exception:
     """The error that says why there is no result."""
     target, views = search.target, search.views
@@ -416,6 +420,37 @@ def _find_mirroring(search: Search) -> str | None:
         if again.place():
             return words
     return None
+
+
+def require_no_likelier_board(search: Search, used: int) -> None:
+    """Refuse a checkerboard where a size that is miscounted easily is in more of the images.
+
+    Raises
+    ------
+    TargetNotFoundError
+        That names the likely size.
+    """
+    if search.target.kind != "checkerboard":
+        return
+    columns, rows = search.target.columns, search.target.rows
+    picked = np.unique(np.linspace(0, len(search.searched) - 1, PLACEMENT.hint_views).astype(np.intp))
+    chosen = [search.searched[i] for i in picked.tolist()]
+    images = [image for image in (search.views[v].read() for v in chosen) if not isinstance(image, str)]
+    stated = len({s.view for s in search.sightings} & set(chosen))
+    counts = {}
+    for more in _MISCOUNTED:
+        size = (columns + more[0], rows + more[1])
+        if min(size) >= 3:
+            other = parse_target(f"checkerboard:{size[0]}x{size[1]}:{search.target.length_m}")
+            counts[size] = sum(bool(detect(image, other)) for image in images)
+    # a part of a larger board may pass for a smaller one
+    likely = max(counts, key=lambda size: (counts[size], size[0] * size[1]), default=None)
+    if likely is not None and counts[likely] > max(stated + 1, len(images) // 4):
+        raise TargetNotFoundError(
+            f"{search.target.spec} agrees in {used} of {len(search.searched)} images, and a board with "
+            f"{likely[0]}x{likely[1]} inner corners is in more of them: COLSxROWS counts inner corners, one less than "
+            "squares"
+        )
 
 
 def _hint_at_absence(search: Search) -> str:

@@ -388,8 +388,27 @@ class Validation:
 
     @property
     def within_tolerance(self) -> bool:
-        """Whether the scale error is at most the tolerance; a model without a unit always passes."""
-        return self.scale_error_pct is None or abs(self.scale_error_pct) <= self.tolerance_pct
+        """Whether the scale error is at most the tolerance (a model without a unit has none), and nothing doubts it."""
+        off = self.scale_error_pct is not None and abs(self.scale_error_pct) > self.tolerance_pct
+        return not off and not self.doubts
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Why the target may not be the stated one: few images agree, or its lengths do not."""
+        found = []
+        if self.views_used < FIT.enough_views:
+            found.append(
+                f"only {self.views_used} of {self.views_searched} images agree on the target, which proves no size: "
+                "check its columns and rows, or take it from more sides"
+            )
+        lengths = self.lengths
+        if lengths is not None and abs(lengths.largest_m) > self.tolerance_pct / 100 * lengths.longest_m:
+            found.append(
+                f"its lengths do not agree: one is off by {1000 * lengths.largest_m:+.3g} mm, more than "
+                f"{self.tolerance_pct:g} % of the longest, {1000 * lengths.longest_m:.4g} mm: check its columns, rows "
+                "and that it is flat"
+            )
+        return tuple(found)
 
     def as_json(self) -> dict[str, Any]:
         """Everything but pixel coordinates, ready for ``json.dump``."""
@@ -400,6 +419,7 @@ class Validation:
             if field.name == "tolerance_pct":
                 values["within_tolerance"] = self.within_tolerance
         values["target"] = self.target.spec
+        values["reasons"] = (*self.doubts, *self.reasons)
         values["views"] = [{"name": v.name, "corners": len(v.corner), "rms_px": v.rms_px} for v in self.views]
         json: dict[str, Any] = convert_to_plain(values)
         return json
@@ -429,6 +449,7 @@ def validation_table(result: Validation) -> Group:
             rejected.add_row(str(count), reason)
         parts.append(rejected)
     proved = [] if result.lengths is None else [f"the check proves that {result.lengths.proves}"]
+    parts += [Text(f"not proved: {text}", "bold red") for text in result.doubts]
     parts += [Text(f"- {text}") for text in (*proved, *result.reasons)]
     return Group(*parts)
 

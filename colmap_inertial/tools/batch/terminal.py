@@ -30,7 +30,7 @@ def live_batch(*, quiet: bool = False) -> Iterator[Watch]:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     console = open_console(stderr=True, quiet=quiet)
-    clock = (TextColumn("clock"), TimeElapsedColumn())
+    clock = (TextColumn("took"), TimeElapsedColumn())
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), *clock)
     bars = Progress(*columns, console=console, disable=not console.is_terminal)
     running = {}
