@@ -2,6 +2,7 @@
 
 import re
 
+import pytest
 from cases import loop_over
 from test_cli import run
 

@@ -232,12 +232,12 @@ def _times(source: ExportSource) -> list[tuple[float, str]]:
 def _up(found: ViewSource, model: pycolmap.Reconstruction) -> Array | None:
     """Against gravity; of an axis that gravity lies on, the one that the pictures' upper edges point along."""
     if found.down_in_world is not None:
-        return -found.down_in_world / np.linalg.norm(found.down_in_world)
+        return 0.0 - found.down_in_world / np.linalg.norm(found.down_in_world)  # no -0.0
     if not found.gravity_on_axis:
         return None
     rotations = [model.image(i).cam_from_world().rotation.matrix() for i in model.reg_image_ids()]
     edges = -np.mean(rotations, axis=0)[1]
-    return max((-down for down in DOWN_IN_WORLD.values()), key=lambda up: float(up @ edges))
+    return max((0.0 - down for down in DOWN_IN_WORLD.values()), key=lambda up: float(up @ edges))
 
 
 def _treated(workspace: Workspace) -> dict[str, tuple[str, bool]]:
