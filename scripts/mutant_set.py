@@ -1020,8 +1020,8 @@ MUTANTS = (
     ),
     Mutant(
         "io/images.py",
-        "size[0] * size[1] > 1e6 * most",
-        "size[0] > 1e6 * most",
+        "size[0] * size[1] * weight > 1e6 * most",
+        "size[0] * weight > 1e6 * most",
         "a picture of any size is decoded",
         ("io_limits",),
     ),

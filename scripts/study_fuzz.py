@@ -1,18 +1,18 @@
 """Damage every reader's files in thousands of ways: only errors of our own may come out, soon, and in little memory.
 
-    python scripts/study_fuzz.py [--mutants 24000] [--seed 0] [--readers NAME ...] [--processes 2]
+    python scripts/study_fuzz.py [--mutants 24000] [--least 0] [--seed 0] [--readers NAME ...] [--processes 2]
 
 Three of four mutants change the structure of a file: nodes of JSON and TOML, members and methods of a zip, values and
 tables of SQLite, boxes of MP4, chunks and tags of images, headers of PLY, cells and columns of tables, counts of binary
 records (``tests/fuzz_structure.py``); the others its bytes and lines.
 
-Needs the checkout and the extra ``dev``. Each reader of ``tests/fuzz_readers.py`` works in a process of its own, in
-which it reads one mutant after the other: with at most 1 GB more address space than at its start, and 10 s of processor
-time for each. Prints a table of readers and outcomes: ``read`` (by one of its functions at least); ``refused``, by an
-``InertialError`` of the reader's own words; ``gated``, by the gate of all readers, which had none; ``foreign``, any
-other exception; ``hung``; ``large``, more memory asked for than there is; ``died``, the process ended. Exit code 1
-where one of the last four is not 0. A mutant is told by its seed, reader and number: ``--only NUMBER`` makes one
-reader's again.
+Needs the checkout and the extra ``dev``. Each reader of ``tests/fuzz_readers.py`` and ``tests/fuzz_steps.py`` works in
+a process of its own, in which it reads one mutant after the other: with at most 1 GB more address space than at its
+start, and 10 s of processor time for each. Prints a table of readers and outcomes: ``read`` (by one of its functions at
+least); ``refused``, by an ``InertialError`` of the reader's own words; ``gated``, by the gate of all readers, which had
+none; ``foreign``, any other exception; ``hung``; ``large``, more memory asked for than there is; ``died``, the process
+ended. Exit code 1 where one of the last four is not 0. A mutant is told by its seed, reader and number: ``--only
+NUMBER`` makes one reader's again.
 """
 
 import argparse
@@ -37,11 +37,13 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from conftest import write_anew
-from fuzz_readers import READERS, Reader, mutant
+from fuzz_readers import READERS as SINGLE, Reader, mutant
+from fuzz_steps import MORE
 
 from colmap_inertial.core.errors import InertialError
 from colmap_inertial.io.files import DAMAGED
 
+READERS = {**SINGLE, **MORE}
 OUTCOMES = ("read", "refused", "gated", "foreign", "hung", "large", "died")
 #: Address space beside that of a process that has read a whole file, and processor time for one mutant.
 MOST_BYTES, MOST_S = 1 << 30, 10.0
@@ -159,13 +161,14 @@ def main() -> int:
     """Run the study; the exit code."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--mutants", type=int, default=24000)
+    parser.add_argument("--least", type=int, default=0, help="mutants of each reader")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--readers", nargs="*", default=list(READERS), choices=list(READERS), metavar="NAME")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--only", type=int, help="the number of one mutant")
     args = parser.parse_args()
     share = args.mutants / sum(1 / READERS[name].cost for name in args.readers)
-    numbers = {name: range(round(share / READERS[name].cost)) for name in args.readers}
+    numbers = {name: range(max(args.least, round(share / READERS[name].cost))) for name in args.readers}
     if args.only is not None:
         numbers = dict.fromkeys(args.readers, range(args.only, args.only + 1))
     print(f"{'reader':32}" + "".join(f"{title:>9}" for title in ("mutants", *OUTCOMES, "s", "MB more")), flush=True)

@@ -98,7 +98,8 @@ def _listed(folder: Path) -> list[Path]:
 
 
 @functools.cache
-def _small(one_clock: bool):
+def small_recording(one_clock: bool):
+    """Some hundred samples of both sensors."""
     imu = recorded(100.0, 100.0)
     imu = at_one_clock(imu) if one_clock else imu
     n = 120
@@ -112,7 +113,7 @@ def _recorder(name: str) -> Reader:
     layout = LAYOUTS[name]
 
     def build(folder: Path) -> list[Path]:
-        path = layout.write(folder, _small(layout.one_clock))
+        path = layout.write(folder, small_recording(layout.one_clock))
         (folder / "at.txt").write_text(str(path.relative_to(folder)))
         return [found for found in _listed(folder) if found.name != "at.txt"]
 

@@ -119,9 +119,16 @@ def write_project(root: Path) -> None:
     options.depth, options.trim, options.num_threads = 5, 0, 1
     pycolmap.poisson_meshing(str(dense / "fused.ply"), str(dense / "meshed-poisson.ply"), options)
     corners = (2 * rng.random((8, 1, 3)) - 1).astype("f4")
-    faces = [np.array(t, np.int32) for t in ((0, 1, 2), (3, 4, 5), (5, 6, 7))]
-    for name in ("textured.obj", "ascii.ply"):
-        cv2.saveMesh(str(dense / name), corners, faces)
+    vertices = [" ".join(f"{value:.9g}" for value in corner) for corner in corners[:, 0]]
+    faces = ((0, 1, 2), (3, 4, 5), (5, 6, 7))
+    obj = [*(f"v {v}" for v in vertices), *(f"f {a + 1} {b + 1} {c + 1} " for a, b, c in faces)]
+    (dense / "textured.obj").write_text("\n".join(["o Point_Cloud", *obj]) + "\n")
+    properties = "".join(f"property float {axis}\n" for axis in "xyz")
+    head = f"ply\nformat ascii 1.0\nelement vertex {len(vertices)}\n{properties}element face {len(faces)}\n"
+    rows = [*vertices, *(f"3 {a} {b} {c}" for a, b, c in faces)]
+    (dense / "ascii.ply").write_text(
+        f"{head}property list uchar int vertex_indices\nend_header\n" + "\n".join(rows) + "\n"
+    )
     (root / "project.ini").write_text("[PatchMatchStereo]\r\ndepth_min=0.25 \r\ndepth_max = -1\r\nwindow_radius=5\r\n")
     (root / "notes.txt").write_text("taken in March\n")
 

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 from cases import loop_over
-from fuzz_readers import READERS, Reader
+from fuzz_readers import Reader
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
-from study_fuzz import outcome, whole_files
+from study_fuzz import READERS, outcome, whole_files
 
 from colmap_inertial.core.errors import FormatError
 

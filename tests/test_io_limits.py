@@ -45,6 +45,23 @@ def png(width, height):
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
 
 
+def test_a_text_of_yaml_is_no_longer_than_calibrations_are(tmp_path):
+    path = tmp_path / "a.yaml"
+    path.write_text("a: [" + "1," * 300_000 + "1]\n")
+    with pytest.raises(FormatError, match="is no calibration: its 600007 characters are more than any has"):
+        read_yaml(path, "a calibration")
+
+
+@pytest.mark.parametrize(
+    ("depth", "kind", "million"), [(8, 2, 250), (16, 2, 125), (8, 6, 107), (16, 6, 53.6), (1, 3, 250)]
+)
+def test_pixels_of_more_bytes_count_more(tmp_path, depth, kind, million):
+    path = tmp_path / "a.png"
+    path.write_bytes(png(16000, 16000).replace(b"\x01\x00\x00\x00\x00", bytes([depth, kind, 0, 0, 0]), 1))
+    with pytest.raises(FormatError, match=f"more than {million} million are not decoded"):
+        read_image(path)
+
+
 def jpeg(width, height):
     data = cv2.imencode(".jpg", np.zeros((16, 16, 3), np.uint8))[1].tobytes()
     at = data.index(b"\xff\xc0") + 5

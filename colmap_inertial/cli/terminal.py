@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import math
 import shlex
+import shutil
+import sys
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import asdict
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,6 +39,19 @@ Line = tuple[str, "str | Text"]
 _COLOUR = {"trusted": "green", "weak": "yellow", "refused": "red"}
 
 
+def _program() -> str:
+    """What to type for this program: its name where that is on the PATH, else where it is."""
+    beside = Path(sys.executable).with_name("colmap-inertial")
+    return str(beside) if shutil.which("colmap-inertial") is None and beside.is_file() else "colmap-inertial"
+
+
+def _next_to_see(out: Path, report: Path | None) -> str:
+    """How to look at a result: in the viewer, or in its report where that is not installed."""
+    if report is not None and find_spec("viser") is None:
+        return f"open {shlex.quote(str(report))} in a browser"
+    return shlex.join([_program(), "view", str(out)])
+
+
 def next_command(result: ReconstructResult, source: Path) -> str:
     """What to type next, by how a reconstruction ended."""
     from colmap_inertial.checks.validate import Validation
@@ -46,9 +62,9 @@ def next_command(result: ReconstructResult, source: Path) -> str:
         return f"read {result.workspace.report}: why, and what to record or to mend"
     if best.scale.verdict == "weak" and best.validation is None and best.sparse_metric is not None:
         images = result.workspace.images
-        words = ["colmap-inertial", "validate", str(best.sparse_metric), "--images", str(images), "--target"]
+        words = [_program(), "validate", str(best.sparse_metric), "--images", str(images), "--target"]
         return f"{shlex.join(words)} checkerboard:8x6:0.03"
-    return shlex.join(["colmap-inertial", "view", str(out)])
+    return _next_to_see(out, result.report)
 
 
 def scale_lines(estimate: ScaleEstimate) -> list[Line]:
@@ -211,7 +227,7 @@ def show_reference(found: Reference) -> None:
     lines: list[Line] = [("metres", f"{metres}{', as far as the target reaches' if small else ''}")]
     lines += [("from", found.made_of), *scale_facts(values), *_label_first("note", found.notes)]
     _print_panel("Project", [*lines, ("written", str(found.out))])
-    say(f"next: {shlex.join(['colmap-inertial', 'view', str(found.out)])}")
+    say(f"next: {_next_to_see(found.out, None)}")
 
 
 def show_fused(lines: Sequence[str], screen: Screen) -> None:

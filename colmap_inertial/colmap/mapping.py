@@ -99,7 +99,7 @@ def map_images(
         raise ValueError("whoever knows the cameras decides whether they are refined")
     pycolmap.set_random_seed(context.seed)
     sparse.mkdir(parents=True)
-    require_room(sparse, database.stat().st_size)
+    require_room(sparse / "points3D.bin", database.stat().st_size)
     # COLMAP's own reader would write to the file
     with contextlib.closing(sqlite3.connect(f"{database.absolute().as_uri()}?immutable=1", uri=True)) as opened:
         (num_images,) = opened.execute("SELECT COUNT(*) FROM images").fetchone()

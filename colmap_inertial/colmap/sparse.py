@@ -148,7 +148,7 @@ def extract_features(
 
     pycolmap.set_random_seed(context.seed)
     for batch, reader in register_images(images, cameras, database, context):
-        require_room(database.parent, len(batch) * options.max_num_features * _FEATURE_BYTES)
+        require_room(database, len(batch) * options.max_num_features * _FEATURE_BYTES)
         with writing_database(database):
             pycolmap.extract_features(
                 str(database),
@@ -181,6 +181,7 @@ def register_images(
         for k in range(0, len(names), _EXTRACTION_BATCH):
             batch = sorted(names)[k : k + _EXTRACTION_BATCH]
             context.progress("features", done, len(cameras))
+            require_room(database, len(batch) * _PAIR_BYTES)  # for the images alone
             with writing_database(database):
                 # in their order, and not in that in which threads come to their ends: COLMAP numbers them as they come,
                 # and begins its model by the numbers
@@ -340,7 +341,7 @@ def match_pairs(
         # how quickly it goes is seen already where some are matched
         for batch in growing_batches(lines, first=_MATCHING_BATCH if done else _FIRST_MATCHING_BATCH):
             context.progress("matches", done, total)
-            require_room(database.parent, len(batch) * _PAIR_BYTES)
+            require_room(database, len(batch) * _PAIR_BYTES)
             listed.write_text("\n".join(batch) + "\n")
             with writing_database(database):
                 pycolmap.match_image_pairs(

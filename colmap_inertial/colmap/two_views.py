@@ -16,6 +16,8 @@ from colmap_inertial.colmap.relative_track import Observations, RelativeTrack, l
 from colmap_inertial.core.arrays import Array, BoolArray, IndexArray, UInt8Array
 from colmap_inertial.core.geometry import matrix_from_quat, so3_log
 from colmap_inertial.core.threads import one_blas_thread
+from colmap_inertial.io.files import reading
+from colmap_inertial.model.database import UNREADABLE, check_records
 
 if TYPE_CHECKING:
     import pycolmap
@@ -87,10 +89,17 @@ class Features:
 
 @contextlib.contextmanager
 def open_features(database: Path) -> Iterator[Features]:
-    """Open COLMAP's database."""
+    """Open COLMAP's database; what is done with its features within is part of reading it.
+
+    Raises
+    ------
+    FormatError
+        Where the database is none, or damaged.
+    """
     import pycolmap
 
-    with pycolmap.Database.open(str(database)) as opened:
+    check_records(database)
+    with reading(database, UNREADABLE), pycolmap.Database.open(str(database)) as opened:
         yield Features(opened)
 
 

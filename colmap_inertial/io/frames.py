@@ -12,7 +12,7 @@ from colmap_inertial.core.arrays import IndexArray, Int64Array, UInt8Array, UInt
 from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.core.types import Frame, FrameLog, FrameTiming
 from colmap_inertial.io.capture import Capture, ImageFolder, Video, load_capture
-from colmap_inertial.io.files import StrPath, path_in
+from colmap_inertial.io.files import StrPath, path_in, reading
 from colmap_inertial.io.frame_times import NO_RIGS, FrameStamps, stamps_of_csv, stamps_of_log, stamps_of_names
 from colmap_inertial.io.images import SUFFIXES, grey_8bit, read_image
 from colmap_inertial.io.video import decode_reduced, decode_video, frame_name, reduced, video_stamps_ns
@@ -48,8 +48,9 @@ def read_frames(
     if not isinstance(capture, Capture):
         capture = load_capture(capture)
     if isinstance(capture.frames, Video):
-        stamps, source_ns = _video_frames(capture.frames, capture.frame_log)
-        timing = _timing(capture, stamps)
+        with reading(capture.path, "describes frames that cannot be read"):
+            stamps, source_ns = _video_frames(capture.frames, capture.frame_log)
+            timing = _timing(capture, stamps)
         return timing, _decode_video(capture, capture.frames, timing, source_ns, _places(timing, only))
     timing = read_frame_timing(capture)
     return timing, _decode_images(capture, timing, _places(timing, only))
@@ -89,13 +90,14 @@ def read_frame_timing(capture: Capture | Path, first_of: Mapping[str, str] = NO_
     """
     if isinstance(capture, Path):
         capture = load_capture(capture)
-    match capture.frames:
-        case ImageFolder():
-            return _timing(capture, _image_stamps(capture.frames).one_per_frame(first_of))
-        case Video():
-            return _timing(capture, _video_frames(capture.frames, capture.frame_log)[0])
-        case None:
-            raise FormatError(capture.path, "describes no frames; add [images] or [video]")
+    with reading(capture.path, "describes frames that cannot be read"):
+        match capture.frames:
+            case ImageFolder():
+                return _timing(capture, _image_stamps(capture.frames).one_per_frame(first_of))
+            case Video():
+                return _timing(capture, _video_frames(capture.frames, capture.frame_log)[0])
+            case None:
+                raise FormatError(capture.path, "describes no frames; add [images] or [video]")
 
 
 def read_frame_times(path: StrPath, first_of: Mapping[str, str] = NO_RIGS) -> FrameTiming:

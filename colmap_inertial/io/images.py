@@ -57,7 +57,8 @@ def read_image(path: Path) -> UInt8Array | UInt16Array:
     if image.dtype not in (np.uint8, np.uint16):
         raise FormatError(path, f"holds {image.dtype} pixels; 8 or 16 bit are needed")
     if image.ndim == 3 and image.shape[2] in (3, 4):
-        image = np.ascontiguousarray(image[:, :, 2::-1])
+        to_rgb = cv2.COLOR_BGR2RGB if image.shape[2] == 3 else cv2.COLOR_BGRA2RGB
+        image = cv2.cvtColor(image, to_rgb, image if image.shape[2] == 3 else None)
     elif image.ndim == 3:
         image = np.ascontiguousarray(image[:, :, 0])
     return image
@@ -71,13 +72,22 @@ def require_modest(path: Path, data: bytes) -> None:
     FormatError
         For more pixels than the limits allow.
     """
-    size, most = _read_size(data), read_limits().megapixels
-    if size is not None and size[0] * size[1] > 1e6 * most:
+    size, most, weight = _read_size(data), read_limits().megapixels, _weigh(data)
+    if size is not None and size[0] * size[1] * weight > 1e6 * most:
         raise FormatError(
             path,
-            f"has {size[0]} x {size[1]} pixels; more than {most:g} million are not decoded: make it smaller, take it "
-            "out of the folder, or raise --limits.megapixels",
+            f"has {size[0]} x {size[1]} pixels; more than {most / weight:.3g} million are not decoded: make it "
+            "smaller, take it out of the folder, or raise --limits.megapixels",
         )
+
+
+def _weigh(data: bytes) -> float:
+    """How many pixels of three bytes take as much memory as one of a PNG, which packs millions to nothing."""
+    if not data.startswith(PNG) or len(data) < 26:
+        return 1.0
+    depth, kind = data[24] / 8, data[25]
+    channels = {0: 1, 4: 7, 6: 7}.get(kind, 3)  # with alpha it is there twice until that is dropped
+    return max(1.0, depth * channels / 3)
 
 
 def _read_size(data: bytes) -> tuple[int, int] | None:

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from colmap_inertial.core.arrays import Int64Array, UInt8Array, UInt16Array
-from colmap_inertial.core.errors import FormatError, TimingError
+from colmap_inertial.core.errors import FormatError, InertialError, TimingError
 from colmap_inertial.io.files import require_regular
 from colmap_inertial.io.mp4 import is_mp4, read_movie
 
@@ -236,8 +236,12 @@ def video_mode(path: Path) -> VideoMode | None:
 
 
 def _open(path: Path) -> tuple[InputContainer, VideoStream]:
-    import av
-
+    try:
+        import av
+    except ImportError:
+        raise InertialError(
+            f"{path} is a video, which PyAV decodes, and that is not installed: pip install av"
+        ) from None
     if not path.is_file():
         if path.exists():
             require_regular(path)

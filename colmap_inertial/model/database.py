@@ -21,8 +21,27 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.types import Similarity
+from colmap_inertial.io.files import reading
 
 SIDE_FILES = ("-wal", "-journal")
+_MATRIX = (
+    "typeof(rows) = 'integer' AND typeof(cols) = 'integer' AND rows BETWEEN 0 AND 1e9 AND cols BETWEEN 0 AND 1e6 AND "
+)
+_HELD = "coalesce(length(data), 0)"
+#: What holds of each record of COLMAP's tables, in SQL: as many bytes as its rows and columns, and as its type, have.
+_RECORDS = {
+    "keypoints": f"{_MATRIX} {_HELD} = 4 * rows * cols",
+    "descriptors": f"{_MATRIX} {_HELD} IN (rows * cols, 4 * rows * cols)",
+    "matches": f"{_MATRIX} {_HELD} = 4 * rows * cols",
+    "two_view_geometries": f"{_MATRIX} {_HELD} = 4 * rows * cols"
+    + "".join(
+        f" AND coalesce(length({name}), 0) IN (0, {size})"
+        for name, size in (("F", 72), ("E", 72), ("H", 72), ("qvec", 32), ("tvec", 24))
+    ),
+    "cameras": "coalesce(length(params), 0) % 8 = 0",
+}
+#: What is said of a database that COLMAP cannot read.
+UNREADABLE = "COLMAP cannot read its database; put it back as it was, or begin anew in another folder"
 #: Rebuilt by SQLite; a copy must not have it.
 SHARED_MEMORY = "-shm"
 
@@ -83,6 +102,21 @@ def is_database(path: Path) -> bool:
     """Whether this is an SQLite file, or has the name of COLMAP's."""
     with open(path, "rb") as file:
         return path.name == "database.db" or file.read(16) == b"SQLite format 3\0"
+
+
+def check_records(database: Path) -> None:
+    """Refuse records of another size than they state: COLMAP would read or write beyond their end.
+
+    Raises
+    ------
+    FormatError
+        That names the table.
+    """
+    uri = f"{database.absolute().as_uri()}?mode=ro"
+    with reading(database, UNREADABLE), contextlib.closing(sqlite3.connect(uri, uri=True)) as opened:
+        for table, holds in _RECORDS.items():
+            if opened.execute(f"SELECT 1 FROM {table} WHERE NOT ({holds}) LIMIT 1").fetchone() is not None:
+                raise FormatError(database, f"{UNREADABLE} (a record of {table} has another size than it states)")
 
 
 def copy_database(source: Path, target: Path) -> None:

@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from colmap_inertial.core.arrays import Array, Int64Array
-from colmap_inertial.core.errors import FormatError
+from colmap_inertial.io.files import reading
 from colmap_inertial.model import points_of_features
+from colmap_inertial.model.database import UNREADABLE, check_records
 from colmap_inertial.model.submodels.graph import Pair, SimilarityConstraint
 
 if TYPE_CHECKING:
@@ -29,9 +30,6 @@ log = logging.getLogger(__name__)
 
 #: Names of two images, and (M, 2) their features that show the same.
 View = tuple[str, str, Int64Array]
-
-#: What COLMAP's complaints about a database have in them: where it cannot be opened, and where it ends too early.
-DATABASE_ERRORS = ("database factory", "SQLite")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,19 +84,13 @@ def read_matches(database: Path, wanted: Callable[[str, str], bool]) -> Iterator
     """
     import pycolmap
 
-    try:
-        with pycolmap.Database.open(str(database)) as opened:
-            name = {image.image_id: image.name for image in opened.read_all_images()}
-            for pair, count in zip(*opened.read_two_view_geometry_num_inliers(), strict=True):
-                i, j = pycolmap.pair_id_to_image_pair(pair)
-                if count >= LIMITS.matches and i in name and j in name and wanted(name[i], name[j]):
-                    yield name[i], name[j], np.array(opened.read_two_view_geometry(i, j).inlier_matches, dtype=np.int64)
-    except RuntimeError as error:
-        if not any(words in str(error) for words in DATABASE_ERRORS):
-            raise
-        raise FormatError(
-            database, "COLMAP cannot read its database; put it back as it was, or begin anew in another folder"
-        ) from error
+    check_records(database)
+    with reading(database, UNREADABLE), pycolmap.Database.open(str(database)) as opened:
+        name = {image.image_id: image.name for image in opened.read_all_images()}
+        for pair, count in zip(*opened.read_two_view_geometry_num_inliers(), strict=True):
+            i, j = pycolmap.pair_id_to_image_pair(pair)
+            if count >= LIMITS.matches and i in name and j in name and wanted(name[i], name[j]):
+                yield name[i], name[j], np.array(opened.read_two_view_geometry(i, j).inlier_matches, dtype=np.int64)
 
 
 def matches_between(

@@ -6,6 +6,7 @@ import contextlib
 import errno
 import fnmatch
 import logging
+import math
 import os
 import re
 import shutil
@@ -307,14 +308,30 @@ def require_apart(out: Path, pictures: Sequence[Path]) -> None:
             )
 
 
-def require_room(folder: Path, num_bytes: int) -> None:
-    """Raise :class:`OutputError` where the disk of ``folder`` has less room left than ``num_bytes``.
+def require_room(file: Path, num_bytes: int) -> None:
+    """Raise :class:`OutputError` where a file cannot grow by ``num_bytes``: its disk is full, or it is not allowed to.
 
     For what COLMAP writes: its threads end the process when a database cannot grow, and its models end early.
     """
-    free = shutil.disk_usage(folder).free
+    free = shutil.disk_usage(file.parent).free
     if free < num_bytes:
         raise OutputError(
-            f"the disk of {folder} is nearly full: {free / 1e6:.0f} MB are left, COLMAP's next step may need "
+            f"the disk of {file.parent} is nearly full: {free / 1e6:.0f} MB are left, COLMAP's next step may need "
             f"{num_bytes / 1e6:.0f} MB; {_MAKE_ROOM}"
         )
+    largest, size = _largest_file_bytes(), file.stat().st_size if file.is_file() else 0
+    if largest < size + num_bytes:
+        raise OutputError(
+            f"{file}: COLMAP cannot write it here: a file may have {largest / 1e6:.2g} MB, and this one may need "
+            f"{(size + num_bytes) / 1e6:.0f} MB; raise the limit (ulimit -f) and start again, it continues"
+        )
+
+
+def _largest_file_bytes() -> float:
+    """The limit of this process."""
+    try:
+        import resource
+    except ImportError:  # Windows has none
+        return math.inf
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
+    return math.inf if limit == resource.RLIM_INFINITY else limit
