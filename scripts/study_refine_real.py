@@ -148,7 +148,7 @@ def filmed_window(asked: argparse.Namespace, world: World) -> dict[str, Any]:
         return out | {"said": "; ".join(model.scale.reasons)}
     out["before"] = scores(model, filmed) | covered(model, filmed)
     begin_s, processor_s = time.perf_counter(), time.process_time()
-    refined = RefineStage(**stages, refine_intrinsics=True)(model)
+    refined = RefineStage(**stages, refine_intrinsics=True, auto=asked.auto)(model)
     out["wall_s"], out["cpu_s"] = time.perf_counter() - begin_s, time.process_time() - processor_s
     said = refined.treatments[-1]
     out |= {"said": said.reason, "accepted": said.action == "refined", "values": said.values}
@@ -243,6 +243,7 @@ def main() -> None:
     parser.add_argument("--readout-ms", type=float, default=0.0)
     parser.add_argument("--declared", action="store_true", help="the readout is known")
     parser.add_argument("--loops", action="store_true", help="points are seen again")
+    parser.add_argument("--auto", action="store_true", help="refine only where that promises something")
     parser.add_argument("--quick", action="store_true", help="six windows")
     parser.add_argument("--json", type=Path)
     asked = parser.parse_args()

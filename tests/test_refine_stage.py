@@ -14,7 +14,7 @@ from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, so3_log
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.core.types import CameraMotion, Similarity
 from colmap_inertial.inertial.core.priors import PRIORS, model_scale_sigma
-from colmap_inertial.inertial.refine import judge
+from colmap_inertial.inertial.refine import judge, motion
 from colmap_inertial.inertial.refine.solve import held_out, solve
 from colmap_inertial.inertial.refine.values import ROTATION
 from colmap_inertial.io.calibration import Declared, calibration_prior
@@ -303,6 +303,28 @@ def test_a_readout_is_refined_with_where_images_keep_their_rolling_shutter(rolle
             for one in (start.reconstruction, made.reconstruction)
         )
         assert np.array_equal(before, after)
+
+
+def test_auto_refines_where_drift_exceeds_what_is_left(walked, monkeypatch):
+    tracks, model = walked
+    made, said = refined_by(tracks.imu, model, auto=True)
+    worth = said.values["expected"]
+    assert said.action == "refined" and worth["alone_m"] > 2**0.5 * worth["refined_m"] and worth["share"] < 0.25
+    # as far off as it was expected to be, by the truth; frames that see next to nothing are farther
+    truth = tracks.motion.cam_in_world_m(tracks.timing.pose_t_s())
+    before, after = (error_of(centres_of(one.reconstruction), truth) for one in (model, made))
+    assert 0.3 < before / worth["alone_m"] < 5 and 0.3 < after / worth["refined_m"] < 5
+    for name, value, why in (
+        ("share", 1e-6, "of the time that features and mapping take"),
+        ("most_bytes", 1, "of the time"),
+    ):
+        monkeypatch.setattr(motion, "_LIMITS", motion.DriftLimits(**{name: value}))
+        same, said = refined_by(tracks.imu, model, auto=True)
+        assert why in said.reason and same.reconstruction is model.reconstruction
+    monkeypatch.undo()
+    monkeypatch.setattr(motion, "_shape_sigma", lambda *_: 1e-3)
+    same, said = refined_by(tracks.imu, model, auto=True)
+    assert "would be left" in said.reason and same.reconstruction is model.reconstruction
 
 
 @pytest.mark.parametrize("found", [(1.5e-3, 0.49e-3), (0.9e-3, 1e-5), (-5e-3, 2e-3)])

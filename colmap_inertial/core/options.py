@@ -12,7 +12,7 @@ from colmap_inertial.core.choices import CheckedOptions
 BlurRemover = Literal["wiener", "path", "deepgyro"]
 DeblurMethod = Literal["off", "wiener", "path", "deepgyro"]
 RollingShutterMethod = Literal["off", "rectify"]
-RefineMethod = Literal["off", "inertial"]
+RefineMethod = Literal["off", "auto", "inertial"]
 JoinMethod = Literal["off", "inertial"]
 WorldAxes = Literal["z-up", "y-down"]
 #: What an export is for: a program, or a format.
@@ -350,7 +350,8 @@ class ReconstructOptions(CheckedOptions):
     """Up to where they are joined."""
     refine: RefineMethod = "off"
     """inertial: fit image observations, rolling shutter and IMU together, which reduces bending and drift of the metric
-    model; kept only where it predicts observations better."""
+    model; kept only where it predicts observations better. auto: where the drift to be expected of images alone exceeds
+    what the refinement leaves, and it takes at most a quarter of the time of features, matching and mapping."""
     world: WorldAxes = "z-up"
     """Axes of the metric model: z away from the ground, or y towards it, as COLMAP's own cameras have it."""
     georeference: bool = False

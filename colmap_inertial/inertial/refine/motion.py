@@ -10,14 +10,34 @@ from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.geometry import skew
 from colmap_inertial.inertial.refine._residuals import CENTRE, N_MOVING, SPEED, TURN, Moving, moving
 from colmap_inertial.inertial.refine._system import Factored, Order
-from colmap_inertial.inertial.refine.pictures import make_pictures, measured_noise, with_noise
+from colmap_inertial.inertial.refine.pictures import make_pictures, measured_noise, pictures_alone, with_noise
 from colmap_inertial.inertial.refine.setup import Seen
 from colmap_inertial.inertial.refine.solve import factored
-from colmap_inertial.inertial.refine.values import N_STATE
+from colmap_inertial.inertial.refine.values import N_STATE, Estimate, Problem
 from colmap_inertial.inertial.refine.world import by_centres, by_mean_turn, derive_log_size
 
-#: Normal equations of pictures alone, for a covariance: more take longer than a scale is worth.
-_MOST_BYTES = 300_000_000
+
+@dataclass(frozen=True, kw_only=True)
+class DriftLimits:
+    """How much work the covariance of a path may take, and when a refinement is worth its own."""
+
+    #: Normal equations of pictures alone, for a covariance: more take longer than a scale is worth.
+    most_bytes: int = 300_000_000
+    #: Processor seconds: of a step of the refinement for each observation, and for each multiplication of its band; its
+    #: steps; of features, matching and mapping for each image and each observation (a desk computer's core).
+    step_observation_s: float = 5e-6
+    step_product_s: float = 2.5e-10
+    steps: int = 40
+    mapped_image_s: float = 0.4
+    mapped_observation_s: float = 1e-4
+    #: Frames whose centres say how much drift is expected, and observations that each of them has.
+    centres: int = 40
+    fewest: int = 10
+    #: Of that time what a refinement may take.
+    share: float = 0.25
+
+
+_LIMITS = DriftLimits()
 
 
 def find_motion_covs(frames: Int64Array, solved: Factored, by: Moving) -> Array:
@@ -107,11 +127,81 @@ def find_drift(seen: Seen, down: Array) -> PictureDrift | None:
     problem, x = make_pictures(seen)
     if not len(problem.observations.point):
         return None
-    if Order.of(problem.observations, len(seen.names)).size_bytes > _MOST_BYTES:
+    if Order.of(problem.observations, len(seen.names)).size_bytes > _LIMITS.most_bytes:
         return None
     problem = with_noise(problem, measured_noise(problem, x))
     solved, by = factored(problem, x), moving(problem, x)
     return PictureDrift(names=seen.names, cam_in_world=seen.cam_in_world, cov=_drift_covs(seen, down, solved, by))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Worth:
+    """What a refinement promises, before it is made.
+
+    Attributes
+    ----------
+    alone_m, refined_m
+        Standard deviation of positions for the path's shape, of pictures alone and of the refinement; 0 where that was
+        not looked at.
+    share
+        Processor time that it takes, of that of features, matching and mapping.
+    reason
+        Why it is not worth that, in words; empty where it is.
+    """
+
+    alone_m: float = 0.0
+    refined_m: float = 0.0
+    share: float
+    reason: str = ""
+
+
+def expect_worth(seen: Seen, problem: Problem, start: Estimate) -> Worth:
+    """Whether a refinement takes more drift away than it leaves, in little time: from what is known before it.
+
+    Times are predicted from counts, so that the same model always has the same answer.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        Where nothing determines the path.
+    """
+    frames, observations = len(seen.names), len(problem.observations.frame)
+    order = Order.of(problem.observations, frames)
+    products = N_STATE * frames * float(order.width) ** 2
+    needed_s = _LIMITS.steps * (_LIMITS.step_observation_s * observations + _LIMITS.step_product_s * products)
+    share = needed_s / (_LIMITS.mapped_image_s * frames + _LIMITS.mapped_observation_s * observations)
+    if share > _LIMITS.share or order.size_bytes > _LIMITS.most_bytes:
+        return Worth(
+            share=share, reason=f"it would take {100 * share:.0f} % of the time that features and mapping take"
+        )
+    pictures, x = make_pictures(seen)
+    pictures = with_noise(pictures, measured_noise(pictures, x))
+    noise = measured_noise(pictures_alone(problem, seen.observations.xy_px), start)
+    alone_m, refined_m = (
+        _shape_sigma(seen, factored(one, at), moving(one, at))
+        for one, at in ((pictures, x), (with_noise(problem, noise), start))
+    )
+    # what it takes away, against what it leaves
+    little = alone_m**2 - refined_m**2 <= refined_m**2
+    reason = (
+        f"images alone are expected to err by {1e3 * alone_m:.2g} mm, and {1e3 * refined_m:.2g} mm would be left"
+        if little
+        else ""
+    )
+    return Worth(alone_m=alone_m, refined_m=refined_m, share=share, reason=reason)
+
+
+def _shape_sigma(seen: Seen, solved: Factored, by: Moving) -> float:
+    """Standard deviation of the centres of cameras that see enough, but for one similarity."""
+    centres = seen.cam_in_world
+    often = np.flatnonzero(np.bincount(seen.observations.frame, minlength=len(centres)) >= _LIMITS.fewest)
+    some = often[np.linspace(0, len(often) - 1, min(len(often), _LIMITS.centres)).astype(np.int64)]
+    away = centres[some] - centres[some].mean(axis=0)
+    free = np.zeros((len(some), 3, 7))
+    free[:, :, :3], free[:, :, 3], free[:, :, 4:] = np.eye(3), away, -skew(away)
+    basis, _ = np.linalg.qr(free.reshape(-1, 7))
+    left = np.eye(len(basis)) - basis @ basis.T
+    return float(np.sqrt(np.trace(left @ solved.centres_cov(some, by) @ left) / len(some)))
 
 
 def _drift_covs(seen: Seen, down: Array, solved: Factored, by: Moving) -> Array:

@@ -7,7 +7,7 @@ import time
 from collections.abc import Hashable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import CAL, CameraImuCalibration, Similarity, SolvedMotion, Treatment
 from colmap_inertial.inertial.core.priors import is_calibrated, model_scale_sigma
 from colmap_inertial.inertial.refine.judge import Judged, refine
-from colmap_inertial.inertial.refine.motion import add_scale
+from colmap_inertial.inertial.refine.motion import add_scale, expect_worth
 from colmap_inertial.inertial.refine.pictures import without_extremes
 from colmap_inertial.inertial.refine.setup import (
     Known,
@@ -70,10 +70,13 @@ class RefineStage(InertialStage):
         Whether the cameras may change.
     shutter
         What rectified the keypoints, where something did.
+    auto
+        Whether a model stays as it is where the refinement promises little, or takes long.
     """
 
     refine_intrinsics: bool
     shutter: InvertibleStage | None = None
+    auto: bool = False
     _writes: int = field(default=_WRITES, init=False, repr=False)
 
     @classmethod
@@ -85,6 +88,7 @@ class RefineStage(InertialStage):
             **cls.fields_for(inputs),
             refine_intrinsics=cls.refines_intrinsics(inputs),
             shutter=find_inverse(inputs.keypoint_stages),
+            auto=inputs.options.refine == "auto",
         )
 
     @property
@@ -129,12 +133,19 @@ class RefineStage(InertialStage):
     def _refined(self, model: Model) -> Model:
         seen = without_extremes(read_seen(model.reconstruction, model.timing))
         problem, start = make_problem(seen, model.timing, self.imu, self._known(model), self._exposed_px(model, seen))
+        promised: dict[str, Any] = {}
+        if self.auto:
+            worth = expect_worth(seen, problem, start)
+            promised = {"expected": {name: value for name, value in asdict(worth).items() if name != "reason"}}
+            if worth.reason:
+                return _said(model, f"left as it is: {worth.reason}", **promised)
         declared = model.timing.readout_s is not None
         judged = refine(problem, start, seen.observations.xy_px, seen.t_s, readout_declared=declared)
         figures = {
             name: getattr(judged, name)
             for name in ("accepted", "held_out", "before_px", "after_px", "change", "change_sigma", "chi2", "sigma_px")
         }
+        figures |= promised
         figures["accel_noise_m_s2_rthz"] = judged.accel_noise_m_s2_rthz
         if judged.readout is not None:
             figures |= dict(zip(("readout_s", "readout_sigma_s"), judged.readout, strict=True))
