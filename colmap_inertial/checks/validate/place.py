@@ -376,10 +376,6 @@ def _spread_evenly(count: int) -> list[int]:
     return [i for i in reverse if i < count]
 
 
-#: What is miscounted in columns and rows: squares for corners first, then lines.
-_MISCOUNTED = ((-1, -1), (1, 1), (0, -1), (-1, 0), (1, 0), (0, 1))
-
-
 def explain_failure(search: Search, images: Path) -> Exception:
     """The error that says why there is no result."""
     target, views = search.target, search.views
@@ -438,7 +434,8 @@ def require_no_likelier_board(search: Search, used: int) -> None:
     images = [image for image in (search.views[v].read() for v in chosen) if not isinstance(image, str)]
     stated = len({s.view for s in search.sightings} & set(chosen))
     counts = {}
-    for more in _MISCOUNTED:
+    # squares counted for corners first, then lines
+    for more in ((-1, -1), (1, 1), (0, -1), (-1, 0), (1, 0), (0, 1)):
         size = (columns + more[0], rows + more[1])
         if min(size) >= 3:
             other = parse_target(f"checkerboard:{size[0]}x{size[1]}:{search.target.length_m}")
