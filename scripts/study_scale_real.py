@@ -102,6 +102,8 @@ def tables(outcomes: Sequence[Outcome]) -> dict[str, dict[str, float]]:
             of = [o for o in outcomes if (o.window.length_s, o.window.noise_m) == (length_s, noise_m)]
             name = "whole" if np.isinf(length_s) else f"{length_s:g} s"
             out[f"{name}, {1000 * noise_m:g} mm"] = summary(of)
+    for recording in dict.fromkeys(o.window.recording for o in outcomes):
+        out[f"{recording}, all"] = summary([o for o in outcomes if o.window.recording == recording])
     out["all with errors"] = summary([o for o in outcomes if o.window.noise_m > 0])
     return out
 

@@ -2,9 +2,14 @@
 
 import importlib
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from colmap_inertial.core.quantiles import Z95
+from colmap_inertial.inertial.scale._shape import ShapeFault
 
 SCRIPTS = Path(__file__).parents[1] / "scripts"
 
@@ -43,3 +48,33 @@ def test_a_wrong_clock_or_gain_is_named_and_counted(study, outcomes, fault):
 def test_arrays_in_another_convention_are_refused_by_name(study, outcomes):
     found = outcomes("wxyz", length_s=20.0, most=1)
     assert all(o.verdict == "refused" and "in the order w x y z" in o.said[0] for o in found)
+
+
+@pytest.mark.parametrize("fault", ["torn", "drift", "stretch"])
+def test_a_wrong_shape_is_named_and_the_larger_part_keeps_its_metres(outcomes, fault):
+    by_hand = [o for o in outcomes(fault, length_s=40.0, most=1) if o.altered.window.recording.startswith("room")]
+    large = [o for o in by_hand if o.altered.size >= 0.03]
+    assert len(large) >= 6 and all(o.named and o.verdict == "weak" for o in large)
+    assert all(abs(o.error) < Z95 * o.sigma for o in by_hand)
+
+
+def test_sound_models_are_not_accused_and_single_wrong_centres_hardly_count(study, outcomes):
+    assert not any(o.named for o in outcomes("clean", length_s=40.0, most=1))
+    moved = study.summary(outcomes("moved", length_s=20.0, most=1))
+    assert moved["named"] >= 5 and moved["given"] == 6 and moved["inside"] >= 5
+
+
+def test_what_is_undone_is_what_was_done():
+    """A path whose steps grew from some instant on, and one that was strained, are what they were."""
+    rng = np.random.default_rng(3)
+    t_s, path = np.arange(0.0, 40.0, 0.125), np.cumsum(rng.standard_normal((320, 3)), axis=0)
+    by_break = ShapeFault(kind="break", at_s=25.0, value=np.array([0.05]), cov=np.eye(1), by_scale=np.zeros(1))
+    steps = np.diff(path, axis=0) * np.exp(-0.05 * (t_s[1:] > 25.0))[:, None]
+    torn = path[0] + np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    assert np.allclose(by_break.undo(t_s, torn), path)
+    earlier = replace(by_break, at_s=10.0)
+    assert np.allclose(np.diff(earlier.undo(t_s, path), axis=0)[100:], np.diff(path, axis=0)[100:])
+    strain = ShapeFault(kind="stretch", value=0.01 * rng.standard_normal(5), cov=np.eye(5), by_scale=np.zeros(5))
+    assert np.trace(strain.strain) == pytest.approx(0, abs=1e-12)
+    bent = path @ np.linalg.inv(np.eye(3) + strain.strain)
+    assert np.allclose(strain.undo(t_s, bent), path)

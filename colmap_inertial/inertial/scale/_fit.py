@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.arrays import Array, BoolArray
 from colmap_inertial.core.types import ImuNoise, ScaleDrift
 from colmap_inertial.inertial.core import factors as fac, parameters as par
 from colmap_inertial.inertial.core.arrow import ArrowSystem, Inverse
 from colmap_inertial.inertial.core.parameters import Estimate, Noise, Prior
 from colmap_inertial.inertial.core.preintegration import Preintegrated
 from colmap_inertial.inertial.core.priors import model_scale_sigma
-from colmap_inertial.inertial.scale import _noise as levels, _residuals as res, _suspects as sus
+from colmap_inertial.inertial.scale import _noise as levels, _residuals as res, _shape as shape, _suspects as sus
 from colmap_inertial.inertial.scale._noise import Expected, LevelSearch
 from colmap_inertial.inertial.scale._setup import Data
 
@@ -47,36 +47,23 @@ def scale_drift(data: Data, noise: Noise, optimum: _Optimum, inflation: float) -
     inflation
         By how much variances are larger than the noise levels say.
     """
-    x, centre, inverse = optimum.estimate, optimum.groups["centre"], optimum.inverse
-    rhs, rhs_z = optimum.rhs
     # standard deviation of the parts' scales that is no drift to speak of
     tolerated_log = model_scale_sigma(calibrated=False)
     span_s = float(data.t_s[-1] - data.t_s[0])
     parts = int(np.clip(round(span_s / _PART_S), 2, _MOST_PARTS))
     edges_s = np.linspace(data.t_s[0], data.t_s[-1], parts + 1)
-    # The fitted path, not the measured one, whose noise would be mistaken for a smaller scale
-    path = x.imu_in_world_m - x.world_from_imu @ (x.cam_from_imu.T @ x.imu_in_cam_m)
+    path = shape.camera_path(optimum.estimate)
     nodes = np.searchsorted(data.t_s, edges_s[:-1]), np.searchsorted(data.t_s, edges_s[1:])
     columns = np.zeros((*path.shape, parts))
     for i, (first, last) in enumerate(zip(*nodes, strict=True)):
         columns[first:last, :, i] = path[first] - path[first:last]
         columns[last:, :, i] = path[first] - path[last]
-    weight = np.ones(len(path)) if centre.weight is None else centre.weight
-    columns = (data.centre_shape / noise.centre_m * np.sqrt(weight)[:, None, None]) @ columns
-
-    pulled, pulled_z = np.zeros((len(path), par.N_STATE, parts)), np.zeros((par.N_GLOBALS, parts))
-    centre.pull_back(columns, pulled, pulled_z)
-    states, z = inverse.solve(np.concatenate([rhs, pulled], axis=2), np.concatenate([rhs_z, pulled_z], axis=1))
-    follow = centre.apply(states, z)
-    residual = centre.residual + follow[:, :, 0]
-    information = np.einsum("kiw,kiv->wv", columns, columns - follow[:, :, 1:])
-    score = np.einsum("kiw,ki->w", columns, residual)
-
+    found = optimum.score(columns, data, noise)
     # All parts together are the scale itself, so that only contrasts between parts are known
     contrasts = np.linalg.qr(np.column_stack([np.ones(parts), np.eye(parts)[:, 1:]]))[0][:, 1:]
-    cov = np.linalg.inv(contrasts.T @ information @ contrasts) * inflation
+    cov = np.linalg.inv(contrasts.T @ found.information @ contrasts) * inflation
     # The columns are those of u, the inverse of the metres per unit
-    log_ratio = (cov / inflation) @ (contrasts.T @ score)
+    log_ratio = (cov / inflation) @ (contrasts.T @ -found.score)
     tested = np.linalg.inv(cov + tolerated_log**2 * np.eye(parts - 1))
     chi2 = float(log_ratio @ tested @ log_ratio)
     middle_s = 0.5 * (edges_s[1:] + edges_s[:-1])
@@ -134,8 +121,8 @@ class Fit:
         Scales of parts of the recording.
     excitation_m_s2
         Standard deviation of the camera's acceleration between nodes.
-    jumped
-        How many of the states' poses hardly count or lie behind a break of the path.
+    jumped_s
+        When states' poses hardly count or lie behind a break of the path, camera time.
     gain_chi2
         Squared deviation of the accelerometer's nine gains and axis errors from their prior.
     gain_surprise
@@ -145,6 +132,8 @@ class Fit:
         What the variance of the logarithm of the scale comes from, by the keys of ``verdict.CAUSES``.
     suspicions
         What an accelerometer with faults that the model does not have would explain.
+    shape
+        What a model with another shape would explain.
     system, rate_rad_s, prior_info
         The normal equations at the end, (K, 3) angular velocities at the nodes, and (79, 79) what of the globals'
         information is the prior's.
@@ -162,11 +151,12 @@ class Fit:
     converged: bool
     drift: ScaleDrift
     excitation_m_s2: float
-    jumped: int
+    jumped_s: Array
     gain_chi2: float
     gain_surprise: float
     variance_parts: dict[str, float]
     suspicions: list[sus.Suspicion]
+    shape: list[shape.ShapeFault]
     system: ArrowSystem
     rate_rad_s: Array
     prior_info: Array
@@ -203,6 +193,7 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
     states, z = states[:, :, :3], z[:, :3]
     inflation = max(1.0, *(squares / expected for squares, expected in sums.values()))
     drift = scale_drift(data, noise, at, inflation)
+    kinds, columns = shape.shape_columns(data.t_s, shape.camera_path(x))
     return Fit(
         estimate=x,
         noise=noise,
@@ -216,11 +207,12 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         converged=converged,
         drift=drift,
         excitation_m_s2=_excitation_m_s2(data, x),
-        jumped=int(np.sum(data.broken)) + _jumped(groups["rotation"], groups["centre"]),
+        jumped_s=data.t_s[np.append(False, data.broken) | _hardly_count(groups["rotation"], groups["centre"])],
         gain_chi2=prior.gain_chi2(x),
         gain_surprise=_gain_surprise(at.prior, x, cov),
         variance_parts=variance_parts,
         suspicions=suspicions,
+        shape=shape.find_faults(kinds, at.score(columns, data, noise), shaken=levels.vibrates(data)),
         system=at.system,
         rate_rad_s=at.pre.rate_rad_s,
         prior_info=at.prior.info,
@@ -237,8 +229,13 @@ class _Optimum:
     groups: dict[str, fac.Group | fac.Direct]
     system: ArrowSystem
     inverse: Inverse
-    rhs: tuple[Array, Array]
     step: tuple[Array, Array]
+
+    def score(self, columns: Array, data: Data, noise: Noise) -> shape.Scores:
+        """What the visual centres say of changes (K, 3, q) of their path."""
+        centre = self.groups["centre"]
+        assert isinstance(centre, fac.Group)
+        return shape.score_columns(columns, data, noise, centre, self.inverse, self.step)
 
 
 def _find_optimum(data: Data, prior: Prior, search: LevelSearch) -> tuple[_Optimum, bool]:
@@ -277,7 +274,6 @@ def _find_optimum(data: Data, prior: Prior, search: LevelSearch) -> tuple[_Optim
         groups=groups,
         system=system,
         inverse=inverse,
-        rhs=(rhs, rhs_z),
         step=(states, z),
     )
     return optimum, converged
@@ -389,15 +385,14 @@ def _moment_scale(data: Data, x: Estimate) -> float:
     return float(inertial_size / visual_size)
 
 
-def _jumped(*groups: fac.Group | fac.Direct) -> int:
-    """How many states have a pose that a robust weight all but switches off."""
-    weights = [group.weight for group in groups if group.weight is not None]
-    return int(np.sum(np.min(weights, axis=0) < _HARDLY)) if weights else 0
+def _hardly_count(*groups: fac.Group | fac.Direct) -> BoolArray:
+    """(K,) which states have a pose that a robust weight all but switches off."""
+    return np.asarray(np.min([group.weight for group in groups if group.weight is not None], axis=0) < _HARDLY)
 
 
 def _excitation_m_s2(data: Data, x: Estimate) -> float:
     """Standard deviation of the camera's acceleration; on its lever arm the IMU swings even where the camera stays."""
-    path = x.imu_in_world_m - x.world_from_imu @ (x.cam_from_imu.T @ x.imu_in_cam_m)
+    path = shape.camera_path(x)
     dt_s = np.diff(data.t_s)[:, None]
     accel = np.diff(np.diff(path, axis=0) / dt_s, axis=0) / (0.5 * (dt_s[1:] + dt_s[:-1]))
     return float(np.sqrt(np.sum(np.var(accel, axis=0))))

@@ -83,6 +83,11 @@ _PATIENCE, _TIRING = 25, 0.6
 _AT_REST = 0.5
 
 
+def vibrates(data: Data) -> bool:
+    """Whether the accelerometer feels rotors or an engine."""
+    return data.accel_roughness_m_s2_rthz > _VIBRATES
+
+
 @dataclass(frozen=True, kw_only=True)
 class Expected:
     """What is known of the levels beforehand.
@@ -122,7 +127,7 @@ class Expected:
         gyro = float(np.clip(data.gyro_roughness_rad_s_rthz, _LEAST_GYRO, _MOST_GYRO))
         rough = max(data.accel_roughness_m_s2_rthz, _LEAST_ACCEL)
         noise = replace(TYPICAL, gyro_density_rad_s_rthz=gyro, accel_density_m_s2_rthz=rough)
-        floor, shaken = {name: level.floor for name, level in LEVELS.items()}, rough > _VIBRATES
+        floor, shaken = {name: level.floor for name, level in LEVELS.items()}, vibrates(data)
         if rough > _MOST_ACCEL:
             noise = replace(noise, accel_density_m_s2_rthz=float(np.sqrt(rough * _MOST_ACCEL)))
         if shaken:

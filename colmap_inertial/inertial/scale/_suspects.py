@@ -223,7 +223,8 @@ class Faults:
                 "unfiltered (raw)"
                 if not self.path_is_smoothed
                 else "the camera's path is smoother than what the accelerometer felt, as if low-passed at about "
-                f"{hz:.2g} Hz: give poses that were not smoothed"
+                f"{hz:.2g} Hz: give poses that were not smoothed, and all readings of the accelerometer (under "
+                "vibration, readings that were held or left out look the same)"
             )
         if "axes" in self.values:
             # a reading that has to be moved forward was taken late

@@ -28,6 +28,7 @@ from colmap_inertial.core.types import (
     CameraImuCalibration,
     CameraTrajectory,
     ImuNoise,
+    ScaleDrift,
     ScaleEstimate,
 )
 from colmap_inertial.inertial.core import parameters as par
@@ -35,6 +36,7 @@ from colmap_inertial.inertial.core.parameters import Prior
 from colmap_inertial.inertial.core.priors import PRIORS, clock_scale_sigma, is_calibrated
 from colmap_inertial.inertial.scale._fit import Fit, fit_jointly
 from colmap_inertial.inertial.scale._setup import Data, prepare
+from colmap_inertial.inertial.scale._shape import LIMITS as SHAPE_LIMITS, ShapeFault, confirmed, suspect
 from colmap_inertial.inertial.scale._suspects import Faults, worst
 from colmap_inertial.inertial.scale.verdict import check_clocks, scale_drifts, student_factor, verdict_of
 
@@ -65,6 +67,8 @@ class JudgementLimits:
     unexplained: float = 0.25
     #: Shorter clips say too little about their own noise for a number to be trusted.
     shortest_s: float = 6.0
+    #: So many places where poses jump are said by their times.
+    jumps_said: int = 5
     #: Gravity that reads longer or shorter by this has a reason: in flights, whose motion cannot tell bias from gain,
     #: clean recordings have 0.1 at most.
     gravity_excess_m_s2: float = 0.25
@@ -121,8 +125,13 @@ def estimate_joint(
     reason.
     """
     options = options or JointOptions()
+    calibrated = is_calibrated(timed.imu)
     try:
-        data, fit, faults = fit_path(trajectory, timed, options)
+        data, prior = _prepared(trajectory, timed, options)
+        fit, faults = _fit_soundly(data, prior, timed.imu.noise)
+        fit, shape = _fit_shapely(
+            fit, faults.undone(data), faults.loosened(prior), timed.imu.noise, calibrated=calibrated
+        )
     except NotObservableError as error:
         return ScaleEstimate.refused("joint", error.hint)
     except np.linalg.LinAlgError:
@@ -131,7 +140,17 @@ def estimate_joint(
     fit = replace(fit, variance_parts={**fit.variance_parts, "accel_faults": left_open})
     wrong = [*faults.sentences(), *_cut_off(data)]
     # what was taken from a path nobody can put back: its scale is too large by more than any interval says
-    return _judged(fit, data.t_s, timed.calibration, is_calibrated(timed.imu), wrong, worthless=faults.path_is_smoothed)
+    return _judged(fit, data.t_s, timed.calibration, calibrated, wrong, shape, worthless=faults.path_is_smoothed)
+
+
+def _prepared(trajectory: CameraTrajectory, timed: CameraTimedImu, options: JointOptions) -> tuple[Data, Prior]:
+    return prepare(
+        trajectory,
+        timed,
+        gravity_m_s2=options.gravity_m_s2,
+        gravity_sigma_m_s2=options.gravity_sigma_m_s2,
+        states_hz=options.states_hz,
+    )
 
 
 def fit_path(trajectory: CameraTrajectory, timed: CameraTimedImu, options: JointOptions) -> tuple[Data, Fit, Faults]:
@@ -144,13 +163,7 @@ def fit_path(trajectory: CameraTrajectory, timed: CameraTimedImu, options: Joint
     numpy.linalg.LinAlgError
         When the data leave the system singular.
     """
-    data, prior = prepare(
-        trajectory,
-        timed,
-        gravity_m_s2=options.gravity_m_s2,
-        gravity_sigma_m_s2=options.gravity_sigma_m_s2,
-        states_hz=options.states_hz,
-    )
+    data, prior = _prepared(trajectory, timed, options)
     return data, *_fit_soundly(data, prior, timed.imu.noise)
 
 
@@ -175,6 +188,31 @@ def _fit_soundly(data: Data, prior: Prior, sheet: ImuNoise | None) -> tuple[Fit,
     return fit, faults
 
 
+def _fit_shapely(
+    fit: Fit, data: Data, prior: Prior, sheet: ImuNoise | None, *, calibrated: bool
+) -> tuple[Fit, list[ShapeFault]]:
+    """The fit of a model without what shows to be wrong with its shape, and what that was."""
+    found: list[ShapeFault] = []
+    before = fit
+    # wrong gains look like a stretch
+    sound = fit.gain_chi2 <= par.LARGEST_GAIN_CHI2 and not _refusals(fit, data.t_s)
+    while sound and len(found) < SHAPE_LIMITS.most:
+        suspected = suspect(fit.shape, scale_of(fit, data.t_s, calibrated).widened)
+        if suspected is None:
+            break
+        mended = replace(data.groups, centre=suspected.undo(data.t_s, data.groups.centre))
+        trial_data = replace(data, groups=mended)
+        trial = fit_jointly(trial_data, prior, sheet)
+        fault = confirmed(suspected, trial.shape, scale_of(trial, data.t_s, calibrated).widened)
+        if fault is None:
+            break
+        data, fit = trial_data, trial
+        found.append(fault)
+    open_variance = sum(float(one.by_scale @ one.cov @ one.by_scale) for one in found)
+    parts = {**fit.variance_parts, "model_shape": open_variance}
+    return replace(fit, drift=before.drift, variance_parts=parts), found
+
+
 def _cut_off(data: Data) -> list[str]:
     out = []
     for sensor, share in (("gyroscope", data.gyro_cut_share), ("accelerometer", data.accel_cut_share)):
@@ -187,7 +225,14 @@ def _cut_off(data: Data) -> list[str]:
 
 
 def _judged(
-    fit: Fit, t_s: Array, calibration: CameraImuCalibration, calibrated: bool, wrong: Sequence[str], *, worthless: bool
+    fit: Fit,
+    t_s: Array,
+    calibration: CameraImuCalibration,
+    calibrated: bool,
+    wrong: Sequence[str],
+    shape: Sequence[ShapeFault],
+    *,
+    worthless: bool,
 ) -> ScaleEstimate:
     x = fit.estimate
     squares = sum(s for s, _ in fit.sums.values())
@@ -200,12 +245,15 @@ def _judged(
     if verdict == "refused":
         reasons = (*reasons, *(() if worthless else wrong))
     else:
-        doubts = [*wrong, *check_clocks(clock_rate), *_checks(fit, t_s, found.undecided_gain)]
+        bent = [fault.sentence(t_s, found.widened) for fault in shape] or _check_drift(fit.drift)
+        doubts = [*wrong, *check_clocks(clock_rate), *_checks(fit, t_s, found.undecided_gain), *bent]
         verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, doubts)
     notes: tuple[str, ...] = ()
-    if fit.jumped:
-        places = "one place" if fit.jumped == 1 else f"{fit.jumped} places"
-        notes = (f"poses jump at {places}, which hardly counts",)
+    if len(fit.jumped_s):
+        places = "one place" if len(fit.jumped_s) == 1 else f"{len(fit.jumped_s)} places"
+        since = ", ".join(f"{at_s - t_s[0]:.1f}" for at_s in fit.jumped_s[: _LIMITS.jumps_said])
+        more = " s, ..." if len(fit.jumped_s) > _LIMITS.jumps_said else " s"
+        notes = (f"poses jump at {places} ({since}{more}), which hardly counts",)
     refused = verdict == "refused"
     keep = [par.SCALE, *range(par.GRAVITY.start, par.ACCEL_BIAS.stop)]
     signs = np.array([-1.0, *[1.0] * 6])
@@ -325,7 +373,10 @@ def _refusals(fit: Fit, t_s: Array) -> list[str]:
     out = []
     x = fit.estimate
     if not fit.converged and float(fit.cov[par.SCALE, par.SCALE]) < 0.15**2:
-        out.append(f"the fit of camera and IMU does not come to rest: {_RECORD_INSTEAD}")
+        out.append(
+            "the fit of camera and IMU does not come to rest: check that stamps are those of the samples, to a "
+            f"millisecond, or {_RECORD_INSTEAD}"
+        )
     bias = float(np.linalg.norm(x.accel_bias_m_s2))
     if bias > _LIMITS.bias_m_s2:
         out.append(
@@ -371,7 +422,12 @@ def _checks(fit: Fit, t_s: Array, undecided_gain: float) -> list[str]:
             "whether by its gain, which lengths follow, or by its bias: check its unit, turn the camera about all axes "
             "while it moves, or calibrate it (calibrate-imu)"
         )
-    drift = fit.drift
+    return out
+
+
+def _check_drift(drift: ScaleDrift) -> list[str]:
+    """A sentence where the scales of parts of the recording differ."""
+    out = []
     if scale_drifts(drift.p_value, drift.trend_log_per_s, drift.trend_sigma_log_per_s):
         low, high = np.expm1(drift.log_ratio.min()), np.expm1(drift.log_ratio.max())
         out.append(

@@ -170,6 +170,9 @@ CAUSES: dict[str, Cause] = {
     "accel_faults": Cause(
         words="what was undone of the accelerometer's faults", advice="record what is undone here rightly"
     ),
+    "model_shape": Cause(
+        words="what was undone of the model's wrong shape", advice="close loops, and film what overlaps more"
+    ),
     "noise_levels": Cause(words="how little the clip says of its own noise", advice="record longer"),
 }
 

@@ -1,0 +1,229 @@
+"""Breaks, drift and stretch of a model's scale: found beside the joint fit, undone, and found again.
+
+Each is a change of the visual path that grows with an unknown or five. To first order about the optimum its derivative
+says how large the unknowns would be, how sure that is, and what the scale would do (the score test of Rao, 1948). Noise
+levels of the fit are swollen by what is wrong, so that a suspicion is undone, fitted and judged again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from colmap_inertial.core.arrays import Array
+from colmap_inertial.inertial.core import factors as fac, parameters as par
+from colmap_inertial.inertial.core.arrow import Inverse
+from colmap_inertial.inertial.core.parameters import Estimate, Noise
+from colmap_inertial.inertial.scale._setup import Data
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShapeLimits:
+    """When a model's shape is wrong."""
+
+    #: Breaks are sought so far apart, and from the ends; so many at most.
+    spacing_s: float = 1.0
+    margin_s: float = 3.0
+    most_breaks: int = 120
+    #: Squared deviations, in standard deviations, from which a break anywhere, a drift, a stretch count. In 27 clean
+    #: clips by hand they are 3.5, 4.3 and 5.0 at most.
+    break_chi2: float = 10.0
+    drift_chi2: float = 7.5
+    stretch_chi2: float = 14.0
+    #: So many are undone at most.
+    most: int = 2
+    #: Part of these from which a suspicion is worth another fit.
+    worth_a_fit: float = 0.6
+    #: Factor on variances under vibration, whose slow errors look like changes of the scale.
+    shaken: float = 1.75
+    #: Standard deviation of what is wrong with sound models.
+    tolerated_log: float = 0.003
+    #: What is known no better (standard deviation) says nothing: a stretch at rest.
+    known_log: float = 0.03
+
+
+LIMITS = ShapeLimits()
+#: Symmetric matrices without trace, orthonormal.
+_STRAINS = 0.5**0.5 * np.array(
+    [
+        np.diag([1.0, -1.0, 0.0]),
+        np.diag([1.0, 1.0, -2.0]) / 3**0.5,
+        *(np.roll([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]], k, (0, 1)) for k in range(3)),
+    ]
+)
+Kind = Literal["break", "drift", "stretch"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ShapeFault:
+    """Unknowns that stand for a wrong shape of the model.
+
+    Attributes
+    ----------
+    kind
+        A break of the scale, a steady drift of it, or a stretch.
+    value, cov
+        (q,), (q, q): by how much the logarithm of metres per unit is larger after the break, or at the end than at the
+        beginning; of a stretch, the strain that undoes it, in five symmetric matrices without trace.
+    by_scale
+        (q,) change of the logarithm of the scale with each.
+    at_s
+        Where it breaks, camera time.
+    """
+
+    kind: Kind
+    value: Array
+    cov: Array
+    by_scale: Array
+    at_s: float = float("nan")
+
+    @property
+    def limit(self) -> float:
+        """Chi-square from which it counts."""
+        return {"break": LIMITS.break_chi2, "drift": LIMITS.drift_chi2, "stretch": LIMITS.stretch_chi2}[self.kind]
+
+    @property
+    def strain(self) -> Array:
+        """(3, 3) of a stretch."""
+        return np.einsum("i,ijk->jk", self.value, _STRAINS)
+
+    def chi2(self, widened: float, tolerated_log: float = LIMITS.tolerated_log) -> float:
+        """Squared deviation from a sound model, in standard deviations; 0 of what is hardly known.
+
+        ``widened`` is the factor on variances, ``tolerated_log`` what is wrong with sound models.
+        """
+        cov = widened * self.cov
+        if float(np.diagonal(cov).max()) > LIMITS.known_log**2:
+            return 0.0
+        return float(self.value @ np.linalg.solve(cov + tolerated_log**2 * np.eye(len(cov)), self.value))
+
+    def undo(self, t_s: Array, centre: Array) -> Array:
+        """(K, 3) centres of a model without it; the larger part of a broken one keeps its steps."""
+        if self.kind == "stretch":
+            return np.asarray(centre @ (np.eye(3) + self.strain))
+        log_scale = float(self.value[0]) * _profile(t_s, self.kind, self.at_s)
+        if self.at_s < 0.5 * (t_s[0] + t_s[-1]):
+            log_scale = log_scale - float(self.value[0])
+        return np.asarray(centre[0] + _grown(centre, np.exp(log_scale)))
+
+    def sentence(self, t_s: Array, widened: float) -> str:
+        """What is wrong, in the user's words; ``t_s`` are the nodes' times."""
+        size, sigma = 100 * np.expm1(float(self.value[0])), 196 * (widened * float(self.cov[0, 0])) ** 0.5
+        advice = "close loops while recording, or scale its parts apart"
+        if self.kind == "stretch":
+            sizes, axes = np.linalg.eigh(self.strain)
+            longest = axes[:, 0] * np.sign(axes[np.argmax(np.abs(axes[:, 0])), 0])
+            return (
+                f"the reconstruction is {100 * (sizes[2] - sizes[0]):.1f} % longer along ({longest[0]:.2f}, "
+                f"{longest[1]:.2f}, {longest[2]:.2f}) than across; lengths are right on average: check the focal "
+                "length and the lens, and film from more sides"
+            )
+        if self.kind == "drift":
+            return (
+                f"the reconstruction's scale is not the same throughout: lengths are {-size:+.1f} +- {sigma:.1f} % "
+                f"larger at the end than at the beginning: {advice}"
+            )
+        since_s, first = self.at_s - float(t_s[0]), 2 * self.at_s < t_s[0] + t_s[-1]
+        return (
+            f"the reconstruction's scale is not the same throughout: lengths are {size if first else -size:+.1f} +- "
+            f"{sigma:.1f} % larger {'before' if first else 'after'} {since_s:.0f} s than in the longer rest, which the "
+            f"metres are those of: {advice}"
+        )
+
+
+def _profile(t_s: Array, kind: str, at_s: float) -> Array:
+    """(K - 1,) growth of the logarithm of the scale between nodes, for a value of one."""
+    middle_s = 0.5 * (t_s[1:] + t_s[:-1])
+    if kind == "break":
+        return np.asarray((middle_s > at_s).astype(np.float64))
+    return np.asarray((middle_s - 0.5 * (t_s[0] + t_s[-1])) / (t_s[-1] - t_s[0]))
+
+
+def _grown(path: Array, factor: Array) -> Array:
+    """(K, 3) a path from the origin whose steps are so many times as long."""
+    return np.concatenate([np.zeros((1, 3)), np.cumsum(np.diff(path, axis=0) * factor[:, None], axis=0)])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Scores:
+    """Of q changes of the visual path: information (q, q), score (q,), and the scale's answer (q,)."""
+
+    information: Array
+    score: Array
+    by_scale: Array
+
+
+def score_columns(
+    columns: Array, data: Data, noise: Noise, centre: fac.Group, inverse: Inverse, step: tuple[Array, Array]
+) -> Scores:
+    """What the residuals at the optimum say of changes of the visual path.
+
+    Parameters
+    ----------
+    columns
+        (K, 3, q) metres that the path changes by, per unknown.
+    centre, inverse, step
+        The group of the visual centres, the inverse of the normal equations, and the last step.
+    """
+    weight = np.ones(len(columns)) if centre.weight is None else centre.weight
+    columns = (data.centre_shape / noise.centre_m * np.sqrt(weight)[:, None, None]) @ columns
+    k, _, q = columns.shape
+    pulled, pulled_z = np.zeros((k, par.N_STATE, q)), np.zeros((par.N_GLOBALS, q))
+    centre.pull_back(columns, pulled, pulled_z)
+    states, z = inverse.solve(pulled, pulled_z)
+    residual = centre.residual + centre.apply(*step)[:, :, 0]
+    return Scores(
+        information=np.einsum("kiw,kiv->wv", columns, columns - centre.apply(states, z)),
+        score=-np.einsum("kiw,ki->w", columns, residual),
+        by_scale=z[par.SCALE],
+    )
+
+
+def camera_path(x: Estimate) -> Array:
+    """(K, 3) the fitted path of the camera, not the measured one, whose noise would be mistaken for a smaller scale."""
+    return x.imu_in_world_m - x.world_from_imu @ (x.cam_from_imu.T @ x.imu_in_cam_m)
+
+
+def shape_columns(t_s: Array, path: Array) -> tuple[list[tuple[Kind, float]], Array]:
+    """What may be wrong, and (K, 3, q) what each unknown moves the path by; a stretch has five."""
+    first_s, last_s = t_s[0] + LIMITS.margin_s, t_s[-1] - LIMITS.margin_s
+    count = int(np.clip((last_s - first_s) // LIMITS.spacing_s + 1, 0, LIMITS.most_breaks))
+    kinds: list[tuple[Kind, float]] = [("break", float(at_s)) for at_s in np.linspace(first_s, last_s, count)]
+    kinds += [("drift", float("nan")), ("stretch", float("nan"))]
+    grown = [_grown(path, _profile(t_s, kind, at_s)) for kind, at_s in kinds[:-1]]
+    strained = [(path - path.mean(axis=0)) @ strain for strain in _STRAINS]
+    return kinds, np.stack([*grown, *strained], axis=2)
+
+
+def find_faults(kinds: Sequence[tuple[Kind, float]], scores: Scores, *, shaken: bool) -> list[ShapeFault]:
+    """Each of :func:`shape_columns` by itself; ``shaken`` under vibration."""
+    out = []
+    for i, (kind, at_s) in enumerate(kinds):
+        at = slice(i, i + (5 if kind == "stretch" else 1))
+        information = scores.information[at, at]
+        information = 0.5 * (information + information.T)
+        if np.linalg.eigvalsh(information)[0] <= LIMITS.known_log**-2 / 100:
+            continue
+        cov = np.asarray(np.linalg.inv(information), dtype=np.float64) * (LIMITS.shaken if shaken else 1.0)
+        out.append(
+            ShapeFault(kind=kind, at_s=at_s, value=cov @ scores.score[at], cov=cov, by_scale=scores.by_scale[at])
+        )
+    return out
+
+
+def suspect(faults: Sequence[ShapeFault], widened: float) -> ShapeFault | None:
+    """The likeliest of those that are worth another fit."""
+    worth = [one for one in faults if one.chi2(widened) > LIMITS.worth_a_fit * one.limit]
+    return max(worth, key=lambda one: one.chi2(widened, 0.0), default=None)
+
+
+def confirmed(fault: ShapeFault, left: Sequence[ShapeFault], widened: float) -> ShapeFault | None:
+    """A fault that was undone, with what is left of it, if it counts against noise that it no longer swells."""
+    for one in left:
+        if one.kind == fault.kind and (one.kind != "break" or one.at_s == fault.at_s):
+            found = replace(one, value=fault.value + one.value)
+            return found if found.chi2(widened) > found.limit else None
+    return None
