@@ -2055,7 +2055,7 @@ MUTANTS = (
         "abs(found[0]) < max(",
         "abs(found[0]) < 1e6 * max(",
         "a model is refined whose images turn out to have a rolling shutter",
-        ("refine_stage::test_a_readout_that_was_not_declared_is_found_and_told",),
+        ("refine_stage::test_a_readout_is_refined_with_where_images_keep_their_rolling_shutter",),
     ),
     Mutant(
         "model/submodels/merging.py",

@@ -162,11 +162,11 @@ def exit_code(*arguments: object) -> int:
 
 
 def test_commands_name_it(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = "if the quaternions are inverted (camera_from_world, not world_from_camera): write each pose as"
+    said = "if the quaternions are inverted (camera_from_world, not world_from_camera)"
     imu, wrong = ["--imu", files / "imu"], files / "inverted.tum"
     assert exit_code("scale", wrong, *imu, "--json", files / "scale.json") == 3
     reasons = json.loads((files / "scale.json").read_text())["reasons"]
-    assert said in reasons[0] and len(reasons) > 1
+    assert said in reasons[0] and "write each pose as" in reasons[0]
     capsys.readouterr()
     assert exit_code("align", wrong, *imu, "--out", files / "calibration.json") == 3
     assert said in " ".join(capsys.readouterr().err.split())

@@ -301,7 +301,7 @@ def test_a_dataset_with_several_imus_asks_which(tmp_path: Path) -> None:
         ("m/s2", 1.0, 1.0 / 9.80665, "a.txt", 'unit = "g" under [imu.accel]'),
         ("m/s2", 1.0, np.array([1.0, 0.0, 1.0]), "a.txt", "y axis never changes"),
         ("m/s2", np.array([1.0, 0.0, 1.0]), 1.0, "g.txt", "y axis never changes"),
-        ("m/s2", 2000.0, 1.0, "g.txt", 'unit = "deg/s" under [imu.gyro]'),
+        ("m/s2", 2000.0, 1.0, "g.txt", "set unit under [imu.gyro], and for raw counts"),
     ],
 )
 def test_a_fault_of_one_sensor_names_its_own_file(

@@ -10,6 +10,7 @@ from colmap_inertial.core.geometry import matrix_from_quat, quat_from_matrix, so
 from colmap_inertial.inertial.join import joined_model
 from colmap_inertial.inertial.join.judge import end_images, relative_cov, tie_cov, worst
 from colmap_inertial.inertial.join.placement import ImuLink, Placed
+from colmap_inertial.model.similarities import compose
 from colmap_inertial.model.submodels.graph import Placements
 
 PAIR = (2, 0)
@@ -167,7 +168,7 @@ def test_a_similarity_after_another_is_both_in_turn():
     placed, points, _ = placements()
     placed = replace(placed, gravity_m_s2=np.array([3.0, -7.0, 6.0]))
     first, then = (joined_model._metric_move(placed, k, "z-up") for k in (1, 2))
-    both = joined_model._after(then, SimpleNamespace(similarity=first))
+    both = compose(then, first)
     np.testing.assert_allclose(apply(both, points), apply(then, apply(first, points)), atol=1e-9)
 
 

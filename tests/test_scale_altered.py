@@ -73,7 +73,7 @@ def weightless(tables: Tables) -> None:
 def attempt(shared_data, tmp_path, capsys):
     """Runs the command on an altered copy; gives exit code, message and the JSON (None where there is none)."""
 
-    def run(alter: Callable[[Tables], None], name: str = NAME, seconds: float = SECONDS):
+    def run(alter: Callable[[Tables], None], *options: str, name: str = NAME, seconds: float = SECONDS):
         source = shared_data / "inertial_scale" / name
         tables = {kind: np.loadtxt(source / f"{kind}.txt") for kind in (POSES, GYRO, ACCEL)}
         begin_ns = tables[POSES][0, 0]
@@ -85,7 +85,7 @@ def attempt(shared_data, tmp_path, capsys):
             np.savetxt(folder / f"{kind}.txt", table, fmt=["%d"] + ["%.9g"] * (table.shape[1] - 1))
         target = tmp_path / "scale.json"
         with pytest.raises(SystemExit) as stopped:
-            main(["scale", str(folder), "--json", str(target)])
+            main(["scale", str(folder), "--json", str(target), *options])
         truth = float((source / "groundtruth.txt").read_text())
         estimate = json.loads(target.read_text()) if target.exists() else None
         if estimate is not None and estimate["verdict"] == "trusted":
@@ -215,7 +215,7 @@ def late(force: np.ndarray) -> np.ndarray:
     ],
 )
 def test_what_is_wrong_with_the_accelerometer_is_named_and_undone(attempt, shared_data, alter, said):
-    code, message, estimate = attempt(alter, seconds=60.0)
+    code, message, estimate = attempt(alter, "--force", seconds=60.0)
     assert code == 0, message
     assert estimate["verdict"] == "weak" and said in " ".join(estimate["reasons"])
     truth = float((shared_data / "inertial_scale" / NAME / "groundtruth.txt").read_text())

@@ -169,10 +169,6 @@ def advise(handle: int, use: str) -> None:
         os.posix_fadvise(handle, 0, 0, getattr(os, f"POSIX_FADV_{use}"))
 
 
-#: Characters; PyYAML takes 300 bytes and 20 us for each.
-_LONGEST_YAML = 1 << 19
-
-
 def read_yaml(path: Path, what: str, loader: Any = None) -> dict[Any, Any]:
     """Keys and values of a YAML file; also of OpenCV's, whose version line YAML does not know.
 
@@ -193,7 +189,7 @@ def read_yaml(path: Path, what: str, loader: Any = None) -> dict[Any, Any]:
     import yaml
 
     text = read_text(path)
-    if len(text) > _LONGEST_YAML:
+    if len(text) > 1 << 19:  # PyYAML takes 300 bytes and 20 us for each character
         raise FormatError(path, f"is no {what.removeprefix('a ')}: its {len(text)} characters are more than any has")
     if text.startswith("%YAML:"):
         text = "#" + text
