@@ -301,13 +301,13 @@ def _small_models(
     cameras = {name: capture.camera for name in names}
     stages = [] if view is None else [RollingShutterStage(view=view)]
     pairs = image_pairs(names, _SMALL)
+    # COLMAP's matcher and mapper differ from run to run with several threads, and the rest of a run would follow them
+    alone = replace(context, num_threads=1)
     if matched is None:
         extract_features(images, cameras, features, _SMALL, keypoint_stages=stages, context=context)
-        match_features(features, database, pairs, context)
+        match_features(features, database, pairs, alone)
     else:
-        verify_again(matched / "database.db", database, pairs, stages, context)
-    # COLMAP's mapper adds up in another order with several threads, and the rest of a run would follow it
-    alone = replace(context, num_threads=1)
+        verify_again(matched / "database.db", database, pairs, stages, alone)
     map_images(database, images, sparse, replace(_SMALL, refine_intrinsics=capture.camera is None), alone)
     models = [read_model(folder) for folder in find_models(sparse).values()]
     return tuple(sorted(models, key=lambda model: -int(model.num_reg_images())))
