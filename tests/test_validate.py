@@ -268,7 +268,8 @@ def test_missing_and_unreadable_images_are_listed(small, tmp_path):
     (tmp_path / "004.png").write_bytes(b"not a picture")
     result = validate_model(small.model(), tmp_path, TARGET)
     reasons = {view.name: view.reason for view in result.views_rejected}
-    assert reasons == {"001.png": "no such file in the image folder", "004.png": "the image cannot be read"}
+    assert reasons.pop("001.png") == "no such file in the image folder"
+    assert reasons.pop("004.png").startswith("cannot be decoded") and not reasons
     assert result.views_used == 3
 
 

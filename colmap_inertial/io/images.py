@@ -18,11 +18,16 @@ from colmap_inertial.io.files import read_bytes, read_limits, reader
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".pgm", ".ppm")
 
 PNG = b"\x89PNG\r\n\x1a\n"
+#: Order of bytes as of ``struct``, by the beginning of a TIFF.
+_TIFF = {b"II*\0": "<", b"MM\0*": ">"}
+#: Pictures of photographs are not packed more tightly, each byte of a file for so many of pixels.
+_PACKED = 20
 #: Markers of JPEG: C4, C8 and CC are none of frames.
 _START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 START_OF_SCAN = 0xDA
 #: OpenCV's level of logging that says nothing.
 _SILENT = 0
+_UNREADABLE = "cannot be decoded: damaged, cut off, or no picture; take it out of the folder"
 
 
 @reader("a picture")
@@ -53,7 +58,7 @@ def read_image(path: Path) -> UInt8Array | UInt16Array:
     finally:
         logging.setLogLevel(level)
     if image is None:
-        raise FormatError(path, "cannot be decoded: damaged, cut off, or no picture; take it out of the folder")
+        raise FormatError(path, _UNREADABLE)
     if image.dtype not in (np.uint8, np.uint16):
         raise FormatError(path, f"holds {image.dtype} pixels; 8 or 16 bit are needed")
     if image.ndim == 3 and image.shape[2] in (3, 4):
@@ -70,10 +75,13 @@ def require_modest(path: Path, data: bytes) -> None:
     Raises
     ------
     FormatError
-        For more pixels than the limits allow.
+        For more pixels than the limits allow, and where no header that is read here states how many there are.
     """
-    size, most, weight = _read_size(data), read_limits().megapixels, _weigh(data)
-    if size is not None and size[0] * size[1] * weight > 1e6 * most:
+    size, most = _read_size(data), read_limits().megapixels
+    if size is None:
+        raise FormatError(path, "is empty" if not data else _UNREADABLE)
+    weight = _weigh(data, size[0] * size[1])
+    if size[0] * size[1] * weight > 1e6 * most:
         raise FormatError(
             path,
             f"has {size[0]} x {size[1]} pixels; more than {most / weight:.3g} million are not decoded: make it "
@@ -81,19 +89,24 @@ def require_modest(path: Path, data: bytes) -> None:
         )
 
 
-def _weigh(data: bytes) -> float:
-    """How many pixels of three bytes take as much memory as one of a PNG, which packs millions to nothing."""
-    if not data.startswith(PNG) or len(data) < 26:
+def _weigh(data: bytes, pixels: int) -> float:
+    """How many pixels of three bytes take as much memory as one of a PNG or TIFF, which pack millions to nothing."""
+    if data.startswith(PNG):
+        # with alpha it is there twice until that is dropped
+        pixel_bytes = data[24] / 8 * {0: 1, 4: 7, 6: 7}.get(data[25], 3)
+    elif data[:4] in _TIFF:
+        bits, channels = (_tiff_number(data, _TIFF[data[:4]], tag, 1) for tag in (258, 277))
+        pixel_bytes = bits / 8 * channels
+    else:
         return 1.0
-    depth, kind = data[24] / 8, data[25]
-    channels = {0: 1, 4: 7, 6: 7}.get(kind, 3)  # with alpha it is there twice until that is dropped
-    return max(1.0, depth * channels / 3)
+    # OpenCV holds it twice; a file that is hardly packed is as large on the disk
+    return max(1.0, (2 if pixels * pixel_bytes > _PACKED * len(data) else 1) * pixel_bytes / 3)
 
 
 def _read_size(data: bytes) -> tuple[int, int] | None:
     """Width and height by the header of a PNG, JPEG, BMP, PGM, PPM or TIFF; ``None`` where it does not tell."""
     try:
-        if data.startswith(PNG):
+        if data.startswith(PNG) and len(data) > 25:
             return struct.unpack_from(">II", data, 16)
         if data.startswith(b"\xff\xd8"):
             frames = (begin for marker, begin, _ in jpeg_segments(data) if marker in _START_OF_FRAME)
@@ -104,23 +117,23 @@ def _read_size(data: bytes) -> tuple[int, int] | None:
             return abs(width), abs(height)
         if pnm := re.match(rb"P[1-6](?:\s|#[^\n]*\n)+(\d{1,9})(?:\s|#[^\n]*\n)+(\d{1,9})\s", data[:4096]):
             return int(pnm[1]), int(pnm[2])
-        if data[:4] in (b"II*\0", b"MM\0*"):
-            return _tiff_size(data)
+        if data[:4] in _TIFF:
+            width, height = (_tiff_number(data, _TIFF[data[:4]], tag, 0) for tag in (256, 257))
+            return (width, height) if width and height else None
     except (struct.error, IndexError):
         pass
     return None
 
 
-def _tiff_size(data: bytes) -> tuple[int, int] | None:
-    """By the first directory: ImageWidth and ImageLength, SHORT or LONG."""
-    order = "<" if data.startswith(b"II") else ">"
-    entries = tiff_entries(data, order, struct.unpack_from(f"{order}I", data, 4)[0])
-    if not {256, 257} <= entries.keys():
-        return None
-    width, height = (
-        struct.unpack_from(order + ("H" if entries[tag][0] == 3 else "I"), entries[tag][2])[0] for tag in (256, 257)
-    )
-    return width, height
+def _tiff_number(data: bytes, order: str, tag: int, default: int) -> int:
+    """The first value of a tag of the first directory, SHORT or LONG."""
+    kind, count, value = tiff_entries(data, order, struct.unpack_from(f"{order}I", data, 4)[0]).get(tag, (0, 0, b""))
+    if not count:
+        return default
+    letter, size = ("H", 2) if kind == 3 else ("I", 4)
+    if count * size > len(value):  # what does not fit is elsewhere in the file
+        return int(struct.unpack_from(order + letter, data, struct.unpack(f"{order}I", value)[0])[0])
+    return int(struct.unpack_from(order + letter, value)[0])
 
 
 def grey_8bit(image: UInt8Array | UInt16Array) -> UInt8Array:
