@@ -253,18 +253,29 @@ class Tests:
         self._files: Counter[str] = Counter()
         for name, seconds in self._seconds.items():
             self._files[name.partition("::")[0]] += seconds
+        #: Lines of a module that a file of tests runs, and of all modules.
+        self._run: Counter[tuple[str, str]] = Counter()
+        self._run_by: Counter[str] = Counter()
+        for module, numbers in self._lines.items():
+            for contexts in numbers.values():
+                for file in {name.partition("::")[0] for name in contexts}:
+                    self._run[file, module] += 1
+                    self._run_by[file] += 1
 
     def of(self, fault: Fault) -> tuple[list[str], list[str]]:
-        """The quickest tests that run a fault's line, and the files that all of these are from."""
+        """The quickest tests that run the line, and files of such tests, those first that test its module most."""
         lines = self._lines.get(fault.file, {})
         # what runs when the module is imported, such as a default, is of every test that runs anything of the module
         contexts = lines.get(str(fault.line)) or sorted(set().union(*lines.values()))
         names = {re.sub(r"\[.*", "", name, flags=re.DOTALL) for name in contexts}
         quickest = sorted(names, key=lambda name: self._seconds.get(name, 10.0))[:MOST_TESTS]
         files, left_s = [], MOST_FILES_S
-        for file in sorted({name.partition("::")[0] for name in names}, key=lambda file: self._files[file]):
-            left_s -= self._files[file]
-            if left_s > 0:
+        for file in sorted(
+            {name.partition("::")[0] for name in names},
+            key=lambda file: -self._run[file, fault.file] / self._run_by[file],
+        ):
+            if self._files[file] < left_s:
+                left_s -= self._files[file]
                 files.append(file)
         return quickest, files
 
