@@ -173,7 +173,7 @@ def write_video(path: Path, images, *, stamps_ms, size=(WIDTH, HEIGHT), crf=23) 
         stream.options = {"crf": str(crf)}
         for image, stamp in zip(images, stamps_ms, strict=True):
             resized = cv2.resize(image, size, interpolation=cv2.INTER_CUBIC)
-            frame = av.VideoFrame.from_ndarray(resized, format="bgr24").reformat(format="yuv420p")
+            frame = av.VideoFrame.from_ndarray(cv2.cvtColor(resized, cv2.COLOR_BGR2YUV_I420), format="yuv420p")
             frame.pts, frame.time_base = stamp, Fraction(1, 1000)
             container.mux(stream.encode(frame))
         container.mux(stream.encode())

@@ -29,6 +29,7 @@ from colmap_inertial.io.mp4 import is_mp4, read_movie
 if TYPE_CHECKING:
     import av
     from av.container import InputContainer
+    from av.video.reformatter import VideoReformatter
     from av.video.stream import VideoStream
 
 
@@ -105,8 +106,11 @@ def decode_video(path: Path, wanted_ns: Int64Array) -> Iterator[tuple[int, UInt8
     FormatError
         Where a wanted frame cannot be decoded whole, or has another size than those before.
     """
+    from av.video.reformatter import VideoReformatter
+
+    reformatter = VideoReformatter()  # one for all frames: to set one up takes longer than a frame
     for t_ns, frame in _decode_wanted(path, wanted_ns):
-        yield t_ns, _pixels(frame)
+        yield t_ns, _pixels(frame, reformatter)
 
 
 def decode_reduced(path: Path, wanted_ns: Int64Array, long_side_px: int) -> Iterator[tuple[int, UInt8Array]]:
@@ -131,14 +135,18 @@ def decode_grey(path: Path) -> Iterator[tuple[int, int, UInt8Array]]:
 
     The grey is in the sensor's orientation, as :func:`decode_video` has it.
     """
+    from av.video.reformatter import VideoReformatter
+
     container, stream = _open(path)
     stream.thread_type = "AUTO"
+    reformatter = VideoReformatter()
     with container:
         for frame in _convert_errors(path, container.decode(stream)):
             if frame.pts is not None and frame.time_base is not None:
                 t_ns = _ns(frame.pts, frame.time_base.numerator, frame.time_base.denominator)
                 turn = int(getattr(frame, "rotation", 0))  # PyAV 13 does not tell it
-                yield t_ns, turn, np.asarray(frame.to_ndarray(format="gray"), dtype=np.uint8)
+                grey = reformatter.reformat(frame, format="gray").to_ndarray()
+                yield t_ns, turn, np.asarray(grey, dtype=np.uint8)
 
 
 def _decode_wanted(path: Path, wanted_ns: Int64Array) -> Iterator[tuple[int, av.VideoFrame]]:
@@ -179,12 +187,15 @@ def _ns(pts: int, numerator: int, denominator: int) -> int:
     return (2 * pts * numerator * 1_000_000_000 + denominator) // (2 * denominator)
 
 
-def _pixels(frame: av.VideoFrame) -> UInt8Array | UInt16Array:
+def _pixels(frame: av.VideoFrame, reformatter: VideoReformatter) -> UInt8Array | UInt16Array:
+    from av.video.reformatter import Colorspace
+
     grey = frame.format.name.startswith("gray")
     deep = max(component.bits for component in frame.format.components) > 8
     layout = ("gray16le" if deep else "gray") if grey else ("rgb48le" if deep else "rgb24")
     by_rows = frame.colorspace == _UNSTATED and frame.height >= _HD_ROWS and not grey
-    pixels = frame.to_ndarray(format=layout, src_colorspace="ITU709" if by_rows else None)
+    colorspace = int(Colorspace.ITU709) if by_rows else None
+    pixels = reformatter.reformat(frame, format=layout, src_colorspace=colorspace).to_ndarray()
     return np.asarray(pixels, dtype=np.uint16) if deep else np.asarray(pixels, dtype=np.uint8)
 
 
