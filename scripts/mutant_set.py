@@ -1818,8 +1818,8 @@ MUTANTS = (
     ),
     Mutant(
         "inertial/refine/_residuals.py",
-        "by_shared[:, :, OFFSET] = -by_time\n    by_shared[:, :, CLOCK_RATE] = -since_middle_s(problem, observations",
-        "by_shared[:, :, OFFSET] = by_time\n    by_shared[:, :, CLOCK_RATE] = -since_middle_s(problem, observations",
+        "by_shared[:, :, OFFSET] = -by_time\n    by_shared[:, :, CLOCK_RATE] = -time_since_middle_s(problem",
+        "by_shared[:, :, OFFSET] = by_time\n    by_shared[:, :, CLOCK_RATE] = -time_since_middle_s(problem",
         "sign of the time offset in observations",
         ("refine::test_derivatives_of_observations_are_those_of_finite_differences",),
     ),

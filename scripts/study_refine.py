@@ -42,10 +42,10 @@ from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.core.types import CAL, CameraImuCalibration, ImuRecording
 from colmap_inertial.inertial.core.priors import PRIORS
 from colmap_inertial.inertial.refine._residuals import moving
-from colmap_inertial.inertial.refine.pictures import measured_noise, pictures_alone, with_noise
+from colmap_inertial.inertial.refine.pictures import apply_noise, measure_picture_noise, pictures_alone
 from colmap_inertial.inertial.refine.setup import (
-    at_middle_lines,
     make_problem,
+    move_to_middle_lines,
     read_seen,
 )
 from colmap_inertial.inertial.refine.solve import factored, solve
@@ -171,11 +171,11 @@ def by_chance(stage: RefineStage, before: Model, after: Model, truth: np.ndarray
     known = replace(known, noise=replace(known.noise, accel_density_m_s2_rthz=values["accel_noise_m_s2_rthz"]))
     problem, start = make_problem(seen, before.timing, stage.imu, known, stage._exposed_px(before, seen))
     alone = pictures_alone(problem, seen.observations.xy_px)
-    noise = measured_noise(alone, start)
-    problem, alone = (with_noise(one, noise) for one in (problem, alone))
+    noise = measure_picture_noise(alone, start)
+    problem, alone = (apply_noise(one, noise) for one in (problem, alone))
     x = solve(problem, start).estimate
     some = np.linspace(0, len(truth) - 1, min(len(truth), CENTRES)).astype(int)
-    centres, true = at_middle_lines(problem, x).cam_in_world[some], truth[some]
+    centres, true = move_to_middle_lines(problem, x).cam_in_world[some], truth[some]
     scale, rotation, shift = similarity(centres, true)
     # the error in the world of the solution
     error = (scale * centres @ rotation.T + shift - true) @ rotation

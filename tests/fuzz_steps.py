@@ -17,7 +17,7 @@ from test_multi_aperture_io import ROTATION, SHIFT, write_plane_capture
 from test_splats import write_splats, write_trained
 from test_validate_lengths import PLACES, validated
 
-from colmap_inertial.checks.validate.markers import with_bars, with_check_points
+from colmap_inertial.checks.validate.markers import add_bars, add_check_points
 from colmap_inertial.colmap.two_views import open_features
 from colmap_inertial.io.calibration import read_calibrations, write_imu_calibration
 from colmap_inertial.io.capture import load_capture
@@ -139,7 +139,7 @@ def _lengths(folder: Path) -> list[Path]:
 
 def _read_lengths(folder: Path) -> None:
     one = validated()
-    each(lambda: with_bars(one, folder / "bars.csv"), lambda: with_check_points(one, folder / "points.csv"))
+    each(lambda: add_bars(one, folder / "bars.csv"), lambda: add_check_points(one, folder / "points.csv"))
 
 
 def _records(folder: Path) -> list[Path]:

@@ -43,7 +43,7 @@ from colmap_inertial.model.similarities import plain_factor, undoing
 from colmap_inertial.tools.export.formats import write_las
 from colmap_inertial.tools.export.source import ExportSource, Picture, flat_names
 from colmap_inertial.tools.export.targets import TARGETS
-from colmap_inertial.tools.export.transforms import Exposure, with_velocities
+from colmap_inertial.tools.export.transforms import Exposure, add_velocities
 from colmap_inertial.tools.export.undistort import Undistortion, list_needed_cameras, pinhole_model
 from colmap_inertial.tools.export.whole import _is_plain, _notes_on, export_model
 from colmap_inertial.tools.view.sources import ScaleFacts, ViewSource
@@ -497,7 +497,7 @@ def test_poses_for_deblurring_are_those_of_the_exported_middle_row():
         readout_s=0.02,
         late_s=0.001,
     )
-    (frame,) = with_velocities(content, {"a.png": moved})["frames"]
+    (frame,) = add_velocities(content, {"a.png": moved})["frames"]
     found = np.array(frame["transform_matrix"])
     np.testing.assert_allclose(found[:3, 3], [0, 0.002, 0], atol=1e-12)
     # -z of COLMAP's camera is z of OpenGL's

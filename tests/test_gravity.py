@@ -8,7 +8,7 @@ import pytest
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import quat_rotate
-from colmap_inertial.core.gyro import gravity_in_cam, up_in_imu
+from colmap_inertial.core.gyro import estimate_up_in_imu, gravity_in_cam
 from colmap_inertial.core.types import FrameTiming, ImuRecording
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.tools.simulate import RecordingOptions, simulate_recording
@@ -59,7 +59,7 @@ def test_a_still_device_shows_the_mean_of_its_accelerometer():
         accel_t_s=t + 0.004,
         accel_m_s2=[1.0, -2.0, 9.5] + 0.05 * rng.normal(size=(400, 3)),
     )
-    up = up_in_imu(still, np.full(3, 0.02), np.array([0.5, 3.0]))
+    up = estimate_up_in_imu(still, np.full(3, 0.02), np.array([0.5, 3.0]))
     expected = np.array([1.0, -2.0, 9.5]) / np.linalg.norm([1.0, -2.0, 9.5])
     np.testing.assert_allclose(up, [expected, expected], atol=2e-3)
 
@@ -90,6 +90,6 @@ def test_a_gyroscope_alone_knows_no_gravity():
     t = np.arange(100) * 0.01
     imu = ImuRecording(gyro_t_s=t, gyro_rad_s=np.ones((100, 3)), accel_t_s=[], accel_m_s2=np.zeros((0, 3)))
     with pytest.raises(NotObservableError, match="no accelerometer"):
-        up_in_imu(imu, np.zeros(3), t)
+        estimate_up_in_imu(imu, np.zeros(3), t)
     timing = FrameTiming(names=("a",), t_s=[0.5])
     assert gravity_in_cam(timed(imu, calibration_prior(), timing), timing) == {}

@@ -10,7 +10,7 @@ from test_validate_lengths import validated
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.options import ReferenceOptions
 from colmap_inertial.reconstruction.drivers import reference
-from colmap_inertial.reconstruction.drivers.reference import _by_distance, _by_target
+from colmap_inertial.reconstruction.drivers.reference import _scale_by_distance, _scale_by_target
 
 BETWEEN = ReferenceOptions(
     scale_from="distance", target="aruco:DICT_4X4_50:0.1", between=("0", "1"), distance="2.0+-0.01"
@@ -28,7 +28,7 @@ def test_the_scale_by_two_markers_scatters_as_it_says(scale):
     """Places of markers are off by what their corners tell; the distance itself is as sure as its owner says."""
     rng = np.random.default_rng(6)
     exact, sigma = validated(scale, unscaled=True), 0.02 / scale
-    found = [_by_distance(BETWEEN, noisy(exact, sigma, rng)) for _ in range(2500)]
+    found = [_scale_by_distance(BETWEEN, noisy(exact, sigma, rng)) for _ in range(2500)]
     scales, sigmas = (np.array([one[k] for one in found]) for k in (0, 1))
     assert np.median(scales) == pytest.approx(scale, rel=2e-3)
     # the length that was given was the same each time
@@ -40,16 +40,16 @@ def test_the_scale_by_two_markers_scatters_as_it_says(scale):
 
 def test_points_are_exact_and_leave_what_the_distance_has():
     given = ReferenceOptions(scale_from="distance", between=("1,2,3", "4,6,3"), distance="2.0+-0.03")
-    scale, sigma_log, _ = _by_distance(given, None)
+    scale, sigma_log, _ = _scale_by_distance(given, None)
     assert scale == pytest.approx(2.0 / 5.0) and sigma_log == pytest.approx(0.015)
 
 
 def test_an_interval_of_a_target_is_that_of_the_measurement():
     exact = replace(validated(0.5, unscaled=True), metres_per_unit_ci95=(0.48, 0.52))
-    scale, sigma_log, _ = _by_target(exact)
+    scale, sigma_log, _ = _scale_by_target(exact)
     assert scale == 0.5 and sigma_log == pytest.approx(np.log(0.52 / 0.48) / 2 / 1.96, rel=1e-4)
     half = replace(exact, control=SimpleNamespace(metres_per_unit=0.6, ci95=(0.57, 0.63)))
-    scale, sigma_log, _ = _by_target(half)
+    scale, sigma_log, _ = _scale_by_target(half)
     assert scale == 0.6 and sigma_log == pytest.approx(np.log(0.63 / 0.57) / 2 / 1.96, rel=1e-4)
 
 

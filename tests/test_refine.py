@@ -12,7 +12,7 @@ from colmap_inertial.inertial.refine import _residuals, judge, pictures, setup, 
 from colmap_inertial.inertial.refine._residuals import moving
 from colmap_inertial.inertial.refine._system import Order, System
 from colmap_inertial.inertial.refine.motion import find_motion_covs
-from colmap_inertial.inertial.refine.solve import _evaluate, _plausible, _weighted, factored, held_out, solve
+from colmap_inertial.inertial.refine.solve import _evaluate, _plausible, _weighted, evaluate_held_out, factored, solve
 from colmap_inertial.inertial.refine.values import FreeCamera
 
 
@@ -58,11 +58,11 @@ def test_derivatives_of_the_camera_s_motion_are_those_of_finite_differences(smal
     _, problem, start, _ = small
     x = replace(nudged(start, np.random.default_rng(3)), offset_s=4e-3)
     x = replace(x, imu_in_cam_m=np.array([0.05, -0.08, 0.02]))
-    by, now = moving(problem, x), setup.at_middle_lines(problem, x)
+    by, now = moving(problem, x), setup.move_to_middle_lines(problem, x)
     centres, turn = now.cam_in_world, now.cam_from_world
 
     def motion(y):
-        written = setup.at_middle_lines(problem, y)
+        written = setup.move_to_middle_lines(problem, y)
         turned = so3_log(written.cam_from_world.transpose(0, 2, 1) @ turn)
         return np.concatenate([written.cam_in_world, moving(problem, y).velocity_m_s, turned], axis=1)
 
@@ -78,8 +78,8 @@ def test_derivatives_of_the_camera_s_motion_are_those_of_finite_differences(smal
             assert away[:, :3].max() < 6e-3 * (1 + np.abs(expected).max())
             assert away.max() < bound * (1 + np.abs(expected).max())
     # and the velocity is how the position changes with time
-    later = setup.at_middle_lines(problem, replace(x, offset_s=x.offset_s - 1e-4)).cam_in_world
-    before = setup.at_middle_lines(problem, replace(x, offset_s=x.offset_s + 1e-4)).cam_in_world
+    later = setup.move_to_middle_lines(problem, replace(x, offset_s=x.offset_s - 1e-4)).cam_in_world
+    before = setup.move_to_middle_lines(problem, replace(x, offset_s=x.offset_s + 1e-4)).cam_in_world
     assert by.velocity_m_s == pytest.approx((later - before) / 2e-4, abs=2e-3)
 
 
@@ -196,7 +196,7 @@ def test_a_walk_is_found_from_a_start_that_is_off(small):
     assert solution.converged
     again = solve(problem, start)
     assert solution.cost == pytest.approx(again.cost, abs=0.2)
-    centres = setup.at_middle_lines(problem, again.estimate).cam_in_world
+    centres = setup.move_to_middle_lines(problem, again.estimate).cam_in_world
     truth = tracks.motion.cam_in_world_m(tracks.timing.pose_t_s())
     change = centres - centres.mean(axis=0) - (truth - truth.mean(axis=0))
     assert np.sqrt(np.mean(np.sum(change**2, axis=1))) < 0.025
@@ -221,7 +221,7 @@ def test_a_frame_that_the_imu_did_not_record_hangs_on_the_pictures():
     assert 0 < problem.inertial.linked.sum() < len(names) - 1
     solution = solve(problem, start)
     assert solution.converged
-    off = setup.at_middle_lines(problem, solution.estimate).cam_in_world
+    off = setup.move_to_middle_lines(problem, solution.estimate).cam_in_world
     assert np.linalg.norm(off - tracks.motion.cam_in_world_m(tracks.timing.pose_t_s()), axis=1).max() < 0.1
 
 
@@ -276,7 +276,8 @@ def test_points_behind_the_camera_are_no_gain(small):
     assert not _residuals.project(problem, behind, problem.observations).seen.all()
     assert _evaluate(problem, behind, problem.observations).cost > _evaluate(problem, start, problem.observations).cost
     assert (
-        held_out(problem, behind, problem.observations).mean() > held_out(problem, start, problem.observations).mean()
+        evaluate_held_out(problem, behind, problem.observations).mean()
+        > evaluate_held_out(problem, start, problem.observations).mean()
     )
 
 
@@ -379,7 +380,7 @@ def test_what_is_held_out_leaves_each_point_enough(small):
 def test_the_model_that_is_written_is_the_one_that_was_found(small):
     tracks, problem, start, seen = small
     model = tracks.reconstruction()
-    back = setup.written_back(model, seen, problem, start)
+    back = setup.write_back(model, seen, problem, start)
     for image_id in model.reg_image_ids():
         a, b = model.image(image_id), back.image(image_id)
         assert b.projection_center() == pytest.approx(a.projection_center(), abs=1e-9)

@@ -12,7 +12,7 @@ from colmap_inertial.inertial.refine._residuals import moving, project
 from colmap_inertial.inertial.refine._system import BandFactor
 from colmap_inertial.inertial.refine.motion import find_drift, find_motion_covs
 from colmap_inertial.inertial.refine.pictures import make_pictures
-from colmap_inertial.inertial.refine.setup import at_middle_lines, read_seen
+from colmap_inertial.inertial.refine.setup import move_to_middle_lines, read_seen
 from colmap_inertial.inertial.refine.solve import factored, solve
 from colmap_inertial.inertial.refine.world import derive_log_size, find_world
 
@@ -52,7 +52,7 @@ def test_the_world_s_covariance_is_that_of_the_centres_split_by_cause():
     options = walk(4.0, points_per_m=60.0)
     problem, start, _ = problem_of(tracks_of(options), options)
     solved, by = factored(problem, start), moving(problem, start)
-    centres = at_middle_lines(problem, start).cam_in_world
+    centres = move_to_middle_lines(problem, start).cam_in_world
     found = find_world(problem, start, centres, solved, by)
     by_size = derive_log_size(centres, np.arange(len(centres))).ravel()
     expected = by_size @ solved.centres_cov(np.arange(len(centres)), by) @ by_size
@@ -83,7 +83,7 @@ def test_a_path_of_pictures_is_as_unsure_as_models_of_other_noise_differ():
     for _ in range(20):
         noisy = perfect + options.noise_px * rng.standard_normal(perfect.shape)
         drawn = replace(problem, observations=replace(problem.observations, xy_px=noisy))
-        made = at_middle_lines(drawn, solve(drawn, start).estimate)
+        made = move_to_middle_lines(drawn, solve(drawn, start).estimate)
         rotation, centre = made.cam_from_world.transpose(0, 2, 1), made.cam_in_world
         true, at = seen.cam_from_world.transpose(0, 2, 1), seen.cam_in_world
         size = np.sum(derive_log_size(at, np.arange(len(at))) * (centre - at))

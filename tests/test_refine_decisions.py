@@ -29,8 +29,8 @@ def test_the_size_of_a_path_and_its_derivative():
 
 
 def test_errors_in_pixels_are_roots_of_mean_costs():
-    assert judge._as_px(np.array([1.0, 4.0, 7.0]), 0.5) == pytest.approx(1.0)
-    assert judge._as_px(np.zeros(0), 0.5) == 0.0
+    assert judge._convert_cost_to_px(np.array([1.0, 4.0, 7.0]), 0.5) == pytest.approx(1.0)
+    assert judge._convert_cost_to_px(np.zeros(0), 0.5) == 0.0
 
 
 @loop_over(
@@ -114,7 +114,7 @@ def test_noise_that_cannot_be_measured_stays_as_it_was(monkeypatch):
     def singular(problem, x):
         raise np.linalg.LinAlgError
 
-    monkeypatch.setattr(judge, "with_measured_noise", singular)
+    monkeypatch.setattr(judge, "apply_measured_noise", singular)
     monkeypatch.setattr(judge, "_part", lambda problem, keep: problem)
     problem = SimpleNamespace(inertial=1)
     assert judge._measured(problem, np.ones(3, dtype=bool), None) is problem

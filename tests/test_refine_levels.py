@@ -8,7 +8,7 @@ from refine_walk import problem_of, tracks_of, walk
 
 from colmap_inertial.inertial.refine import pictures, solve as solver
 from colmap_inertial.inertial.refine._residuals import imu_rows, project
-from colmap_inertial.inertial.refine.solve import factored, solve, with_measured_noise
+from colmap_inertial.inertial.refine.solve import apply_measured_noise, factored, solve
 
 TRUE = 2e-3
 
@@ -19,7 +19,7 @@ def at_level(problem, density):
 
 
 def found(problem, x):
-    return with_measured_noise(problem, x).inertial.noise.accel_density_m_s2_rthz
+    return apply_measured_noise(problem, x).inertial.noise.accel_density_m_s2_rthz
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +36,7 @@ def test_the_noise_is_the_simulator_s_whatever_was_thought_of_it(solved, times):
     problem, start = solved
     thought = at_level(problem, times * TRUE)
     x = solve(thought, start).estimate
-    measured = with_measured_noise(thought, x)
+    measured = apply_measured_noise(thought, x)
     assert measured.inertial.noise.accel_density_m_s2_rthz == pytest.approx(TRUE, rel=0.25)
     kept = vars(replace(measured.inertial.noise, accel_density_m_s2_rthz=times * TRUE))
     assert kept == vars(thought.inertial.noise)
@@ -76,7 +76,7 @@ def test_observations_weigh_as_much_as_they_tell(solved, times):
     scaled = replace(
         alone, observations=replace(alone.observations, xy_px=_with_noise(alone, x, sigma_px)), robust_px=1.0
     )
-    noise = pictures.measured_noise(scaled, x)
+    noise = pictures.measure_picture_noise(scaled, x)
     k = 0.5 * (noise.robust_px / noise.sigma_px) ** 2
     weight = k * np.exp(k) * exp1(k)
     slope = k * (1 - weight)
@@ -93,7 +93,7 @@ def test_noise_is_measured_beside_what_was_fitted_to_it():
     options = walk(6.0, points_per_m=80.0)
     problem, start, _ = problem_of(tracks_of(options), options)
     alone = pictures.pictures_alone(problem, problem.observations.xy_px)
-    assert pictures.measured_noise(alone, solve(alone, start).estimate).sigma_px == pytest.approx(0.5, rel=0.03)
+    assert pictures.measure_picture_noise(alone, solve(alone, start).estimate).sigma_px == pytest.approx(0.5, rel=0.03)
 
 
 def _with_noise(problem, x, sigma_px):

@@ -15,7 +15,7 @@ from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.core.types import CameraMotion, Similarity
 from colmap_inertial.inertial.core.priors import PRIORS, model_scale_sigma
 from colmap_inertial.inertial.refine import judge, motion
-from colmap_inertial.inertial.refine.solve import held_out, solve
+from colmap_inertial.inertial.refine.solve import evaluate_held_out, solve
 from colmap_inertial.inertial.refine.values import ROTATION
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.capture import Capture
@@ -436,7 +436,9 @@ def test_an_imu_that_contradicts_the_pictures_leaves_the_model_as_it_is(walked):
 def test_what_predicts_worse_is_not_believed(walked, monkeypatch):
     tracks, model = walked
     # as if the refined model predicted what the other one does, and the other way round
-    monkeypatch.setattr(judge, "held_out", lambda problem, x, seen: held_out(problem, x, seen) * _sign(problem))
+    monkeypatch.setattr(
+        judge, "evaluate_held_out", lambda problem, x, seen: evaluate_held_out(problem, x, seen) * _sign(problem)
+    )
     made, said = refined_by(tracks.imu, model)
     assert "no better with the IMU" in said.reason
     assert not said.values["accepted"]

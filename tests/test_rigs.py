@@ -21,7 +21,7 @@ from colmap_inertial.io.frames import read_frame_times
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.io.trajectories import read_tum
 from colmap_inertial.model import read_model, trajectory_from_model
-from colmap_inertial.model.rigs import frames_of_rigs, posed_frames, rig_sensors
+from colmap_inertial.model.rigs import frames_of_rigs, list_posed_frames, rig_sensors
 from colmap_inertial.reconstruction.drivers.project import reconstruct_project
 from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, SfmOptions, simulate_recording
 
@@ -193,7 +193,7 @@ def without_second(model):
     alone = pycolmap.Reconstruction()
     alone.add_camera_with_trivial_rig(model.camera(1))
     place = {}
-    for frame in posed_frames(model):
+    for frame in list_posed_frames(model):
         first = frame.images[0]
         if first.camera_id == 1:
             points = [pycolmap.Point2D(point.xy) for point in first.points2D]

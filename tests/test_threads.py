@@ -21,7 +21,7 @@ from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.inertial.refine._system import BandFactor
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.model import Model, trajectory_from_model
-from colmap_inertial.pipeline.stages.metric import MetricStage, gravity_in_model, metric_trajectory, smoothed_path
+from colmap_inertial.pipeline.stages.metric import MetricStage, gravity_in_model, metric_trajectory, smooth_path
 from colmap_inertial.pipeline.stages.refine import RefineStage
 
 PLACES = ("scipy/linalg/_decomp_cholesky.py", "scipy/linalg/_basic.py", "core/arrow.py", "refine/_system.py")
@@ -47,7 +47,7 @@ metric, refine = MetricStage(**stages), RefineStage(**stages, refine_intrinsics=
 sys.setprofile(counted)
 model = metric(model)
 path, _ = trajectory_from_model(model.reconstruction, model.timing)
-smoothed_path(metric_trajectory(path), tracks.imu, model.scale, gravity_in_model(model))
+smooth_path(metric_trajectory(path), tracks.imu, model.scale, gravity_in_model(model))
 refine(model)
 """
 

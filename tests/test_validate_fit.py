@@ -8,7 +8,12 @@ from validate_scenes import default_camera, orbit
 
 from colmap_inertial.checks.validate import parse_target
 from colmap_inertial.checks.validate.detect import Detection
-from colmap_inertial.checks.validate.fit import estimate_ratio, fit_scale, normal_equations, restricted_likelihood
+from colmap_inertial.checks.validate.fit import (
+    compute_restricted_likelihood,
+    estimate_ratio,
+    fit_scale,
+    normal_equations,
+)
 from colmap_inertial.checks.validate.measure import fit_without_outliers
 from colmap_inertial.checks.validate.observations import Placement, linearise, triangulate
 from colmap_inertial.checks.validate.place import observe
@@ -128,11 +133,11 @@ def test_the_restricted_likelihood_is_that_of_the_whole_covariance_matrix():
     s = a.T @ inverse @ a
     projected = inverse - inverse @ a @ np.linalg.solve(s, a.T @ inverse)
     expected = (size - 7) * np.log(y @ projected @ y) + np.linalg.slogdet(cov)[1] + np.linalg.slogdet(s)[1]
-    value, gradient = restricted_likelihood(n, ratio)
+    value, gradient = compute_restricted_likelihood(n, ratio)
     assert value == pytest.approx(expected, rel=1e-6)
     for k in range(5):
         step = 1e-3 * ratio[k] * np.eye(5)[k]
-        numeric = restricted_likelihood(n, ratio + step)[0] - restricted_likelihood(n, ratio - step)[0]
+        numeric = compute_restricted_likelihood(n, ratio + step)[0] - compute_restricted_likelihood(n, ratio - step)[0]
         assert gradient[k] * 2e-3 * ratio[k] == pytest.approx(numeric, rel=1e-4, abs=1e-9)
 
 

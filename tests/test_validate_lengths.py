@@ -11,11 +11,11 @@ from colmap_inertial.checks.validate import (
     Distance,
     TargetSpecError,
     Validation,
+    add_bars,
+    add_other_target,
     parse_target,
-    with_bars,
-    with_other_target,
 )
-from colmap_inertial.checks.validate.markers import distance_between, with_check_points
+from colmap_inertial.checks.validate.markers import add_check_points, distance_between
 from colmap_inertial.checks.validate.result import check_lengths, model_diagonal
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError
 from colmap_inertial.core.geometry import quat_exp, quat_rotate
@@ -49,10 +49,10 @@ def validated(scale=1.0, error_m=0.0, *, unscaled=False):
 def test_a_scale_bar_is_measured_between_centres(tmp_path):
     table = tmp_path / "bars.csv"
     table.write_text("marker_a,marker_b,length_m,sigma_m\n0,1,2.001,0.0002\n1,3,3.2,\n")
-    first, second = with_bars(validated(), table).bars
+    first, second = add_bars(validated(), table).bars
     assert first.measured == pytest.approx(2) and first.residual_m == pytest.approx(-0.001)
     assert (first.markers, first.sigma_m, second.sigma_m) == ((0, 1), 0.0002, None)
-    (first, _) = with_bars(validated(0.25, unscaled=True), table).bars
+    (first, _) = add_bars(validated(0.25, unscaled=True), table).bars
     assert first.measured == pytest.approx(8) and first.residual_m == pytest.approx(-0.001)
 
 
@@ -72,22 +72,22 @@ def test_a_table_of_bars_that_cannot_be_used_says_where(tmp_path, text, words):
     table = tmp_path / "bars.csv"
     table.write_text(text)
     with pytest.raises(FormatError, match=words):
-        with_bars(validated(), table)
+        add_bars(validated(), table)
 
 
 def test_check_points_leave_the_models_own_error(tmp_path):
     table = tmp_path / "points.csv"
     rows = [f"{number},{10 + x},{20 + y},{z},0.002" for number, (x, y, z) in PLACES.items()]
     table.write_text("\n".join(["marker,x,y,z,sigma_m", *rows]) + "\n")
-    exact = with_check_points(validated(), table).check_points
+    exact = add_check_points(validated(), table).check_points
     np.testing.assert_allclose(exact.rmse_m, 0, atol=1e-9)
     assert exact.rmse_vertical_m == pytest.approx(0.002) and exact.rmse_horizontal_m == pytest.approx(0.002 * 2**0.5)
-    off = with_check_points(validated(error_m=0.05), table).check_points
+    off = add_check_points(validated(error_m=0.05), table).check_points
     worst = max(off.points, key=lambda point: np.linalg.norm(point.residual_m))
     assert worst.marker == 3 and 0.01 < off.rmse_vertical_m < 0.05
     table.write_text("\n".join(["marker,x,y,z", *rows[:3]]).replace(",0.002", "") + "\n")
     with pytest.raises(NotObservableError, match="3 check points; 4 are needed"):
-        with_check_points(validated(), table)
+        add_check_points(validated(), table)
 
 
 def board(spec, middle, scale=1.0, *, left_out=()):
@@ -101,13 +101,13 @@ def board(spec, middle, scale=1.0, *, left_out=()):
 def test_the_distance_between_two_boards_is_a_length_to_check_by():
     first = board("checkerboard:8x6:0.03", [0.2, 0.1, 0.0], left_out=range(9))
     other = board("checkerboard:9x6:0.05", [0.2, 4.1, 3.0], left_out=(0, 1, 2))
-    apart = with_other_target(first, other, 5.01, 0.002).apart
+    apart = add_other_target(first, other, 5.01, 0.002).apart
     assert (apart.other, apart.known_m, apart.sigma_m) == ("checkerboard:9x6:0.05", 5.01, 0.002)
     assert apart.measured == pytest.approx(5) and apart.residual_m == pytest.approx(-0.01)
     unscaled = replace(board("checkerboard:8x6:0.03", [0.2, 0.1, 0.0], 0.5), unscaled=True)
-    assert with_other_target(unscaled, board("checkerboard:9x6:0.05", [0.2, 4.1, 3.0], 0.5), 5.0).apart.measured == 10
+    assert add_other_target(unscaled, board("checkerboard:9x6:0.05", [0.2, 4.1, 3.0], 0.5), 5.0).apart.measured == 10
     with pytest.raises(NotObservableError, match="too few corners of checkerboard:8x6"):
-        with_other_target(board("checkerboard:8x6:0.03", [0, 0, 0], left_out=range(3, 48)), other, 5.0)
+        add_other_target(board("checkerboard:8x6:0.03", [0, 0, 0], left_out=range(3, 48)), other, 5.0)
 
 
 @loop_over(

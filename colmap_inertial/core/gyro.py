@@ -143,7 +143,7 @@ def _differentiate_symmetric(rate: Array) -> Array:
 _AVERAGING_S = 3.0
 
 
-def up_in_imu(imu: ImuRecording, gyro_bias_rad_s: Array, query_s: Array, accel_delay_s: float = 0.0) -> Array:
+def estimate_up_in_imu(imu: ImuRecording, gyro_bias_rad_s: Array, query_s: Array, accel_delay_s: float = 0.0) -> Array:
     """The direction against gravity in the IMU frame.
 
     The gyroscope gives the attitude relative to the first sample; in that slowly drifting frame the specific force is
@@ -205,7 +205,7 @@ def gravity_in_cam(timed: CameraTimedImu, timing: FrameTiming) -> dict[str, Arra
         return {}
     query_s = timing.pose_t_s() - timed.gyro_offset_s
     covered = (query_s >= imu.gyro_t_s[0]) & (query_s <= imu.gyro_t_s[-1])
-    up = up_in_imu(imu, calibration.gyro_bias_rad_s, query_s[covered], calibration.accel_delay_s)
+    up = estimate_up_in_imu(imu, calibration.gyro_bias_rad_s, query_s[covered], calibration.accel_delay_s)
     down_in_cam = -quat_rotate(calibration.cam_from_imu_xyzw, up)
     names = [name for name, inside in zip(timing.names, covered, strict=True) if inside]
     return dict(zip(names, down_in_cam, strict=True))

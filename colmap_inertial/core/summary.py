@@ -25,7 +25,7 @@ _LIMITS = PrintLimits()
 
 def prints_in_lines(cls: Class) -> Class:
     """Class decorator: ``repr`` in at most 20 lines, and a table for notebooks (``_repr_html_``)."""
-    for name, shown in (("__repr__", _as_text), ("_repr_html_", _as_table)):
+    for name, shown in (("__repr__", _format_text), ("_repr_html_", _format_table)):
         setattr(cls, name, shown)
     return cls
 
@@ -39,13 +39,13 @@ def _rows(value: Any) -> list[tuple[str, str]]:
     return rows
 
 
-def _as_text(self: Any) -> str:
+def _format_text(self: Any) -> str:
     rows = _rows(self)
     width = max(len(name) for name, _ in rows)
     return "\n".join([type(self).__name__, *(f"  {name:<{width}}  {text}" for name, text in rows)])
 
 
-def _as_table(self: Any) -> str:
+def _format_table(self: Any) -> str:
     lines = "".join(
         f"<tr><th style='text-align:left'>{name}</th><td style='text-align:left'>{html.escape(text)}</td></tr>"
         for name, text in _rows(self)

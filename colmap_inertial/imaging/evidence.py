@@ -17,7 +17,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array, Float32Array, IndexArray, UInt8Array, UInt16Array
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath, middles
-from colmap_inertial.imaging.tracking import to_grey
+from colmap_inertial.imaging.tracking import convert_to_grey
 
 #: Lags as factors of the predicted extent, and directions against the predicted one.
 FACTORS = np.arange(0.6, 1.5001, 0.05)
@@ -257,7 +257,7 @@ def _compute_spectra(
     import cv2
     from scipy.fft import rfft2
 
-    light = _to_light(image)
+    light = _linearise(image)
     chords = path.field()
     lengths = chords.extent_px()
     long_px = float(np.percentile(lengths, 90))
@@ -314,11 +314,11 @@ def _weigh_tiles(logarithm: Float32Array) -> Array:
     return np.asarray(weight * (weight.sum() / (weight @ weight)))
 
 
-def _to_light(image: UInt8Array | UInt16Array) -> Float32Array:
+def _linearise(image: UInt8Array | UInt16Array) -> Float32Array:
     """(H, W) roughly linear light, 0 to 1."""
     import cv2
 
-    grey = to_grey(image)
+    grey = convert_to_grey(image)
     codes = np.iinfo(grey.dtype).max
     if grey.dtype == np.uint8:
         return np.asarray(cv2.LUT(grey, ((np.arange(256) / 255) ** 2.2).astype(np.float32)))

@@ -21,7 +21,7 @@ from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence, measure_blur_share
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.imaging.psf import PredictedBlur
-from colmap_inertial.imaging.tracking import to_grey
+from colmap_inertial.imaging.tracking import convert_to_grey
 
 Code = TypeVar("Code", np.uint8, np.uint16)
 Action = Literal["keep", "deblur", "drop"]
@@ -389,7 +389,7 @@ def keep_sharp(image: NDArray[Code], deblurred: NDArray[Code], blur: BlurField) 
     rows, columns = -(-height // _SHARP.block_px), -(-width // _SHARP.block_px)
     # judged at half the size: a quarter of the cost, and of the noise
     size = (max(1, width // 2), max(1, height // 2))
-    small = cv2.resize(to_grey(image), size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    small = cv2.resize(convert_to_grey(image), size, interpolation=cv2.INTER_AREA).astype(np.float32)
     grey: Float32Array = np.asarray(cv2.GaussianBlur(small, (0, 0), 0.5) / np.float32(np.iinfo(image.dtype).max))
     nearest = [
         np.minimum(np.rint(np.arange(n) * 2 / blur.step_px).astype(np.intp), nodes - 1)

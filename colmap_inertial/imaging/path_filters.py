@@ -101,7 +101,7 @@ def smoothed(image: NDArray[Code], sigma_px: float) -> NDArray[Code]:
     """An image smoothed by a Gaussian in linear light, as feature extraction likes it after a filter."""
     import cv2
 
-    light = np.asarray(cv2.GaussianBlur(_to_light(image), (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT_101))
+    light = np.asarray(cv2.GaussianBlur(_linearise(image), (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT_101))
     if image.dtype == np.uint8:  # the table is fine enough for 256 codes
         codes = encode_table(image.dtype)[np.rint(light * np.float32(ENCODE_STEPS)).astype(np.intp)]
     else:
@@ -200,7 +200,7 @@ def filter_along(
     return result
 
 
-def _to_light(image: AnyArray) -> Float32Array:
+def _linearise(image: AnyArray) -> Float32Array:
     """Linear light of codes."""
     if image.dtype == np.uint8:
         import cv2
@@ -219,7 +219,7 @@ def _filter_image(
     threads = options.threads or 0
     tiling = Tiling.covering(path.width, path.height, extent_px)
     paths = tiling.paths(path)
-    light = _to_light(planes).reshape(planes.shape)
+    light = _linearise(planes).reshape(planes.shape)
     channels = planes.shape[2]
     if options.noise is None:
         noise = noise_along(light, tiling, paths, threads)

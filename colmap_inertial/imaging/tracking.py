@@ -7,7 +7,7 @@ import numpy as np
 from colmap_inertial.core.arrays import AnyArray, BoolArray, Float32Array, UInt8Array
 
 
-def to_grey(image: AnyArray) -> AnyArray:
+def convert_to_grey(image: AnyArray) -> AnyArray:
     """(H, W) brightness of an RGB image, in its own type; a grey one as it is."""
     import cv2
 

@@ -25,8 +25,6 @@ _PACKED = 20
 #: Markers of JPEG: C4, C8 and CC are none of frames.
 _START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 START_OF_SCAN = 0xDA
-#: OpenCV's level of logging that says nothing.
-_SILENT = 0
 _UNREADABLE = "cannot be decoded: damaged, cut off, or no picture; take it out of the folder"
 
 
@@ -50,7 +48,7 @@ def read_image(path: Path) -> UInt8Array | UInt16Array:
     if fault is not None:
         raise FormatError(path, f"{fault}; copy it again from its source, or take it out of the folder")
     logging = getattr(cv2.utils, "logging", cv2)  # before OpenCV 4.13 it stood in cv2 itself
-    level = logging.setLogLevel(_SILENT)
+    level = logging.setLogLevel(0)  # nothing is logged
     try:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:

@@ -29,7 +29,7 @@ from colmap_inertial.core.types import (
 )
 from colmap_inertial.io.files import StrPath, check_names, convert_to_plain, read_json, reader, write_json
 from colmap_inertial.model.pose_covariances import pose_covariances
-from colmap_inertial.model.rigs import posed_frames
+from colmap_inertial.model.rigs import list_posed_frames
 from colmap_inertial.model.soundness import check_binary_model, check_values
 
 if TYPE_CHECKING:
@@ -270,7 +270,7 @@ def trajectory_from_model(
         When fewer than two images have a time.
     """
     t_of = dict(zip(timing.names, timing.pose_t_s(), strict=True))
-    frames = posed_frames(reconstruction)
+    frames = list_posed_frames(reconstruction)
     named = [(next((image.name for image in frame.images if image.name in t_of), ""), frame) for frame in frames]
     timed = sorted(((name, frame) for name, frame in named if name), key=lambda one: float(t_of[one[0]]))
     if len(timed) < 2:

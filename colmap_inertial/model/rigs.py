@@ -60,7 +60,7 @@ class PosedFrame:
         return np.asarray(image.projection_center() if image.is_ref_in_frame() else self.pose.inverse().translation)
 
 
-def posed_frames(reconstruction: pycolmap.Reconstruction) -> list[PosedFrame]:
+def list_posed_frames(reconstruction: pycolmap.Reconstruction) -> list[PosedFrame]:
     """The registered frames of a model."""
     if not has_rigs(reconstruction):
         images = [reconstruction.image(number) for number in reconstruction.reg_image_ids()]
@@ -82,7 +82,7 @@ def frames_of_rigs(reconstructions: Iterable[pycolmap.Reconstruction]) -> dict[s
         image.name: frame.images[0].name
         for reconstruction in reconstructions
         if has_rigs(reconstruction)
-        for frame in posed_frames(reconstruction)
+        for frame in list_posed_frames(reconstruction)
         for image in frame.images
     }
 

@@ -249,11 +249,11 @@ def _model_scale(path: Path, fields: Any, world: WorldAxes) -> ModelScale:
             raise FormatError(path, "gravity_in_world_m_s2 is missing: give the number with --factor to scale alone")
         provenance = f"inertial scale, method {estimate.method}, {estimate.verdict}, from {path.name}"
         similarity = Similarity.from_scale(estimate, world=world, provenance=provenance)
-    left_out = () if similarity is None else _left_out(path, fields.get("rotations"))
+    left_out = () if similarity is None else _read_left_out(path, fields.get("rotations"))
     return ModelScale(similarity=similarity, verdict=estimate.verdict, reasons=estimate.reasons, left_out=left_out)
 
 
-def _left_out(path: Path, rotations: Any) -> tuple[str, ...]:
+def _read_left_out(path: Path, rotations: Any) -> tuple[str, ...]:
     """Images that an estimate left out; none where it was made before cameras were compared."""
     names = [] if rotations is None else rotations.get("left_out") if isinstance(rotations, dict) else None
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):

@@ -28,7 +28,7 @@ from colmap_inertial.core.sampling import fit_robust_slope, subtract_running_mea
 from colmap_inertial.core.types import CameraTrajectory, Frame, FrameTiming, ImuRecording, Projector
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.rolling_shutter import append_unit_depth
-from colmap_inertial.imaging.tracking import reduce_image, to_grey, track_points
+from colmap_inertial.imaging.tracking import convert_to_grey, reduce_image, track_points
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -352,7 +352,7 @@ def _measure_quick_rotation(rate: Array, width: int) -> float:
 
 def reduced(image: UInt8Array | UInt16Array, options: FlowOptions) -> UInt8Array:
     """The picture in which corners are tracked: (H, W), 8 bit."""
-    grey = reduce_image(to_grey(image), options.long_side_px)
+    grey = reduce_image(convert_to_grey(image), options.long_side_px)
     return np.asarray(grey if grey.dtype == np.uint8 else grey >> 8, dtype=np.uint8)
 
 

@@ -1,6 +1,6 @@
 """Is a reconstruction the right size? Checked with a target of known size in its images."""
 
-from colmap_inertial.checks.validate.markers import distance_between, with_bars, with_check_points, with_other_target
+from colmap_inertial.checks.validate.markers import add_bars, add_check_points, add_other_target, distance_between
 from colmap_inertial.checks.validate.measure import validate_model
 from colmap_inertial.checks.validate.overlays import write_overlays
 from colmap_inertial.checks.validate.result import (
@@ -27,8 +27,8 @@ __all__ = [
     "parse_target",
     "validate_model",
     "validation_table",
-    "with_bars",
-    "with_check_points",
-    "with_other_target",
+    "add_bars",
+    "add_check_points",
+    "add_other_target",
     "write_overlays",
 ]

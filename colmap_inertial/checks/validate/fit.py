@@ -169,7 +169,7 @@ def solve(s: Array, rhs: Array) -> tuple[Array, float]:
     return inverse @ (rhs / norm) / norm, np.inf if free else float(inverse[0, 0] / norm[0] ** 2)
 
 
-def restricted_likelihood(n: Normal, ratio: Array) -> tuple[float, Array]:
+def compute_restricted_likelihood(n: Normal, ratio: Array) -> tuple[float, Array]:
     """Minus twice the restricted log likelihood, corner noise profiled out, and its gradient over ``ratio``."""
     gain, s, rhs, yy = weigh_equations(n, ratio)
     x = np.linalg.solve(s, rhs)
@@ -202,13 +202,13 @@ def estimate_ratio(n: Normal) -> Array:
 
     def cost(log_ratio: Array) -> tuple[float, Array]:
         ratio = unit * np.exp(log_ratio)
-        value, gradient = restricted_likelihood(n, ratio)
+        value, gradient = compute_restricted_likelihood(n, ratio)
         return value, gradient * ratio
 
     starts = [np.full(len(unit), np.log(r)) for r in (0.3, 10.0, 300.0, 1e4)]
     start = min(starts, key=lambda x: cost(x)[0])
     found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=[(low, high)] * len(unit))
-    if restricted_likelihood(n, none)[0] - found.fun < FIT.pose_error_evidence:
+    if compute_restricted_likelihood(n, none)[0] - found.fun < FIT.pose_error_evidence:
         return none
     return np.where(np.exp(found.x) < FIT.negligible_ratio, 0.0, unit * np.exp(found.x))
 

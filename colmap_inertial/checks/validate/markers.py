@@ -25,7 +25,7 @@ def marker_centres(validation: Validation) -> dict[int, Array]:
     return {number: np.mean(four, axis=0) for number, four in corners.items() if len(four) == 4}
 
 
-def with_bars(validation: Validation, path: Path) -> Validation:
+def add_bars(validation: Validation, path: Path) -> Validation:
     """A validation with the scale bars of a table: ``marker_a,marker_b,length_m`` and, where known, ``sigma_m``.
 
     Raises
@@ -47,7 +47,7 @@ def with_bars(validation: Validation, path: Path) -> Validation:
     return replace(validation, bars=tuple(bars))
 
 
-def with_check_points(validation: Validation, path: Path) -> Validation:
+def add_check_points(validation: Validation, path: Path) -> Validation:
     """A validation with the check points of a table: ``marker,x,y,z`` in metres and, where known, ``sigma_m``.
 
     The model is moved and turned onto them, not scaled: what is left is its own error, and that of the points.
@@ -86,7 +86,7 @@ def with_check_points(validation: Validation, path: Path) -> Validation:
     return replace(validation, check_points=found)
 
 
-def with_other_target(
+def add_other_target(
     validation: Validation, other: Validation, known_m: float, sigma_m: float | None = None
 ) -> Validation:
     """A validation with the distance between the middles of its target and of another one in the same model.

@@ -8,7 +8,7 @@ from colmap_inertial.core.arrays import AnyArray, BoolArray, Float32Array, UInt8
 from colmap_inertial.imaging.multi_aperture._geometry import Rectified
 
 
-def to_codes(image: AnyArray) -> UInt8Array:
+def convert_to_codes(image: AnyArray) -> UInt8Array:
     """(H, W) codes of 8 bit, brighter for brighter; 16 bit go over the square root of what is in use."""
     if image.dtype == np.uint8:
         return image

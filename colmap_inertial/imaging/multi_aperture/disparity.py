@@ -14,7 +14,7 @@ from colmap_inertial.imaging.multi_aperture._geometry import Rectified
 from colmap_inertial.imaging.multi_aperture._information import cost_tables
 from colmap_inertial.imaging.multi_aperture._light import adds_up, light_cost
 from colmap_inertial.imaging.multi_aperture._noise import measure_noise, smoothing
-from colmap_inertial.imaging.multi_aperture._sampling import shrunk, to_codes, warp_to_canvas
+from colmap_inertial.imaging.multi_aperture._sampling import convert_to_codes, shrunk, warp_to_canvas
 from colmap_inertial.imaging.multi_aperture._volume import candidates, match
 from colmap_inertial.imaging.semi_global import MOST, Views
 
@@ -116,7 +116,7 @@ def _prepare_codes(planes: Sequence[AnyArray], canvas: Rectified) -> tuple[UInt8
 
     codes, least = [], 0
     for i, plane in enumerate(planes):
-        of_plane = to_codes(plane)
+        of_plane = convert_to_codes(plane)
         width_px, telling = smoothing(of_plane, measure_noise(of_plane))
         least = telling if i == 0 else least
         if width_px > 0:

@@ -95,7 +95,7 @@ def poses_at(problem: Problem, x: Estimate, frame: Int64Array, line: Array) -> P
             force=still,
         )
     turning = problem.inertial.turning
-    since_s = line * x.readout_s - x.offset_s - x.clock_rate * since_middle_s(problem, frame)
+    since_s = line * x.readout_s - x.offset_s - x.clock_rate * time_since_middle_s(problem, frame)
     powers, t = turning.powers[frame], since_s[:, None]
     reading, rate = np.zeros((len(frame), 3)), np.zeros((len(frame), 3))
     for k in range(4, -1, -1):
@@ -124,7 +124,7 @@ def poses_at(problem: Problem, x: Estimate, frame: Int64Array, line: Array) -> P
     )
 
 
-def since_middle_s(problem: Problem, frame: Int64Array) -> Array:
+def time_since_middle_s(problem: Problem, frame: Int64Array) -> Array:
     """(M,) of frames' nodes, for the clock rate."""
     if problem.inertial is None:
         return np.zeros(len(frame))
@@ -144,7 +144,7 @@ def cameras_of(problem: Problem, x: Estimate) -> list[CameraModel]:
     return [camera_of(free, x.intrinsics[first[i] : first[i + 1]]) for i, free in enumerate(problem.cameras)]
 
 
-def _by_camera(problem: Problem, observations: Observations) -> list[IndexArray]:
+def _group_by_camera(problem: Problem, observations: Observations) -> list[IndexArray]:
     """Which observations each camera made."""
     if len(problem.cameras) == 1:
         return [np.arange(len(observations.frame))]
@@ -182,7 +182,7 @@ def project(problem: Problem, x: Estimate, observations: Observations) -> Projec
     in_imu = np.einsum("nji,nj->ni", poses.world_from_imu, away)
     in_cam = in_imu @ x.cam_from_imu.T + x.imu_in_cam_m
     predicted = np.empty((len(away), 2))
-    for model, mine in zip(cameras_of(problem, x), _by_camera(problem, observations), strict=True):
+    for model, mine in zip(cameras_of(problem, x), _group_by_camera(problem, observations), strict=True):
         predicted[mine] = colmap_camera(model).img_from_cam(in_cam[mine])
     seen: BoolArray = np.all(np.isfinite(predicted), axis=1)
     residual = np.where(seen[:, None], predicted - observations.xy_px, 0.0)
@@ -207,12 +207,12 @@ def derivatives(problem: Problem, x: Estimate, observations: Observations, at: P
     by_cam, by_intrinsics = np.zeros((count, 2, 3)), np.zeros((count, 2, len(x.intrinsics)))
     place = 0
     for free, model, mine in zip(
-        problem.cameras, cameras_of(problem, x), _by_camera(problem, observations), strict=True
+        problem.cameras, cameras_of(problem, x), _group_by_camera(problem, observations), strict=True
     ):
         in_cam = at.in_cam[mine]
-        by_cam[mine] = _by_direction(model, in_cam)
+        by_cam[mine] = _differentiate_by_direction(model, in_cam)
         for k in range(len(free.free)):
-            by_intrinsics[mine, :, place + k] = _by_number(model, free.free[k], in_cam)
+            by_intrinsics[mine, :, place + k] = _differentiate_by_number(model, free.free[k], in_cam)
         place += len(free.free)
     # beside the camera, a step of the difference may see nothing
     lost = ~at.seen | ~np.isfinite(by_cam).all(axis=(1, 2)) | ~np.isfinite(by_intrinsics).all(axis=(1, 2))
@@ -233,7 +233,7 @@ def derivatives(problem: Problem, x: Estimate, observations: Observations, at: P
     by_shared[:, :, ROTATION] = -by_cam @ skew(at.in_cam - x.imu_in_cam_m)
     by_shared[:, :, LEVER] = by_cam
     by_shared[:, :, OFFSET] = -by_time
-    by_shared[:, :, CLOCK_RATE] = -since_middle_s(problem, observations.frame)[:, None] * by_time
+    by_shared[:, :, CLOCK_RATE] = -time_since_middle_s(problem, observations.frame)[:, None] * by_time
     by_shared[:, :, READOUT] = observations.line[:, None] * by_time
     by_shared[:, :, FIRST_INTRINSIC : x.columns.seen.stop] = by_intrinsics
     if rolling:
@@ -246,7 +246,7 @@ def derivatives(problem: Problem, x: Estimate, observations: Observations, at: P
     return Derivatives(by_frame=by_frame, by_shared=by_shared, by_point=by_point)
 
 
-def _by_direction(model: CameraModel, in_cam: Array) -> Array:
+def _differentiate_by_direction(model: CameraModel, in_cam: Array) -> Array:
     """(M, 2, 3) of pixels by points in the camera frame; along the ray nothing changes."""
     camera, depth = colmap_camera(model), in_cam[:, 2:]
     out = np.empty((len(in_cam), 2, 3))
@@ -259,7 +259,7 @@ def _by_direction(model: CameraModel, in_cam: Array) -> Array:
     return out
 
 
-def _by_number(model: CameraModel, place: int, in_cam: Array) -> Array:
+def _differentiate_by_number(model: CameraModel, place: int, in_cam: Array) -> Array:
     """(M, 2) of pixels by one of the camera's numbers."""
     step = _STEP * max(abs(model.params[place]), 1.0)
     ends = []
@@ -464,7 +464,7 @@ def moving(problem: Problem, x: Estimate) -> Moving:
         turning = np.einsum("nij,nj->ni", now, poses.rate)
         by_time = np.concatenate([velocity, force, turning], axis=1)
         by_shared[:, :, OFFSET] = -by_time
-        by_shared[:, :, CLOCK_RATE] = -since_middle_s(problem, frames)[:, None] * by_time
+        by_shared[:, :, CLOCK_RATE] = -time_since_middle_s(problem, frames)[:, None] * by_time
         by_gain = -swinging[:, :, :, None] * problem.inertial.turning.powers[:, 0][:, None, None, :]
         by_shared[:, SPEED, at.gyro_gain] = by_gain.reshape(count, 3, 9)
     return Moving(velocity_m_s=velocity, by_state=by_state, by_shared=by_shared)

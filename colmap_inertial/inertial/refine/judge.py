@@ -12,11 +12,17 @@ from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.inertial.refine._residuals import Moving, moving
 from colmap_inertial.inertial.refine._system import Factored, Order
 from colmap_inertial.inertial.refine.motion import find_motion_covs
-from colmap_inertial.inertial.refine.pictures import measured_noise, pictures_alone, with_noise
-from colmap_inertial.inertial.refine.setup import NO_READOUT_S, at_middle_lines
-from colmap_inertial.inertial.refine.solve import Solution, factored, held_out, solve, with_measured_noise
+from colmap_inertial.inertial.refine.pictures import apply_noise, measure_picture_noise, pictures_alone
+from colmap_inertial.inertial.refine.setup import NO_READOUT_S, move_to_middle_lines
+from colmap_inertial.inertial.refine.solve import Solution, apply_measured_noise, evaluate_held_out, factored, solve
 from colmap_inertial.inertial.refine.values import READOUT, Estimate, Observations, Problem
-from colmap_inertial.inertial.refine.world import FoundWorld, by_centres, derive_log_size, find_world, size_of
+from colmap_inertial.inertial.refine.world import (
+    FoundWorld,
+    derive_log_size,
+    differentiate_by_centres,
+    find_world,
+    size_of,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,8 +158,8 @@ def refine(
         why = f"frames far apart see the same points, and solving for all at once takes {1e-9 * needed:.1f} GB"
         raise NotObservableError("refinement", why)
     alone = pictures_alone(problem, at_once_px)
-    noise = measured_noise(alone, start)
-    problem, alone = (with_noise(one, noise) for one in (problem, alone))
+    noise = measure_picture_noise(alone, start)
+    problem, alone = (apply_noise(one, noise) for one in (problem, alone))
     kept = ~_chosen(problem.observations)
     seen_alone, seen = solve(_part(alone, kept), start), solve(_part(problem, kept), start)
     # pictures alone may fit worse than with a rolling shutter: the IMU's own squares are the least that it costs
@@ -169,8 +175,8 @@ def refine(
         problem = _measured(problem, kept, seen.estimate)
         seen = solve(_part(problem, kept), seen.estimate)
         steps += seen.steps
-    before = held_out(alone, seen_alone.estimate, alone.observations.select(~kept))
-    after = held_out(problem, seen.estimate, problem.observations.select(~kept))
+    before = evaluate_held_out(alone, seen_alone.estimate, alone.observations.select(~kept))
+    after = evaluate_held_out(problem, seen.estimate, problem.observations.select(~kept))
     change, count = after - before, len(before)
     mean = float(change.mean()) if count else 0.0
     spread = float(change.std(ddof=1) / count**0.5) if count > 1 else np.inf
@@ -181,8 +187,8 @@ def refine(
         accepted=False,
         reason=reason,
         held_out=count,
-        before_px=_as_px(before, problem.sigma_px),
-        after_px=_as_px(after, problem.sigma_px),
+        before_px=_convert_cost_to_px(before, problem.sigma_px),
+        after_px=_convert_cost_to_px(after, problem.sigma_px),
         change=mean,
         change_sigma=spread,
         chi2=chi2,
@@ -217,7 +223,7 @@ def _solve_all(judged: Judged, problem: Problem, x: Estimate, t_s: Array) -> Jud
         estimate=final,
         accepted=True,
         shared_cov=cov,
-        world=find_world(problem, final, at_middle_lines(problem, final).cam_in_world, solved, by),
+        world=find_world(problem, final, move_to_middle_lines(problem, final).cam_in_world, solved, by),
         drift=drift_map(problem, judged.estimate, final, t_s, solved, by),
         velocity_m_s=np.where(moved[:, None], by.velocity_m_s, np.nan),
         motion_covs=dict(zip(chosen.tolist(), find_motion_covs(chosen, solved, by), strict=True)),
@@ -240,7 +246,7 @@ def _part(problem: Problem, keep: BoolArray) -> Problem:
 def _measured(problem: Problem, kept: BoolArray, x: Estimate) -> Problem:
     """The problem with its accelerometer's noise as what it was solved without a tenth for says."""
     try:
-        return replace(problem, inertial=with_measured_noise(_part(problem, kept), x).inertial)
+        return replace(problem, inertial=apply_measured_noise(_part(problem, kept), x).inertial)
     except np.linalg.LinAlgError:  # the solution says why not
         return problem
 
@@ -277,7 +283,7 @@ def _test_readout(
     found = _readout(_part(problem, kept), seen.estimate)
     if found is None or abs(found[0]) < max(LIMITS.least_readout_s, LIMITS.sure_sigma * found[1]):
         return None, still, without
-    better = held_out(still, without.estimate, still.observations.select(~kept)) - held_out(
+    better = evaluate_held_out(still, without.estimate, still.observations.select(~kept)) - evaluate_held_out(
         problem, seen.estimate, observations.select(~kept)
     )
     if len(better) < 2 or better.mean() < LIMITS.better_sigma * better.std(ddof=1) / len(better) ** 0.5:
@@ -315,7 +321,7 @@ def _too_late(problem: Problem, x: Estimate) -> str:
     )
 
 
-def _as_px(costs: Array, sigma_px: float) -> float:
+def _convert_cost_to_px(costs: Array, sigma_px: float) -> float:
     return float(sigma_px * np.sqrt(np.mean(costs))) if len(costs) else 0.0
 
 
@@ -333,7 +339,7 @@ def drift_map(
     solved, by
         The information at ``x``, and the camera's motion there.
     """
-    before, after = (at_middle_lines(problem, one).cam_in_world for one in (start, x))
+    before, after = (move_to_middle_lines(problem, one).cam_in_world for one in (start, x))
     timed = np.isfinite(t_s)
     first_s, last_s = float(t_s[timed].min()), float(t_s[timed].max())
     edges = np.linspace(first_s, last_s, max(1, round((last_s - first_s) / LIMITS.part_s)) + 1).tolist()
@@ -341,7 +347,7 @@ def drift_map(
         parts = [np.flatnonzero((t_s >= begin_s) & (t_s <= end_s)) for begin_s, end_s in pairwise(edges)]
     whole = size_of(before[timed]) / size_of(after[timed])
     by_log = np.stack([derive_log_size(after, part) for part in (np.flatnonzero(timed), *parts)])
-    sigma = np.sqrt(np.diagonal(solved.cov_of(*by_centres(by_log[1:] - by_log[0], by))[0]))
+    sigma = np.sqrt(np.diagonal(solved.cov_of(*differentiate_by_centres(by_log[1:] - by_log[0], by))[0]))
     last = np.array([part[-1] if len(part) else 0 for part in parts])
     end_sigma_m = np.sqrt(np.diagonal(find_motion_covs(last, solved, by), axis1=1, axis2=2)[:, :3])
     out = []

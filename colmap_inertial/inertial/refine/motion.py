@@ -10,11 +10,11 @@ from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.geometry import skew
 from colmap_inertial.inertial.refine._residuals import CENTRE, N_MOVING, SPEED, TURN, Moving, moving
 from colmap_inertial.inertial.refine._system import Factored, Order
-from colmap_inertial.inertial.refine.pictures import make_pictures, measured_noise, pictures_alone, with_noise
+from colmap_inertial.inertial.refine.pictures import apply_noise, make_pictures, measure_picture_noise, pictures_alone
 from colmap_inertial.inertial.refine.setup import Seen
 from colmap_inertial.inertial.refine.solve import factored
 from colmap_inertial.inertial.refine.values import N_STATE, Estimate, Problem
-from colmap_inertial.inertial.refine.world import by_centres, by_mean_turn, derive_log_size
+from colmap_inertial.inertial.refine.world import derive_log_size, differentiate_by_centres, differentiate_by_mean_turn
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,7 +129,7 @@ def find_drift(seen: Seen, down: Array) -> PictureDrift | None:
         return None
     if Order.of(problem.observations, len(seen.names)).size_bytes > _LIMITS.most_bytes:
         return None
-    problem = with_noise(problem, measured_noise(problem, x))
+    problem = apply_noise(problem, measure_picture_noise(problem, x))
     solved, by = factored(problem, x), moving(problem, x)
     return PictureDrift(names=seen.names, cam_in_world=seen.cam_in_world, cov=_drift_covs(seen, down, solved, by))
 
@@ -175,11 +175,11 @@ def expect_worth(seen: Seen, problem: Problem, start: Estimate) -> Worth:
             share=share, reason=f"it would take {100 * share:.0f} % of the time that features and mapping take"
         )
     pictures, x = make_pictures(seen)
-    pictures = with_noise(pictures, measured_noise(pictures, x))
-    noise = measured_noise(pictures_alone(problem, seen.observations.xy_px), start)
+    pictures = apply_noise(pictures, measure_picture_noise(pictures, x))
+    noise = measure_picture_noise(pictures_alone(problem, seen.observations.xy_px), start)
     alone_m, refined_m = (
         _shape_sigma(seen, factored(one, at), moving(one, at))
-        for one, at in ((pictures, x), (with_noise(problem, noise), start))
+        for one, at in ((pictures, x), (apply_noise(problem, noise), start))
     )
     # what it takes away, against what it leaves
     little = alone_m**2 - refined_m**2 <= refined_m**2
@@ -209,8 +209,8 @@ def _drift_covs(seen: Seen, down: Array, solved: Factored, by: Moving) -> Array:
     count, shared = len(seen.names), by.by_shared.shape[2]
     by_state, by_shared = np.zeros((10, count, N_STATE)), np.zeros((10, shared))
     size = derive_log_size(seen.cam_in_world, np.arange(count))[None]
-    by_state[:1], by_shared[:1] = by_centres(size, by)
-    by_state[1:4], by_shared[1:4] = by_mean_turn(by)
+    by_state[:1], by_shared[:1] = differentiate_by_centres(size, by)
+    by_state[1:4], by_shared[1:4] = differentiate_by_mean_turn(by)
     for at, rows in ((slice(4, 7), CENTRE), (slice(7, 10), TURN)):
         by_state[at, 0], by_shared[at] = by.by_state[0, rows], by.by_shared[0, rows]
     both = solved.with_frames(np.arange(count), by, by_state, by_shared)

@@ -25,7 +25,7 @@ def make_pictures(seen: Seen) -> tuple[Problem, Estimate]:
 
     The IMU stands where the camera does, as nothing is known of it.
     """
-    seen = without_extremes(seen)
+    seen = remove_extremes(seen)
     cameras = free_cameras(seen, True)
     intrinsics, spread = intrinsics_of(cameras)
     still, none = np.zeros_like(seen.cam_in_world), np.zeros((3, 3))
@@ -62,7 +62,7 @@ def make_pictures(seen: Seen) -> tuple[Problem, Estimate]:
     return problem, x
 
 
-def without_extremes(seen: Seen) -> Seen:
+def remove_extremes(seen: Seen) -> Seen:
     """A model without points that are extremely near to one of their cameras, or far, by the path's extent.
 
     Beside their observations, rounding hides what the others tell.
@@ -115,7 +115,7 @@ class PictureNoise:
     informs: float
 
 
-def measured_noise(problem: Problem, x: Estimate) -> PictureNoise:
+def measure_picture_noise(problem: Problem, x: Estimate) -> PictureNoise:
     """How observations err, by the residuals of a fit and how many numbers were fitted to them."""
     observations = problem.observations
     at = project(problem, x, observations)
@@ -137,6 +137,6 @@ def measured_noise(problem: Problem, x: Estimate) -> PictureNoise:
     )
 
 
-def with_noise(problem: Problem, noise: PictureNoise) -> Problem:
+def apply_noise(problem: Problem, noise: PictureNoise) -> Problem:
     """The problem with its observations weighed so."""
     return replace(problem, sigma_px=noise.weighed_px, robust_px=noise.robust_px, informs=noise.informs)

@@ -157,13 +157,13 @@ def lines_of(seen: Seen, timing: FrameTiming, xy_px: Array) -> Array:
 def keypoints_of(seen: Seen, keypoints_px: Mapping[str, Array]) -> Array:
     """(M, 2) observations by image names' keypoints (N, 2); as the model has them where there are none."""
     out = seen.observations.xy_px.copy()
-    for name, mine in zip(seen.names, _by_frame(seen), strict=True):
+    for name, mine in zip(seen.names, _group_by_frame(seen), strict=True):
         if name in keypoints_px:
             out[mine] = keypoints_px[name][seen.place[mine]]
     return out
 
 
-def _by_frame(seen: Seen) -> list[Int64Array]:
+def _group_by_frame(seen: Seen) -> list[Int64Array]:
     """Which observations each frame has."""
     frames = seen.observations.frame
     order = np.argsort(frames, kind="stable")
@@ -368,7 +368,7 @@ class Written:
     xy_px: Array
 
 
-def at_middle_lines(problem: Problem, x: Estimate) -> Written:
+def move_to_middle_lines(problem: Problem, x: Estimate) -> Written:
     """What a camera without a rolling shutter would have seen."""
     frames = np.arange(len(x.velocity_m_s))
     poses = poses_at(problem, x, frames, np.zeros(len(frames)))
@@ -385,7 +385,7 @@ def at_middle_lines(problem: Problem, x: Estimate) -> Written:
     return Written(cam_from_world=cam_from_world, cam_in_world=centre, xy_px=moved)
 
 
-def written_back(
+def write_back(
     reconstruction: pycolmap.Reconstruction, seen: Seen, problem: Problem, x: Estimate, *, rectified: bool = True
 ) -> pycolmap.Reconstruction:
     """A copy of a model with the poses, points, observations and cameras of a solution.
@@ -396,9 +396,9 @@ def written_back(
     """
     import pycolmap
 
-    written = at_middle_lines(problem, x)
+    written = move_to_middle_lines(problem, x)
     copy = pycolmap.Reconstruction(reconstruction)
-    for i, (image_id, mine) in enumerate(zip(seen.image_ids, _by_frame(seen), strict=True)):
+    for i, (image_id, mine) in enumerate(zip(seen.image_ids, _group_by_frame(seen), strict=True)):
         rotation = written.cam_from_world[i]
         image = copy.image(image_id)
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ written.cam_in_world[i])

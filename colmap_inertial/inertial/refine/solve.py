@@ -233,7 +233,7 @@ def linearised(problem: Problem, x: Estimate) -> Linearised:
     return Linearised(order=order, projected=at.projected, by=by, residual=residual, estimate=x)
 
 
-def held_out(problem: Problem, x: Estimate, observations: Observations) -> Array:
+def evaluate_held_out(problem: Problem, x: Estimate, observations: Observations) -> Array:
     """(M,) robust costs of observations that were not used."""
     at = project(replace(problem, observations=observations), x, observations)
     cost = robust_cost(at.residual, problem.sigma_px, problem.robust_px)
@@ -251,7 +251,7 @@ _PROBES, _SEED = 8, 0
 _LEVEL_STEPS, _LARGEST_LEVEL_STEP, _LEVEL_AT_REST = 8, 1.0, 0.02
 
 
-def with_measured_noise(problem: Problem, x: Estimate) -> Problem:
+def apply_measured_noise(problem: Problem, x: Estimate) -> Problem:
     """The problem with its accelerometer as noisy as what is left of its readings says.
 
     The scale estimate knows the noise from the readings' roughness more than from the path: what shakes faster than

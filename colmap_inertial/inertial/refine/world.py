@@ -63,8 +63,8 @@ def find_world(problem: Problem, x: Estimate, centres: Array, solved: Factored, 
     count = len(centres)
     by_state, by_shared = np.zeros((COUNT, count, N_STATE)), np.zeros((COUNT, x.columns.count))
     size = derive_log_size(centres, np.arange(count))[None]
-    by_state[:1], by_shared[:1] = by_centres(size, by)
-    by_state[TURN], by_shared[TURN] = by_mean_turn(by)
+    by_state[:1], by_shared[:1] = differentiate_by_centres(size, by)
+    by_state[TURN], by_shared[TURN] = differentiate_by_mean_turn(by)
     by_shared[STRENGTH, x.columns.gravity] = 1.0
     by_state[BIAS, :, ACCEL_BIAS] = np.eye(3)[:, None] / count
     cov, states, shared = solved.cov_of(by_state, by_shared)
@@ -184,13 +184,13 @@ def _along(rows: Rows, states: Array, shared: Array) -> Array:
     return out if rows.by_shared is None else out + rows.by_shared @ shared
 
 
-def by_centres(by_centre: Array, by: Moving) -> tuple[Array, Array]:
+def differentiate_by_centres(by_centre: Array, by: Moving) -> tuple[Array, Array]:
     """(k, F, 15) and (k, Q) derivatives by states and what is shared, of (k, F, 3) by the camera's centres."""
     by_state = np.einsum("kfi,fij->kfj", by_centre, by.by_state[:, :3])
     return by_state, np.einsum("kfi,fiq->kq", by_centre, by.by_shared[:, :3])
 
 
-def by_mean_turn(by: Moving) -> tuple[Array, Array]:
+def differentiate_by_mean_turn(by: Moving) -> tuple[Array, Array]:
     """(3, F, 15) and (3, Q) derivatives of the camera's mean rotation."""
     by_state = by.by_state[:, MOVING_TURN].transpose(1, 0, 2) / len(by.by_state)
     return by_state, by.by_shared[:, MOVING_TURN].mean(axis=0)

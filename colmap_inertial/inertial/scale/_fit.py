@@ -327,7 +327,7 @@ def _variance_parts(
         parts[res.CAUSE_OF_GROUP[name]] += float(np.sum(values**2))
     imu = groups["imu"]
     along = imu.apply(states, z[:, None])
-    white = float(np.sum(along * levels.by_level(imu, along)))
+    white = float(np.sum(along * levels.differentiate_by_level(imu, along)))
     parts["accel_noise"] += white
     assert isinstance(imu, fac.Group) and imu.root is not None
     unwhitened = imu.root.transpose(0, 2, 1) @ along

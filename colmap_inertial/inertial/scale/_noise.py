@@ -159,7 +159,7 @@ def correlation_factor(group: Group | Direct, states: Array, z: Array) -> float:
     return float(np.sqrt((1 + correlation) / (1 - correlation)))
 
 
-def by_level(group: Group | Direct, values: Array) -> Array:
+def differentiate_by_level(group: Group | Direct, values: Array) -> Array:
     """(N, r, q) whitened values times the derivative of the whitened covariance by the logarithm of the variance."""
     return values if group.share is None else np.asarray(group.share @ values)
 
@@ -208,7 +208,7 @@ class LevelSearch:
         for i, (name, level) in enumerate(LEVELS.items()):
             group = groups[level.group]
             moved = group.residual[:, :, None] + group.apply(states, z)
-            own.append(by_level(group, moved))
+            own.append(differentiate_by_level(group, moved))
             squares[i] = float(np.sum(moved * own[i]))
             if name == "rotation_rad":
                 squares[i] *= self.noise.rotation_excess**2
@@ -306,7 +306,7 @@ class LevelSearch:
         for level in LEVELS.values():
             group = groups[level.group]
             values = group.apply(states, z)
-            shares.append(float(np.sum(values * by_level(group, values))))
+            shares.append(float(np.sum(values * differentiate_by_level(group, values))))
         by_level_of_log = np.array(shares) / float(z[0, 0])
         return (
             float(self.by_scale @ cov @ self.by_scale),

@@ -82,8 +82,8 @@ def visual_groups(data: Data, noise: Noise, x: Estimate, rate_rad_s: Array, *, r
     rotation_root = data.rotation_shape / (noise.rotation_rad * noise.rotation_excess)
     columns = par.VISUAL_GLOBALS
     return (
-        _weighted_group(rotation, rotation_here, rotation_z[:, :, columns], rotation_root, columns, robust=robust),
-        _weighted_group(
+        _weight_group(rotation, rotation_here, rotation_z[:, :, columns], rotation_root, columns, robust=robust),
+        _weight_group(
             centre, centre_here, centre_z, data.centre_shape / noise.centre_m, slice(0, par.N_GLOBALS), robust=robust
         ),
     )
@@ -146,7 +146,7 @@ def _centre_residuals(data: Data, x: Estimate, rate_rad_s: Array, smear: Array) 
     return centre, centre_here, centre_z
 
 
-def _weighted_group(
+def _weight_group(
     residual: Array, here: Array, by_globals: Array, root: Array, columns: slice, *, robust: bool
 ) -> Group:
     """Whitened residuals; with ``robust``, by the weights of Cauchy's loss."""

@@ -280,7 +280,7 @@ def _judged(
     )
 
 
-def undecided_gain(fit: Fit, widened: float) -> tuple[float, float]:
+def find_undecided_gain(fit: Fit, widened: float) -> tuple[float, float]:
     """Whether gravity's length may be the accelerometer's gain, which a motion that hardly turns cannot tell from bias.
 
     Parameters
@@ -321,7 +321,7 @@ class FoundScale:
     widened
         Factor on variances of the fit: squares beyond their expectation, few degrees of freedom, what no model has.
     undecided_gain
-        Of an accelerometer whose gravity is too long, 0 of others (:func:`undecided_gain`).
+        Of an accelerometer whose gravity is too long, 0 of others (:func:`find_undecided_gain`).
     """
 
     metres_per_unit: float
@@ -354,7 +354,7 @@ def scale_of(fit: Fit, t_s: Array, calibrated: bool, clock_rate: float = 0.0) ->
     variances["accel_gain"] *= fit.gain_surprise
     variances["noise_levels"] = (student * _UNIFORM * share) ** 2 + fit.level_variance
     variances["accel_gain"] += 0.0 if calibrated else PRIORS.accel_model**2
-    gain, change = (0.0, 0.0) if calibrated else undecided_gain(fit, widened)
+    gain, change = (0.0, 0.0) if calibrated else find_undecided_gain(fit, widened)
     # gain or bias, as likely
     variances["accel_gain"] += change**2 / 2
     variances["lens"] = PRIORS.lens**2

@@ -22,10 +22,10 @@ from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.motion.align._clock_search import (
     TRIMMED,
     ClockFit,
-    explained_at,
     intervals_of,
+    measure_explained_share,
     search_offsets,
-    spaced_frames,
+    select_spaced_frames,
 )
 from colmap_inertial.motion.align._fit import OFFSET_UNKNOWN_FROM_S, Alignment, middle_of_overlap, refine_alignment
 
@@ -125,7 +125,7 @@ def align_clocks(
         if drifting is None:
             raise start
         start, rate = drifting
-    keep = spaced_frames(trajectory.t_s, _SPACING_S)
+    keep = select_spaced_frames(trajectory.t_s, _SPACING_S)
     return refine_alignment(trajectory.select(keep), imu, start, prior, clock_rate=rate)
 
 
@@ -230,7 +230,7 @@ class _Search:
                 )
             best = fits[0]
             rival = max([0.0, *(fit.log_likelihood for fit in fits[1:])])
-            explained = explained_at(spaced, self.path, best.offset_s, held, share)
+            explained = measure_explained_share(spaced, self.path, best.offset_s, held, share)
             if best.log_likelihood - rival >= options.min_log_likelihood and explained >= options.min_explained:
                 return best
         seconds = intervals_of(trajectory, _SHORTEST_S)

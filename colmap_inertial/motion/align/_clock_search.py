@@ -107,7 +107,7 @@ class ClockFit:
         )
 
 
-def spaced_frames(t_s: Array, spacing_s: float) -> IndexArray:
+def select_spaced_frames(t_s: Array, spacing_s: float) -> IndexArray:
     """Indices of frames at least ``spacing_s`` apart (to within half a frame interval); sparse frames all stay."""
     if len(t_s) < 2:
         return np.arange(len(t_s))
@@ -122,7 +122,7 @@ def spaced_frames(t_s: Array, spacing_s: float) -> IndexArray:
 
 def intervals_of(trajectory: CameraTrajectory, spacing_s: float) -> Intervals:
     """Consecutive intervals of frames at least ``spacing_s`` apart."""
-    keep = spaced_frames(trajectory.t_s, spacing_s)
+    keep = select_spaced_frames(trajectory.t_s, spacing_s)
     t_s, pose = trajectory.t_s[keep], trajectory.cam_from_world_xyzw[keep]
     turn = quat_log(quat_multiply(pose[:-1], quat_conjugate(pose[1:])))
     return Intervals(begin_s=t_s[:-1], end_s=t_s[1:], turn_rad=turn)
@@ -159,7 +159,7 @@ def search_offsets(
     Up to four fits; none where the recordings cannot overlap within the range.
     """
     rotation = None if cam_from_imu_xyzw is None else matrix_from_quat(cam_from_imu_xyzw)
-    intervals = _without_jumps(intervals, path)
+    intervals = _remove_jumps(intervals, path)
     dense = intervals.dt_s <= DENSE_S
     if share == 1 and dense.any() and intervals.dt_s[dense].sum() > 0.5 * intervals.dt_s.sum():
         intervals, step_s = intervals.select(dense), _GRID_S
@@ -177,12 +177,12 @@ def search_offsets(
     return sorted(fits, key=lambda fit: -fit.log_likelihood)
 
 
-def explained_at(
+def measure_explained_share(
     intervals: Intervals, path: GyroPath, offset_s: float, cam_from_imu_xyzw: Array | None, share: float = 1.0
 ) -> float:
     """Fraction of the camera's rotation that the gyroscope explains at one offset."""
     rotation = None if cam_from_imu_xyzw is None else matrix_from_quat(cam_from_imu_xyzw)
-    return _closest(_without_jumps(intervals, path), path, np.array([offset_s]), 1.0, rotation, share).explained
+    return _closest(_remove_jumps(intervals, path), path, np.array([offset_s]), 1.0, rotation, share).explained
 
 
 def _evenly(count: int, wanted: int) -> IndexArray:
@@ -191,7 +191,7 @@ def _evenly(count: int, wanted: int) -> IndexArray:
     return np.unique(np.linspace(0, count - 1, wanted).astype(np.intp))
 
 
-def _without_jumps(intervals: Intervals, path: GyroPath) -> Intervals:
+def _remove_jumps(intervals: Intervals, path: GyroPath) -> Intervals:
     """Rotations faster than the gyroscope ever turned are jumps of the poses: shorten them to what it did."""
     fastest = 1.2 * np.percentile(np.linalg.norm(path.rate_rad_s, axis=1), 99.9)
     angle = np.linalg.norm(intervals.turn_rad, axis=1)
@@ -220,8 +220,8 @@ def _correlate(
 ) -> tuple[Array, Array, float]:
     """Gain at all offsets on a grid, for dense frames, by FFT of the angular velocities with their gaps masked."""
     swept = 0.5 * (path.rate_rad_s[1:] + path.rate_rad_s[:-1]) * np.diff(path.t_s)[:, None]
-    visual, visual_ok, begin_s = _on_grid(intervals.begin_s, intervals.end_s, intervals.turn_rad)
-    inertial, inertial_ok, imu_begin_s = _on_grid(path.t_s[:-1], path.t_s[1:], swept)
+    visual, visual_ok, begin_s = _resample_on_grid(intervals.begin_s, intervals.end_s, intervals.turn_rad)
+    inertial, inertial_ok, imu_begin_s = _resample_on_grid(path.t_s[:-1], path.t_s[1:], swept)
     size = _fft_length(len(visual) + len(inertial))
 
     def spectrum(x: Array) -> ComplexArray:
@@ -258,7 +258,7 @@ def _fft_length(at_least: int) -> int:
     return 1 << max(at_least - 1, 1).bit_length()
 
 
-def _on_grid(begin_s: Array, end_s: Array, turn_rad: Array) -> tuple[Array, BoolArray, float]:
+def _resample_on_grid(begin_s: Array, end_s: Array, turn_rad: Array) -> tuple[Array, BoolArray, float]:
     """Mean rates in the cells of a grid, which cells are covered by intervals without gaps, and the grid's start."""
     start_s = float(begin_s[0])
     edges = start_s + _GRID_S * np.arange(max(int((end_s[-1] - start_s) / _GRID_S), 1) + 1)

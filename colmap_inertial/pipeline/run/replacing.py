@@ -88,7 +88,7 @@ def replace_result(workspace: Workspace) -> None:
         remove(path)
 
 
-def changed_options(earlier: Path, config: str) -> list[str]:
+def list_changed_options(earlier: Path, config: str) -> list[str]:
     """What another configuration says otherwise, a few words for each option."""
     with contextlib.suppress(FormatError):
         before, after = _flat(read_values(earlier)), _flat(tomllib.loads(config))

@@ -26,10 +26,10 @@ from colmap_inertial.pipeline.run.config import config_as_toml
 from colmap_inertial.pipeline.run.context import RunContext
 from colmap_inertial.pipeline.run.progress import Progress, tell
 from colmap_inertial.pipeline.run.replacing import (
-    changed_options,
     drop_beside,
     is_finished,
     is_made_of,
+    list_changed_options,
     moved,
     place_beside,
     replace_result,
@@ -148,7 +148,8 @@ def open_session(
         if is_finished(workspace) and not is_made_of(workspace, config, inputs):
             stack.enter_context(_earlier_result_stays(out))
             changes = (
-                "; ".join(changed_options(workspace.config, config)) or "the recording or what is made of it changed"
+                "; ".join(list_changed_options(workspace.config, config))
+                or "the recording or what is made of it changed"
             )
             tell(context.progress, f"{changes}: the result in {out} stays until the new one is whole")
             beside = place_beside(workspace, config, inputs)

@@ -240,7 +240,7 @@ class ExposureStage:
         if self.fusion == "mertens":
             dark = brightened(frame.image, replace(pair.brightness, gain=1.0))
             light = fuse_mertens([dark, light])
-        done = replace(done, fused=True, used="both", reason=_in_words(pair, path))
+        done = replace(done, fused=True, used="both", reason=_describe_pair(pair, path))
         return _replace_light(frame, light), done
 
 
@@ -312,7 +312,7 @@ def _described(done: FusedPair, pair: ExposurePair) -> FusedPair:
     )
 
 
-def _in_words(pair: ExposurePair, path: Path) -> str:
+def _describe_pair(pair: ExposurePair, path: Path) -> str:
     by = [
         name
         for name, used in (("the gyroscope", pair.registered.by_gyro), ("the pixels", pair.registered.by_pixels))

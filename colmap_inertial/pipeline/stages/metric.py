@@ -128,7 +128,9 @@ class InertialStage:
                     estimate, trajectory, found = second, poses, found.updated(second.rotations)
             left_out = set(found.left_out)
             trajectory = trajectory.select(np.array([name not in left_out for name in trajectory.names]))
-            model = _without_left_out(model, reconstruction, found, [name for name in again if name not in left_out])
+            model = _select_agreeing_images(
+                model, reconstruction, found, [name for name in again if name not in left_out]
+            )
         if model.rotations is not None and estimate.rotations is not None:
             said = describe_consensus(estimate.rotations)
             notes = (*(note for note in estimate.notes if note not in said), *describe_consensus(model.rotations))
@@ -151,7 +153,7 @@ class InertialStage:
         return register_again(model.reconstruction, wrong, self.database)
 
 
-def _without_left_out(
+def _select_agreeing_images(
     model: Model, reconstruction: pycolmap.Reconstruction, found: RotationConsensus, again: Sequence[str]
 ) -> Model:
     """A model of the images that agree with the gyroscope; some of them may have been registered again."""
@@ -202,7 +204,7 @@ def provenance(estimate: ScaleEstimate) -> str:
     return f"inertial scale, method {estimate.method}, {estimate.verdict}"
 
 
-def smoothed_path(
+def smooth_path(
     trajectory: CameraTrajectory,
     imu: ImuRecording,
     estimate: ScaleEstimate,
@@ -272,7 +274,7 @@ def write_trajectory(path: Path, model: Model, trajectory: CameraTrajectory, imu
         unknown = np.full(3, np.nan)
         velocity = np.array([solved.velocity_in_world.get(name, unknown) for name in trajectory.names])
     else:
-        smoothed = smoothed_path(trajectory, imu, estimate, gravity)
+        smoothed = smooth_path(trajectory, imu, estimate, gravity)
         write_tum(path, smoothed)
         velocity = smoothed.velocity_in_world
         if model.parts:
@@ -280,12 +282,12 @@ def write_trajectory(path: Path, model: Model, trajectory: CameraTrajectory, imu
             log.info("%s: no covariance of a joined path is written; result.json has that of each part", path.name)
             target.unlink(missing_ok=True)
         else:
-            cov, rotation = _with_drift(model, smoothed, gravity)
+            cov, rotation = _add_drift(model, smoothed, gravity)
             _write_covariance(target, smoothed.t_s + smoothed.epoch_ns * 1e-9, cov, rotation)
     write_record(motion_file(path), _motion(model, trajectory, velocity, imu, estimate.calibration))
 
 
-def _with_drift(model: Model, smoothed: SmoothedTrajectory, gravity: Array) -> tuple[Array, Array | None]:
+def _add_drift(model: Model, smoothed: SmoothedTrajectory, gravity: Array) -> tuple[Array, Array | None]:
     """(T, 9, 9) of position against the first image, velocity, acceleration, and (T, 3, 3) of rotation.
 
     What smoothing leaves is far less than what pictures bend a path by. Where that is too much work, or pictures do not

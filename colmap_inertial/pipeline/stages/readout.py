@@ -15,7 +15,7 @@ from colmap_inertial.imaging.gyro_camera import FrameShutter
 from colmap_inertial.model import Model
 from colmap_inertial.model.readout import settle_readout
 from colmap_inertial.pipeline.stages.inputs import StageInputs
-from colmap_inertial.pipeline.stages.metric import InertialStage, smoothed_path
+from colmap_inertial.pipeline.stages.metric import InertialStage, smooth_path
 
 if TYPE_CHECKING:
     import pycolmap
@@ -67,7 +67,7 @@ class ReadoutStage(InertialStage):
             pose_cov=None,
         )
         try:
-            path = smoothed_path(metric, self.imu, estimate, estimate.gravity_in_world_m_s2)
+            path = smooth_path(metric, self.imu, estimate, estimate.gravity_in_world_m_s2)
         except NotObservableError as error:
             log.info("model %d: readout left as it is: %s", model.colmap_index, error)
             return model

@@ -19,16 +19,16 @@ from colmap_inertial.core.types import CAL, CameraImuCalibration, Similarity, So
 from colmap_inertial.inertial.core.priors import is_calibrated, model_scale_sigma
 from colmap_inertial.inertial.refine.judge import Judged, refine
 from colmap_inertial.inertial.refine.motion import add_scale, expect_worth
-from colmap_inertial.inertial.refine.pictures import without_extremes
+from colmap_inertial.inertial.refine.pictures import remove_extremes
 from colmap_inertial.inertial.refine.setup import (
     Known,
     Seen,
     Written,
-    at_middle_lines,
     keypoints_of,
     make_problem,
+    move_to_middle_lines,
     read_seen,
-    written_back,
+    write_back,
 )
 from colmap_inertial.inertial.refine.values import FIRST_INTRINSIC, LEVER, OFFSET, READOUT, ROTATION, Estimate, Problem
 from colmap_inertial.inertial.refine.world import size_of, state_scale
@@ -131,7 +131,7 @@ class RefineStage(InertialStage):
         return ""
 
     def _refined(self, model: Model) -> Model:
-        seen = without_extremes(read_seen(model.reconstruction, model.timing))
+        seen = remove_extremes(read_seen(model.reconstruction, model.timing))
         problem, start = make_problem(seen, model.timing, self.imu, self._known(model), self._exposed_px(model, seen))
         promised: dict[str, Any] = {}
         if self.auto:
@@ -159,7 +159,7 @@ class RefineStage(InertialStage):
         figures |= {"drift": [asdict(part) for part in judged.drift]} | _calibration_figures(judged)
         assert model.scale is not None and model.scale.calibration is not None
         assert model.similarity is not None and judged.world is not None
-        written = at_middle_lines(problem, x)
+        written = move_to_middle_lines(problem, x)
         move = _move_of(seen, written)
         calibrated = is_calibrated(self.imu)
         own, similarity = state_scale(
@@ -171,11 +171,11 @@ class RefineStage(InertialStage):
         # a motion's readout has the direction that was declared
         readout_s = x.readout_s if model.timing.readout_s or (judged.readout and x.readout_s > 0) else None
         rolling = not model.rectified and bool(model.timing.readout_s or judged.readout)
-        reconstruction = written_back(model.reconstruction, seen, problem, x, rectified=not rolling)
+        reconstruction = write_back(model.reconstruction, seen, problem, x, rectified=not rolling)
         done = replace(
             model,
             reconstruction=reconstruction,
-            scale=replace(own, calibration=_refined_calibration(model.scale.calibration, problem, judged)),
+            scale=replace(own, calibration=_make_refined_calibration(model.scale.calibration, problem, judged)),
             similarity=similarity,
             parts=tuple(replace(part, similarity=_moved(part.similarity, move)) for part in model.parts),
             observed_px={},
@@ -341,7 +341,7 @@ def _axes_sigma_deg(estimate: Estimate, cov: Array, gain: slice) -> list[float]:
     return [float(sigma) for sigma in np.degrees(np.sqrt(np.einsum("ij,jk,ik->i", by, cov, by)))]
 
 
-def _refined_calibration(before: CameraImuCalibration, problem: Problem, judged: Judged) -> CameraImuCalibration:
+def _make_refined_calibration(before: CameraImuCalibration, problem: Problem, judged: Judged) -> CameraImuCalibration:
     """The calibration with what the refinement says of it, and its covariance."""
     x, shared, inertial = judged.estimate, judged.shared_cov, problem.inertial
     assert shared is not None and inertial is not None

@@ -130,9 +130,9 @@ def scale_project_by(
             progress=lambda done, total: progress("validation", done, total),
         )
     if reference.scale_from == "distance":
-        scale, sigma_log, made_of = _by_distance(reference, validation)
+        scale, sigma_log, made_of = _scale_by_distance(reference, validation)
     else:
-        scale, sigma_log, made_of = _by_target(validation)
+        scale, sigma_log, made_of = _scale_by_target(validation)
     half = Z95 * sigma_log
     notes = ["which way is up is not known: no IMU was used"]
     if validation is not None:
@@ -182,7 +182,7 @@ def check_reference(reference: ReferenceOptions) -> None:
         parse_target(reference.target)
 
 
-def _by_target(validation: Validation | None) -> tuple[float, float, str]:
+def _scale_by_target(validation: Validation | None) -> tuple[float, float, str]:
     if validation is None:
         raise InertialError(_NO_TARGET)
     # by half of its corners, so that the others can tell how right that is
@@ -193,7 +193,7 @@ def _by_target(validation: Validation | None) -> tuple[float, float, str]:
     return scale, float(np.log(high / low)) / (2 * Z95), made_of
 
 
-def _by_distance(reference: ReferenceOptions, validation: Validation | None) -> tuple[float, float, str]:
+def _scale_by_distance(reference: ReferenceOptions, validation: Validation | None) -> tuple[float, float, str]:
     between, distance = reference.between, reference.distance
     if between is None or distance is None:
         raise InertialError(_NO_DISTANCE)

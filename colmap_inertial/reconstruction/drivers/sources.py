@@ -13,11 +13,11 @@ from colmap_inertial.checks.diagnose import Recorded, diagnose
 from colmap_inertial.checks.validate import (
     Target,
     Validation,
+    add_bars,
+    add_check_points,
+    add_other_target,
     parse_target,
     validate_model,
-    with_bars,
-    with_check_points,
-    with_other_target,
     write_overlays,
 )
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError, OutputError, OutputExistsError
@@ -404,11 +404,11 @@ def validate_source(
     second = known.second_target(parsed)
     result = validate_model(folder, images, parsed, options)
     if second is not None:
-        result = with_other_target(result, validate_model(folder, images, second[0], options), second[1], second[2])
+        result = add_other_target(result, validate_model(folder, images, second[0], options), second[1], second[2])
     if known.bars is not None:
-        result = with_bars(result, known.bars)
+        result = add_bars(result, known.bars)
     if known.check_points is not None:
-        result = with_check_points(result, known.check_points)
+        result = add_check_points(result, known.check_points)
     if outputs.apply is not None:
         if result.control is None:
             raise InertialError("too few corners to keep control and check distances apart; --apply needs more views")

@@ -28,7 +28,7 @@ from colmap_inertial.motion.lateral_flow import follow_pairs
 from colmap_inertial.pipeline.run.context import Recording
 from colmap_inertial.pipeline.run.progress import Progress, counted
 from colmap_inertial.pipeline.stages.imaging_plan import GyroView
-from colmap_inertial.pipeline.stages.metric import calibration_of_rectified, smoothed_path
+from colmap_inertial.pipeline.stages.metric import calibration_of_rectified, smooth_path
 from colmap_inertial.reconstruction.preparation.sampling import some_frames
 
 if TYPE_CHECKING:
@@ -163,7 +163,7 @@ def _measure_parallax(model: pycolmap.Reconstruction, view: GyroView) -> Iterato
         (every_s >= trajectory.t_s[0] - _LIMITS.farthest_s) & (every_s <= trajectory.t_s[-1] + _LIMITS.farthest_s)
     )
     try:
-        path = smoothed_path(metric, imu, estimate, estimate.gravity_in_world_m_s2, also_at_s=every_s[around])
+        path = smooth_path(metric, imu, estimate, estimate.gravity_in_world_m_s2, also_at_s=every_s[around])
     except NotObservableError as error:
         log.info("no blur by translation: %s", error)
         return

@@ -48,7 +48,7 @@ class LasLimits:
 _LIMITS = LasLimits()
 
 
-def smoothed_path(trajectory: Path | None, model: Path) -> CameraTrajectory:
+def smooth_path(trajectory: Path | None, model: Path) -> CameraTrajectory:
     """The smoothed path of a model.
 
     Raises

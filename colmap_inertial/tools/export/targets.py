@@ -23,7 +23,7 @@ from colmap_inertial.model import write_files
 from colmap_inertial.tools.export.formats import (
     require_laspy,
     require_pygltflib,
-    smoothed_path,
+    smooth_path,
     write_cameras,
     write_gltf,
     write_las,
@@ -34,9 +34,9 @@ from colmap_inertial.tools.export.transforms import (
     OPENGL_FROM_CAM,
     Exposure,
     View,
+    add_row_poses,
+    add_velocities,
     transforms,
-    with_row_poses,
-    with_velocities,
 )
 from colmap_inertial.tools.export.undistort import Undistortion, pinhole_model
 
@@ -272,7 +272,7 @@ def _write_las(content: ExportContent, folder: Path) -> None:
 
 def _write_tum(content: ExportContent, folder: Path) -> None:
     found = content.source.found
-    write_tum(folder / "trajectory.tum", smoothed_path(found.trajectory, found.folder))
+    write_tum(folder / "trajectory.tum", smooth_path(found.trajectory, found.folder))
 
 
 def _write_csv(content: ExportContent, folder: Path) -> None:
@@ -282,7 +282,7 @@ def _write_csv(content: ExportContent, folder: Path) -> None:
 
 def _write_gltf(content: ExportContent, folder: Path) -> None:
     found = content.source.found
-    path = None if found.trajectory is None else smoothed_path(found.trajectory, found.folder)
+    path = None if found.trajectory is None else smooth_path(found.trajectory, found.folder)
     write_gltf(folder / "scene.glb", content.views, path, content.xyz, content.rgb, content.up_in_world)
 
 
@@ -310,7 +310,7 @@ def _add_row_poses(values: dict[str, Any], content: ExportContent) -> dict[str, 
     if motion is None or not motion.names:
         content.notes.append("no velocities are known: each picture has one pose, as if it was taken in an instant")
         return values
-    return with_row_poses(values, _exposures(content))
+    return add_row_poses(values, _exposures(content))
 
 
 def _add_velocities(values: dict[str, Any], content: ExportContent) -> dict[str, Any]:
@@ -318,7 +318,7 @@ def _add_velocities(values: dict[str, Any], content: ExportContent) -> dict[str,
     left_out, count = len(content.names) - len(exposures), len(content.names)
     if left_out:
         content.notes.append(f"{left_out} of {count} images have no velocity and are left out of transforms.json")
-    return with_velocities(values, exposures)
+    return add_velocities(values, exposures)
 
 
 def _exposures(content: ExportContent) -> dict[str, Exposure]:

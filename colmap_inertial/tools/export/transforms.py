@@ -123,7 +123,7 @@ def transforms(views: Sequence[View], xyz: Array, up_in_world: Array) -> dict[st
     }
 
 
-def with_velocities(content: Mapping[str, Any], exposures: Mapping[str, Exposure]) -> dict[str, Any]:
+def add_velocities(content: Mapping[str, Any], exposures: Mapping[str, Exposure]) -> dict[str, Any]:
     """The same for the deblurring fork of splatfacto: velocities in OpenGL camera axes, exposure and readout.
 
     It takes a pose for that of the picture's middle row, so that each is brought to it.
@@ -151,7 +151,7 @@ def with_velocities(content: Mapping[str, Any], exposures: Mapping[str, Exposure
     }
 
 
-def with_row_poses(content: Mapping[str, Any], exposures: Mapping[str, Exposure]) -> dict[str, Any]:
+def add_row_poses(content: Mapping[str, Any], exposures: Mapping[str, Exposure]) -> dict[str, Any]:
     """The same for instant-ngp: a pose for the first row's begin and the last one's end, and what lies between them.
 
     A ray of row ``v`` (0 to 1) at the share ``b`` (0 to 1) of its exposure has the pose at ``A + B u + C v + D b``
