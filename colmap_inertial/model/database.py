@@ -40,6 +40,12 @@ _RECORDS = {
     ),
     "cameras": "coalesce(length(params), 0) % 8 = 0",
 }
+#: COLMAP 4 also stores the cameras of a pair: 33 bytes, then the parameters, whose count is the last of these numbers.
+_PAIR_CAMERAS = "".join(
+    f" AND ({name} IS NULL OR typeof({name}) = 'blob' AND length({name}) BETWEEN 33 AND 2000 AND "
+    f"hex(substr({name}, 26, 8)) = printf('%02X00000000000000', (length({name}) - 33) / 8))"
+    for name in ("camera1", "camera2")
+)
 #: What is said of a database that COLMAP cannot read.
 UNREADABLE = "COLMAP cannot read its database; put it back as it was, or begin anew in another folder"
 #: Rebuilt by SQLite; a copy must not have it.
@@ -114,7 +120,10 @@ def check_records(database: Path) -> None:
     """
     uri = f"{database.absolute().as_uri()}?mode=ro"
     with reading(database, UNREADABLE), contextlib.closing(sqlite3.connect(uri, uri=True)) as opened:
+        columns = {row[1] for row in opened.execute("PRAGMA table_info(two_view_geometries)")}
         for table, holds in _RECORDS.items():
+            if table == "two_view_geometries" and {"camera1", "camera2"} <= columns:
+                holds += _PAIR_CAMERAS
             if opened.execute(f"SELECT 1 FROM {table} WHERE NOT ({holds}) LIMIT 1").fetchone() is not None:
                 raise FormatError(database, f"{UNREADABLE} (a record of {table} has another size than it states)")
 
