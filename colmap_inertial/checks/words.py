@@ -49,7 +49,7 @@ def half_width_pct(metres_per_unit: float, ci95: Sequence[float]) -> float:
 
 
 def length_error(pct: float) -> str:
-    """What a relative error does to ten metres, in a unit that fits."""
+    """A relative error as a length error over ten metres, in a suitable unit."""
     metres = 10 * pct / 100
     if metres >= 1:
         return f"{metres:.2g} m"
@@ -92,7 +92,7 @@ def model_facts(model: Mapping[str, Any], available: str = "") -> Iterator[Fact]
 
 
 def target_facts(found: Mapping[str, Any]) -> Iterator[Fact]:
-    """What a target of known size says of a model, by ``Validation.as_json()``."""
+    """Facts from a target of known size in a model, from ``Validation.as_json()``."""
     yield "target", found["target"]
     if found["scale_error_pct"] is not None:
         low, high = found["ci95_pct"]
@@ -147,7 +147,7 @@ def place_facts(place: Mapping[str, Any] | None) -> Iterator[Fact]:
 
 
 def describe_joined(models: Collection[int], gaps: Sequence[Mapping[str, Any]]) -> str:
-    """Which of COLMAP's models were joined into one, and how well each gap between them is known."""
+    """Describe which COLMAP models were joined, and how well each gap between them is known."""
     across = [
         f"{gap['seconds']:.1f} s to {100 * gap['sigma_m']:.1f} cm, {gap['sigma_deg']:.2f} degrees"
         for gap in gaps
@@ -158,7 +158,7 @@ def describe_joined(models: Collection[int], gaps: Sequence[Mapping[str, Any]]) 
 
 
 def not_checked(checked: Collection[str]) -> str:
-    """What the check of a recording had no data for, where that matters; empty otherwise."""
+    """Checks of a recording that had no data and matter; empty otherwise."""
     if "gyroscope" not in checked:
         return ""
     sentences = []
@@ -174,7 +174,7 @@ def not_checked(checked: Collection[str]) -> str:
 
 
 def parts_mapped_in_words(mapping: dict[str, Any] | None) -> list[str]:
-    """In how many parts a recording was mapped, and which of them do not fit; by ``mapping`` of the result."""
+    """Describe in how many parts a recording was mapped, and which do not fit, from ``mapping`` of the result."""
     if mapping is None or mapping["parts"] == 1:
         return []
     apart = [
@@ -187,7 +187,7 @@ def parts_mapped_in_words(mapping: dict[str, Any] | None) -> list[str]:
 
 
 def describe_mapping(mapping: dict[str, Any] | None, colmap_index: int | None) -> list[str]:
-    """Which loops of one model were closed; by ``mapping`` of the result."""
+    """Describe the loops of one model that were closed, from ``mapping`` of the result."""
     sentences = []
     for closure in [] if mapping is None else mapping["ends"]:
         if closure["model"] == colmap_index:

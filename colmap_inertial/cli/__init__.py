@@ -107,7 +107,7 @@ def parse(args: Sequence[str]) -> Speaker:
 
 
 def _expand_options(args: Sequence[str]) -> list[str]:
-    """What follows the command, with each option as that command has it.
+    """Complete the abbreviated options after the command.
 
     The name of an option's group may be left out, and may stand where there is none: ``--latitude-deg`` and
     ``--scale.latitude-deg`` are the same in every command.

@@ -152,7 +152,7 @@ class Deblur(Reader):
 
 
 class Fuser(Reader):
-    """What the commands have in common that make one picture of several."""
+    """Options shared by the commands that fuse several pictures into one."""
 
     out: Path
 

@@ -126,7 +126,7 @@ def _describe_value(kind: Any, name: str) -> str:
 
 
 def _describe_default(default: object, text: str) -> str:
-    """What counts where an option is not given; empty where its text says so, and where that is nothing."""
+    """Text on the default of an option; empty where the option's text has it, or where there is none."""
     if default is dataclasses.MISSING or default is None or default == () or isinstance(default, bool):
         return ""
     if "default" in text.lower():

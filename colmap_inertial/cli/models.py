@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class SourceReader(Reader):
-    """What the commands have in common that read poses of a camera and the IMU that ran along."""
+    """Options shared by the commands that read camera poses and the IMU recorded with them."""
 
     source: Positional[Path]
     """COLMAP model folder, trajectory in TUM format (a text file of t x y z qx qy qz qw), or InertialScale folder (text
@@ -49,7 +49,7 @@ class SourceReader(Reader):
     """Calibration files of this device: from `align --out`, from `calibrate-imu --out`, or both."""
 
     def read_from(self, calibration: tuple[Path, ...] | None = None) -> ScaleSource:
-        """Where poses and IMU come from, with these calibrations or those that were given."""
+        """Source of poses and IMU, with these calibrations or the given ones."""
         from colmap_inertial.reconstruction.drivers.sources import ScaleSource
 
         files = self.calibration if calibration is None else calibration
@@ -252,7 +252,7 @@ class CalibrateImu(Reader):
 
 @dataclass(frozen=True, kw_only=True)
 class Diagnose(SourceReader):
-    """What is wrong with a recording, and what to do, before any reconstruction.
+    """Find problems of a recording, with advice, before any reconstruction.
 
     Exit code 1 when something makes a scale wrong or impossible, 0 when nothing is worse than a warning.
 

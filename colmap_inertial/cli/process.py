@@ -28,7 +28,7 @@ class Terminated(KeyboardInterrupt):
 
 @contextlib.contextmanager
 def answering_signals() -> Iterator[None]:
-    """Within it, the first Ctrl-C is answered at once and ends the work where it can be ended; the second one ends all.
+    """Answer Ctrl-C: the first one ends the work where it can stop cleanly, the second one at once.
 
     Python's own handlers wait until compiled code returns, which may be minutes. So a thread hears of signals as well.
     Outside of the main thread nothing is changed.

@@ -51,7 +51,7 @@ def clock(seconds: float) -> str:
 
 
 class Stage:
-    """How far one stage is, and how long it will take.
+    """Progress of one stage, with elapsed and remaining time.
 
     A stage that goes on where an earlier run was begins above zero; what that run did does not count for its speed.
     """
@@ -68,11 +68,11 @@ class Stage:
         self.done, self.total = done, total
 
     def seconds(self, now_s: float) -> float:
-        """How long it has been at work."""
+        """Elapsed time of the stage."""
         return now_s - self._begun_s
 
     def left_s(self, now_s: float) -> float | None:
-        """How long it will take at the speed so far; ``None`` before there is one, and where the end is unknown."""
+        """Remaining time at the present speed; ``None`` at the beginning and where the end is unknown."""
         if self.done <= self._from or not self.total:
             return None
         each_s = (self._moved_s - self._begun_s) / (self.done - self._from)
@@ -93,7 +93,7 @@ class Stage:
 
 
 def _size(path: Path) -> int:
-    """Bytes of a file, and of the log that SQLite keeps beside a database."""
+    """Bytes of a file, and of SQLite's log beside a database."""
     size = 0
     for file in (path, path.with_name(f"{path.name}-wal")):
         with contextlib.suppress(OSError):
@@ -102,7 +102,7 @@ def _size(path: Path) -> int:
 
 
 class Screen:
-    """What is seen of a command at work."""
+    """Display of a running command."""
 
     def __init__(self, console: Console, bars: Bars, now: Callable[[], float] = time.monotonic) -> None:
         self._console, self._bars, self._now = console, bars, now
@@ -208,7 +208,7 @@ def live_progress(*, quiet: bool, verbose: bool) -> Iterator[Screen]:
             return Text(stage.count(), "progress.download")
 
     class Clock(ProgressColumn):
-        """How long a stage has been at work, and how long it will be."""
+        """Elapsed and remaining time of a stage."""
 
         def render(self, task: Task) -> Text:
             stage: Stage = task.fields["stage"]

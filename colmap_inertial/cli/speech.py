@@ -1,4 +1,4 @@
-"""What every command says and how: words for people, JSON for scripts, nothing, or all of the log."""
+"""Output of all commands: text for people, JSON for scripts, nothing, or the whole log."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Speaker:
 
         @property
         def limits(self) -> ReadLimits:
-            """How large a file may be that is read."""
+            """Limits on the size of files."""
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
@@ -111,7 +111,7 @@ class Speaker:
 
 @dataclass(frozen=True, kw_only=True)
 class Reader(Speaker):
-    """What commands without options of a reconstruction have besides."""
+    """Common options of commands without options of a reconstruction."""
 
     limits: ReadLimits = field(default_factory=ReadLimits)
     """How large a file may be that is read."""
@@ -119,7 +119,7 @@ class Reader(Speaker):
 
 @dataclass(frozen=True, kw_only=True)
 class ConfiguredCommand(Speaker):
-    """What commands with the options of a reconstruction have besides."""
+    """Common options of commands with options of a reconstruction."""
 
     options: Annotated[ReconstructOptions, arg(name="")] = field(default_factory=ReconstructOptions)
     config: Path | None = None
@@ -127,13 +127,13 @@ class ConfiguredCommand(Speaker):
 
     @property
     def limits(self) -> ReadLimits:
-        """How large a file may be that is read."""
+        """Limits on the size of files."""
         return self.options.limits
 
 
 @dataclass(frozen=True, kw_only=True)
 class DeviceCommand(Speaker):
-    """What commands have besides that use the calibrations kept of a device."""
+    """Common options of commands that use the stored calibrations of a device."""
 
     device: str | None = None
     """Name under which calibrations of the device were kept by --remember (default: what the recording says)."""
@@ -174,7 +174,7 @@ class _StandardError(logging.StreamHandler[Any]):
 
     @stream.setter
     def stream(self, _: Any) -> None:
-        """What the parent class wants to keep."""
+        """The stream that the parent class stores."""
 
 
 @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""What the command line shows at the end: one screen."""
+"""Summary of a finished command: one screen."""
 
 from __future__ import annotations
 
@@ -40,20 +40,20 @@ _COLOUR = {"trusted": "green", "weak": "yellow", "refused": "red"}
 
 
 def _program() -> str:
-    """What to type for this program: its name where that is on the PATH, else where it is."""
+    """The command that starts this program: its name if it is on the PATH, else its path."""
     beside = Path(sys.executable).with_name("colmap-inertial")
     return str(beside) if shutil.which("colmap-inertial") is None and beside.is_file() else "colmap-inertial"
 
 
 def _next_to_see(out: Path, report: Path | None) -> str:
-    """How to look at a result: in the viewer, or in its report where that is not installed."""
+    """The command that shows a result: the viewer, or the report where the viewer is not installed."""
     if report is not None and find_spec("viser") is None:
         return f"open {shlex.quote(str(report))} in a browser"
     return shlex.join([_program(), "view", str(out)])
 
 
 def next_command(result: ReconstructResult, source: Path) -> str:
-    """What to type next, by how a reconstruction ended."""
+    """The next command to type, by how a reconstruction ended."""
     from colmap_inertial.checks.validate import Validation
 
     out, best = result.workspace.root, result.models[0]
@@ -197,7 +197,7 @@ def show_validation(result: Validation) -> None:
 
 
 def imaging_lines(frames: Sequence[FrameRecord], plan: ImagingPlan, rectified: Collection[str]) -> list[Line]:
-    """What was done to the frames, as labelled lines."""
+    """Treatment of the frames, as labelled lines."""
     from colmap_inertial.reconstruction.drivers.result import shutter_note
 
     counts = {action: sum(frame.action == action for frame in frames) for action in ("deblurred", "dropped")}
@@ -278,7 +278,7 @@ def show_result(result: ReconstructResult, source: Path) -> None:
 
 
 def _model_lines(model: ModelResult, result: ReconstructResult) -> Iterator[Line]:
-    """What there is to say of one model, as labelled lines."""
+    """Summary of one model, as labelled lines."""
     from colmap_inertial.checks.words import (
         describe_joined,
         describe_mapping,
@@ -319,7 +319,7 @@ def _model_lines(model: ModelResult, result: ReconstructResult) -> Iterator[Line
 
 
 def _describe_layout(result: ReconstructResult) -> str:
-    """Where what is metric lies, and where what is not."""
+    """Describe where the metric and the other outputs are."""
     workspace = result.workspace
     if all(model.sparse_metric is None for model in result.models):
         where = {str(model.sparse) for model in result.models}
@@ -354,7 +354,7 @@ def show_exported(made: Exported) -> None:
 
 
 def show_view(out: Path, url: str, host: str) -> None:
-    """Where a model is shown, and to whom."""
+    """Print the address of the viewer, and who may open it."""
     from colmap_inertial.tools.view.guard import is_loopback
 
     say(f"{out} is shown at {url} (Ctrl-C ends this)")

@@ -1,4 +1,4 @@
-"""From a metric model to depth maps, a fused point cloud and a mesh in metres.
+"""Depth maps, a fused point cloud and a mesh in metres, from a metric model.
 
 Depth maps are made by COLMAP's patch-match where pycolmap has CUDA, else by our plane sweep; the rest is COLMAP's.
 """
@@ -89,7 +89,7 @@ class DenseResult:
     waiting: str = ""
 
     def as_json(self, root: Path) -> dict[str, object]:
-        """In JSON types; paths count from ``root``."""
+        """As JSON types; paths are relative to ``root``."""
         paths = {name: str(value.relative_to(root)) for name, value in vars(self).items() if isinstance(value, Path)}
         return vars(self) | paths | {"waiting": self.waiting or None}
 
@@ -301,7 +301,7 @@ def _undistort(session: Session, index: int, images: Path, prepared: _Prepared) 
 
 
 def digest(model: Path) -> str:
-    """Of a model's poses and cameras."""
+    """Digest of a model's poses and cameras."""
     found = hashlib.sha256()
     for path in sorted(model.iterdir()):
         if path.stem in ("cameras", "images", "rigs", "frames"):

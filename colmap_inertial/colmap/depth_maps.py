@@ -44,7 +44,7 @@ pycolmap.patch_match_stereo(sys.argv[1], options=ColmapSettings(tuple(sys.argv[3
 
 @dataclass(frozen=True, kw_only=True)
 class MadeFrom:
-    """What a workspace's depth maps are made from; stands in it as ``made_from.json``.
+    """Inputs of a workspace's depth maps, stored in it as ``made_from.json``.
 
     Attributes
     ----------
@@ -139,7 +139,7 @@ def _plan_maps(model: str, max_image_size: int | None, maker: Maker, settings: C
 
 
 def map_file(folder: Path, what: str, name: str, kind: str = "geometric") -> Path:
-    """Where a workspace has the map of a picture; ``what`` is depth or normal."""
+    """Path of a picture's map in a workspace; ``what`` is depth or normal."""
     return path_in(folder / "stereo" / f"{what}_maps", f"{name}.{kind}.bin")
 
 

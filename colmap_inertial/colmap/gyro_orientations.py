@@ -42,7 +42,7 @@ APART_DEG = 90.0
 
 @dataclass(frozen=True, kw_only=True)
 class OrientationLimits:
-    """How uncertain an uncalibrated gyroscope's orientations are."""
+    """Uncertainty of the orientations of an uncalibrated gyroscope."""
 
     #: A pair is ruled out, and a rotation disagrees, beyond so many standard deviations.
     sure_sigmas: float = 3.0
@@ -113,7 +113,7 @@ class GyroOrientations:
         timing: FrameTiming,
         camera: CameraModel | None,
     ) -> GyroOrientations:
-        """Of the frames of ``timing``, by a calibration that fits the recording."""
+        """Orientations of the frames of ``timing``, with a calibration that fits the recording."""
         motion = GyroCamera.from_timed(CameraTimedImu.from_recording(imu, calibration, timing.epoch_ns))
         t_s = timing.pose_t_s()
         on_gyro_s, path = t_s - motion.offset_s, motion.path

@@ -35,7 +35,7 @@ LONGEST = 1000
 
 @dataclass(frozen=True, kw_only=True)
 class LoopClosureLimits:
-    """Which pairs of images close a loop, and whether the closed loop is accepted."""
+    """Limits for pairs of images that close a loop, and for accepting the closed loop."""
 
     #: A pair is torn that has so many matches between points: COLMAP asks so many to place an image ...
     torn_matches: int = 30
@@ -268,7 +268,9 @@ def _agreeing_share(model: Submodel, torn: Sequence[_TornPair]) -> float:
 def _adjustment(
     pipeline: pycolmap.IncrementalPipelineOptions, reconstruction: pycolmap.Reconstruction
 ) -> pycolmap.BundleAdjustmentOptions:
-    """Of a whole model; solved directly, however many images it has, where few see the same, as along a chain."""
+    """Options of the adjustment of a whole model: direct, however many images, where few see the same, as along a
+    chain.
+    """
     adjustment = pipeline.get_global_bundle_adjustment()
     adjustment.print_summary = False
     images = reconstruction.num_reg_images()
@@ -281,7 +283,7 @@ def _adjustment(
 
 
 def _work(reconstruction: pycolmap.Reconstruction) -> float:
-    """Of solving an adjustment directly: the sum of squared rows of its factor, in images; no less than it takes.
+    """Work of solving an adjustment directly: the sum of squared rows of its factor, in images; an upper bound.
 
     Two images have an entry in common where they see the same point. In an order in which such images lie close
     together, the factor has none before the first entry of each row.

@@ -30,7 +30,7 @@ from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 
 @dataclass(frozen=True, kw_only=True)
 class LoopSearchLimits:
-    """Which images are compared for loops, and when a pair of places is one."""
+    """Limits of the search for loops."""
 
     #: Frames among which loops are sought are about so far apart, and so many at most.
     spacing_s: float = 1.0

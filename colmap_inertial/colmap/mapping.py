@@ -43,7 +43,7 @@ class ModelEnds(LoopClosure):
 
 @dataclass(frozen=True, kw_only=True)
 class MapRecord:
-    """How models were made.
+    """Record of how models were mapped.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Which pairs of a capture's images are matched: not those that the gyroscope or a quick comparison excludes."""
+"""Choose the pairs of images to match: all but those that the gyroscope or a quick comparison excludes."""
 
 from __future__ import annotations
 

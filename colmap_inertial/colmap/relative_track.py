@@ -19,7 +19,7 @@ from colmap_inertial.core.threads import one_blas_thread
 
 @dataclass(frozen=True, kw_only=True)
 class TrackLimits:
-    """When two images tell how far a third moved."""
+    """Limits for estimating the distance to a third image from two others."""
 
     #: A point is known once rays to it are so far apart.
     parallax_rad: float = 0.02
@@ -62,7 +62,7 @@ class Observations:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RelativeTrack:
-    """Where frames were, up to a length, and the points by which they were placed.
+    """Positions of frames up to scale, and the points that determined them.
 
     Attributes
     ----------

@@ -256,7 +256,7 @@ def growing_batches(pairs: Sequence[str], *, first: int = _FIRST_MATCHING_BATCH)
 
 @dataclass(frozen=True, kw_only=True)
 class KeypointRecord:
-    """What the keypoint stages did to one image's keypoints; see :class:`~colmap_inertial.core.types.Keypoints`."""
+    """Record of what the keypoint stages did to one image; see :class:`~colmap_inertial.core.types.Keypoints`."""
 
     name: str
     rectified: bool = False

@@ -123,7 +123,7 @@ def _find_features(
 
 
 def _identify_extraction(options: ReconstructOptions, context: RunContext) -> dict[str, object]:
-    """What decides features beside the images."""
+    """Values that decide the features, beside the images."""
     chosen: list[object] = [options.database_images]
     if options.database is None:
         names = ("max_image_size", "max_num_features", "first_octave")

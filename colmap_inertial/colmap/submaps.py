@@ -195,7 +195,7 @@ def find_ties(
 
 
 def place_parts(count: int, ties: Sequence[SimilarityConstraint]) -> Placements:
-    """Where parts that hang together lie in the first one's world, by all constraints at once."""
+    """Place connected parts in the first one's world, by all constraints at once."""
     order = sorted(ties, key=lambda tie: -float(np.trace(tie.info)))
     start = chained(
         Placements.at_origin(np.ones(count)), 0, order, lambda state, tie, new: tie.attach(state, new, scaled=True)

@@ -75,7 +75,7 @@ class SweptWorkspace:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the pictures, in the order of the views."""
+        """Names of the pictures, in the order of the views."""
         return self._scene[0]
 
     @property

@@ -177,7 +177,7 @@ def _sort_mesh(o3d: ModuleType, mesh: Any) -> Any:
 
 
 def _measure_typical(depth: Float32Array, camera: pycolmap.Camera) -> tuple[float, float]:
-    """What is near in a map, and what a pixel covers there."""
+    """Typical near depth of a map, and the size of a pixel there."""
     known = depth[depth > 0]
     near = float(np.quantile(known, SURFACE.near_quantile)) if len(known) else 0.0
     return near, near / float(camera.mean_focal_length())

@@ -1,4 +1,4 @@
-"""What COLMAP's database holds of pairs of images: rotations, the overlap that was matched, shared features."""
+"""Read pairs of images from COLMAP's database: rotations, matched overlap, shared features."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FramePair = tuple[int, int]
 
 @dataclass(frozen=True, kw_only=True)
 class TwoViewLimits:
-    """When the matches of a pair confirm where its images are."""
+    """Limits for matches that confirm the place of a pair's images."""
 
     #: A rotation of fewer matches is not believed.
     least_matches: int = 30
@@ -105,7 +105,7 @@ def open_features(database: Path) -> Iterator[Features]:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TwoViews:
-    """Of M pairs of images, by their verified matches.
+    """M pairs of images with their verified matches.
 
     Attributes
     ----------
@@ -332,7 +332,7 @@ class Covisibility:
 
     @classmethod
     def of(cls, database: Path, names: Sequence[str]) -> Covisibility:
-        """Of images, from a database that holds their features."""
+        """Read the features of images from a database."""
         descriptors, places = [], []
         with open_features(database) as features:
             for name in names:

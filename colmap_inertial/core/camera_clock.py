@@ -12,7 +12,7 @@ from colmap_inertial.core.types import CameraImuCalibration, ImuRecording
 
 
 def epoch_shift_s(imu: ImuRecording, camera_epoch_ns: int) -> float:
-    """What turns an offset between raw stamps into one between times since the two epochs, by addition."""
+    """Constant that turns an offset between raw stamps into one between times since the two epochs, by addition."""
     return (imu.epoch_ns - camera_epoch_ns) * 1e-9
 
 

@@ -55,7 +55,7 @@ class GyroPath:
         self._coverage = Coverage(t_s)
 
     def covers(self, begin_s: Array, end_s: Array) -> BoolArray:
-        """Which of the intervals lie inside the recording and contain no gap."""
+        """Whether each interval lies inside the recording and contains no gap."""
         return self._coverage.covers(begin_s, end_s)
 
     def at(self, query_s: Array) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""What a user may choose, as the command line and ``config.toml`` have it. Plain values: loading this costs nothing."""
+"""Options of the command line, ``config.toml`` and Python. Plain values: loading them costs nothing."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def _check(
 
 @dataclass(frozen=True, kw_only=True)
 class ReadLimits(CheckedOptions):
-    """How large a file may be that is read: above any camera's and recorder's, below what takes all memory."""
+    """Limits on the size of files: above those of any camera or recorder, below what exhausts the memory."""
 
     megapixels: float = 250
     """Pictures of more pixels (millions) are not decoded."""
@@ -70,7 +70,7 @@ class ReadLimits(CheckedOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class MappingOptions(CheckedOptions):
-    """How COLMAP builds the model."""
+    """Options of COLMAP's mapping."""
 
     pairing: Literal["auto", "exhaustive", "sequential"] = "auto"
     """Which images are matched: every pair, neighbours in time, or `auto`: every pair up to 150 images."""
@@ -104,7 +104,9 @@ class MappingOptions(CheckedOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class GravityOptions(CheckedOptions):
-    """How strong gravity is where something was recorded: a number, or the place; else what spans the Earth."""
+    """Strength of gravity where the recording was made: a number, or the place; else an interval that spans the
+    Earth.
+    """
 
     gravity_m_s2: float | None = None
     """Strength of gravity at the place, known to four digits or better; 9.80665 and 9.81 are nominal, not local."""
@@ -126,7 +128,7 @@ class GravityOptions(CheckedOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class ScaleOptions(GravityOptions):
-    """How the scale is estimated."""
+    """Options of the scale estimate."""
 
     method: Literal["joint", "spectral"] = "joint"
     """joint fits all measurements at once, video or keyframes; spectral compares spectra of accelerations, for
@@ -157,7 +159,7 @@ class JoinOptions(CheckedOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class ValidateOptions(CheckedOptions):
-    """How to validate a model."""
+    """Options of the validation of a model."""
 
     unscaled: bool = False
     """The model claims no unit: report the factor that makes it metric instead of a scale error."""
@@ -180,7 +182,7 @@ class ValidateOptions(CheckedOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class DenseOptions(CheckedOptions):
-    """How the dense reconstruction is made."""
+    """Options of the dense reconstruction."""
 
     max_image_size: int | None = None
     """Longer side in pixels of the undistorted images and their depth maps (default: as the images are with CUDA, at
@@ -196,7 +198,7 @@ class DenseOptions(CheckedOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class FrameOptions(CheckedOptions):
-    """Which frames are used."""
+    """Options of the choice of frames."""
 
     use: Literal["auto", "all"] | None = None
     """auto: as many frames as the motion needs, each the sharpest of its neighbours. Not given: auto for a video, all
@@ -252,7 +254,7 @@ class ProjectOptions(CheckedOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class ReferenceOptions(CheckedOptions):
-    """Where the metres of a project come from, and what is known of its size."""
+    """Source of a project's metres, and known lengths."""
 
     scale_from: Literal["imu", "target", "distance"] = "imu"
     """Where metres come from: the IMU; or, without any IMU, a target of known size in the images, or one known
@@ -274,7 +276,7 @@ class ReferenceOptions(CheckedOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class ApertureOptions(CheckedOptions):
-    """How the pictures of a multi-aperture camera are fused."""
+    """Options of the fusion of a multi-aperture camera's pictures."""
 
     cost: Literal["census", "mutual-information"] = "census"
     """What pixels of different colour are compared by: the order of brightness around them, or how their brightness
@@ -303,7 +305,7 @@ class ApertureOptions(CheckedOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class ExposureOptions(CheckedOptions):
-    """How pairs of a short and a long exposure become frames."""
+    """Options of the fusion of a short and a long exposure."""
 
     fuse: bool = True
     """Fuse them; otherwise the short ones are used as they were filmed."""
@@ -428,7 +430,7 @@ def _check_stage_name(kind: str, name: str) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class BatchOptions(CheckedOptions):
-    """Who works on the captures of a batch."""
+    """Workers of a batch."""
 
     workers: int | None = None
     """Captures in work at once on this machine. Not given: what processors and free memory allow."""
@@ -447,7 +449,7 @@ class BatchOptions(CheckedOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class FuseAperturesOptions(CheckedOptions):
-    """What is made of the pictures of a multi-aperture camera."""
+    """Outputs of the fusion of a multi-aperture camera's pictures."""
 
     fusion: ApertureOptions = field(default_factory=ApertureOptions)
     """How they are fused."""

@@ -16,7 +16,7 @@ PAUSE_STEPS = 3.5
 
 @dataclass(frozen=True, kw_only=True)
 class ClippingLimits:
-    """When readings count as cut off."""
+    """Limits for readings at the end of a sensor's range."""
 
     #: A reading is cut off where its very largest value comes so often, and so many times as often as any value near it
     #: (in parts of the usual range).
@@ -71,14 +71,14 @@ def _column_at_ceiling(values: Array) -> BoolArray:
 
 
 class Coverage:
-    """What samples at (N,) times ``t_s`` cover without a gap."""
+    """Intervals without a gap of samples at (N,) times ``t_s``."""
 
     def __init__(self, t_s: Array) -> None:
         self._t_s = t_s
         self._gaps = np.concatenate([[0], np.cumsum(is_gap(t_s))])
 
     def covers(self, begin_s: Array, end_s: Array) -> BoolArray:
-        """Which of the intervals lie inside the recording and contain no gap."""
+        """Whether each interval lies inside the recording and contains no gap."""
         top = len(self._t_s) - 1
         first = np.searchsorted(self._t_s, begin_s, side="right") - 1
         last = np.searchsorted(self._t_s, end_s, side="left")
@@ -94,7 +94,7 @@ def integral_at(t_s: Array, values: Array, query_s: Array) -> Array:
 
 
 def subtract_running_mean(values: Array, width: int) -> Array:
-    """What of samples (N, k) changes faster than their running mean over ``width`` of them: (N - width + 1, k)."""
+    """High-pass samples (N, k) by subtracting their running mean over ``width`` samples: (N - width + 1, k)."""
     kernel = np.ones(width) / width
     slow = np.stack([np.convolve(column, kernel, mode="valid") for column in values.T], axis=1)
     start = (width - 1) // 2

@@ -12,7 +12,7 @@ Class = TypeVar("Class", bound=type)
 
 @dataclass(frozen=True, kw_only=True)
 class PrintLimits:
-    """How much of a value is printed."""
+    """Limits on the printed size of a value."""
 
     lines: int = 20
     width: int = 100

@@ -1,4 +1,4 @@
-"""How many threads there are, work that several of them share, and how many linear algebra may use."""
+"""Number of threads, work shared by threads, and threads of linear algebra."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _MOST_FRAMES = 4
 
 
 def usable_processors() -> int:
-    """How many processors this process may use."""
+    """Number of processors that this process may use."""
     if hasattr(os, "process_cpu_count"):  # Python 3.13
         return os.process_cpu_count() or 1
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -32,7 +32,7 @@ def usable_cores() -> list[int]:
 
 
 def threads_beside(workers: int) -> int:
-    """How many threads a pool should count that workers share, each of which computes along with it as one of them.
+    """Number of threads of each worker's pool, where workers compute along with their pools.
 
     Then no processor is idle, and none has two.
     """
@@ -40,12 +40,12 @@ def threads_beside(workers: int) -> int:
 
 
 def frames_at_once() -> int:
-    """How many frames to work on at once: one for each processor, but few."""
+    """Number of frames to work on at once: one for each processor, but few."""
     return min(_MOST_FRAMES, usable_processors())
 
 
 def map_in_order(work: Callable[[Item], Result], items: Iterable[Item], *, workers: int) -> Iterator[Result]:
-    """What becomes of items, in their order; ``workers`` are in work at once, and hardly more are held.
+    """Apply a function to items with ``workers`` threads; results come in order, and few are held at a time.
 
     What holds for the caller (a context variable) holds for the work.
 

@@ -38,7 +38,7 @@ def _fits(found: tuple[int, ...], shape: tuple[int | None, ...]) -> bool:
 
 
 def check_field(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Array:
-    """As :func:`check_array`, and what the end of the name says of it.
+    """:func:`check_array`, and the check that the end of the name implies.
 
     Times (``t_s``) increase strictly, quaternions (``xyzw``) have unit norm and are normalised, covariances (``cov``)
     are symmetric with a non-negative diagonal.

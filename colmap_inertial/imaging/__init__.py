@@ -1,1 +1,1 @@
-"""What happens to pixels before feature extraction: blur fields, deconvolution, rolling shutter."""
+"""Images before feature extraction: blur fields, deconvolution, rolling shutter."""

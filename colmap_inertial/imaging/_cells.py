@@ -1,4 +1,4 @@
-"""How an image is divided for deblurring: cells with one set of taps each, and where its pixels stay untouched."""
+"""Division of an image for deblurring: cells with one set of taps each, and borders that stay untouched."""
 
 from __future__ import annotations
 

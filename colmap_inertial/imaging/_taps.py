@@ -39,7 +39,7 @@ def gaussian_weights(sigma_px: float) -> Float32Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Prior:
-    """What the filter assumes of the sharp image, relative to the noise: ``1 / (eps + alpha 4 sin^2(pi f))``."""
+    """Prior of the sharp image, relative to the noise: ``1 / (eps + alpha 4 sin^2(pi f))``."""
 
     alpha: float
     eps: float

@@ -1,4 +1,4 @@
-"""How an image is divided for filters in the Fourier domain: overlapping tiles with one path of blur each."""
+"""Division of an image for filters in the Fourier domain: overlapping tiles with one blur path each."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from colmap_inertial.imaging.blur_path import BlurPath
 
 @dataclass(frozen=True, kw_only=True)
 class TilingLimits:
-    """How tiles are laid out."""
+    """Limits of the layout of tiles."""
 
     #: Part of a tile's side that is left out, since the filter has less than all of the blur there,
     margin: float = 48 / 256
@@ -68,7 +68,7 @@ class Tiling:
 
     @classmethod
     def covering(cls, width: int, height: int, extent_px: float) -> Tiling:
-        """For an image with blur of at most this length."""
+        """Tiles of an image with blur of at most this length."""
         side = TILING.shortest_side_px
         while side < TILING.blurs_per_side * extent_px and side < TILING.longest_side_px:
             side *= 2
@@ -83,7 +83,7 @@ class Tiling:
 
     @property
     def before(self) -> int:
-        """How far the first tile begins before the image."""
+        """Distance from the beginning of the first tile to the image."""
         return self.margin
 
     @property

@@ -72,7 +72,7 @@ class BlurField:
         return np.asarray(np.hypot(self.vector_px[..., 0], self.vector_px[..., 1]), dtype=np.float64)
 
     def unsure_share(self) -> float:
-        """How far off the vectors may be against their length, over the image."""
+        """Uncertainty of the vectors relative to their length, over the image."""
         off, whole = float(self.cov_px2[..., ::2].sum()), float(np.sum(self.vector_px.astype(np.float64) ** 2))
         return (off / whole) ** 0.5 if whole > 0 else 0.0
 

@@ -16,7 +16,7 @@ SAMPLES, SAMPLE_PX = 17, 2.0
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BlurPath:
-    """Where the light that a pixel gathered while it was exposed stands in the sharp picture.
+    """Path of each pixel's light across the sharp picture during the exposure.
 
     The blurred picture is ``g(x) = mean over k of L(x + q_k(x))``, ``L`` the sharp picture of the same shutter. The
     path q has a sign and a middle of its own: reversed in time it is another one where it is curved.
@@ -72,7 +72,7 @@ class BlurPath:
         return bilinear(nodes, np.asarray(rows_px) / self.step_px, np.asarray(columns_px) / self.step_px)
 
     def departure_px(self) -> float:
-        """How far a path leaves a line along its chord at the most, anywhere in the image."""
+        """Largest distance of a path from its chord, anywhere in the image."""
         path = self.path_px - self.path_px.mean(axis=0)
         chord = self.field().vector_px
         line = middles(len(path))[:, None, None, None] * chord
@@ -91,7 +91,7 @@ class BlurPath:
 
 
 def samples_for(extent_px: float) -> int:
-    """How many samples of the exposure blur of this length takes."""
+    """Number of samples of the exposure for blur of this length."""
     return max(SAMPLES, int(np.ceil(extent_px / SAMPLE_PX)))
 
 

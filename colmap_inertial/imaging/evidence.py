@@ -1,4 +1,4 @@
-"""What an image itself says about its motion blur: does it bear out the blur that the gyroscope predicts?
+"""Evidence of motion blur in an image: does it confirm the blur that the gyroscope predicts?
 
 An image smeared by L pixels along a direction has a spectrum with zeros every 1/L, and therefore a dip in its
 cepstrum (the inverse transform of the logarithm of its power spectrum) at that lag, in that direction and in no
@@ -26,7 +26,7 @@ DIRECTIONS_RAD = np.radians(np.arange(0.0, 180.0, 15.0))
 
 @dataclass(frozen=True, kw_only=True)
 class EvidenceLimits:
-    """What the evidence of blur is looked for in, and what it is weighed by."""
+    """Settings of the search for evidence of blur, and its weights."""
 
     #: Side of the smallest tiles.
     smallest_tile_px: int = 64
@@ -112,7 +112,7 @@ class BlurEvidence:
 
     @classmethod
     def nothing(cls) -> BlurEvidence:
-        """Of no image."""
+        """Evidence of no image."""
         zero = np.zeros((len(FACTORS), len(DIRECTIONS_RAD)))
         return cls(total=zero, total_square=zero, mirrored=zero[:, :1], mirrored_square=zero[:, :1], tiles=0)
 
@@ -161,7 +161,7 @@ class BlurEvidence:
 
     @property
     def mirrored_support(self) -> float:
-        """As ``support``, in the direction that a gyroscope with one axis flipped would predict.
+        """``support`` in the direction that a gyroscope with one axis flipped would predict.
 
         What textures have of their own, which is upright or level, is the same in both.
         """
@@ -198,7 +198,7 @@ def blur_evidence(image: UInt8Array | UInt16Array, blur: BlurField | BlurPath) -
 
 
 def _sum_tiles(values: Array, mirrored: Array, lengths_px: Array, weight: Array) -> BlurEvidence:
-    """Of tiles' depths, (N, FACTORS, DIRECTIONS_RAD) and (N, FACTORS, 1)."""
+    """Sums of the depths of tiles, (N, FACTORS, DIRECTIONS_RAD) and (N, FACTORS, 1)."""
     values, mirrored = (weight[:, None, None] * depths for depths in (values, mirrored))
     return BlurEvidence(
         total=values.sum(axis=0),
@@ -211,7 +211,7 @@ def _sum_tiles(values: Array, mirrored: Array, lengths_px: Array, weight: Array)
 
 
 def measure_blur_share(image: UInt8Array | UInt16Array, blur: BlurField | BlurPath) -> float | None:
-    """How much of the fall of detail that a blur predicts an image has: 1 where it is blurred so, 0 where it is sharp.
+    """Share of the loss of detail that a blur predicts: 1 where the image is blurred so, 0 where it is sharp.
 
     At one distance from the origin of a tile's spectrum, blur leaves the directions across it as they were and takes
     power from those along it: ``log((S |K|^2 + n) / (S + n))``, with the path's own transfer K, a 1/f^2 picture S as
@@ -230,7 +230,7 @@ def measure_blur_share(image: UInt8Array | UInt16Array, blur: BlurField | BlurPa
 def measure_blur_shares(
     image: UInt8Array | UInt16Array, blur: BlurField | BlurPath
 ) -> tuple[float | None, float | None]:
-    """As `measure_blur_share`, and that of the blur that a gyroscope with one axis flipped would predict."""
+    """`measure_blur_share`, and the share of the blur that a gyroscope with one axis flipped would predict."""
     path = BlurPath.straight(blur) if isinstance(blur, BlurField) else blur
     found = _compute_spectra(image, path, _LIMITS.few_tiles)
     if found is None:
@@ -380,7 +380,9 @@ def _compute_transfer(path_px: Array, x: Array, y: Array) -> Array:
 
 
 def _leak_window(power: Array) -> Array:
-    """As a tile under Hann's window has it: each frequency takes a sixth of either neighbour; without the outermost."""
+    """Leakage of a tile under Hann's window: each frequency takes a sixth of either neighbour; without the
+    outermost.
+    """
     for axis in (1, 2):
         inner = np.moveaxis(power, axis, 0)
         power = np.moveaxis((inner[:-2] + 4 * inner[1:-1] + inner[2:]) / 6, 0, axis)

@@ -29,7 +29,9 @@ Action = Literal["keep", "deblur", "drop"]
 
 @dataclass(frozen=True, kw_only=True)
 class GateOptions:
-    """What is deblurred. Blur is the 90th percentile over the image, scaled to an image 1920 px wide."""
+    """Options of the choice of frames to deblur. Blur is the 90th percentile over the image, scaled to an image 1920 px
+    wide.
+    """
 
     skip_below_px: float = 3.0
     """Less blur than this is left alone."""
@@ -63,7 +65,7 @@ class GateOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class FrameDecision:
-    """What happens to one frame, and why.
+    """Decision on one frame, with the reason.
 
     Attributes
     ----------
@@ -131,7 +133,7 @@ def decide(
 def _find_droppable(
     candidate: BoolArray, px: Array, t_s: Array, motion: GyroCamera | None, options: GateOptions
 ) -> BoolArray:
-    """Which candidates can go, the most blurred first, without opening too wide a gap between those that stay."""
+    """Candidates that can be dropped, the most blurred first, without too wide a gap between those that stay."""
     looking = None if motion is None else motion.start_from_cam(t_s)
     stays = np.ones(len(px), dtype=np.bool_)
     before, after = np.arange(len(px)) - 1, np.arange(len(px)) + 1
@@ -154,7 +156,7 @@ def _find_droppable(
 
 @dataclass(frozen=True, kw_only=True)
 class GateLimits:
-    """What the gate decides by, beside the options."""
+    """Limits of the gate, beside the options."""
 
     #: An extent is corrected where it is off by a larger share,
     corrected_from: float = 0.1
@@ -259,7 +261,7 @@ def _judge_evidence(evidence: Sequence[BlurEvidence], options: GateOptions) -> R
 
 
 def _is_clear_together(telling: Sequence[BlurEvidence], together: BlurEvidence) -> bool:
-    """Whether many frames, of which none says much, bear the gyroscope out, and no flipped axis."""
+    """Whether many individually weak frames together confirm the gyroscope, and no flipped axis."""
     if (
         together.support - max(0.0, together.mirrored_support) < GATE_LIMITS.together_support
         or not together.extent_is_plausible
@@ -353,7 +355,7 @@ def _lacks_dip(image: NDArray[Code], curve: BlurPath, options: GateOptions) -> b
 
 @dataclass(frozen=True, kw_only=True)
 class SharpBlockLimits:
-    """Which blocks of a deblurred frame keep their original pixels (:func:`keep_sharp`)."""
+    """Limits for blocks of a deblurred frame that keep their original pixels (:func:`keep_sharp`)."""
 
     #: Side of the blocks that keep or give up their pixels together.
     block_px: int = 32

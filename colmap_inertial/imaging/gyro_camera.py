@@ -1,4 +1,4 @@
-"""How a camera rotates while it exposes: the gyroscope on the camera's clock, and the order in which lines expose."""
+"""Rotation of a camera during its exposure: the gyroscope on the camera's clock, and the exposure of each line."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MOST_BIAS_RAD_S = 0.01
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MotionErrors:
-    """How far off a camera's turning may be, by its gyroscope.
+    """Errors of a camera's rotation due to its gyroscope.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class MotionErrors:
 
     @classmethod
     def of(cls, calibration: CameraImuCalibration) -> MotionErrors:
-        """As a calibration's covariance says."""
+        """Errors by a calibration's covariance."""
         turn = matrix_from_quat(calibration.cam_from_imu_xyzw)
         bias = calibration.cov[CAL.GYRO_BIAS, CAL.GYRO_BIAS]
         bias = bias * min(1.0, MOST_BIAS_RAD_S**2 / max(float(np.diagonal(bias).max()), 1e-30))
@@ -137,7 +137,7 @@ class GyroCamera:
 
 @dataclass(frozen=True, kw_only=True)
 class FrameShutter:
-    """When each line of one frame is exposed, camera clock.
+    """Exposure of each line of one frame, on the camera's clock.
 
     Attributes
     ----------
@@ -168,7 +168,7 @@ class FrameShutter:
 
     @classmethod
     def of(cls, timing: FrameTiming, index: int, *, width: int, height: int) -> FrameShutter:
-        """Of one frame of a recording; a readout that is unknown counts as none."""
+        """The shutter of one frame of a recording; an unknown readout counts as none."""
         return cls(
             width=width,
             height=height,

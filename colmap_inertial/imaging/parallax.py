@@ -1,4 +1,4 @@
-"""What a camera's translation does to its image: the part of the blur that no gyroscope measures.
+"""Image motion by the camera's translation: the part of the blur that the gyroscope does not measure.
 
 Close to things, a hand's translation blurs as much as its rotation. It takes the camera's velocity and the depth of
 what it sees, from a model of some sort; the lengths' unit is of no matter, as only velocity by depth counts.
@@ -21,7 +21,7 @@ from colmap_inertial.imaging.blur_field import BlurField, check_nodes
 
 @dataclass(frozen=True, kw_only=True)
 class ParallaxLimits:
-    """How depths are spread over an image."""
+    """Limits for spreading depths over an image."""
 
     #: Spacing of the nodes, as a share of the longer side: depths between a few hundred points tell no more.
     step_share: float = 1 / 24
@@ -40,7 +40,7 @@ _LIMITS = ParallaxLimits()
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Parallax:
-    """How fast a camera moves past what one of its frames shows.
+    """Velocity of a camera relative to the depths in one of its frames.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class Parallax:
         return interpolate_nodes(self.inverse_depth[..., None], at) * self.velocity_in_cam
 
     def as_json(self) -> dict[str, object]:
-        """In JSON types; the unit of length becomes the median depth, and four digits are kept."""
+        """As JSON types; the unit of length becomes the median depth, and four digits are kept."""
         unit = float(np.median(self.inverse_depth)) or 1.0
         return {
             "width": self.width,
@@ -87,7 +87,7 @@ class Parallax:
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Parallax:
-        """What :meth:`as_json` made."""
+        """Inverse of :meth:`as_json`."""
         return cls(**values)
 
 

@@ -26,7 +26,7 @@ Code = TypeVar("Code", np.uint8, np.uint16)
 
 @dataclass(frozen=True, kw_only=True)
 class PathFilterModel:
-    """What the filters along paths assume of pictures and their noise."""
+    """Model of pictures and their noise in the filters along paths."""
 
     #: Noise counts so many times: for JPEG's errors, and for paths that change within a tile.
     noise_factor: float = 8.0
@@ -118,7 +118,9 @@ class Noise:
 
     @classmethod
     def fitted(cls, found: Array) -> Noise:
-        """To the light and the variance of (N, 2) tiles, some of which show more than noise: by least distances."""
+        """Fit the model to the light and the variance of (N, 2) tiles, some of which show more than noise, by least
+        distances.
+        """
         if not len(found):
             return cls(FILTER_MODEL.least_noise**2, 0.0)
         light, variance = found.T
@@ -135,7 +137,7 @@ class Noise:
 
 
 def noise_along(light: Float32Array, tiling: Tiling, paths: Float32Array, threads: int = 0) -> tuple[Noise, ...]:
-    """Of each channel of (H, W, C) linear light: what shows at frequencies that the blur leaves nothing of.
+    """Noise of each channel of (H, W, C) linear light, from frequencies that the blur removes.
 
     So the errors of compression count, and those of the path.
     """

@@ -21,7 +21,7 @@ from colmap_inertial.imaging.rolling_shutter import rays
 
 @dataclass(frozen=True, kw_only=True)
 class PredictionGrid:
-    """Where blur is predicted, and how many exposures at once."""
+    """Grid of the prediction of blur, and exposures at once."""
 
     #: Nodes at which the blur of a frame is predicted, and frames predicted together.
     predicted_columns: int = 7
@@ -37,7 +37,7 @@ _LIMITS = PredictionGrid()
 
 
 class Camera(Projector, Protocol):
-    """Intrinsics that know the size of their images; ``pycolmap.Camera`` is one."""
+    """Intrinsics with image sizes; ``pycolmap.Camera`` is one."""
 
     @property
     def width(self) -> int: ...
@@ -191,7 +191,7 @@ def blur_path(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PredictedBlur:
-    """How blurred the frames of a recording are, before any of them is decoded.
+    """Blur of the frames of a recording, before any is decoded.
 
     Attributes
     ----------

@@ -20,7 +20,7 @@ Pixel = TypeVar("Pixel", np.uint8, np.uint16)
 
 @dataclass(frozen=True, kw_only=True)
 class RectificationLimits:
-    """When the row of a rectified point has settled."""
+    """Convergence of the row of a rectified point."""
 
     #: Each round of the fixed-point iteration gains one to three digits: by how much less the image moves within a
     #: readout than the shutter does.

@@ -1,4 +1,4 @@
-"""Which frames of a video to use: the least blurred of each stretch that brings enough baseline.
+"""Choose frames of a video: the least blurred of each stretch with enough baseline.
 
 A video is looked at in small grey images. Corners are followed from image to image; what they moved beyond the
 camera's rotation is the baseline. From the last chosen frame on, a window closes when the baseline is enough, when the
@@ -28,7 +28,7 @@ Ranking = Literal["blur", "speed", "sharpness"]
 
 @dataclass(frozen=True, kw_only=True)
 class FollowerLimits:
-    """How corners are followed from image to image."""
+    """Limits of tracking corners from image to image."""
 
     #: Images are followed at this size.
     followed_px: int = 480
@@ -49,7 +49,7 @@ _LIMITS = FollowerLimits()
 
 @dataclass(frozen=True, kw_only=True)
 class WindowLimits:
-    """When a window closes. Lengths are shares of the image's longer side, as medians over the image.
+    """Limits of a window. Lengths are shares of the image's longer side, as medians over the image.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class WindowLimits:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Ranked:
-    """What is known of the frames to look at before any is decoded.
+    """Ranking of the frames before any is decoded.
 
     Attributes
     ----------

@@ -17,7 +17,7 @@ MOST = (2 * CENSUS_RADIUS + 1) ** 2 - 1
 
 @dataclass(frozen=True, kw_only=True)
 class MatchingLimits:
-    """What semi-global matching weighs, and the memory that it takes."""
+    """Weights and memory of semi-global matching."""
 
     #: A pixel that no view sees costs this share of the most: more than a good match, less than a poor one.
     unseen: float = 0.25

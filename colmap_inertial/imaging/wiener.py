@@ -29,7 +29,7 @@ LONGEST_PX = 500.0
 
 @dataclass(frozen=True, kw_only=True)
 class DeblurOptions:
-    """How blur is undone."""
+    """Options of the deconvolution."""
 
     noise: float | None = None
     """Standard deviation of the image noise in linear light, full scale = 1; estimated from each image where absent."""

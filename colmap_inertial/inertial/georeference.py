@@ -1,4 +1,4 @@
-"""Where on Earth a metric model stands, by positions of a satellite receiver: heading and place, never the scale.
+"""Heading and place of a metric model on Earth, from positions of a satellite receiver; never the scale.
 
 A path in metres with gravity along an axis fits to positions by four numbers: a turn about the vertical and a shift.
 Errors of such positions are white in part, and in part alike over minutes; how much of each is not known beforehand.
@@ -35,7 +35,7 @@ _ECCENTRICITY2 = FLATTENING * (2 - FLATTENING)
 
 @dataclass(frozen=True, kw_only=True)
 class GeoreferenceLimits:
-    """How positions of a receiver are fitted, and when the fit decides."""
+    """Limits of the fit to a receiver's positions."""
 
     #: Sizes of the errors on the grid (standard deviation of each horizontal coordinate), and how long they are alike.
     white_m: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0)
@@ -74,7 +74,7 @@ _LIMITS = GeoreferenceLimits()
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Georeference:
-    """How a metric model stands on Earth.
+    """Pose of a metric model on Earth.
 
     East, north and up count from a point at ``latitude_deg``, ``longitude_deg``, ``height_m`` in its tangential plane:
     ``enu = enu_from_world (3, 3) @ world + shift_m``.

@@ -73,7 +73,7 @@ _CLOCK = frozenset({"clock_rate", "clock_middle_s"})
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Declared:
-    """What is stated of the camera and the IMU of a device, ``None`` where nothing is, and how sure it is.
+    """Stated values of a device's camera and IMU, ``None`` where nothing is stated, with uncertainties.
 
     Attributes
     ----------
@@ -157,7 +157,7 @@ def largest_offset_s(shared_clock: bool, asked: float | None = None) -> float | 
 
 
 def reset_for_recording(calibration: CameraImuCalibration, *, shared_clock: bool = False) -> CameraImuCalibration:
-    """What a calibration of one recording says about the next one of the same device.
+    """Turn a calibration from one recording into a prior for the next one of the same device.
 
     Rotation, lever arm, readout and the accelerometer's delay against the gyroscope stay; the time offset, its growth
     and the gyroscope's bias change with every recording and are opened again. With ``shared_clock`` the offset stays
@@ -243,7 +243,7 @@ def _read_fields(
 
 
 def _field_fault(value: object, kind: str) -> str | None:
-    """What is wrong with a value from JSON for a field of this annotation; ``None`` where nothing is."""
+    """Reason why a value from JSON does not fit a field's annotation; ``None`` where it does."""
     if kind == "str":
         return None if isinstance(value, str) else ": expected a text"
     if kind == "int":
@@ -273,7 +273,7 @@ _WORDS = {CAMERA_IMU: "how camera and IMU relate", IMU: "the IMU's own gains"}
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Calibrations:
-    """What is known of a device from files: how camera and IMU relate, and the IMU's own; ``None`` where nothing is.
+    """Calibrations of a device from files: camera to IMU, and the IMU's own; ``None`` where missing.
 
     Attributes
     ----------
@@ -307,7 +307,7 @@ def read_imu_calibration(path: StrPath) -> ImuCalibration:
 
 
 def calibration_kind(path: StrPath) -> str:
-    """What a calibration file holds: ``"camera-imu"`` or ``"imu"``.
+    """Kind of a calibration file: ``"camera-imu"`` or ``"imu"``.
 
     Raises
     ------
@@ -335,7 +335,7 @@ def list_paths(paths: CalibrationFiles) -> tuple[Path, ...]:
 
 
 def describe_files(paths: CalibrationFiles) -> list[dict[str, str]]:
-    """What a result says of the calibration files that were used: path and kind of each."""
+    """Calibration files in a result: path and kind of each."""
     return [{"path": str(path.resolve()), "kind": calibration_kind(path)} for path in list_paths(paths)]
 
 
@@ -360,7 +360,7 @@ def read_calibrations(paths: CalibrationFiles) -> Calibrations:
 
 
 def read_for_recording(paths: CalibrationFiles, *, shared_clock: bool = False) -> Calibrations:
-    """As :func:`read_calibrations`; of camera and IMU, what they say about another recording of the device."""
+    """:func:`read_calibrations` as priors for another recording of the device."""
     found = read_calibrations(paths)
     if found.camera_imu is None:
         return found

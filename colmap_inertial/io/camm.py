@@ -89,7 +89,7 @@ def read_camm_frames(path: Path) -> FrameLog:
 
 
 def read_camm_positions(path: Path) -> PositionFixes | None:
-    """Where the receiver was, on the video's clock; ``None`` where the track has no positions.
+    """Positions of the receiver, on the video's clock; ``None`` where the track has none.
 
     Raises
     ------

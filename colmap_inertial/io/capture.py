@@ -241,7 +241,7 @@ def _read_imu(table: Section, capture: Capture) -> Capture:
 
 
 def _read_timing(table: Section, capture: Capture) -> Capture:
-    """What the user states goes before what the recorder noted, and that before what others published."""
+    """Read frame times: those of the user override those of the recorder, and these override published ones."""
     capture = _add_recorder_notes(capture)
     directions: tuple[ReadoutDirection, ...] = get_args(ReadoutDirection)
     exposure_s, readout_s = table.number("exposure_s", low=0, high=10), table.number("readout_s", low=0, high=0.5)

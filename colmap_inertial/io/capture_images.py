@@ -66,7 +66,7 @@ from colmap_inertial.io.units import TIME_UNITS_NS, seconds
 
 @dataclass(frozen=True, kw_only=True)
 class SubImages:
-    """Where one aperture's pictures are.
+    """Location of one aperture's pictures.
 
     Attributes
     ----------
@@ -199,7 +199,7 @@ _FARTHEST_S = 10.0
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LongTiming:
-    """When the long exposures were made.
+    """Times of the long exposures.
 
     Attributes
     ----------
@@ -279,7 +279,7 @@ class LongExposures:
         return [self.path(name) for name in names]
 
     def timing(self, short: FrameTiming) -> LongTiming | None:
-        """When the long exposures were made; ``None`` where their start or their exposure time is unknown.
+        """Times of the long exposures; ``None`` where their start or their exposure time is unknown.
 
         Raises
         ------

@@ -213,7 +213,7 @@ def _read_noise(table: Section | None) -> ImuNoise | None:
 
 
 def _read_correction(table: Section | None, quantity: Quantity) -> tuple[str | None, Axes | None]:
-    """What a sensor's table may say beside ``[imu] path``."""
+    """Read the corrections that a sensor's table may have beside ``[imu] path``."""
     if table is None:
         return None, None
     if "file" in table:

@@ -29,7 +29,7 @@ _EPOCH = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
 
 
 class _Tag(IntEnum):
-    """Of EXIF (CIPA DC-008): its directories, DateTimeOriginal and what belongs to it, PhotographicSensitivity."""
+    """EXIF tags (CIPA DC-008): directories, DateTimeOriginal and its companions, PhotographicSensitivity."""
 
     EXIF, GPS = 0x8769, 0x8825
     DATE, OFFSET, FRACTION = 0x9003, 0x9011, 0x9291
@@ -37,13 +37,13 @@ class _Tag(IntEnum):
 
 
 class _GpsTag(IntEnum):
-    """Of the directory of positions: GPSLatitudeRef and so on; GPSHPositioningError."""
+    """EXIF tags of positions: GPSLatitudeRef and so on; GPSHPositioningError."""
 
     LATITUDE_REF, LATITUDE, LONGITUDE_REF, LONGITUDE, HEIGHT_REF, HEIGHT, ERROR = 1, 2, 3, 4, 5, 6, 31
 
 
 class _Type(IntEnum):
-    """Of an entry's value."""
+    """EXIF types of a value."""
 
     ASCII, SHORT = 2, 3
 
@@ -175,7 +175,7 @@ def exposure_of(head: bytes) -> tuple[float | None, float | None]:
 
 
 def position_of(head: bytes) -> tuple[float, float, float, float, HeightDatum] | None:
-    """Where a picture was taken, by the EXIF in the head of its file; ``None`` where it does not say.
+    """Position from the EXIF in the head of a picture's file; ``None`` where there is none.
 
     Returns
     -------

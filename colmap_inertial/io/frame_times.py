@@ -1,4 +1,4 @@
-"""When frames were exposed: from file names, CSV files, a recorder's log. Never from an index and a frame rate."""
+"""Exposure times of frames from file names, CSV files, or a recorder's log; never from an index and a frame rate."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class FrameStamps:
     source: Path | None = None
 
     def timing(self, *, exposure_s: float | None = None, readout_s: float | None = None) -> FrameTiming:
-        """As a :class:`FrameTiming`; ``exposure_s`` fills in where the stamps bring none.
+        """As a :class:`FrameTiming`; ``exposure_s`` is used where the stamps have none.
 
         Raises
         ------
@@ -82,7 +82,7 @@ class FrameStamps:
         )
 
     def one_per_frame(self, first_of: Mapping[str, str]) -> FrameStamps:
-        """With one image for each frame of a rig.
+        """The table with one image for each frame of a rig.
 
         Parameters
         ----------

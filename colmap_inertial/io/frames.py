@@ -84,7 +84,7 @@ def _places(timing: FrameTiming, only: Collection[str] | None) -> IndexArray:
 
 
 def read_frame_timing(capture: Capture | Path, first_of: Mapping[str, str] = NO_RIGS) -> FrameTiming:
-    """When the frames of a capture were exposed, without decoding any; see :func:`read_frames`.
+    """Exposure times of a capture's frames, without decoding any; see :func:`read_frames`.
 
     ``first_of`` names the image that stands for each frame of a rig (:meth:`FrameStamps.one_per_frame`).
     """

@@ -125,7 +125,7 @@ def _number(path: Path, header: dict[str, tuple[str, int]], key: str, default: f
 
 
 def _orientation(path: Path, header: dict[str, tuple[str, int]]) -> Axes:
-    """Which column is which axis; as written where the log does not say."""
+    """Map of columns to axes; as written where the log does not state it."""
     text, line = header.get("orientation", ("XYZ", 1))
     try:
         return Axes.of_letters(text)

@@ -48,7 +48,7 @@ _USUAL_ORDER = "YxZ"
 
 @dataclass(frozen=True, kw_only=True)
 class _GoproLimits:
-    """What is believed of a GoPro's telemetry."""
+    """Limits for a GoPro's telemetry."""
 
     #: Standard deviation of a position where the dilution of precision is 1; beyond the largest one, a position says
     #: nothing.
@@ -102,7 +102,7 @@ def read_gopro(path: Path, units: DeclaredUnits) -> ImuRecording:
 
 
 def read_gopro_frames(path: Path) -> FrameLog:
-    """What a GoPro video's telemetry says about its frames.
+    """Notes of a GoPro video's telemetry on its frames.
 
     Raises
     ------
@@ -143,7 +143,7 @@ def read_gopro_frames(path: Path) -> FrameLog:
 
 
 def read_gopro_positions(path: Path) -> PositionFixes | None:
-    """Where a GoPro's receiver was, on the video's clock; ``None`` where it wrote nothing or never had a fix.
+    """Positions of a GoPro's receiver, on the video's clock; ``None`` without telemetry of it, or without a fix.
 
     Raises
     ------
@@ -184,7 +184,7 @@ def read_gopro_positions(path: Path) -> PositionFixes | None:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Telemetry:
-    """What the camera with the gyroscope wrote.
+    """Telemetry of the camera that has the gyroscope.
 
     Attributes
     ----------
@@ -231,7 +231,7 @@ class _Telemetry:
 
 
 def _temperature_c(streams: dict[str, Stream]) -> float | None:
-    """What the camera says beside its sensors' readings, degrees Celsius; ``None`` where it says nothing possible."""
+    """Temperature beside the sensors' readings, degrees Celsius; ``None`` where missing or impossible."""
     stream = streams.get("TMPC")
     readings = np.empty(0) if stream is None or not stream.data else stream.values[:, 0]
     readings = readings[np.abs(readings) < _LIMITS.hottest_c]

@@ -234,7 +234,7 @@ def _stamp(inside: dict[str, Entry], key: str) -> int | None:
 
 
 def spread(stamp_ns: Int64Array, count: Int64Array, reach: int, lost_share: float) -> Int64Array:
-    """When each sample was taken, from the stamps of the first sample of each payload.
+    """Times of samples, from the stamps of the first sample of each payload.
 
     Samples are even within a payload, stamps jitter by what the camera was busy with. So a line is fitted to the stamps
     around each payload against the number of samples, and samples lie evenly between the fitted stamps. Where samples

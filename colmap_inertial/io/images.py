@@ -88,7 +88,9 @@ def require_modest(path: Path, data: bytes) -> None:
 
 
 def _weigh(data: bytes, pixels: int) -> float:
-    """How many pixels of three bytes take as much memory as one of a PNG or TIFF, which pack millions to nothing."""
+    """Memory of a pixel of a PNG or TIFF in pixels of three bytes: these formats compress millions of pixels to
+    nothing.
+    """
     if data.startswith(PNG):
         # with alpha it is there twice until that is dropped
         pixel_bytes = data[24] / 8 * {0: 1, 4: 7, 6: 7}.get(data[25], 3)
@@ -143,7 +145,7 @@ def grey_8bit(image: UInt8Array | UInt16Array) -> UInt8Array:
 
 
 def _fault(data: bytes) -> str | None:
-    """What is wrong with the bytes of a picture, as far as its format tells; decoders pass over some of it."""
+    """Fault in the bytes of a picture, where its format shows it; decoders pass over some of them."""
     if not data:
         return "is empty"
     if data.startswith(b"\xff\xd8"):

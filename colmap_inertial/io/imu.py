@@ -48,7 +48,7 @@ def read_imu(path: StrPath, *, format: str = "auto") -> ImuRecording:
 
 @reader("an inertial recording")
 def read_raw_imu(path: Path, *, format: str = "auto") -> RawImu:
-    """As :func:`read_imu`, without looking whether the numbers are plausible: for those who look themselves."""
+    """:func:`read_imu` without the check that the numbers are plausible, for callers who check themselves."""
     if format == "capture" or (format == "auto" and is_capture(path)):
         return read_raw_capture_imu(load_capture(path))
     return RawImu(imu=find_imu_format(path, format).read(path, DeclaredUnits()), path=path)
@@ -56,7 +56,7 @@ def read_raw_imu(path: Path, *, format: str = "auto") -> RawImu:
 
 @reader("an inertial recording")
 def read_frame_log(path: StrPath, *, format: str = "auto") -> FrameLog | None:
-    """What a recording says about the frames of its video: times, exposure, readout, stabilisation, intrinsics.
+    """Notes of a recording on the frames of its video: times, exposure, readout, stabilisation, intrinsics.
 
     Parameters
     ----------

@@ -354,7 +354,7 @@ _OWN: tuple[ImuFormat, ...] = (
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Recording:
-    """What was found.
+    """Content of a recording.
 
     Attributes
     ----------

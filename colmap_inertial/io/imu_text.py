@@ -109,7 +109,7 @@ def _gyro(values: Array, time: int | None, accel: int | None) -> tuple[int | Non
 
 @dataclass(frozen=True, kw_only=True)
 class SensorTable:
-    """Where one sensor's samples lie in a text table.
+    """Columns of one sensor in a text table.
 
     Attributes
     ----------

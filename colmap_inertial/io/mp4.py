@@ -98,7 +98,7 @@ class Movie:
         return [data[b:e] for b, e in zip(begin.tolist(), ends.tolist(), strict=True)]
 
     def beyond(self, track: Track) -> Int64Array:
-        """Which of a track's samples do not lie inside the file."""
+        """Whether each of a track's samples lies outside the file."""
         length = self.path.stat().st_size
         return np.flatnonzero((track.offset < 0) | (track.size < 0) | (track.offset + track.size > length))
 
@@ -231,7 +231,7 @@ class _Boxes:
             at += size
 
     def find(self, begin: int, end: int, *names: bytes) -> tuple[int, int] | None:
-        """Where the contents of a nested box lie, or ``None``."""
+        """Location of a nested box's contents, or ``None``."""
         for name, b, e in self.inside(begin, end):
             if name == names[0]:
                 return (b, e) if len(names) == 1 else self.find(b, e, *names[1:])
@@ -334,7 +334,7 @@ def _runs(reader: _Boxes, rows: Int64Array, count: int, what: str) -> Int64Array
 
 
 def _offsets(reader: _Boxes, boxes: dict[bytes, tuple[int, int]], size: Int64Array) -> Int64Array:
-    """Where each sample begins: samples follow each other inside their chunk."""
+    """Offset of each sample: samples follow each other inside their chunk."""
     if b"co64" in boxes:
         chunks = reader.table(boxes[b"co64"], "co64", ">i8", 1)[:, 0]
     else:
@@ -359,7 +359,7 @@ def _offsets(reader: _Boxes, boxes: dict[bytes, tuple[int, int]], size: Int64Arr
 
 
 def _edit_ns(reader: _Boxes, place: tuple[int, int] | None, scale: int, movie_scale: int) -> int:
-    """What an edit list adds to all presentation times: empty edits delay, a first edit inside the media advances."""
+    """Offset of all presentation times by an edit list: empty edits delay, a first edit inside the media advances."""
     if place is None:
         return 0
     begin, end = place

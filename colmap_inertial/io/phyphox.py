@@ -24,7 +24,9 @@ _GYRO, _ACCEL = r"gyroscope {} \(rad/s\)", r"acceleration {} \(m/s(\^2|²)\)"
 
 
 def is_phyphox(path: Path) -> bool:
-    """Whether ``path`` is an export of phyphox with a gyroscope: its tables begin with a time in seconds, named so."""
+    """Whether ``path`` is an export of phyphox with a gyroscope: the first column of its tables is a time in
+    seconds.
+    """
     members = members_of(path)
     return any(_kind(head_of(path, members[name])) == "gyro" for name in sorted(members) if _may_be(name))
 

@@ -27,7 +27,7 @@ from colmap_inertial.io.units import SENSOR_NAMES, STANDARD_GRAVITY_M_S2, Axes, 
 
 @dataclass(frozen=True, kw_only=True)
 class ConsistencyLimits:
-    """What the comparison of readings decides by.
+    """Limits of the comparison of readings.
 
     On 8 handheld recordings, each with 47 wrong readings of its axes, 366 of 376 are named with the right one and none
     with a wrong one; the best other reading of the 8 clean recordings and of a drone has 0.02 in place of
@@ -74,7 +74,7 @@ class Reading:
 
 
 def _readings() -> tuple[Reading, ...]:
-    """As stated; every other order and sign of the axes; other units."""
+    """The readings as stated, in every other order and sign of the axes, and in other units."""
     matrices = []
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         matrix = np.zeros((3, 3))
@@ -395,7 +395,7 @@ def check_consistent(raw: RawImu) -> None:
 
 
 def _mirroring(matrix: Array) -> str:
-    """What is wrong with an accelerometer that a mirrored signed permutation puts right."""
+    """The mirroring of an accelerometer that a signed permutation undoes."""
     kept = np.diag(matrix)
     if np.abs(kept).all() and (kept < 0).sum() == 1:
         return f"it is the accelerometer's {'xyz'[int(np.argmin(kept))]} axis that is mirrored"

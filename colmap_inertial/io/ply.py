@@ -64,7 +64,7 @@ class Element:
 
 @dataclass(frozen=True)
 class Header:
-    """What stands before ``end_header``; ``raw`` has its bytes, ``order`` is ``None`` for ASCII."""
+    """Header of a PLY file; ``raw`` has its bytes, ``order`` is ``None`` for ASCII."""
 
     raw: bytes
     order: str | None
@@ -208,7 +208,7 @@ def is_splats(names: set[str]) -> bool:
 
 
 def _mover(similarity: Similarity, element: Element) -> Mover | SplatMover:
-    """What moves the rows of an element."""
+    """Function that transforms the rows of an element."""
     names = {p.name for p in element.properties} if element.name == "vertex" else set()
     return SplatMover(similarity, names) if is_splats(names) else Mover(similarity, names)
 

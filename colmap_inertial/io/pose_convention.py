@@ -1,4 +1,4 @@
-"""How tables write poses: which way quaternions turn, where w stands, and what the position is."""
+"""Conventions of poses in tables: direction of quaternions, place of w, and meaning of the position."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from colmap_inertial.core.types import CameraTrajectory
 
 @dataclass(frozen=True, kw_only=True)
 class PoseConvention:
-    """How a table writes poses.
+    """Convention of a table of poses.
 
     Attributes
     ----------

@@ -133,7 +133,7 @@ def _opencv(path: Path, sheet: dict[str, Any], metres: float) -> dict[str, Mount
 
 
 def _stereo_pair(path: Path, sheet: dict[str, Any]) -> dict[str, Any]:
-    """What OpenCV's stereo sample writes, as a map for each of the cameras ``1`` and ``2``."""
+    """Output of OpenCV's stereo sample, as a map for each of the cameras ``1`` and ``2``."""
     if not {"R", "T"} <= sheet.keys():
         raise FormatError(path, "R and T of the second camera are missing: put intrinsics and extrinsics in one file")
     shared = {key: sheet[key] for key in ("image_width", "image_height") if key in sheet}

@@ -15,7 +15,7 @@ from colmap_inertial.io.units import SENSOR_NAMES, Quantity, convert_to_si
 
 @dataclass(frozen=True, kw_only=True)
 class SampleLimits:
-    """What is repaired in a recording, and what refuses it."""
+    """Limits for repairing or refusing a recording."""
 
     #: A sample this far behind the newest one before it means that the clock was set back, not that rows changed
     #: places.

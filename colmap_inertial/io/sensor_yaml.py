@@ -59,7 +59,7 @@ class Sheet:
     part: str = ""
 
     def fault(self, reason: str) -> FormatError:
-        """What is wrong with it."""
+        """Reason why the value is wrong."""
         return FormatError(self.path, f"{self.part}: {reason}"[:400] if self.part else reason[:400])
 
     def numbers(self, key: str, count: int | None = None) -> list[float]:

@@ -284,7 +284,7 @@ def split_unit(cell: str) -> tuple[str, str | None]:
 
 
 def recognise(cell: str) -> Column | None:
-    """What a header cell names, or ``None``.
+    """Quantity of a header cell, or ``None``.
 
     Raises
     ------
@@ -319,7 +319,7 @@ def _unit(cell: str, text: str | None, allowed: tuple[str, ...]) -> str | None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Packing:
-    """What a packed table may take, in bytes; real ones take a tenth."""
+    """Limits on the unpacked size of a table, in bytes; real ones take a tenth."""
 
     #: Of memory for each line beside its text.
     line: int = 100

@@ -69,7 +69,7 @@ def seconds(t_ns: Int64Array, epoch_ns: int) -> Array:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Axes:
-    """Which file axes make x, y and z: ``"y,-x,z"`` means x = the file's y, y = minus the file's x, z = its z.
+    """File axes of x, y and z: ``"y,-x,z"`` means x = the file's y, y = minus the file's x, z = its z.
 
     Attributes
     ----------

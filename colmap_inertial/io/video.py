@@ -114,7 +114,7 @@ def decode_video(path: Path, wanted_ns: Int64Array) -> Iterator[tuple[int, UInt8
 
 
 def decode_reduced(path: Path, wanted_ns: Int64Array, long_side_px: int) -> Iterator[tuple[int, UInt8Array]]:
-    """As :func:`decode_video`, but 8 bit of brightness, as coded, not larger than ``long_side_px``: to look at."""
+    """:func:`decode_video`, with 8 bit luma only, not larger than ``long_side_px``: for analysis."""
     for t_ns, frame in _decode_wanted(path, wanted_ns):
         yield t_ns, reduced(_brightness(frame), long_side_px)
 
@@ -296,7 +296,7 @@ def _area(stream: VideoStream) -> int:
 
 
 def _count_lost(path: Path, kind: str, listed: int, not_found: int) -> int:
-    """How many of the frames that an index lists lie beyond the end of the file, where FFmpeg gave fewer than it lists.
+    """Number of frames in an index that lie beyond the end of the file, where FFmpeg gave fewer than the index lists.
 
     An intact file gives fewer, too: what an edit list cuts away is dropped by whole groups of pictures, and AVI counts
     a frame that the camera dropped as an empty one.
@@ -327,7 +327,7 @@ def _ends_inside_riff(path: Path) -> bool:
 
 
 def _read_duration_s(stream: VideoStream) -> float | None:
-    """When the stream ends by its own account, where that was noted at the end of the recording (Matroska)."""
+    """End of the stream as noted at the end of the recording (Matroska)."""
     try:
         hours, minutes, seconds = stream.metadata.get("DURATION", "").split(":")
         return 3600 * int(hours) + 60 * int(minutes) + float(seconds)
@@ -415,7 +415,7 @@ def read_published_readouts() -> tuple[PublishedReadout, ...]:
 
 
 def readout_of_video(path: Path) -> PublishedReadout | None:
-    """What was published of the camera and mode that a video names; ``None`` where it names none, or none known."""
+    """Published readout of the camera and mode that a video names; ``None`` where unnamed or unknown."""
     try:
         mode = video_mode(path)
     except FormatError:

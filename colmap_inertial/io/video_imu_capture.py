@@ -115,7 +115,7 @@ def read_video_imu_capture_frames(path: Path) -> FrameLog:
 
 
 def _stabilisation(file: Path, data: bytes, lens_moves: bool) -> tuple[bool | None, str]:
-    """What the camera's facts (field 2) say: 3 optical, 4 electronic stabilisation; proto3 leaves out what is false."""
+    """Stabilisation in the camera's facts (field 2): 3 optical, 4 electronic; proto3 leaves out what is false."""
     for begin, end in _messages(file, data, 2):
         flags = {number: value for number, value, _ in _fields(file, data, begin, end) if number in (3, 4)}
         words = [name for number, name in ((3, "optical"), (4, "electronic")) if flags.get(number)]
@@ -140,7 +140,7 @@ def _samples(file: Path, t_ns: Int64Array, rows: list[bytes], quantity: Quantity
 
 
 def _messages(file: Path, data: bytes, wanted: int) -> list[tuple[int, int]]:
-    """Where each message of one field of the outermost message lies."""
+    """Location of each message of one field of the outermost message."""
     return [
         value for number, value, _ in _fields(file, data, 0, len(data)) if number == wanted and isinstance(value, tuple)
     ]

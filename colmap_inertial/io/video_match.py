@@ -1,4 +1,6 @@
-"""Which frame of a video a picture is, by its content: through another codec, size or brightness, never by counting."""
+"""Find the frame of a video that a picture shows, by its content: through another codec, size or brightness, never by
+counting.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,7 @@ from colmap_inertial.io.video import decode_grey
 
 @dataclass(frozen=True, kw_only=True)
 class _MatchLimits:
-    """What decides whether a picture is a frame of the video."""
+    """Limits for a picture that is a frame of the video."""
 
     #: Sides of the thumbnails: the small one chooses which frames are compared closely, the large one decides.
     small_px: int = 40
@@ -42,7 +44,7 @@ _LIMITS = _MatchLimits()
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class VideoMatch:
-    """What was found.
+    """Result of the search.
 
     Attributes
     ----------
@@ -88,7 +90,7 @@ class _Candidates:
                 self.distance[i, place], self._frames[i, place], self.t_ns[i, place] = distance, thumbnail, t_ns
 
     def fraction_to_next(self, i: int) -> float:
-        """Where picture ``i`` lies on the way from its best frame (0) to the next best (1); at most half-way."""
+        """Position of picture ``i`` between its best frame (0) and the next best (1); at most half-way."""
         first, second = self.distance[i]
         if not np.isfinite(second):
             return 0.0

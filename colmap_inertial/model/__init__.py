@@ -90,7 +90,7 @@ class Model:
     motion: SolvedMotion | None = None
 
     def scaled(self, estimate: ScaleEstimate, similarity: Similarity | None) -> Model:
-        """With a scale estimate, and where it was not refused in its units; doubts make it weak at most.
+        """Apply a scale estimate, unless its units were refused; doubts make it weak at most.
 
         Raises
         ------
@@ -129,7 +129,7 @@ def model_format(folder: Path) -> str | None:
 
 
 def require_format(folder: Path) -> str:
-    """As :func:`model_format`; a :class:`FormatError` where the folder holds no model."""
+    """:func:`model_format`; a :class:`FormatError` where the folder holds no model."""
     suffix = model_format(folder)
     if suffix is None:
         raise FormatError(folder, "no COLMAP model here (cameras, images and points3D, .bin or .txt)")
@@ -400,7 +400,7 @@ def load_pycolmap() -> None:
 
 
 def points_of_features(image: pycolmap.Image) -> Int64Array:
-    """Of an image's features, the numbers of their points; -1 without one."""
+    """Point numbers of an image's features; -1 without a point."""
     points = np.full(image.num_points2D(), -1, dtype=np.int64)
     seen = np.array(image.get_observation_point2D_idxs(), dtype=np.intp)
     points[seen] = [point.point3D_id for point in image.get_observation_points2D()]

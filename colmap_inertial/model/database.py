@@ -61,7 +61,7 @@ _SAME_FRAME = 0.1
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PlacedModel:
-    """Where a model's cameras stand, and what becomes of it.
+    """Positions of a model's cameras, and its transform.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ class PlacedModel:
         return float(np.linalg.norm(np.ptp(centres, axis=0)))
 
     def has_cameras_at(self, pairs: Sequence[tuple[Array, Array]]) -> bool:
-        """Whether centres of its cameras, each with where it stands elsewhere, are in the same places."""
+        """Whether centres of its cameras, each with its position elsewhere, are at the same positions."""
         return are_near(pairs, max(_SAME_CENTRE * self.extent(), 1e-9))
 
 
@@ -94,7 +94,7 @@ def are_near(pairs: Sequence[tuple[Array, Array]], largest: float) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class DatabaseChange:
-    """What was moved: numbers of rows, and the models whose priors and rigs the database has."""
+    """Changes of a database: numbers of rows, and the models whose priors and rigs it has."""
 
     priors_moved: int = 0
     priors_kept: int = 0
@@ -284,7 +284,9 @@ def _are_in_frame(
     model: int,
     decided: Collection[int] | None,
 ) -> bool:
-    """Whether there are rows and they are in the frame of a model of this size: as was decided, or by their places."""
+    """Whether there are rows and they are in the frame of a model of this size, by an earlier decision or by their
+    positions.
+    """
     if not rows or decided is not None:
         return bool(rows) and decided is not None and model in decided
     return are_near([(row.place, places[row.key]) for row in rows], _SAME_FRAME * size)

@@ -33,7 +33,7 @@ def foreign_kind(path: Path) -> str | None:
 
 
 def kind_of(file: Path, path: Path) -> str | None:
-    """What a file is, where it carries length; damaged maps are refused here even where they would not change."""
+    """Kind of a file that carries length; damaged maps are refused here even where they would not change."""
     suffix = path.suffix.lower()
     stereo = path.parts[:-1]
     if suffix == ".bin" and "depth_maps" in stereo:

@@ -38,7 +38,8 @@ def is_transforms(path: Path) -> bool:
 
 
 def cameras_are_those_of(path: Path, placed: Sequence[PlacedModel]) -> bool:
-    """Whether the file's cameras stand where those of one of the models do, once ``applied_transform`` is undone.
+    """Whether the file's cameras have the positions of those of one of the models, once ``applied_transform`` is
+    undone.
 
     Some programs write cameras that they have turned, moved and scaled without saying how: a similarity of the model is
     none of theirs.
@@ -159,7 +160,7 @@ def transform_export(source: Path, target: Path, similarity: Similarity) -> tupl
 
 
 def _describe_metres(values: Mapping[str, Any], similarity: Similarity) -> dict[str, Any]:
-    """What an export of unknown unit says once a similarity made it metric."""
+    """Unit of an export that a similarity made metric, in words."""
     up = values.get("up_in_world")
     up = _up(similarity) if up is None else up
     sigma = math.sqrt(similarity.cov[0, 0])

@@ -1,4 +1,4 @@
-"""How well the images of a model say where it has them."""
+"""Covariances of the poses of a model's images."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class PointLimits:
-    """How many observations a model needs, and how many are looked at."""
+    """Numbers of observations that a model needs and that are used."""
 
     #: Observations of an image that its covariance is computed from: fewer do not tell, more are not needed.
     fewest_observations: int = 10

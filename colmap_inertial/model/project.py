@@ -40,7 +40,7 @@ from colmap_inertial.model.soundness import check_binary_model
 
 @dataclass(frozen=True, kw_only=True)
 class Change:
-    """What was done to one file or model folder: its path in the project, what it is, what changed, whose frame."""
+    """Change of one file or model folder: its path in the project, its kind, the change, and the model of its frame."""
 
     path: str
     kind: str
@@ -50,7 +50,7 @@ class Change:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Applied:
-    """What :func:`apply_to_project` or :func:`undo_project` did.
+    """Result of :func:`apply_to_project` or :func:`undo_project`.
 
     Attributes
     ----------
@@ -204,7 +204,7 @@ def _assign_scales(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Plan:
-    """What a copy of a project is made by.
+    """Plan of a copy of a project.
 
     Attributes
     ----------
@@ -234,7 +234,7 @@ class _Plan:
 
     @property
     def similarities(self) -> dict[int, Similarity | None]:
-        """By sub-model."""
+        """Similarities by sub-model."""
         return {index: scale.similarity for index, scale in self.by_model.items()}
 
 
@@ -357,7 +357,7 @@ class _Work:
         return databases, jobs
 
     def _is_of_a_model(self, layout: Layout, path: Path) -> bool:
-        """Whether cameras of a NeRF trainer are those of the models here; the user hears where they are not."""
+        """Whether a NeRF trainer's cameras are those of a model here; the user is told where they are not."""
         if cameras_are_those_of(self._project / path, layout.placed):
             return True
         self._notes.append(f"{path}: copied as it is, as its cameras do not stand where those of a model do")
@@ -374,7 +374,7 @@ class _Work:
         return owner
 
     def _is_side_file(self, path: Path) -> bool:
-        """What SQLite has beside a database is copied with it."""
+        """Whether a file is a companion of a SQLite database, which is copied with it."""
         for suffix in (*SIDE_FILES, SHARED_MEMORY):
             base = path.with_name(path.name.removesuffix(suffix))
             if base != path and (self._project / base).is_file() and is_database(self._project / base):
@@ -462,7 +462,7 @@ class _Work:
 
 
 def _copy(source: Path, target: Path, *, link: bool) -> str:
-    """How the file was copied."""
+    """Copy a file, and return how."""
     how = copy_file(source, target, link=link)
     if how == "copied":
         begin_writing(target)

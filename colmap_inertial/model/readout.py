@@ -1,4 +1,4 @@
-"""What the camera's translation does to keypoints within a readout, once depths and velocities are known.
+"""Shift of keypoints by the camera's translation within a readout, once depths and velocities are known.
 
 Keypoints that a gyroscope rectified lack the camera's turning, but each is still seen from where the camera was when
 its line was exposed. A model gives the depth of each point, and with the camera's velocity where it would have been
@@ -27,7 +27,7 @@ _LEAST_SHIFT_PX = 0.05
 
 @dataclass(frozen=True, kw_only=True)
 class Settled:
-    """What became of a model.
+    """Outcome for one model.
 
     Attributes
     ----------

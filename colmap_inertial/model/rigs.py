@@ -77,7 +77,7 @@ def list_posed_frames(reconstruction: pycolmap.Reconstruction) -> list[PosedFram
 
 
 def frames_of_rigs(reconstructions: Iterable[pycolmap.Reconstruction]) -> dict[str, str]:
-    """By image name, the first image of its rig frame; empty where no model has rigs."""
+    """First image of each image's rig frame, by name; empty where no model has rigs."""
     return {
         image.name: frame.images[0].name
         for reconstruction in reconstructions

@@ -1,4 +1,4 @@
-"""Which similarity: from a scale that was estimated, from a file, or a plain factor."""
+"""Similarities from an estimated scale, a file, or a factor."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from colmap_inertial.model import similarity_as_json
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ModelScale:
-    """What is applied to one sub-model.
+    """Similarity of one sub-model.
 
     Attributes
     ----------
@@ -190,7 +190,7 @@ def read_scales(sources: Sequence[str], *, world: WorldAxes = "z-up") -> dict[in
 
 
 def _scales_of(source: str, world: WorldAxes) -> list[tuple[int | None, ModelScale]]:
-    """What ``FILE`` or ``NUMBER=FILE`` states."""
+    """Parse ``FILE`` or ``NUMBER=FILE``."""
     number, equals, name = source.partition("=")
     is_numbered = bool(equals) and number.isascii() and number.isdigit() and not Path(source).exists()
     path = Path(name if is_numbered else source)
@@ -211,7 +211,7 @@ def _colmap_index(fields: Any) -> Any:
 
 
 def _fragments(path: Path, entries: Any) -> list[tuple[int | None, ModelScale]]:
-    """What a result left out, which keeps its own units."""
+    """Models that a result left out, which keep their own units."""
     numbers = [_colmap_index(entry) for entry in entries] if isinstance(entries, list) else [None]
     if not all(isinstance(number, int) for number in numbers):
         raise FormatError(path, "fragments: each needs a colmap_index")

@@ -1,1 +1,1 @@
-"""How the camera turned and where its clock stands: pixels, gyroscope, alignment, smoothing."""
+"""Rotation and clock of the camera: pixels, gyroscope, alignment, smoothing."""

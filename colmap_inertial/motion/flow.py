@@ -1,4 +1,4 @@
-"""How a camera turns from frame to frame, from its pixels: before any reconstruction exists.
+"""Rotation of a camera from frame to frame, from its pixels: before any reconstruction exists.
 
 Corners are tracked from each frame to the next on a reduced picture; frames too far apart for tracking are matched by
 features. One angular velocity is fitted to the rays of each pair, robustly, each ray at the time of its own line, so
@@ -33,7 +33,7 @@ from colmap_inertial.imaging.tracking import convert_to_grey, reduce_image, trac
 
 @dataclass(frozen=True, kw_only=True)
 class FlowOptions:
-    """How rotations between frames are measured."""
+    """Options of the measurement of rotations between frames."""
 
     long_side_px: int = 640
     """Pictures are reduced to this size before corners are tracked."""
@@ -51,7 +51,7 @@ class FlowOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class FlowLimits:
-    """What decides on rotations from pixels, beside the options."""
+    """Limits for rotations from pixels, beside the options."""
 
     #: Corners of a pair of frames that are kept.
     most_tracks: int = 80

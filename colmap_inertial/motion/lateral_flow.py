@@ -1,4 +1,4 @@
-"""How quickly a camera slides past what it sees, by its pixels: close to things that smears them, without any turn."""
+"""Speed of the image motion without rotation: close to objects, translation blurs them."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class FollowedPair:
     points: Array
 
     def speed_px_s(self, camera: Projector, motion: GyroCamera | None = None) -> float:
-        """How quickly the points move in the picture; with a gyroscope, other than by the camera's turning.
+        """Speed of points in the picture; with a gyroscope, without the camera's rotation.
 
         The 90th percentile of their speeds; NaN where the gyroscope did not record all the time between the frames, or
         too few of the points have rays.

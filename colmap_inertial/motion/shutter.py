@@ -1,4 +1,4 @@
-"""How long a camera reads a frame, by its own pictures and the gyroscope: for cameras that nobody has measured.
+"""Readout time of a camera from its pictures and the gyroscope, where it was not measured.
 
 A corner is seen in two frames, each time when its own line is exposed. How far the camera turned between these two
 instants depends on the readout where the turning changes from frame to frame. All corners of all pairs are fitted at
@@ -25,7 +25,7 @@ from colmap_inertial.motion.flow import VisualRotation
 
 @dataclass(frozen=True, kw_only=True)
 class ReadoutLimits:
-    """What decides on the readout of a rolling shutter."""
+    """Limits for the readout of a rolling shutter."""
 
     #: Pairs of frames, at least.
     least_pairs: int = 24

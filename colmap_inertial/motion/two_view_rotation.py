@@ -1,4 +1,4 @@
-"""How a camera turned between pictures that lie seconds apart: photographs, keyframes, frames cut once a second.
+"""Rotation of a camera between pictures seconds apart: photographs, keyframes, frames cut once a second.
 
 There the camera has moved, too, and the pixels' motion is no rotation. Features are matched, the geometry of two views
 with unknown translation is fitted (the five-point method of Nister, 2004, and RANSAC), and a rotation is kept only
@@ -22,7 +22,7 @@ from colmap_inertial.motion.flow import FlowOptions, VisualRotation, reduced
 
 @dataclass(frozen=True, kw_only=True)
 class TwoViewLimits:
-    """What decides on the rotation between two views."""
+    """Limits for the rotation between two views."""
 
     #: Features of a picture.
     features: int = 1000

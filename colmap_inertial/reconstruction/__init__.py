@@ -1,1 +1,1 @@
-"""From a recording to a result."""
+"""Reconstruction, from a recording to a result."""

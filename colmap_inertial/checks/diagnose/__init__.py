@@ -1,4 +1,4 @@
-"""What a capture can and cannot give, before any reconstruction: findings, each with a code, evidence and advice.
+"""Check a capture before any reconstruction: findings, each with a code, evidence and advice.
 
 A check is a function of what was recorded (:class:`Recorded`) that yields :class:`Finding` values; it opens no file.
 ``CHECKS`` lists all of them. ``reconstruction.preparation.preflight`` reads captures for them.
@@ -74,7 +74,7 @@ def diagnose(recorded: Recorded) -> Diagnosis:
 
 
 def unreadable(error: InertialError) -> Finding:
-    """What a reader refused, as a finding."""
+    """A reader's error as a finding."""
     code = error.code if isinstance(error, FormatError | TimingError) else "unreadable"
     return Finding(
         code=code,

@@ -26,7 +26,7 @@ from colmap_inertial.motion.align.conventions import quick_accelerations
 
 @dataclass(frozen=True, kw_only=True)
 class CameraCheckLimits:
-    """When the camera and the gyroscope do not belong together."""
+    """Limits of the check that camera and gyroscope belong together."""
 
     #: Intervals over which rotations are compared, and how strong the axis must be that turns the wrong way.
     interval_s: float = 0.1
@@ -81,7 +81,9 @@ _MAP_AGAIN = (
 
 
 def check_belonging(recorded: Recorded) -> Iterator[Finding]:
-    """Whether at some offset the gyroscope turns as the camera does; if not, whether it would, read otherwise."""
+    """Whether the gyroscope turns as the camera does at some time offset; if not, under which other reading it
+    would.
+    """
     failed, imu, turning = recorded.aligned, recorded.imu, recorded.turning
     if recorded.lacks_majority or recorded.likely_convention is not None:
         return
@@ -170,7 +172,7 @@ def _never_fits(recorded: Recorded, turning: CameraTrajectory, failed: NotObserv
 
 
 def _find_better_fit(recorded: Recorded, imu: ImuRecording) -> Finding | None:
-    """What makes the gyroscope turn as the camera does: another sign, rate, frame rate, or offset."""
+    """Find the sign, rate, frame rate or offset with which the gyroscope turns as the camera does."""
     if isinstance(recorded.align(replace(imu, gyro_rad_s=-imu.gyro_rad_s)), Alignment):
         return _MIRRORED
     elsewhere = recorded.align(imu, any_offset=True)
@@ -251,7 +253,7 @@ def check_pose_convention(recorded: Recorded) -> Iterator[Finding]:
 
 
 def _is_mirrored(turning: CameraTrajectory, imu: ImuRecording, aligned: Alignment) -> bool:
-    """Whether rates of camera and IMU are related by a mirror: where one axis hardly turns, a rotation nearly fits."""
+    """Whether a mirror relates the rates of camera and IMU: where one axis hardly turns, a rotation nearly fits."""
     motion = GyroCamera.of(imu, aligned.calibration, camera_epoch_ns=turning.epoch_ns)
     step = max(1, round(_LIMITS.interval_s / float(np.median(np.diff(turning.t_s)))))
     poses = turning.select(slice(None, None, step))
@@ -345,7 +347,7 @@ def check_focal_length(recorded: Recorded) -> Iterator[Finding]:
 
 
 def check_accelerometer_sign(recorded: Recorded) -> Iterator[Finding]:
-    """Where a reconstruction shows how the camera sped up, the accelerometer must show that, not its opposite."""
+    """Compare the accelerometer's sign with the accelerations of a reconstructed path."""
     aligned, imu, poses = recorded.aligned, recorded.imu, recorded.trajectory
     if not isinstance(aligned, Alignment) or imu is None or not imu.has_accel or poses is None:
         return

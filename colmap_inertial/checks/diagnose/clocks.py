@@ -15,7 +15,7 @@ from colmap_inertial.motion.align import Alignment
 
 @dataclass(frozen=True, kw_only=True)
 class ClockCheckLimits:
-    """When the clocks of camera and IMU do not keep step."""
+    """Limits of the comparison of the clocks of camera and IMU."""
 
     #: Clock rates: phones keep within 1e-4, action cameras within 1 %; the scale is corrected for what is found.
     rate: float = 0.003
@@ -174,7 +174,7 @@ def check_even_times(recorded: Recorded) -> Iterator[Finding]:
 
 
 def _part_offset_s(part: CameraTrajectory, motion: GyroCamera, drift_s: float) -> float | None:
-    """What must be added to a part's offset so that the gyroscope explains it best."""
+    """Correction of the time offset with which the gyroscope explains this part best."""
     if len(part) < 8:
         return None
     visual = part.turn_rad()

@@ -62,7 +62,7 @@ class Finding:
 
     @property
     def sentence(self) -> str:
-        """What was found, and what to do."""
+        """Message and advice."""
         return f"{self.evidence}; {self.advice}"
 
     def as_json(self) -> dict[str, object]:
@@ -116,7 +116,7 @@ class Diagnosis:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FramesInVideo:
-    """Where pictures were found in the video that they were taken from.
+    """Places of pictures in the video that they were taken from.
 
     Attributes
     ----------
@@ -142,7 +142,7 @@ class FramesInVideo:
 
 @dataclass(frozen=True, kw_only=True)
 class Clocks:
-    """How long frames and gyroscope run by their own stamps, and how often they come."""
+    """Durations and rates of frames and gyroscope by their own stamps."""
 
     frames_s: float
     frame_hz: float
@@ -167,7 +167,7 @@ class Clocks:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Recorded:
-    """What there is of a recording; every check looks at what it needs and says nothing where that is missing.
+    """The data of a recording. Each check uses the parts it needs and reports nothing where they are missing.
 
     Attributes
     ----------
@@ -210,7 +210,7 @@ class Recorded:
 
     @cached_property
     def implausible(self) -> tuple[FormatError, ...]:
-        """What a reader would refuse the inertial samples for."""
+        """Reasons why a reader would refuse the inertial samples."""
         if self.imu is None:
             return ()
         found = RawImu(imu=self.imu, path=Path("IMU"), gyro_axes=self.gyro_axes, accel_axes=self.accel_axes).problems()
@@ -223,7 +223,7 @@ class Recorded:
 
     @cached_property
     def consensus(self) -> RotationConsensus | NotObservableError | None:
-        """Which cameras of a reconstruction agree with the gyroscope; ``None`` where one of them is missing."""
+        """Agreement of a reconstruction's cameras with the gyroscope; ``None`` where either is missing."""
         if self.imu is None or self.trajectory is None:
             return None
         options = AlignOptions(max_offset_s=self.max_offset_s)
@@ -261,7 +261,7 @@ class Recorded:
 
     @cached_property
     def stabilisation(self) -> Stabilisation | None:
-        """What the pictures tell of stabilisation; ``None`` without them."""
+        """Signs of stabilisation in the pictures; ``None`` without pictures."""
         if self.rotation is None or self.imu is None:
             return None
         return find_stabilisation(self.rotation, self.imu, offset_s=self.offset_s(self.rotation.epoch_ns))
@@ -291,7 +291,7 @@ class Recorded:
 
     @cached_property
     def likely_convention(self) -> LikelyConvention | None:
-        """By which other convention the poses fit the IMU; ``None`` where they fit as read, or by none."""
+        """The other convention under which the poses fit the IMU; ``None`` where they fit as read, or under none."""
         if self.imu is None or self.trajectory is None or self.turning is None:
             return None
         options = AlignOptions(max_offset_s=self.max_offset_s)

@@ -17,7 +17,7 @@ from colmap_inertial.motion.shutter import ReadoutEstimate, estimate_readout
 
 @dataclass(frozen=True, kw_only=True)
 class FrameCheckLimits:
-    """When frames, their times or exposures are not good enough."""
+    """Limits for frames, their times and exposures."""
 
     #: Frames come evenly where this share of their intervals is the usual one to within this; keyframes do not.
     even_share: float = 0.8
@@ -43,7 +43,7 @@ _LIMITS = FrameCheckLimits()
 
 
 def check_dropped(recorded: Recorded) -> Iterator[Finding]:
-    """Intervals of twice the usual length and more."""
+    """Report intervals of at least twice the usual length."""
     frames = recorded.timing or recorded.trajectory
     if frames is None or len(frames.t_s) < 20:
         return
@@ -147,7 +147,7 @@ def check_readout(recorded: Recorded) -> Iterator[Finding]:
 
 
 def _readout(recorded: Recorded) -> ReadoutEstimate:
-    """By what was followed from frame to frame, and the gyroscope as it was aligned."""
+    """Estimate the readout from tracked corners and the aligned gyroscope."""
     rotation, aligned, imu = recorded.rotation, recorded.aligned, recorded.imu
     if rotation is not None and not recorded.is_dense:
         raise NotObservableError("readout", "pictures that are this far apart in time do not tell it; a video does")

@@ -1,4 +1,4 @@
-"""What the inertial samples tell by themselves: units, axes, stamps, range, resolution, and whether both keep step."""
+"""Checks of the inertial samples alone: units, axes, stamps, range, resolution, and whether both sensors keep step."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from colmap_inertial.motion.align import Alignment
 
 @dataclass(frozen=True, kw_only=True)
 class MotionCheckLimits:
-    """When the motion gives no scale."""
+    """Limits below which the motion gives no scale."""
 
     #: Specific force is compared with itself over windows this long, in means over steps this long.
     window_s: float = 2.0
@@ -110,7 +110,7 @@ def _glides(trajectory: CameraTrajectory) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class ImuCheckLimits:
-    """When inertial samples are not good enough."""
+    """Limits for inertial samples."""
 
     #: Pauses longer than this are findings (shorter ones cost nothing); over the second, much can happen in them.
     pause_s: float = 0.03
@@ -172,7 +172,7 @@ def refusal(error: FormatError) -> Finding:
 
 
 def check_accelerometer(recorded: Recorded) -> Iterator[Finding]:
-    """Without one there are no metres."""
+    """Report a missing accelerometer: there is no scale without one."""
     if recorded.imu is not None and not recorded.imu.has_accel:
         yield Finding(
             code="no-accelerometer",
@@ -183,7 +183,7 @@ def check_accelerometer(recorded: Recorded) -> Iterator[Finding]:
 
 
 def check_repairs(recorded: Recorded) -> Iterator[Finding]:
-    """What the reader sorted, merged and dropped."""
+    """Report samples that the reader sorted, merged or dropped."""
     if recorded.imu is None:
         return
     by_code: dict[str, list[str]] = {}
@@ -365,7 +365,7 @@ def check_delay(recorded: Recorded) -> Iterator[Finding]:
 
 
 def accel_delay_s(imu: ImuRecording) -> tuple[float, float]:
-    """How late the accelerometer's stamps are, and the correlation there (0 where nothing can be told).
+    """Delay of the accelerometer's stamps, and the correlation there (0 where it cannot be estimated).
 
     Slow changes of the specific force a are those of gravity: its derivative is ``a x w``. The delay is where the two
     correlate best.

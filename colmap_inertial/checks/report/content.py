@@ -1,4 +1,4 @@
-"""What a report says, gathered from the files of an output folder: nothing is computed again."""
+"""Content of a report, read from the files of an output folder; nothing is computed again."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ Content = dict[str, Any]
 
 
 def recording_file(out: Path) -> Path:
-    """What is kept of the recording."""
+    """File of the report's data on the recording."""
     return out / DATA_FOLDER / "recording.json"
 
 
 def model_file(out: Path, index: int) -> Path:
-    """What is kept of one model."""
+    """File of the report's data on one model."""
     return out / DATA_FOLDER / f"model_{index}.json"
 
 
@@ -112,7 +112,7 @@ def gather(
 
 
 def _describe_path(model: Content) -> list[str]:
-    """What the refinement did to a model's path, in a sentence; or that it could."""
+    """A sentence on what the refinement changed in a model's path, or that it could be run."""
     done = [each for each in model.get("treatments", []) if each["stage"] == "refine"]
     if not done:
         length = model.get("scene", {}).get("path_length")
@@ -129,7 +129,7 @@ def _describe_path(model: Content) -> list[str]:
 
 
 def find_refined_parts(model: Content) -> list[Content]:
-    """By how much the refinement stretched the parts of a model's path; empty where it left the model as it was."""
+    """Stretch of each part of a model's path by the refinement; empty where the model was left as it was."""
     done = [each for each in model.get("treatments", []) if each["stage"] == "refine" and each["action"]]
     parts: list[Content] = done[-1]["values"].get("drift", []) if done else []
     return parts

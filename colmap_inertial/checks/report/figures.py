@@ -112,7 +112,7 @@ def _underlay(figure: Figure) -> Figure:
 
 
 def rotation_before(rotation: dict[str, Any]) -> Figure | None:
-    """As recorded: each in its own axes, with its own clock."""
+    """Rates as recorded: each sensor in its own axes, on its own clock."""
     before = rotation["before"]
     if not before["gyroscope"]:
         return None
@@ -135,7 +135,7 @@ def rotation_after(rotation: dict[str, Any]) -> Figure | None:
 
 
 def deviations(rotation: dict[str, Any]) -> Figure | None:
-    """How far each camera is turned against those around it, by the gyroscope; wrong ones stand out."""
+    """Rotation of each camera against its neighbours, compared with the gyroscope; wrong cameras stand out."""
     line = rotation.get("deviation_deg")
     return None if line is None else _stack_rows([("camera", CAMERA, [line], "left")], ["deviation"], unit="°")
 
@@ -301,7 +301,7 @@ def _make_time_layout(height: int, title: str) -> Figure:
 
 
 def shutter_over_time(shutter: dict[str, Any]) -> Figure:
-    """By how much keypoints move in each frame."""
+    """Shift of keypoints in each frame."""
     data = []
     for key, name, colour in (("largest_px", "largest in the frame", IMU), ("median_px", "median", CAMERA)):
         line = {"t_s": shutter["t_s"], "values": shutter[key]}
@@ -311,7 +311,7 @@ def shutter_over_time(shutter: dict[str, Any]) -> Figure:
 
 
 def shutter_field(worst: dict[str, Any]) -> Figure:
-    """Where keypoints of the frame with the largest movement go; longer than it is where it would not be seen."""
+    """Shift of keypoints in the frame where it is largest, enlarged where it would not be visible."""
     at, shift = np.array(worst["at_px"]), np.array(worst["shift_px"])
     largest = float(np.linalg.norm(shift, axis=1).max())
     times = max(1.0, round(0.09 * worst["width"] / max(largest, 1e-9)))
@@ -388,7 +388,7 @@ def target_views(validation: dict[str, Any]) -> Figure:
 
 
 def distortion(camera: dict[str, Any]) -> Figure:
-    """Where the lens puts points, from where a pinhole would."""
+    """Shift of points by the lens, relative to a pinhole camera."""
     figure = shutter_field({**camera["distortion"], "width": camera["width"], "height": camera["height"]})
     return {**figure, "layout": {**figure["layout"], "height": 360}}
 
@@ -445,7 +445,7 @@ def residuals_on_sensor(sensor: dict[str, Any]) -> Figure:
 
 
 def track_lengths(tracks: dict[str, Any]) -> Figure:
-    """How many images see a point."""
+    """Histogram of the number of images that see a point."""
     counts = tracks["counts"]
     names = [str(n) for n in range(2, len(counts) + 2)]
     names[-1] += "+"

@@ -46,7 +46,7 @@ def calibration_page(found: RestCalibration, *, source: str) -> str:
 
 
 def gain_effect(found: RestCalibration) -> str:
-    """What the calibration does for the interval of a scale, in words."""
+    """A sentence on how the calibration changes the interval of a scale."""
     pct = 100 * Z95 * found.calibration.gain_sigma
     known = (
         f"the accelerometer's gain is known to +-{pct:.2g} % in every direction (95 %; without calibration to +-1 %)"

@@ -123,7 +123,7 @@ def sentence(text: str) -> Markup:
 
 
 def _gauge_at(pct: float) -> float:
-    """Where a half-width lies on the gauge (of 10 to 490): from a tenth of a per cent to a hundred."""
+    """Position of a half-width on the gauge (10 to 490): from 0.1 % to 100 %."""
     return 10.0 + 480.0 * (min(max(math.log10(max(pct, 1e-9)), -1.0), 2.0) + 1) / 3
 
 

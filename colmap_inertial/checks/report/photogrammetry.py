@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 def photogrammetry_record(
     reconstruction: pycolmap.Reconstruction, display_from_model_xyzw: Array, *, unit: str
 ) -> dict[str, Any]:
-    """What a model says about itself, its images and cameras; lengths are in ``unit``.
+    """Figures of a model, its images and cameras; lengths are in ``unit``.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def photogrammetry_record(
 
 
 class _Seen(NamedTuple):
-    """What one image sees: where, how far from where the model has it, and how fine."""
+    """Observations of one image: position, reprojection error and resolution."""
 
     name: str
     size: tuple[int, int]
@@ -108,7 +108,7 @@ def _choose_cameras(reconstruction: pycolmap.Reconstruction, image_ids: list[int
 def _describe_camera(
     reconstruction: pycolmap.Reconstruction, camera_id: int, image_ids: list[int], sigma: Array | None
 ) -> dict[str, Any]:
-    """Intrinsics, field of view, and by how much the lens moves points from where a pinhole would have them."""
+    """Intrinsics, field of view, and the shift of points by the lens relative to a pinhole camera."""
     camera = reconstruction.camera(camera_id)
     names = [name.strip() for name in camera.params_info.split(",")]
     count = SIZES.distortion_points

@@ -166,7 +166,7 @@ def _round_to_sigma(value: float, sigma: float | None) -> tuple[str, str]:
 
 
 def readout_rows(models: Sequence[Content]) -> Rows:
-    """What taking the translation within the readout out of each model changed."""
+    """Changes of each model by removing the translation within the readout."""
     rows: Rows = []
     for model in models:
         change = model.get("readout_translation")
@@ -214,5 +214,5 @@ def gap_rows(gaps: Sequence[Content]) -> Rows:
 
 
 def count_drifted_parts(parts: Sequence[Content]) -> int:
-    """How many parts of a path had drifted by more than their 95 % interval."""
+    """Number of parts of a path that had drifted by more than their 95 % interval."""
     return sum(abs(part["percent"]) > Z95 * part["sigma_percent"] for part in parts)

@@ -1,4 +1,4 @@
-"""How much the report shows: long series thinned to their extremes, and numbers rounded."""
+"""Size of the report: long series are thinned to their extremes, and numbers rounded."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from colmap_inertial.core.arrays import Array, IndexArray
 
 @dataclass(frozen=True, kw_only=True)
 class ReportSizes:
-    """Of a page."""
+    """Sizes of a page."""
 
     #: The largest models, which are shown in full.
     models: int = 3

@@ -29,7 +29,7 @@ from colmap_inertial.motion.smooth import WorldAcceleration, smooth_attitude
 
 @dataclass(frozen=True, kw_only=True)
 class ComparisonSettings:
-    """How camera and IMU are compared."""
+    """Settings of the comparison of camera and IMU."""
 
     #: Positions are differentiated over this long: a millimetre of noise becomes 0.06 m/s2.
     reach_s: float = 0.2
@@ -58,7 +58,7 @@ def signal_record(
     *,
     first_frame_s: float | None = None,
 ) -> Record:
-    """What the report shows of camera and IMU, at most some thousand numbers for a recording of any length.
+    """The report's data on camera and IMU: at most some thousand numbers, however long the recording.
 
     Parameters
     ----------

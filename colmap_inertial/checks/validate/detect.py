@@ -26,7 +26,7 @@ from colmap_inertial.core.geometry import colmap_px_from_opencv
 
 @dataclass(frozen=True, kw_only=True)
 class DetectionLimits:
-    """What counts as a target in an image."""
+    """Limits of the detection of targets in an image."""
 
     #: Checkerboards are searched in images whose longer side is at most this long, and refined in the original.
     search_size_px: int = 1600
@@ -206,7 +206,7 @@ def detect(image: UInt8Array, target: Target, *, thorough: bool = False) -> list
 
 
 def other_checkerboard(image: UInt8Array) -> tuple[int, int] | None:
-    """Inner corners (columns, rows) of whatever checkerboard an image shows, to help with a wrong description."""
+    """Inner corners (columns, rows) of any checkerboard in an image, to help with a wrong description."""
     import cv2
 
     small, _ = _shrink(image)
@@ -334,7 +334,7 @@ def _side_px(corners: Array) -> Array:
 
 
 def _split_copies(corners: Array, number: IndexArray, layout_m: Array) -> list[IndexArray]:
-    """Indices of the markers of each copy of a board, when several are in view.
+    """Indices of the markers of each copy of a board, where an image shows several.
 
     Markers are gathered by growing from one to its neighbours on the board: the homography of those gathered says
     where the next should be.

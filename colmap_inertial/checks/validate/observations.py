@@ -57,7 +57,7 @@ class Observations:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Placement:
-    """Where the parts of a target are in the model: ``x_world = scale * rotation @ target_m + centre``.
+    """Poses of a target's parts in the model: ``x_world = scale * rotation @ target_m + centre``.
 
     Attributes
     ----------
@@ -99,7 +99,7 @@ def linearise(obs: Observations, at: Placement) -> tuple[Array, Array, Array]:
 
 
 def tangent_residual(obs: Observations, in_cam: Array) -> tuple[Array, Array, Array]:
-    """As :func:`linearise`, for corners (M, 3) at any place in the camera frames."""
+    """:func:`linearise` for corners (M, 3) at any place in the camera frames."""
     depth = np.einsum("mi,mi->m", obs.ray, in_cam)
     behind: BoolArray = np.asarray(depth <= 0)
     depth = np.where(behind, 1.0, depth)

@@ -1,4 +1,4 @@
-"""Which detections belong together: finds where a target stands in the model, and how each view numbers its corners.
+"""Find the place of a target in a model, the detections that belong together, and how each view numbers its corners.
 
 Two views that see a part of the target from different places give its corners in space, and with them a similarity,
 scale included. Every other view then says whether it agrees. The pair on which most views agree wins, so false
@@ -29,7 +29,7 @@ from colmap_inertial.core.options import ValidateOptions
 
 @dataclass(frozen=True, kw_only=True)
 class PlacementLimits:
-    """Where a target stands in a model, and which images agree on it."""
+    """Limits of placing a target in a model."""
 
     #: Images with the target after which checkerboards are no longer searched thoroughly, and images searched so.
     enough_views: int = 10
@@ -243,7 +243,7 @@ class _Judge:
         return out, self._views
 
     def choose(self, placement: Placement) -> tuple[list[int], list[int]]:
-        """Indices of the sightings that agree, the best of each view, and their numberings."""
+        """Indices of the sightings that agree, the best of each view, with their numberings."""
         cost, close = self._table(placement)
         cost = np.where(close > 0.5, cost, np.inf)
         chosen, numbering = [], []
@@ -347,7 +347,7 @@ class Search:
         return bool(found)
 
     def place(self) -> dict[int, PartPlacement]:
-        """Where each part of the target is; parts on which no two views agree are left out."""
+        """Pose of each part of the target; parts on which no two views agree are left out."""
         self.parts, self.one_line = {}, None
         for s in self.sightings:
             self.parts.setdefault(s.part, []).append(s)
@@ -404,7 +404,7 @@ def explain_failure(search: Search, images: Path) -> Exception:
 
 
 def _find_mirroring(search: Search) -> str | None:
-    """How the images are mirrored against the model, if that explains them."""
+    """The mirroring of the images against the model that explains the detections, if there is one."""
     for flip, words in ((1, "left to right"), (0, "top to bottom")):
         again = Search(search.views, search.target, search.options, None)
         for v in search.searched[: PLACEMENT.mirror_views]:

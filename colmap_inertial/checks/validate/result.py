@@ -1,4 +1,4 @@
-"""What a validation found, as values, JSON and a table.
+"""Results of a validation as values, JSON and a table.
 
 Lengths are measured as VDI/VDE 2634 (part 1) has them: each known length against the same one in the model, over as
 much of the volume and in as many directions as there are. Accuracy of points is given as ASPRS (2023) has it: root mean
@@ -153,7 +153,7 @@ def model_diagonal(xyz: Array) -> float | None:
 
 
 def _count_directions(ends: Array) -> int:
-    """In how many directions (K, 2, 3) lengths lie."""
+    """Number of distinct directions of the lengths (K, 2, 3)."""
     along = ends[:, 1] - ends[:, 0]
     norm = np.linalg.norm(along, axis=1, keepdims=True)
     along = along[norm[:, 0] > 0] / norm[norm[:, 0] > 0]
@@ -388,7 +388,9 @@ class Validation:
 
     @property
     def within_tolerance(self) -> bool:
-        """Whether the scale error is at most the tolerance (a model without a unit has none), and nothing doubts it."""
+        """Whether the scale error is within the tolerance (a model without a unit has none) and nothing casts doubt on
+        it.
+        """
         off = self.scale_error_pct is not None and abs(self.scale_error_pct) > self.tolerance_pct
         return not off and not self.doubts
 

@@ -124,11 +124,11 @@ class Target:
         return f"r{self.row[corner]}c{self.column[corner]}"
 
     def part_name(self, part: int) -> str:
-        """What to call a rigid part in a sentence."""
+        """Name of a rigid part in messages."""
         return f"marker {part}" if self.kind == "aruco" else self.kind
 
     def control(self, seen: BoolArray) -> BoolArray:
-        """Which corners may set a scale; the rest are kept to check it.
+        """Indices of the corners that may set a scale; the rest check it.
 
         The two sets share no corner, so no corner's detection error is in both. Boards are split by every second
         line of corners along their longer side, AprilGrids tag by tag like the fields of a chessboard, single markers

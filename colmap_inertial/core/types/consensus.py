@@ -1,4 +1,4 @@
-"""Which cameras of a reconstruction agree with the gyroscope."""
+"""Agreement of a reconstruction's cameras with the gyroscope."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class WrongCamera:
 
 @dataclass(frozen=True, kw_only=True)
 class Seam:
-    """Where the cameras after are turned, all alike, against those before.
+    """A place where all later cameras are rotated against the earlier ones by the same angle.
 
     Attributes
     ----------
@@ -97,7 +97,7 @@ class RotationConsensus:
 
     @property
     def seams(self) -> tuple[Seam, ...]:
-        """Where one part ends and another begins."""
+        """Seams between the parts."""
         placed = np.flatnonzero(self.part >= 0)
         out = []
         for i, j in pairwise(placed.tolist()):
@@ -108,7 +108,7 @@ class RotationConsensus:
         return tuple(out)
 
     def updated(self, later: RotationConsensus) -> RotationConsensus:
-        """What is known once some of the cameras were registered again; those that are not in it stay wrong."""
+        """The consensus after some cameras were registered again; the others stay wrong."""
         place = {name: i for i, name in enumerate(later.names)}
         at = np.array([place.get(name, -1) for name in self.names])
         return RotationConsensus(

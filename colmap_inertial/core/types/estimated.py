@@ -1,4 +1,4 @@
-"""What is estimated, each with its covariance: smoothed trajectory, scale, similarity."""
+"""Estimates with their covariance: smoothed trajectory, scale, similarity."""
 
 from __future__ import annotations
 
@@ -336,7 +336,7 @@ class Similarity:
 
 @dataclass(frozen=True, kw_only=True)
 class Gap:
-    """What lies between two sub-models, and whether they were joined across it.
+    """The gap between two sub-models, and whether they were joined across it.
 
     Attributes
     ----------
@@ -415,7 +415,7 @@ _UNMOVED = 1e-6
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CameraMotion:
-    """How a camera moved while each of its frames was exposed, and how long its shutter took.
+    """Motion of a camera during the exposure of each of its frames, and its readout time.
 
     Attributes
     ----------
@@ -454,7 +454,7 @@ class CameraMotion:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SolvedMotion:
-    """How a camera moved, where a stage solved for poses and velocities together.
+    """Motion of a camera from a stage that solved for poses and velocities together.
 
     Attributes
     ----------
@@ -481,7 +481,7 @@ class SolvedMotion:
             set_fields(self, **{field: values})
 
     def of(self, names: Sequence[str], cam_in_world: Array) -> SolvedMotion:
-        """What holds of these images: of those that still stand where they stood when this was solved.
+        """The motion of these images, without those that have moved since it was solved.
 
         Parameters
         ----------

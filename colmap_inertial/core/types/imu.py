@@ -23,7 +23,7 @@ CALIBRATION_PARAMETERS = (
 
 
 class CAL:
-    """Where they stand: indices of the numbers, slices of the vectors of ``CALIBRATION_PARAMETERS``."""
+    """Indices and slices of ``CALIBRATION_PARAMETERS``."""
 
     ROTATION = slice(0, 3)
     GYRO_TIME_OFFSET, ACCEL_TIME_OFFSET = 3, 4
@@ -37,7 +37,7 @@ class CAL:
 @prints_in_lines
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CameraImuCalibration:
-    """How the camera and the IMU of one device relate.
+    """Relation of the camera and the IMU of one device.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class CameraImuCalibration:
 
     @property
     def accel_delay_s(self) -> float:
-        """What the accelerometer's time offset is larger than the gyroscope's."""
+        """Time offset of the accelerometer minus that of the gyroscope."""
         return self.accel_time_offset_s - self.gyro_time_offset_s
 
     @property
@@ -117,7 +117,7 @@ class CameraImuCalibration:
         )
 
     def drift_s(self, t_cam_s: Array) -> Array:
-        """How much the time offsets have grown since ``clock_middle_s``, at camera times of any shape."""
+        """Growth of the time offsets since ``clock_middle_s``, at camera times of any shape."""
         return np.asarray(self.clock_rate * (t_cam_s - self.clock_middle_s))
 
 
@@ -169,7 +169,7 @@ IMU_CALIBRATION_PARAMETERS = (
 
 
 class IMU_CAL:
-    """Where they stand: slices of ``IMU_CALIBRATION_PARAMETERS``."""
+    """Slices of ``IMU_CALIBRATION_PARAMETERS``."""
 
     ACCEL_GAIN, ACCEL_BIAS = slice(0, 9), slice(9, 12)
     GYRO_GAIN, GYRO_BIAS = slice(12, 21), slice(21, 24)
@@ -179,7 +179,7 @@ class IMU_CAL:
 @prints_in_lines
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ImuCalibration:
-    """What the readings of an IMU have to be corrected by, found where it lay still in several attitudes.
+    """Corrections of an IMU's readings, estimated from rests in several attitudes.
 
     The true specific force is ``(I + accel_gain) reading - accel_bias_m_s2``, the true rate
     ``(I + gyro_gain) reading - gyro_bias_rad_s``, both in one frame: x along the accelerometer's x axis, y in the plane
@@ -240,7 +240,8 @@ class ImuCalibration:
         return float(np.sqrt(np.einsum("ni,ij,nj->n", along, block, along).max()))
 
     def loosened(self, calibration: CameraImuCalibration) -> CameraImuCalibration:
-        """What is known of camera and IMU, its rotation as open as the gyroscope stands askew in the accelerometer.
+        """The calibration of camera and IMU with its rotation widened by the gyroscope's misalignment to the
+        accelerometer.
 
         It may have been found with readings that were not corrected, whose axes are the gyroscope's own.
         """
@@ -250,7 +251,7 @@ class ImuCalibration:
         return replace(calibration, cov=cov)
 
     def summary(self) -> dict[str, object]:
-        """What a result says of it, in JSON types."""
+        """Summary for a result, in JSON types."""
         return {
             "device": self.device,
             "attitudes": self.attitudes,
@@ -344,7 +345,7 @@ class ImuRecording:
 
     @property
     def warmer_k(self) -> float | None:
-        """By how much the sensors were warmer than at their calibration; ``None`` where either was not logged."""
+        """Temperature above that of the calibration; ``None`` where either was not logged."""
         then = None if self.calibration is None else self.calibration.temperature_c
         return None if then is None or self.temperature_c is None else self.temperature_c - then
 

@@ -1,4 +1,4 @@
-"""What was recorded or reconstructed: frames with times, cameras, apertures, trajectories, satellite positions."""
+"""Recorded and reconstructed data: frames with times, cameras, apertures, trajectories, satellite positions."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Projector(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Treatment:
-    """What a stage decided about a frame, its keypoints or a model, and why; it travels with what it is about.
+    """Decision of a stage about a frame, its keypoints or a model, with the reason.
 
     Attributes
     ----------
@@ -116,7 +116,7 @@ class Frame:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Keypoints:
-    """Where the features of one image are, on their way to matching.
+    """Keypoints of one image, on their way to matching.
 
     Attributes
     ----------
@@ -142,7 +142,7 @@ class Keypoints:
 @prints_in_lines
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FrameTiming:
-    """When each frame was exposed, on the camera's clock.
+    """Exposure times of frames, on the camera's clock.
 
     Attributes
     ----------
@@ -181,7 +181,7 @@ class FrameTiming:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FrameLog:
-    """What a recorder noted about the frames of its video, beside the inertial samples.
+    """A recorder's notes on the frames of its video, beside the inertial samples.
 
     Attributes
     ----------
@@ -348,7 +348,7 @@ class ApertureRig:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the apertures, in order."""
+        """Names of the apertures, in order."""
         return tuple(aperture.name for aperture in self.apertures)
 
     @property

@@ -21,7 +21,7 @@ from colmap_inertial.imaging.rolling_shutter import grid_nodes, sampling_maps
 
 @dataclass(frozen=True, kw_only=True)
 class RegistrationLimits:
-    """What two exposures are registered by, and when they show one view."""
+    """Limits of the registration of two exposures."""
 
     #: Longer sides of the reduced images; the last one also judges.
     sides_px: tuple[int, ...] = (120, 240, 480)
@@ -81,7 +81,7 @@ _SHIFT = 0
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Registered:
-    """Where the long exposure shows what the short one does.
+    """Positions of the short exposure's content in the long one.
 
     Attributes
     ----------
@@ -209,7 +209,7 @@ class _Level:
         return float(self.long.std()) < _FLAT[0] and float(self.short.std()) < _FLAT[1]
 
     def alike(self, shift_px: Array) -> bool:
-        """Whether the details agree all over, and not by chance: in most parts of the image, each for itself."""
+        """Whether details agree all over, in most parts of the image independently."""
         found = self._correlate_parts(shift_px)
         if len(found) < _LIMITS.least_parts:
             return self.agreement(shift_px) >= _LIMITS.alike_as_a_whole
@@ -343,6 +343,8 @@ def _maximise_correlation(level: _Level, start: Registered, mapping: Array, kind
 
 
 def _scale_about_corner(scale: float) -> Array:
-    """From OpenCV's pixels of an image to those of one reduced by area: corners stay, not centres of pixels."""
+    """Transform from OpenCV's pixels of an image to those of one reduced by area: corners stay, not centres of
+    pixels.
+    """
     offset = 0.5 * scale - 0.5
     return np.array([[scale, 0, offset], [0, scale, offset], [0, 0, 1.0]])

@@ -1,4 +1,4 @@
-"""Where one reduced image lies on another, looked for everywhere: correlation of what tells in both, over all shifts.
+"""Global search for one reduced image in another: weighted correlation over all shifts.
 
 Of images of which parts tell nothing, and that overlap in part, the correlation at all shifts is a few Fourier
 transforms (D. Padfield, Masked object registration in the Fourier domain, 2012), here of detail whose mean is about 0.
@@ -17,7 +17,7 @@ from colmap_inertial.core.arrays import Array, ComplexArray, Float32Array
 
 @dataclass(frozen=True, kw_only=True)
 class SearchLimits:
-    """Where one image is looked for on another."""
+    """Limits of the search for one image in another."""
 
     #: The images must share so much of their area: with less, chance correlates, too.
     least_shared: float = 0.3

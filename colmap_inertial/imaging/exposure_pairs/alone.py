@@ -14,7 +14,7 @@ from colmap_inertial.imaging.transfer import decode_table
 
 @dataclass(frozen=True, kw_only=True)
 class AloneLimits:
-    """By what the better one of two exposures is told."""
+    """Limits of the choice of the better of two exposures."""
 
     #: Detail is compared in bands: octaves from this standard deviation on,
     finest_px: float = 0.7
@@ -115,8 +115,9 @@ def _split_bands(image: Float32Array) -> list[tuple[float, float]]:
 
 
 def _estimate_noise_variance(image: Float32Array) -> float:
-    """Of white noise: by a second difference that planes and straight edges do not pass, in most squares (J.
-    Immerkaer, Fast noise variance estimation, 1996)."""
+    """Variance of white noise, from a second difference without planes and straight edges, over most squares (J.
+    Immerkaer, Fast noise variance estimation, 1996).
+    """
     import cv2
 
     mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)

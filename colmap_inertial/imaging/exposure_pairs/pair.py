@@ -27,7 +27,7 @@ from colmap_inertial.imaging.transfer import decode_table, srgb_from_linear
 
 @dataclass(frozen=True, kw_only=True)
 class BrightnessLimits:
-    """What the gain between two exposures is measured on, and when it is believed."""
+    """Limits of the measurement of the gain between two exposures."""
 
     #: Pixels as bright as this share of the largest code may have been clipped.
     clipped: float = 250 / 255
@@ -64,7 +64,7 @@ _STEP_PX = 16
 
 @dataclass(frozen=True, kw_only=True)
 class Brightness:
-    """By what the short exposure's light is multiplied to be as bright as the long one's.
+    """Gain that makes the short exposure as bright as the long one.
 
     Attributes
     ----------
@@ -158,7 +158,7 @@ def brightened(short: AnyArray, brightness: Brightness) -> Float32Array:
 def gyro_shift(
     motion: GyroCamera, camera: Projector, short: FrameShutter, long: FrameShutter, *, step_px: int = _STEP_PX
 ) -> Array:
-    """Where the long exposure shows what the short one does, by the camera's rotation between them.
+    """Shift of the long exposure against the short one by the camera's rotation between them.
 
     What a pixel of the short exposure sees in the middle of its own line's exposure is looked for in the long one, each
     of whose lines has a middle of its own: by fixed-point iteration.
@@ -346,7 +346,7 @@ def bring_together(
 
 
 def _choose_gain(stated: float | None, measured: float | None, factor: float) -> float | None:
-    """What is stated, where the pixels agree with it to a factor or tell nothing; what they tell otherwise."""
+    """The stated gain where the pixels agree to a factor or show nothing; else the measured one."""
     if stated is not None and (measured is None or abs(np.log(measured / stated)) <= np.log(factor)):
         return stated
     return measured

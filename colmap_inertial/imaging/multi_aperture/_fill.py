@@ -11,7 +11,7 @@ from colmap_inertial.core.arrays import BoolArray, Float32Array, IndexArray
 
 @dataclass(frozen=True, kw_only=True)
 class FillLimits:
-    """Which neighbours a hidden pixel takes its colour from."""
+    """Limits for the neighbours that colour a hidden pixel."""
 
     #: Neighbours on a square grid: this many steps to each side,
     steps: int = 3

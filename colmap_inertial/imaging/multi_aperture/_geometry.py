@@ -90,7 +90,7 @@ class Rectified:
         return float(np.linalg.norm(self.baselines[0]))
 
     def disparity(self, depth: float) -> float:
-        """Of a thing at this depth along the canvas' optical axis, in the rig's unit."""
+        """Disparity at this depth along the canvas' optical axis, in the rig's unit."""
         return self.focal_px * self.baseline / depth
 
     @property
@@ -118,7 +118,7 @@ class Rectified:
         )
 
     def transfers(self, disparities_px: Array) -> tuple[Array, Array]:
-        """Where candidates put the canvas in the other views: (N - 1, D) sizes and (N - 1, D, 2) offsets.
+        """Transforms of the canvas into the other views for each candidate: (N - 1, D) sizes and (N - 1, D, 2) offsets.
 
         A pixel (x, y) lies at ``size (x, y) + offset``: the trifocal tensor takes the pixel, and the line in the
         partner across the direction of disparities, to the view.
@@ -242,7 +242,7 @@ def _project_directions(projector: Projector, in_cam: Array) -> Array:
 def _map_reference(
     camera: CameraModel, projector: Projector, rect_from_ref: Array, focal_px: float, centre: Array
 ) -> tuple[Float32Array, Float32Array]:
-    """Where the reference's pixels lie on the canvas, and their depth there as a factor of that on the canvas."""
+    """Positions of the reference's pixels on the canvas, and their depth there as a factor of that on the canvas."""
     pixels = np.stack(np.meshgrid(np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float)), axis=-1)
     seen = _cast_rays(projector, pixels.reshape(-1, 2)) @ rect_from_ref.T
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -31,7 +31,7 @@ def adds_up(roles: Sequence[SpectralRole]) -> bool:
 def light_cost(
     codes: UInt8Array, canvas: Rectified, disparity_px: Float32Array, roles: Sequence[SpectralRole], most: int
 ) -> LightCost | None:
-    """How luminance follows from the colours, by images that are roughly aligned already.
+    """Luminance as a function of the colours, from images that are roughly aligned.
 
     ``luminance = a red + b green + c blue + d``, fitted, so that neither the filters' curves nor exposures need be
     known. ``None`` where too few pixels are seen by all.

@@ -11,7 +11,7 @@ from colmap_inertial.core.arrays import AnyArray, Array, Float32Array, UInt8Arra
 
 @dataclass(frozen=True, kw_only=True)
 class NoiseLimits:
-    """How noise is measured and smoothed."""
+    """Limits of the measurement and smoothing of noise."""
 
     #: Side of the blocks in which noise is measured.
     block_px: int = 16

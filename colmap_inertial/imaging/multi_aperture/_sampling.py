@@ -39,7 +39,7 @@ def shrunk(codes: UInt8Array, by: int) -> UInt8Array:
 def places(
     canvas: Rectified, index: int, disparity_px: Float32Array, x: Float32Array, y: Float32Array
 ) -> tuple[Float32Array, Float32Array]:
-    """Where points (x, y) of the canvas with these disparities lie on the canvas as another aperture sees it."""
+    """Positions of canvas points (x, y) with these disparities on the canvas of another aperture."""
     r = canvas.ratios[index - 1]
     cx, cy = (np.float32(c) for c in canvas.centre_px)
     size = 1 - disparity_px * np.float32(r[2])
@@ -51,7 +51,7 @@ def places(
 def warp_view(
     view: AnyArray, canvas: Rectified, index: int, disparity_px: Float32Array, every: int = 1
 ) -> tuple[Float32Array, BoolArray]:
-    """What the reference sees on the canvas in another aperture's view, itself on the canvas; and whether it is there.
+    """Warp another aperture's view to the canvas of the reference, with a mask of the pixels that it shows.
 
     Parameters
     ----------

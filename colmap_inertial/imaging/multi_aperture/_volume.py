@@ -1,4 +1,4 @@
-"""Which disparities are tried on a canvas, and what comes of matching them."""
+"""Candidate disparities of a canvas, and their matching costs."""
 
 from __future__ import annotations
 

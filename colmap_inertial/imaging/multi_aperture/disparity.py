@@ -24,7 +24,7 @@ SAME_PX = 0.75
 
 @dataclass(frozen=True, kw_only=True)
 class RangeLimits:
-    """How the range of disparities is found, and the first ones for mutual information."""
+    """Limits of the search for the range of disparities, and of the first ones for mutual information."""
 
     #: The image is matched this many times smaller to find the range of its disparities,
     shrink: int = 4

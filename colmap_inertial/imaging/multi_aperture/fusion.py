@@ -51,7 +51,7 @@ class Fused:
 
 
 def plane_of(image: AnyArray, role: SpectralRole) -> AnyArray:
-    """What an aperture recorded, (H, W), from a file of one or three channels.
+    """The plane (H, W) of an aperture, from a file of one or three channels.
 
     A colour is taken from its own channel of an RGB image, luminance (and ``other``) from ITU-R BT.601's sum.
     """

@@ -16,7 +16,7 @@ Transfer = tuple[Array, Array]
 
 @dataclass(frozen=True, kw_only=True)
 class AgreementLimits:
-    """When depths of two images agree."""
+    """Limits for depths of two images that agree."""
 
     #: How far from itself a pixel may come back, and by which share its depth may have changed.
     within_px: float = 1.0

@@ -19,7 +19,7 @@ from colmap_inertial.imaging.semi_global import Views, match_candidates
 
 @dataclass(frozen=True, kw_only=True)
 class SweepLimits:
-    """What candidates a plane sweep tries, and what it compares."""
+    """Candidates and comparisons of a plane sweep."""
 
     #: Between two candidates a thing moves by this much in the partner where it moves most.
     step_px: float = 1.0
@@ -157,7 +157,7 @@ class _Sweep:
         return self._of(best, slice(0, len(self.inverse)))
 
     def of_tile(self, tile: Tile) -> Float32Array:
-        """Of a tile and what it shares with its neighbours, by its own candidates."""
+        """Depth of a tile and its margins, from its own candidates."""
         part = np.ascontiguousarray(self.views.reference[tile.rows, tile.columns])
         columns = np.ascontiguousarray(self.columns[:, tile.candidates, tile.columns])
         rows = np.ascontiguousarray(self.rows[:, tile.candidates, tile.rows])
@@ -181,7 +181,7 @@ def _halve_codes(codes: UInt8Array) -> UInt8Array:
 
 
 def _halve_camera(camera: Pinhole) -> Pinhole:
-    """What would have taken it."""
+    """The camera of the picture at half its size."""
     by = np.array([(camera.width // 2) / camera.width, (camera.height // 2) / camera.height])
     return replace(
         camera,
@@ -211,7 +211,7 @@ def _place_planes(camera: Pinhole, baseline: Array, inverse: Array, axis: int) -
 
 
 def _make_canvas(camera: Pinhole, view: Pinhole, depths: tuple[float, float]) -> _Canvas | None:
-    """What a view shows of what the reference sees between two depths; ``None`` where it shows nothing of it."""
+    """Part of a view that shows what the reference sees between two depths; ``None`` where there is none."""
     baseline = camera.cam_from_world @ (view.cam_in_world - camera.cam_in_world)
     turn = camera.cam_from_world @ view.cam_from_world.T
     canvas_from_view = camera.matrix @ turn @ np.linalg.inv(view.matrix)

@@ -12,7 +12,7 @@ from colmap_inertial.imaging.plane_sweep.pinhole import ROWS_AT_ONCE, Pinhole
 
 @dataclass(frozen=True, kw_only=True)
 class NormalLimits:
-    """What a plane is fitted to."""
+    """Limits of the fit of planes."""
 
     #: Pixels from the centre of the window.
     radius_px: int = 3
@@ -60,7 +60,7 @@ def estimate_normals(depth: Float32Array, camera: Pinhole) -> Float32Array:
 
 
 def _fit_rows(known: BoolArray, middle: Float32Array, room: Float32Array, begin: int, camera: Pinhole) -> Float32Array:
-    """Of rows ``begin ...``; ``room`` is their inverse depth with the neighbours around."""
+    """Fit rows ``begin ...``; ``room`` is their inverse depth with the neighbours around."""
     height, width = known.shape
     tolerance = _LIMITS.same_share * middle
     count, sx, sy, sxx, sxy, syy, sq, sxq, syq = (np.zeros(known.shape, dtype=np.float32) for _ in range(9))

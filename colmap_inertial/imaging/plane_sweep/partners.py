@@ -1,4 +1,4 @@
-"""Which pictures are compared with which, and between which depths: by the sparse points that they share."""
+"""Choose partner pictures and depth ranges from the sparse points that pictures share."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from colmap_inertial.imaging.plane_sweep.pinhole import Pinhole
 
 @dataclass(frozen=True, kw_only=True)
 class PartnerLimits:
-    """Which views are compared, and over which depths."""
+    """Limits for partner views and their depth ranges."""
 
     #: The best angle between two rays to a point: small angles measure no depth, at large ones things look different
     #: and hide each other.
@@ -41,7 +41,7 @@ _LIMITS = PartnerLimits()
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Sights:
-    """Which view observes which sparse points.
+    """Observations of sparse points by views.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class Sights:
 
     @classmethod
     def of(cls, views: Sequence[Pinhole], points: Array, observed: Sequence[Int64Array]) -> Sights:
-        """Of views and the numbers of the points that each of them observes."""
+        """Observations from views and the numbers of the points that each of them sees."""
         each = tuple(np.unique(numbers) for numbers in observed)
         number = np.concatenate([np.zeros(0, dtype=np.int64), *each])
         view = np.repeat(np.arange(len(each)), [len(numbers) for numbers in each])

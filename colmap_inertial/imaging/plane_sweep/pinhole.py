@@ -42,7 +42,7 @@ class Pinhole:
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
     def seen_from(self, other: Pinhole) -> tuple[Array, Array]:
-        """Where the points of another camera's depth map lie in this one.
+        """Positions of the points of another camera's depth map in this one.
 
         Returns
         -------

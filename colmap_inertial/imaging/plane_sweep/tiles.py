@@ -1,4 +1,4 @@
-"""Which candidates each part of a picture needs, by depths that were found at half its size."""
+"""Candidates of each part of a picture, from depths at half its size."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from colmap_inertial.core.arrays import Array
 
 @dataclass(frozen=True, kw_only=True)
 class TileLimits:
-    """How a picture is cut into tiles with candidates of their own."""
+    """Limits of tiles with candidates of their own."""
 
     #: Side of a tile: smaller ones need fewer candidates, but share more (2.2 times less work than all candidates; 1.8
     #: with 128 and 16).
@@ -47,7 +47,7 @@ class Tile:
 
     @property
     def kept(self) -> tuple[slice, slice]:
-        """Of what is worked on, what is of the tile."""
+        """The part of the worked area that belongs to the tile."""
         return _make_relative(self.inner_rows, self.rows), _make_relative(self.inner_columns, self.columns)
 
 

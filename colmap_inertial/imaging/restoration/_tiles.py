@@ -1,4 +1,4 @@
-"""How an image is handed to a network: in parts that overlap, of which the middles make the result."""
+"""Split an image for a network into overlapping parts whose middles make the result."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ class Span:
 
     @property
     def size(self) -> int:
-        """How much the network sees."""
+        """Size of the network's input."""
         return self.end - self.begin
 
     def kept(self, limit: int) -> tuple[slice, slice]:
-        """What is kept: its place in the image, which ends at ``limit``, and in the result."""
+        """Place of the kept part in the image, which ends at ``limit``, and in the result."""
         end = min(self.keep_end, limit)
         return slice(self.keep_begin, end), slice(self.keep_begin - self.begin, end - self.begin)
 

@@ -219,7 +219,7 @@ def _import_runtime() -> Any:
 
 
 def _choose_device(device: Device) -> Literal["cpu", "cuda"]:
-    """What to try to run on."""
+    """Devices to try, in order."""
     available = _CUDA in _import_runtime().get_available_providers()
     if device == "cuda" and not available:
         raise InertialError(

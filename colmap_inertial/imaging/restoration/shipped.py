@@ -16,7 +16,7 @@ _AGAIN = "install colmap-inertial again"
 
 
 def folder() -> Traversable:
-    """Where the files are, with ``checksums.json``."""
+    """Folder of the files, with ``checksums.json``."""
     return files("colmap_inertial.imaging.restoration").joinpath("weights")
 
 
@@ -46,7 +46,7 @@ def checksum(name: NetworkName) -> str:
 
 
 def read_model(name: NetworkName) -> bytes:
-    """What the ONNX file of a network holds.
+    """Content of the ONNX file of a network.
 
     Raises
     ------

@@ -1,1 +1,1 @@
-"""What estimators from inertial data share: preintegration, parameters, factors, priors, normal equations."""
+"""Common parts of the inertial estimators: preintegration, parameters, factors, priors, normal equations."""

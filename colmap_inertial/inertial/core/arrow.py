@@ -114,7 +114,7 @@ class ArrowSystem:
         return Inverse(unit=unit, factor=factor, here=here, beside=beside, followed=followed, root=root)
 
     def scaling(self, rhs_states: Array) -> tuple[Array, Array]:
-        """What makes the diagonal one, and the right-hand sides multiplied by it.
+        """Scaling that makes the diagonal one, and the right-hand sides multiplied by it.
 
         Radians, metres and bias walks differ by many orders of magnitude.
         """

@@ -75,7 +75,7 @@ class Group:
             z[self.columns] += flat.T @ values.reshape(len(flat), -1)
 
     def explained(self, inverse: Inverse) -> float:
-        """How many of the residuals' degrees of freedom the fit takes: the trace of their covariance after it."""
+        """Degrees of freedom of the residuals that the fit takes: the trace of their covariance after it."""
         n = len(self.residual)
         here, after = inverse.here[self.first :], inverse.here[self.first + 1 :]
         cov = self.here @ here[:n] @ self.here.transpose(0, 2, 1)
@@ -127,7 +127,7 @@ class Direct:
     share: Array | None = None
 
     def apply(self, states: Array, z: Array) -> Array:
-        """As :meth:`Group.apply`."""
+        """See :meth:`Group.apply`."""
         values = states[self.first : self.first + len(self.info) + self.step, self.columns]
         if self.step:
             values = values[1:] - self._kept(values[:-1])
@@ -137,7 +137,7 @@ class Direct:
         return values if self.keep is None else np.asarray(self.keep[:, None, None] * values)
 
     def pull_back(self, values: Array, states: Array, z: Array) -> None:
-        """As :meth:`Group.pull_back`."""
+        """See :meth:`Group.pull_back`."""
         n = len(self.info)
         pulled = self.info[:, None, None] * values
         if self.step:
@@ -146,7 +146,7 @@ class Direct:
         states[self.first : self.first + n, self.columns] += pulled
 
     def explained(self, inverse: Inverse) -> float:
-        """As :meth:`Group.explained`; of the share, the diagonal."""
+        """See :meth:`Group.explained`; only the diagonal of the share."""
         last = self.first + len(self.info)
         own = np.s_[:, self.columns, self.columns]
         cov = np.diagonal(inverse.here[self.first : last][own], axis1=1, axis2=2)
@@ -162,7 +162,7 @@ class Direct:
         return float(np.sum(cov if self.share is None else cov * np.diagonal(self.share, axis1=1, axis2=2)))
 
     def add_to(self, system: ArrowSystem) -> None:
-        """As :meth:`Group.add_to`."""
+        """See :meth:`Group.add_to`."""
         n, squared = len(self.info), self.info**2
         keep = np.ones(n) if self.keep is None else self.keep
         for i in range(self.columns.start, self.columns.stop):
@@ -177,7 +177,7 @@ def rotate(matrices: Array, vectors: Array) -> Array:
 
 
 def still_near(then: Estimate, x: Estimate, t_s: Array, tolerance: float = 1.0) -> bool:
-    """Whether the increments of an earlier estimate need only :func:`corrected` to be those of this one.
+    """Whether :func:`corrected` turns the increments of an earlier estimate into those of this one well enough.
 
     At a tolerance of one the difference is far below the noise.
     """
@@ -191,7 +191,7 @@ def still_near(then: Estimate, x: Estimate, t_s: Array, tolerance: float = 1.0) 
 
 
 def corrected(pre: Preintegrated, then: Estimate, x: Estimate) -> Preintegrated:
-    """Increments that were integrated for the estimate ``then``, for ``x``, to first order."""
+    """Correct increments that were integrated for the estimate ``then`` to first order for ``x``."""
     gyro_gain, accel_gain = x.gyro_gain - then.gyro_gain, x.accel_gain - then.accel_gain
     gyro_bias = x.gyro_bias_rad_s - then.gyro_bias_rad_s
     accel_bias = x.accel_biases_m_s2 - then.accel_biases_m_s2

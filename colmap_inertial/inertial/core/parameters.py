@@ -1,4 +1,4 @@
-"""What the estimators assume and estimate, and in which columns of states and globals."""
+"""Assumptions and parameters of the estimators, and their columns in states and globals."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ class Noise(ImuNoise):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class InertialStates:
-    """What the factor between two states of an IMU acts on, beside its increments."""
+    """Arguments of the factor between two states of an IMU, beside its increments."""
 
     world_from_imu: Array  # (K, 3, 3)
     imu_in_world_m: Array  # (K, 3)
@@ -143,7 +143,7 @@ class Estimate(InertialStates):
         imu_in_cam_m: Array,
         gyro_bias_rad_s: Array,
     ) -> Estimate:
-        """Where a fit begins: rotations, gravity and what the calibration says; all else is zero, the scale one."""
+        """Start of a fit: rotations, gravity and the calibration's values; scale one, all else zero."""
         zeros, none = np.zeros((len(world_from_imu), 3)), np.zeros((3, 3))
         return cls(
             metres_per_unit=1.0,
@@ -251,5 +251,5 @@ class Prior:
 
 
 def middle_s(t_s: Array) -> float:
-    """Where the clock rate and the accelerometer's walk are anchored."""
+    """Reference time of the clock rate and of the accelerometer's random walk."""
     return 0.5 * float(t_s[0] + t_s[-1])

@@ -1,4 +1,4 @@
-"""What the IMU says between two instants: relative rotation, velocity and position with covariance and derivatives.
+"""Preintegration of an IMU: relative rotation, velocity and position with covariance and derivatives.
 
 Between nodes ``k`` and ``k + 1``, ``T`` apart, with the body frame at node ``k`` as reference (Lupton and Sukkarieh
 2012; Forster et al. 2017)::
@@ -49,7 +49,7 @@ class SensorStream:
     paused_s: Array  # by each sample, the sum of the pauses before it
 
     def gap_s(self, begin_s: Array, end_s: Array) -> Array:
-        """How much of each interval from ``begin_s`` to ``end_s`` lies in gaps."""
+        """Duration of the gaps in each interval from ``begin_s`` to ``end_s``."""
         ends = np.interp(end_s, self.t_s, self.paused_s) - np.interp(begin_s, self.t_s, self.paused_s)
         return np.asarray(ends)
 
@@ -131,7 +131,7 @@ def find_saturated(imu: ImuRecording) -> tuple[BoolArray, BoolArray]:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SensorErrors:
-    """What is wrong with the readings of K intervals.
+    """Errors of the readings in K intervals.
 
     Attributes
     ----------
@@ -230,7 +230,7 @@ def preintegrate(nodes_s: Array, streams: SensorStreams, errors: SensorErrors) -
 
 
 def integration_steps(nodes_s: Array, streams: SensorStreams) -> Int64Array:
-    """In how many steps each interval is integrated."""
+    """Number of integration steps of each interval."""
     spacing = min(float(np.median(np.diff(stream.t_s))) for stream in (streams.gyro, streams.accel))
     step_s = float(np.clip(spacing, _SHORTEST_STEP_S, _LONGEST_STEP_S))
     return np.maximum(np.ceil(np.diff(nodes_s) / step_s).astype(np.int64), 2)

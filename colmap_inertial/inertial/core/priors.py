@@ -1,4 +1,4 @@
-"""What the joint estimator takes for granted before it sees a recording. All are zero-mean normal."""
+"""Priors of the joint estimator. All are zero-mean normal."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def model_scale_sigma(calibrated: bool) -> float:
 
 
 def clock_scale_sigma(clock_rate: float) -> float:
-    """What clocks of camera and IMU that run apart leave of a scale, as a standard deviation of its logarithm.
+    """Standard deviation of the logarithm of the scale due to different rates of the clocks of camera and IMU.
 
     Metres go with the square of time. The scale holds where the camera's clock is right; it is off by twice the rate
     where the IMU's is, which is as likely.
@@ -68,7 +68,7 @@ def clock_scale_sigma(clock_rate: float) -> float:
 
 
 def is_calibrated(imu: ImuRecording) -> bool:
-    """Whether the accelerometer's gain was corrected by a calibration that knows it well enough, as warm as it was."""
+    """Whether a calibration corrected the accelerometer's gain well enough, at this temperature."""
     if imu.calibration is None:
         return False
     return math.hypot(imu.calibration.gain_sigma, _sigma_of_warming(imu)) <= KNOWN_GAIN

@@ -1,4 +1,4 @@
-"""What ties submodels of a recording together, and what speaks against their being of one device and one recording."""
+"""Constraints between submodels of a recording, and evidence against one device and one recording."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from colmap_inertial.model.submodels.matches import PlacedImages
 
 @dataclass(frozen=True, kw_only=True)
 class EvidenceLimits:
-    """What counts between two submodels of a recording."""
+    """Limits for evidence between two submodels of a recording."""
 
     #: Links between the same two: the shortest ones; more say little beyond.
     links: int = 4
@@ -206,7 +206,7 @@ def _agreeing(rotations: Array, centres: Array, own_centres: Array) -> tuple[Boo
 
 
 def silent_s(submodels: Sequence[FittedSubmodel], streams: SensorStreams, link: ImuLink) -> float:
-    """How long the IMU was silent between two nodes."""
+    """Duration of the IMU's gaps between two nodes."""
     ends = [submodels[k].path.stamps_s(np.array([node]))[0] for k, node in link.ends]
     return float(max(gap_s[0] for gap_s in streams.gap_s(np.array(ends))))
 
@@ -245,7 +245,7 @@ def mounting_differs(one: FittedSubmodel, other: FittedSubmodel) -> bool:
 
 
 def clocks_differ(submodels: Sequence[FittedSubmodel], link: ImuLink) -> bool:
-    """Whether the IMU's clock runs on between two nodes as the camera's does no better than by chance."""
+    """Whether the clocks of IMU and camera disagree between two nodes by more than chance."""
     away_s, variance = 0.0, (PRIORS.clock_rate * link.seconds(submodels)) ** 2 + LEAST_STAMP_S**2
     for sign, (k, node) in zip((-1, 1), link.ends, strict=True):
         fit = submodels[k].path.at(np.array([node]))
@@ -267,7 +267,7 @@ def times_counted(submodels: Sequence[FittedSubmodel]) -> float:
 
 
 def chi2_limit(dof: int, *, real: bool) -> float:
-    """What chance hardly makes of a sum of squares over variances; ``real``: in real recordings.
+    """Upper limit of a sum of normalised squares by chance; ``real``: in real recordings.
 
     By Wilson and Hilferty's root: the third root of chi-square is next to normal.
     """

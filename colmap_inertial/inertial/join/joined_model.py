@@ -105,7 +105,7 @@ def join_models(
 
 
 def _metric_move(placed: Placed, k: int, world: WorldAxes) -> Similarity:
-    """From a submodel's own metric world to the joined one; the first one's origin stays where it is."""
+    """Similarity from a submodel's own metric world to the joined one; the first one's origin stays where it is."""
     up = matrix_from_quat(rotation_between(placed.gravity_m_s2, DOWN_IN_WORLD[world]))
     scale, rotation = float(placed.places.scale[k]), up @ placed.places.rotation[k]
     shift = up @ placed.places.translation[k] + placed.origins[0] - scale * rotation @ placed.origins[k]

@@ -1,4 +1,4 @@
-"""Which submodels of a recording become one model, and which stay apart."""
+"""Decide which submodels of a recording become one model."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ class Trial:
         return replace(gap, sigma_m=sigma_m, sigma_deg=float(np.degrees(sigma_rad)))
 
     def reason(self, gap: Gap, pair: Pair, why_not: str = "") -> str:
-        """What a gap was joined by, or why not, in words."""
+        """How a gap was joined, or why it was not."""
         by = [f"{gap.shared_images} images that both have"] if gap.shared_images else []
         by += [f"{gap.matched_images} images of one that match the other"] if gap.matched_images else []
         reason = why_not or (f"joined by {', '.join(by)}, and the IMU" if by else "joined by the IMU")
@@ -235,12 +235,12 @@ def _of(ties: Sequence[ImuLink] | Sequence[SimilarityConstraint], pair: Pair) ->
 
 
 def _count_images(constraints: Sequence[SimilarityConstraint], pair: Pair) -> int:
-    """How many images of a pair some constraints were measured by."""
+    """Number of images of a pair that measured some constraints."""
     return sum(len(one.images) for one in constraints if pair_of(one) == pair)
 
 
 def _gap(evidence: Evidence, pair: Pair) -> Gap:
-    """What lies between two submodels, before it is judged."""
+    """The gap between two submodels, before it is judged."""
     submodels = evidence.submodels
     links = [link for link in evidence.links if pair_of(link) == pair]
     shortest = min(links, key=lambda link: link.seconds(submodels), default=None)
@@ -343,7 +343,7 @@ def _why_unlinked(evidence: Evidence, pair: Pair) -> str:
 
 
 def _unsure(gap: Gap, limits: JoinOptions) -> str:
-    """What is not known well enough across a gap; empty where all is."""
+    """The part of a relative pose across a gap that is too uncertain; empty where none is."""
     assert gap.sigma_m is not None and gap.sigma_deg is not None
     if gap.sigma_m > limits.sigma_m:
         return (

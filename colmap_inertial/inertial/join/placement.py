@@ -38,7 +38,7 @@ LEAST_STAMP_S = 1e-5
 
 @dataclass(frozen=True, kw_only=True)
 class JointPlacement:
-    """How fitted submodels are placed."""
+    """Limits of placing fitted submodels."""
 
     #: Standard deviations about where a submodel starts, for what nothing ties: next to nothing.
     free_rad: float = 30.0
@@ -104,14 +104,14 @@ class ImuLink:
         return (self.first, self.from_node), (self.second, self.to_node)
 
     def seconds(self, submodels: Sequence[FittedSubmodel]) -> float:
-        """How long it lasts."""
+        """Duration of the gap."""
         begin_s, end_s = (float(submodels[k].path.nodes_s[node]) for k, node in self.ends)
         return end_s - begin_s
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Placed:
-    """Where K submodels come to lie.
+    """Placement of K submodels.
 
     Attributes
     ----------
@@ -182,7 +182,7 @@ class Problem:
         self.info = [_information(fit.cov) for fit in self.fits]
 
     def own(self, k: int) -> int:
-        """Where columns of what submodel k has for itself count from."""
+        """First column of submodel k's own parameters."""
         return int(self.begin[k + 1]) - post.OWN
 
     def columns(self, k: int) -> Int64Array:
@@ -193,7 +193,7 @@ class Problem:
         )
 
     def start(self) -> Placements:
-        """Where submodels come to lie by one constraint after the other, from the held one on."""
+        """Start: submodels placed by one constraint after the other, from the held one on."""
         origin = Placements.at_origin(np.array([fit.metres_per_unit for fit in self.fits]), self.size)
 
         def attach(state: Placements, tie: SimilarityConstraint | ImuLink, new: int) -> None:
@@ -235,7 +235,7 @@ class Problem:
         return np.asarray(self.fits[self.held].accel_gain + change)
 
     def preintegrated(self, state: Placements, begin: Node, end: Node) -> Preintegrated:
-        """What the IMU felt, by the device as it is thought of now."""
+        """Preintegrated motion with the current parameters of the device."""
         reference, change = self.fits[self.held], state.change[self.shared :]
         errors = SensorErrors(
             gyro_bias_rad_s=0.5 * (begin.gyro_bias_rad_s + end.gyro_bias_rad_s)[None],
@@ -271,7 +271,7 @@ class Problem:
         return out
 
     def _add_link(self, state: Placements, link: ImuLink, equations: Equations, *, by_imu: bool) -> None:
-        """What the IMU felt between two nodes, and that its biases and its clock walk but little."""
+        """Add the preintegrated motion between two nodes, and the random walk of its biases and clock."""
         begin, end = (Node.of(self, state, k, node) for k, node in link.ends)
         noise, every = self._noise(link), np.arange(self.size)
         dt_s = end.t_s - begin.t_s
@@ -323,7 +323,7 @@ class Problem:
         return np.asarray(-root @ np.concatenate(change) / (2 * step_s))
 
     def _noise(self, link: ImuLink) -> ImuNoise:
-        """Of the IMU between two submodels: the louder one's."""
+        """Noise of the IMU between two submodels: that of the noisier one."""
         one, other = (vars(self.submodels[k].path.noise.imu_over_seconds()) for k in (link.first, link.second))
         return ImuNoise(**{name: max(one[name], other[name]) for name in one})
 

@@ -60,7 +60,7 @@ def turning_around(nodes_s: Array, streams: SensorStreams, half_span_s: float) -
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Poses:
-    """Where the IMU was when each of M lines was exposed."""
+    """Pose of the IMU at the exposure of each of M lines."""
 
     since_s: Array  # (M,) after the frame's node
     reading: Array  # (M, 3) rotation vector since then, by the readings
@@ -145,7 +145,7 @@ def cameras_of(problem: Problem, x: Estimate) -> list[CameraModel]:
 
 
 def _group_by_camera(problem: Problem, observations: Observations) -> list[IndexArray]:
-    """Which observations each camera made."""
+    """Indices of the observations of each camera."""
     if len(problem.cameras) == 1:
         return [np.arange(len(observations.frame))]
     of = problem.camera_of[observations.frame]
@@ -172,7 +172,7 @@ class Projected:
 
 
 def project(problem: Problem, x: Estimate, observations: Observations) -> Projected:
-    """Where the points are predicted."""
+    """Predicted image positions of the points."""
     if np.any(observations.line != 0):
         poses = poses_at(problem, x, observations.frame, observations.line)
     else:
@@ -358,7 +358,7 @@ def walk_rows(problem: Problem, x: Estimate) -> Rows:
 
 
 def state_rows(problem: Problem, x: Estimate) -> Rows:
-    """What is known of states: next to nothing of poses and speeds; of the first one biases, position and heading."""
+    """Priors of states: weak on poses and velocities; on biases, position and heading of the first one."""
     count, prior = len(x.velocity_m_s), problem.prior
     residual, here = np.zeros((count, 21)), np.zeros((count, 21, N_STATE))
     inertial = problem.inertial

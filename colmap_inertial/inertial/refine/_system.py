@@ -34,7 +34,7 @@ class BandFactor:
 
     @classmethod
     def of(cls, band: Array, state: int) -> BandFactor:
-        """Of the lower triangle (n, width + 1), column by column, of states of so many numbers; it is used up.
+        """Factor of the lower triangle (n, width + 1), column by column, of states of this size; it is overwritten.
 
         Raises
         ------
@@ -97,13 +97,13 @@ class BandFactor:
         return np.asarray(out.reshape(-1, state, state)[: self.count // state])
 
     def log_determinant(self) -> float:
-        """Of the band."""
+        """Logarithm of the band's determinant."""
         return 2 * float(np.log(np.diagonal(self.blocks, axis1=1, axis2=2)).sum())
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Order:
-    """In which order the frames stand in the band, and how wide it is.
+    """Order of the frames in the band, and its width.
 
     Attributes
     ----------
@@ -118,7 +118,7 @@ class Order:
 
     @classmethod
     def of(cls, observations: Observations, frames: int) -> Order:
-        """In order of time, or by Cuthill and McKee's rule where that is narrower, as it is where loops close."""
+        """Order by time, or by Cuthill and McKee's rule where that is narrower, as it is where loops close."""
         from scipy.sparse import coo_array, csr_array
         from scipy.sparse.csgraph import reverse_cuthill_mckee
 
@@ -183,7 +183,9 @@ class System:
         *,
         damping: float,
     ) -> System:
-        """Of weighted observations, of all other residuals, and of the prior's information and right-hand side."""
+        """Build the system from weighted observations, all other residuals, and the prior's information and right-hand
+        side.
+        """
         frames, points, shared = len(order.place), len(observations.first) - 1, len(prior[1])
         n, seen = frames * N_STATE, by.by_shared.shape[2]
         band, border = np.zeros((n, order.width + 1)), np.zeros((n, seen))

@@ -27,7 +27,7 @@ from colmap_inertial.inertial.refine.world import (
 
 @dataclass(frozen=True, kw_only=True)
 class RefineLimits:
-    """When a refinement is believed, and how much of it is told."""
+    """Limits for accepting a refinement, and of its summary."""
 
     #: Every so many observations of points with at least so many is held out.
     every: int = 10
@@ -52,7 +52,7 @@ LIMITS = RefineLimits()
 
 @dataclass(frozen=True, kw_only=True)
 class Stretched:
-    """By how much a part of the path was stretched against the whole.
+    """Stretch of a part of the path against the whole.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class Stretched:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Judged:
-    """What a refinement came to.
+    """Result of a refinement.
 
     Attributes
     ----------
@@ -252,14 +252,14 @@ def _measured(problem: Problem, kept: BoolArray, x: Estimate) -> Problem:
 
 
 def _freedom(problem: Problem) -> float:
-    """How many more residuals than unknowns the IMU brings: rows and priors, less velocities, biases and the rest."""
+    """Residuals minus unknowns that the IMU adds: rows and priors, less velocities, biases and the rest."""
     assert problem.inertial is not None
     # biases walk, or are known beforehand: as many residuals as unknowns
     return float(max(1, 9 * int(problem.inertial.linked.sum()) - 3 * int(problem.inertial.touched.sum())))
 
 
 def _readout(problem: Problem, x: Estimate) -> tuple[float, float] | None:
-    """What the readout came to and its standard deviation, in seconds; None where nothing says how sure that is."""
+    """Estimated readout and its standard deviation, in seconds; None where there is no standard deviation."""
     try:
         cov = factored(problem, x).shared_cov()
     except np.linalg.LinAlgError:
@@ -328,7 +328,7 @@ def _convert_cost_to_px(costs: Array, sigma_px: float) -> float:
 def drift_map(
     problem: Problem, start: Estimate, x: Estimate, t_s: Array, solved: Factored, by: Moving
 ) -> tuple[Stretched, ...]:
-    """How the refinement changed the scale along a path, and how sure it is of it.
+    """Change of the scale along a path by the refinement, with its uncertainty.
 
     Parameters
     ----------

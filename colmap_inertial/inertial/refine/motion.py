@@ -19,7 +19,7 @@ from colmap_inertial.inertial.refine.world import derive_log_size, differentiate
 
 @dataclass(frozen=True, kw_only=True)
 class DriftLimits:
-    """How much work the covariance of a path may take, and when a refinement is worth its own."""
+    """Limits of the work for a path's covariance, and for choosing a refinement."""
 
     #: Normal equations of pictures alone, for a covariance: more take longer than a scale is worth.
     most_bytes: int = 300_000_000
@@ -65,7 +65,7 @@ def add_scale(cov: Array, variance_log: float, centre_m: Array, velocity_m_s: Ar
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PictureDrift:
-    """How a path that pictures alone made may be bent.
+    """Drift of a path that was mapped from pictures alone.
 
     Attributes
     ----------
@@ -110,7 +110,8 @@ class PictureDrift:
 
 
 def find_drift(seen: Seen, down: Array) -> PictureDrift | None:
-    """How surely pictures alone know the shape of a metric path; ``None`` without points, or where it is too much work.
+    """Covariance of the shape of a metric path from pictures alone; ``None`` without points, or where it takes too much
+    work.
 
     Parameters
     ----------
@@ -136,7 +137,7 @@ def find_drift(seen: Seen, down: Array) -> PictureDrift | None:
 
 @dataclass(frozen=True, kw_only=True)
 class Worth:
-    """What a refinement promises, before it is made.
+    """Expected benefit of a refinement.
 
     Attributes
     ----------
@@ -156,7 +157,7 @@ class Worth:
 
 
 def expect_worth(seen: Seen, problem: Problem, start: Estimate) -> Worth:
-    """Whether a refinement takes more drift away than it leaves, in little time: from what is known before it.
+    """Whether a refinement is expected to remove more drift than it leaves, in little time.
 
     Times are predicted from counts, so that the same model always has the same answer.
 

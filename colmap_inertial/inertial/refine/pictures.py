@@ -93,7 +93,7 @@ def pictures_alone(problem: Problem, xy_px: Array) -> Problem:
 
 @dataclass(frozen=True, kw_only=True)
 class PictureNoise:
-    """How observations err, and what the robust loss makes of them.
+    """Noise of observations, and its robust loss.
 
     Attributes
     ----------
@@ -116,7 +116,7 @@ class PictureNoise:
 
 
 def measure_picture_noise(problem: Problem, x: Estimate) -> PictureNoise:
-    """How observations err, by the residuals of a fit and how many numbers were fitted to them."""
+    """Noise of observations, from the residuals of a fit and its number of parameters."""
     observations = problem.observations
     at = project(problem, x, observations)
     squares = np.sum(at.residual[at.seen] ** 2, axis=1)

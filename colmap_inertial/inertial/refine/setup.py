@@ -1,4 +1,4 @@
-"""From a metric COLMAP model and a recording to the problem, and from its solution back to a model."""
+"""Set the problem up from a metric COLMAP model and a recording, and turn its solution back into a model."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ _LONGEST_STEP_S = 10.0
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Seen:
-    """What a COLMAP model says, in arrays.
+    """Content of a COLMAP model, in arrays.
 
     Attributes
     ----------
@@ -87,7 +87,7 @@ class Seen:
 
 
 def read_seen(reconstruction: pycolmap.Reconstruction, timing: FrameTiming) -> Seen:
-    """What a model says; its observations at the middle line."""
+    """Read a model into arrays; its observations are at the middle line."""
     t_of = dict(zip(timing.names, timing.pose_t_s().tolist(), strict=True))
     images = [reconstruction.image(i) for i in reconstruction.reg_image_ids()]
     images.sort(key=lambda image: (t_of.get(image.name, np.inf), image.name))
@@ -164,7 +164,7 @@ def keypoints_of(seen: Seen, keypoints_px: Mapping[str, Array]) -> Array:
 
 
 def _group_by_frame(seen: Seen) -> list[Int64Array]:
-    """Which observations each frame has."""
+    """Indices of the observations of each frame."""
     frames = seen.observations.frame
     order = np.argsort(frames, kind="stable")
     return np.split(order, np.searchsorted(frames[order], np.arange(1, len(seen.names))))
@@ -172,7 +172,7 @@ def _group_by_frame(seen: Seen) -> list[Int64Array]:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Known:
-    """What was known or estimated before.
+    """Values that were known or estimated before.
 
     Attributes
     ----------
@@ -369,7 +369,7 @@ class Written:
 
 
 def move_to_middle_lines(problem: Problem, x: Estimate) -> Written:
-    """What a camera without a rolling shutter would have seen."""
+    """Move observations to where a camera without a rolling shutter would have them."""
     frames = np.arange(len(x.velocity_m_s))
     poses = poses_at(problem, x, frames, np.zeros(len(frames)))
     cam_from_world = x.cam_from_imu @ poses.world_from_imu.transpose(0, 2, 1)

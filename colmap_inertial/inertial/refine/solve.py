@@ -32,7 +32,7 @@ _REST_DAMPING = 1e-3
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Solution:
-    """What a solve came to.
+    """Result of a solve.
 
     Attributes
     ----------
@@ -147,7 +147,7 @@ def solve(problem: Problem, start: Estimate) -> Solution:
 
 
 def _step(system: System, observations: Observations, by: Derivatives) -> tuple[Array, Array, Array] | None:
-    """What the system asks for; ``None`` where it needs more damping to be solved."""
+    """Step of the system; ``None`` where it needs more damping to be solved."""
     try:
         step = system.factored().step(system, observations, by)
     except np.linalg.LinAlgError:
@@ -169,7 +169,7 @@ def _promised(
     step: tuple[Array, Array, Array],
     observations: Observations,
 ) -> float:
-    """How much of the cost a step takes away if all were linear."""
+    """Decrease of the cost by a step, if all were linear."""
     states, shared, points = step
     change = np.einsum("nri,ni->nr", by.by_frame, states[observations.frame, : by.by_frame.shape[2]])
     change += by.by_shared @ shared[: by.by_shared.shape[2]]

@@ -1,4 +1,4 @@
-"""What the refinement measures, assumes and estimates, and in which columns."""
+"""Measurements, assumptions and parameters of the refinement, and their columns."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ FIRST_INTRINSIC = 9
 
 @dataclass(frozen=True, kw_only=True)
 class Columns:
-    """Where the shared numbers stand that follow those of the cameras."""
+    """Columns of the shared parameters, which follow those of the cameras."""
 
     intrinsics: int
 
     @property
     def seen(self) -> slice:
-        """What observations depend on where all lines are exposed at once."""
+        """Parameters of observations where all lines are exposed at once."""
         return slice(0, FIRST_INTRINSIC + self.intrinsics)
 
     @property
@@ -54,13 +54,13 @@ class Columns:
 
     @property
     def count(self) -> int:
-        """How many there are."""
+        """Number of parameters."""
         return self.gravity + 1
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Observations:
-    """Where points are seen, point by point.
+    """Observations, ordered by point.
 
     Attributes
     ----------
@@ -91,7 +91,7 @@ class Observations:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Turning:
-    """How each frame's IMU turns and is pushed around the instant of its state.
+    """Rotation and acceleration of each frame's IMU around the instant of its state.
 
     Attributes
     ----------
@@ -110,7 +110,7 @@ class Turning:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Inertial:
-    """What the IMU says of F frames, in order of time.
+    """Inertial measurements of F frames, in order of time.
 
     Attributes
     ----------
@@ -142,7 +142,7 @@ class Inertial:
 
     @property
     def middle_s(self) -> float:
-        """Where the clock rate is anchored."""
+        """Reference time of the clock rate."""
         return 0.5 * float(self.nodes_s[0] + self.nodes_s[-1])
 
 
@@ -209,7 +209,7 @@ class Estimate:
 
     @property
     def columns(self) -> Columns:
-        """Of what is shared."""
+        """Columns of the shared parameters."""
         return Columns(intrinsics=len(self.intrinsics))
 
     def moved(self, states: Array, shared: Array, points: Array) -> Estimate:
@@ -252,7 +252,7 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Prior:
-    """What is known beforehand, normal.
+    """Normal priors.
 
     Attributes
     ----------

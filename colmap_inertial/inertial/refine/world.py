@@ -33,7 +33,7 @@ COUNT = BIAS.stop
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FoundWorld:
-    """How sure a solution is of its world.
+    """Uncertainty of a solution's world: scale, gravity, velocities.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class FoundWorld:
 
 
 def find_world(problem: Problem, x: Estimate, centres: Array, solved: Factored, by: Moving) -> FoundWorld:
-    """What the information at a solution says of its world.
+    """Estimate the world from the information at a solution.
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ def state_scale(
 
 
 def _doubts(first: AcceptedScale, move: Similarity, problem: Problem, x: Estimate) -> list[str]:
-    """What keeps a refinement's own scale from being trusted, in the user's words."""
+    """Reasons why a refinement's own scale is not trusted."""
     out, gains = [], x.columns.accel_gain
     errors = x.accel_gain.ravel()
     if errors @ problem.prior.info[gains, gains] @ errors > LARGEST_GAIN_CHI2:

@@ -110,7 +110,7 @@ def first_seconds(trajectory: CameraTrajectory, seconds: float, *, start_s: floa
 
 
 def check_units(imu: ImuRecording) -> list[str]:
-    """What makes an IMU recording's numbers implausible as rad/s and m/s2; empty where nothing does.
+    """Reasons why an IMU recording's numbers are implausible as rad/s and m/s2; empty where there are none.
 
     Readers of files raise their own errors before; this guards arrays that come from elsewhere.
     """

@@ -232,7 +232,7 @@ class _Optimum:
     step: tuple[Array, Array]
 
     def score(self, columns: Array, data: Data, noise: Noise) -> shape.Scores:
-        """What the visual centres say of changes (K, 3, q) of their path."""
+        """Score of the visual centres for changes (K, 3, q) of their path."""
         centre = self.groups["centre"]
         assert isinstance(centre, fac.Group)
         return shape.score_columns(columns, data, noise, centre, self.inverse, self.step)
@@ -295,7 +295,7 @@ _CAUSE_OF_GLOBALS = {
 
 
 def _gain_surprise(prior: Prior, x: Estimate, cov: Array) -> float:
-    """How much farther from their prior the gains are than chance has it; see :class:`Fit`.
+    """Squared distance of the gains from their prior beyond chance; see :class:`Fit`.
 
     What of the gains the data do not determine stays at the prior's mean: ``9 - trace(information covariance)`` of them
     are determined.

@@ -1,4 +1,4 @@
-"""What every estimator of the scale begins with: the strength of gravity, and a recording on the camera's clock."""
+"""Inputs of every estimator of the scale: the strength of gravity, and a recording on the camera's clock."""
 
 from __future__ import annotations
 

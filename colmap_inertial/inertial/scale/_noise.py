@@ -23,7 +23,7 @@ Groups = Mapping[str, Group | Direct]
 
 @dataclass(frozen=True, kw_only=True)
 class Level:
-    """What is known beforehand of a noise level, in the unit of its field of :class:`Noise`."""
+    """Prior of a noise level, in the unit of its field of :class:`Noise`."""
 
     #: The most probable value.
     typical: float
@@ -90,7 +90,7 @@ def vibrates(data: Data) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class Expected:
-    """What is known of the levels beforehand.
+    """Priors of the levels.
 
     Attributes
     ----------
@@ -114,7 +114,7 @@ class Expected:
 
     @classmethod
     def of(cls, data: Data, sheet: ImuNoise | None) -> Expected:
-        """From the streams of the sensors; a data sheet raises it, never lowers it.
+        """Priors from the sensors' streams; a data sheet raises them, never lowers them.
 
         The white noise of a sensor is in its stream, and so is all that is quicker than the states: motion, and above
         all vibration, of which only a part harms. Up to what sensors have, an accelerometer's stream counts as its
@@ -201,7 +201,9 @@ class LevelSearch:
         self.noise = self.expected.start
 
     def update(self, groups: Groups, inverse: Inverse, states: Array, z: Array, *, moving: bool) -> None:
-        """What a step (K, m, 1), (n, 1) of all else and the inverse of its equations say; levels go along if moving."""
+        """Update with a step (K, m, 1), (n, 1) of the other parameters and the inverse of their equations; ``moving``
+        moves the levels.
+        """
         squares, right, counts = np.zeros((3, len(LEVELS)))
         own = []
         rhs, rhs_z = np.zeros((*states.shape[:2], len(LEVELS))), np.zeros((len(z), len(LEVELS)))
@@ -279,17 +281,17 @@ class LevelSearch:
         return self.decrement * self._left < _AT_REST
 
     def scale_moves(self) -> float:
-        """How much the logarithm of the scale would change with the step that the levels want to make."""
+        """Change of the logarithm of the scale with the next step of the levels."""
         most = _LARGEST_FIRST * self._left
         return abs(float(self.by_scale @ np.clip(self.wanted, -most, most)))
 
     @property
     def _left(self) -> float:
-        """What is left of the largest change."""
+        """Remaining part of the largest change."""
         return float(_TIRING ** max(0, self._steps - _PATIENCE))
 
     def scale_variance(self, groups: Groups, states: Array, z: Array) -> tuple[float, float]:
-        """What the levels' own uncertainty means for the scale.
+        """Variance of the scale due to the uncertainty of the levels.
 
         Parameters
         ----------

@@ -217,7 +217,7 @@ def all_groups(
 def rotation_groups(
     data: Data, noise: Noise, prior: Prior, x: Estimate, pre: Preintegrated
 ) -> dict[str, Group | Direct]:
-    """What rotations alone say; all else is held."""
+    """Residuals of rotations alone; all else is held."""
     k = len(data.t_s)
     rotation, _ = visual_groups(data, noise, x, pre.rate_rad_s, robust=True)
     held = {

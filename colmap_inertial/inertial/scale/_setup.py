@@ -1,4 +1,4 @@
-"""From a recording and a calibration to the measurements and priors of the joint fit.
+"""Measurements and priors of the joint fit, from a recording and a calibration.
 
 Frames of a video are averaged to one pose an eighth of a second. Averaging keeps what every frame says without a state
 for every frame. Within a group the IMU tells the motion far better than pictures do, so frames are compared after
@@ -376,7 +376,7 @@ def _information(calibration: CameraImuCalibration, imu: ImuRecording) -> Array:
 
 
 def _pose_shapes(pose_cov: Array | None, world_from_cam: Array) -> tuple[Array, Array, Array]:
-    """What covariances of the poses say about frames relative to each other; their overall levels are estimated."""
+    """Relative covariances of frames from covariances of the poses; their overall levels are estimated."""
     k = len(world_from_cam)
     if pose_cov is None:
         eye = np.tile(np.eye(3), (k, 1, 1))

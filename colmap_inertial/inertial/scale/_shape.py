@@ -22,7 +22,7 @@ from colmap_inertial.inertial.scale._setup import Data
 
 @dataclass(frozen=True, kw_only=True)
 class ShapeLimits:
-    """When a model's shape is wrong."""
+    """Limits for errors of a model's shape."""
 
     #: Breaks are sought so far apart, and from the ends; so many at most.
     spacing_s: float = 1.0
@@ -110,7 +110,7 @@ class ShapeFault:
         return np.asarray(centre[0] + _grown(centre, np.exp(log_scale)))
 
     def sentence(self, t_s: Array, widened: float) -> str:
-        """What is wrong, in the user's words; ``t_s`` are the nodes' times."""
+        """The error in words; ``t_s`` are the nodes' times."""
         size, sigma = 100 * np.expm1(float(self.value[0])), 196 * (widened * float(self.cov[0, 0])) ** 0.5
         advice = "close loops while recording, or scale its parts apart"
         if self.kind == "stretch":
@@ -149,7 +149,7 @@ def _grown(path: Array, factor: Array) -> Array:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Scores:
-    """Of q changes of the visual path: information (q, q), score (q,), and the scale's answer (q,)."""
+    """Scores of q changes of the visual path: information (q, q), score (q,), and the scale's response (q,)."""
 
     information: Array
     score: Array
@@ -159,7 +159,7 @@ class Scores:
 def score_columns(
     columns: Array, data: Data, noise: Noise, centre: fac.Group, inverse: Inverse, step: tuple[Array, Array]
 ) -> Scores:
-    """What the residuals at the optimum say of changes of the visual path.
+    """Score of the residuals at the optimum for changes of the visual path.
 
     Parameters
     ----------
@@ -188,7 +188,7 @@ def camera_path(x: Estimate) -> Array:
 
 
 def shape_columns(t_s: Array, path: Array) -> tuple[list[tuple[Kind, float]], Array]:
-    """What may be wrong, and (K, 3, q) what each unknown moves the path by; a stretch has five."""
+    """Candidate errors, and the motion (K, 3, q) of the path by each unknown; a stretch has five."""
     first_s, last_s = t_s[0] + LIMITS.margin_s, t_s[-1] - LIMITS.margin_s
     count = int(np.clip((last_s - first_s) // LIMITS.spacing_s + 1, 0, LIMITS.most_breaks))
     kinds: list[tuple[Kind, float]] = [("break", float(at_s)) for at_s in np.linspace(first_s, last_s, count)]

@@ -128,7 +128,7 @@ class Signals:
 
     @property
     def duration_s(self) -> float:
-        """Of all segments."""
+        """Duration of all segments."""
         return sum(end - begin for begin, end in self.segments)
 
     @property

@@ -67,12 +67,12 @@ class Suspicion:
 
     @property
     def scale_variance(self) -> float:
-        """What the uncertainty of the unknowns adds to the variance of the logarithm of the scale."""
+        """Variance of the logarithm of the scale due to the uncertainty of the unknowns."""
         return float(self.by_scale @ self.cov @ self.by_scale)
 
 
 def perturbations(accel: SensorStream, middle_s: float) -> dict[str, list[Array]]:
-    """For each suspicion the changes (N, 3) of the readings by its unknowns.
+    """Changes (N, 3) of the readings by the unknowns of each suspicion.
 
     ``bandwidth`` (s2): to second order, and but for a delay, a low-pass filter takes from a signal what is proportional
     to its second derivative. ``axes`` (s): axes that are not read at the same time. ``rate``: a clock of its own.
@@ -86,7 +86,7 @@ def perturbations(accel: SensorStream, middle_s: float) -> dict[str, list[Array]
 
 
 def columns(data: Data, x: Estimate, imu: fac.Group) -> tuple[dict[str, slice], Array]:
-    """Where each suspicion's unknowns stand, and their columns (K, 9, q) of the whitened inertial residuals ``imu``."""
+    """Slices of each suspicion's unknowns, and their columns (K, 9, q) of the whitened inertial residuals ``imu``."""
     k, accel = len(data.t_s) - 1, data.streams.accel
     errors = SensorErrors(
         gyro_bias_rad_s=x.gyro_bias_rad_s[:-1],
@@ -114,7 +114,7 @@ def columns(data: Data, x: Estimate, imu: fac.Group) -> tuple[dict[str, slice], 
 def suspicions(
     where: dict[str, slice], own: Array, explained: Array, residual: Array, by_scale: Array
 ) -> list[Suspicion]:
-    """What the score tests say.
+    """Results of the score tests.
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ def _is_of_path(suspicion: Suspicion) -> bool:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Faults:
-    """What was found wrong with an accelerometer: the sums of the unknowns of each suspicion that counted."""
+    """Faults of an accelerometer: the sums of the unknowns of each significant suspicion."""
 
     values: dict[str, Array]
 
@@ -214,7 +214,7 @@ class Faults:
         return np.asarray(self.values["axes"] @ _AXES)
 
     def sentences(self) -> list[str]:
-        """What is wrong, in the user's words."""
+        """The faults in words."""
         out = []
         if "bandwidth" in self.values:
             hz = 1 / (2 * np.pi * self._time_constant_s)

@@ -56,7 +56,7 @@ _RECORD_INSTEAD = (
 
 @dataclass(frozen=True, kw_only=True)
 class JudgementLimits:
-    """What decides whether a fit is refused, or doubtful."""
+    """Limits beyond which a fit is refused or doubtful."""
 
     #: Largest bias of the accelerometer.
     bias_m_s2: float = 2.0
@@ -82,7 +82,7 @@ _LIMITS = JudgementLimits()
 
 @dataclass(frozen=True, kw_only=True)
 class JointOptions:
-    """How the joint estimator works."""
+    """Options of the joint estimator."""
 
     gravity_m_s2: float = 9.80665
     """Magnitude of gravity where the recording was made (``gravity_at_latitude_m_s2``)."""
@@ -281,7 +281,8 @@ def _judged(
 
 
 def find_undecided_gain(fit: Fit, widened: float) -> tuple[float, float]:
-    """Whether gravity's length may be the accelerometer's gain, which a motion that hardly turns cannot tell from bias.
+    """Whether gravity's length may be the accelerometer's gain, which a motion with little rotation cannot tell from
+    bias.
 
     Parameters
     ----------
@@ -312,7 +313,7 @@ def find_undecided_gain(fit: Fit, widened: float) -> tuple[float, float]:
 
 @dataclass(frozen=True, kw_only=True)
 class FoundScale:
-    """What a fit says of the scale.
+    """Scale of a fit.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What the joint fit of one model says of the IMU at chosen instants, with the covariance of all of it together.
+"""Posterior of one model's joint fit at chosen instants, with the covariance of all of it together.
 
 Two models of one recording share the device and what it felt between them. To bring them together one needs more than
 their scales: rotation, position, velocity and biases at their ends, the direction of gravity, delays and gains, and how
@@ -44,7 +44,7 @@ _SHARED = [
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Posterior:
-    """What a fit says of n of its nodes, in metres, in the model's world with its origin at ``origin``.
+    """Posterior of n nodes of a fit, in metres, in the model's world with its origin at ``origin``.
 
     Attributes
     ----------
@@ -156,7 +156,7 @@ class FittedPath:
 
     @property
     def noise(self) -> Noise:
-        """As the fit found it."""
+        """Noise levels that the fit estimated."""
         return self._fit.noise
 
     @property
@@ -202,7 +202,7 @@ class FittedPath:
         return np.asarray(first + (instant_s - first_s) * (last - first) / (last_s - first_s))
 
     def _rows(self, nodes: Int64Array) -> tuple[Array, Array]:
-        """What is asked for of n nodes, by the fit's states (K, 21, s) and globals (79, s)."""
+        """Rows for n nodes, by the fit's states (K, 21, s) and globals (79, s)."""
         fit, x, t_s = self._fit, self._fit.estimate, self._data.t_s
         n, k = len(nodes), len(t_s)
         since_s = t_s[nodes] - par.middle_s(t_s)

@@ -40,7 +40,7 @@ _WHAT_TO_RECORD = "swing the camera back and forth by 20 cm or more, for 10 s or
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SpectralFit:
-    """What the spectra tell; ``cov`` (7, 7) of log scale, gravity and bias."""
+    """Fit to the spectra; ``cov`` (7, 7) of log scale, gravity and bias."""
 
     metres_per_unit: float
     gravity: Array
@@ -140,7 +140,7 @@ def fit_spectra(spectra: Spectra, calibration: CameraImuCalibration, gravity_m_s
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Prior:
-    """Of lever arm and bias: mean (6,) and the root of the information (6, 6)."""
+    """Prior of lever arm and bias: mean (6,) and the root of the information (6, 6)."""
 
     mean: Array
     root: Array

@@ -1,4 +1,4 @@
-"""From a scale and its standard deviation to an interval and a verdict, and what makes the interval wide."""
+"""Interval and verdict from a scale and its standard deviation, and the parts of the interval."""
 
 from __future__ import annotations
 
@@ -182,7 +182,7 @@ _WORTH_SAYING = 0.2
 
 
 def parts_in_words(parts: Mapping[str, float]) -> tuple[str, str]:
-    """What an interval is made of, and what would narrow it most.
+    """Parts of an interval in words, and what would narrow it most.
 
     Parameters
     ----------

@@ -50,7 +50,7 @@ MISALIGNMENT_SIGMA = np.sqrt(2) * PRIORS.accel_gain
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RestFit:
-    """What the fit found.
+    """Result of the fit.
 
     Attributes
     ----------
@@ -203,7 +203,7 @@ def _prior_sigma(gravity_sigma_m_s2: float) -> Array:
 
 
 def _widened(ratio: Array) -> Array:
-    """By how much the priors of each kind of error are too narrow for this device, at least 1."""
+    """Factor, at least 1, by which the priors of each kind of error are too narrow for this device."""
     factor = np.ones(_COUNT)
     for kind in (_ACCEL, _BIAS, _GYRO):
         factor[kind] = max(1.0, float(np.sqrt(np.mean(ratio[kind] ** 2))))
@@ -354,7 +354,7 @@ def _result(
 
 
 def _student(freedom: Array) -> Array:
-    """By how much 95 % intervals are wider than normal ones where the noise was learnt from so few residuals."""
+    """Factor of 95 % intervals against normal ones where few residuals estimate the noise."""
     from scipy.stats import t
 
     return np.asarray(t.ppf(0.975, freedom) / 1.959963984540054)

@@ -1,4 +1,4 @@
-"""Where a device lies still: found in its own readings."""
+"""Find rests of a device in its own readings."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from colmap_inertial.core.types import ImuRecording
 
 @dataclass(frozen=True, kw_only=True)
 class RestLimits:
-    """What counts as rest."""
+    """Limits of a rest."""
 
     #: Readings vary over windows of this length.
     window_s: float = 1.0
@@ -68,7 +68,7 @@ class Rests:
 
     @property
     def attitudes(self) -> int:
-        """How many there are."""
+        """Number of attitudes."""
         return len(np.unique(self.attitude))
 
 

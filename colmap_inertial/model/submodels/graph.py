@@ -49,7 +49,7 @@ def connected(members: Sequence[int], pairs: Iterable[Pair]) -> list[list[int]]:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Placements:
-    """Where K submodels lie: ``x_world = scale * rotation x_submodel + translation``, beside other unknowns.
+    """Poses of K submodels: ``x_world = scale * rotation x_submodel + translation``, with further unknowns.
 
     Attributes
     ----------
@@ -156,7 +156,7 @@ class Equations:
 
 @dataclass(frozen=True, kw_only=True)
 class Convergence:
-    """Where Gauss and Newton's method ends."""
+    """Convergence of Gauss-Newton's method."""
 
     #: Rounds at most.
     rounds: int

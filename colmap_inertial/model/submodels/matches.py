@@ -34,7 +34,7 @@ View = tuple[str, str, Int64Array]
 
 @dataclass(frozen=True, kw_only=True)
 class MatchLimits:
-    """What matches between images of two submodels must have to count."""
+    """Limits for matches between images of two submodels."""
 
     #: Matches of a pair of images, and points of a pair of submodels: as many as COLMAP asks of two views.
     matches: int = 15
@@ -64,7 +64,7 @@ class Submodel:
         self._points: dict[str, Int64Array] = {}
 
     def points(self, name: str) -> Int64Array:
-        """Of an image's features, the numbers of their points; -1 without one."""
+        """Point numbers of an image's features; -1 without a point."""
         if name not in self._points:
             self._points[name] = points_of_features(self.images[name])
         return self._points[name]
@@ -96,7 +96,7 @@ def read_matches(database: Path, wanted: Callable[[str, str], bool]) -> Iterator
 def matches_between(
     database: Path, submodels: Sequence[Submodel], wanted: Callable[[str, str], bool] | None = None
 ) -> dict[Pair, list[View]]:
-    """By pairs of submodels: matches of images, each of which is in one of the two alone."""
+    """Matches between images that are in one of two submodels alone, by pair of submodels."""
     holders: dict[str, set[int]] = defaultdict(set)
     for k, submodel in enumerate(submodels):
         for name in submodel.images:
@@ -117,7 +117,7 @@ def matches_between(
 
 
 def find_common_features(submodels: Sequence[Submodel]) -> dict[Pair, list[View]]:
-    """By pairs of submodels: the features of images that both have."""
+    """Features of images that two submodels share, by pair of submodels."""
     out: dict[Pair, list[View]] = {}
     for (a, first), (b, second) in itertools.combinations(enumerate(submodels), 2):
         if both := sorted(first.images.keys() & second.images.keys()):
@@ -237,7 +237,8 @@ def place_images(
 def localise(
     there: Submodel, own: Submodel, views: Sequence[View]
 ) -> list[tuple[str, str, pycolmap.Rigid3d, Int64Array]]:
-    """Of images of ``own``: name, image that matches best, pose, and the keypoints with points of ``there`` that agree.
+    """Localise images of ``own``: name, best matching image, pose, and the keypoints with points of ``there`` that
+    agree.
 
     ``views`` are matches of images, ``there`` first.
     """

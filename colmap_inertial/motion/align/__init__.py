@@ -44,7 +44,7 @@ _STILL_RAD_RTS = 0.015
 
 @dataclass(frozen=True, kw_only=True)
 class AlignOptions:
-    """How the clocks of camera and IMU are brought together."""
+    """Options of the alignment of the clocks of camera and IMU."""
 
     max_offset_s: float | None = None
     """Largest offset between raw stamps to consider; 1 for a shared clock. Without it, every offset is searched."""
@@ -136,7 +136,7 @@ def align_trimmed(
     prior: CameraImuCalibration | None = None,
     options: AlignOptions | None = None,
 ) -> CameraImuCalibration | None:
-    """Where to begin where some poses are wrong: the search of :func:`align_clocks` by the rotations that fit best.
+    """Start where some poses are wrong: the search of :func:`align_clocks` with the rotations that fit best.
 
     ``None`` where no offset is clearly better than the rest by 85 % of the intervals, nor by 70 %.
     """
@@ -155,7 +155,7 @@ def coarse_fit(
     prior: CameraImuCalibration | None = None,
     options: AlignOptions | None = None,
 ) -> ClockFit | NotObservableError:
-    """What :func:`align_clocks` starts from where the clocks keep step, with its evidence; or why there is nothing."""
+    """Start of :func:`align_clocks` where the clocks keep step, with its evidence; or the reason why there is none."""
     try:
         return _search(trajectory, imu, prior, options).whole(trajectory)
     except NotObservableError as error:
@@ -201,7 +201,7 @@ def _range(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Search:
-    """What the offset is sought by: the gyroscope, lowest and highest offset, what is known, thresholds."""
+    """Search for the offset: the gyroscope, lowest and highest offset, priors, thresholds."""
 
     path: GyroPath
     offsets_s: tuple[float, float]

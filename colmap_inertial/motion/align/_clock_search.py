@@ -332,7 +332,9 @@ def _scan(
 
 
 def _effective_intervals(intervals: Intervals) -> float:
-    """Independent intervals: long ones weigh more, and neighbours whose rotations are correlated repeat each other."""
+    """Number of independent intervals: long ones weigh more, and neighbours with correlated rotations repeat each
+    other.
+    """
     dt_s = intervals.dt_s
     scaled = intervals.turn_rad / np.sqrt(dt_s)[:, None]
     energy = max(float(np.mean(np.sum(scaled**2, axis=1))), 1e-15)

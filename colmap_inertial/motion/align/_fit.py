@@ -55,7 +55,7 @@ _OPEN_ROTATION_RAD, _OPEN_OFFSET_S = 0.2, 0.1
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Alignment:
-    """What the rotations tell about camera and IMU.
+    """Relation of camera and IMU estimated from rotations.
 
     Attributes
     ----------
@@ -70,7 +70,9 @@ class Alignment:
     clock_rate_sigma: float
 
     def drifts(self, faster_than: float = _FAST_CLOCK) -> bool:
-        """Whether the clocks drift apart beyond doubt, and faster than what the estimators allow for (or as asked)."""
+        """Whether the clocks drift apart significantly, and faster than the estimators allow for (or than
+        ``beyond``).
+        """
         return abs(self.calibration.clock_rate) > max(_SIGNIFICANT * self.clock_rate_sigma, faster_than)
 
     def settled(self) -> CameraImuCalibration:
@@ -80,7 +82,7 @@ class Alignment:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """What Gauss-Newton moves: rotation (xyzw), offset, bias, nuisance parameters."""
+    """State of Gauss-Newton: rotation (xyzw), offset, bias, nuisance parameters."""
 
     rotation: Array
     offset_s: float

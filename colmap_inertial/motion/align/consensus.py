@@ -28,7 +28,7 @@ from colmap_inertial.motion.align import Alignment, AlignOptions, align_clocks, 
 
 @dataclass(frozen=True, kw_only=True)
 class ConsensusLimits:
-    """What counts as agreement with the gyroscope."""
+    """Limits of agreement with the gyroscope."""
 
     #: Cameras agree to within this, or to within so many standard deviations of the steps between them (whose median
     #: is 1.538 standard deviations of an axis) ...
@@ -132,7 +132,7 @@ def _require_majority(consensus: RotationConsensus) -> None:
 
 
 def describe_consensus(consensus: RotationConsensus) -> tuple[str, ...]:
-    """What contradicts the gyroscope, in sentences; none where nothing does."""
+    """Describe contradictions to the gyroscope in sentences; empty where there are none."""
     out = []
     wrong, count = consensus.wrong, len(consensus.names)
     if wrong:
@@ -213,17 +213,17 @@ class _Recorded:
 
     @property
     def steps_deg(self) -> Array:
-        """How far ``D`` turns from each camera to the next."""
+        """Change of ``D`` from each camera to the next."""
         return _angles_deg(self.world_from_start[:-1], self.world_from_start[1:])
 
     @property
     def agreement_deg(self) -> float:
-        """To within what neighbours agree."""
+        """Tolerance of the agreement of neighbours."""
         usual = float(np.median(self.steps_deg)) / 1.538 if len(self.t_s) > 1 else 0.0
         return float(np.clip(LIMITS.sigmas * usual, LIMITS.least_deg, LIMITS.most_deg))
 
     def allowed_deg(self, within_deg: float, i: IndexArray | int, j: IndexArray | int) -> Array:
-        """By how much two cameras may differ, with what the gyroscope drifts from one to the other."""
+        """Tolerance between two cameras, including the gyroscope's drift from one to the other."""
         drift = LIMITS.drift_deg_s * np.abs(self.t_s[j] - self.t_s[i])
         drift = drift + LIMITS.drift_share * np.abs(self.swept_deg[j] - self.swept_deg[i])
         return np.minimum(within_deg + drift, max(within_deg, LIMITS.most_deg))
@@ -231,7 +231,7 @@ class _Recorded:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Parts:
-    """To which part each camera belongs, what it deviates by, and how parts turn to the first of them.
+    """Part of each camera, its deviation, and the rotation of each part against the first.
 
     A wrong camera's part is -1; that of one that was not judged -2.
     """
@@ -242,7 +242,7 @@ class _Parts:
 
     @classmethod
     def none(cls) -> _Parts:
-        """Of no cameras, with a largest part of none."""
+        """The parts of no cameras, with a largest part of none."""
         return cls(number=np.zeros(0, int), deviation_deg=np.zeros(0), ref_from_part_xyzw=np.array([[0.0, 0, 0, 1]]))
 
     def joined(self, later: _Parts) -> _Parts:
@@ -321,7 +321,7 @@ def _place_short_runs(
 
 
 def _deviations_deg(cameras: _Recorded, number: IndexArray) -> Array:
-    """How far each camera is turned against the next four of its part; a wrong one, against the nearest five placed."""
+    """Deviation of each camera from the next four of its part; of a wrong one, from the nearest five placed."""
     d, out = cameras.world_from_start, np.zeros(len(number))
     placed = np.flatnonzero(number >= 0)
     if not len(placed):

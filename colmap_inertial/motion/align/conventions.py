@@ -31,7 +31,7 @@ ACCELERATION_S = 0.5
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class QuickAccelerations:
-    """What changes within some two windows; N instants of the poses.
+    """Accelerations of N instants of the poses, averaged over two windows.
 
     Attributes
     ----------
@@ -108,7 +108,7 @@ _NOTHING = 1e-9
 
 @dataclass(frozen=True, kw_only=True)
 class LikelyConvention:
-    """What a table of poses most likely holds, other than it was read.
+    """Most likely convention of a table of poses, other than the one it was read in.
 
     Attributes
     ----------
@@ -126,7 +126,7 @@ class LikelyConvention:
 
     @property
     def found(self) -> str:
-        """What fits."""
+        """The convention that fits."""
         fits = "the IMU fits the camera's motion if"
         if len(self.written_as) > 1:
             fits = "the gyroscope fits the camera's rotations if"
@@ -134,17 +134,17 @@ class LikelyConvention:
 
     @property
     def advice(self) -> str:
-        """What to do."""
+        """Advice to the user."""
         return f"write each pose as {self.read_as}"
 
     @property
     def sentence(self) -> str:
-        """What fits and what to do."""
+        """The convention that fits, and the advice."""
         return f"{self.found}: {self.advice}"
 
 
 def _difference(read_as: PoseConvention, written_as: PoseConvention) -> str:
-    """What is different in the table from what is read."""
+    """Difference between the table and the reading."""
     differences = []
     if written_as.rotation != read_as.rotation:
         differences.append(f"the quaternions are inverted ({written_as.rotation}, not {read_as.rotation})")
@@ -192,7 +192,7 @@ def likely_convention(
     prior: CameraImuCalibration | None = None,
     options: AlignOptions | None = None,
 ) -> LikelyConvention | None:
-    """Whether poses fit the IMU if their table was written by another convention than it was read by.
+    """Whether poses fit the IMU under another convention of their table better than as read.
 
     Parameters
     ----------
@@ -264,7 +264,9 @@ def _evaluate_conventions(
 
 
 def _inverts(read_as: PoseConvention, written_as: PoseConvention) -> bool:
-    """Whether the rotations of a table, read by one instead of the other, turn the wrong way to a gyroscope."""
+    """Whether the rotations of a table, read in one convention instead of the other, turn the wrong way to a
+    gyroscope.
+    """
     return (read_as.rotation != written_as.rotation) != (read_as.order != written_as.order)
 
 

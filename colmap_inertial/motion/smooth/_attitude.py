@@ -224,12 +224,12 @@ class WorldAcceleration:
 
     @property
     def variance(self) -> float:
-        """Of the motion itself, each axis (m2/s4)."""
+        """Variance of the motion, each axis (m2/s4)."""
         return float(np.mean(np.var(self.accel_m_s2, axis=0)))
 
     @property
     def sample_variance(self) -> float:
-        """Of one sample's noise, each axis, by what does not even follow a straight line (m2/s4)."""
+        """Variance of one sample's noise, each axis, from deviations from straight lines (m2/s4)."""
         bend = self.accel_m_s2[2:] - 2 * self.accel_m_s2[1:-1] + self.accel_m_s2[:-2]
         # median of the square of a normal variable: 0.455; a second difference has six times the variance
         return float(np.median(bend**2)) / 0.455 / 6

@@ -104,7 +104,7 @@ class Chain:
 
     @cached_property
     def log_determinant(self) -> float:
-        """Of the measurements' covariance, up to a constant that does not depend on the noise."""
+        """Log determinant of the measurements' covariance, up to a constant that does not depend on the noise."""
         return float(
             2 * np.sum(np.log(self._factor[0][0]))
             + np.sum(np.linalg.slogdet(self.process_cov)[1])
@@ -113,7 +113,7 @@ class Chain:
 
     @property
     def log_likelihood(self) -> float:
-        """Of all axes, up to a constant; free directions of the first state are integrated out."""
+        """Log likelihood of all axes, up to a constant; free directions of the first state are integrated out."""
         return -0.5 * (self.energy + self.measured.shape[1] * self.log_determinant)
 
     @cached_property
@@ -195,7 +195,7 @@ def white_acceleration(dt_s: Array) -> Array:
 
 
 def worst_outliers(t: Array, wrong: Array, jumped: Array, *, limit: float, reach: float) -> tuple[BoolArray, BoolArray]:
-    """Which measurements (T,) to leave out and which transitions (T-1,) to free, after one look.
+    """Measurements (T,) to leave out and transitions (T-1,) to free, after one look.
 
     Whatever exceeds ``limit`` competes; the worst wins, and silences everything within ``reach`` of its time, because
     an outlier makes its neighbours look like ones.
@@ -249,7 +249,7 @@ def most_likely(chain_of: Callable[[Array], Chain], start: Array, *, expected: A
 
 @dataclass(frozen=True, kw_only=True)
 class PositionLimits:
-    """How the noise of positions is searched, and when one is an outlier."""
+    """Limits of the search for the noise of positions, and for outliers."""
 
     #: Range of the smoother's time constant in frame intervals. Longer ones than the last would lose the digits of a
     #: double; they would smooth nothing but stillness any further.
@@ -269,7 +269,7 @@ _LIMITS = PositionLimits()
 
 @dataclass(frozen=True, kw_only=True)
 class SmoothOptions:
-    """How the camera's path is smoothed."""
+    """Options of smoothing the camera's path."""
 
     outlier_chi2: float = 30.0
     """A pose, or a jump between two poses, this unlikely (chi-square with 3 degrees of freedom) is left out."""

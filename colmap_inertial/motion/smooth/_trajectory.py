@@ -190,7 +190,7 @@ def _rate_of_change(attitude: Attitude, t_s: Array, step_s: float) -> Array:
 
 
 def _spin_variance(imu: ImuRecording, step_s: float) -> float:
-    """Of that angular acceleration, from the gyroscope's white noise."""
+    """Variance of that angular acceleration, from the gyroscope's white noise."""
     density = (imu.noise or TYPICAL_NOISE).gyro_density_rad_s_rthz
     return 2 * density**2 / step_s / (2 * step_s) ** 2
 

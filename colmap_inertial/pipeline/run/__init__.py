@@ -1,1 +1,1 @@
-"""How a run works: its folder, its steps and their resumption, options as TOML, progress."""
+"""A run: its folder, its steps and their resumption, options as TOML, progress."""

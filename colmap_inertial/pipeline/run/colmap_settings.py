@@ -128,7 +128,7 @@ class ColmapSettings:
         return tuple(text for text in self.settings if _SECTIONS[_section(text)].step in steps)
 
     def identity(self, *steps: Step) -> list[object]:
-        """What decides these steps: also the content of files that settings name."""
+        """Values that decide these steps, with the content of files that settings name."""
         chosen = self.of(*steps)
         files = [Path(text.partition("=")[2]) for text in chosen]
         return [*chosen, *(fingerprint(path) for path in files if path.is_absolute() and path.exists())]
@@ -145,7 +145,7 @@ NO_SETTINGS: ColmapSettings = ColmapSettings()
 
 
 def read_settings(given: tuple[str, ...], project: Path | None) -> ColmapSettings:
-    """What ``--colmap`` and a ``project.ini`` set, checked against the installed pycolmap.
+    """Settings of ``--colmap`` and of a ``project.ini``, checked against the installed pycolmap.
 
     Parameters
     ----------

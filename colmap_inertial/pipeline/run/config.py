@@ -55,7 +55,7 @@ def read_config(path: StrPath, cls: type[Options]) -> Options:
 
 
 def read_values(path: Path) -> dict[str, Any]:
-    """What a TOML file says, unchecked; a :class:`FormatError` for a file that is none."""
+    """Content of a TOML file, unchecked; a :class:`FormatError` for another file."""
     try:
         require_regular(path)
         return tomllib.loads(path.read_text(encoding="utf-8"))

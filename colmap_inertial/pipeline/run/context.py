@@ -1,4 +1,4 @@
-"""What goes through a run together: what was recorded, and how the work is done."""
+"""Values that go through a run: the recording, and how the work is done."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Recording:
         return cls(capture=capture, imu=imu, timing=timing, prior=prior, every=timing, max_offset_s=limit_s)
 
     def using(self, timing: FrameTiming) -> Recording:
-        """With some of its frames."""
+        """The recording with some of its frames."""
         return replace(self, timing=timing)
 
     def identity(self) -> dict[str, object]:
@@ -78,7 +78,7 @@ class Recording:
         }
 
     def inputs(self) -> list[object]:
-        """What identifies the files that frames are read from."""
+        """Identity of the files that frames are read from."""
         capture, source = self.capture, self.capture.image_folder
         paths = [] if source is None else [path_in(source, name) for name in self.timing.names]
         if isinstance(capture.frames, Video):
@@ -91,7 +91,7 @@ class Recording:
 
 
 def prior_calibration(capture: Capture, given: CalibrationFiles) -> CameraImuCalibration:
-    """What is known of camera and IMU beforehand: from a calibration file where one is given, else from the capture."""
+    """Prior calibration of camera and IMU: from a calibration file if given, else from the capture."""
     files = read_for_recording(given, shared_clock=capture.shared_clock)
     calibration, of_imu = files.camera_imu or capture.calibration, files.imu or capture.imu_calibration
     return calibration if of_imu is None else of_imu.loosened(calibration)
@@ -105,7 +105,7 @@ def correct_imu(capture: Capture, imu: ImuRecording, given: CalibrationFiles) ->
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RunContext:
-    """How the work is done.
+    """Settings of the work: progress, threads, seed, limits.
 
     Attributes
     ----------
@@ -135,7 +135,7 @@ class RunContext:
 
     @classmethod
     def of(cls, options: ReconstructOptions, *, device: Device = "cpu", progress: Progress = silent) -> RunContext:
-        """As the options of a reconstruction ask for; an ``InertialError`` for options that COLMAP does not have."""
+        """Settings from the options of a reconstruction; an ``InertialError`` for options that COLMAP does not have."""
         num_threads = 1 if options.deterministic else -1
         settings = read_settings(options.colmap, options.colmap_project)
         return cls(
@@ -152,5 +152,5 @@ class RunContext:
         return replace(self, progress=progress)
 
     def identity(self) -> dict[str, object]:
-        """What decides a result: not who listens, nor where."""
+        """Settings that decide a result, without listeners and places."""
         return {name: getattr(self, name) for name in ("num_threads", "seed", "device", "features")}

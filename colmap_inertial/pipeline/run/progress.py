@@ -1,4 +1,4 @@
-"""Who hears how far a run is."""
+"""Receivers of a run's progress."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Progress(Protocol):
 
 @runtime_checkable
 class HearsSteps(Protocol):
-    """What a receiver of progress may also be told: which steps a run does, and which it keeps."""
+    """A receiver of progress that is also told which steps a run does, and which it keeps."""
 
     def kept(self, step: str, /) -> None:
         """An earlier run finished this step, and it stands."""

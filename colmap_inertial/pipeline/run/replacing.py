@@ -38,7 +38,7 @@ def is_finished(workspace: Workspace) -> bool:
 
 
 def is_made_of(workspace: Workspace, config: str, inputs: str) -> bool:
-    """Whether what a folder holds is, or becomes, the result of a configuration and of inputs, by their hash."""
+    """Whether a folder holds, or will hold, the result of this configuration and these inputs, by their hash."""
     try:
         known = read_json(workspace.inputs).get("inputs")
         return known == inputs and workspace.config.read_bytes() == config.encode()
@@ -47,7 +47,9 @@ def is_made_of(workspace: Workspace, config: str, inputs: str) -> bool:
 
 
 def place_beside(workspace: Workspace, config: str, inputs: str) -> Workspace:
-    """Where the run of something else works: as an earlier one left it, or with all that the folder holds."""
+    """Folder beside the result in which a run with other options works: as an earlier one left it, or with links to all
+    files.
+    """
     beside = Workspace(workspace.stamps / _NEXT)
     if not is_made_of(beside, config, inputs):
         drop_beside(workspace)
@@ -89,7 +91,7 @@ def replace_result(workspace: Workspace) -> None:
 
 
 def list_changed_options(earlier: Path, config: str) -> list[str]:
-    """What another configuration says otherwise, a few words for each option."""
+    """Describe each option that differs in another configuration, in a few words."""
     with contextlib.suppress(FormatError):
         before, after = _flat(read_values(earlier)), _flat(tomllib.loads(config))
         names = [name for name in sorted({*before, *after}) if before.get(name) != after.get(name)]
@@ -114,7 +116,7 @@ def moved(value: T, source: Path, target: Path) -> T:
 
 
 def _entries(workspace: Workspace) -> list[str]:
-    """What a folder and the records of its steps hold, but the log, the lock, and what is of this module."""
+    """Content of a folder and of the records of its steps, without the log, the lock, and this module's own files."""
     own = {_NEXT, _RECORD, _EARLIER, workspace.lock.name}
     steps = [f"{workspace.stamps.name}/{path.name}" for path in workspace.stamps.iterdir() if path.name not in own]
     others = {workspace.stamps.name, workspace.log.name}

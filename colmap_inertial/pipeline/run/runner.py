@@ -60,7 +60,7 @@ def canonical(value: object) -> object:
 
 
 def hash_values(*values: object) -> str:
-    """What tells values from others."""
+    """Hash of values."""
     return hashlib.sha256(json.dumps(canonical(values), sort_keys=True).encode()).hexdigest()
 
 
@@ -104,7 +104,7 @@ _READ_BYTES, _PIECE_BYTES = 4 << 20, 1 << 16
 
 
 def fingerprint(path: Path) -> list[object]:
-    """What identifies an input: names, sizes, modification times and what is in it.
+    """Identity of an input: names, sizes, modification times and content.
 
     Tools that edit metadata or copy with the old times leave size and time as they were, so the content counts, too: of
     files up to 4 MiB, as most pictures and tables are, each byte; of larger ones 64 pieces over their whole length. Not
@@ -125,7 +125,7 @@ def _content(path: Path, stat: os.stat_result) -> str:
 
 @functools.lru_cache(maxsize=100_000)
 def _digest(path: Path, size: int, _mtime_ns: int, _ctime_ns: int) -> str:
-    """Of a file's content; once in a run, as several steps ask for the same inputs."""
+    """Digest of a file's content; once in a run, as several steps ask for the same inputs."""
     digest = hashlib.blake2b(digest_size=16)
     try:
         with open(path, "rb") as file:

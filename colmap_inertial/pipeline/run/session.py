@@ -64,16 +64,16 @@ class Session:
     out: Path | None = None
 
     def in_place(self, value: T) -> T:
-        """What a run made, with its paths as they are after the end."""
+        """The result of a run, with its paths after the end."""
         return value if self.out is None else moved(value, self.workspace.root, self.out)
 
     @property
     def progress(self) -> Progress:
-        """Who hears how far it is."""
+        """Receiver of the progress."""
         return self.context.progress
 
     def stands(self, content: Mapping[str, object]) -> bool:
-        """Whether an earlier run's ``result.json`` says this already, and nothing had to be made again."""
+        """Whether an earlier run's ``result.json`` holds this result already, and nothing had to be made again."""
         if self.runner.worked or find_loss(self.workspace, ["report"]):
             return False
         try:

@@ -235,7 +235,7 @@ def refuse_links(root: Path) -> None:
 
 
 def _places_of_links(workspace: Workspace) -> list[Path]:
-    """Where links of an existing project may be: as they came, and where a run that was killed made them ready."""
+    """Possible places of links of an existing project: its copy, and the copy that a killed run prepared."""
     names: Sequence[object] = ()
     if workspace.placed.is_file() and not workspace.placed.is_symlink():
         names = read_json(workspace.placed).get("paths", ())
@@ -245,7 +245,7 @@ def _places_of_links(workspace: Workspace) -> list[Path]:
 
 @dataclass(frozen=True, kw_only=True)
 class Places:
-    """Where a finished folder may hold what others go on with, the best first; not each of them is there.
+    """Places in a finished folder that other commands continue from, the best first; not each of them exists.
 
     Attributes
     ----------

@@ -39,7 +39,7 @@ from colmap_inertial.pipeline.stages.inputs import StageInputs
 
 @dataclass(frozen=True, kw_only=True)
 class SmoothingLimits:
-    """How COLMAP sees deblurred frames smoothed."""
+    """Smoothing of deblurred frames for COLMAP."""
 
     #: Standard deviation of the Gaussian, in linear light, as a share of the blur's length, and at most: what a filter
     #: leaves of noise and ringing grows with the blur, and moves cameras; of short blur, it leaves detail that gives
@@ -140,7 +140,7 @@ class DeblurStage:
 
     @classmethod
     def of_plan(cls, plan: ImagingPlan, *, drop: bool = True, smoothing: bool = True) -> DeblurStage | None:
-        """What a plan says; it need not drop what is too blurred, nor have COLMAP see it smoothed.
+        """The stage of a plan, optionally without dropping frames and without smoothing.
 
         Where frames must bear out the gyroscope by themselves, they must do so clearly for a filter; for the network
         it is enough that they do not speak against it.

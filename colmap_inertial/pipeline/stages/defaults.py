@@ -30,17 +30,17 @@ _MODEL: tuple[Callable[[StageInputs], ModelStage | None], ...] = (
 
 
 def default_frame_stages(inputs: StageInputs) -> list[FrameStage]:
-    """What stands for ``...`` in ``frame_stages``."""
+    """Frame stages that replace ``...`` in ``frame_stages``."""
     return _applying(_FRAME, inputs)
 
 
 def default_keypoint_stages(inputs: StageInputs) -> list[KeypointStage]:
-    """What stands for ``...`` in ``keypoint_stages``."""
+    """Keypoint stages that replace ``...`` in ``keypoint_stages``."""
     return _applying(_KEYPOINT, inputs)
 
 
 def default_model_stages(inputs: StageInputs) -> list[ModelStage]:
-    """What stands for ``...`` in ``model_stages``."""
+    """Model stages that replace ``...`` in ``model_stages``."""
     return _applying(_MODEL, inputs)
 
 

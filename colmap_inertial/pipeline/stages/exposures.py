@@ -59,7 +59,7 @@ def fuses_pairs(capture: Capture, options: ExposureOptions, *, deblur: str | Non
 
 @dataclass(frozen=True, kw_only=True)
 class FusedPair:
-    """What was done with one pair.
+    """Treatment of one pair.
 
     Attributes
     ----------

@@ -25,7 +25,7 @@ from colmap_inertial.pipeline.stages.protocols import FrameStage, KeypointStage
 
 @dataclass(frozen=True, kw_only=True)
 class FrameRecord:
-    """What happened to one frame.
+    """Treatment of one frame.
 
     Attributes
     ----------
@@ -62,14 +62,14 @@ class FrameRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class FrameRecords:
-    """What happened to the frames of a capture, in order of time."""
+    """Treatment of the frames of a capture, in order of time."""
 
     frames: tuple[FrameRecord, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
 class FramePaths:
-    """Where frames come from and go to.
+    """Sources and destinations of frames.
 
     Attributes
     ----------

@@ -53,7 +53,7 @@ class GyroView:
         return GyroCamera.from_timed(self.timed())
 
     def shutter(self, index: int) -> FrameShutter:
-        """When the lines of one frame are exposed."""
+        """Exposure of the lines of one frame."""
         return FrameShutter.of(self.timing, index, width=self.camera.width, height=self.camera.height)
 
     def index(self) -> dict[str, int]:
@@ -63,7 +63,7 @@ class GyroView:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ImagingPlan:
-    """What is to be done to frames and keypoints, and why.
+    """Treatment of frames and keypoints, with its reasons.
 
     Attributes
     ----------
@@ -90,7 +90,7 @@ class ImagingPlan:
     rolling_shutter_note: str = ""
 
     def as_json(self) -> dict[str, object]:
-        """In JSON types, without the recording."""
+        """As JSON types, without the recording."""
         view = self.view
         return {
             "deblur": self.deblur_note,

@@ -1,4 +1,4 @@
-"""What the default stages of a run are made of, and the network that fuses pairs of exposures."""
+"""Inputs of the default stages of a run, and the network that fuses pairs of exposures."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Fuse = Callable[[Float32Array, Float32Array, BlurField | None], Float32Array]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Fuser:
-    """What makes one picture of two.
+    """Function that fuses two pictures into one.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ def lsd2_fuser(options: ExposureOptions | None = None) -> Fuser:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StageInputs:
-    """What the default stages of a run are made of.
+    """Inputs of the default stages of a run.
 
     Attributes
     ----------

@@ -50,7 +50,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class MotionLimits:
-    """How velocities of frames, and the readout of rectified ones, are stated."""
+    """Limits for the velocities of frames, and for the readout of rectified ones."""
 
     #: Share of the readout that acts on poses after rectification.
     readout_share: float = 0.1
@@ -107,7 +107,7 @@ class InertialStage:
         return inputs.recording.capture.camera is None if asked is None else asked
 
     def calibration_of(self, model: Model) -> CameraImuCalibration | None:
-        """What is known of the camera that a model was mapped for; rectified keypoints leave it hardly any readout."""
+        """Calibration of the camera that a model was mapped for; rectified keypoints leave it hardly any readout."""
         if model.rectified and self.calibration is not None:
             return calibration_of_rectified(self.calibration)
         return self.calibration
@@ -200,7 +200,7 @@ class MetricStage(InertialStage):
 
 
 def provenance(estimate: ScaleEstimate) -> str:
-    """Where an inertial scale comes from, in words."""
+    """Source of an inertial scale, in words."""
     return f"inertial scale, method {estimate.method}, {estimate.verdict}"
 
 
@@ -321,7 +321,7 @@ def _write_covariance(target: Path, t_s: Array, cov: Array, rotation: Array | No
 
 
 def motion_file(trajectory: Path) -> Path:
-    """Where the motion during each frame (``types.CameraMotion``) lies beside a path."""
+    """File of the motion during each frame (``types.CameraMotion``), beside a path."""
     return trajectory.with_name(f"{trajectory.stem}_motion.json")
 
 

@@ -1,4 +1,4 @@
-"""What a stage of each kind takes and gives: the three hooks of a reconstruction.
+"""Arguments and results of each kind of stage: the three hooks of a reconstruction.
 
 Our own stages come in by the same doors. What a stage did travels with the data (``treatments``), and results are made
 from that alone.
@@ -108,7 +108,7 @@ def joins_models(stage: object) -> TypeGuard[JoiningStage]:
 
 
 def changes_images(stages: Iterable[ModelStage]) -> bool:
-    """Whether images can be made only after these stages: one of them changes what the images agree with."""
+    """Whether images can be made only after these stages, because one of them changes the matching images."""
     return any(getattr(stage, "changes_images", False) for stage in stages)
 
 

@@ -102,6 +102,6 @@ class ReadoutStage(InertialStage):
 
 
 def _keypoints_of(reconstruction: pycolmap.Reconstruction) -> dict[str, Array]:
-    """By image name, (N, 2) where a model has its keypoints."""
+    """Positions (N, 2) of a model's keypoints, by image name."""
     images = (reconstruction.image(i) for i in reconstruction.reg_image_ids())
     return {image.name: np.array([point.xy for point in image.points2D]).reshape(-1, 2) for image in images}

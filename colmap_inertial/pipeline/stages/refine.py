@@ -93,7 +93,7 @@ class RefineStage(InertialStage):
 
     @property
     def changes_images(self) -> bool:
-        """Whether images that were rectified agree with the refined model only once they are made again."""
+        """Whether rectified images agree with the refined model only once they are made again."""
         return self.shutter is not None
 
     def __call__(self, model: Model, /) -> Model:
@@ -213,7 +213,7 @@ class RefineStage(InertialStage):
 
 
 def _alternate(model: Model) -> bool:
-    """Whether cameras take turns: two devices, or a rig that nobody declared; not one that zoomed, and back."""
+    """Whether cameras take turns, as two devices or an undeclared rig do; not a camera that zoomed, and back."""
     t_of = dict(zip(model.timing.names, model.timing.pose_t_s().tolist(), strict=True))
     images = [model.reconstruction.image(image_id) for image_id in model.reconstruction.reg_image_ids()]
     timed = sorted((image for image in images if image.name in t_of), key=lambda image: t_of[image.name])
@@ -227,7 +227,9 @@ def _alternate(model: Model) -> bool:
 
 
 def _devices(reconstruction: pycolmap.Reconstruction, images: Sequence[pycolmap.Image]) -> list[Hashable]:
-    """What took each image: its camera; where nearly each has one of its own, those alike by folder, size and focus."""
+    """Device of each image: its camera; where nearly each image has its own camera, those with the same folder, size
+    and focus.
+    """
     cameras = [reconstruction.camera(image.camera_id) for image in images]
     if len({camera.camera_id for camera in cameras}) <= max(1, len(images) // 2):
         return [camera.camera_id for camera in cameras]
@@ -252,7 +254,7 @@ def _said(model: Model, reason: str, *, action: str = "", **values: object) -> M
 
 
 def _rolling(x: Estimate, rolling: bool) -> str:
-    """What is said of pictures that keep their rolling shutter."""
+    """Describe pictures that keep their rolling shutter."""
     if not rolling:
         return ""
     upwards = "" if x.readout_s > 0 else " from the last line to the first"
@@ -280,7 +282,7 @@ def _motion(seen: Seen, centres: Array, judged: Judged, *, calibrated: bool, rea
 
 
 def _move_of(seen: Seen, after: Written) -> Similarity:
-    """From the model before to the refined one: sizes, mean orientation and middles agree."""
+    """Similarity from the model before to the refined one: sizes, mean orientation and middles agree."""
     turns = after.cam_from_world.transpose(0, 2, 1) @ seen.cam_from_world
     u, _, vt = np.linalg.svd(turns.sum(axis=0))
     turn = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
@@ -298,7 +300,7 @@ def _moved(similarity: Similarity, move: Similarity) -> Similarity:
 
 
 def _calibration_figures(judged: Judged) -> dict[str, object]:
-    """What was estimated of the device, with standard deviations."""
+    """Estimates of the device, with standard deviations."""
     x, cov = judged.estimate, judged.shared_cov
     assert cov is not None
     sigma = np.sqrt(np.diagonal(cov))

@@ -1,1 +1,1 @@
-"""What a command does from beginning to end, and what it leaves behind."""
+"""Commands from beginning to end, and their outputs."""

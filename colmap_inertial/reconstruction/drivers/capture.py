@@ -1,4 +1,4 @@
-"""From a capture to a metric, gravity-up COLMAP model: one list of calls, with a hook at each seam."""
+"""Reconstruct a capture as a metric, gravity-up COLMAP model: one list of calls, with a hook at each seam."""
 
 from __future__ import annotations
 
@@ -291,7 +291,7 @@ def _run(session: Session, given: _Given, options: ReconstructOptions, stages: S
 
 
 def _require_known_images(options: ReconstructOptions, stages: Sequence[KeypointStage]) -> None:
-    """Ask which images a given database is of, where keypoints are corrected."""
+    """Ask which images a given database describes, where keypoints are corrected."""
     if options.database is not None and stages and options.database_images is None:
         raise InertialError(
             "--database: the rolling shutter is corrected here. Say --database-images filmed where its keypoints were "

@@ -49,7 +49,7 @@ class Remembered:
 
 
 def configuration_folder() -> Path:
-    """Where this system keeps a user's configuration of this program."""
+    """The system's folder for a user's configuration of this program."""
     home = Path.home()
     if sys.platform == "win32":
         base = Path(os.environ.get("APPDATA") or home / "AppData" / "Roaming")
@@ -84,7 +84,7 @@ def remember(device: str, calibration: Path) -> Path:
 
 
 def read_remembered(source: Path, given: tuple[Path, ...], *, device: str | None = None) -> Remembered:
-    """What is kept for the device of a recording, of the kinds that were not given.
+    """Read the stored calibrations of the device of a recording, of the kinds that were not given.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What ``diagnose`` looks at, read from captures, sources of ``scale`` and IMU files."""
+"""Inputs of ``diagnose``, read from captures, sources of ``scale`` and IMU files."""
 
 from __future__ import annotations
 

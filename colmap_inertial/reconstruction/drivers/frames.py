@@ -121,7 +121,7 @@ class CropKeeper:
 
     @classmethod
     def of(cls, plan: ImagingPlan) -> CropKeeper:
-        """For a plan: frames that are to be deblurred, evenly from the most to the least blurred."""
+        """The sheet of a plan: frames to deblur, evenly from the most to the least blurred."""
         blurred = () if plan.deblur is None else plan.deblur[0]
         by_blur = sorted((d for d in blurred if d.action == "deblur"), key=lambda d: (-(d.blur_px or 0.0), d.name))
         some = by_blur[:: -(-len(by_blur) // _LIMITS.candidates) or 1]

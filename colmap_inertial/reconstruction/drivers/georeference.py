@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Outcome:
-    """What came of one model; the reason where its heading stays open."""
+    """Outcome for one model; the reason where its heading stays open."""
 
     index: int
     found: Georeference | None = None
@@ -37,7 +37,7 @@ class _Outcome:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Outcomes:
-    """Of all metric models."""
+    """Outcomes of all metric models."""
 
     models: tuple[_Outcome, ...]
 

@@ -98,7 +98,7 @@ def _run_fusion(
 @prints_in_lines
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DeblurResult:
-    """What ``deblur_capture`` made; the same as ``result.json``.
+    """Result of ``deblur_capture``; the same as ``result.json``.
 
     Attributes
     ----------

@@ -46,7 +46,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class FragmentLimits:
-    """Which of COLMAP's models are too small to go on with."""
+    """Limits for models that are too small to use."""
 
     #: COLMAP's models of fewer images, or of a smaller share of those of its largest one, are fragments.
     fewest_images: int = 5
@@ -62,7 +62,7 @@ _Begun: TypeAlias = "tuple[ScaledModel, Model | None]"
 
 @dataclass(frozen=True, kw_only=True)
 class _Made:
-    """What the model stages made of all models."""
+    """Results of the model stages for all models."""
 
     models: tuple[ScaledModel, ...]
     fragments: tuple[Fragment, ...]
@@ -71,7 +71,7 @@ class _Made:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Submodels:
-    """What COLMAP made of a recording.
+    """COLMAP's models of a recording.
 
     Attributes
     ----------
@@ -189,7 +189,7 @@ def _run_stages(
     *,
     numbered: bool,
 ) -> tuple[list[ScaledModel], tuple[Gap, ...]]:
-    """What the stages make of COLMAP's models; without one that joins them, one is in memory at a time.
+    """Run the stages on COLMAP's models; without a stage that joins them, one is in memory at a time.
 
     Raises
     ------
@@ -242,7 +242,7 @@ def _run_stages(
 
 
 def _joined(joining: JoiningStage, begun: Sequence[_Begun], *, numbered: bool) -> tuple[list[_Begun], tuple[Gap, ...]]:
-    """What a stage makes of all models at once, the largest first; what was joined into one leaves its numbers free."""
+    """Run a stage on all models at once, the largest first; numbers of models that were joined become free."""
     of_number = {one.colmap_index: one for one, _ in begun}
     models, gaps = joining.join_models([model for _, model in begun if model is not None])
     left: list[_Begun] = [(one, None) for one, model in begun if model is None]
@@ -274,7 +274,7 @@ def _others(model: Model | ScaledModel) -> list[JoinedPart]:
 
 
 def _after(stages: Sequence[ModelStage], model: Model) -> Model:
-    """What stages make of a model, one after the other."""
+    """Run stages on a model, one after the other."""
     for stage in stages:
         model = stage(model)
     return model
@@ -334,7 +334,7 @@ def _refused(reason: str) -> ScaleEstimate:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Checked:
-    """What came of measuring the target in a model; an error in its parts."""
+    """Measurement of the target in a model, or the error, in its parts."""
 
     found: Validation | None = None
     unobservable: str | None = None

@@ -82,7 +82,7 @@ _HOW_TIMES = (
 
 
 def is_project(path: Path) -> bool:
-    """Whether ``path`` holds a COLMAP model where a project has it, and is no capture by itself."""
+    """Whether ``path`` holds a COLMAP model in a project's place, and is no capture."""
     if not _has_model(path):
         return False
     try:
@@ -256,7 +256,7 @@ def _check_options(options: ReconstructOptions) -> None:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Given:
-    """What the user gave beside the project.
+    """Inputs given beside the project.
 
     Attributes
     ----------
@@ -359,7 +359,7 @@ def _images(project: Path, source: ProjectOptions, *, needed: bool) -> Path | No
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Times:
-    """When the images were taken, and what the user should know about that."""
+    """Times of the images, with notes for the user."""
 
     timing: FrameTiming
     notes: tuple[str, ...]
@@ -372,7 +372,7 @@ def _run_times(
     images: Path | None,
     read: Callable[[Path], pycolmap.Reconstruction],
 ) -> tuple[FrameTiming, tuple[str, ...]]:
-    """When the images were taken, and what the user should know about that."""
+    """Read the times of the images, with notes for the user."""
 
     def work(partial: Sequence[Path]) -> None:
         first_of = frames_of_rigs(read(folder) for folder in models.values())
@@ -475,7 +475,7 @@ def _noted(result: ModelResult, notes: Sequence[str]) -> ModelResult:
 
 
 def _scales(results: Sequence[ModelResult], fragments: Sequence[Fragment]) -> dict[int | None, ModelScale]:
-    """What is applied to each sub-model of the project, by COLMAP's number."""
+    """Similarity of each sub-model of the project, by COLMAP's number."""
     small = "a fragment of {} images: too small to be made metric (--fragments does it all the same)"
     scales: dict[int | None, ModelScale] = {
         one.colmap_index: ModelScale(similarity=None, verdict="refused", reasons=(small.format(one.registered_images),))

@@ -1,4 +1,4 @@
-"""What stands in an output folder beside the result: an existing project in metres, and dense reconstructions."""
+"""Outputs beside the result: an existing project in metres, and dense reconstructions."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def place_project(
 
 
 def list_placed_paths(workspace: Workspace) -> list[Path]:
-    """What came from the project into the folder; a killed run may have left part of it."""
+    """Paths in the folder that came from the project; a killed run may have left part of it."""
     if not workspace.placed.is_file():
         return []
     names = read_record(workspace.placed, _Placed).paths
@@ -136,7 +136,7 @@ def _correct_record(path: Path, workspace: Workspace, folders: Mapping[int, Path
 
 
 def _moves(workspace: Workspace, scratch: Path, folders: Mapping[int, Path]) -> dict[Path, Path]:
-    """Where each part of the transformed project goes: all but what the metric models are.
+    """Destination of each part of the transformed project, without the metric models.
 
     A model that is there in the other format, too, is written again: a model stage may have changed it.
     """

@@ -1,4 +1,4 @@
-"""What a run keeps for the report, and the report itself: of finished runs, and of those the recording stops.
+"""Data for the report, and the report itself: of finished runs, and of those that the recording stopped.
 
 A report that fails never costs a result, nor hides why a run stopped: the log says what went wrong with it.
 """
@@ -45,7 +45,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class ReportLimits:
-    """How much of a run its report shows."""
+    """Sizes of the report's data."""
 
     #: Frames for which the movement by the rolling shutter is computed, and points across an image.
     shutter_frames: int = 300
@@ -98,7 +98,7 @@ def write_recording(
 def _shutter_record(
     stages: Sequence[KeypointStage], recording: Recording, rectified: Collection[str]
 ) -> dict[str, Any] | None:
-    """By how much keypoints move: of some frames the largest shift, and that of the worst one over the image."""
+    """Shift of keypoints: the largest of some frames, and that of the worst one over the image."""
     if not rectified:
         return None
     timing, camera = recording.timing, guess_camera(recording.capture, recording.timing)
@@ -197,7 +197,7 @@ def report_result(
 
 @contextlib.contextmanager
 def reporting_stops(workspace: Workspace, capture: Capture) -> Iterator[None]:
-    """Where the recording gives no scale, or COLMAP no model, a report says why and what to do; other errors have none.
+    """Write a report where the recording gives no scale, or COLMAP no model; for other errors there is none.
 
     What an earlier run made metric no longer stands. The error carries a note that names the page.
     """

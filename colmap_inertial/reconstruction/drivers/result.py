@@ -1,4 +1,4 @@
-"""What a reconstruction made, and ``result.json``, which says the same."""
+"""Results of a reconstruction, as values and as ``result.json``."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from colmap_inertial.reconstruction.preparation.selection import Selection
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScaledModel:
-    """What the model stages made of one of COLMAP's models; paths are ``None`` where the scale was refused.
+    """Result of the model stages for one of COLMAP's models; paths are ``None`` where the scale was refused.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class ScaledModel:
 @prints_in_lines
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ModelResult(ScaledModel):
-    """What became of one of COLMAP's models.
+    """Outcome for one of COLMAP's models.
 
     Attributes
     ----------
@@ -115,7 +115,7 @@ class Fragment:
 @prints_in_lines
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ReconstructResult:
-    """What ``reconstruct`` made; the same as ``result.json``.
+    """Result of ``reconstruct``; the same as ``result.json``.
 
     Attributes
     ----------
@@ -165,7 +165,7 @@ class ReconstructResult:
 
     @property
     def waiting(self) -> tuple[str, ...]:
-        """What the user has to do for the dense reconstructions to go on; empty where nothing is left to do."""
+        """Steps that the dense reconstructions wait for; empty where nothing is left to do."""
         return tuple(model.dense.waiting for model in self.models if model.dense is not None and model.dense.waiting)
 
     def exit_code(self) -> int:
@@ -197,14 +197,14 @@ class ReconstructResult:
 
 
 def imaging_as_json(plan: ImagingPlan, rectified: Collection[str]) -> dict[str, object]:
-    """What was decided beforehand and why, without what concerns single frames; and whether any was rectified."""
+    """Treatment of frames and its reasons, without single frames; and whether any was rectified."""
     values = {key: value for key, value in plan.as_json().items() if key not in ("decisions", "parallaxes")}
     values |= {"rectify": bool(rectified), "rolling_shutter": shutter_note(plan, rectified)}
     return {**values, "frames_with_translation": len(plan.parallaxes)}
 
 
 def shutter_note(plan: ImagingPlan, rectified: Collection[str]) -> str:
-    """What was done about a rolling shutter, in words, by the images whose keypoints were rectified."""
+    """Describe the treatment of a rolling shutter, from the images whose keypoints were rectified."""
     if rectified and not plan.rectify:
         return f"{plan.rolling_shutter_note}, which rectified keypoints of {len(rectified)} images"
     if plan.rectify and not rectified:
@@ -213,7 +213,7 @@ def shutter_note(plan: ImagingPlan, rectified: Collection[str]) -> str:
 
 
 def frame_as_json(record: FrameRecord, plan: ImagingPlan, rectified: Collection[str]) -> dict[str, object]:
-    """What happened to one frame."""
+    """Treatment of one frame."""
     return {
         "name": record.name,
         "action": record.action,
@@ -224,7 +224,7 @@ def frame_as_json(record: FrameRecord, plan: ImagingPlan, rectified: Collection[
 
 
 def _change(first: CameraImuCalibration, refined: CameraImuCalibration | None) -> dict[str, object] | None:
-    """How far the scale estimate moved the calibration that the frames were treated with."""
+    """Change of the calibration by the scale estimate, against the one that frames were treated with."""
     if refined is None:
         return None
     turn = quat_log(quat_multiply(refined.cam_from_imu_xyzw, quat_conjugate(first.cam_from_imu_xyzw)))
@@ -236,7 +236,7 @@ def _change(first: CameraImuCalibration, refined: CameraImuCalibration | None) -
 
 
 def measurement_as_json(found: Validation | Georeference | InertialError | None) -> dict[str, Any] | None:
-    """What was measured in a model, or why it could not be."""
+    """Measurement in a model, or the reason why there is none."""
     if found is None:
         return None
     return {"error": str(found)} if isinstance(found, InertialError) else found.as_json()

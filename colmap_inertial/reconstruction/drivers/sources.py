@@ -55,7 +55,7 @@ from colmap_inertial.motion.align.conventions import likely_convention
 
 @dataclass(frozen=True, kw_only=True)
 class ScaleSource:
-    """Where a trajectory and its IMU recording come from.
+    """Source of a trajectory and its IMU recording.
 
     Attributes
     ----------
@@ -299,13 +299,13 @@ def scale_source(
 
 
 def scale_as_json(estimate: ScaleEstimate, calibration: CalibrationFiles = None) -> dict[str, object]:
-    """What ``scale --json`` writes: the estimate, and the calibration files that it used."""
+    """Output of ``scale --json``: the estimate, and the calibration files that it used."""
     return {**estimate.as_json(), "calibration_files": describe_files(calibration)}
 
 
 @dataclass(frozen=True, kw_only=True)
 class ValidationOutputs:
-    """Where a validation is written.
+    """Output files of a validation.
 
     Attributes
     ----------
@@ -334,7 +334,7 @@ class ValidationOutputs:
 
 @dataclass(frozen=True, kw_only=True)
 class KnownLengths:
-    """What is known of a scene beside the target.
+    """Known lengths in a scene beside the target.
 
     Attributes
     ----------

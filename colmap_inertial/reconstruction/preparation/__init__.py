@@ -1,1 +1,1 @@
-"""What is decided before the reconstruction: the check, frames to use, calibration, treatment of frames."""
+"""Decisions before the reconstruction: the check, frames to use, calibration, treatment of frames."""

@@ -55,7 +55,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class PreliminaryLimits:
-    """What a calibration before the reconstruction is made of, and how good it must be."""
+    """Limits for a calibration before the reconstruction."""
 
     #: Frames of the small model: at most so many, at least so far apart.
     model_frames: int = 60
@@ -85,7 +85,7 @@ _SMALL = MappingOptions(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PreliminaryCalibration:
-    """What there is before the reconstruction.
+    """Calibration before the reconstruction.
 
     Attributes
     ----------
@@ -266,7 +266,7 @@ def _calibrate_by_model(
 def _image_folder(
     capture: Capture, timing: FrameTiming, names: Sequence[str], work: Path, stages: Sequence[FrameStage] = ()
 ) -> Path:
-    """Where some frames are as pictures: with the capture, or written to a folder of work."""
+    """Folder with some frames as pictures: the capture's own, or one to which they are written."""
     images = capture.image_folder
     if images is not None and not stages:
         return images

@@ -73,7 +73,7 @@ def located(fixes: PositionFixes, path: CameraTrajectory) -> tuple[PositionFixes
 def georeference_path(
     fixes: PositionFixes, path: CameraTrajectory, up_in_world: Array, *, timed: bool = True
 ) -> Georeference:
-    """How a metric path stands on Earth; raises :class:`NotObservableError` where the positions leave it open.
+    """Georeference a metric path; raises :class:`NotObservableError` where the positions leave it open.
 
     ``timed``: whether the path's times are true; without, nothing tells where the camera was a moment before.
     """
@@ -82,7 +82,7 @@ def georeference_path(
 
 
 def path_at(path: CameraTrajectory) -> Callable[[Array], Array]:
-    """Where a camera was at any instants (T,), (T, 3): straight on between its images, and before and after them."""
+    """Positions (T, 3) of a camera at any instants (T,), linear between its images and beyond them."""
 
     def at(t_s: Array) -> Array:
         within = np.clip(t_s, path.t_s[0], path.t_s[-1])
@@ -103,7 +103,7 @@ def _after(path: CameraTrajectory, end: int) -> int:
 
 
 def read_georeference(path: Path, index: int) -> Georeference | None:
-    """What a run found for one of its models; ``None`` where it was not asked.
+    """Read the georeference of one of a run's models; ``None`` where it was not asked for.
 
     Raises
     ------
@@ -122,7 +122,7 @@ def read_georeference(path: Path, index: int) -> Georeference | None:
 
 
 def cameras_as_json(found: Georeference, names: Sequence[str], centres: Array) -> list[dict[str, object]]:
-    """Where each image was taken."""
+    """Positions of all images."""
     return [
         {"name": name, "latitude_deg": latitude, "longitude_deg": longitude, "height_m": height}
         for name, (latitude, longitude, height) in zip(names, found.geodetic(centres).tolist(), strict=True)

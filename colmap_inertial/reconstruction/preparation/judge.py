@@ -1,4 +1,4 @@
-"""What some of the frames say of the gyroscope, before any is treated."""
+"""Compare some of the frames with the gyroscope, before any is treated."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from colmap_inertial.reconstruction.preparation.sampling import some_frames
 
 @dataclass(frozen=True, kw_only=True)
 class JudgeLimits:
-    """When frames bear out the gyroscope's blur."""
+    """Limits for frames that confirm the gyroscope's blur."""
 
     #: A gyroscope that is borne out by this share of the frames is trusted for all of them.
     trusted_share: float = 0.95
@@ -95,8 +95,9 @@ def judge_frames(
 
 @dataclass(frozen=True, eq=False)
 class Looked:
-    """What one picture says: its dips, the share that it shows of the predicted fall of detail, that blur, and the
-    share that it shows of what a flipped axis would predict."""
+    """Evidence of one picture: its dips, its share of the predicted loss of detail, that blur, and its share of the
+    loss that a flipped axis would predict.
+    """
 
     evidence: BlurEvidence
     share: float | None
@@ -121,7 +122,7 @@ class Looked:
 
     @property
     def gain(self) -> float:
-        """By how much it rather shows the gyroscope's direction than the mirrored one."""
+        """Evidence for the gyroscope's direction over the mirrored one."""
         return np.nan if self.share is None or self.mirrored_share is None else self.share - self.mirrored_share
 
     @property
@@ -139,7 +140,7 @@ def _look(
     progress: Progress,
     factor: float,
 ) -> list[Looked]:
-    """What some frames say of the blur that is predicted, or of so many times as much."""
+    """Evidence of some frames for the predicted blur, or a multiple of it."""
     motion, camera, index = view.motion(), colmap_camera(view.camera), view.index()
     blur_px = {decision.name: factor * (decision.blur_px or 0.0) for decision in chosen}
     looked: list[Looked] = []
@@ -179,7 +180,7 @@ def _together(evidence: Sequence[BlurEvidence]) -> float:
 
 
 def judged(looked: Sequence[Looked]) -> RecordingVerdict:
-    """What frames say together, and whether nearly each of them does."""
+    """Joint evidence of frames, and whether nearly each of them confirms the blur."""
     return judge_each_frame(judge_sky(judge_recording([one.evidence for one in looked]), looked), looked)
 
 

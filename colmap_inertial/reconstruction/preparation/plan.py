@@ -1,4 +1,4 @@
-"""What is done to the frames of a capture before COLMAP sees them, decided once and written down."""
+"""Plan the treatment of a capture's frames before COLMAP reads them; decided once and stored."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class PlanLimits:
-    """When frames are looked at for deblurring."""
+    """Limits for frames that are considered for deblurring."""
 
     #: Blur below this cannot be told from the texture: where no frame has more, nothing is deblurred.
     telling_px: float = 4.0
@@ -84,7 +84,7 @@ def add_stated_exposures(capture: Capture, timing: FrameTiming) -> FrameTiming:
 
 @dataclass(frozen=True, kw_only=True)
 class Treatments:
-    """What is to be done to frames and keypoints.
+    """Treatments of frames and keypoints.
 
     Attributes
     ----------
@@ -111,7 +111,7 @@ class Treatments:
 def ask_for_plan(
     options: ReconstructOptions, frame_stages: Sequence[object], keypoint_stages: Sequence[object], *, pairs: bool
 ) -> Treatments:
-    """What the options ask for, as far as the default stages are to do it."""
+    """Treatments that the options ask for, as far as the default stages do them."""
     return Treatments(
         deblur=options.deblur,
         rolling_shutter=options.rolling_shutter,
@@ -122,7 +122,7 @@ def ask_for_plan(
 
 
 def run_plan(session: Session, recording: Recording, asked: Treatments) -> ImagingPlan:
-    """What to do to frames and keypoints; where nothing is asked for, nothing is looked at."""
+    """Plan the treatment of frames and keypoints; nothing is looked at where nothing is asked for."""
 
     # the user's settings are for the whole capture, not for small models of parts of it
     plain = replace(session.context, features="sift", colmap=NO_SETTINGS)
@@ -262,7 +262,7 @@ def _no_deblurring(recording: Recording, asked: Treatments, progress: Progress) 
 
 
 def _most_turned_rad(recording: Recording, exposure_s: Array) -> float:
-    """By how much the camera turned during an exposure at the most: as quickly as ever while it may have been taken."""
+    """Largest rotation of the camera during an exposure, over all times when the frame may have been exposed."""
     timing, prior = recording.timing, recording.prior
     timed = CameraTimedImu.from_recording(recording.imu, prior, timing.epoch_ns)
     rate_rad_s, stamps_s = np.linalg.norm(timed.imu.gyro_rad_s, axis=1), timed.gyro_t_s
@@ -365,7 +365,7 @@ def _merge_parallaxes(
 
 @dataclass(frozen=True, eq=False)
 class _Surveyed:
-    """What the small models of a part of a recording tell."""
+    """Results of the small models of a part of a recording."""
 
     parallaxes: Mapping[str, Parallax]
     registered: frozenset[str]
@@ -381,7 +381,7 @@ def _select_blurred(decisions: Sequence[FrameDecision]) -> set[str]:
 
 
 def _decisions(view: GyroView, parallaxes: Mapping[str, Parallax]) -> tuple[FrameDecision, ...]:
-    """What to do with each frame, before any is looked at."""
+    """Decision on each frame, before any is looked at."""
     width, height = view.camera.width, view.camera.height
     motion, camera = view.motion(), colmap_camera(view.camera)
     predicted = predict_blur_px(motion, camera, view.timing, width=width, height=height, parallaxes=parallaxes)

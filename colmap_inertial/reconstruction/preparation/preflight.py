@@ -37,7 +37,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class PreflightEffort:
-    """How much of a recording is looked at, before a reconstruction and by ``diagnose``."""
+    """Effort of the check, before a reconstruction and by ``diagnose``."""
 
     #: Frames of a video that are followed by their pixels, how far apart at least, and how often they must come.
     frames: int = 400

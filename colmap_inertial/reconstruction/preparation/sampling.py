@@ -24,7 +24,7 @@ from colmap_inertial.pipeline.run.progress import Progress, counted
 
 @dataclass(frozen=True, kw_only=True)
 class SampleLimits:
-    """How frames of a recording are looked at before the reconstruction."""
+    """Limits for sampling frames of a recording before the reconstruction."""
 
     #: Where a quick look at a video begins at the latest: all before it is decoded, too.
     begin_s: float = 5.0
@@ -55,7 +55,7 @@ def guess_camera(capture: Capture, timing: FrameTiming) -> CameraModel:
 
 
 def sample_spaced(timing: FrameTiming, spacing_s: float) -> list[int]:
-    """Indices of frames that are not closer together than asked for, from the first one on."""
+    """Indices of frames from the first one on, not closer together than asked for."""
     kept = [0]
     for i, t_s in enumerate(timing.t_s.tolist()):
         if t_s - timing.t_s[kept[-1]] >= spacing_s:

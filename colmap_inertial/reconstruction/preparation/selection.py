@@ -1,4 +1,4 @@
-"""Which frames of a capture the reconstruction uses, decided once and written down.
+"""Choose the frames of a capture for the reconstruction; decided once and stored.
 
 The gyroscope ranks frames before any is decoded, where its clock is known against the camera's: from the capture, or by
 following the pixels of some frames. Otherwise their sharpness decides.
@@ -46,7 +46,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class SelectionLimits:
-    """How frames are ranked before a reconstruction."""
+    """Limits for ranking frames before a reconstruction."""
 
     #: Of several frames within so much time, the least blurred one is looked at.
     slot_s: float = 1 / 30
@@ -102,7 +102,7 @@ class Selection:
         return part_of(every, self.names)
 
     def as_json(self) -> dict[str, object]:
-        """In JSON types: one list for each property of the windows, and the frames left out as ranges."""
+        """As JSON types: one list for each property of the windows, and the frames left out as ranges."""
         kept = [window.place for window in self.windows] if self.windows else list(range(self.frames))
         edges = [-1, *kept, self.frames]
         return {
@@ -196,7 +196,7 @@ def run_selection(session: Session, recording: Recording, options: FrameOptions)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Clocks:
-    """What is known of gyroscope and camera before a reconstruction.
+    """Clocks of gyroscope and camera before a reconstruction.
 
     ``motion`` is ``None`` where the offset is unknown; its orientation counts only where ``oriented``. The offset is as
     good as ``offset_sigma_s`` at ``middle_s``, camera clock, and worse the farther from there.
@@ -291,7 +291,7 @@ def _slots(t_s: Array, blur: Array) -> IndexArray:
 
 
 def _predicted(clocks: _Clocks, timing: FrameTiming) -> tuple[Array, Ranking]:
-    """What ranks every frame, NaN where the gyroscope says nothing, and what it is."""
+    """Rank of every frame, NaN where the gyroscope has no data, and its quantity."""
     motion = clocks.motion
     if motion is None:
         return np.full(len(timing.t_s), np.nan), "speed"

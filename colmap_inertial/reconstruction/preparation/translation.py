@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class TranslationLimits:
-    """When the camera's translation is known to blur."""
+    """Limits for blur by the camera's translation."""
 
     #: Pairs that are followed in each segment of a recording.
     pairs: int = 12
@@ -76,7 +76,7 @@ def translating_segments(
     progress: Progress,
     motion: GyroCamera | None = None,
 ) -> list[bool]:
-    """In which parts of a recording frames are blurred by more than a limit, by what moves from frame to frame.
+    """Parts of a recording in which translation blurs frames by more than a limit, from motion between frames.
 
     Parameters
     ----------
@@ -189,7 +189,7 @@ def _measure_parallax(model: pycolmap.Reconstruction, view: GyroView) -> Iterato
 
 
 def _points_seen(model: pycolmap.Reconstruction, trajectory: CameraTrajectory, factor: float) -> list[Array]:
-    """For each pose, (N, 3) the points that its image has seen."""
+    """Points (N, 3) that the image of each pose sees."""
     points = {key: factor * point.xyz for key, point in model.points3D.items()}
     out = []
     for name in trajectory.names:

@@ -42,7 +42,7 @@ from colmap_inertial.tools.batch.task import (
 
 @dataclass(frozen=True, kw_only=True)
 class BatchTiming:
-    """How often a batch looks at its captures."""
+    """Intervals at which a batch checks its captures."""
 
     progress_s: float = 0.5
     """How often progress is shown."""
@@ -61,7 +61,7 @@ Watch = Callable[[CaptureStatus], None]
 @prints_in_lines
 @dataclass(frozen=True, kw_only=True)
 class BatchResult:
-    """How a batch ended; the same as ``summary.json``.
+    """Result of a batch; the same as ``summary.json``.
 
     Attributes
     ----------

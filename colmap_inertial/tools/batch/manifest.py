@@ -1,4 +1,4 @@
-"""Which captures a batch is made of: a TOML file, or a folder of captures."""
+"""Captures of a batch: a TOML file, or a folder of captures."""
 
 from __future__ import annotations
 

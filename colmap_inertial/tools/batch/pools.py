@@ -1,4 +1,4 @@
-"""Where captures are worked on: processes of this machine, or the workers of a Dask cluster."""
+"""Workers of a batch: processes of this machine, or a Dask cluster."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class MemoryLimits:
-    """How much memory decides the number of workers."""
+    """Memory of a worker, which limits their number."""
 
     per_thread_bytes: int = 3 * 2**30
     """What a thread needs: 2.4 GB were measured for a picture of 12 megapixels with COLMAP's defaults."""
@@ -52,7 +52,7 @@ Submit = Callable[[CaptureTask], Pending]
 
 
 def available_memory() -> int:
-    """Bytes that processes may still take on this machine, within the limits of its container."""
+    """Memory available to processes on this machine, within the limits of its container, in bytes."""
     try:
         free = int(re.findall(r"MemAvailable:\s+(\d+) kB", Path("/proc/meminfo").read_text())[0]) * 1024
     except OSError:  # no Linux

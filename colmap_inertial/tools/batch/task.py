@@ -33,7 +33,7 @@ State = Literal["waiting", "running", "done", "failed", "interrupted"]
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """How a capture is to be reconstructed, as its task's configuration file has it.
+    """Options of a capture's reconstruction, as in its task's configuration file.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Job:
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureTask:
-    """What a worker needs to know; every path is absolute and the same on all machines.
+    """Task of a worker; every path is absolute and the same on all machines.
 
     Attributes
     ----------
@@ -87,7 +87,7 @@ class CaptureTask:
 @prints_in_lines
 @dataclass(frozen=True, kw_only=True)
 class CaptureStatus:
-    """What became of one capture; the same as its status file.
+    """Outcome of one capture; the same as its status file.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What the command line shows of a batch."""
+"""Display of a batch on the command line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What there is to export: the model, its unit and up, its pictures and cameras, and how the camera moved."""
+"""Source of an export: the model, its unit and up, its pictures and cameras, and the camera's motion."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ class ExportSource:
 def read_source(
     out: Path, *, model: int | None = None, image_folder: Path | None = None, unscaled: bool = False
 ) -> ExportSource:
-    """What a finished run, or a project, has to export.
+    """Read the source from a finished run, or from a project.
 
     Parameters
     ----------
@@ -180,7 +180,7 @@ def read_source(
 
 
 def find_georeference(out: Path, source: ExportSource, capture: Capture | None) -> Georeference:
-    """Where on Earth a model stands: as its run found it, else by the positions of the capture or of its pictures.
+    """Georeference of a model: from its run, else from positions of the capture or of its pictures.
 
     Raises
     ------
@@ -222,7 +222,7 @@ def _path(source: ExportSource) -> CameraTrajectory:
 
 
 def _times(source: ExportSource) -> list[tuple[float, str]]:
-    """When the images were taken, and their names; empty where that was not kept."""
+    """Times of the images by name; empty where they were not stored."""
     if source.motion is None:
         return []
     names = {source.model.image(i).name for i in source.model.reg_image_ids()}
@@ -294,7 +294,7 @@ _Z_UP = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ExportContent:
-    """What an export is made of.
+    """Content of an export.
 
     Attributes
     ----------
@@ -365,7 +365,7 @@ class ExportContent:
 
 
 def _notes_on_model(source: ExportSource) -> list[str]:
-    """What the user should know of the model."""
+    """Notes for the user on the model."""
     notes = []
     if source.found.scale.unit != "m":
         notes.append(NO_SCALE)

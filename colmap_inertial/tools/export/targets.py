@@ -1,4 +1,4 @@
-"""What an export can be for: one value for each program or format, which says what it writes."""
+"""Targets of an export: one value for each program or format, with the files that it writes."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def _require_motion(motion: CameraMotion | None, pictures: Mapping[str, Picture]
 
 
 def _rows(undistortion: Undistortion) -> tuple[float, float]:
-    """How many rows of the filmed picture the new one shows, and how much lower its middle is: shares of its height."""
+    """Rows of the filmed picture that the new one shows, and the shift of its middle, as shares of its height."""
     pinhole, height = undistortion.pinhole, undistortion.camera.height
     middle = [0.5 * pinhole.width, 0.5 * pinhole.height]
     step = 0.25 * pinhole.height
@@ -256,7 +256,7 @@ class ExportTarget:
     require: Callable[[], None] = lambda: None
 
     def command_line(self, folder: Path) -> str:
-        """What a program is called with for an export; empty for a format."""
+        """Command line that starts a program on an export; empty for a format."""
         return self.command.format(folder=shlex.quote(str(folder)))
 
 
@@ -322,7 +322,7 @@ def _add_velocities(values: dict[str, Any], content: ExportContent) -> dict[str,
 
 
 def _exposures(content: ExportContent) -> dict[str, Exposure]:
-    """By the new names."""
+    """Exposures by the new names."""
     source = content.source
     exposures = exposures_of(source.model, source, content.pictures, content.cameras, content.notes)
     return {content.names[name]: exposure for name, exposure in exposures.items()}

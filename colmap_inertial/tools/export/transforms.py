@@ -61,7 +61,7 @@ class View:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Exposure:
-    """How a camera moved while a picture of the export was exposed.
+    """Motion of a camera during the exposure of a picture of the export.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ class Exposure:
 
     @property
     def span_s(self) -> float:
-        """From the first row's begin to the last one's end."""
+        """Time from the begin of the first row's exposure to the end of the last one's."""
         return self.exposure_s + self.readout_s
 
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class UndistortionLimits:
-    """How the undistorted image is searched."""
+    """Limits of the search for the undistorted image."""
 
     #: A side of the new picture is at most this many times the old one's: beyond it a wide lens shows hardly any
     #: detail.
@@ -260,7 +260,7 @@ def _rigs(model: pycolmap.Reconstruction) -> list[int]:
 
 
 def _observations(image: pycolmap.Image, undistortion: Undistortion) -> list[tuple[np.ndarray, int]]:
-    """Where an image sees points after undistortion, and which."""
+    """Positions of an image's points after undistortion, and their numbers."""
     seen = [point for point in image.points2D if point.has_point3D()]
     if not seen:
         return []

@@ -94,7 +94,7 @@ def three_channels(image: AnyArray) -> UInt8Array:
 
 
 def _is_plain(source: Path, target: Path, image: AnyArray) -> bool:
-    """Whether a file is what trainers read, as it is; an orientation in its metadata some of them would heed."""
+    """Whether trainers can read a file as it is; some of them would heed an orientation in its metadata."""
     suffix = {".jpeg": ".jpg"}.get(source.suffix.lower(), source.suffix.lower())
     plain = image.ndim == 3 and image.dtype == np.uint8 and suffix == target.suffix
     if not plain:
@@ -107,7 +107,7 @@ def _is_plain(source: Path, target: Path, image: AnyArray) -> bool:
 @prints_in_lines
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Exported:
-    """What :func:`export_model` wrote; ``export.json`` says the same.
+    """Result of :func:`export_model`; the same as ``export.json``.
 
     Attributes
     ----------
@@ -243,7 +243,7 @@ def export_model(
 
 
 def _write_georeference(path: Path, content: ExportContent, on_map: Georeference) -> None:
-    """Where on Earth the model and its images are; ``content`` gets the notes."""
+    """Write the georeference of the model and its images; ``content`` gets the notes."""
     centres = np.array([view.cam_in_world for view in content.views])
     names = tuple(view.name for view in content.views)
     write_json(path, {**on_map.as_json(), "cameras": cameras_as_json(on_map, names, centres)})
@@ -296,7 +296,7 @@ def _record(made: Exported, content: ExportContent, kind: ExportImages) -> dict[
 
 
 def _notes_on(pictures: Mapping[str, Picture], kind: ExportImages) -> list[str]:
-    """What the user should know of the pictures."""
+    """Notes for the user on the pictures."""
     notes = []
     bent = sum(not picture.agrees for picture in pictures.values())
     if bent:

@@ -94,7 +94,7 @@ def _shift_camera(camera: ShutterCamera, by_m: tuple[float, float, float]) -> tu
 
 
 def _apply_filter(image: UInt8Array | UInt16Array, role: SpectralRole) -> UInt8Array:
-    """What an aperture lets through of a colour picture."""
+    """The plane of a colour picture behind an aperture's filter."""
     if role in ("red", "green", "blue"):
         return np.asarray(image[..., ("red", "green", "blue").index(role)], dtype=np.uint8)
     light = np.asarray(decode_table(image.dtype)[image] @ _LUMINANCE, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""How a hand moves a camera: smooth functions of time with exact derivatives.
+"""Motion of a camera in a hand: smooth functions of time with exact derivatives.
 
 A :class:`Motion` is a quintic spline with uniform knots through camera positions and (unnormalised) quaternions, so
 position, velocity, acceleration, orientation, angular velocity and angular acceleration are closed-form functions of
@@ -73,7 +73,7 @@ _QUINTIC = (
 
 @dataclass(frozen=True, kw_only=True)
 class MotionOptions:
-    """What kind of motion, for how long, and how lively."""
+    """Kind, duration and intensity of a motion."""
 
     kind: MotionKind = "orbit"
     """orbit: around a subject at the origin, looking at it; walk: forwards, with a gait; roam: about a room, spectrum

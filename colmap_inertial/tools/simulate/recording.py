@@ -23,7 +23,7 @@ from colmap_inertial.tools.simulate.sensors import STANDARD_GRAVITY_M_S2, ImuOpt
 
 @dataclass(frozen=True, kw_only=True)
 class SfmOptions:
-    """How well structure from motion sees the camera, in metres and radians of the true world.
+    """Noise of structure from motion, in metres and radians of the true world.
 
     The defaults are of the size estimated from the recordings of Mustaniemi et al. (IROS 2017).
     """
@@ -74,7 +74,7 @@ class RecordingOptions:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RecordingTruth:
-    """What nobody can know of a real recording.
+    """Truth of a simulated recording.
 
     Attributes
     ----------
@@ -116,7 +116,7 @@ class RecordingTruth:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SimulatedRecording:
-    """What an estimator gets, and the truth beside it."""
+    """Inputs of an estimator, and the truth."""
 
     trajectory: CameraTrajectory
     imu: ImuRecording

@@ -25,7 +25,7 @@ from colmap_inertial.tools.simulate.world import World
 
 @dataclass(frozen=True, kw_only=True)
 class RenderLimits:
-    """How finely pixels are sampled.
+    """Sampling of pixels.
 
     Against 256 samples the error is then about one grey level rms, from no blur to 60 px of it; more only where black
     meets white all over the picture.
@@ -265,7 +265,7 @@ class Renderer:
     def _trace(
         self, camera: ShutterCamera, motion: Motion, instants: Array, x: NDArray[np.floating], y: NDArray[np.floating]
     ) -> tuple[IndexArray, NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
-        """What rays (x, y, 1) meet: the piece (-1 is none), its (U, V) / depth in metres, 1 / depth.
+        """Intersections of rays (x, y, 1): the piece (-1 is none), its (U, V) / depth in metres, 1 / depth.
 
         ``instants`` holds one time for all rays, or one for each row or column.
         """
@@ -314,7 +314,7 @@ class Renderer:
     def _extent(
         self, a: Array, b: Array, c: Array, x: NDArray[np.floating], y: NDArray[np.floating]
     ) -> list[tuple[slice, slice]]:
-        """For each piece, rows and columns outside of which no ray can meet it (over all poses given)."""
+        """Rows and columns outside of which no ray meets a piece, for each piece (over all poses given)."""
         some = np.unique(np.linspace(0, a.shape[1] - 1, 9).round().astype(int))
         side_u = a[:, some] * self._size[:, None, :1]
         side_v = b[:, some] * self._size[:, None, 1:]
@@ -332,7 +332,7 @@ class Renderer:
 
 
 def _spans(inside: BoolArray) -> list[slice]:
-    """For each row of (Q, N), from the first to the last that is true."""
+    """First to last true place of each row of (Q, N)."""
     first, last = inside.argmax(axis=1), inside.shape[1] - inside[:, ::-1].argmax(axis=1)
     return [slice(a, b) for a, b in zip(first.tolist(), np.where(inside.any(axis=1), last, 0).tolist(), strict=True)]
 

@@ -32,7 +32,7 @@ _UP_IN_IMU = np.concatenate([np.eye(3), -np.eye(3), np.array(_EDGES, dtype=np.fl
 
 @dataclass(frozen=True, kw_only=True)
 class RestOptions:
-    """How the device is laid down."""
+    """Options of laying the device down."""
 
     attitudes: int = 12
     """Six sides first, then edges; at most fifteen."""
@@ -136,7 +136,7 @@ def _triangular(matrix: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Turn:
-    """From one rest to the next: about one axis, with a tremor about another."""
+    """Motion from one rest to the next: about one axis, with a tremor about another."""
 
     options: RestOptions
     duration_s: float

@@ -60,7 +60,7 @@ class TrackOptions:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Tracks:
-    """What a camera saw of points, and the truth.
+    """Observations of points by a camera, and the truth.
 
     Attributes
     ----------
@@ -196,7 +196,7 @@ def simulate_tracks(options: TrackOptions, *, seed: int) -> Tracks:
 
 
 def _add_vibration(imu: ImuRecording, amplitude: float, rng: np.random.Generator) -> ImuRecording:
-    """With vibrations of the accelerometer, which samples at its rate fold into lower frequencies."""
+    """Add vibrations of the accelerometer, whose sampling folds them into lower frequencies."""
     if amplitude == 0:
         return imu
     since_s = imu.accel_t_s - imu.accel_t_s[0]
@@ -223,7 +223,7 @@ def _draw_points(motion: Motion, options: TrackOptions, rng: np.random.Generator
 def _observe(
     motion: Motion, timing: FrameTiming, points: Array, options: TrackOptions, rng: np.random.Generator
 ) -> tuple[Int64Array, Int64Array, Array]:
-    """Which frame sees which point and where, each line at its own instant; points by at least three frames."""
+    """Observations of points by frames, each line at its own instant; points with at least three frames."""
     camera, pose_s = colmap_camera(options.camera), timing.pose_t_s()
     width, height = options.camera.width, options.camera.height
     centre = motion.cam_in_world_m(pose_s)

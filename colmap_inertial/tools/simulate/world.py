@@ -59,7 +59,7 @@ class Board:
     """Side of a square."""
 
     def spec(self) -> str:
-        """As the validator takes it."""
+        """Description for the validator."""
         return f"checkerboard:{self.columns}x{self.rows}:{self.square_m:g}"
 
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class CloudLimits:
-    """Which points are shown, and how far the scene reaches."""
+    """Limits of the points that are shown, and of the scene's extent."""
 
     fewest_views: int = 3
     """Points seen by fewer images are left out where enough others remain."""

@@ -1,4 +1,4 @@
-"""What does not change in the viewer, drawn once; and the shapes that come and go."""
+"""Constant parts of the viewer, drawn once; and the shapes that come and go."""
 
 from __future__ import annotations
 
@@ -201,7 +201,7 @@ class Drawing:
 
 
 def path_colours(percent: Array | None) -> tuple[int, int, int] | UInt8Array:
-    """Of a path: amber; towards red where it was stretched and towards blue where it was shortened, (S, 2, 3)."""
+    """Colours of a path: amber; red where it was stretched and blue where it was shortened, (S, 2, 3)."""
     if percent is None:
         return AMBER
     share = percent / max(float(np.abs(percent).max(initial=0.0)), 1e-9)

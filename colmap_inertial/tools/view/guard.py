@@ -1,4 +1,4 @@
-"""Who may talk to the viewer, and what they may say.
+"""Access control of the viewer: connections, and messages from them.
 
 viser serves whoever reaches its port: any web page in the same browser can open its socket and read the scene, and a
 message can set any field of a control, its callbacks included. It has no setting for this, and a proxy before it would
@@ -49,7 +49,7 @@ _patching = threading.Lock()
 
 @dataclass(frozen=True, kw_only=True)
 class ConnectionLimits:
-    """What strangers can take up."""
+    """Limits of a connection's resources."""
 
     viewers: int = 16
     """At the same time."""
@@ -130,7 +130,7 @@ def is_loopback(host: str) -> bool:
 
 
 def allowed(message: Any) -> bool:
-    """Whether a decoded message is one that the viewer's own page sends: a click, a pose, the value of a control."""
+    """Whether a decoded message is one of the viewer's own page: a click, a pose, the value of a control."""
     if not isinstance(message, dict) or not isinstance(message.get("type"), str):
         return False
     known = _SPOKEN.get(message["type"])
@@ -197,7 +197,7 @@ def _quiet(handler: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _complete_settings(guard: Guard, settings: dict[str, Any]) -> dict[str, Any]:
-    """What viser gives ``serve``, completed."""
+    """Complete the settings that viser gives ``serve``."""
     import msgspec.msgpack
     from websockets.asyncio.connection import Connection
     from websockets.asyncio.server import ServerConnection

@@ -12,7 +12,7 @@ from colmap_inertial.core.types import LengthUnit
 
 @dataclass(frozen=True, kw_only=True)
 class ClickAngles:
-    """How close to something a click has to be."""
+    """Largest angles of a click from its target."""
 
     widest_rad: float = 0.03
     """A click means a point within this angle of it."""

@@ -53,7 +53,7 @@ def scale_text(scene: Scene) -> str:
 
 
 def contents_text(scene: Scene) -> str:
-    """How much of what is shown."""
+    """Number of points and cameras, in words."""
     cloud = scene.cloud
     kind = "points from depth maps" if cloud.dense else "points"
     of_all = "" if len(cloud.xyz) == cloud.total else f"of {cloud.total:,} "
@@ -70,7 +70,7 @@ def contents_text(scene: Scene) -> str:
 
 
 def ground_text(scene: Scene) -> str:
-    """What the grid's cells are."""
+    """Size of the grid's cells, in words."""
     return "" if scene.ground is None else f"One cell of the grid is {length_text(scene.ground.step_m)}."
 
 
@@ -103,7 +103,7 @@ def tolerance_html(target: TargetFacts) -> str:
 
 
 def target_text(target: TargetFacts) -> str:
-    """What the validation found, with known against measured distances by length."""
+    """Results of the validation, with known against measured distances by length."""
     low, high = target.ci95_pct
     lines = [
         f"The target {_plain(target.spec)} measures **{target.error_pct:+.2f} %** (95 %: {low:+.2f} to {high:+.2f})",

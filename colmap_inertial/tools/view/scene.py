@@ -1,4 +1,4 @@
-"""What is shown, as plain values: nothing here knows of a browser."""
+"""The scene as plain values, independent of a browser."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneLimits:
-    """How much is drawn, and what is seen at first."""
+    """Sizes of a drawing, and the first view."""
 
     pieces: int = 4000
     """Of the path, at most."""
@@ -154,7 +154,7 @@ class Scene:
 
     @property
     def scale(self) -> ScaleFacts:
-        """What is known of the model's scale."""
+        """Facts on the model's scale."""
         return self.source.scale
 
     @property
@@ -298,7 +298,7 @@ def _side(centre: Array, reach: float, up: Array, cameras: Cameras) -> Array:
 
 
 def _distance(side: Array, reach: float, up: Array, must_be_seen: Array) -> float:
-    """How far away one has to be to see all of these points (N, 3), given from the scene's middle."""
+    """Distance from which all of these points (N, 3) are visible, from the scene's middle."""
     right = np.cross(up, side)
     right /= np.linalg.norm(right)
     above = np.cross(side, right)

@@ -80,7 +80,7 @@ class Viewer:
 
     @property
     def url(self) -> str:
-        """What to open in a browser; whoever knows it sees the scene."""
+        """Address for a browser; whoever knows it sees the scene."""
         host = self._server.get_host()
         host = "localhost" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
         return f"http://{host}:{self._server.get_port()}/{self._guard.token}"

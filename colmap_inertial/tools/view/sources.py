@@ -1,4 +1,4 @@
-"""What a folder holds that can be shown: which model, in which unit, how sure its scale is, and what lies beside it."""
+"""Content of a folder that can be shown: the model, its unit, its scale's uncertainty, and other files."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from colmap_inertial.pipeline.run.workspace import Workspace, a_record_of_ours, 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScaleFacts:
-    """What is known of a model's scale.
+    """Facts on a model's scale.
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ class TargetFacts:
 
 @dataclass(frozen=True, kw_only=True)
 class StretchedPart:
-    """By how many per cent the refinement stretched a part of the path against the whole; times, camera clock."""
+    """Stretch of a part of the path against the whole by the refinement, in per cent; times on the camera's clock."""
 
     begin_s: float
     end_s: float
@@ -317,7 +317,7 @@ def _target(fields: Mapping[str, Any]) -> TargetFacts | None:
 
 
 def _image_folders(folder: Path) -> list[Path]:
-    """Where COLMAP's projects have the images of a model."""
+    """Folders of a model's images in COLMAP's projects."""
     return [place / "images" for place in (folder, *folder.absolute().parents[:3])]
 
 
