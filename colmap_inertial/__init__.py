@@ -1,4 +1,4 @@
-"""Metric, gravity-aligned COLMAP reconstructions from the gyroscope and accelerometer that filmed along.
+"""Metric, gravity-aligned COLMAP reconstructions from the gyroscope and accelerometer recorded with the images.
 
 The public names stand in ``__init__.pyi``, once, for type checkers and for this module. Each loads its home when it is
 first used; importing the package itself costs nothing.

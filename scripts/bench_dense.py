@@ -3,7 +3,7 @@
     python scripts/bench_dense.py FOLDER [--scenes desk seed12 seed13] [--json FILE]
     python scripts/bench_dense.py FOLDER --scenes desk --cost 640 1200
 
-FOLDER takes the captures and reconstructions; what is there already is gone on with. ``desk`` is the example scene, the
+FOLDER takes the captures and reconstructions; what is there already is continued. ``desk`` is the example scene, the
 others are the same recipe with another seed: another world, path and device. Each is reconstructed by ``reconstruct
 --dense``, in a process of its own.
 

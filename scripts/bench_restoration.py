@@ -18,7 +18,7 @@ single pairs no more than their mean); and both without the gate. Walls in 1080p
 is the thesis's U-Net, picture and blur alone, trained on the same samples (``--unet``).
 
 ``false_blur``: sharp frames with the blur field of blurred ones, as a wrong exposure time would give: the share of
-correct matches that is kept. Behind the gate twice: where other frames of the recording bear the gyroscope out, and
+correct matches that is kept. Behind the gate twice: where other frames of the recording confirm the gyroscope, and
 where all of them are sharp.
 
 ``colmap``: a whole reconstruction of the scene with 10 px of blur of ``bench_imaging.py``, by each way.

@@ -51,7 +51,7 @@ def deblur_gated(
     deblur: Callable[[NDArray[Code], BlurField], NDArray[Code]] | None = None,
     options: GateOptions | None = None,
 ) -> GatedFrame:
-    """Deblur a frame where the image bears it out, and only there.
+    """Deblur a frame where the image confirms it, and only there.
 
     Parameters
     ----------

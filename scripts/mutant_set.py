@@ -973,7 +973,7 @@ MUTANTS = (
         "pipeline/run/runner.py",
         "for path in (*outputs, *partial):\n            remove(path)",
         "for path in outputs:\n            remove(path)",
-        "what an interrupted step left half made is gone on with",
+        "what an interrupted step left half made is continued",
         ("pipeline_parts",),
     ),
     Mutant(
@@ -1120,7 +1120,7 @@ MUTANTS = (
         "pipeline/stages/deblur.py",
         "dropped=bool(self.drop and self.verdict.trusted)",
         "dropped=bool(self.drop)",
-        "frames are dropped by a gyroscope that nothing bears out",
+        "frames are dropped by a gyroscope that nothing confirms",
         ("run_models::test_frames_are_dropped_only_by_a_gyroscope_that_the_images_bear_out",),
     ),
     Mutant(
@@ -1358,7 +1358,7 @@ MUTANTS = (
         "reconstruction/preparation/judge.py",
         "if verdict.trusted is not True or shown >= most * len(telling):",
         "if verdict.trusted is not True or shown >= (1 - most) * len(telling):",
-        "a gyroscope that few frames bear out is trusted for all",
+        "a gyroscope that few frames confirm is trusted for all",
         ("run_steps::test_a_gyroscope_is_trusted_for_all_frames_where_nearly_all_bear_it_out",),
     ),
     Mutant(
@@ -1603,7 +1603,7 @@ MUTANTS = (
         "colmap/sweep_stereo.py",
         "if record.is_file() and read_json(record) == content:",
         "if record.is_file():",
-        "a sweep of other pictures is gone on with",
+        "a sweep of other pictures is continued",
         ("swept::test_a_sweep_that_was_cut_off_goes_on",),
     ),
     Mutant(

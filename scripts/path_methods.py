@@ -117,7 +117,7 @@ def gate(takes: Sequence[Take], binned: Callable[[float], str], *, console: Cons
             one["frames"] += 1
             one["treated"] += int(factor is not None)
         sharp = [pair.short(i) for pair, i in blurred]
-        # as a wrong exposure time has it: alone, and among frames that bear the gyroscope out; and as it is
+        # as a wrong exposure time has it: alone, and among frames that confirm the gyroscope; and as it is
         row["sharp recording"] = _kept(take.pairs, known, verdict_on(sharp, known))
         row["sharp among blurred"] = _kept(take.pairs, known, trusted)
         brief = [pair.known(i, "exact", shortened(pair.moments[i])) for pair, i in blurred]

@@ -136,7 +136,7 @@ def test_a_gyroscope_alone_names_both_that_it_cannot_tell_apart() -> None:
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A trajectory with inverted quaternions, the right one, and the IMU that ran along."""
+    """A trajectory with inverted quaternions, the right one, and the IMU recorded with it."""
     folder = tmp_path_factory.mktemp("conventions")
     recording = simulated(4)
     imu = recording.imu

@@ -198,7 +198,7 @@ def test_a_gyroscope_of_another_recording_is_left_out(scene, pair, stranger):
     wrong = PairGyro(motion=other.motion, camera=other.camera, short=scene.short, long=scene.long)
     together = bring_together(*pair, gyro=wrong)
     assert not together.registered.by_gyro and together.blur is None
-    assert "do not bear out" in together.gyro_note
+    assert "do not confirm" in together.gyro_note
     assert np.median(errors_px(scene, together.registered.shift_px)) < 1.0
 
 

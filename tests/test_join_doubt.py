@@ -147,13 +147,13 @@ def test_images_that_lie_otherwise_in_either_part_keep_them_apart(walked):
     other = replace(other, trajectory=moved)
     (gap,) = join_submodels([first, other], walked.imu, LIMITS).gaps
     assert not gap.joined
-    assert gap.reason == f"the {both} images that both have lie otherwise in one than in the other"
+    assert gap.reason == f"the {both} images in both models have different relative poses in the two"
 
 
 def test_two_models_of_one_piece_are_not_joined(walked):
     parts = [part_of(walked, T_S[T_S < 9.5], 0), part_of(walked, T_S[T_S < 8.5], 1)]
     (gap,) = join_submodels(parts, walked.imu, LIMITS).gaps
-    assert not gap.joined and "two models of one piece" in gap.reason
+    assert not gap.joined and "two models of the same part" in gap.reason
 
 
 def test_cameras_are_told_apart_by_number_and_by_folder():

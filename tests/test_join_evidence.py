@@ -114,9 +114,9 @@ def test_images_that_agree_are_those_of_a_loop_over_all():
         (0, ("a", "b"), False, "other cameras"),
         (0, ("", "b"), False, None),
         (8, ("a", "a"), True, None),
-        (9, ("a", "a"), True, "two models of one piece"),
+        (9, ("a", "a"), True, "two models of the same part"),
         (2, ("a", "a"), False, None),
-        (3, ("a", "a"), False, "lie otherwise"),
+        (3, ("a", "a"), False, "different relative poses"),
         (3, ("a", "a"), True, None),
     ],
 )

@@ -206,7 +206,7 @@ def test_a_finished_result_is_not_overwritten(finished, capsys):
     after = contents(out)
     assert {name for name in after if after[name] != before.get(name)} == {"log.txt"}
     assert set(after) == set(before)
-    # somebody else's capture is not gone on with
+    # somebody else's capture is not continued
     other = copy_scene(out.parent / "other", first=4)
     with pytest.raises(OutputExistsError, match="another capture"):
         reconstruct(other, out, FINE)

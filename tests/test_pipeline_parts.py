@@ -109,7 +109,7 @@ def test_a_folder_that_holds_something_else_is_left_alone(tmp_path):
     with pytest.raises(OutputExistsError, match="another capture"):
         other.open(tmp_path / "b" / "capture.toml")
     other.result.write_text("{}")
-    other.open(tmp_path / "a" / "capture.toml")  # a finished run can be gone on with
+    other.open(tmp_path / "a" / "capture.toml")  # a finished run can be continued
     assert other.result.is_file()
     with pytest.raises(OutputExistsError, match="another capture"):
         other.open(tmp_path / "b" / "capture.toml")

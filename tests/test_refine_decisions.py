@@ -52,7 +52,7 @@ def test_what_the_imu_adds_is_counted(links, nodes, expected):
         (True, True, 1.0, -0.011, ""),
         (True, True, 1.0, -0.01, "no better"),
         (False, True, 1.0, -0.1, "pictures alone"),
-        (True, False, 9.0, -0.1, "the refinement does not come to rest"),
+        (True, False, 9.0, -0.1, "the refinement does not converge"),
     ],
 )
 def test_a_refinement_is_doubted(alone, seen, chi2, change, words):

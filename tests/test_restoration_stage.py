@@ -35,7 +35,7 @@ DEEP = replace(QUICK, deblur="deepgyro")
 
 @pytest.fixture(scope="module")
 def blurred(tmp_path_factory):
-    """Pictures without loss, so that every pixel can be compared; all that are looked at bear the gyroscope out."""
+    """Pictures without loss, so that every pixel can be compared; all that are looked at confirm the gyroscope."""
     scene = CornerScene.make(exposure_s=0.03, readout_s=0.0, frames=12, vigour=0.8)
     return scene.write(tmp_path_factory.mktemp("blurred") / "capture", extra=CALIBRATED, suffix=".png")
 
@@ -90,7 +90,7 @@ def test_the_network_treats_the_frames_that_the_filter_would_and_the_result_says
     assert "the network DeepGyro undoes it" in stored["imaging"]["deblur"]
     before = json.loads(by_filter.workspace.result.read_text())
     assert before["imaging"]["deblur_method"] == "wiener" and "DeepGyro" not in before["imaging"]["deblur"]
-    assert "the images bear out the gyroscope's blur" in before["imaging"]["deblur"]
+    assert "the images confirm the gyroscope's blur" in before["imaging"]["deblur"]
     for new, old in zip(stored["frames"], before["frames"], strict=True):
         assert (new["name"], new["action"]) == (old["name"], old["action"])
         assert new["blur_px"] == pytest.approx(old["blur_px"], rel=0.02)
@@ -163,7 +163,7 @@ def test_frames_need_not_speak_for_themselves_where_a_network_treats_them(blurre
     plan = deep_plan
     assert plan.deblur is not None
     decisions, verdict = plan.deblur
-    # as in a recording of which only some frames bear the gyroscope out
+    # as in a recording of which only some frames confirm the gyroscope
     plan = replace(plan, deblur=(decisions, replace(verdict, trusted=None)))
     loaded = parts(blurred).capture
     treated = {}

@@ -1,4 +1,4 @@
-"""Commands that begin with a capture: images or video, and the IMU that ran along."""
+"""Commands that begin with a capture: images or video, and the IMU recorded with it."""
 
 from __future__ import annotations
 
@@ -274,7 +274,7 @@ class Batch(ConfiguredCommand):
 
 @dataclass(frozen=True, kw_only=True)
 class Simulate(Reader):
-    """Make a simulated capture with known truth: a desk or room, filmed by a hand, with the IMU that ran along.
+    """Make a simulated capture with known truth: a desk or room, filmed by a hand, with the IMU recorded with it.
 
     Example: colmap-inertial simulate example_scenes/rolling_shutter/recipe.toml my_scene
     """

@@ -97,7 +97,7 @@ def read_given(path: Path) -> GivenDatabase:
     Raises
     ------
     FormatError
-        For a file that is no COLMAP database, damaged or in use, and for one that has nothing to go on with.
+        For a file that is no COLMAP database, damaged or in use, and for one that has nothing to continue with.
     """
     if not path.is_file():
         raise FormatError(path, "no such file: --database takes a COLMAP database")

@@ -220,7 +220,7 @@ class FrameOptions(CheckedOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class ProjectOptions(CheckedOptions):
-    """An existing COLMAP project in place of a capture: the recording that ran along, and when images were taken."""
+    """An existing COLMAP project in place of a capture: the IMU recording, and when images were taken."""
 
     imu: Path | None = None
     """IMU recording: a file or folder of a known format, or a capture.toml."""

@@ -1,4 +1,4 @@
-"""The safety gate of deblurring: which frames to touch, and nothing that the image does not bear out.
+"""The safety gate of deblurring: which frames to touch, and nothing that the image does not confirm.
 
 Deconvolving what is sharp, or along a wrong direction, destroys more than blur does. So a frame is deblurred only
 where its own cepstrum shows the blur that the gyroscope predicts, or other frames of the recording have shown that
@@ -34,10 +34,10 @@ class GateOptions:
     """
 
     skip_below_px: float = 3.0
-    """Less blur than this is left alone."""
+    """Images with less blur are left alone."""
 
     skip_below_own_px: float = 2.0
-    """So is less than this in the picture as it is, however small: below, a filter may lose more than it gains."""
+    """Images with less blur, in their own pixels, are left alone: a filter may lose more than it gains."""
 
     drop_above_px: float = 45.0
     """Frames with more blur are left out, unless they bridge a gap."""
@@ -188,7 +188,7 @@ GATE_LIMITS = GateLimits()
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingVerdict:
-    """Whether the images of a recording bear out its gyroscope.
+    """Whether the images of a recording confirm its gyroscope.
 
     Attributes
     ----------
@@ -254,7 +254,7 @@ def _judge_evidence(evidence: Sequence[BlurEvidence], options: GateOptions) -> R
         )
     else:
         sigmas = max(median, together.support)
-        trusted, reason = True, f"the images bear out the gyroscope's blur ({sigmas:.0f} standard deviations)"
+        trusted, reason = True, f"the images confirm the gyroscope's blur ({sigmas:.0f} standard deviations)"
         if factor != 1.0:
             reason += f", but for its extent, which is multiplied by {factor:.2f}"
     return RecordingVerdict(trusted=trusted, support=median, extent_factor=factor, frames=len(telling), reason=reason)
@@ -296,7 +296,7 @@ def judge_frame(
     options: GateOptions,
     path: BlurPath | None = None,
 ) -> tuple[float | None, str]:
-    """Whether an image bears out its blur.
+    """Whether an image confirms its blur.
 
     Parameters
     ----------
@@ -342,7 +342,7 @@ def judge_frame(
             f"the image does not show the blur that the gyroscope predicts ({own:.1f} standard deviations where "
             f"{options.min_support:g} are wanted)"
         )
-    return _correct_extent(evidence), f"the image bears out the gyroscope's blur ({own:.0f} standard deviations)"
+    return _correct_extent(evidence), f"the image confirms the gyroscope's blur ({own:.0f} standard deviations)"
 
 
 def _lacks_dip(image: NDArray[Code], curve: BlurPath, options: GateOptions) -> bool:

@@ -80,7 +80,7 @@ def unreadable(error: InertialError) -> Finding:
         code=code,
         severity="error",
         evidence=str(error),
-        advice="correct this and diagnose again: what needs it was not checked",
+        advice="correct this and run diagnose again: checks that depend on it were skipped",
     )
 
 

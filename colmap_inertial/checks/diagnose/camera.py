@@ -148,7 +148,7 @@ def _never_fits(recorded: Recorded, turning: CameraTrajectory, failed: NotObserv
         return Finding(
             code="offset-undecided",
             severity="warning",
-            evidence=f"in {span_s:.1f} s no time offset between camera and gyroscope is clearly better than the rest",
+            evidence=f"no time offset between camera and gyroscope fits clearly better than others in {span_s:.1f} s",
             advice="record ten seconds or more, with rotation about all three axes",
             numbers={"seconds": span_s},
         )
@@ -156,8 +156,8 @@ def _never_fits(recorded: Recorded, turning: CameraTrajectory, failed: NotObserv
         return Finding(
             code="pictures-too-few",
             severity="info",
-            evidence=f"only {len(turning) - 1} pictures that follow each other share enough to be compared with the "
-            "gyroscope, and it fits them at no offset",
+            evidence=f"only {len(turning) - 1} pairs of consecutive pictures overlap enough to be compared with the "
+            "gyroscope, and no time offset fits them",
             advice="take pictures closer together, or film; after a reconstruction diagnose its model",
             numbers={"pairs": len(turning) - 1.0},
         )

@@ -44,9 +44,9 @@ _ADVICE = (
 
 
 def check_motion_content(recorded: Recorded) -> Iterator[Finding]:
-    """Accelerations are all that tells metres; rest, turning on the spot and gliding have none."""
+    """Report motion without acceleration, which gives no scale: rest, rotation on the spot, constant velocity."""
     imu = recorded.imu
-    # of numbers in other units no motion is told
+    # in wrong units the motion cannot be judged
     if imu is None or not imu.has_accel or recorded.implausible or recorded.wrong_unit is not None:
         return
     accel = acceleration_rms_m_s2(imu)

@@ -65,7 +65,7 @@ def signal_record(
     trajectory
         Poses of the model, in metres where its scale is known, else in the model's units.
     imu
-        The recording that ran along.
+        The IMU recording.
     estimate
         What was found about the two.
     gravity_in_world_m_s2

@@ -217,7 +217,7 @@ class _Level:
         return bool(mean >= _LIMITS.alike and mean >= _LIMITS.alike_sigmas * spread)
 
     def _correlate_parts(self, shift_px: Array) -> Array:
-        """Correlations in squares where enough tells."""
+        """Correlations of the squares with enough detail."""
         moved, tells = self.moved(shift_px)
         height, width = self.short.shape
         side = max(16, max(height, width) // _LIMITS.parts_along)

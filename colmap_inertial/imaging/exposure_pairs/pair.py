@@ -95,7 +95,7 @@ def match_brightness(short: AnyArray, long: AnyArray, *, stated: float | None = 
     """The gain between two exposures, in linear light.
 
     The images are compared in squares: the median over those that neither clip nor sink into black, weighted by their
-    light. What is stated is taken where the pixels bear it out or tell too little, and the pixels' own gain otherwise:
+    light. What is stated is taken where the pixels confirm it or tell too little, and the pixels' own gain otherwise:
     it is the images that have to agree.
 
     Parameters
@@ -322,7 +322,7 @@ def bring_together(
             # the exposure is known and recorded: else there were no shift
             blur = blur_seen_from_short(blur_field(gyro.motion, gyro.camera, gyro.long), registered.shift_px)
         else:
-            note = "the pictures do not bear out the gyroscope's rotation"
+            note = "the pictures do not confirm the gyroscope's rotation"
     map_x, map_y = sampling_maps(registered.shift_px, width, height, _STEP_PX)
     covered = (map_x >= 0) & (map_x <= width - 1) & (map_y >= 0) & (map_y <= height - 1)
     seen = cv2.remap(long, map_x, map_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)

@@ -98,7 +98,7 @@ class Noise(ImuNoise):
         return math.hypot(self.accel_density_m_s2_rthz / dt_s**0.5, self.accel_slow_m_s2)
 
     def imu_over_seconds(self) -> ImuNoise:
-        """The IMU's noise with white noise that does over seconds what the slow errors do beside their own."""
+        """The IMU's noise with the slow errors included in its white noise, as they act over seconds."""
         density = math.hypot(self.accel_density_m_s2_rthz, self.accel_slow_m_s2_rts * ACCEL_SLOW_S)
         imu = {field.name: getattr(self, field.name) for field in fields(ImuNoise)}
         return ImuNoise(**{**imu, "accel_density_m_s2_rthz": density})

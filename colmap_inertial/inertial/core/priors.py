@@ -35,11 +35,11 @@ class JointPriors:
     known_gravity_m_s2: float = 5e-4
     """The same where the latitude is known: what lies under the ground, 0.0003 m/s2 rms, is rarely more."""
     lens: float = 0.0015
-    """Scale of the part of the model that somebody measures against that of the camera's path: errors of the focal
-    length and of the lens bend a model by tenths of a percent, and no inertial data show it."""
+    """Scale error by lens calibration between a measured part of the model and the camera's path: errors of focal
+    length and distortion bend a model by tenths of a percent, and inertial data do not show it."""
     accel_model: float = 0.00477
-    """What an accelerometer that nobody calibrated is off beside a constant gain, as a factor of the scale: with the
-    lens it makes the 0.5 % that real recordings show at least."""
+    """Scale error of an uncalibrated accelerometer beside a constant gain: with the lens it makes the 0.5 % that real
+    recordings show at least."""
     calibrated_gain: float = 0.001
     """Each gain and axis error of a calibrated sensor, beside its calibration's own covariance: age, and the few kelvin
     that nobody logs."""

@@ -223,21 +223,21 @@ def overlaps(submodels: Sequence[FittedSubmodel], link: ImuLink) -> bool:
 
 
 def incompatible_pairs(submodels: Sequence[FittedSubmodel], shared: Sequence[SimilarityConstraint]) -> dict[Pair, str]:
-    """Why pairs of submodels cannot be one model whatever the IMU says, in words."""
+    """Reasons why pairs of submodels cannot be one model, whatever the IMU measured."""
     agree, out = {pair_of(one) for one in shared}, {}
     for (a, one), (b, other) in combinations(enumerate(submodels), 2):
         both = len(set(one.trajectory.names) & set(other.trajectory.names))
         if one.cameras and other.cameras and not one.cameras & other.cameras:
-            out[a, b] = "other cameras took the pictures of one than those of the other"
+            out[a, b] = "the two models are of different cameras"
         elif both > LIMITS.most_shared * min(len(one.trajectory.names), len(other.trajectory.names)):
-            out[a, b] = f"{both} images are in both: they are two models of one piece, not two pieces"
+            out[a, b] = f"{both} images are in both: they are two models of the same part of the recording"
         elif both >= LIMITS.images and (a, b) not in agree:
-            out[a, b] = f"the {both} images that both have lie otherwise in one than in the other"
+            out[a, b] = f"the {both} images in both models have different relative poses in the two"
     return out
 
 
 def mounting_differs(one: FittedSubmodel, other: FittedSubmodel) -> bool:
-    """Whether the camera of two submodels is mounted to the IMU in two ways."""
+    """Whether the relative pose of camera and IMU differs between two submodels."""
     (a, b), at = (submodel.path.at(np.array([0])) for submodel in (one, other)), np.r_[-MOUNTING:0]
     away = np.concatenate([so3_log(a.cam_from_imu @ b.cam_from_imu.T), a.imu_in_cam_m - b.imu_in_cam_m])
     cov = a.cov[np.ix_(at, at)] + b.cov[np.ix_(at, at)]

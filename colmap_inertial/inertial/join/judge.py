@@ -79,7 +79,7 @@ class Trial:
     Attributes
     ----------
     placed
-        ``None`` where they do not come to rest.
+        ``None`` where they do not converge.
     chi2, dof
         Squares that the constraints add to what the submodels say of each other, and what chance makes of them.
     sigmas
@@ -202,17 +202,17 @@ class _Judgement:
 def join_submodels(
     submodels: Sequence[FittedSubmodel], imu: ImuRecording, limits: JoinOptions, found: Sequence[PlacedImages] = ()
 ) -> Joined:
-    """Join what can be joined surely enough.
+    """Join submodels whose relative poses are known accurately enough.
 
-    Two by two first; then the surest pairs bring their groups together, one after the other, where all that ties the
-    submodels of both suits.
+    Pairs first; then the most accurate pairs merge their groups, one after the other, where all constraints between
+    the submodels of both are consistent.
 
     Parameters
     ----------
     submodels
         The largest one first: each joined model has the world of its first submodel.
     imu
-        The recording that ran along, as it was read.
+        The IMU recording, as it was read.
     limits
         Up to where gaps are closed.
     found
@@ -296,7 +296,7 @@ def _try(evidence: Evidence, members: Sequence[int], matched: Collection[Similar
         device_chi2 = place_submodels(problem, by_imu=False).squares
         placed = place_submodels(problem)
     except np.linalg.LinAlgError:
-        fits_none = "what the IMU felt in it fits no place of one in the other"
+        fits_none = "no relative pose of the two models fits the IMU's motion between them"
         return Trial(contradiction=_OTHER_IMU if device_chi2 > chi2_limit(device_dof, real=True) else fits_none)
     # heading and place are all that submodels do not know of each other
     dof = max(1, round(9 * len(links) + sum(one.equations for one in images)) - 4 * (len(members) - 1))
@@ -316,12 +316,12 @@ def _try(evidence: Evidence, members: Sequence[int], matched: Collection[Similar
         why = _OTHER_IMU
     elif chi2 > chi2_limit(dof, real=True):
         why = (
-            f"what the IMU felt in it contradicts the motion before and after it ({chi2:.0f} times the squares of one "
-            f"standard deviation, where chance makes {dof})"
+            f"the IMU's motion in the gap contradicts the motion before and after it (chi-square {chi2:.0f}, expected "
+            f"{dof})"
         )
     elif farthest > chi2_limit(POSE_DOF, real=False):
         why = (
-            f"the poses before and after it contradict what the IMU or shared images say of them "
+            f"the poses before and after the gap contradict the IMU or the shared images "
             f"({farthest**0.5:.0f} standard deviations)"
         )
     return Trial(placed=placed, chi2=chi2, dof=dof, sigmas=sigmas, contradiction=why, matched=tuple(matched))

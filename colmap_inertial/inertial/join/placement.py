@@ -402,7 +402,7 @@ def place_submodels(problem: Problem, *, by_imu: bool = True) -> Placed:
     Raises
     ------
     numpy.linalg.LinAlgError
-        Where it does not come to rest.
+        Where it does not converge.
     """
     state, cov, squares = minimised(problem.start(), lambda state: problem.equations(state, by_imu=by_imu), CONVERGENCE)
     count, own = len(problem.submodels), problem.own(problem.held)

@@ -206,7 +206,7 @@ def _solve_all(judged: Judged, problem: Problem, x: Estimate, t_s: Array) -> Jud
     whole = solve(problem, x)
     judged = replace(judged, steps=judged.steps + whole.steps)
     if not whole.converged:
-        return replace(judged, reason="with all observations, the refinement does not come to rest")
+        return replace(judged, reason="with all observations, the refinement does not converge")
     try:
         solved = factored(problem, whole.estimate)
     except np.linalg.LinAlgError:
@@ -244,7 +244,7 @@ def _part(problem: Problem, keep: BoolArray) -> Problem:
 
 
 def _measured(problem: Problem, kept: BoolArray, x: Estimate) -> Problem:
-    """The problem with its accelerometer's noise as what it was solved without a tenth for says."""
+    """The problem with the accelerometer's noise re-estimated, from the solution on nine tenths of the observations."""
     try:
         return replace(problem, inertial=apply_measured_noise(_part(problem, kept), x).inertial)
     except np.linalg.LinAlgError:  # the solution says why not
@@ -294,9 +294,9 @@ def _test_readout(
 def _doubt(alone: Solution, seen: Solution, chi2: float, change: float, spread: float) -> str:
     """Why a refinement is not believed; empty where it is."""
     if not alone.converged:
-        return "pictures alone, which it is compared with, do not come to rest"
+        return "pictures alone, which it is compared with, do not converge"
     if not seen.converged:
-        return "the refinement does not come to rest"
+        return "the refinement does not converge"
     if chi2 > LIMITS.largest_chi2:
         return (
             f"the IMU contradicts the pictures ({chi2:.1f} times the squares that its noise explains): check that both "

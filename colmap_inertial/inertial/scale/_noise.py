@@ -71,13 +71,13 @@ _LARGEST_CORRELATION = 0.8
 #: together, noise of the one would otherwise grow to metres and explain the other away. Where a device vibrates, that
 #: much would take noise for none that explains all but a little.
 _LEAST_LEFT, _LEAST_LEFT_SHAKEN = 1e-2, 1e-6
-#: First steps go by sums of squares, of the slow share of an error by its whole logarithm; then Newton's, damped
-#: (Levenberg): so much at first, and by these factors more where a step leads no nearer, less where it does.
+#: The first steps set levels by their sums of squares (EM; whole logarithms for slow errors). Newton steps follow,
+#: damped (Levenberg) by this much at first, and by these factors more or less after a step away or nearer.
 _BY_SQUARES, _DAMPED, _MORE, _LESS = 3, 0.3, 3.0, 0.4
 _LEAST_DAMPING, _MOST_DAMPING = 0.03, 10.0
 #: Largest changes of a variance's logarithm in a step: at first, and then.
 _LARGEST_FIRST, _LARGEST_CHANGE = 3.0, 1.8
-#: Where levels that explain the same do not come to rest in so many steps, that shrinks by the factor with each more.
+#: After so many steps without convergence, the largest change shrinks by the factor with each further step.
 _PATIENCE, _TIRING = 25, 0.6
 #: At rest: the likelihood has no more than this to gain, as standard deviations of the levels (Newton's decrement).
 _AT_REST = 0.5

@@ -129,8 +129,8 @@ class ShapeFault:
         since_s, first = self.at_s - float(t_s[0]), 2 * self.at_s < t_s[0] + t_s[-1]
         return (
             f"the reconstruction's scale is not the same throughout: lengths are {size if first else -size:+.1f} +- "
-            f"{sigma:.1f} % larger {'before' if first else 'after'} {since_s:.0f} s than in the longer rest, which the "
-            f"metres are those of: {advice}"
+            f"{sigma:.1f} % larger {'before' if first else 'after'} {since_s:.0f} s than in the longer part, whose "
+            f"scale is used: {advice}"
         )
 
 

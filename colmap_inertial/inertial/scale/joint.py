@@ -375,7 +375,7 @@ def _refusals(fit: Fit, t_s: Array) -> list[str]:
     x = fit.estimate
     if not fit.converged and float(fit.cov[par.SCALE, par.SCALE]) < 0.15**2:
         out.append(
-            "the fit of camera and IMU does not come to rest: check that stamps are those of the samples, to a "
+            "the fit of camera and IMU does not converge: check that stamps are those of the samples, to a "
             f"millisecond, or {_RECORD_INSTEAD}"
         )
     bias = float(np.linalg.norm(x.accel_bias_m_s2))

@@ -201,4 +201,4 @@ def parts_in_words(parts: Mapping[str, float]) -> tuple[str, str]:
         for name, sigma in largest
         if sigma >= _WORTH_SAYING * whole
     ]
-    return f"{', '.join(said)}; they add up in squares", CAUSES[largest[0][0]].advice
+    return f"{', '.join(said)}; they combine as root sum of squares", CAUSES[largest[0][0]].advice

@@ -175,7 +175,7 @@ def minimised(
     Raises
     ------
     numpy.linalg.LinAlgError
-        Where they are not determined, or do not come to rest.
+        Where they are not determined, or do not converge.
     """
     state, largest, squares = start, np.inf, np.inf
     for _ in range(limits.rounds):
@@ -186,7 +186,7 @@ def minimised(
             return state, cov, equations.squares
         squares, state = equations.squares, state.moved(step)
         largest = float(np.abs(step[: PLACEMENT * len(state.scale)].reshape(-1, PLACEMENT)[:, 1:]).max())
-    raise np.linalg.LinAlgError("the places of the submodels do not come to rest")
+    raise np.linalg.LinAlgError("the places of the submodels do not converge")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

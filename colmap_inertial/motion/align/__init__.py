@@ -4,7 +4,7 @@ Step 1 of Mustaniemi et al., "Inertial-based scale estimation for structure from
 with three changes. Every offset at which the two recordings could coincide is searched, because clock origins are
 arbitrary, and clocks may run at different rates. Rotations over intervals between frames are compared instead of
 differentiated orientations, so that video and sparse keyframes are treated in the same way. And a result is refused
-where no offset is clearly better than the rest.
+where no offset is clearly better than the others.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def align_clocks(
     Raises
     ------
     NotObservableError
-        Where no offset is clearly better than the rest (another recording's IMU, no rotation, rotation that repeats
+        Where no offset is clearly better than the others (another recording's IMU, no rotation, rotation that repeats
         itself), where the recordings cannot overlap, or where turning about one axis only leaves the rotation open.
     """
     search = _search(trajectory, imu, prior, options)
@@ -241,9 +241,9 @@ class _Search:
         hint += ": record longer, with rotation that does not repeat itself"
         if explained < options.min_explained:
             hint = (
-                "at no offset does the gyroscope fit the camera's rotations clearly better than at the rest (it "
-                f"explains {100 * max(explained, 0):.0f} % of them): check that this IMU recording belongs to these "
-                "images and that the gyroscope's columns, axes and unit are right, or record longer with rotation "
+                "no time offset fits gyroscope and camera rotations clearly better than the others (the gyroscope "
+                f"explains {100 * max(explained, 0):.0f} % of them): check that this IMU recording belongs to "
+                "these images and that the gyroscope's columns, axes and unit are right, or record longer with rotation "
                 "about all three axes"
             )
         return NotObservableError("time offset", hint)

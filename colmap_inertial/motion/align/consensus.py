@@ -158,7 +158,7 @@ def judge_rotations(
     Parameters
     ----------
     trajectory, imu
-        A reconstruction and the recording that ran along. Cameras outside of it are not judged; those on either side
+        A reconstruction and the IMU recording. Cameras outside of it are not judged; those on either side
         of a pause of the gyroscope are not compared with each other.
     calibration
         Of the two, from :func:`align_by_consensus` or ``align_clocks``.

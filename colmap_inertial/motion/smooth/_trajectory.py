@@ -68,7 +68,7 @@ def smooth_trajectory(
     also_at_s: Array | None = None,
     options: SmoothOptions | None = None,
 ) -> SmoothedTrajectory:
-    """Smooth a metric camera path with the IMU that filmed along.
+    """Smooth a metric camera path with the IMU recorded with it.
 
     The accelerometer, turned into the world by orientations from gyroscope and camera, drives positions and
     velocities from frame to frame; what it leaves (tilt, bias, gravity) is an acceleration that walks. Positions from

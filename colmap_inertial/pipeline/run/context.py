@@ -22,7 +22,7 @@ Features = Literal["sift", "aliked"]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Recording:
-    """One recording: its frames' times, the IMU that ran along, and what is known of both.
+    """One recording: its frames' times, the IMU recorded with it, and what is known of both.
 
     Attributes
     ----------

@@ -108,7 +108,7 @@ def open_session(
     Parameters
     ----------
     out
-        A folder that does not exist, or holds a run on the same source, which is then gone on with.
+        A folder that does not exist, or holds a run on the same source, which is then continued.
     source
         The capture or project.
     options
@@ -236,7 +236,7 @@ def conflicts() -> list[str]:
 
 
 def warn_of_conflicts() -> None:
-    """Say them, before a run fails in a way that does not tell."""
+    """Log conflicts of installed packages, before they cause failures that do not name them."""
     for sentence in conflicts():
         log.warning("%s", sentence)
 

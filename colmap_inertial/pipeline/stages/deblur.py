@@ -53,7 +53,7 @@ class SmoothingLimits:
 SMOOTHING = SmoothingLimits()
 
 
-#: Standard deviations by which a frame must bear out the gyroscope by itself, where others do not. With 4, the filter
+#: Standard deviations by which a frame must confirm the gyroscope by itself, where others do not. With 4, the filter
 #: made some worse; the network, which sees whether the filter's result can be true, is worth using unless a frame
 #: speaks against.
 _CLEAR_SUPPORT: dict[BlurRemover, float] = {
@@ -142,7 +142,7 @@ class DeblurStage:
     def of_plan(cls, plan: ImagingPlan, *, drop: bool = True, smoothing: bool = True) -> DeblurStage | None:
         """The stage of a plan, optionally without dropping frames and without smoothing.
 
-        Where frames must bear out the gyroscope by themselves, they must do so clearly for a filter; for the network
+        Where frames must confirm the gyroscope by themselves, they must do so clearly for a filter; for the network
         it is enough that they do not speak against it.
         """
         if plan.view is None or plan.deblur is None:
@@ -192,7 +192,7 @@ class DeblurStage:
         shutter: FrameShutter,
         remove: _Remover,
     ) -> Frame:
-        """The frame to go on with, and what was decided about it."""
+        """The frame to continue with, and what was decided about it."""
 
         def said(reason: str, kept_share: float = 1.0, extent_factor: float = 1.0, action: str = "") -> Frame:
             values = {"blur_px": decision.blur_px, "kept_share": kept_share, "extent_factor": extent_factor}

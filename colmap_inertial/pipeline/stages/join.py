@@ -32,7 +32,7 @@ _NO_MATCHES = "without matches between the two: COLMAP's database is gone"
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class JoinStage(InertialStage):
-    """Joins metric models of one recording; those that nothing places surely enough stay apart.
+    """Joins metric models of one recording; those whose relative pose is not known well enough stay apart.
 
     Comes after the scale. It takes all models at once (:meth:`join_models`); one alone stays as it is. Each joined
     model is in the world of its largest part, gravity and scale as all parts together have them.

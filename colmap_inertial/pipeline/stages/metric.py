@@ -70,7 +70,7 @@ class InertialStage:
     Attributes
     ----------
     imu
-        The recording that ran along.
+        The IMU recording.
     calibration
         What is known of the camera and the IMU beforehand.
     options
@@ -258,14 +258,14 @@ def write_trajectory(path: Path, model: Model, trajectory: CameraTrajectory, imu
     trajectory
         Its poses, in metres.
     imu
-        The recording that ran along.
+        The IMU recording.
     """
     estimate, gravity = model.scale, gravity_in_model(model)
     if estimate is None or model.similarity is None or estimate.calibration is None or gravity is None:
         raise ValueError("only a metric model has a metric trajectory")
     target = path.with_name(f"{path.stem}_cov.npz")
     if model.motion is not None:
-        # the IMU made these poses already: smoothed by it once more, they would be worse, and seem far surer
+        # these poses contain the IMU already: smoothing them again would be worse and overconfident
         solved = model.motion.of(trajectory.names, trajectory.cam_in_world)
         write_tum(path, trajectory)
         told = [i for i, name in enumerate(trajectory.names) if name in solved.cov]

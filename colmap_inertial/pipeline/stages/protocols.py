@@ -59,7 +59,7 @@ class InvertibleStage(KeypointStage, Protocol):
 
 
 class ModelStage(Protocol):
-    """Between mapping and the final write: takes a model and returns the one to go on with."""
+    """Between mapping and the final write: takes a model and returns the one to continue with."""
 
     def __call__(self, model: Model, /) -> Model:
         """Return the model, or another one made from it."""
@@ -70,7 +70,7 @@ class JoiningStage(ModelStage, Protocol):
     """A model stage that takes all models of a run at once."""
 
     def join_models(self, models: Sequence[Model], /) -> tuple[tuple[Model, ...], tuple[Gap, ...]]:
-        """Return the models to go on with, and what lies between those that came, the largest first."""
+        """Return the models to continue with, and what lies between those that came, the largest first."""
         ...
 
 

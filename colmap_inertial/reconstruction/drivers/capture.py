@@ -84,7 +84,7 @@ def reconstruct(
     capture
         A ``capture.toml``, a folder that holds one, or a dataset folder that ``load_capture`` knows.
     out
-        A folder that does not exist, or holds a run of the same capture, which is then gone on with: only what the
+        A folder that does not exist, or holds a run of the same capture, which is then continued: only what the
         options, the recording or the stages changed is made again.
     options
         See :class:`ReconstructOptions`.

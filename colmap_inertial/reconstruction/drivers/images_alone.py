@@ -141,7 +141,7 @@ def deblur_capture(
     capture
         As for ``reconstruct``.
     out
-        A folder that does not exist, or holds a run of the same capture, which is then gone on with. No frame is left
+        A folder that does not exist, or holds a run of the same capture, which is then continued. No frame is left
         out: those that cannot be deblurred are copied.
     method
         How blur is undone.
@@ -246,7 +246,7 @@ def fuse_captured(
     capture
         A ``capture.toml`` with ``[images]`` and ``[apertures]``, or its folder.
     out
-        A folder that does not exist, or holds a run of the same capture, which is then gone on with: ``images/``, and
+        A folder that does not exist, or holds a run of the same capture, which is then continued: ``images/``, and
         where asked for ``refocused/``, ``disparity/``, ``depth/``.
     options
         Defaults serve.
@@ -322,7 +322,7 @@ def fuse_exposures_captured(
     capture
         A ``capture.toml`` with ``[images]`` and ``[exposures]``, or its folder.
     out
-        A folder that does not exist, or holds a run of the same capture, which is then gone on with: ``images/`` with
+        A folder that does not exist, or holds a run of the same capture, which is then continued: ``images/`` with
         the short ones' names, formats and metadata, and ``result.json``.
     options
         Defaults serve.

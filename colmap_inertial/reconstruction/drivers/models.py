@@ -168,7 +168,7 @@ def run_models(
 
 
 def _select_models(found: Mapping[int, Path], *, keep: bool) -> tuple[list[int], list[Fragment]]:
-    """COLMAP's numbers of the models to go on with, the largest first; and what is too small."""
+    """COLMAP's numbers of the models to continue with, the largest first; and what is too small."""
     sizes = {number: num_registered(folder) for number, folder in found.items()}
     order = sorted(found, key=lambda number: (-sizes[number], number))
     least = 0.0 if keep else max(_LIMITS.fewest_images, _LIMITS.least_share * sizes[order[0]])

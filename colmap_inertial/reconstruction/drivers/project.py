@@ -127,10 +127,10 @@ def reconstruct_project(
     project
         A folder with a COLMAP model; it is only read.
     out
-        A folder that does not exist, or holds a run on the same project, which is then gone on with. It becomes the
+        A folder that does not exist, or holds a run on the same project, which is then continued. It becomes the
         whole project in metres, with ``trajectory.tum``, ``result.json`` and the report of :func:`reconstruct`.
     source
-        The recording that ran along, and when the images were taken.
+        The IMU recording, and when the images were taken.
     options
         Those of mapping and of pixels must be left alone: the model is what it is.
     model_stages
@@ -282,7 +282,7 @@ def _require_recording(project: Path, source: ProjectOptions) -> Path:
     if source.imu is None:
         stated = (source.frame_times, source.name_times, source.video, source.exif_times or None)
         when = "" if any(times is not None for times in stated) else f"; and when its images were taken: {_HOW_TIMES}"
-        raise FormatError(project, f"is a COLMAP project and needs the recording that ran along: give --imu PATH{when}")
+        raise FormatError(project, f"is a COLMAP project and needs the IMU recording: give --imu PATH{when}")
     if source.frame_times is not None and not source.frame_times.exists():
         raise FormatError(source.frame_times, "no such file or folder")
     return source.imu

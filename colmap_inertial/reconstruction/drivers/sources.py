@@ -152,7 +152,7 @@ def _require_all(source: ScaleSource) -> None:
     if path.is_dir():
         only_model(path)
     if source.imu is None:
-        missing.append("the recording that ran along: give --imu PATH")
+        missing.append("the IMU recording: give --imu PATH")
     if path.is_dir() and source.frame_times is None and not (source.imu is not None and is_capture(source.imu)):
         missing.append("the times of its images: give --frame-times, a CSV with name,t_s")
     if missing:

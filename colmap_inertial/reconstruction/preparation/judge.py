@@ -28,23 +28,23 @@ from colmap_inertial.reconstruction.preparation.sampling import some_frames
 class JudgeLimits:
     """Limits for frames that confirm the gyroscope's blur."""
 
-    #: A gyroscope that is borne out by this share of the frames is trusted for all of them.
+    #: A gyroscope that is confirmed by this share of the frames is trusted for all of them.
     trusted_share: float = 0.95
     #: Of frames that are mostly sky, this share: of the little below it, the fall of detail scatters by .2.
     trusted_share_of_skies: float = 0.85
-    #: A frame whose dip is faint bears the gyroscope out, too, where detail falls along the blur as predicted, and no
+    #: A frame whose dip is faint confirms the gyroscope, too, where detail falls along the blur as predicted, and no
     #: other direction shows a dip this deep.
     other_support: float = 4.0
     #: Pictures whose tiles tell no more than this share of them would if all were alike are mostly sky. Common ones
     #: with short blur are at .8; 70 % of sky leaves .6.
     standing_share: float = 0.7
-    #: So many frames that are mostly sky bear the gyroscope out where so large a share of them shows the fall of
+    #: So many frames that are mostly sky confirm the gyroscope where so large a share of them shows the fall of
     #: detail, and they rather show it than the mirrored one by so many standard deviations of the mean. Right
     #: gyroscopes have .7 to 1 and 3.8 to 5.6, wrong ones .45 and 3.2 at most, not both at once.
     sky_frames: int = 5
     sky_share: float = 0.65
     sky_sigmas: float = 3.0
-    #: Where the pictures do not bear the gyroscope out, exposure times may be wrong by a common factor; these are
+    #: Where the pictures do not confirm the gyroscope, exposure times may be wrong by a common factor; these are
     #: tried. Twice the blur shows a dip, too, where the right one shows a deeper one.
     exposure_factors: tuple[float, ...] = (0.5, 2.0)
     exposure_support: float = 10.0
@@ -77,7 +77,7 @@ def judge_frames(
 
     Returns
     -------
-    Whether it is trusted for all frames, or every frame must bear it out by itself. Where the pictures bear it out but
+    Whether it is trusted for all frames, or every frame must confirm it by itself. Where the pictures confirm it but
     for exposure times that are wrong by one factor, that is corrected, and said.
     """
 
@@ -106,7 +106,7 @@ class Looked:
 
     @property
     def shows(self) -> bool:
-        """Whether it bears the gyroscope out."""
+        """Whether it confirms the gyroscope."""
         one = self.evidence
         if (
             self.is_mostly_sky
@@ -168,7 +168,7 @@ def _correct_exposures(
         if found.trusted is True and support >= _LIMITS.exposure_support and support > deepest:
             whole = factor * found.extent_factor
             reason = (
-                f"the images bear out the gyroscope's blur ({support:.0f} standard deviations), but for its extent, "
+                f"the images confirm the gyroscope's blur ({support:.0f} standard deviations), but for its extent, "
                 f"which is multiplied by {whole:.2f}: the exposure times are wrong by this factor"
             )
             best, deepest = replace(found, extent_factor=whole, reason=reason), support
@@ -193,14 +193,15 @@ def judge_sky(verdict: RecordingVerdict, looked: Sequence[Looked]) -> RecordingV
     sigmas = float(gains.mean() / max(gains.std(ddof=1) / np.sqrt(len(gains)), 1e-9))
     if shown < _LIMITS.sky_share * len(gains) or sigmas < _LIMITS.sky_sigmas:
         return verdict
-    reason = f"what stands below the sky bears out the gyroscope's blur ({sigmas:.0f} standard deviations)"
+    reason = f"the images below the sky confirm the gyroscope's blur ({sigmas:.0f} standard deviations)"
     return replace(verdict, trusted=True, support=sigmas, extent_factor=1.0, reason=reason)
 
 
 def judge_each_frame(verdict: RecordingVerdict, looked: Sequence[Looked]) -> RecordingVerdict:
-    """The verdict, unless only some of the frames bear it out: then every frame must do so by itself.
+    """The verdict; where only some of the frames confirm the blur, each frame must confirm it by itself.
 
-    So it is where the camera moves close to things: they blur by translation, too, which no gyroscope feels.
+    This happens where the camera moves close to objects: translation blurs them, too, and the gyroscope does not
+    measure it.
     """
     telling = [one for one in looked if one.evidence.enough and one.blur_px >= GATE_LIMITS.must_show_px]
     shown = sum(one.shows for one in telling)
@@ -209,7 +210,7 @@ def judge_each_frame(verdict: RecordingVerdict, looked: Sequence[Looked]) -> Rec
     if verdict.trusted is not True or shown >= most * len(telling):
         return verdict
     reason = (
-        f"{shown} of {len(telling)} frames that were looked at bear out the gyroscope's blur, so each frame must do so "
-        "by itself (close to things, the camera's translation blurs, too)"
+        f"{shown} of {len(telling)} frames that were looked at confirm the gyroscope's blur, so each frame must do so "
+        "by itself (close to objects, the camera's translation blurs, too)"
     )
     return replace(verdict, trusted=None, reason=reason)

@@ -30,7 +30,7 @@ class BatchCapture:
     options
         How it is reconstructed.
     project
-        For an existing COLMAP project: the recording that ran along, and when its images were taken.
+        For an existing COLMAP project: the IMU recording, and when its images were taken.
     stages
         Its hooks; ``None`` for those of all captures.
     """

@@ -40,7 +40,7 @@ class Job:
     options
         As for ``reconstruct``.
     project
-        For an existing COLMAP project: the recording that ran along, and when its images were taken.
+        For an existing COLMAP project: the IMU recording, and when its images were taken.
     stages
         The hooks.
     """

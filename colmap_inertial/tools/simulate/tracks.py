@@ -73,7 +73,7 @@ class Tracks:
     xy_px
         (M, 2) where.
     imu
-        The recording that ran along.
+        The IMU recording.
     motion, sampled
         The path; the samples without vibration, and the device they came from.
     """
