@@ -66,7 +66,7 @@ def test_a_part_in_a_hole_is_held_to_the_poses_on_both_sides(walked, inside, shi
     assert 1.0 < gap.seconds < 1.2
     assert gap.joined == (shift_m == 0)
     if shift_m:
-        assert "the poses before and after it contradict" in gap.reason
+        assert "the poses before and after the gap contradict" in gap.reason
     else:
         (group,) = joined.groups
         parts = [around, inside]
@@ -130,7 +130,7 @@ def test_pictures_of_two_cameras_stay_apart(walked):
         parts = [replace(first, cameras=frozenset({"1"})), replace(other, cameras=frozenset(cameras))]
         (gap,) = join_submodels(parts, walked.imu, LIMITS).gaps
         assert gap.joined == joined
-        assert joined or "other cameras" in gap.reason
+        assert joined or "different cameras" in gap.reason
 
 
 def test_images_that_lie_otherwise_in_either_part_keep_them_apart(walked):

@@ -111,7 +111,7 @@ def test_images_that_agree_are_those_of_a_loop_over_all():
     ("shared", "cameras", "agree", "why"),
     [
         (0, ("a", "a"), False, None),
-        (0, ("a", "b"), False, "other cameras"),
+        (0, ("a", "b"), False, "different cameras"),
         (0, ("", "b"), False, None),
         (8, ("a", "a"), True, None),
         (9, ("a", "a"), True, "two models of the same part"),

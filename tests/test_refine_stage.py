@@ -453,7 +453,7 @@ def test_what_takes_too_much_memory_is_left_as_it_is(walked, monkeypatch):
     assert made.reconstruction is model.reconstruction
 
 
-def test_what_does_not_come_to_rest_is_not_believed(walked, monkeypatch):
+def test_what_does_not_converge_is_not_believed(walked, monkeypatch):
     tracks, model = walked
     # pictures alone, the refinement, without a readout, with the noise measured, and with all observations
     whys = ("pictures alone", *3 * ("the refinement does not",), "with all observations")
@@ -467,7 +467,7 @@ def test_what_does_not_come_to_rest_is_not_believed(walked, monkeypatch):
         monkeypatch.setattr(judge, "solve", solved)
         made, said = refined_by(tracks.imu, model)
         assert why in said.reason
-        assert "come to rest" in said.reason
+        assert "converge" in said.reason
         assert made.reconstruction is model.reconstruction
 
 

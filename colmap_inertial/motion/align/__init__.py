@@ -242,8 +242,8 @@ class _Search:
         if explained < options.min_explained:
             hint = (
                 "no time offset fits gyroscope and camera rotations clearly better than the others (the gyroscope "
-                f"explains {100 * max(explained, 0):.0f} % of them): check that this IMU recording belongs to "
-                "these images and that the gyroscope's columns, axes and unit are right, or record longer with rotation "
+                f"explains {100 * max(explained, 0):.0f} % of them): check that this IMU recording belongs to these "
+                "images and that the gyroscope's columns, axes and unit are right, or record longer with rotation "
                 "about all three axes"
             )
         return NotObservableError("time offset", hint)
