@@ -95,9 +95,10 @@ from .pipeline.stages.readout import ReadoutStage as ReadoutStage
 from .pipeline.stages.refine import RefineStage as RefineStage
 from .pipeline.stages.rolling_shutter import RollingShutterStage as RollingShutterStage
 from .reconstruction.drivers.capture import reconstruct as reconstruct
-from .reconstruction.drivers.images_alone import DeblurResult as DeblurResult, deblur_capture as deblur_capture
+from .reconstruction.drivers.images_alone import deblur_capture as deblur_capture
 from .reconstruction.drivers.project import reconstruct_project as reconstruct_project
 from .reconstruction.drivers.result import (
+    DeblurResult as DeblurResult,
     Fragment as Fragment,
     ModelResult as ModelResult,
     ReconstructResult as ReconstructResult,

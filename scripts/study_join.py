@@ -38,8 +38,9 @@ from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, so3_log
 from colmap_inertial.core.options import JoinOptions, ScaleOptions
 from colmap_inertial.core.types import ImuRecording
 from colmap_inertial.inertial.join.evidence import find_links
-from colmap_inertial.inertial.join.judge import end_images, join_submodels, tie_cov
+from colmap_inertial.inertial.join.judge import join_submodels
 from colmap_inertial.inertial.join.placement import FittedSubmodel, ImuLink, Placed
+from colmap_inertial.inertial.join.relative_poses import end_images, tie_cov
 from colmap_inertial.inertial.scale.posterior import FittedPath
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.io.trajectories import read_inertial_scale

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pycolmap
 
-from colmap_inertial.checks.report.content import CROPS_FOLDER, DATA_FOLDER
+from colmap_inertial.checks.report.folders import CROPS_FOLDER, DATA_FOLDER
 from colmap_inertial.checks.report.photogrammetry import photogrammetry_record, scene_record
 from colmap_inertial.checks.report.signals import signal_record
 from colmap_inertial.core.geometry import quat_rotate

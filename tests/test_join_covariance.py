@@ -8,8 +8,8 @@ import pytest
 
 from colmap_inertial.core.geometry import matrix_from_quat, quat_from_matrix, so3_exp, so3_log
 from colmap_inertial.inertial.join import joined_model
-from colmap_inertial.inertial.join.judge import end_images, relative_cov, tie_cov, worst
 from colmap_inertial.inertial.join.placement import ImuLink, Placed
+from colmap_inertial.inertial.join.relative_poses import end_images, relative_cov, tie_cov, worst
 from colmap_inertial.model.similarities import compose
 from colmap_inertial.model.submodels.graph import Placements
 

@@ -12,8 +12,9 @@ from colmap_inertial.core.options import JoinOptions, ScaleOptions
 from colmap_inertial.core.types import CameraTrajectory
 from colmap_inertial.inertial.join.evidence import find_links
 from colmap_inertial.inertial.join.joined_model import _sigma_log
-from colmap_inertial.inertial.join.judge import join_submodels, tie_cov, worst
+from colmap_inertial.inertial.join.judge import join_submodels
 from colmap_inertial.inertial.join.placement import FittedSubmodel
+from colmap_inertial.inertial.join.relative_poses import tie_cov, worst
 from colmap_inertial.inertial.scale.posterior import FittedPath
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.pipeline.stages.join import _cameras

@@ -21,8 +21,13 @@ from test_pipeline_parts import frames_of, recording_of, session_in
 from colmap_inertial.checks.diagnose import Recorded, diagnose
 from colmap_inertial.colmap import steps
 from colmap_inertial.colmap.mapping import MapRecord, map_images
-from colmap_inertial.colmap.pairing import MatchRecord
-from colmap_inertial.colmap.sparse import KeypointRecords, extract_features, image_pairs, write_gravity_priors
+from colmap_inertial.colmap.sparse import (
+    KeypointRecords,
+    MatchRecord,
+    extract_features,
+    image_pairs,
+    write_gravity_priors,
+)
 from colmap_inertial.core.errors import FormatError, NotObservableError, OutputError, OutputExistsError
 from colmap_inertial.core.options import MappingOptions, ProjectOptions, ReconstructOptions
 from colmap_inertial.core.threads import map_in_order

@@ -28,9 +28,8 @@ if TYPE_CHECKING:
     from colmap_inertial.pipeline.run.workspace import Workspace
     from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
     from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan
-    from colmap_inertial.reconstruction.drivers.images_alone import DeblurResult
     from colmap_inertial.reconstruction.drivers.reference import Reference
-    from colmap_inertial.reconstruction.drivers.result import ModelResult, ReconstructResult
+    from colmap_inertial.reconstruction.drivers.result import DeblurResult, ModelResult, ReconstructResult
     from colmap_inertial.tools.export.whole import Exported
 
 #: A label and what there is to say.

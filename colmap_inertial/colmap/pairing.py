@@ -15,7 +15,7 @@ from colmap_inertial.colmap.given_database import can_match, read_matched_pairs
 from colmap_inertial.colmap.gyro_orientations import GyroOrientations, estimate_gyro_orientations
 from colmap_inertial.colmap.loops import LoopSearch, name_pairs, split_pairs
 from colmap_inertial.colmap.relative_track import RelativeTrack, estimate_relative_track
-from colmap_inertial.colmap.sparse import image_pairs, match_pairs, matches_every_pair
+from colmap_inertial.colmap.sparse import MatchRecord, image_pairs, match_pairs, matches_every_pair
 from colmap_inertial.colmap.two_views import (
     Covisibility,
     FramePair,
@@ -43,63 +43,6 @@ _NEXT = 2
 #: Where neighbours are matched, those within so many times the overlap are no loop; those up to as many times that are
 #: matched, and stay where they pass as one.
 _NEAR = 2
-
-
-@dataclass(frozen=True, kw_only=True)
-class MatchRecord:
-    """Pairs that were matched, and why not the rest.
-
-    Attributes
-    ----------
-    device
-        What extracted and matched features: ``"cpu"`` or ``"cuda"``.
-    pairing
-        ``"exhaustive"`` or ``"sequential"``.
-    images, pairs
-        How many there are, and pairs by the pairing.
-    given
-        Pairs that a given database has matches of.
-    far
-        Pairs of neighbours far apart in time that were left out, or matched only as candidates for loops: loops are
-        sought in their place, where the gyroscope can be used.
-    apart
-        Pairs that were excluded: by the gyroscope the camera looked elsewhere.
-    unlike
-        Pairs that were excluded: their largest features show nothing in common.
-    loops_compared
-        Pairs of frames about a second apart and far apart in time whose largest features were compared, as neither the
-        gyroscope nor the relative track excludes them.
-    loop_candidates
-        Pairs that were matched as they may close a loop.
-    loops_refused
-        Of these, pairs that COLMAP verified and that were left out: their matches cover too little of both pictures,
-        contradict the gyroscope's rotation, the relative track, or other loops, or no pair beside them agrees.
-    loops_closed
-        Of these, pairs that stay.
-    matched, verified
-        Pairs that were matched, and those of them whose matches COLMAP verified.
-    gyroscope
-        How its heading was used, or why not.
-    heading_sigma_deg
-        Largest standard deviation of the heading between two frames; ``None`` where it was not used.
-    """
-
-    device: str
-    pairing: str
-    images: int
-    pairs: int
-    given: int = 0
-    far: int = 0
-    apart: int = 0
-    unlike: int = 0
-    loops_compared: int = 0
-    loop_candidates: int = 0
-    loops_refused: int = 0
-    loops_closed: int = 0
-    matched: int
-    verified: int
-    gyroscope: str
-    heading_sigma_deg: float | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

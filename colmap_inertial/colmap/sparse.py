@@ -369,3 +369,60 @@ def write_gravity_priors(database: Path, gravity_in_cam: Mapping[str, Array]) ->
                 prior.gravity = direction / np.linalg.norm(direction)
                 prior.corr_data_id = image.data_id
                 opened.write_pose_prior(prior)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatchRecord:
+    """Pairs that were matched, and why not the rest.
+
+    Attributes
+    ----------
+    device
+        What extracted and matched features: ``"cpu"`` or ``"cuda"``.
+    pairing
+        ``"exhaustive"`` or ``"sequential"``.
+    images, pairs
+        How many there are, and pairs by the pairing.
+    given
+        Pairs that a given database has matches of.
+    far
+        Pairs of neighbours far apart in time that were left out, or matched only as candidates for loops: loops are
+        sought in their place, where the gyroscope can be used.
+    apart
+        Pairs that were excluded: by the gyroscope the camera looked elsewhere.
+    unlike
+        Pairs that were excluded: their largest features show nothing in common.
+    loops_compared
+        Pairs of frames about a second apart and far apart in time whose largest features were compared, as neither the
+        gyroscope nor the relative track excludes them.
+    loop_candidates
+        Pairs that were matched as they may close a loop.
+    loops_refused
+        Of these, pairs that COLMAP verified and that were left out: their matches cover too little of both pictures,
+        contradict the gyroscope's rotation, the relative track, or other loops, or no pair beside them agrees.
+    loops_closed
+        Of these, pairs that stay.
+    matched, verified
+        Pairs that were matched, and those of them whose matches COLMAP verified.
+    gyroscope
+        How its heading was used, or why not.
+    heading_sigma_deg
+        Largest standard deviation of the heading between two frames; ``None`` where it was not used.
+    """
+
+    device: str
+    pairing: str
+    images: int
+    pairs: int
+    given: int = 0
+    far: int = 0
+    apart: int = 0
+    unlike: int = 0
+    loops_compared: int = 0
+    loop_candidates: int = 0
+    loops_refused: int = 0
+    loops_closed: int = 0
+    matched: int
+    verified: int
+    gyroscope: str
+    heading_sigma_deg: float | None = None

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from colmap_inertial.colmap.given_database import import_features, read_given
 from colmap_inertial.colmap.mapping import MapRecord, map_images
-from colmap_inertial.colmap.pairing import MatchRecord, match_capture
-from colmap_inertial.colmap.sparse import KeypointRecords, extract_features, write_gravity_priors
+from colmap_inertial.colmap.pairing import match_capture
+from colmap_inertial.colmap.sparse import KeypointRecords, MatchRecord, extract_features, write_gravity_priors
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.core.types import CameraModel

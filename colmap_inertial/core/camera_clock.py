@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
-from colmap_inertial.core.types import CameraImuCalibration, ImuRecording
+from colmap_inertial.core.types.imu import CameraImuCalibration, ImuRecording
 
 
 def epoch_shift_s(imu: ImuRecording, camera_epoch_ns: int) -> float:

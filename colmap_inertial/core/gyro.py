@@ -21,7 +21,8 @@ from colmap_inertial.core.geometry import (
     quat_rotate,
 )
 from colmap_inertial.core.sampling import Coverage
-from colmap_inertial.core.types import FrameTiming, ImuRecording
+from colmap_inertial.core.types.imu import ImuRecording
+from colmap_inertial.core.types.recorded import FrameTiming
 
 #: Order of the differences by which noise is told from motion; what the median of a normal distribution's sizes is.
 _DIFFERENCES, _NORMAL_MEDIAN = 5, 0.6745

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from colmap_inertial import __version__
+from colmap_inertial.checks.report.folders import CROPS_FOLDER, DATA_FOLDER, model_file, recording_file
 from colmap_inertial.checks.report.series import SIZES, strided
 from colmap_inertial.checks.words import (
     describe_joined,
@@ -22,23 +23,10 @@ from colmap_inertial.checks.words import (
 from colmap_inertial.io.files import read_json, read_text
 
 VERSION = 1
-#: What the pipeline keeps for the report alone, in an output folder.
-DATA_FOLDER = "report_data"
-CROPS_FOLDER = "crops"
 #: Of a model in ``result.json``, what the page shows otherwise or not.
 _NOT_SHOWN = ("drift", "validation", "cov", "dense")
 
 Content = dict[str, Any]
-
-
-def recording_file(out: Path) -> Path:
-    """File of the report's data on the recording."""
-    return out / DATA_FOLDER / "recording.json"
-
-
-def model_file(out: Path, index: int) -> Path:
-    """File of the report's data on one model."""
-    return out / DATA_FOLDER / f"model_{index}.json"
 
 
 def gather(

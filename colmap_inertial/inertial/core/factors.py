@@ -13,7 +13,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray
 from colmap_inertial.core.geometry import skew, so3_exp, so3_log
-from colmap_inertial.core.types import ImuNoise
+from colmap_inertial.core.types.imu import ImuNoise
 from colmap_inertial.inertial.core import parameters as par
 from colmap_inertial.inertial.core.arrow import ArrowSystem, Inverse
 from colmap_inertial.inertial.core.parameters import Estimate, InertialStates, Prior

@@ -10,7 +10,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import so3_exp, so3_log
-from colmap_inertial.core.types import ImuNoise
+from colmap_inertial.core.types.imu import ImuNoise
 
 # Columns of the globals: the scale, those that the IMU factors see, those that the visual factors see.
 SCALE = 0

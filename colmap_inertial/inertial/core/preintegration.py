@@ -23,7 +23,7 @@ from colmap_inertial._kernels import _inertial
 from colmap_inertial.core.arrays import Array, BoolArray, Int64Array
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.sampling import find_clipped, is_gap
-from colmap_inertial.core.types import ImuRecording
+from colmap_inertial.core.types.imu import ImuRecording
 
 #: Integration steps: as the samples come, within these. Steps of 5 instead of 2.5 ms change the scale by 0.003 %.
 _SHORTEST_STEP_S, _LONGEST_STEP_S = 0.0025, 0.005

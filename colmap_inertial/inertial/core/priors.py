@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
-from colmap_inertial.core.types import IMU_CAL, ImuRecording
+from colmap_inertial.core.types.imu import IMU_CAL, ImuRecording
 
 
 @dataclass(frozen=True, kw_only=True)

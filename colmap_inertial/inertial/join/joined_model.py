@@ -19,8 +19,8 @@ from colmap_inertial.core.geometry import (
 )
 from colmap_inertial.core.options import WorldAxes
 from colmap_inertial.core.types import DOWN_IN_WORLD, JoinedPart, ScaleEstimate, Similarity, Treatment
-from colmap_inertial.inertial.join.judge import JoinedGroup, relative_cov, worst
 from colmap_inertial.inertial.join.placement import FittedSubmodel, Placed
+from colmap_inertial.inertial.join.relative_poses import JoinedGroup, relative_cov, worst
 from colmap_inertial.inertial.scale.verdict import TRUSTED_HALF_WIDTH, half_width, verdict_of
 from colmap_inertial.model import Model, transformed
 from colmap_inertial.model.similarities import compose

@@ -16,7 +16,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
-from colmap_inertial.checks.report.content import CROPS_FOLDER, DATA_FOLDER
+from colmap_inertial.checks.report.folders import CROPS_FOLDER, DATA_FOLDER
 from colmap_inertial.core.errors import FormatError, OutputError, OutputExistsError
 from colmap_inertial.io.files import CHANGED_RECORD, locked, read_json, reading, write_json
 

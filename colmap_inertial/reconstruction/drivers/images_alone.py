@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
@@ -12,7 +12,6 @@ from colmap_inertial import __version__
 from colmap_inertial.colmap.sparse import check_pair_names
 from colmap_inertial.core.errors import FormatError, InertialError, OutputError, OutputExistsError
 from colmap_inertial.core.options import BlurRemover, ExposureOptions, FuseAperturesOptions, ReconstructOptions
-from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.types import Frame, FrameTiming
 from colmap_inertial.imaging.multi_aperture import refocus, require_colours
 from colmap_inertial.io.calibration import CalibrationFiles, list_paths
@@ -42,7 +41,7 @@ from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan
 from colmap_inertial.pipeline.stages.inputs import Fuser, StageInputs, lsd2_fuser
 from colmap_inertial.pipeline.stages.protocols import FrameStage
 from colmap_inertial.reconstruction.drivers.frames import run_frames, run_images, write_contact_sheet
-from colmap_inertial.reconstruction.drivers.result import frame_as_json, imaging_as_json
+from colmap_inertial.reconstruction.drivers.result import DeblurResult, frame_as_json, imaging_as_json
 from colmap_inertial.reconstruction.preparation.plan import Treatments, add_stated_exposures, run_plan
 
 _SHEET = "sheet.json"
@@ -93,35 +92,6 @@ def _run_fusion(
     workspace = session.workspace
     session.runner.run("frames", depends, [workspace.images, workspace.frames, *outputs], work)
     return read_frame_records(workspace.frames)
-
-
-@prints_in_lines
-@dataclass(frozen=True, eq=False, kw_only=True)
-class DeblurResult:
-    """Result of ``deblur_capture``; the same as ``result.json``.
-
-    Attributes
-    ----------
-    workspace
-        ``images/``; with ``rectify`` also ``colmap/images/``, what they were rectified from.
-    frames
-        What happened to each frame.
-    imaging
-        What was decided beforehand, and why.
-    sheet
-        The contact sheet; ``None`` where none was asked for or no frame was deblurred.
-    unchanged
-        Whether there was nothing to do: the folder held this result already.
-    rectified
-        Names of the images that were rectified, too.
-    """
-
-    workspace: Workspace
-    frames: tuple[FrameRecord, ...]
-    imaging: ImagingPlan
-    sheet: Path | None = None
-    unchanged: bool = False
-    rectified: frozenset[str] = frozenset()
 
 
 def deblur_capture(

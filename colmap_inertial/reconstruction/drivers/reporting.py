@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from colmap_inertial.checks.report import write_report
-from colmap_inertial.checks.report.content import model_file, recording_file
+from colmap_inertial.checks.report.folders import model_file, recording_file
 from colmap_inertial.checks.report.photogrammetry import photogrammetry_record, scene_record
 from colmap_inertial.checks.report.series import rounded, strided
 from colmap_inertial.checks.report.signals import signal_record

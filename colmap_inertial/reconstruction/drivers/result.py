@@ -13,8 +13,7 @@ from colmap_inertial import __version__
 from colmap_inertial.checks.validate import Validation
 from colmap_inertial.colmap.dense import DenseResult
 from colmap_inertial.colmap.mapping import MapRecord
-from colmap_inertial.colmap.pairing import MatchRecord
-from colmap_inertial.colmap.sparse import KeypointRecords
+from colmap_inertial.colmap.sparse import KeypointRecords, MatchRecord
 from colmap_inertial.core.errors import InertialError, NotObservableError
 from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply
 from colmap_inertial.core.summary import prints_in_lines
@@ -194,6 +193,35 @@ class ReconstructResult:
         if outside:
             return 1
         return failures[0] if len(failures) == len(checked) > 0 else 0
+
+
+@prints_in_lines
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DeblurResult:
+    """Result of ``deblur_capture``; the same as ``result.json``.
+
+    Attributes
+    ----------
+    workspace
+        ``images/``; with ``rectify`` also ``colmap/images/``, what they were rectified from.
+    frames
+        What happened to each frame.
+    imaging
+        What was decided beforehand, and why.
+    sheet
+        The contact sheet; ``None`` where none was asked for or no frame was deblurred.
+    unchanged
+        Whether there was nothing to do: the folder held this result already.
+    rectified
+        Names of the images that were rectified, too.
+    """
+
+    workspace: Workspace
+    frames: tuple[FrameRecord, ...]
+    imaging: ImagingPlan
+    sheet: Path | None = None
+    unchanged: bool = False
+    rectified: frozenset[str] = frozenset()
 
 
 def imaging_as_json(plan: ImagingPlan, rectified: Collection[str]) -> dict[str, object]:
