@@ -34,8 +34,9 @@ def check(model: Path, dataset: Path) -> dict[str, float]:
     """The figures that :mod:`this script <check_euroc>` prints."""
     reconstruction = read_model(model)
     images = sorted((reconstruction.image(i) for i in reconstruction.reg_image_ids()), key=lambda image: image.name)
+    images = [image for image in images if not image.name.startswith("cam1/")]  # the right camera of a rig
     centres = np.array([image.projection_center() for image in images])
-    stamps_ns = np.array([int(image.name.split("_")[0]) for image in images])
+    stamps_ns = np.array([int(Path(image.name).stem.split("_")[0]) for image in images])
 
     truth = np.loadtxt(dataset / "gt" / "V1_01_easy.csv", delimiter=",", skiprows=1)
     truth_ns = np.loadtxt(dataset / "gt" / "V1_01_easy.csv", delimiter=",", skiprows=1, usecols=0, dtype=np.int64)
