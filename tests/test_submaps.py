@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -334,15 +333,20 @@ def test_what_is_too_long_for_one_go_is_mapped_in_parts(tmp_path, monkeypatch, l
     ring = make(tmp_path, drift=1.0, wider=1.0, true_focal_px=200.0)
     monkeypatch.setattr(mapping, "LONGEST", longest)
     monkeypatch.setattr(mapping, "runs", lambda count: PARTS)
-    asked, told, incremental = [], [], pycolmap.incremental_mapping
+    asked, told, write, incremental = [], [], submaps.write_part_database, pycolmap.incremental_mapping
 
-    def made(*args, options, **more):
-        asked.append(list(options.image_names))
+    def write_part(database, names, part):
+        asked.append(list(names))
         # what a kill leaves goes with the folder
-        assert not in_parts or Path(args[2]).parent == tmp_path / "sparse"
+        assert part.parents[2] == tmp_path / "sparse"
+        write(database, names, part)
+
+    def in_one_go(*args, options, **more):
+        asked.append(list(options.image_names))
         return incremental(*args, options=options, **more)
 
-    monkeypatch.setattr(pycolmap, "incremental_mapping", made)
+    monkeypatch.setattr(submaps, "write_part_database", write_part)
+    monkeypatch.setattr(pycolmap, "incremental_mapping", in_one_go)
     record = mapping.map_images(
         ring.database,
         tmp_path,
@@ -394,7 +398,8 @@ def test_parts_may_have_cameras_that_others_lack(tmp_path):
     assert rig_of == {2: 1, 1: 2}
     parts = [(0, 20), (14, 34), (28, 48)]
     capture = replace(ring.capture(), database=path)
-    (whole,), _ = submaps.map_in_parts(capture, tmp_path, tmp_path, parts, near=4, loops=True, registered=lambda: None)
+    made = submaps.map_runs(capture, tmp_path, tmp_path, parts, workers=2, registered=lambda: None)
+    (whole,), _ = join_runs(capture, made, near=4, loops=True)
     assert whole.num_reg_images() == FRAMES and error_m(ring, whole) < 0.008
     assert {whole.image(k).camera_id for k in range(1, FRAMES // 2 + 1)} == {1}
     assert {whole.image(k).camera_id for k in range(FRAMES // 2 + 1, FRAMES + 1)} == {2}

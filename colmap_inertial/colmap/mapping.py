@@ -6,6 +6,7 @@ import contextlib
 import itertools
 import logging
 import sqlite3
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from colmap_inertial.colmap.loop_closure import LONGEST, LoopClosure, MappedCapture, close_gaps
 from colmap_inertial.colmap.sparse import matches_every_pair
-from colmap_inertial.colmap.submaps import map_in_parts, runs
+from colmap_inertial.colmap.submaps import join_runs, map_runs, runs
 from colmap_inertial.core.errors import MappingError
 from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.model import find_models
@@ -161,7 +162,9 @@ def _map_in_parts(
     # neighbouring parts have some images both
     parts = runs(len(capture.names))
     counted = _counter(context.progress, len(capture.names), of=sum(end - begin for begin, end in parts))
-    models, seams = map_in_parts(capture, images, sparse, parts, near=near, loops=loops, registered=counted)
+    with tempfile.TemporaryDirectory(dir=sparse) as scratch:
+        made = map_runs(capture, images, Path(scratch), parts, workers=context.workers, registered=counted)
+    models, seams = join_runs(capture, made, near=near, loops=loops) if made else ([], [])
     for number, model in enumerate(models):
         model.extract_colors_for_all_images(str(images))
         (sparse / str(number)).mkdir()

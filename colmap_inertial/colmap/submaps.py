@@ -12,7 +12,6 @@ from __future__ import annotations
 import copy
 import itertools
 import logging
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,6 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from colmap_inertial.colmap.loop_closure import LoopClosure, MappedCapture, SubmapOverlap, merge_overlaps
+from colmap_inertial.colmap.parts import map_parts, write_part_database
 from colmap_inertial.model.submodels.graph import (
     Convergence,
     Equations,
@@ -73,58 +73,59 @@ def runs(count: int, *, longest: int = PART, shared: int = SHARED) -> list[tuple
     return [(begin, min(count, end + shared)) for begin, end in itertools.pairwise(begins)]
 
 
-def map_in_parts(
+def map_runs(
     capture: MappedCapture,
     images: Path,
-    sparse: Path,
+    scratch: Path,
     parts: Sequence[tuple[int, int]],
     *,
-    near: int,
-    loops: bool,
+    workers: int,
     registered: Callable[[], None],
-) -> tuple[list[pycolmap.Reconstruction], list[LoopClosure]]:
-    """Run COLMAP's incremental mapper on runs of the images, and join what comes out; the largest model first.
+) -> list[MappedRun]:
+    """Run COLMAP's incremental mapper on runs of the images.
 
     Parameters
     ----------
-    sparse
-        Where models go; the parts' own are for a while in folders inside.
+    scratch
+        An empty folder.
     parts
         Begins and ends, as :func:`runs` has them.
-    near
-        Images no farther apart in time are neighbours.
-    loops
-        Whether matches of others may be believed; else they may join copies, and are not looked at.
+    workers
+        Parts that are mapped at a time, each by a process with one thread.
     registered
         Is called for each image that a part places.
-
-    Returns
-    -------
-    The models, and the overlaps of parts.
     """
-    import pycolmap
-
-    made = []
-    own = copy.copy(capture.pipeline)
-    own.extract_colors = False
-    for begin, end in parts:
+    jobs = []
+    for number, (begin, end) in enumerate(parts):
+        own = copy.copy(capture.pipeline)
+        own.extract_colors, own.num_threads = False, 1
         own.image_names = list(capture.names[begin:end])
-        with tempfile.TemporaryDirectory(dir=sparse) as folder:
-            models = pycolmap.incremental_mapping(
-                str(capture.database), str(images), folder, options=own, next_image_callback=registered
-            )
-        made += [MappedRun(model=model, begin=begin, end=end) for _, model in sorted(models.items())]
-    joined, seams = join_runs(capture, made, near=near, loops=loops) if made else ([], [])
-    return sorted(joined, key=lambda model: -int(model.num_reg_images())), seams
+        folder = scratch / str(number)
+        folder.mkdir()
+        write_part_database(capture.database, own.image_names, folder / "part.db")
+        jobs.append((folder, own))
+    mapped = map_parts(jobs, images, workers=workers, registered=registered)
+    return [
+        MappedRun(model=model, begin=begin, end=end)
+        for (begin, end), models in zip(parts, mapped, strict=True)
+        for model in models.values()
+    ]
 
 
 def join_runs(
     capture: MappedCapture, parts: Sequence[MappedRun], *, near: int, loops: bool
 ) -> tuple[list[pycolmap.Reconstruction], list[LoopClosure]]:
-    """Join overlapping parts to one model; the seams between them, those that did not fit, too.
+    """Join overlapping parts to one model, the largest first; the seams between them, those that did not fit, too.
 
     Of a seam that does not fit, first the loops are left out, then all its matches: it constrains no part then, and
     merges no points. Each round leaves one out, so that the loop ends; at worst, parts stay as they are.
+
+    Parameters
+    ----------
+    near
+        Images no farther apart in time are neighbours.
+    loops
+        Whether matches of others may be believed; else they may join copies, and are not looked at.
     """
     farthest = None if loops else near
     ties = find_ties(capture, parts, nearest=farthest)
@@ -162,7 +163,7 @@ def join_runs(
             if worst in nearby or worst[0] == worst[1]:
                 nearest[worst] = near
         waiting = connected(members, ties) + waiting
-    return joined, seams
+    return sorted(joined, key=lambda model: -int(model.num_reg_images())), seams
 
 
 def _worst(overlap: SubmapOverlap, misfit: dict[Pair, float]) -> Pair:

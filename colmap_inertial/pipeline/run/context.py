@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 from colmap_inertial.core.options import ReconstructOptions
+from colmap_inertial.core.threads import usable_processors
 from colmap_inertial.core.types import CameraImuCalibration, FrameTiming, ImuRecording
 from colmap_inertial.io.calibration import CalibrationFiles, largest_offset_s, read_calibrations, read_for_recording
 from colmap_inertial.io.capture import Capture, Video
@@ -121,6 +122,8 @@ class RunContext:
         What COLMAP finds and matches.
     colmap
         What the user set of COLMAP's own options.
+    workers
+        Processes that map parts of a long capture at a time.
     progress
         Hears how far it is.
     """
@@ -131,6 +134,7 @@ class RunContext:
     device: Device = "cpu"
     features: Features = "sift"
     colmap: ColmapSettings = NO_SETTINGS
+    workers: int = field(default_factory=usable_processors)
     progress: Progress = silent
 
     @classmethod
@@ -144,6 +148,7 @@ class RunContext:
             device=device,
             features=options.mapping.features,
             colmap=settings,
+            workers=options.workers or usable_processors(),
             progress=progress,
         )
 
