@@ -28,6 +28,7 @@ from .core.options import (
     StageNames as StageNames,
     ValidateOptions as ValidateOptions,
 )
+from .core.threads import using_workers as using_workers
 from .core.types import (
     AcceptedScale as AcceptedScale,
     CameraImuCalibration as CameraImuCalibration,

@@ -10,8 +10,12 @@ from pathlib import Path
 import pytest
 from test_closing import NAMES, make
 
+from colmap_inertial.cli import main
+from colmap_inertial.cli.captures import Reconstruct
 from colmap_inertial.colmap.parts import map_parts, start_part, write_part_database
 from colmap_inertial.core.errors import MappingError
+from colmap_inertial.core.threads import usable_processors, using_workers
+from colmap_inertial.pipeline.run.context import RunContext
 
 PARTS = [(0, 18), (12, 30), (24, 42)]
 
@@ -120,3 +124,15 @@ def test_a_process_ends_with_the_one_that_started_it(ring, tmp_path):
         process.send_signal(signal.SIGCONT)
         assert process.wait(timeout=60) == 1
     assert not (folder / "models" / "0").exists()
+
+
+def test_the_number_of_workers_is_that_of_the_command_and_no_option_of_the_result(monkeypatch):
+    given = []
+    monkeypatch.setattr(Reconstruct, "_by_imu", lambda self: given.append(RunContext().workers) or 0)
+    for argv in (["--workers", "3"], []):
+        assert main(["reconstruct", "capture", "out", *argv]) == 0
+    assert given == [3, usable_processors()] and RunContext().identity().keys().isdisjoint({"workers"})
+    with pytest.raises(ValueError, match="at least 1"), using_workers(0):
+        pass
+    with pytest.raises(SystemExit, match="2"):
+        main(["reconstruct", "capture", "out", "--workers", "0"])

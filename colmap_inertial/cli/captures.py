@@ -25,6 +25,7 @@ from colmap_inertial.core.options import (
     ReferenceOptions,
 )
 from colmap_inertial.core.printing import say
+from colmap_inertial.core.threads import using_workers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,16 +52,26 @@ class Reconstruct(DeviceCommand, ConfiguredCommand):
     """A new folder for the results, or that of an earlier run on the same capture, which is continued."""
     project: Annotated[ProjectOptions, arg(name="")] = dataclasses.field(default_factory=ProjectOptions)
     reference: Annotated[ReferenceOptions, arg(name="")] = dataclasses.field(default_factory=ReferenceOptions)
+    workers: int | None = None
+    """Processes that map the parts of a long capture; by default one for each processor. Their number does not change
+    the result."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.workers is not None and self.workers < 1:
+            raise ValueError(f"workers must be at least 1, not {self.workers}")
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
+        with using_workers(self.workers):
+            return self._by_reference() if self.reference.scale_from != "imu" else self._by_imu()
+
+    def _by_imu(self) -> int:
         from colmap_inertial.checks.diagnose import Diagnosis
         from colmap_inertial.reconstruction.drivers.capture import reconstruct
         from colmap_inertial.reconstruction.drivers.project import is_project, reconstruct_project
 
         self.check_json(self.capture, self.project.imu, self.project.frame_times)
-        if self.reference.scale_from != "imu":
-            return self._by_reference()
         options = self.options
         if not options.deterministic:
             calibration = self.add_remembered(options.calibration, self.project.imu or self.capture)
@@ -92,6 +103,7 @@ class Reconstruct(DeviceCommand, ConfiguredCommand):
         return code
 
     def _by_reference(self) -> int:
+        self.check_json(self.capture, self.project.imu, self.project.frame_times)
         from colmap_inertial.reconstruction.drivers.project import is_project
         from colmap_inertial.reconstruction.drivers.reference import reconstruct_by, scale_project_by
 

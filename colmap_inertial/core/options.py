@@ -363,9 +363,6 @@ class ReconstructOptions(CheckedOptions):
     """Also compute depth maps (faster with CUDA), a fused point cloud and a mesh, in metres."""
     dense_options: DenseOptions = field(default_factory=DenseOptions)
     """How the dense reconstruction is made."""
-    workers: int | None = None
-    """Processes that map parts of a long capture at a time; by default one for each processor. Their number does not
-    change the result."""
     deterministic: bool = False
     """Fixed seed and one thread in each process: the same input gives the same model, bit for bit. Slower."""
     seed: int = 0
@@ -387,7 +384,6 @@ class ReconstructOptions(CheckedOptions):
             object.__setattr__(self, "calibration", ())
         super().__post_init__()
         _check("seed", self.seed, 0, 2**31 - 1)
-        _check("workers", self.workers, 1)
 
 
 #: How a list of stage names spells ``...``, the default stages.

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from colmap_inertial.core.options import ReconstructOptions
-from colmap_inertial.core.threads import usable_processors
+from colmap_inertial.core.threads import worker_processes
 from colmap_inertial.core.types import CameraImuCalibration, FrameTiming, ImuRecording
 from colmap_inertial.io.calibration import CalibrationFiles, largest_offset_s, read_calibrations, read_for_recording
 from colmap_inertial.io.capture import Capture, Video
@@ -134,7 +134,7 @@ class RunContext:
     device: Device = "cpu"
     features: Features = "sift"
     colmap: ColmapSettings = NO_SETTINGS
-    workers: int = field(default_factory=usable_processors)
+    workers: int = field(default_factory=worker_processes)
     progress: Progress = silent
 
     @classmethod
@@ -148,7 +148,6 @@ class RunContext:
             device=device,
             features=options.mapping.features,
             colmap=settings,
-            workers=options.workers or usable_processors(),
             progress=progress,
         )
 
