@@ -130,7 +130,8 @@ def test_the_number_of_workers_is_that_of_the_command_and_no_option_of_the_resul
     given = []
     monkeypatch.setattr(Reconstruct, "_by_imu", lambda self: given.append(RunContext().workers) or 0)
     for argv in (["--workers", "3"], []):
-        assert main(["reconstruct", "capture", "out", *argv]) == 0
+        with pytest.raises(SystemExit, match="0"):
+            main(["reconstruct", "capture", "out", *argv])
     assert given == [3, usable_processors()] and RunContext().identity().keys().isdisjoint({"workers"})
     with pytest.raises(ValueError, match="at least 1"), using_workers(0):
         pass
