@@ -20,10 +20,13 @@ from test_pipeline import DETERMINISTIC, SCENE, copy_scene
 
 from colmap_inertial.checks.report import figures, signals, write_report
 from colmap_inertial.checks.report.content import _describe_path
-from colmap_inertial.checks.report.figure_3d import nice_length, scene_figure
+from colmap_inertial.checks.report.figure_3d import scene_figure
 from colmap_inertial.checks.report.photogrammetry import scene_record
-from colmap_inertial.checks.report.series import SIZES, rounded, strided, thinned
+from colmap_inertial.checks.report.series import SIZES, nice_length, rounded, strided, thinned
 from colmap_inertial.checks.report.signals import signal_record
+from colmap_inertial.checks.report.still import draw_still
+from colmap_inertial.checks.report.still_3d import StillView, draw_scene_still
+from colmap_inertial.checks.report.still_axes import choose_axis, equalise
 from colmap_inertial.checks.words import outcome_of_model
 from colmap_inertial.cli import main
 from colmap_inertial.core.errors import FormatError, InertialError, MappingError
@@ -135,6 +138,7 @@ def test_every_section_that_has_data_is_there_and_every_figure_has_its_place(ful
     assert page.anchors() == [
         "outcome",
         "findings",
+        "numbers",
         "scene",
         "survey",
         "residuals",
@@ -152,6 +156,100 @@ def test_every_section_that_has_data_is_there_and_every_figure_has_its_place(ful
     assert places == list(page.figures())
     assert len(places) == 18
     assert sum(tag == "img" for tag, _ in page.tags) == 3 * 2 + 4
+
+
+class Drawing(html.parser.HTMLParser):
+    """Shapes and words of a still picture."""
+
+    def __init__(self, svg):
+        super().__init__()
+        self.shapes, self.words = [], []
+        self.feed(svg)
+
+    def handle_starttag(self, tag, attrs):
+        self.shapes.append((tag, dict(attrs)))
+
+    def handle_data(self, data):
+        self.words.append(data)
+
+    def lines(self, colour):
+        """Corners of the lines of a colour, piece by piece."""
+        paths = [a["d"] for tag, a in self.shapes if tag == "path" and a.get("stroke") == colour]
+        pieces = [piece for path in paths for piece in path.split("M") if piece]
+        return [np.array([corner.split() for corner in piece.split("L")], dtype=float) for piece in pieces]
+
+
+def test_every_plot_has_a_still_picture_that_shows_the_same(full):
+    _, page = report_of(full[0])
+    stills = [attrs for tag, attrs in page.tags if tag == "svg" and attrs["class"] == "still"]
+    places = [attrs for tag, attrs in page.tags if attrs.get("class") == "plot" and tag == "div"]
+    assert [s["aria-label"] for s in stills][1:] == [
+        p["aria-label"] for p in places
+    ]  # the first one is the first screen's
+    for figure in page.figures().values():
+        if "scene" not in figure["layout"]:
+            words = Drawing(draw_still(figure, "x")).words
+            assert figure["layout"]["xaxis"]["title"]["text"] in words
+
+
+def test_a_still_line_lies_where_its_axes_say():
+    line = {"type": "scatter", "mode": "lines", "x": [0.0, 5.0, None, 10.0, 10.0], "y": [0.0, 50.0, None, 100.0, 0.0]}
+    spec = figures.layout(300, figures.axis("t", range=[0, 10]), figures.axis("v", range=[0, 100]))
+    trace = {**line, "name": "a <b>", "line": {"color": "#123456", "width": 1}}
+    still = Drawing(draw_still({"data": [trace], "layout": spec}, 'a "label"'))
+    first, second = still.lines("#123456")
+    ticks = {
+        word: (float(attrs["x"]), float(attrs["y"]))
+        for (tag, attrs), word in zip([s for s in still.shapes if s[0] == "text"], still.words, strict=True)
+    }
+    assert {"0", "2", "4", "6", "8", "10", "40", "60", "100", "t", "v"} <= set(ticks)
+    # x ticks lie below their place, y ticks beside it, a quarter of a line lower
+    assert first[0] == pytest.approx([ticks["2"][0] - (ticks["4"][0] - ticks["2"][0]), second[1, 1]], abs=0.2)
+    assert first[1] == pytest.approx(
+        [0.5 * (ticks["4"][0] + ticks["6"][0]), 0.5 * (ticks["40"][1] + ticks["60"][1]) - 4], abs=0.2
+    )
+    assert second[0] == pytest.approx([ticks["10"][0], ticks["100"][1] - 4], abs=0.2)
+
+
+def test_logarithmic_equal_and_coloured_axes_of_stills():
+    axis = choose_axis({"type": "log"}, [[0.1, None, 100.0]], 0.0, 300.0, pad=0.0)
+    assert [axis.place(v) for v in (0.1, 1.0, 100.0)] == pytest.approx([0, 100, 300]) and axis.place(0.0) is None
+    assert [text for _, text in axis.ticks(50.0)] == ["0.1", "1", "10", "100"]
+    x, y = (choose_axis({"range": [0, 10 * n]}, [], 0.0, 100.0, pad=0.0) for n in (1, 2))
+    x, y = equalise(x, y)
+    assert x.px_per_unit == y.px_per_unit == 5 and (x.begin, x.end) == (25.0, 75.0)
+    heat = {"type": "heatmap", "x0": 0.5, "dx": 1.0, "y0": 0.5, "dy": 1.0, "z": [[0, None], [5, 10]]}
+    heat |= {"colorscale": [[0, "#000000"], [1, "#ff0000"]], "colorbar": {"title": {"text": "images"}}}
+    shape = figures.layout(200, figures.axis("x"), figures.axis("y"))
+    still = Drawing(draw_still({"data": [heat], "layout": shape}, "heat"))
+    cells = {a["fill"]: a["d"] for tag, a in still.shapes if tag == "path" and "fill" in a}
+    assert list(cells) == ["#050000", "#850000", "#fa0000"]  # the middles of 24 steps
+    assert len({path.count("M") for path in cells.values()}) == 1 and "images" in still.words
+
+
+def test_the_picture_of_a_model_shows_near_over_far_and_up_upwards(full):
+    points = {"x": [0.0, 0.0, 5.0], "y": [-1.0, 1.0, 5.0], "z": [0.0, 0.0, 5.0]}
+    cloud = {"type": "scatter3d", "mode": "markers", "name": "points", **points}
+    cloud["marker"] = {"color": ["#ff0000", "#0000ff", "#00ff00"], "size": 1}
+    ends = {"x": [0.0, 0.0], "y": [0.0, 0.0], "z": [-1.0, 2.0]}
+    line = {
+        "type": "scatter3d",
+        "mode": "lines",
+        "name": "camera path",
+        **ends,
+        "line": {"color": "#abcdef", "width": 4},
+    }
+    grid = {**line, "name": "grid of 1 m"}
+    level = StillView(
+        azimuth_deg=-90.0, elevation_deg=0.0, distance=None
+    )  # the eye is at -y: the red point hides the blue one
+    still = Drawing(draw_scene_still({"data": [cloud, line, grid], "layout": {}}, "model", level))
+    ((low, high),) = still.lines("#abcdef")
+    assert low[0] == pytest.approx(high[0]) and high[1] < low[1] - 50
+    (address,) = [attrs["href"] for tag, attrs in still.shapes if tag == "image"]
+    image = cv2.imdecode(np.frombuffer(base64.b64decode(address.partition(",")[2]), np.uint8), cv2.IMREAD_UNCHANGED)
+    seen = {tuple(colour) for colour in image[image[:, :, 3] > 0].tolist()}
+    assert seen == {(0, 0, 255, 255), (0, 255, 0, 255)}
 
 
 def test_figures_are_what_plotly_takes(full):
@@ -180,8 +278,10 @@ def test_a_refused_scale_has_no_number_and_says_what_to_do(tmp_path):
     (model,) = content["models"]
     assert content["outcome"]["verdict"] == result["models"][0]["verdict"] == "refused"
     assert model["metres_per_unit"] is None and model["half_width_pct"] is None
-    assert "What to do" in page.text
+    assert "What was tried" in page.text and "What to record or to mend" in page.text
     assert "Film again" in page.text
+    assert "they differ by" in page.text.partition("What was tried")[2]
+    assert "How the scale was found" not in page.text and "how the scale was found" not in page.text
     assert model["reasons"][0] in page.text.replace("The scale", "the scale", 1) or model["reasons"][0][1:] in page.text
     assert model["signals"]["acceleration"]["camera_unit"] == "units/s2"
     assert "missing" in model["drift"] and "missing" in model["validation"]
@@ -189,6 +289,44 @@ def test_a_refused_scale_has_no_number_and_says_what_to_do(tmp_path):
     assert {"scene", "rotation", "acceleration"} <= set(page.anchors())
     assert "scale bar" not in json.dumps(page.figures())
     assert model["drift"]["missing"] in page.text
+
+
+def test_the_first_screen_says_how_large_how_sure_where_and_what_next(full, tmp_path):
+    out = copy_of(full, tmp_path)
+    result = json.loads((out / "result.json").read_text(encoding="utf-8"))
+    stored = json.loads((out / "report_data" / "model_0.json").read_text(encoding="utf-8"))
+    stored["photogrammetry"]["extent"] = [12.34, 0.456, 3.0]
+    write_json(out / "report_data" / "model_0.json", stored)
+    model = result["models"][0]
+    model |= {"metres_per_unit": 0.2275, "ci95": [0.2251, 0.23], "georeference": None}
+    first = report_of_changed(out, result)[1].text.partition("Check of the recording")[0]
+    # half of 0.2251 to 0.2300 over 0.2275 is 1.0769 %
+    for said in ("12.3 m × 45.6 cm, 3 m high", "12.3 m are known to ±13 cm, lengths of 10 m to ±11 cm (±1.1 %, 95 %)"):
+        assert said in first
+    assert "−0.31 % off, within the tolerance of 2 %" in first and "no positions (GPS) were used" in first
+    assert "What next" in first and "colmap-inertial view ." in first
+    assert "of COLMAP's own model" not in first  # the unit scale is of no use for the metric model
+    model["georeference"] = {
+        "origin": {"latitude_deg": 47.3769, "longitude_deg": 8.5417},
+        "positions": {"used": 9, "left_out": 0, "source": "GPS"},
+        "heading_ci95_deg": 2.5, "position_ci95_m": 3.25, "notes": [],
+    }  # fmt: skip
+    model["validation"] |= {"scale_error_pct": 3.5, "within_tolerance": False}
+    text = report_of_changed(out, result)[1].text
+    assert "47.376900, 8.541700°, ±3.2 m, heading ±2.5°" in text.partition("Check of the recording")[0]
+    assert "not until this is resolved" in text and "+3.50 % off, outside the tolerance" in text
+    model["validation"] |= {"scale_error_pct": 0.5}
+    assert "+0.50 % off, not proved to be within the tolerance of 2 %" in report_of_changed(out, result)[1].text
+    assert "between 0.2251 and 0.2300 m" in text
+    assert "rms, in which large residuals weigh more than in their mean, 0.40 px" in text
+
+
+def test_a_refused_report_does_not_say_that_nothing_was_wrong(tmp_path):
+    out = tmp_path / "out"
+    write_run(out, kind="constant_velocity")
+    write_json(out / "diagnosis.json", {"version": 1, "worst": "info", "checked": ["gyroscope"], "findings": []})
+    text = report_of(out)[1].text
+    assert "Nothing was found wrong" not in text and "Nothing was found beforehand that explains this outcome" in text
 
 
 @pytest.mark.parametrize(
@@ -253,8 +391,8 @@ def test_a_weak_scale_is_told_from_a_trusted_one():
     weak = outcome_of_model(model)
     assert weak["headline"] != outcome_of_model({**model, "verdict": "trusted"})["headline"]
     assert weak["todo"]
-    assert "±10 %" in weak["summary"][0]
-    assert "1 m" in weak["summary"][1]
+    assert "+-10 %" in weak["summary"][0] and "between 1.800 and 2.200 m" in weak["summary"][0]
+    assert dict(weak["answers"])["How sure"] == "lengths of 10 m to +-1 m (+-10 %, 95 %)"
     assert weak["todo"][0].startswith("Film again")
     narrow = outcome_of_model({**model, "ci95": [1.99, 2.01]})
     assert not any("Film again" in text for text in narrow["todo"])

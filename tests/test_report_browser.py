@@ -19,18 +19,6 @@ pytestmark = pytest.mark.skipif(
     CHROMIUM is None or DRIVER is None, reason="no Chromium here (apt-get install chromium chromium-driver)"
 )
 
-#: Still pictures for paper take as long as the plots: made on the page alone that is printed.
-NO_STILLS = """
-    let plotly;
-    if (location.search !== "?stills") Object.defineProperty(window, "Plotly", {
-        get: () => plotly,
-        set: (value) => {
-            const toImage = value.toImage;
-            value.toImage = (what, ...how) => what instanceof Element ? toImage(what, ...how) : Promise.reject("still");
-            plotly = value;
-        },
-    });
-"""
 WIDTHS = {"desktop": (1280, 900, False), "phone": (390, 844, True)}
 
 
@@ -54,7 +42,6 @@ def browser():
     options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
     driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
     driver.set_script_timeout(60)
-    driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": NO_STILLS})
     driver.shown = None
     yield driver
     driver.quit()
@@ -100,8 +87,7 @@ def visit(driver, page: Path, width: str, *, dark: bool = False, wait: bool = Tr
     driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [scheme]})
     driver.get_log("browser")
     driver.get_log("performance")
-    stills = page.parent.name == "full" and width == "desktop"
-    driver.get(page.as_uri() + "?stills" * stills)
+    driver.get(page.as_uri())
     until = time.monotonic() + 60
     while wait and not driver.execute_script("return document.documentElement.dataset.plots"):
         assert time.monotonic() < until, "the plots were not drawn within a minute"
@@ -118,7 +104,7 @@ def drawn(browser, pages, kind, width, *, dark=False) -> Visit:
     seen = visit(browser, pages[kind], width, dark=dark)
     assert seen.script("return document.documentElement.dataset.plots") == "drawn"
     assert not [line for line in seen.console if line.startswith("SEVERE")]
-    asked = [url.removesuffix("?stills") for url in seen.requests if not url.startswith(("data:", "blob:"))]
+    asked = [url for url in seen.requests if not url.startswith(("data:", "blob:"))]
     assert asked == [pages[kind].as_uri()]
     empty = seen.script(
         """return [...document.querySelectorAll('.plot')].filter(div => {
@@ -205,26 +191,29 @@ def test_the_cloud_is_really_there_and_can_be_turned(browser, pages):
     assert before != after
 
 
-#: Of each plot: whether it is shown, and where its still picture lies.
+#: Of each plot: whether it is shown, where its still picture lies, and how many shapes that has.
 BOXES = """JSON.stringify([...document.querySelectorAll('.plot')].map((plot) => {
     const still = plot.nextElementSibling, box = still.getBoundingClientRect();
     return {
         shown: getComputedStyle(plot).display, left: box.left, right: box.right, height: box.height,
-        natural: still.naturalWidth,
+        width: box.width, shapes: still.querySelectorAll('path, rect').length,
     };
 }))"""
-#: The number of colours of the model's still picture.
-INK = """(() => {
-    const still = document.querySelector('#scene .still');
-    const canvas = Object.assign(document.createElement('canvas'), {width: 300, height: 220});
-    const brush = canvas.getContext('2d');
-    brush.drawImage(still, 0, 0, 300, 220);
-    const pixels = brush.getImageData(0, 0, 300, 220).data, colours = new Set();
-    for (let i = 0; i < pixels.length; i += 4) {
-        if (pixels[i + 3]) colours.add(pixels[i] * 65536 + pixels[i + 1] * 256 + pixels[i + 2]);
-    }
-    return colours.size;
-})()"""
+#: Of the picture of the model on the first screen: where it lies, and how many pixels of its points are drawn.
+PICTURE = """
+    const done = arguments[arguments.length - 1];
+    const still = document.querySelector('#outcome .still'), box = still.getBoundingClientRect(), image = new Image();
+    image.src = still.querySelector('image').getAttribute('href');
+    image.decode().then(() => {
+        const canvas = Object.assign(document.createElement('canvas'), {width: image.width, height: image.height});
+        const brush = canvas.getContext('2d');
+        brush.drawImage(image, 0, 0);
+        const pixels = brush.getImageData(0, 0, image.width, image.height).data;
+        let drawn = 0;
+        for (let i = 3; i < pixels.length; i += 4) drawn += pixels[i] > 0;
+        done([box.top, box.bottom, box.left, box.right, drawn]);
+    });
+"""
 
 #: Until eight frames are drawn.
 SETTLE = """
@@ -234,12 +223,38 @@ SETTLE = """
 """
 
 
+@pytest.mark.parametrize("width", ["phone", "desktop"])
+def test_the_first_screen_shows_the_model_beside_what_it_says(browser, pages, width):
+    seen = visit(browser, pages["full"], width)
+    top, bottom, left, right, points = browser.execute_async_script(PICTURE)
+    across, down, _ = WIDTHS[width]
+    assert 0 < top < bottom < down and 0 < left < right <= across
+    assert right - left > 0.3 * across and points > 1000
+    asked = (
+        "return [...document.querySelectorAll('.answers dt, .answers h2')].map(e => e.getBoundingClientRect().bottom)"
+    )
+    said = seen.script(asked)
+    assert len(said) == 4 and max(said) < down
+
+
+def test_without_waiting_a_page_prints_with_all_of_its_plots(browser, pages):
+    """Printed while plotly.js is still at work, and where it never works."""
+    browser.shown = None
+    source = {"source": "delete window.DecompressionStream"}
+    old = browser.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", source)
+    try:
+        visit(browser, pages["full"], "desktop")
+        boxes = json.loads(browser.execute_script(f"return {BOXES}"))
+        assert len(boxes) > 10
+        for box in boxes:
+            assert box["shown"] == "none" and box["width"] > 500 and box["height"] > 150 and box["shapes"] > 3
+    finally:
+        browser.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", {"identifier": old["identifier"]})
+        browser.shown = None
+
+
 def test_it_prints_on_a4_with_still_pictures_and_nothing_cut(browser, pages):
     seen = visit(browser, pages["full"], "desktop")
-    until = time.monotonic() + 120
-    while seen.script("return document.documentElement.dataset.stills") != "made":
-        assert time.monotonic() < until, "the still pictures were not made"
-        time.sleep(0.1)
     paper = {"preferCSSPageSize": True, "printBackground": True}
     printed = base64.b64decode(browser.execute_cdp_cmd("Page.printToPDF", paper)["data"])
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
@@ -250,7 +265,6 @@ def test_it_prints_on_a4_with_still_pictures_and_nothing_cut(browser, pages):
         browser.execute_async_script(SETTLE)
         boxes = json.loads(seen.script(f"return {BOXES}"))
         wide = seen.script("return document.documentElement.scrollWidth")
-        colours = seen.script(f"return {INK}")
     finally:
         across, down, mobile = WIDTHS["desktop"]
         screen = {"width": across, "height": down, "deviceScaleFactor": 1, "mobile": mobile}
@@ -258,15 +272,15 @@ def test_it_prints_on_a4_with_still_pictures_and_nothing_cut(browser, pages):
         browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
     assert len(boxes) > 10
     for box in boxes:
-        assert box["shown"] == "none" and box["natural"] > 0
+        assert box["shown"] == "none" and box["width"] > 300 and box["shapes"] > 3
         assert box["left"] >= 0 and box["right"] <= 689 and box["height"] < 500
     assert wide <= 689
-    assert colours > 20  # the model is on its picture
     assert b"/MediaBox [0 0 594" in printed or b"/MediaBox [0 0 595" in printed
 
 
 def test_it_follows_a_dark_screen(browser, pages):
-    colour = "return getComputedStyle(document.body).backgroundColor"
+    words = "getComputedStyle(document.querySelector('.still .title')).fill"
+    colour = f"return getComputedStyle(document.body).backgroundColor + {words}"
     tick = "return getComputedStyle(document.querySelector('#rotation .plot .xtick text')).fill"
     light = visit(browser, pages["full"], "desktop")
     bright = [light.script(colour), light.script(tick)]
@@ -289,7 +303,7 @@ def test_a_run_that_stopped_has_a_page_without_plots(browser, pages):
     assert_nothing_overflows(seen, "phone")
 
 
-def test_text_and_tables_stand_without_scripts(browser, pages):
+def test_text_tables_and_plots_stand_without_scripts(browser, pages):
     browser.shown = None
     browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
     try:
@@ -299,7 +313,9 @@ def test_text_and_tables_stand_without_scripts(browser, pages):
     finally:
         browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": False})
     assert "No scale could be found" in names
-    assert "The plots need JavaScript" in names
+    assert "With JavaScript, the plots can be turned and zoomed" in names
+    # the words of the still pictures
+    assert "time since the first frame (s)" in names
     assert "config.toml" in names
 
 

@@ -5,6 +5,7 @@ Values come as ``result.json`` has them. Texts of facts are ASCII ("+-", "m/s2",
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -38,6 +39,18 @@ def digits(value: float, count: int = 4) -> str:
     return f"{value:.0f}" if "e+" in text and abs(value) < 1e9 else text
 
 
+def fixed(value: float, count: int = 4) -> str:
+    """The same with its zeros at the end, so that both ends of an interval are equally long."""
+    text = f"{value:#.{count}g}".rstrip(".")
+    return f"{value:.0f}" if "e+" in text and abs(value) < 1e9 else text
+
+
+def length(metres: float, count: int = 3) -> str:
+    """A length with so many digits, in a unit that fits."""
+    factor, unit = next(((f, u) for f, u in ((1, "m"), (100, "cm")) if abs(metres) * f * (1 + 5e-4) >= 1), (1000, "mm"))
+    return f"{digits(metres * factor, count)} {unit}"
+
+
 def signed(value: float, decimals: int = 2) -> str:
     """A number with its sign."""
     return f"{value:+.{decimals}f}".replace("-", "−")
@@ -50,10 +63,7 @@ def half_width_pct(metres_per_unit: float, ci95: Sequence[float]) -> float:
 
 def length_error(pct: float) -> str:
     """A relative error as a length error over ten metres, in a suitable unit."""
-    metres = 10 * pct / 100
-    if metres >= 1:
-        return f"{metres:.2g} m"
-    return f"{100 * metres:.2g} cm" if metres >= 0.01 else f"{1000 * metres:.2g} mm"
+    return length(10 * pct / 100, 2)
 
 
 def length_in_words(verdict: str, pct: float) -> str:
@@ -72,7 +82,7 @@ def scale_facts(estimate: Mapping[str, Any]) -> Iterator[Fact]:
         low, high = estimate["ci95"]
         pct = half_width_pct(estimate["metres_per_unit"], (low, high))
         yield "scale", f"{estimate['metres_per_unit']:.6g} m per unit, +-{pct:.2g} % (95 %)"
-        yield "interval", f"{low:.6g} to {high:.6g} m per unit"
+        yield "interval", f"{fixed(low, 6)} to {fixed(high, 6)} m per unit"
 
 
 def sensor_facts(estimate: Mapping[str, Any]) -> Iterator[Fact]:
@@ -91,14 +101,18 @@ def model_facts(model: Mapping[str, Any], available: str = "") -> Iterator[Fact]
     yield "points", f"{model['points']}, mean reprojection error {model['mean_reprojection_error_px']:.2f} px"
 
 
+def place_against_tolerance(error_pct: float, tolerance_pct: float, proved: bool) -> str:
+    """Where a scale error lies: outside a tolerance, within, or within without a proof."""
+    return "outside" if abs(error_pct) > tolerance_pct else "within" if proved else "not proved to be within"
+
+
 def target_facts(found: Mapping[str, Any]) -> Iterator[Fact]:
     """Facts from a target of known size in a model, from ``Validation.as_json()``."""
     yield "target", found["target"]
     if found["scale_error_pct"] is not None:
         low, high = found["ci95_pct"]
-        off = abs(found["scale_error_pct"]) > found["tolerance_pct"]
-        place = "outside" if off else "within" if found["within_tolerance"] else "not proved to be within"
         error = f"{found['scale_error_pct']:+.3f} % (95 %: {low:+.3f} to {high:+.3f})"
+        place = place_against_tolerance(found["scale_error_pct"], found["tolerance_pct"], found["within_tolerance"])
         yield "scale error", f"{error}, {place} {found['tolerance_pct']:g} %"
     low, high = found["metres_per_unit_ci95"]
     yield "metres per unit", f"{found['metres_per_unit']:.6g} (95 %: {low:.6g} to {high:.6g})"
@@ -202,41 +216,125 @@ def _describe_overlap(overlap: Mapping[str, Any]) -> str:
 
 
 def outcome_of_model(model: dict[str, Any]) -> dict[str, Any]:
-    """Headline, summary and advice for one model of ``result.json``, with ``signals`` where they were kept.
+    """What a reader wants to know first of one model of ``result.json``.
+
+    Parameters
+    ----------
+    model
+        As there, with ``signals``, ``photogrammetry`` and ``findings`` where they were kept.
 
     Returns
     -------
-    ``verdict``, ``headline``, ``summary`` (sentences) and ``todo`` (sentences; empty where nothing needs doing).
+    ``verdict``, ``headline``, ``answers`` (question and answer), ``summary`` (sentences about the scale), ``tried``
+    (sentences; of a refused scale) and ``todo`` (sentences).
     """
     verdict, scale, ci95 = model["verdict"], model["metres_per_unit"], model["ci95"]
     if scale is None or ci95 is None:
         return _refused(model)
     pct = half_width_pct(scale, ci95)
+    extent = model.get("photogrammetry", {}).get("extent")
+    sides = [length(side, 3 if verdict == "trusted" else 2) for side in extent or ()]
+    headline = "The scale can be trusted" if verdict == "trusted" else "The scale is rough"
+    if sides:
+        about = "" if verdict == "trusted" else "roughly "
+        headline = f"{about}{sides[0]} x {sides[1]}, {sides[2]} high".capitalize()
     summary = [
-        f"One unit of COLMAP's model is {digits(scale)} m; with 95 % certainty between {digits(ci95[0])} and "
-        f"{digits(ci95[1])} m (±{digits(pct, 2)} %).",
+        f"One unit of COLMAP's own model is {digits(scale)} m; with 95 % certainty between {fixed(ci95[0])} and "
+        f"{fixed(ci95[1])} m (+-{digits(pct, 2)} %).",
     ]
-    todo = []
-    if verdict == "trusted":
-        headline = "The scale can be trusted"
-        summary.append(f"In the metric model, which is aligned with gravity, {length_in_words(verdict, pct)}.")
-    else:
-        headline = "The scale is rough"
-        summary.append(f"In the metric model, which is aligned with gravity, {length_in_words(verdict, pct)}.")
-        # livelier motion narrows the interval; it mends nothing else
-        todo = [_MOVE if pct > 100 * TRUSTED_HALF_WIDTH else _CHECK]
-        todo += [] if model.get("validation") else [_TARGET]
     if model.get("parts"):
         made_of, advice = parts_in_words(model["parts"])
-        summary.append(f"What makes the interval so wide: {made_of.replace('+-', '±')}. To narrow it most, {advice}.")
+        summary.append(f"What makes the interval so wide: {made_of}. To narrow it most, {advice}.")
+    return {
+        "verdict": verdict,
+        "headline": headline,
+        "answers": [
+            ("How sure", _describe_accuracy(pct, extent)),
+            ("Trusted", _describe_trust(model)),
+            ("Where", _describe_place(model.get("georeference"))),
+        ],
+        "summary": summary,
+        "tried": [],
+        "todo": _next_steps(model, pct),
+    }
+
+
+def _describe_accuracy(pct: float, extent: Sequence[float] | None) -> str:
+    """An interval as errors of lengths: of the model's longest side, and of ten metres."""
+    ten = f"10 m to +-{length_error(pct)} (+-{digits(pct, 2)} %, 95 %)"
+    if not extent:
+        return f"lengths of {ten}"
+    longest = max(extent)
+    return f"{length(longest)} are known to +-{length(longest * pct / 100, 2)}, lengths of {ten}"
+
+
+def _describe_trust(model: dict[str, Any]) -> str:
     checked = model.get("validation")
+    against = ""
     if checked and checked.get("scale_error_pct") is not None:
-        word = "within" if checked["within_tolerance"] else "outside"
-        summary.append(
-            f"Measured against the target in the images, lengths are {signed(checked['scale_error_pct'])} % off, "
-            f"{word} the tolerance of {checked['tolerance_pct']:g} %."
+        off_pct, tolerance_pct = checked["scale_error_pct"], checked["tolerance_pct"]
+        place = place_against_tolerance(off_pct, tolerance_pct, checked["within_tolerance"])
+        against = (
+            f"measured against the target in the images, lengths are {signed(off_pct)} % off, {place} the tolerance of "
+            f"{tolerance_pct:g} %"
         )
-    return {"verdict": verdict, "headline": headline, "summary": summary, "todo": todo}
+        if place == "outside":
+            return f"not until this is resolved: {against}"
+    if model["verdict"] == "trusted":
+        return f"yes; {against}" if against else "yes: the IMU determines the scale, and all checks were passed"
+    rough = "no, it is rough for the reasons below: check a known length before you measure"
+    return f"{rough}; {against}" if against else rough
+
+
+def _describe_place(place: Mapping[str, Any] | None) -> str:
+    """A model's place on Earth in a few words."""
+    if place is None:
+        return "in its own coordinates, z up; no positions (GPS) were used"
+    if "error" in place:
+        return f"not on the map: {place['error']}"
+    origin = place["origin"]
+    sure = f"+-{digits(place['position_ci95_m'], 2)} m, heading +-{digits(place['heading_ci95_deg'], 2)} degrees (95 %)"
+    return f"{origin['latitude_deg']:.6f}, {origin['longitude_deg']:.6f} degrees, {sure}"
+
+
+def _next_steps(model: dict[str, Any], pct: float) -> list[str]:
+    """What to do with a model that has a scale; commands are for its folder."""
+    checked = model.get("validation")
+    steps = []
+    if model["verdict"] != "trusted":
+        # livelier motion narrows the interval; it mends nothing else
+        steps = [_MOVE if pct > 100 * TRUSTED_HALF_WIDTH else _CHECK, *([] if checked else [_TARGET])]
+    elif checked and checked.get("scale_error_pct") is not None and not checked["within_tolerance"]:
+        steps = ["Measure the board's squares, compare them with [target], and see below which images hold it."]
+    steps.append("Turn it, and measure in it: `colmap-inertial view .`, in this folder.")
+    if model["verdict"] == "trusted":
+        steps.append("Take it to other programs in metres: `colmap-inertial export . ../export` (--for PROGRAM).")
+        if not model.get("dense"):
+            steps.append("For depth maps, a dense cloud and a mesh, run `reconstruct` again with `--dense`.")
+    return steps
+
+
+def _describe_attempt(model: dict[str, Any]) -> list[str]:
+    """What was tried of a scale that was refused, and what came of it."""
+    signals = model.get("signals", {})
+    rotation, acceleration = signals.get("rotation") or {}, signals.get("acceleration") or {}
+    tried = [f"COLMAP placed {model['registered_images']} images and {model['points']} points."]
+    if signals.get("alignment") == "found" and rotation.get("after"):
+        apart, rate = (math.degrees(rotation["after"][f"rms_{name}_rad_s"]) for name in ("difference", "rate"))
+        tried.append(
+            "Camera and gyroscope were brought onto one clock and into one frame: they differ by "
+            f"{digits(apart, 2)} °/s where the camera rotates at {digits(rate, 2)} °/s (rms)."
+        )
+    elif signals.get("alignment") == "failed":
+        tried.append("No time offset and no rotation between camera and IMU make their rotations agree.")
+    elif signals.get("alignment") == "not tried":
+        tried.append("Camera and IMU were not aligned: the recording does not permit it.")
+    if "correlation" in acceleration:
+        tried.append(
+            "The scale was fitted to all measurements; the accelerations of camera and accelerometer have a "
+            f"correlation of {acceleration['correlation']:.2f} (1 where they agree)."
+        )
+    return tried
 
 
 def _refused(model: dict[str, Any]) -> dict[str, Any]:
@@ -262,7 +360,14 @@ def _refused(model: dict[str, Any]) -> dict[str, Any]:
         )
         todo = [_MOVE, _TARGET]
     summary.append(f"COLMAP's own model ({model['sparse']}) is complete: only its size is unknown.")
-    return {"verdict": "refused", "headline": "No scale could be found", "summary": summary, "todo": todo}
+    return {
+        "verdict": "refused",
+        "headline": "No scale could be found",
+        "answers": [("Trusted", "no; nothing here is in metres")],
+        "summary": summary,
+        "tried": _describe_attempt(model),
+        "todo": todo,
+    }
 
 
 def outcome_of_stop(reason: str, *, findings: bool) -> dict[str, Any]:
@@ -270,6 +375,8 @@ def outcome_of_stop(reason: str, *, findings: bool) -> dict[str, Any]:
     return {
         "verdict": "stopped",
         "headline": "Stopped before there was a scale",
+        "answers": [],
+        "tried": [],
         "summary": [reason[:1].upper() + reason[1:]],
         "todo": ["The findings are listed below, each with what to do about it."] if findings else [],
     }

@@ -56,7 +56,7 @@ class Stage:
     A stage that goes on where an earlier run was begins above zero; what that run did does not count for its speed.
     """
 
-    def __init__(self, now_s: float, done: int, total: int, outputs: Sequence[Path] = ()) -> None:
+    def __init__(self, now_s: float, done: int, total: int, outputs: Sequence[Path] = (), *, name: str = "") -> None:
         self._outputs = outputs
         self._from, self._begun_s, self._moved_s = done, now_s, now_s
         self.done, self.total = done, total

@@ -11,7 +11,8 @@ largest values, ``null`` for gaps; three lines are x, y, z.
 ``format``         ``"colmap-inertial report"``; ``version``: 1, counts changes of this layout
 ``title``          name of the capture; ``capture``: its path
 ``outcome``        ``verdict`` (``trusted``, ``weak``, ``refused``; ``stopped`` where the run ended before a model),
-                   ``headline``, ``summary`` and ``todo``: sentences; of the first model
+                   ``headline``, ``answers`` (question and answer), ``summary``, ``tried`` and ``todo`` (sentences);
+                   of the first model
 ``models``         those with a scale first, then by size; each as in ``result.json`` (``metres_per_unit``, ``ci95``,
                    ``verdict``, ``reasons``, calibration, ``readout_translation``, ...), with
 

@@ -158,7 +158,7 @@ def _model(out: Path, model: Content, *, in_full: bool, project: bool) -> Conten
         why = failed if in_full else f"Only the {SIZES.models} largest models are shown in full."
         kept["scene"], kept["signals"] = _mark_missing(why), _mark_missing(why)
     kept.setdefault("photogrammetry", _mark_missing("Its data were not kept: the run was made by an earlier version."))
-    kept["outcome"] = outcome_of_model({**model, "signals": kept["signals"]})
+    kept["outcome"] = outcome_of_model({**model, "signals": kept["signals"], "photogrammetry": kept["photogrammetry"]})
     return kept
 
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from colmap_inertial.checks.report.figures import CAMERA, GOOD, IMU, QUIET, Figure
-from colmap_inertial.checks.report.series import SIZES
-from colmap_inertial.checks.words import digits
+from colmap_inertial.checks.report.series import SIZES, nice_length
+from colmap_inertial.checks.words import digits, length
 from colmap_inertial.core.arrays import Array
 
 
@@ -70,16 +70,8 @@ def scene_figure(scene: dict[str, Any]) -> Figure:
     }
 
 
-def nice_length(value: float) -> float:
-    """The nearest of 1, 2, 5 times a power of ten, at least ``value``."""
-    power = 10.0 ** math.floor(math.log10(value)) if value > 0 else 1.0
-    return next((m * power for m in (1, 2, 5) if m * power >= value * 0.999), 10 * power)
-
-
 def _length(value: float, unit: str) -> str:
-    if unit == "m" and value < 1:
-        return f"{digits(100 * value, 3)} cm" if value >= 0.01 else f"{digits(1000 * value, 3)} mm"
-    return f"{digits(value, 3)} {unit}"
+    return length(value) if unit == "m" else f"{digits(value, 3)} {unit}"
 
 
 def _box(xyz: Array, path: Array) -> tuple[Array, Array]:

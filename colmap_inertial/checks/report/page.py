@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from colmap_inertial.checks.report.figures import Figure
+from colmap_inertial.checks.report.still import draw_still
+from colmap_inertial.checks.report.still_3d import PLAN, draw_scene_still
 from colmap_inertial.checks.words import digits, signed
 from colmap_inertial.inertial.scale.verdict import TRUSTED_HALF_WIDTH, WEAK_HALF_WIDTH
 from colmap_inertial.io.files import path_in, read_bytes
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
     from markupsafe import Markup
 
 _UNIT = re.compile(r"(\d) ((?:m|cm|mm|s|ms|px|Hz|m/s²|°/s|rad/s)\b|%)")
+_CODE = re.compile("`([^`]+)`")
 _MINUS = re.compile(r"(?<![^\s(])-(?=\d+\.\d)")
 #: Images are embedded no wider than this, as JPEG of this quality.
 _IMAGE = {"width_px": 720, "jpeg_quality": 78}
@@ -58,11 +61,17 @@ def render_page(template: str, *, out: Path | None = None, **values: Any) -> str
     links: list[tuple[str, str]] = []
 
     def plot(figure: Figure, label: str) -> Markup:
-        """A place for a figure; ``label`` is for those who cannot see it."""
+        """A place for a figure, and its still picture; ``label`` is for those who cannot see it."""
         key = f"f{len(figures)}"
         figures[key] = figure
-        place = '<div class="plot" data-figure="{}" style="min-height:{}px" role="img" aria-label="{}"></div>'
-        return Markup(place).format(key, figure["layout"]["height"], label)
+        place = '<div class="plot" data-figure="{}" role="img" aria-label="{}"></div>'
+        is_scene = "scene" in figure["layout"]
+        still = draw_scene_still(figure, label, PLAN) if is_scene else draw_still(figure, label)
+        return Markup(place).format(key, label) + Markup(still)
+
+    def picture(figure: Figure, label: str) -> Markup:
+        """The model as it looks, for the first screen."""
+        return Markup(draw_scene_still(figure, label))
 
     def add_link(anchor: str, short: str) -> str:
         """Note a section for the list of links, where it has a name there."""
@@ -73,7 +82,14 @@ def render_page(template: str, *, out: Path | None = None, **values: Any) -> str
     def embedded(paths: Sequence[str], captions: Sequence[str] | None = None) -> list[tuple[str, str]]:
         return [] if out is None else embed_images(out, paths, captions)
 
-    shared = {"plot": plot, "add_link": add_link, "embedded": embedded, "figures_drawn": figures, "links": links}
+    shared = {
+        "plot": plot,
+        "picture": picture,
+        "add_link": add_link,
+        "embedded": embedded,
+        "figures_drawn": figures,
+        "links": links,
+    }
     try:
         return _environment().get_template(template).render(**values, **shared)
     except UndefinedError as error:
@@ -109,11 +125,12 @@ def _environment() -> Environment:
 
 
 def prose(text: str) -> Markup:
-    """Text for a paragraph: escaped, signs and exponents set in type, numbers kept on one line with their units."""
+    """Text for a paragraph: escaped, signs and `code` set in type, numbers kept on one line with their units."""
     from markupsafe import Markup, escape
 
-    typeset = escape(_MINUS.sub("−", text.replace("m/s2", "m/s²").replace("+-", "±")))
-    return Markup(_UNIT.sub("\\1\N{NO-BREAK SPACE}\\2", typeset))
+    signs = text.replace("m/s2", "m/s²").replace("+-", "±").replace(" x ", " × ").replace(" degrees", "°")
+    typeset = escape(_MINUS.sub("−", signs))
+    return Markup(_CODE.sub("<code>\\1</code>", _UNIT.sub("\\1\N{NO-BREAK SPACE}\\2", typeset)))
 
 
 def sentence(text: str) -> Markup:

@@ -102,7 +102,8 @@ def run_facts(content: Content) -> Iterator[Fact]:
         for sensor in model["rig"]:
             length = f"{digits(1000 * sensor['baseline_m'], 4)} mm"
             yield "rig", f"camera {sensor['camera_id']} is {length} from camera {sensor['reference_id']}"
-        yield "how the scale was found", _METHODS.get(model["method"]) or str(model["method"])
+        if model["metres_per_unit"] is not None:
+            yield "how the scale was found", _METHODS.get(model["method"]) or str(model["method"])
         yield from sensor_facts(model)
     if selection is not None:
         yield "frames used", f"{selection['used']} of {selection['frames']}: {selection['note']}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,6 +51,12 @@ class ReportSizes:
 
 
 SIZES = ReportSizes()
+
+
+def nice_length(value: float) -> float:
+    """The nearest of 1, 2, 5 times a power of ten, at least ``value``."""
+    power = 10.0 ** math.floor(math.log10(value)) if value > 0 else 1.0
+    return next((m * power for m in (1, 2, 5) if m * power >= value * 0.999), 10 * power)
 
 
 def rounded(values: Array, digits: int = 5) -> list[float | None]:

@@ -8,7 +8,7 @@
     root.dataset.plots = "none";
   };
   if (typeof DecompressionStream === "undefined") {
-    notice("The plots need a newer browser (Chrome or Edge 80, Firefox 113, Safari 16.4). All text and tables are complete without them.");
+    notice("To turn and zoom the plots takes a newer browser (Chrome or Edge 80, Firefox 113, Safari 16.4).");
     return;
   }
   const inflate = async (id) => {
@@ -23,11 +23,8 @@
   const narrow = () => window.innerWidth < 640;
 
   // Colours of text, grids and lines come from the page, so that light and dark agree with it.
-  const screen = () => ({
-    ink: style("--ink"), soft: style("--soft"), rule: style("--rule"), paper: style("--paper"), small: narrow(),
-  });
-  const print = () => ({ ink: "#000", soft: "#444", rule: "#ccc", paper: "#fff", small: false });
-  const dressed = (layout, { ink, soft, rule, paper, small } = screen()) => {
+  const dressed = (layout) => {
+    const [ink, soft, rule, paper] = ["--ink", "--soft", "--rule", "--paper"].map(style), small = narrow();
     const out = { ...layout, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)" };
     out.font = { family: getComputedStyle(document.body).fontFamily, size: small ? 11 : 12.5, color: ink };
     out.hoverlabel = { bgcolor: paper, bordercolor: rule, font: { color: ink } };
@@ -65,7 +62,7 @@
     document.head.append(script);
     figures = JSON.parse(figures);
   } catch (error) {
-    notice(`The plots could not be unpacked (${error}). All text and tables are complete without them.`);
+    notice(`The plots that can be turned and zoomed could not be unpacked (${error}).`);
     return;
   }
   const plots = [...document.querySelectorAll(".plot")];
@@ -79,13 +76,11 @@
   for (const div of plots) {
     const figure = figures[div.dataset.figure];
     try {
-      div.replaceChildren();
+      div.classList.add("drawn"); // it takes the place of the still picture beside it
       await Plotly.newPlot(div, figure.data, dressed(figure.layout), { ...config, modeBarButtons: buttons(figure.layout) });
-      div.classList.add("drawn");
-      div.style.minHeight = "";
     } catch (error) {
       failed.push(error);
-      div.textContent = `This plot could not be drawn: ${error}`;
+      div.classList.remove("drawn");
     }
     await new Promise((resume) => setTimeout(resume));
   }
@@ -98,24 +93,6 @@
       Plotly.react(div, figure.data, layout);
     }
   });
+  if (failed.length) notice(`${failed.length} plots cannot be turned and zoomed here (${failed[0]}).`);
   root.dataset.plots = failed.length ? "failed" : "drawn";
-
-  // Paper takes still pictures, made beforehand: printing waits for nobody.
-  for (const div of plots) {
-    const figure = figures[div.dataset.figure], still = new Image();
-    if (!div.classList.contains("drawn")) continue;
-    try {
-      const layout = dressed(figure.layout, print());
-      const size = { width: 690, height: figure.layout.scene ? 520 : figure.layout.height };
-      const format = figure.layout.scene ? { format: "png", scale: 2 } : { format: "svg" };
-      still.src = await Plotly.toImage({ data: figure.data, layout: { ...layout, ...size } }, { ...format, ...size });
-      still.className = "still";
-      still.alt = div.getAttribute("aria-label");
-      div.after(still);
-    } catch {
-      // the plot itself is printed then
-    }
-    await new Promise((resume) => setTimeout(resume));
-  }
-  root.dataset.stills = "made";
 })();
