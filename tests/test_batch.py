@@ -291,7 +291,7 @@ def test_dense_captures_want_a_gpu_where_colmap_uses_one(monkeypatch, cuda):
 
 def test_without_dask_the_extra_is_named(monkeypatch, manifest, tmp_path):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(MissingExtraError, match=r"colmap-inertial\[cluster\]"):
+    with pytest.raises(MissingExtraError, match=r"extra `cluster`: pip install 'dask\[distributed\]>="):
         run_batch(manifest, tmp_path / "out", batch=BatchOptions(scheduler="tcp://127.0.0.1:1"))
 
 

@@ -1,5 +1,6 @@
 """What is wrong with options and arrays is said where they enter."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,12 @@ from colmap_inertial import (
     reconstruct_project,
     run_batch,
 )
+from colmap_inertial.core.types import Gap, Similarity
+from colmap_inertial.imaging.wiener import DeblurOptions
+from colmap_inertial.motion.align import AlignOptions
+from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
+from colmap_inertial.reconstruction.drivers.result import Fragment
+from colmap_inertial.tools.batch.manifest import BatchCapture
 
 
 @pytest.mark.parametrize(
@@ -35,6 +42,48 @@ from colmap_inertial import (
 def test_an_option_is_refused_where_it_is_given(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ReconstructOptions(wolrd="z-up"), "ReconstructOptions has no field 'wolrd'; did you mean 'world'?"),
+        (lambda: AlignOptions(min_overlp=0.3), "AlignOptions has no field 'min_overlp'; did you mean 'min_overlap'?"),
+        (lambda: DeblurOptions(qqq=1), "DeblurOptions has no field 'qqq'"),
+    ],
+)
+def test_a_field_that_there_is_not_is_refused_with_the_nearest_one(make, message):
+    with pytest.raises(TypeError, match=re.escape(message) + "$"):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: AlignOptions(max_offset_s="1"), "max_offset_s: '1' is not a float"),
+        (lambda: DeblurOptions(threads=1.5), "threads: 1.5 is not a int"),
+        (lambda: BatchCapture(name="a", path="b", options=ScaleOptions()), "is not a ReconstructOptions"),
+    ],
+)
+def test_options_of_all_rooms_are_checked(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+    assert BatchCapture(name="a", path="b").path == Path("b")
+
+
+def test_results_print_on_a_screen_and_in_a_notebook():
+    shown = [
+        Similarity(
+            scale=2, rotation_xyzw=np.eye(4)[3], translation_m=np.zeros(3), cov=np.zeros((7, 7)), provenance="x"
+        ),
+        Gap(first=0, second=1, seconds=2.5, reason="<b>", joined=False),
+        Fragment(colmap_index=3, registered_images=2, sparse=Path("sparse/3")),
+        FrameRecord(name="a.jpg", action="passed"),
+    ]
+    for value in shown:
+        assert str(value).splitlines()[0] == type(value).__name__ and len(str(value).splitlines()) <= 20
+        assert value._repr_html_().startswith("<table>")
+    assert "array 7 x 7" in str(shown[0]) and "&lt;b&gt;" in shown[1]._repr_html_()
 
 
 def test_values_become_what_their_annotation_says():

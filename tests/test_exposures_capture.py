@@ -480,7 +480,7 @@ def test_a_missing_partner_or_network_is_said_before_the_work(capture, tmp_path,
     for command in ("reconstruct", "fuse-exposures"):
         with pytest.raises(SystemExit) as end:
             main([command, str(capture), str(tmp_path / "out")])
-        assert end.value.code == 2 and "pip install 'colmap-inertial[restore]'" in capsys.readouterr().err
+        assert end.value.code == 2 and "pip install 'onnxruntime>=" in capsys.readouterr().err
     (capture / "long" / "001.png").unlink()
     with pytest.raises(SystemExit):
         main(["reconstruct", str(capture), str(tmp_path / "out")])

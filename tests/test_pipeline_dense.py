@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -319,7 +320,7 @@ def test_a_mesh_that_nothing_can_make_is_said_before_the_work(box, tmp_path, cap
     flags = ["--imu", box.imu, "--frame-times", box.frame_times, *FLAGS]
     code, _, err = run(capsys, "reconstruct", box.root, tmp_path / "out", *flags, "--dense-options.mesh", "tsdf")
     assert code == 2
-    assert "colmap-inertial[mesh]" in err and not (tmp_path / "out").exists()
+    assert "extra `mesh`: pip install 'open3d>=" in err and not (tmp_path / "out").exists()
 
 
 def test_a_mesh_maker_that_lacks_a_library_is_said_and_not_loaded(tmp_path, monkeypatch):
@@ -330,6 +331,14 @@ def test_a_mesh_maker_that_lacks_a_library_is_said_and_not_loaded(tmp_path, monk
     assert options.dense
     with pytest.raises(InertialError, match=r"libusb-1\.0\.so\.0: cannot open.*apt install libusb"):
         require_mesh_maker(options)
+    for library, mend in (
+        ("libGL.so.1", "apt install libgl1,"),
+        ("libtbb.so.12", "pip install --force-reinstall open3d"),
+    ):
+        (tmp_path / "open3d.py").write_text(f"raise OSError('{library}: cannot open shared object file')")
+        with pytest.raises(InertialError, match=re.escape(mend)) as caught:
+            require_mesh_maker(options)
+        assert "libusb" not in str(caught.value)
     assert "open3d" not in sys.modules
     (tmp_path / "open3d.py").write_text("")
     require_mesh_maker(options)

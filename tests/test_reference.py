@@ -66,6 +66,12 @@ def test_markers_and_targets_give_their_scale(bare, tmp_path, monkeypatch):
         bare, tmp_path / "target", ReferenceOptions(scale_from="target", target="aruco:DICT_4X4_50:0.1")
     )
     assert target.metres_per_unit == pytest.approx(0.5) and target.made_of.startswith("target aruco")
+    doubted = dataclasses.replace(validated(0.5, unscaled=True), views_used=2)
+    monkeypatch.setattr(rooms, "validate_model", lambda *_, **__: doubted)
+    with pytest.raises(NotObservableError, match="only 2 of 5 images agree on the target, which proves no size"):
+        scale_project_by(bare, tmp_path / "no", ReferenceOptions(scale_from="target", target="aruco:DICT_4X4_50:0.1"))
+    found = scale_project_by(bare, tmp_path / "doubted", known)
+    assert any("only 2 of 5 images agree" in note for note in found.notes)
     with pytest.raises(NotObservableError, match="marker 9 was not measured in the model; measured: 0, 1, 2, 3, 7"):
         scale_project_by(bare, tmp_path / "no", ReferenceOptions(**markers, between=("0", "9"), distance="2.1+-0.001"))
     assert not (tmp_path / "no").exists()

@@ -203,7 +203,7 @@ def test_workers_share_the_network_and_make_the_same_pixels(blurred, deep_plan, 
 def test_what_is_missing_is_told_before_any_work(tmp_path, blurred, weights, lacking, monkeypatch, capsys):
     if lacking == "onnxruntime":
         monkeypatch.setitem(sys.modules, "onnxruntime", None)
-        error, words = MissingExtraError, "pip install 'colmap-inertial[restore]'"
+        error, words = MissingExtraError, "pip install 'onnxruntime>="
     else:
         (weights / "deepgyro.onnx").unlink()
         error, words = FormatError, "deepgyro.onnx: is missing"

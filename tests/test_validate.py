@@ -184,6 +184,17 @@ def test_a_wrong_board_size_is_not_found_and_the_right_one_is_suggested(small):
     assert caught.value.exit_code == 5
 
 
+@pytest.mark.parametrize(("stated", "visible"), [("8x7", "8x6"), ("9x7", "8x6")])
+def test_a_board_with_a_row_or_squares_too_many_is_refused_by_its_likely_size(tmp_path, stated, visible):
+    """9x7 squares are 8x6 inner corners; patterns beside the board pass for the row that it does not have."""
+    scene = Scene(
+        tmp_path, orbit(np.random.default_rng(2), 5), SMALL, target=parse_target(f"checkerboard:{visible}:0.04")
+    )
+    with pytest.raises(TargetNotFoundError, match=f"{visible} inner corners is") as caught:
+        validate_model(scene.model(), scene.images, parse_target(f"checkerboard:{stated}:0.04"))
+    assert caught.value.exit_code == 5
+
+
 def test_a_board_that_is_never_visible_is_not_found(tmp_path):
     scene = Scene(tmp_path, orbit(np.random.default_rng(4), 3), SMALL, texture=ground, samples=1)
     for spec in ("checkerboard:9x6:0.03", "aprilgrid:6x6:0.05:0.3", "aruco:4X4_50:0.1"):

@@ -30,7 +30,14 @@ from colmap_inertial.tools.view import load_scene, measure_distance, nearest_to_
 from colmap_inertial.tools.view.clouds import dense_cloud, read_mesh
 from colmap_inertial.tools.view.drawing import AMBER, BLUE, path_colours
 from colmap_inertial.tools.view.measure import ball_at_ray, length_text
-from colmap_inertial.tools.view.panel import camera_text, contents_text, describe_distance, scale_text, target_text
+from colmap_inertial.tools.view.panel import (
+    camera_text,
+    contents_text,
+    describe_distance,
+    scale_text,
+    target_text,
+    tolerance_html,
+)
 from colmap_inertial.tools.view.scene import LIMITS
 from colmap_inertial.tools.view.sources import TargetFacts
 
@@ -101,6 +108,7 @@ def validation_record():
         "target": "checkerboard:2x2:0.1",
         "scale_error_pct": 1.0,
         "ci95_pct": [0.8, 1.2],
+        "tolerance_pct": 2.0,
         "within_tolerance": True,
         "distances": [
             {"pair": [a, b], "known_m": known, "measured": 1.01 * known, "residual_m": 0.01 * known, "set": "check"}
@@ -339,7 +347,13 @@ def test_names_from_files_are_text_and_nothing_else(tmp_path):
         scene, cameras=dataclasses.replace(scene.cameras, names=(name,) * len(scene.cameras.names))
     )
     target = TargetFacts(
-        spec=name, error_pct=1.0, ci95_pct=(0.5, 1.5), within_tolerance=True, distances=(), corners={"a": np.zeros(3)}
+        spec=name,
+        error_pct=1.0,
+        ci95_pct=(0.5, 1.5),
+        tolerance_pct=2.0,
+        within_tolerance=True,
+        distances=(),
+        corners={"a": np.zeros(3)},
     )
     for text in (scale_text(scene), camera_text(scene, 0, name), target_text(target)):
         kinds, words = shown(text)
@@ -460,12 +474,21 @@ def test_options_out_of_range_exit_2(capsys, flags):
     assert stopped.value.code == 2
 
 
+@pytest.mark.parametrize(
+    ("error_pct", "proved", "words"),
+    [(1.0, True, "Within its"), (-3.0, False, "Outside its"), (1.0, False, "Not proved to be within its")],
+)
+def test_a_target_is_outside_its_tolerance_only_where_its_error_is(error_pct, proved, words):
+    facts = {"ci95_pct": (-5, 5), "tolerance_pct": 2.0, "distances": (), "corners": {}}
+    assert words in tolerance_html(TargetFacts(spec="x", error_pct=error_pct, within_tolerance=proved, **facts))
+
+
 def test_without_viser_the_extra_is_named(monkeypatch, out, capsys):
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(SystemExit) as stopped:
         main(["view", str(out[0])])
     assert stopped.value.code == MissingExtraError.exit_code == 2
-    assert "pip install 'colmap-inertial[view]'" in capsys.readouterr().err
+    assert "extra `view`: pip install 'viser>=" in capsys.readouterr().err
 
 
 def test_an_address_of_another_machine_is_an_error_and_a_taken_port_makes_way(out):

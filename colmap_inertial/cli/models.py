@@ -296,7 +296,8 @@ class Validate(Reader):
     tolerance: float = 2.0
     """Largest scale error that passes, in per cent."""
     unscaled: bool = False
-    """The model is not in metres: report the factor that makes it metric; always passes."""
+    """The model is not in metres: report the factor that makes it metric. Passes where enough images and all
+    lengths agree."""
     apply: Path | None = None
     """With --unscaled: a new folder for the model in metres, scaled by the control distances alone."""
     bars: Path | None = None

@@ -29,6 +29,17 @@ if TYPE_CHECKING:
     import pycolmap
 
 
+#: Libraries that open3d takes from the system, and their packages on Debian.
+_SYSTEM_LIBRARIES = {
+    "libusb-1.0": "libusb-1.0-0",
+    "libGL.so": "libgl1",
+    "libEGL.so": "libegl1",
+    "libgomp.so": "libgomp1",
+    "libX11.so": "libx11-6",
+    "libudev.so": "libudev1",
+}
+
+
 @dataclass(frozen=True, kw_only=True)
 class SurfaceLimits:
     """The voxels of a surface."""
@@ -81,10 +92,10 @@ def _missing_error() -> MissingExtraError:
 
 
 def _unloadable_error(why: str) -> InertialError:
-    return InertialError(
-        f"open3d cannot be loaded ({why}); on Debian: apt install libusb-1.0-0 libgl1 libgomp1 libx11-6, or take "
-        "--dense-options.mesh poisson"
-    )
+    package = next((package for library, package in _SYSTEM_LIBRARIES.items() if library in why), None)
+    # its wheel brings all others
+    mend = "pip install --force-reinstall open3d" if package is None else f"on Debian: apt install {package}"
+    return InertialError(f"open3d cannot be loaded ({why}); {mend}, or take --dense-options.mesh poisson")
 
 
 def _import_open3d() -> ModuleType:

@@ -6,14 +6,28 @@ import difflib
 import numbers
 import types
 import typing
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 
 @dataclass(frozen=True, kw_only=True)
 class CheckedOptions:
     """Options whose values are those that their annotations allow; what is nearly one of a choice is suggested."""
+
+    def __new__(cls, *_: object, **values: object) -> Self:
+        """Refuse a field that there is not.
+
+        Raises
+        ------
+        TypeError
+            With the field that is spelled nearly the same.
+        """
+        known = cls.__dataclass_fields__
+        for name in values:
+            if name not in known:
+                raise TypeError(f"{cls.__name__} has no field {name!r}{suggest_nearest(name, known)}")
+        return super().__new__(cls)
 
     def __post_init__(self) -> None:
         """Check every field.
@@ -110,5 +124,10 @@ def _describe(kinds: tuple[Any, ...]) -> str:
 def _suggest(value: object, kinds: tuple[Any, ...]) -> str:
     """The choice that is spelled nearly the same."""
     choices = [word for kind in kinds if typing.get_origin(kind) is typing.Literal for word in typing.get_args(kind)]
-    near = difflib.get_close_matches(value, choices, n=1) if isinstance(value, str) else []
+    return suggest_nearest(value, choices) if isinstance(value, str) else ""
+
+
+def suggest_nearest(word: str, known: Iterable[str]) -> str:
+    """The known word that is spelled nearly the same, as the end of a sentence; empty where there is none."""
+    near = difflib.get_close_matches(word, list(known), n=1)
     return f"; did you mean {near[0]!r}?" if near else ""

@@ -70,14 +70,24 @@ class MissingExtraError(InertialError):
     Parameters
     ----------
     extra
-        The name in brackets of ``pip install 'colmap-inertial[...]'``.
+        Its name in ``pyproject.toml``.
     what
         What needs it.
     """
 
     def __init__(self, extra: str, what: str) -> None:
         self.extra = extra
-        super().__init__(f"{what}, which needs an extra package: pip install 'colmap-inertial[{extra}]'")
+        needed = " ".join(f"'{package}'" for package in _list_packages(extra))
+        super().__init__(f"{what}, which needs the extra `{extra}`: pip install {needed}")
+
+
+def _list_packages(extra: str) -> list[str]:
+    """What an extra consists of, by this package's own metadata: its name need not be that of an index's package."""
+    from importlib.metadata import requires
+
+    stated = (line.partition(";") for line in requires("colmap-inertial") or ())
+    marks = (f'extra == "{extra}"', f"extra == '{extra}'")
+    return [name.strip() for name, _, when in stated if any(mark in when for mark in marks)]
 
 
 class AlreadyMetricError(InertialError):

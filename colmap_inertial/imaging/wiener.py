@@ -12,6 +12,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_inertial.core.choices import CheckedOptions
 from colmap_inertial.imaging._cells import Cells
 from colmap_inertial.imaging._taps import STEPS_PER_PX, Prior, TapTable, smoothing_px
 from colmap_inertial.imaging.blur_field import BlurField
@@ -28,7 +29,7 @@ LONGEST_PX = 500.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class DeblurOptions:
+class DeblurOptions(CheckedOptions):
     """Options of the deconvolution."""
 
     noise: float | None = None
@@ -38,6 +39,7 @@ class DeblurOptions:
     """Threads for one image; as many as the process may use where absent."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.noise is not None and not 0 <= self.noise < 1:
             raise ValueError("noise must be at least 0 and below 1")
         if self.threads is not None and self.threads < 1:

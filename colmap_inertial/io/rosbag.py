@@ -1,4 +1,4 @@
-"""ROS 1 bags and ROS 2 recordings (sqlite3, mcap), by the package ``rosbags``: ``pip install 'colmap-inertial[ros]'``.
+"""ROS 1 bags and ROS 2 recordings (sqlite3, mcap), by the package ``rosbags`` (extra ``ros``).
 
 ``sensor_msgs/Imu`` is in rad/s and m/s2, gravity included; times are the headers'. A driver that publishes gyroscope
 and accelerometer apart fills the other one with zeros, or sets the first number of its covariance to -1.

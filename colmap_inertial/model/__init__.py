@@ -16,6 +16,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import AlreadyMetricError, FormatError, OutputExistsError, TimingError
+from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.types import (
     CameraModel,
     CameraTrajectory,
@@ -43,6 +44,7 @@ TRANSFORM_FILE = "transform.json"
 _MODEL_FILES = ("cameras", "images", "points3D")
 
 
+@prints_in_lines
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Model:
     """A COLMAP model on its way through the model stages.

@@ -19,7 +19,7 @@ import numpy as np
 
 from colmap_inertial.checks.report.figures import Figure
 from colmap_inertial.checks.report.still import draw_still
-from colmap_inertial.checks.report.still_3d import PLAN, draw_scene_still
+from colmap_inertial.checks.report.still_3d import StillView, draw_scene_still
 from colmap_inertial.checks.words import digits, signed
 from colmap_inertial.inertial.scale.verdict import TRUSTED_HALF_WIDTH, WEAK_HALF_WIDTH
 from colmap_inertial.io.files import path_in, read_bytes
@@ -66,7 +66,7 @@ def render_page(template: str, *, out: Path | None = None, **values: Any) -> str
         figures[key] = figure
         place = '<div class="plot" data-figure="{}" role="img" aria-label="{}"></div>'
         is_scene = "scene" in figure["layout"]
-        still = draw_scene_still(figure, label, PLAN) if is_scene else draw_still(figure, label)
+        still = draw_scene_still(figure, label, StillView.from_above()) if is_scene else draw_still(figure, label)
         return Markup(place).format(key, label) + Markup(still)
 
     def picture(figure: Figure, label: str) -> Markup:

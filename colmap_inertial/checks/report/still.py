@@ -7,7 +7,7 @@ page's colours, so that they follow a dark screen.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any
@@ -67,6 +67,7 @@ def draw_still(figure: Figure, label: str) -> str:
 
 
 def wrap_svg(parts: Sequence[str], width: int, height: int, label: str) -> str:
+    """An SVG element of these parts."""
     head = f'<svg class="still" viewBox="0 0 {width} {height}" role="img" aria-label="{escape(label)}">'
     return f"{head}{''.join(parts)}</svg>"
 
@@ -75,9 +76,7 @@ def _panels(layout: Figure, data: Sequence[Figure], top: float, bottom: float) -
     """Axes and traces that are drawn over each other; those with an axis on the right come a second time."""
     names = dict.fromkeys(["y", *(trace.get("yaxis", "y") for trace in data)])
     specs = {name: layout.get(f"yaxis{name[1:]}", {}) for name in names}
-    has_right = any(spec.get("side") == "right" for spec in specs.values())
-    bars = any("colorbar" in trace for trace in data)
-    right = STYLE.width - (STYLE.right_axis if has_right or bars else STYLE.right)
+    right = STYLE.width - _right_margin(specs.values(), data)
     lowest = min(spec.get("domain", (0, 1))[0] for spec in specs.values())
     x_spec = layout["xaxis"]
     lines = all(trace["type"] == "scatter" and trace.get("mode") == "lines" for trace in data)
@@ -91,6 +90,12 @@ def _panels(layout: Figure, data: Sequence[Figure], top: float, bottom: float) -
         if spec.get("scaleanchor"):
             x, y = equalise(x, y)
         yield x, y, spec, traces, domain[0] == lowest and spec.get("side") != "right"
+
+
+def _right_margin(axes: Iterable[Figure], data: Sequence[Figure]) -> int:
+    """Room for an axis on the right, or for the colours of a table."""
+    wide = any(spec.get("side") == "right" for spec in axes) or any("colorbar" in trace for trace in data)
+    return STYLE.right_axis if wide else STYLE.right
 
 
 def _column(trace: Figure, name: str) -> list[Any]:
@@ -278,5 +283,6 @@ def _box(x0: float, y0: float, x1: float, y1: float, fill: str, *, opacity: floa
 
 
 def draw_text(x: float, y: float, text: str, *, anchor: str = "start", css: str = "tick", turned: bool = False) -> str:
+    """Words at a place."""
     turn = f' transform="rotate(-90 {x:.4g} {y:.4g})"' if turned else ""
     return f'<text class="{css}" x="{x:.4g}" y="{y:.4g}" text-anchor="{anchor}"{turn}>{escape(text)}</text>'

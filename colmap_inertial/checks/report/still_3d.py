@@ -40,10 +40,13 @@ class StillView:
     #: Around the model (px).
     margin: int = 22
 
+    @classmethod
+    def from_above(cls) -> StillView:
+        """Straight down, with y upwards in the picture."""
+        return cls(azimuth_deg=-90.0, elevation_deg=90.0, distance=None, width=640, height=440)
+
 
 OBLIQUE = StillView()
-#: Straight from above, with north (y) up.
-PLAN = StillView(azimuth_deg=-90.0, elevation_deg=90.0, distance=None, width=640, height=440)
 
 
 def draw_scene_still(figure: Figure, label: str, view: StillView = OBLIQUE) -> str:

@@ -275,6 +275,7 @@ class ScaleEstimate:
         }
 
 
+@prints_in_lines
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Similarity:
     """``x_target = scale * R x_source + translation``.
@@ -283,10 +284,8 @@ class Similarity:
     ----------
     scale
         Target units (metres) per source unit.
-    rotation_xyzw
-        (4,) ``target_from_source``.
-    translation_m
-        (3,).
+    rotation_xyzw, translation_m
+        (4,) ``target_from_source``, and (3,).
     cov
         (7, 7) of log scale, rotation (rad, target frame, left), translation (m).
     provenance
@@ -334,6 +333,7 @@ class Similarity:
         )
 
 
+@prints_in_lines
 @dataclass(frozen=True, kw_only=True)
 class Gap:
     """The gap between two sub-models, and whether they were joined across it.

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from colmap_inertial.core.camera_clock import epoch_shift_s
+from colmap_inertial.core.choices import CheckedOptions
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.threads import one_blas_thread
@@ -43,7 +44,7 @@ _STILL_RAD_RTS = 0.015
 
 
 @dataclass(frozen=True, kw_only=True)
-class AlignOptions:
+class AlignOptions(CheckedOptions):
     """Options of the alignment of the clocks of camera and IMU."""
 
     max_offset_s: float | None = None

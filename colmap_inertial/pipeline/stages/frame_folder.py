@@ -12,6 +12,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import AnyArray
 from colmap_inertial.core.errors import FormatError, InertialError
+from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.threads import map_in_order
 from colmap_inertial.core.types import CameraModel, Frame, Treatment
 from colmap_inertial.imaging.path_filters import smoothed
@@ -23,6 +24,7 @@ from colmap_inertial.pipeline.run.progress import Progress
 from colmap_inertial.pipeline.stages.protocols import FrameStage, KeypointStage
 
 
+@prints_in_lines
 @dataclass(frozen=True, kw_only=True)
 class FrameRecord:
     """Treatment of one frame.

@@ -129,6 +129,8 @@ def scale_project_by(
             ValidateOptions(unscaled=True),
             progress=lambda done, total: progress("validation", done, total),
         )
+        if validation.doubts and reference.scale_from == "target":
+            raise NotObservableError("scale", "; ".join(validation.doubts))
     if reference.scale_from == "distance":
         scale, sigma_log, made_of = _scale_by_distance(reference, validation)
     else:
@@ -139,7 +141,7 @@ def scale_project_by(
         notes += [] if validation.lengths is None else [f"this proves that {validation.lengths.proves}"]
         if validation.check_error_pct is not None:
             notes.append(f"corners that the scale does not rest on are {validation.check_error_pct:+.2g} % off")
-        notes += validation.reasons
+        notes += (*validation.doubts, *validation.reasons)
     found = Reference(
         out=out,
         scale_from=reference.scale_from,

@@ -92,6 +92,7 @@ class ModelResult(ScaledModel):
         return replace(self, **{name: root / path for name, path in paths.items() if path is not None})
 
 
+@prints_in_lines
 @dataclass(frozen=True, kw_only=True)
 class Fragment:
     """A model of COLMAP's that is too small to be made metric.

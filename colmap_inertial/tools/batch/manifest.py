@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from colmap_inertial.core.choices import CheckedOptions
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, StageNames
 from colmap_inertial.io.files import StrPath, check_names, reader
@@ -18,7 +19,7 @@ _RESERVED = ("status", "summary.csv", "summary.json")
 
 
 @dataclass(frozen=True, kw_only=True)
-class BatchCapture:
+class BatchCapture(CheckedOptions):
     """One capture of a batch.
 
     Attributes
@@ -42,6 +43,7 @@ class BatchCapture:
     stages: StageNames | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not self.name.isprintable() or "/" in self.name or self.name.startswith(".") or not self.name.strip():
             raise ValueError(f"a capture's name is that of its folder: {self.name!r} cannot be one")
         try:

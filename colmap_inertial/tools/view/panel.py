@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from colmap_inertial.checks.report.series import strided
+from colmap_inertial.checks.words import place_against_tolerance
 from colmap_inertial.tools.view.measure import Measured, length_text
 from colmap_inertial.tools.view.scene import Scene
 from colmap_inertial.tools.view.sources import KnownDistance, TargetFacts
@@ -98,8 +99,9 @@ def describe_distance(result: Measured) -> str:
 
 def tolerance_html(target: TargetFacts) -> str:
     """Whether the target has its size, with a colour."""
-    text = "Within its tolerance" if target.within_tolerance else "Outside its tolerance"
-    return _flag(_COLOUR["trusted" if target.within_tolerance else "refused"], text, "1em")
+    place = place_against_tolerance(target.error_pct, target.tolerance_pct, target.within_tolerance)
+    colour = {"within": "trusted", "outside": "refused"}.get(place, "weak")
+    return _flag(_COLOUR[colour], f"{place.capitalize()} its tolerance", "1em")
 
 
 def target_text(target: TargetFacts) -> str:

@@ -62,8 +62,8 @@ class TargetFacts:
         The target's description.
     error_pct, ci95_pct
         How much larger than it should be the target is in the model, per cent, and the 95 % interval.
-    within_tolerance
-        Whether that passes.
+    tolerance_pct, within_tolerance
+        The largest error that passes, and whether it is proved to.
     distances
         Known distances, measured.
     corners
@@ -73,6 +73,7 @@ class TargetFacts:
     spec: str
     error_pct: float
     ci95_pct: tuple[float, float]
+    tolerance_pct: float
     within_tolerance: bool
     distances: tuple[KnownDistance, ...]
     corners: Mapping[str, Array]
@@ -301,6 +302,7 @@ def _target(fields: Mapping[str, Any]) -> TargetFacts | None:
         spec=str(fields["target"]),
         error_pct=float(fields["scale_error_pct"]),
         ci95_pct=(low, high),
+        tolerance_pct=float(fields["tolerance_pct"]),
         within_tolerance=bool(fields["within_tolerance"]),
         distances=tuple(
             KnownDistance(
