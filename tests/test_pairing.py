@@ -436,7 +436,7 @@ def test_where_the_gyroscope_looked_elsewhere_no_loop_is_sought(monkeypatch):
 
 def test_pairs_without_a_gyroscope_are_those_of_before(database, tmp_path, monkeypatch):
     matched = []
-    monkeypatch.setattr(pairing, "match_pairs", lambda db, pairs, context, **_: matched.extend(pairs))
+    monkeypatch.setattr(pairing, "match_pairs", lambda db, pairs, context, **_: matched.extend(pairs) or 0)
 
     def refused(*_):
         raise NotObservableError("time offset", "no")
@@ -454,7 +454,7 @@ def test_pairs_without_a_gyroscope_are_those_of_before(database, tmp_path, monke
 
 def test_without_a_gyroscope_a_long_capture_matches_neighbours_only(database, tmp_path, monkeypatch):
     matched = []
-    monkeypatch.setattr(pairing, "match_pairs", lambda db, pairs, context, **_: matched.extend(pairs))
+    monkeypatch.setattr(pairing, "match_pairs", lambda db, pairs, context, **_: matched.extend(pairs) or 0)
 
     def refused(*_):
         raise NotObservableError("time offset", "no")
@@ -599,11 +599,13 @@ def test_batches_of_pairs_grow_and_hold_every_pair_once():
 def test_once_some_are_matched_batches_are_large(database, tmp_path, monkeypatch):
     told = []
     monkeypatch.setattr(pycolmap, "match_image_pairs", lambda *_, **__: None)
-    context = RunContext(scratch=tmp_path, progress=lambda _, done, total: told.append(done))
+    context = RunContext(scratch=tmp_path, progress=lambda _, done, total: told.append((done, total)))
     pairs = [("a", "b")] * 700
-    sparse.match_pairs(database, pairs, context, total=1400)
-    sparse.match_pairs(database, pairs, context, done=700, total=1400)
-    assert told == [0, 100, 300, 700, 700, 1400]
+    # a batch costs its pairs, and to index its two images as much as two more
+    done = sparse.match_pairs(database, pairs, context, total=0)
+    assert sparse.match_pairs(database, pairs, context, done=done) == 706 + sparse.matching_work(pairs) == 1408
+    assert told == [(0, 0), (102, 0), (304, 0), (706, 0), (706, 1408), (1408, 1408)]
+    assert [len(b) for b in sparse.growing_batches(range(45), first=4, most=16)] == [4, 8, 16, 16, 1]
 
 
 # --- the same matches, verified anew ---------------------------------------------------------------------------------

@@ -107,7 +107,7 @@ def test_a_pipe_has_a_line_for_each_stage_and_few_of_how_far_it_is():
         now[0] += 1
     screen("metric", 0, 1)
     lines = file.getvalue().splitlines()
-    assert lines[:3] == ["kept from the earlier run: frames, matches", "Mapping ...", "Mapping 10/100, 1:30 left"]
+    assert lines[:3] == ["kept from the earlier run: frames, matches", "Mapping ...", "Mapping 10/100, 3:10 left"]
     assert lines[-2:] == ["Mapping 100/100, took 1:40", "Metric scale ..."] and len(lines) == 13
     assert not screen.unchanged
 
@@ -121,6 +121,35 @@ def test_the_time_left_is_by_what_this_run_did_and_runs_down():
     stage.moved(60.0, 100, 100)
     assert stage.ends_in(60.0) == ""
     assert Stage(0.0, 0, 0).left_s(9.0) is None
+
+
+def test_no_time_is_said_where_a_step_takes_longer_than_all_was_to():
+    stage = Stage(0.0, 0, 4)
+    stage.moved(10.0, 3, 4)
+    assert stage.ends_in(12.0) == "0:01 left" and stage.ends_in(14.0) == ""
+
+
+@pytest.mark.parametrize("share", [0.1, 0.2, 0.5, 0.8])
+def test_a_stage_whose_steps_grow_dearer_ends_when_it_says(share):
+    """An image costs as much as 0.3 of those before it, as a mapper's does: to the power of 1.3 in all."""
+    stage, total = Stage(0.0, 0, 500, name="mapping"), 500.0
+    done = round(500 * share)
+    now_s = total * (done / 500) ** 1.3
+    stage.moved(now_s, done, 500)
+    assert stage.left_s(now_s) == pytest.approx(total - now_s, rel=0.02)
+    if share < 0.3:
+        assert Stage(0.0, 0, 500).left_s(now_s) is None
+        linear = Stage(0.0, 0, 500)
+        linear.moved(now_s, done, 500)
+        assert linear.left_s(now_s) < 0.65 * (total - now_s)
+
+
+def test_work_is_shown_as_a_share_and_its_unknown_end_not_at_all():
+    stage = Stage(0.0, 0, 0, name="matches")
+    stage.moved(5.0, 145, 0)
+    assert stage.count() == "" and stage.ends_in(5.0) == ""
+    stage.moved(6.0, 145, 580)
+    assert stage.count() == "25 %" and stage.ends_in(6.0) == "0:14 left"
 
 
 def test_before_the_first_step_is_done_the_bytes_written_move(tmp_path):

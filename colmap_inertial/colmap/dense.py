@@ -51,8 +51,23 @@ _LEAST_DEPTH, _MOST_DEPTH = 6, 13
 #: COLMAP cuts away what is sampled three levels (8 times) more coarsely than the finest; so do we.
 _TRIM_LEVELS = 3
 
-#: Undistortion, fusion and mesh are one each of what progress counts; the depth maps between are one or one by one.
-_STEPS = 3
+
+@dataclass(frozen=True, kw_only=True)
+class DenseWork:
+    """What progress counts for an image: time on the example scene and on EuRoC (``scripts/study_progress.py``)."""
+
+    #: To find its depths by the plane sweep, 1.3 s of two cores, and to compare them with those of others.
+    matched: int = 40
+    confirmed: int = 3
+    undistorted: int = 1
+    #: 0.17 to 0.19 of the depths' time.
+    fused: int = 7
+    #: COLMAP's Poisson surface of one core: 1.3 to 2.6 times the depths' time; the others were not measured.
+    meshed: int = 70
+    meshed_otherwise: int = 7
+
+
+_WORK = DenseWork()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -116,24 +131,32 @@ def run_dense(session: Session, indices: Sequence[int], images: Path, options: D
         Where depth maps of patch-match lie in the workspace that were made from another model.
     """
     prepared = {index: _prepare_model(session, index, images, options) for index in indices}
-    done, total = 0, sum(model.steps for model in prepared.values())
+    # all are undistorted first: depth maps that come later then change nothing that others depend on
+    work = {index: _list_work(len(prepared[index].names), options) for index in indices}
+    done, total = 0, sum(sum(costs.values()) for costs in work.values())
 
-    def step() -> None:
+    def count(cost: int) -> None:
         nonlocal done
-        done += 1
+        done += cost
         session.progress("dense", done, total)
 
-    # all of them first: depth maps that come later then change nothing that others depend on
     for index in indices:
         _undistort(session, index, images, prepared[index])
-        step()
+        count(work[index].pop("undistorted"))
     found: dict[int, DenseResult] = {}
-    for before, index in enumerate(indices, 1):
-        found[index] = _densify(session, index, prepared[index], options, step)
-        # what was kept, or was not needed, counts as done
-        done = max(done, len(indices) + sum(prepared[i].steps - 1 for i in indices[:before]) - 1)
-        step()
+    for index in indices:
+        end = done + sum(work[index].values())
+        found[index] = _densify(session, index, prepared[index], options, count)
+        # what was kept, or was not needed, counts as done; the mesh ends it
+        count(end - done)
     return found
+
+
+def _list_work(images: int, options: DenseOptions) -> dict[str, int]:
+    """The work of each step of a model of so many images."""
+    mesh = {"none": 0, "poisson": _WORK.meshed}.get(options.mesh, _WORK.meshed_otherwise)
+    by_image = {**vars(_WORK), "meshed": mesh, "meshed_otherwise": 0}
+    return {step: images * cost for step, cost in by_image.items()}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -154,14 +177,9 @@ class _Prepared:
     made_from: MadeFrom
     has_maps: bool
 
-    @property
-    def steps(self) -> int:
-        """Steps that progress counts."""
-        return _STEPS + (2 * len(self.names) if self.made_from.maps == "plane sweep" else 1)
-
 
 def _densify(
-    session: Session, index: int, prepared: _Prepared, options: DenseOptions, progress: Callable[[], object]
+    session: Session, index: int, prepared: _Prepared, options: DenseOptions, count: Callable[[int], None]
 ) -> DenseResult:
     """Everything after undistortion."""
     import pycolmap
@@ -170,13 +188,13 @@ def _densify(
     folder, names, maker = session.workspace.dense / str(index), prepared.names, prepared.made_from.maps
     before = [f"dense_{index}_undistorted"]
     if maker == "plane sweep":
-        _sweep(session, index, prepared, progress)
+        _sweep(session, index, prepared, count)
     elif pycolmap.has_cuda:
         size = prepared.made_from.max_image_size
         decided = {"maps": maker, "settings": prepared.made_from.settings}
         step, maps_of, colmap = f"dense_{index}_depth", partial(_map_folders, folder), context.colmap
         runner.run(step, decided, [], lambda _: patch_match(folder, size, colmap), after=before, beside=maps_of)
-        progress()
+        count(len(names) * (_WORK.matched + _WORK.confirmed))
     kind, mapped = find_maps(folder, names)
     result = DenseResult(folder=folder, images=len(names), depth_maps=len(mapped), maps=maker)
     if not mapped:
@@ -198,7 +216,7 @@ def _densify(
     outputs = [fused, folder / "fused.ply.vis", record]
     made_by: dict[str, object] = {"maps": maps, "colmap": context.colmap.identity("fusion")}
     runner.run(f"dense_{index}_fused", made_by, outputs, fuse, after=before)
-    progress()
+    count(len(names) * _WORK.fused)
     with a_record_of_ours(record):
         covered = float(read_json(record)["coverage"])
     result = replace(result, fused=fused, points=_count_elements(fused, "vertex"), coverage=covered)
@@ -241,7 +259,7 @@ def _prepare_model(session: Session, index: int, images: Path, options: DenseOpt
     return _Prepared(names=names, made_from=made_from, has_maps=has_maps)
 
 
-def _sweep(session: Session, index: int, prepared: _Prepared, progress: Callable[[], object]) -> None:
+def _sweep(session: Session, index: int, prepared: _Prepared, count: Callable[[int], None]) -> None:
     """Depth maps by our own sweep; those that a run made that was cut off are kept."""
     folder, stamps = session.workspace.dense / str(index), session.workspace.stamps
     record, raw = stamps / f"dense_{index}_depth_maps.json", stamps / f"sweep_{index}"
@@ -250,7 +268,8 @@ def _sweep(session: Session, index: int, prepared: _Prepared, progress: Callable
         swept = SweptWorkspace(folder, raw)
         swept.begin({"made_from": prepared.made_from, "images": fingerprint(folder / "images")})
         threads = session.context.num_threads
-        swept.sweep(0 if threads < 0 else threads, progress)
+        costs = iter([_WORK.matched] * len(swept.names) + [_WORK.confirmed] * len(swept.names))
+        swept.sweep(0 if threads < 0 else threads, lambda: count(next(costs)))
         write_json(partial[0], {"names": [n for n in prepared.names if map_file(folder, "depth", n).is_file()]})
         remove(raw)
 

@@ -15,7 +15,13 @@ from colmap_inertial.colmap.given_database import can_match, read_matched_pairs
 from colmap_inertial.colmap.gyro_orientations import GyroOrientations, estimate_gyro_orientations
 from colmap_inertial.colmap.loops import LoopSearch, name_pairs, split_pairs
 from colmap_inertial.colmap.relative_track import RelativeTrack, estimate_relative_track
-from colmap_inertial.colmap.sparse import MatchRecord, image_pairs, match_pairs, matches_every_pair
+from colmap_inertial.colmap.sparse import (
+    MatchRecord,
+    image_pairs,
+    match_pairs,
+    matches_every_pair,
+    matching_work,
+)
 from colmap_inertial.colmap.two_views import (
     Covisibility,
     FramePair,
@@ -137,14 +143,16 @@ def match_capture(
     names = recording.timing.names
     pairs = _Pairs.of(database, names, options)
     close = pairs.where(pairs.close)
-    match_pairs(database, name_pairs(names, close), context, total=pairs.count)
+    # how many of the others are worth matching is not known yet
+    done = match_pairs(database, name_pairs(names, close), context, total=0)
     matched = len(close)
 
     def match(more: Sequence[FramePair]) -> None:
-        nonlocal matched
+        nonlocal matched, done
         more = [pair for pair in more if pairs.may_match(pair)]
-        total = max(pairs.count, matched + len(more))
-        match_pairs(database, name_pairs(names, more), context, done=total - len(more), total=total)
+        named = name_pairs(names, more)
+        # where loops are looked for, more may come
+        done = match_pairs(database, named, context, done=done, total=done + matching_work(named) + 1)
         matched += len(more)
 
     counts: dict[str, int] = {}
@@ -168,6 +176,7 @@ def match_capture(
             search = LoopSearch(database, names, orientations, track, covisibility, pairs.near + 1)
             doubtful = pairs.where(pairs.far & (pairs.j - pairs.i <= _NEAR * pairs.near) & ~pairs.is_given)
             counts |= search.close_loops(match, doubtful=doubtful, neighbours=near_pairs, given=loops).counts()
+    context.progress("matches", done, done)
     record = MatchRecord(
         device=context.device,
         pairing="exhaustive" if pairs.every else "sequential",
