@@ -6,6 +6,9 @@ import pytest
 from cases import loop_over
 from test_cli import run
 
+from colmap_inertial.cli import _COMMANDS
+from colmap_inertial.cli.help import options_of
+
 TASKS = [
     ("see whether a recording is any good before mapping", "", "diagnose", ["before any"]),
     ("make a model in metres of a video with its IMU", "", "reconstruct", ["IMU", "in metres"]),
@@ -17,7 +20,8 @@ TASKS = [
     ("check the size by a printed board", "validate", "--target", ["look for"]),
     ("take the model into a splatting trainer", "export", "--for", ["program"]),
     ("make a device's next recordings better", "align", "--remember", ["by themselves"]),
-    ("raise how large a picture may be", "deblur", "--limits.megapixels", ["Pictures of more pixels"]),
+    ("repeat a run bit for bit", "reconstruct", "--deterministic", ["same model, bit for bit"]),
+    ("keep the depths of a multi-aperture camera", "fuse-apertures", "--depth", ["depths (metres)"]),
 ]
 
 
@@ -33,8 +37,6 @@ def test_the_help_solves_it(task, command, name, words, monkeypatch, capsys):
 
 
 def test_each_page_begins_with_what_it_does_and_an_example(capsys):
-    from colmap_inertial.cli import _COMMANDS
-
     for command in _COMMANDS:
         _, out, _ = run(capsys, command, "--help-all")
         paragraphs = out.split("\n\n")
@@ -43,11 +45,26 @@ def test_each_page_begins_with_what_it_does_and_an_example(capsys):
         assert out.index("Arguments:") < out.index("Of every command:")
 
 
-@pytest.mark.parametrize(
-    "command", ["reconstruct", "batch", "scale", "validate", "diagnose", "deblur", "export", "view"]
-)
+@pytest.mark.parametrize("command", ["", *_COMMANDS])
 def test_the_common_options_fit_one_screen(command, monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "80")
-    code, out, _ = run(capsys, command, "--help")
+    code, out, _ = run(capsys, *filter(None, [command]), "--help")
     assert code == 0 and len(out.splitlines()) <= 45
-    assert "--help-all" in out and "--limits" not in out
+    assert "--help-all" in out or not command
+    assert ("--limits.megapixels NUMBER [250]" in out) == (not command)
+
+
+@loop_over("command", list(_COMMANDS))
+def test_all_options_are_there_by_topic_but_for_special_cameras_and_limits(command, capsys):
+    _, out, _ = run(capsys, command, "--help-all")
+    known = {option.names[0] for option in options_of(_COMMANDS[command], with_text=False) if not option.positional}
+    shown = set(re.findall(r"^  (--[a-z][\w.-]*)", out, re.MULTILINE)) - {"--help-all"}
+    left_out = {name for name in known if name.startswith(("--limits.", "--apertures.", "--exposures."))}
+    assert shown == known - left_out and len(left_out) >= 3
+    assert ("[apertures] as of `fuse-apertures`, [exposures] as of" in " ".join(out.split())) == (len(left_out) > 3)
+    assert command != "reconstruct" or "\nLess common:" not in out
+
+
+def test_the_overview_is_the_same_for_all_that_ask_for_help(capsys):
+    pages = [run(capsys, word)[:2] for word in ("-h", "--help", "--help-all")]
+    assert pages[0][0] == 0 and pages[0] == pages[1] == pages[2]

@@ -24,7 +24,7 @@ from colmap_inertial.cli.models import Align, Apply, CalibrateImu, Diagnose, Exp
 from colmap_inertial.cli.process import INTERRUPTED, TERMINATED, Terminated, answering_signals, require_limits
 from colmap_inertial.cli.speech import Speaker, log_on_terminal, print_json
 from colmap_inertial.core.errors import InertialError, exhausted
-from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, ReferenceOptions
+from colmap_inertial.core.options import ProjectOptions, ReadLimits, ReconstructOptions, ReferenceOptions
 from colmap_inertial.core.printing import say
 
 DESCRIPTION = """Metric, gravity-aligned COLMAP models from the gyroscope and accelerometer recorded beside the images.
@@ -32,8 +32,8 @@ DESCRIPTION = """Metric, gravity-aligned COLMAP models from the gyroscope and ac
 Begin with `colmap-inertial diagnose CAPTURE`, which checks a recording within a minute; then `colmap-inertial
 reconstruct CAPTURE OUT`.
 
-Exit codes: 0 done (also where there was nothing to do), 1 a check failed, 2 bad input, 3 not observable (scale
-refused), 4 mapping failed, 5 target not found, 130 interrupted.
+Exit codes: 0 done, 1 a check failed, 2 bad input, 3 not observable (scale refused), 4 mapping failed, 5 target not
+found, 130 interrupted.
 
 --version prints the version; --tyro-print-completion bash (zsh, tcsh) a script that completes names and options."""
 
@@ -42,11 +42,15 @@ _CONFIG = (tyro.conf.PositionalMetavarFromFieldName, tyro.conf.DisallowNone)
 
 #: By what they begin with.
 _GROUPS: dict[str, dict[str, type[Speaker]]] = {
-    "From a recording to metres": {"diagnose": Diagnose, "reconstruct": Reconstruct, "batch": Batch},
+    "From a recording to metres": {
+        "diagnose": Diagnose,
+        "reconstruct": Reconstruct,
+        "batch": Batch,
+        "simulate": Simulate,
+    },
     "With a model that exists": {"scale": Scale, "apply": Apply, "validate": Validate, "view": View, "export": Export},
     "Calibrate a device": {"align": Align, "calibrate-imu": CalibrateImu},
     "Images only": {"deblur": Deblur, "fuse-apertures": FuseApertures, "fuse-exposures": FuseExposures},
-    "Practise": {"simulate": Simulate},
 }
 _COMMANDS: dict[str, type[Speaker]] = {name: cls for group in _GROUPS.values() for name, cls in group.items()}
 #: Options that most people use, by field; in the help they come first. Without an entry all do, in their order.
@@ -58,6 +62,7 @@ _COMMON: dict[str, tuple[str, ...]] = {
     "diagnose": ("imu", "frame_times", "json"),
     "validate": ("images", "target", "tolerance", "pictures"),
     "calibrate-imu": ("out", "latitude_deg", "height_m", "remember"),
+    "fuse-apertures": ("refocus", "lens_width", "depth", "disparity_px"),
     "apply": ("scale", "factor", "sim3", "undo", "world"),
     "export": ("program", "images", "model"),
 }
@@ -82,8 +87,8 @@ def parse(args: Sequence[str]) -> Speaker:
     InertialError
         For ``--calibration`` without a file, and for a command or an option that there is not, with the nearest one.
     """
-    if not args or args[0] in _HELP:
-        print_overview(DESCRIPTION, _GROUPS)
+    if not args or args[0] in (*_HELP, _HELP_ALL):
+        print_overview(DESCRIPTION, _GROUPS, ReadLimits)
         sys.exit(0 if args else 2)
     name = args[0].replace("_", "-")
     if name in _COMMANDS and any(word in (*_HELP, _HELP_ALL) for word in args[1:]):

@@ -118,7 +118,7 @@ class Reconstruct(DeviceCommand, ConfiguredCommand):
 
 @dataclass(frozen=True, kw_only=True)
 class Deblur(Reader):
-    """Undo the motion blur of images by the gyroscope, without reconstructing anything.
+    """Undo the motion blur of images by the gyroscope.
 
     Writes OUT/images with the frames' names, sizes, formats and metadata, and OUT/result.json with what happened to
     each of them and why. Frames that are sharp, or in which the gyroscope's blur does not show, are copied as they
@@ -178,7 +178,7 @@ class Fuser(Reader):
 
 @dataclass(frozen=True, kw_only=True)
 class FuseApertures(Fuser):
-    """Make RGB pictures of a multi-aperture camera's sub-images, without reconstructing anything.
+    """Make RGB pictures of a multi-aperture camera's sub-images.
 
     One disparity map from all apertures takes their parallax out. Writes OUT/images, seen through the first aperture,
     with the names of its pictures; with --refocus OUT/refocused; with --depth OUT/disparity and OUT/depth.
@@ -210,7 +210,7 @@ class FuseApertures(Fuser):
 
 @dataclass(frozen=True, kw_only=True)
 class FuseExposures(Fuser):
-    """Make one clean, sharp picture of each short and long exposure, without reconstructing anything.
+    """Make one clean, sharp picture of each short and long exposure.
 
     The long one is brought to the short one's geometry, by the gyroscope where there is one and by the pixels; a
     network makes one picture of the two (needs the extra `restore`). Writes OUT/images with the short ones' names,
@@ -286,7 +286,9 @@ class Batch(ConfiguredCommand):
 
 @dataclass(frozen=True, kw_only=True)
 class Simulate(Reader):
-    """Make a simulated capture with known truth: a desk or room, filmed by a hand, with the IMU recorded with it.
+    """Make a simulated capture with known truth: a desk or a room.
+
+    It is filmed by hand, with the IMU recorded with it.
 
     Example: colmap-inertial simulate example_scenes/rolling_shutter/recipe.toml my_scene
     """

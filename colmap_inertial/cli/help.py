@@ -27,7 +27,7 @@ _BY_NAME = {
     "keep": "PATTERN",
     "colmap": "SECTION.option=value",
 }
-_WIDEST, _NARROWEST, _COLUMN, _LONG = 100, 40, 28, 120
+_WIDEST, _NARROWEST, _COLUMN, _OVERVIEW_COLUMN, _LONG = 100, 40, 28, 18, 120
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,7 +170,11 @@ def print_help(
         The class with the options of all commands, which come last.
     """
     page = _Page()
-    sections = _sort_into_sections(options_of(cls), common, titles, everywhere)
+    options = options_of(cls)
+    groups = {option.group for option in options}
+    # the overview has the limits, which are the same for every command
+    shown = [option for option in options if option.group not in (*_SPECIAL, "limits")]
+    sections = _sort_into_sections(shown, common, titles, everywhere)
     arguments = "".join(f" {argument.names[0]}" for argument in sections[_ARGUMENTS])
     page.line(f"usage: colmap-inertial {name}{arguments} [OPTIONS]")
     paragraphs = inspect.cleandoc(cls.__doc__ or "").split("\n\n")
@@ -187,6 +191,9 @@ def print_help(
     pages = [("-h, --help", "The common options."), ("--help-all", "All options, by topic.")]
     for title, options in sections.items():
         page.group(title, options, more=pages if title == _EVERYWHERE else ())
+    special = [f"[{group}] as of `{command}`" for group, command in _SPECIAL.items() if everything and group in groups]
+    if special:
+        page.paragraph(f"Special cameras have options of their own, in the file of --config: {', '.join(special)}.")
 
 
 def _cut_to_sentence(text: str) -> str:
@@ -212,34 +219,38 @@ def _sort_into_sections(
             return _TITLES.get(option.group, option.group.capitalize())
         if option in first:
             return _OPTIONS
-        rest = _REST if first else _OPTIONS
+        rest = _TOPICS.get(option.field, _REST) if first else _OPTIONS
         return _EVERYWHERE if option.source is everywhere else titles.get(option.source, rest)
 
-    order = (_ARGUMENTS, _OPTIONS, _REST, *titles.values(), _EVERYWHERE)
-    sections: dict[str, list[Option]] = {title: [] for title in order}
-    others = sorted((option for option in options if option not in first), key=lambda option: option.group in _LAST)
-    for option in (*first, *others):
-        sections.setdefault(choose_title(option), []).append(option)
+    order = (_ARGUMENTS, _OPTIONS, _REST, *titles.values(), *dict.fromkeys(_TITLES.values()))
+    sections: dict[str, list[Option]] = {title: [] for title in (*order, *_TOPICS.values(), _EVERYWHERE)}
+    for option in (*first, *(option for option in options if option not in first)):
+        sections[choose_title(option)].append(option)
     return sections
 
 
-#: Titles of groups by what stands in front of their options; and those that fewest people need.
+#: Titles of groups by what stands in front of their options, in the order in which they are shown.
 _TITLES = {
     "frames": "Choice of frames",
-    "apertures": "Multi-aperture cameras",
-    "exposures": "Pairs of exposures",
     "mapping": "How COLMAP builds the model",
     "scale": "How metres come from the IMU",
-    "join-options": "How sure a join by the IMU must be",
+    "join-options": "Joining, refinement and place",
     "dense-options": "Dense reconstruction",
-    "limits": "How large files may be",
 }
-_LAST = ("apertures", "exposures", "limits")
+#: The same for options without a group, by field.
+_TOPICS = {
+    **dict.fromkeys(("colmap", "colmap_project", "database", "database_images"), _TITLES["mapping"]),
+    **dict.fromkeys(("join", "fragments", "refine", "georeference"), _TITLES["join-options"]),
+    **dict.fromkeys(("device", "remembered"), "Calibrations kept of a device"),
+    **dict.fromkeys(("deterministic", "seed"), "Runs that can be repeated"),
+}
+#: Groups of special cameras, and the commands that explain their options.
+_SPECIAL = {"apertures": "fuse-apertures", "exposures": "fuse-exposures"}
 
 
-def print_overview(about: str, groups: Mapping[str, Mapping[str, type[Any]]]) -> None:
-    """Print the page of all commands, by what they begin with."""
-    page = _Page()
+def print_overview(about: str, groups: Mapping[str, Mapping[str, type[Any]]], limits: type[Any]) -> None:
+    """Print the page of all commands, by what they begin with, and the limits of files that all of them have."""
+    page = _Page(column=_OVERVIEW_COLUMN)
     page.line("usage: colmap-inertial COMMAND ... (colmap-inertial COMMAND --help explains it)")
     for paragraph in inspect.cleandoc(about).split("\n\n"):
         page.paragraph(paragraph)
@@ -247,12 +258,15 @@ def print_overview(about: str, groups: Mapping[str, Mapping[str, type[Any]]]) ->
         page.heading(title)
         for name, cls in commands.items():
             page.entry(name, inspect.cleandoc(cls.__doc__ or "").partition("\n\n")[0])
+    stated = (f"{option.names[0]} {option.value} [{option.default}]" for option in options_of(limits, "limits."))
+    page.paragraph(f"How large files may be that any command reads: {', '.join(stated)}.")
 
 
 class _Page:
     """Lines that fit the terminal, headings bold where it can."""
 
-    def __init__(self) -> None:
+    def __init__(self, column: int = _COLUMN) -> None:
+        self._column = column
         self._width = max(_NARROWEST, min(shutil.get_terminal_size().columns, _WIDEST))
         self._bold = ("\033[1m", "\033[0m") if sys.stdout.isatty() else ("", "")
 
@@ -267,17 +281,17 @@ class _Page:
         print(f"\n{self._bold[0]}{text}:{self._bold[1]}")
 
     def entry(self, name: str, text: str) -> None:
-        indent = " " * _COLUMN
+        indent = " " * self._column
         lines = textwrap.wrap(
-            " ".join(text.split()), self._width - _COLUMN, break_on_hyphens=False, break_long_words=False
+            " ".join(text.split()), self._width - self._column, break_on_hyphens=False, break_long_words=False
         )
         label = f"  {name}"
         if len(label) >= self._width:  # choices, which are many
             print(textwrap.fill(label.replace(",", ", "), self._width, subsequent_indent=" " * 6))
-        elif len(label) >= _COLUMN:
+        elif len(label) >= self._column:
             print(label)
         else:
-            print(f"{label:<{_COLUMN}}{lines.pop(0) if lines else ''}".rstrip())
+            print(f"{label:<{self._column}}{lines.pop(0) if lines else ''}".rstrip())
         for text_line in lines:
             print(f"{indent}{text_line}")
 

@@ -58,7 +58,7 @@ class SourceReader(Reader):
 
 @dataclass(frozen=True, kw_only=True)
 class Scale(DeviceCommand, SourceReader):
-    """Metres per unit of an existing model or trajectory, without mapping.
+    """Metres per unit of an existing model or trajectory.
 
     SOURCE is a COLMAP model folder (needs --imu and --frame-times), a trajectory in TUM format (needs --imu), or an
     InertialScale folder. Exit code 3 when the recording does not determine the scale; the reasons say why.
@@ -252,9 +252,10 @@ class CalibrateImu(Reader):
 
 @dataclass(frozen=True, kw_only=True)
 class Diagnose(SourceReader):
-    """Find problems of a recording, with advice, before any reconstruction.
+    """Find problems of a recording, before any reconstruction.
 
-    Exit code 1 when something makes a scale wrong or impossible, 0 when nothing is worse than a warning.
+    Each finding says what to do. Exit code 1 when something makes a scale wrong or impossible, 0 when nothing is worse
+    than a warning.
 
     Example: colmap-inertial diagnose my_capture/capture.toml --json findings.json
     """
@@ -275,7 +276,7 @@ class Diagnose(SourceReader):
 
 @dataclass(frozen=True, kw_only=True)
 class Validate(Reader):
-    """Compare the size of a model with a target of known size in its images.
+    """Compare the size of a model with a known target in its images.
 
     TARGET is checkerboard:COLSxROWS:SQUARE_M (inner corners), charuco:COLSxROWS:SQUARE_M:MARKER_M:DICT (squares),
     aprilgrid:COLSxROWS:TAG_M:GAP (GAP = gap / tag), or aruco:DICT:SIDE_M; +- after the length says how well it is known
@@ -391,10 +392,11 @@ class Export(Reader):
 
 @dataclass(frozen=True, kw_only=True)
 class View(Reader):
-    """Show a reconstruction in the browser: points, cameras, gravity, a scale bar, the target; and measure in it.
+    """Show a reconstruction in the browser, and measure in it.
 
-    OUT is what reconstruct or apply wrote, or a COLMAP model folder. A model without a scale is shown in its own units,
-    without a grid in metres. Prints an address to open; Ctrl-C ends it. Needs the extra package [view].
+    Points, cameras, gravity, a scale bar and the target are shown. OUT is what reconstruct or apply wrote, or a COLMAP
+    model folder. A model without a scale is shown in its own units, without a grid in metres. Prints an address to
+    open; Ctrl-C ends it. Needs the extra package [view].
 
     Example: colmap-inertial view out
     """
