@@ -14,3 +14,10 @@ else
 fi
 echo "demo: step 3 of 3: compare with the scene's truth"
 .venv/bin/python scripts/compare_with_truth.py "$out" example_scenes/desk
+printf 'demo: done; the report is %q; look at the model, or measure the board in its images again:\n' "$out/report.html"
+program=$(printf %q "$PWD/.venv/bin/colmap-inertial")
+if .venv/bin/python -c "import viser" 2> /dev/null; then
+  printf '  %s view %q\n' "$program" "$out"
+else
+  printf '  %s validate %q --images %q --target checkerboard:8x6:0.04\n' "$program" "$out/sparse/0" "$out/images"
+fi

@@ -194,6 +194,9 @@ def test_deblur_keeps_names_sizes_metadata_and_says_what_it_did(blurred, deblurr
     assert np.median(crisper) > 1.2
     sheet = cv2.imread(str(deblurred.sheet))
     assert sheet is not None and sheet.shape[1] > 2 * LENS.width
+    # a line of words on white says first what the red lines are; each row begins with one, too
+    for line in (sheet[:22], sheet[22:44]):
+        assert np.median(line) == 255 and line.min() < 128
 
 
 def test_a_finished_folder_is_not_touched_again(blurred, deblurred):

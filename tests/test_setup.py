@@ -1,12 +1,15 @@
 """What sets the checks up: skips that count as failures, and the extras that a set-up remembers."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from colmap_inertial.cli import parse
 
 ROOT = Path(__file__).parents[1]
 TESTS = """
@@ -170,3 +173,11 @@ def test_the_browser_comes_along_and_only_tests_of_it_need_it(checkout, tmp_path
     asked.unlink()
     subprocess.run(command, cwd=checkout, env=env, check=True, capture_output=True)
     assert not asked.exists()
+
+
+def test_the_demo_ends_with_commands_that_there_are():
+    text = (ROOT / "scripts" / "demo.sh").read_text()
+    templates = re.findall(r"printf '  %s (.*?)\\n'", text)
+    assert len(templates) == 2
+    for template in templates:
+        parse(template.replace("%q", "out").split())

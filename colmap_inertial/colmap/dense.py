@@ -62,8 +62,8 @@ class DenseWork:
     undistorted: int = 1
     #: 0.17 to 0.19 of the depths' time.
     fused: int = 7
-    #: COLMAP's Poisson surface of one core: 1.3 to 2.6 times the depths' time; the others were not measured.
-    meshed: int = 70
+    #: COLMAP's Poisson surface: 1.3 to 4.6 times the depths' time (the latter on a busy machine); others: not measured.
+    meshed: int = 100
     meshed_otherwise: int = 7
 
 

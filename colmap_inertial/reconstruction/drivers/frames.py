@@ -54,6 +54,7 @@ class ContactSheet:
 
 
 _LIMITS = ContactSheet()
+_LEGEND = "red lines: the path of a point while the frame is exposed, by the gyroscope"
 
 #: Top, left, height and width.
 Part = tuple[int, int, int, int]
@@ -93,16 +94,24 @@ def write_contact_sheet(path: Path, capture: Capture, plan: ImagingPlan, images:
         _draw(cut[0], field, top, left)
         length = float(np.percentile(field.extent_px(), 90))
         gap = np.full((height, _LIMITS.gap, 3), 255, np.uint8)
-        label = np.full((_LIMITS.label, 2 * width + _LIMITS.gap, 3), 255, np.uint8)
-        text = f"{frame.name}   {length:.1f} px   before | {plan.method}"
-        cv2.putText(label, text, (4, _LIMITS.label - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
+        label = _write_label(f"{frame.name}   {length:.1f} px   before | {plan.method}", 2 * width + _LIMITS.gap)
         rows[frame.name] = np.concatenate([label, np.concatenate([cut[0], gap, cut[1]], axis=1)])
-    sheet = np.concatenate([rows[name] for name in names[: _LIMITS.frames]])
+    shown = [rows[name] for name in names[: _LIMITS.frames]]
+    sheet = np.concatenate([_write_label(_LEGEND, shown[0].shape[1]), *shown])
     data = cv2.imencode(".png", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))[1]
     try:
         path.write_bytes(data.tobytes())
     except OSError as error:
         raise OutputError(f"{path} cannot be written: {error.strerror or error}") from error
+
+
+def _write_label(text: str, width: int) -> UInt8Array:
+    """Black words on a white line."""
+    import cv2
+
+    label = np.full((_LIMITS.label, width, 3), 255, np.uint8)
+    cv2.putText(label, text, (4, _LIMITS.label - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
+    return label
 
 
 @dataclass(eq=False)
