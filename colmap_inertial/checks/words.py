@@ -40,7 +40,7 @@ def digits(value: float, count: int = 4) -> str:
 
 
 def fixed(value: float, count: int = 4) -> str:
-    """The same with its zeros at the end, so that both ends of an interval are equally long."""
+    """A number with so many significant digits, trailing zeros included: both ends of an interval are equally long."""
     text = f"{value:#.{count}g}".rstrip(".")
     return f"{value:.0f}" if "e+" in text and abs(value) < 1e9 else text
 
@@ -102,7 +102,7 @@ def model_facts(model: Mapping[str, Any], available: str = "") -> Iterator[Fact]
 
 
 def place_against_tolerance(error_pct: float, tolerance_pct: float, proved: bool) -> str:
-    """Where a scale error lies: outside a tolerance, within, or within without a proof."""
+    """Position of a scale error against a tolerance: outside, within, or not proved to be within."""
     return "outside" if abs(error_pct) > tolerance_pct else "within" if proved else "not proved to be within"
 
 
@@ -216,7 +216,7 @@ def _describe_overlap(overlap: Mapping[str, Any]) -> str:
 
 
 def outcome_of_model(model: dict[str, Any]) -> dict[str, Any]:
-    """What a reader wants to know first of one model of ``result.json``.
+    """First screen of the report for one model of ``result.json``.
 
     Parameters
     ----------
@@ -298,7 +298,7 @@ def _describe_place(place: Mapping[str, Any] | None) -> str:
 
 
 def _next_steps(model: dict[str, Any], pct: float) -> list[str]:
-    """What to do with a model that has a scale; commands are for its folder."""
+    """Next steps for a model with a scale; commands are for its folder."""
     checked = model.get("validation")
     steps = []
     if model["verdict"] != "trusted":
@@ -315,7 +315,7 @@ def _next_steps(model: dict[str, Any], pct: float) -> list[str]:
 
 
 def _describe_attempt(model: dict[str, Any]) -> list[str]:
-    """What was tried of a scale that was refused, and what came of it."""
+    """Attempts at a scale that was refused, with their outcome."""
     signals = model.get("signals", {})
     rotation, acceleration = signals.get("rotation") or {}, signals.get("acceleration") or {}
     tried = [f"COLMAP placed {model['registered_images']} images and {model['points']} points."]

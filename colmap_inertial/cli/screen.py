@@ -53,10 +53,10 @@ def clock(seconds: float) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class StageCost:
-    """How the time of a stage goes with its steps: with this power of the share that is done.
+    """Time of a stage against its steps: it grows with this power of the share of steps done.
 
     Measured on the example scenes (``scripts/study_progress.py``), where the times left are within a factor of two
-    after a tenth of each stage. Steps of ``work`` are no things that one could count.
+    after a tenth of each stage on an idle machine. Steps of ``work`` are units of work, shown as a percentage.
     """
 
     power: float = 1.0
@@ -90,7 +90,7 @@ class Stage:
 
     @property
     def counts_work(self) -> bool:
-        """Whether its steps are work, and nothing that one could count."""
+        """Tell whether its steps are units of work instead of things to count."""
         return self._cost.work
 
     def seconds(self, now_s: float) -> float:

@@ -82,7 +82,7 @@ class MissingExtraError(InertialError):
 
 
 def _list_packages(extra: str) -> list[str]:
-    """What an extra consists of, by this package's own metadata: its name need not be that of an index's package."""
+    """Requirements of an extra, by this package's own metadata: the package itself need not be on an index."""
     from importlib.metadata import requires
 
     stated = (line.partition(";") for line in requires("colmap-inertial") or ())

@@ -16,14 +16,15 @@ from colmap_inertial.core.arrays import Array
 
 @dataclass(frozen=True, kw_only=True)
 class StillView:
-    """From where a model is seen, and how large its picture is.
+    """Viewpoint and size of the picture of a model.
 
     Attributes
     ----------
     azimuth_deg, elevation_deg
-        Of the eye, seen from the middle of the model; 90 degrees of elevation look straight down.
+        Direction of the eye from the middle of the model; 90 degrees of elevation look straight down.
     distance
-        Of the eye, in half diagonals of the model; none for parallel rays, with which lengths can be compared.
+        Distance of the eye in half diagonals of the model; ``None`` for a parallel projection, in which lengths can be
+        compared.
     """
 
     azimuth_deg: float = -53.0
@@ -103,7 +104,7 @@ def _runs(at: Array) -> Iterator[list[tuple[float, float]]]:
 
 
 class _Projection:
-    """From the model to the picture, so that all of it fits."""
+    """Projection of the model into the picture, so that all of it fits."""
 
     def __init__(self, view: StillView, traces: Sequence[Figure]) -> None:
         a, e = np.radians([view.azimuth_deg, view.elevation_deg])

@@ -25,7 +25,7 @@ class Axis:
     names: tuple[str, ...] = ()
 
     def place(self, value: Any) -> float | None:
-        """Where a value lies (px); ``None`` for gaps and for what a logarithmic axis cannot show."""
+        """Position of a value (px); ``None`` for gaps and for what a logarithmic axis cannot show."""
         if self.names:
             value = self.names.index(value)
         elif value is None or (self.log and value <= 0):
@@ -85,7 +85,7 @@ def _reach(columns: Iterable[Values], log: bool, pad: float, *, tozero: bool) ->
 
 
 def equalise(x: Axis, y: Axis) -> tuple[Axis, Axis]:
-    """Both with the same pixels a unit: the wider one is shortened about its middle."""
+    """Give both axes the same pixels per unit: the wider one is shortened about its middle."""
     scale = min(x.px_per_unit, y.px_per_unit)
 
     def shortened(axis: Axis) -> Axis:
