@@ -171,7 +171,6 @@ def print_help(
     """
     page = _Page()
     options = options_of(cls)
-    groups = {option.group for option in options}
     # the overview has the limits, which are the same for every command
     shown = [option for option in options if option.group not in (*_SPECIAL, "limits")]
     sections = _sort_into_sections(shown, common, titles, everywhere)
@@ -181,24 +180,20 @@ def print_help(
     rest = [title for title in sections if sections[title] and title not in (_ARGUMENTS, _OPTIONS, _EVERYWHERE)]
     if not everything and rest:
         paragraphs = [paragraphs[0], paragraphs[-1]] if sections[_OPTIONS] else paragraphs
-        sections = {
-            title: [dataclasses.replace(option, text=_cut_to_sentence(option.text)) for option in found]
-            for title, found in sections.items()
-            if title not in rest
-        }
+        sections = {title: _shorten(found) for title, found in sections.items() if title not in rest}
     for paragraph in paragraphs:
         page.paragraph(paragraph)
     pages = [("-h, --help", "The common options."), ("--help-all", "All options, by topic.")]
     for title, options in sections.items():
         page.group(title, options, more=pages if title == _EVERYWHERE else ())
-    special = [f"[{group}] as of `{command}`" for group, command in _SPECIAL.items() if everything and group in groups]
-    if special:
-        page.paragraph(f"Special cameras have options of their own, in the file of --config: {', '.join(special)}.")
+    if everything and not {option.group for option in options}.isdisjoint(_SPECIAL):
+        page.paragraph(_SPECIAL_CAMERAS)
 
 
-def _cut_to_sentence(text: str) -> str:
-    """The first sentence of a long text."""
-    return text if len(text) <= _LONG else text.partition(". ")[0].rstrip(".") + "."
+def _shorten(options: Iterable[Option]) -> list[Option]:
+    """The options with the first sentences of long texts."""
+    texts = ((option, option.text.partition(". ")[0].rstrip(".") + ".") for option in options)
+    return [option if len(option.text) <= _LONG else dataclasses.replace(option, text=first) for option, first in texts]
 
 
 _ARGUMENTS, _OPTIONS, _REST, _EVERYWHERE = "Arguments", "Options", "Less common", "Of every command"
@@ -244,8 +239,12 @@ _TOPICS = {
     **dict.fromkeys(("device", "remembered"), "Calibrations kept of a device"),
     **dict.fromkeys(("deterministic", "seed"), "Runs that can be repeated"),
 }
-#: Groups of special cameras, and the commands that explain their options.
-_SPECIAL = {"apertures": "fuse-apertures", "exposures": "fuse-exposures"}
+#: Groups of special cameras, whose options have commands that explain them.
+_SPECIAL = ("apertures", "exposures")
+_SPECIAL_CAMERAS = (
+    "Special cameras have options of their own, in the file of --config: [apertures] as of `fuse-apertures`, [exposures] "
+    "as of `fuse-exposures`."
+)
 
 
 def print_overview(about: str, groups: Mapping[str, Mapping[str, type[Any]]], limits: type[Any]) -> None:

@@ -37,6 +37,7 @@ _STAGES = {
     "validation": "Validation",
     "apply": "Files",
     "dense": "Dense",
+    "mesh": "Mesh",
     "export": "Pictures",
 }
 SEVERITY_COLOUR = {"info": "blue", "warning": "yellow", "error": "red"}

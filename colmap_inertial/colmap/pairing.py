@@ -150,8 +150,7 @@ def match_capture(
     def match(more: Sequence[FramePair]) -> None:
         nonlocal matched, done
         more = [pair for pair in more if pairs.may_match(pair)]
-        named = name_pairs(names, more)
-        # where loops are looked for, more may come
+        named = name_pairs(names, more)  # more may come where loops are looked for
         done = match_pairs(database, named, context, done=done, total=done + matching_work(named) + 1)
         matched += len(more)
 

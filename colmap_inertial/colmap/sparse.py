@@ -371,7 +371,7 @@ def match_pairs(
 
 
 def matching_work(pairs: Sequence[tuple[str, str]]) -> int:
-    """Cost of matching pairs after others, in pairs: indexing the features of an image for a batch costs as much as one.
+    """Cost of matching pairs after others, in pairs: to index an image's features for a batch costs as much as one.
 
     With that, batches of 28 to 1600 pairs of the example scene and of EuRoC take the same time a unit within a third
     (``scripts/study_progress.py``).

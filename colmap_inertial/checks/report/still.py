@@ -99,7 +99,7 @@ def _right_margin(axes: Iterable[Figure], data: Sequence[Figure]) -> int:
 
 
 def _column(trace: Figure, name: str) -> list[Any]:
-    """Values that an axis has to reach: those of a trace with their intervals, whole cells of a table, bars from zero."""
+    """Values that an axis has to reach: with their intervals, whole cells of a table, bars from zero."""
     if trace["type"] == "heatmap":
         count = len(trace["z"]) if name == "y" else len(trace["z"][0])
         if name in trace:
