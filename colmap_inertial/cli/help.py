@@ -184,8 +184,8 @@ def print_help(
     for paragraph in paragraphs:
         page.paragraph(paragraph)
     pages = [("-h, --help", "The common options."), ("--help-all", "All options, by topic.")]
-    for title, options in sections.items():
-        page.group(title, options, more=pages if title == _EVERYWHERE else ())
+    for title, found in sections.items():
+        page.group(title, found, more=pages if title == _EVERYWHERE else ())
     if everything and not {option.group for option in options}.isdisjoint(_SPECIAL):
         page.paragraph(_SPECIAL_CAMERAS)
 
@@ -242,8 +242,8 @@ _TOPICS = {
 #: Groups of special cameras, whose options have commands that explain them.
 _SPECIAL = ("apertures", "exposures")
 _SPECIAL_CAMERAS = (
-    "Special cameras have options of their own, in the file of --config: [apertures] as of `fuse-apertures`, [exposures] "
-    "as of `fuse-exposures`."
+    "Special cameras have options of their own, in the file of --config: [apertures] as of `fuse-apertures`, "
+    "[exposures] as of `fuse-exposures`."
 )
 
 
