@@ -32,6 +32,9 @@ the correct matches the gate leaves, with each of the package's methods.
 
 ``cost``: processor time of a grey 1080p frame at 10, 20 and 40 px, as a ratio to the straight filter's in the same run.
 
+``colour``: colour frames as luma in full and chroma at half the size, against each channel by itself: PSNR gained, and
+processor time and time of a 1080p frame with one and two threads.
+
 ``--colmap``: whole reconstructions of simulated scenes at 10 and 20 px by ``--deblur`` methods, each with the default
 smoothing of what features see, and with the ``--widths``.
 """
@@ -51,6 +54,7 @@ import numpy as np
 import path_reconstructions
 import path_scenes
 from bench_imaging import about
+from path_colour import colour
 from path_false import false_gyroscopes, mostly_sky, recording, short_blur
 from path_methods import METHODS, cost, gate
 from path_tables import print_report
@@ -59,7 +63,7 @@ from rich.progress import track
 
 from colmap_inertial.core.options import BlurRemover
 
-SECTIONS = ("quality", "gate", "sky", "false", "short", "cost")
+SECTIONS = ("quality", "gate", "sky", "false", "short", "cost", "colour")
 #: Lower ends of the bins of blur, px.
 BINS_PX = (3.0, 8.0, 15.0, 25.0)
 console = Console(stderr=True)
@@ -134,6 +138,7 @@ def main() -> None:
             "false": lambda: false_gyroscopes(make, removers, console=console),
             "short": lambda: short_blur(make, removers, console=console),
             "cost": lambda: cost(takes[0], args.methods),
+            "colour": lambda: colour(args.photos, args.motion, tuple(args.size), args.seed, console=console),
         }
         report["pairs_beyond"] = {f"{1e3 * t.exposure_s:g} ms": t.beyond for t in takes}
         for name in args.only:

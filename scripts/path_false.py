@@ -16,7 +16,7 @@ import cv2
 import imaging_metrics as metrics
 import numpy as np
 from imaging_scenes import photographed_walls
-from path_methods import LEAST_PX, METHODS, MOSTLY_KEPT, with_blur
+from path_methods import LEAST_PX, METHODS, MOSTLY_KEPT, Made, with_blur
 from path_scenes import FOCAL, HELD_OUT, INTERVAL_S, READOUT_S, Known, Pair, blur_px
 from restoration.photographs import photographs
 from rich.console import Console
@@ -24,11 +24,14 @@ from rich.progress import track
 from turning_world import Moment, Turning, TurningCamera
 
 from colmap_inertial.core.arrays import Float32Array, UInt8Array
+from colmap_inertial.core.types import Frame, FrameTiming
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.evidence import blur_evidence, measure_blur_shares
 from colmap_inertial.imaging.gate import GateOptions, RecordingVerdict, judge_frame, keep_sharp
 from colmap_inertial.imaging.path_filters import smoothed
 from colmap_inertial.imaging.psf import blur_field, blur_path
+from colmap_inertial.motion.flow import measure_rotation
+from colmap_inertial.motion.sign import SignCheck, compare_signs
 from colmap_inertial.pipeline.stages import deblur
 from colmap_inertial.pipeline.stages.deblur import smoothing_for
 from colmap_inertial.reconstruction.preparation.judge import Looked, judged
@@ -124,7 +127,10 @@ def known_by(pair: Pair, index: int, wrong: Callable[[Turning], Turning] | None 
 
 
 def judgement(frames: Sequence[UInt8Array], known: Sequence[Known]) -> RecordingVerdict:
-    """What the pipeline says of a recording."""
+    """What the pipeline says of a recording of pairs of neighbours: of its gyroscope's sign, and of its blur."""
+    sign = _sign(frames, known)
+    if sign.right is False:
+        return RecordingVerdict(trusted=False, support=0.0, extent_factor=1.0, frames=len(frames), reason=sign.reason)
     looked = []
     for frame, one in zip(frames, known, strict=True):
         path = blur_path(*one)
@@ -133,13 +139,28 @@ def judgement(frames: Sequence[UInt8Array], known: Sequence[Known]) -> Recording
     return judged(looked)
 
 
+def _sign(frames: Sequence[UInt8Array], known: Sequence[Known]) -> SignCheck:
+    found = []
+    for first, second, (motion, camera, one), (_, _, other) in zip(
+        frames[::2], frames[1::2], known[::2], known[1::2], strict=True
+    ):
+        timing = FrameTiming(names=("0", "1"), t_s=np.array([one.t_s, other.t_s]), readout_s=one.readout_s)
+        pair = (Frame(name=str(i), image=image, t_s=0.0) for i, image in enumerate((first, second)))
+        rotation = measure_rotation(pair, camera, timing)
+        times_s = np.array([shutter.reference_s() for shutter in (one, other)])
+        found.append((rotation.turn_rad[0], motion.turn_rad(times_s)[0], rotation.sigma_rad[0]))
+    visual, inertial, sigma = (np.array(values) for values in zip(*found, strict=True))
+    seen = np.isfinite(visual).all(axis=1)
+    return compare_signs(visual[seen], inertial[seen], sigma[seen])
+
+
 def options_for(verdict: RecordingVerdict, method: str) -> GateOptions:
     """The pipeline's: where a recording is not trusted in all, each frame must be clear by itself."""
     return GateOptions() if verdict.trusted else GateOptions(min_support=deblur._CLEAR_SUPPORT[method])
 
 
-def gated(image: UInt8Array, known: Known, verdict: RecordingVerdict, method: str) -> UInt8Array | None:
-    """What features see of a frame that goes through the gate, as ``DeblurStage`` has it; ``None`` as it was."""
+def gated(image: UInt8Array, known: Known, verdict: RecordingVerdict, method: str) -> Made | None:
+    """What becomes of a frame that goes through the gate, as ``DeblurStage`` has it; ``None`` as it was."""
     factor, _ = judge_frame(image, blur_field(*known), verdict, options_for(verdict, method), blur_path(*known))
     if factor is None:
         return None
@@ -150,7 +171,8 @@ def gated(image: UInt8Array, known: Known, verdict: RecordingVerdict, method: st
     if _length_px(field) < LEAST_PX * image.shape[1] / 1920:
         return None
     out, kept = keep_sharp(image, METHODS[method](image, motion, camera, shutter).for_people, field)
-    return smoothed(out, smoothing_for(_length_px(field))) if kept < MOSTLY_KEPT else out
+    seen = smoothed(out, smoothing_for(_length_px(field))) if kept < MOSTLY_KEPT else out
+    return Made(for_features=seen, for_people=out)
 
 
 def _length_px(field: BlurField) -> float:
@@ -208,10 +230,13 @@ def false_gyroscopes(
             verdict = judgement([image for two in frames[shot] for image in two], [one for two in known for one in two])
             for method in methods:
                 after = treated = 0
+                gained_db = []
                 for pair, images, two, alone in zip(pairs, frames[shot], known, before[shot], strict=True):
                     made = [gated(image, one, verdict, method) for image, one in zip(images, two, strict=True)]
                     treated += sum(one is not None for one in made)
-                    seen = [image if one is None else one for image, one in zip(images, made, strict=True)]
+                    seen = [image if one is None else one.for_features for image, one in zip(images, made, strict=True)]
+                    if shot != "sharp":
+                        gained_db += _gained_db(pair, images, made)
                     changed = any(one is not None for one in made)
                     after += pair.correct_matches(*map(_features, seen))[0] if changed else alone
                 rows.append(
@@ -221,11 +246,22 @@ def false_gyroscopes(
                         "method": method,
                         "trusted": verdict.trusted,
                         "kept": after / max(sum(before[shot]), 1),
+                        "gained_db": float(np.mean(gained_db)) if gained_db else 0.0,
+                        "worst_db": min(gained_db, default=0.0),
                         "treated": treated,
                         "frames": 2 * len(pairs),
                     }
                 )
     return rows
+
+
+def _gained_db(pair: Pair, images: Sequence[UInt8Array], made: Sequence[Made | None]) -> list[float]:
+    """PSNR that the treated ones gain."""
+    return [
+        metrics.psnr_db(one.for_people, pair.sharp(i)) - metrics.psnr_db(image, pair.sharp(i))
+        for i, (image, one) in enumerate(zip(images, made, strict=True))
+        if one is not None
+    ]
 
 
 def _features(image: UInt8Array) -> metrics.Features:

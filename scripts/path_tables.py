@@ -20,6 +20,8 @@ WANTED: dict[str, dict[str, dict[str, float]]] = {
     },
 }
 TREATED, KEPT = 0.9, 0.98
+#: Least change of the PSNR of a treated frame, dB.
+LEAST_DB = -0.1
 #: Of the straight filter's time.
 TIMES = {"wiener": {"10": 6.0, "20": 6.0, "40": 6.0}, "path": {"10": 14.0, "20": 14.0, "40": 24.0}}
 
@@ -36,6 +38,7 @@ def print_report(report: dict[str, Any], console: Console) -> None:
         "false": _false,
         "short": _short,
         "cost": _cost,
+        "colour": _colour,
         "colmap": _colmap,
     }
     for name, section in sections.items():
@@ -139,6 +142,8 @@ def _false(rows: list[dict[str, Any]], console: Console) -> None:
         "trusted": lambda row: str(row["trusted"]),
         "kept": lambda row: _verdict(row["kept"], KEPT, f"{row['kept']:.3f}"),
         "treated": _treated_share,
+        "PSNR gained dB": lambda row: f"{row['gained_db']:+.2f}",
+        "worst": lambda row: _verdict(row["worst_db"], LEAST_DB, f"{row['worst_db']:+.2f}"),
     }
     _print_rows("Wrong gyroscopes: correct matches against doing nothing", rows, columns, console)
 
@@ -164,6 +169,18 @@ def _cost(found: dict[str, Any], console: Console) -> None:
             cells.append(_verdict(times, TIMES.get(name, {}).get(blur), text, least=False))
         table.add_row(f"{blur} (departs by {row['departure_px']:.1f})", *cells)
     console.print(table)
+
+
+def _colour(found: dict[str, Any], console: Console) -> None:
+    columns = list(next(iter(found.values())))
+    table = table_of("Colour: PSNR gained, dB; ms of a 1080p frame by threads, least of several", "way", *columns)
+    for way, row in found.items():
+        table.add_row(way, *(f"{row[c]:+.2f}" if c.endswith("px") else f"{row[c]:.1f}" for c in columns))
+    console.print(table)
+    for name in dict.fromkeys(way.split(",")[0] for way in found):
+        old, new = (found[f"{name}, {way}"] for way in ("each channel", "luma and chroma"))
+        share, faster = new["cpu_ms_1"] / old["cpu_ms_1"], new["wall_ms_1"] / new["wall_ms_2"]
+        console.print(f"{name}: {share:.2f} of the processor time; two threads are {faster:.2f} times as fast")
 
 
 def _colmap(found: dict[str, Any], console: Console) -> None:

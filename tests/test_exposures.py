@@ -14,12 +14,13 @@ from colmap_inertial.imaging.exposure_pairs import (
     blur_seen_from_short,
     brightened,
     bring_together,
+    darken_fused,
     fuse_mertens,
     gyro_shift,
     match_brightness,
 )
 from colmap_inertial.imaging.psf import blur_field
-from colmap_inertial.imaging.transfer import linear_from_srgb
+from colmap_inertial.imaging.transfer import linear_from_srgb, srgb_from_linear
 from colmap_inertial.model import colmap_camera
 
 
@@ -269,3 +270,23 @@ def test_exposure_fusion_is_opencv_s_and_brings_lamps_back():
         fuse_mertens([found])
     with pytest.raises(ValueError, match="one shape"):
         fuse_mertens([found, found[:50]])
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_exposure_fusion_takes_lamps_of_the_short_exposure_and_none_of_its_noise(channels):
+    gain, shape = 8.0, (120, 160, channels)
+    truth = np.broadcast_to(np.linspace(0.1, 0.6, 160)[:, None], shape).copy()
+    truth[40:70, 60:90] = 3.0  # a lamp, with something written on it
+    truth[52:58, 70:80] = 1.5
+    noise = 0.01 * np.random.default_rng(5).standard_normal(shape)
+    long = srgb_from_linear(truth).astype(np.float32).squeeze()
+    dark = srgb_from_linear(truth / gain + noise).astype(np.float32).squeeze()
+    clipped = truth[..., 0] > 1
+    found = darken_fused(long, dark, clipped, gain)
+    np.testing.assert_allclose(found[clipped], dark[clipped], atol=0.002)
+    wall = (slice(90, 120), slice(None))
+    np.testing.assert_allclose(found[wall], srgb_from_linear(truth / gain).squeeze()[wall], atol=1e-5)
+    blended = fuse_mertens([found, long])
+    assert (blended >= 0.98).mean() < 0.5 * (long >= 0.98).mean()
+    of_noisy, of_clean = (np.diff(fuse_mertens([one, long])[wall], axis=0).std() for one in (dark, found))
+    assert of_clean < 0.05 * of_noisy

@@ -199,6 +199,15 @@ def test_deblur_keeps_names_sizes_metadata_and_says_what_it_did(blurred, deblurr
         assert np.median(line) == 255 and line.min() < 128
 
 
+def test_images_for_matching_are_those_that_colmap_sees(tmp_path, blurred, deblurred, stopped):
+    made = deblur_capture(blurred, tmp_path / "out", purpose="matching", progress=silent)
+    assert contents(made.workspace.images) == contents(stopped / "colmap" / "images")
+    treated = [record.name for record in made.frames if record.action == "deblurred"]
+    assert len(treated) >= 8
+    for name in treated:
+        assert (made.workspace.images / name).read_bytes() != (deblurred.workspace.images / name).read_bytes()
+
+
 def test_a_finished_folder_is_not_touched_again(blurred, deblurred):
     before = contents(deblurred.workspace.root)
     assert deblur_capture(blurred, deblurred.workspace.root, progress=silent).unchanged

@@ -10,6 +10,8 @@ from colmap_inertial.core.choices import CheckedOptions
 
 #: How blur is undone.
 BlurRemover = Literal["wiener", "path", "deepgyro"]
+#: Who the deblurred images are for: people, or feature extraction, for which they are smoothed.
+DeblurPurpose = Literal["viewing", "matching"]
 DeblurMethod = Literal["off", "wiener", "path", "deepgyro"]
 RollingShutterMethod = Literal["off", "rectify"]
 RefineMethod = Literal["off", "auto", "inertial"]

@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar, copy_context
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
@@ -15,8 +16,18 @@ if TYPE_CHECKING:
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-#: Frames in work at once: enough for a desk computer's cores, few enough for its memory.
-_MOST_FRAMES = 4
+
+@dataclass(frozen=True, kw_only=True)
+class FrameLimits:
+    """Number of frames in work at once."""
+
+    #: Enough for a desk computer's cores, few enough for its memory;
+    most: int = 4
+    #: of small ones, more: so many million pixels in all. A filter takes some 60 bytes for each pixel in colour.
+    megapixels: float = 32.0
+
+
+FRAME_LIMITS = FrameLimits()
 
 
 def usable_processors() -> int:
@@ -62,9 +73,12 @@ def threads_beside(workers: int) -> int:
     return max(1, usable_processors() - workers + 1)
 
 
-def frames_at_once() -> int:
-    """Number of frames to work on at once: one for each processor, but few."""
-    return min(_MOST_FRAMES, usable_processors())
+def frames_at_once(megapixels: float | None = None) -> int:
+    """Number of frames, of this size where it is known, to work on at once: one for each processor, but few."""
+    most = (
+        FRAME_LIMITS.most if megapixels is None else max(FRAME_LIMITS.most, int(FRAME_LIMITS.megapixels / megapixels))
+    )
+    return min(most, usable_processors())
 
 
 def map_in_order(work: Callable[[Item], Result], items: Iterable[Item], *, workers: int) -> Iterator[Result]:

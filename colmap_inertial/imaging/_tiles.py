@@ -26,6 +26,12 @@ class TilingLimits:
     short_ramp: float = 48 / 256
     #: up to so many px of blur, tiles of the shortest side are laid out for short blur; above, for long blur.
     short_blur_px: float = 25.0
+    #: Tiles of chroma, whose detail is coarse, are further apart where blur is below this, px of the half size:
+    coarse_blur_px: float = 12.5
+    #: with this part of the margin,
+    coarse_margin: float = 24 / 256
+    #: and of the ramp.
+    coarse_ramp: float = 32 / 256
     #: A side is at least so many times as long as the blur.
     blurs_per_side: float = 5.0
     #: Shortest side of a tile,
@@ -67,13 +73,17 @@ class Tiling:
     ramp: int
 
     @classmethod
-    def covering(cls, width: int, height: int, extent_px: float) -> Tiling:
-        """Tiles of an image with blur of at most this length."""
+    def covering(cls, width: int, height: int, extent_px: float, *, coarse: bool = False) -> Tiling:
+        """Tiles of an image with blur of at most this length; ``coarse`` for chroma."""
         side = TILING.shortest_side_px
         while side < TILING.blurs_per_side * extent_px and side < TILING.longest_side_px:
             side *= 2
-        short = extent_px <= TILING.short_blur_px
-        margin, ramp = (TILING.short_margin, TILING.short_ramp) if short else (TILING.margin, TILING.ramp)
+        if coarse and extent_px <= TILING.coarse_blur_px:
+            margin, ramp = TILING.coarse_margin, TILING.coarse_ramp
+        elif extent_px <= TILING.short_blur_px:
+            margin, ramp = TILING.short_margin, TILING.short_ramp
+        else:
+            margin, ramp = TILING.margin, TILING.ramp
         return cls(width=width, height=height, side=side, margin=int(margin * side), ramp=int(ramp * side))
 
     @property

@@ -66,6 +66,19 @@ class BlurPath:
         """So many times as long."""
         return replace(self, path_px=self.path_px * np.float32(factor), cov_px2=self.cov_px2 * np.float32(factor**2))
 
+    def halved(self) -> BlurPath:
+        """The path of the image at half its size, each pixel of which is two by two; odd sizes are rounded up."""
+        width, height = -(-self.width // 2), -(-self.height // 2)
+        rows, columns = BlurField.nodes(width, height, self.step_px)
+        at = [2 * self.step_px * np.arange(n) + 0.5 for n in (rows, columns)]
+        return BlurPath(
+            width=width,
+            height=height,
+            step_px=self.step_px,
+            path_px=(np.moveaxis(self.at(*at), 2, 0) / 2).astype(np.float32),
+            cov_px2=(self.cov_at(*at) / 4).astype(np.float32),
+        )
+
     def cov_at(self, rows_px: AnyArray, columns_px: AnyArray) -> Array:
         """(R, C, 3) covariance of the chord at the crossings of rows and columns of pixels."""
         nodes = self.cov_px2.astype(np.float64)

@@ -224,20 +224,28 @@ def measure_blur_share(image: UInt8Array | UInt16Array, blur: BlurField | BlurPa
     About 0 also where an image is blurred otherwise: textures decide then, and tiles are many. ``None`` where there is
     too little to tell.
     """
-    return measure_blur_shares(image, blur)[0]
+    found = _find_share_inputs(image, blur)
+    return None if found is None else _fit_share(*found)
 
 
 def measure_blur_shares(
     image: UInt8Array | UInt16Array, blur: BlurField | BlurPath
 ) -> tuple[float | None, float | None]:
     """`measure_blur_share`, and the share of the blur that a gyroscope with one axis flipped would predict."""
-    path = BlurPath.straight(blur) if isinstance(blur, BlurField) else blur
-    found = _compute_spectra(image, path, _LIMITS.few_tiles)
+    found = _find_share_inputs(image, blur)
     if found is None:
         return None, None
-    logarithm, vectors, paths = found
-    weight = _weigh_tiles(logarithm)
-    return _fit_share(*found, weight), _fit_share(logarithm, vectors * [1, -1], paths * [1, -1], weight)
+    logarithm, vectors, paths, weight = found
+    return _fit_share(*found), _fit_share(logarithm, vectors * [1, -1], paths * [1, -1], weight)
+
+
+def _find_share_inputs(
+    image: UInt8Array | UInt16Array, blur: BlurField | BlurPath
+) -> tuple[Float32Array, Array, Array, Array] | None:
+    """Log power, chords, paths and weights of some tiles; ``None`` where there are too few to tell."""
+    path = BlurPath.straight(blur) if isinstance(blur, BlurField) else blur
+    found = _compute_spectra(image, path, _LIMITS.few_tiles)
+    return None if found is None else (*found, _weigh_tiles(found[0]))
 
 
 def _fit_share(logarithm: Float32Array, vectors: Array, path_px: Array, weight: Array) -> float | None:

@@ -169,6 +169,9 @@ class GateLimits:
     #: Blur that is known no better than this, as a share of its length, is left alone: a filter along a line that is
     #: off by a third or 20 degrees loses what it wins.
     most_unsure: float = 0.25
+    #: Where the gyroscope's sign is in doubt, frames whose paths leave their chords by no more than this are deblurred:
+    #: with the other sign, their blur is the same to this, px.
+    straight_px: float = 0.5
     #: A frame that shows less of the fall that its blur predicts is not blurred so. Blurred ones show .7 of it, the
     #: fewest .2 (textures with a direction of their own), sharp ones .05 +- .1.
     least_share: float = 0.25

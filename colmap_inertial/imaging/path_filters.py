@@ -9,16 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.core.arrays import AnyArray, Array, Float32Array
+from colmap_inertial.core.arrays import Array, Float32Array, UInt8Array
+from colmap_inertial.core.threads import usable_processors
 from colmap_inertial.imaging._cells import Cells
+from colmap_inertial.imaging._chroma import join_colours, split_colours
 from colmap_inertial.imaging._tiles import TILING, TiledPaths, Tiling
 from colmap_inertial.imaging.blur_path import BlurPath
-from colmap_inertial.imaging.transfer import ENCODE_STEPS, decode_table, encode_table, srgb_from_linear
+from colmap_inertial.imaging.transfer import ENCODE_STEPS, decode_table, encode_table, linearise, srgb_from_linear
 from colmap_inertial.imaging.wiener import DeblurOptions, lowest_saturated_code, require_planes
 
 Code = TypeVar("Code", np.uint8, np.uint16)
@@ -46,6 +49,8 @@ class PathFilterModel:
     noise_count: int = 200
     #: Of many tiles, about so many of the shortest side are looked at; of longer ones, which show more, fewer.
     noise_tiles: int = 20
+    #: of chroma, fewer: its noise is taken as the same in all of the picture.
+    chroma_noise_tiles: int = 8
     #: Weight of the data against gradients to the power 2/3 where noise is 1 % of full scale.
     data_weight: float = 1000.0
     #: Weights of the splitting, one for each round.
@@ -56,7 +61,7 @@ FILTER_MODEL = PathFilterModel()
 
 
 def path_wiener(image: NDArray[Code], path: BlurPath, options: DeblurOptions | None = None) -> NDArray[Code]:
-    """Undo motion blur along a path by Wiener's filter.
+    """Undo motion blur along a path by Wiener's filter; of three channels, luma in full and chroma at half the size.
 
     Parameters
     ----------
@@ -92,7 +97,7 @@ def half_quadratic(image: NDArray[Code], path: BlurPath, options: DeblurOptions 
 
     Wiener's result is the first guess. In turn, what its gradients w should be is found by minimising
     ``|w|^(2/3) + b / 2 (w - gradient)^2``, and the picture that has these gradients and, blurred, is the one seen;
-    b grows (`FILTER_MODEL.splitting`).
+    b grows (`FILTER_MODEL.splitting`). Chroma keeps Wiener's result.
     """
     return _filter_image(image, path, options or DeblurOptions(), FILTER_MODEL.splitting)
 
@@ -101,12 +106,20 @@ def smoothed(image: NDArray[Code], sigma_px: float) -> NDArray[Code]:
     """An image smoothed by a Gaussian in linear light, as feature extraction likes it after a filter."""
     import cv2
 
-    light = np.asarray(cv2.GaussianBlur(_linearise(image), (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT_101))
+    light = np.asarray(cv2.GaussianBlur(linearise(image), (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT_101))
     if image.dtype == np.uint8:  # the table is fine enough for 256 codes
-        codes = encode_table(image.dtype)[np.rint(light * np.float32(ENCODE_STEPS)).astype(np.intp)]
-    else:
-        codes = np.iinfo(image.dtype).max * srgb_from_linear(light.astype(np.float64)).astype(np.float32)
+        steps = cv2.multiply(light, float(ENCODE_STEPS), dtype=cv2.CV_16U)  # rounded as np.rint does
+        return np.asarray(_nearest_codes().take(steps), dtype=image.dtype)
+    codes = np.iinfo(image.dtype).max * srgb_from_linear(light.astype(np.float64)).astype(np.float32)
     return np.rint(codes).astype(image.dtype)
+
+
+@lru_cache(maxsize=1)
+def _nearest_codes() -> UInt8Array:
+    """Codes of 8 bit of evenly spaced linear light."""
+    table = np.rint(encode_table(np.dtype(np.uint8))).astype(np.uint8)
+    table.setflags(write=False)
+    return table
 
 
 @dataclass(frozen=True)
@@ -136,13 +149,16 @@ class Noise:
         return cls(dark, by_light)
 
 
-def noise_along(light: Float32Array, tiling: Tiling, paths: Float32Array, threads: int = 0) -> tuple[Noise, ...]:
+def noise_along(
+    light: Float32Array, tiling: Tiling, paths: Float32Array, threads: int = 0, *, chroma: bool = False
+) -> tuple[Noise, ...]:
     """Noise of each channel of (H, W, C) linear light, from frequencies that the blur removes.
 
-    So the errors of compression count, and those of the path.
+    So the errors of compression count, and those of the path. Of chroma, which has no light to grow with, one variance.
     """
     from colmap_inertial._kernels import _path
 
+    most_tiles = FILTER_MODEL.chroma_noise_tiles if chroma else FILTER_MODEL.noise_tiles
     found = _path.noise(
         light,
         paths=paths,
@@ -153,14 +169,13 @@ def noise_along(light: Float32Array, tiling: Tiling, paths: Float32Array, thread
         share=FILTER_MODEL.noise_share,
         every=max(
             1,
-            round(
-                (tiling.count[0] * tiling.count[1] * tiling.side / TILING.shortest_side_px / FILTER_MODEL.noise_tiles)
-                ** 0.5
-            ),
+            round((tiling.count[0] * tiling.count[1] * tiling.side / TILING.shortest_side_px / most_tiles) ** 0.5),
         ),
         threads=threads,
     )
     channels = np.reshape(found, (light.shape[2], -1, 3))
+    if chroma:
+        channels[..., 0] = 0
     return tuple(Noise.fitted(tiles[tiles[:, 2] >= FILTER_MODEL.noise_count, :2]) for tiles in channels)
 
 
@@ -202,13 +217,25 @@ def filter_along(
     return result
 
 
-def _linearise(image: AnyArray) -> Float32Array:
-    """Linear light of codes."""
-    if image.dtype == np.uint8:
-        import cv2
-
-        return np.asarray(cv2.LUT(image, decode_table(image.dtype)), dtype=np.float32)
-    return decode_table(image.dtype)[image]
+def _filter_light(
+    light: Float32Array,
+    path: BlurPath,
+    options: DeblurOptions,
+    splitting: Sequence[float],
+    threads: int,
+    *,
+    chroma: bool = False,
+) -> Float32Array:
+    """(H, W, C) linear light without blur."""
+    tiling = Tiling.covering(path.width, path.height, path.extent_px(), coarse=chroma)
+    paths = tiling.paths(path)
+    if options.noise is None:
+        noise = noise_along(light, tiling, paths, threads, chroma=chroma)
+    else:
+        # chroma is the difference of two channels, each of them the mean of four pixels
+        variance = options.noise**2 * (0.5 if chroma else 1.0)
+        noise = (Noise(variance, 0.0),) * light.shape[2]
+    return filter_along(light, tiling, TiledPaths(paths, tiling.spreads(path)), noise, splitting, threads=threads)
 
 
 def _filter_image(
@@ -216,19 +243,16 @@ def _filter_image(
 ) -> NDArray[Code]:
     from colmap_inertial._kernels import _wiener
 
-    extent_px = path.extent_px()
-    planes = require_planes(image, path, "path", extent_px)
-    threads = options.threads or 0
-    tiling = Tiling.covering(path.width, path.height, extent_px)
-    paths = tiling.paths(path)
-    light = _linearise(planes).reshape(planes.shape)
-    channels = planes.shape[2]
-    if options.noise is None:
-        noise = noise_along(light, tiling, paths, threads)
+    planes = require_planes(image, path, "path", path.extent_px())
+    threads = options.threads or usable_processors()
+    if planes.shape[2] == 3:
+        luma, chroma = split_colours(planes, threads)
+        sharp_luma = _filter_light(luma[..., None], path, options, splitting, threads)
+        sharp_chroma = _filter_light(chroma, path.halved(), options, (), threads, chroma=True)
+        sharp = join_colours(sharp_luma[..., 0], sharp_chroma, threads)
     else:
-        noise = (Noise(options.noise**2, 0.0),) * channels
-    tiled = TiledPaths(paths, tiling.spreads(path))
-    sharp = filter_along(light, tiling, tiled, noise, splitting, threads=threads)
+        light = linearise(planes).reshape(planes.shape)
+        sharp = _filter_light(light, path, options, splitting, threads)
     cells = Cells.of(path.field())
     result = np.empty_like(planes)
     _wiener.blend(

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array, Float32Array
+from colmap_inertial.core.arrays import AnyArray, Array, Float32Array
 
 #: Resolution of the tables back to codes. sRGB is steepest in the dark, 12.92: there one 8-bit code spans five entries.
 ENCODE_STEPS = 16384
@@ -40,3 +40,12 @@ def encode_table(dtype: np.dtype[Any]) -> Float32Array:
     table = (np.iinfo(dtype).max * srgb_from_linear(light)).astype(np.float32)
     table.setflags(write=False)
     return table
+
+
+def linearise(image: AnyArray) -> Float32Array:
+    """Linear light of codes."""
+    if image.dtype == np.uint8:
+        import cv2
+
+        return np.asarray(cv2.LUT(image, decode_table(image.dtype)), dtype=np.float32)
+    return decode_table(image.dtype)[image]

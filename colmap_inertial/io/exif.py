@@ -5,6 +5,7 @@ Times are taken only where they tell more than whole seconds.
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import re
 import struct
@@ -20,7 +21,8 @@ from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.core.types import HeightDatum
 from colmap_inertial.io.files import path_in, read_bytes, reader, reading
 from colmap_inertial.io.frame_times import FrameStamps, stamps_in_order
-from colmap_inertial.io.images import PNG, jpeg_segments, png_chunks, tiff_entries
+from colmap_inertial.io.images import PNG, TIFF_ORDERS, jpeg_segments, png_chunks, tiff_entries
+from colmap_inertial.io.tiff_metadata import carry_tiff_metadata
 
 _EXIF_HEADER = b"Exif\0\0"
 #: EXIF stands at the beginning of a file.
@@ -146,7 +148,7 @@ def _tiff(head: bytes) -> bytes | None:
     if head.startswith(PNG):
         chunk = next((part for name, part in png_chunks(head) if name == b"eXIf"), None)
         return None if chunk is None else chunk[8 : 8 + struct.unpack_from(">I", chunk)[0]]
-    return head if head[:4] in (b"II*\0", b"MM\0*") else None
+    return head if head[:4] in TIFF_ORDERS else None
 
 
 def exposure_of(head: bytes) -> tuple[float | None, float | None]:
@@ -236,7 +238,7 @@ _JPEG_CODING = (0xE0, 0xEE)
 def carry_metadata(original: bytes, encoded: bytes) -> bytes:
     """A newly encoded picture with the metadata of the one that it was made from: EXIF, XMP, colour profile, comments.
 
-    Of JPEG and PNG; other formats come back as they are.
+    Of JPEG, PNG and TIFF; other formats, and TIFFs whose directories are damaged, come back as they are.
     """
     if original.startswith(b"\xff\xd8") and encoded.startswith(b"\xff\xd8"):
         *own, (_, scan, _) = jpeg_segments(encoded)
@@ -248,6 +250,9 @@ def carry_metadata(original: bytes, encoded: bytes) -> bytes:
         carried = [part for name, part in png_chunks(original) if name in _PNG_CARRIED]
         kept = [part for name, part in png_chunks(encoded) if name not in _PNG_CARRIED]
         return PNG + kept[0] + b"".join(carried) + b"".join(kept[1:])
+    if original[:4] in TIFF_ORDERS and encoded[:4] in TIFF_ORDERS:
+        with contextlib.suppress(struct.error):
+            return carry_tiff_metadata(original, encoded)
     return encoded
 
 

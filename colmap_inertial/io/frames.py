@@ -148,6 +148,13 @@ def _image_stamps(source: ImageFolder) -> FrameStamps:
     if untimed:
         raise TimingError(f"{source.times}: no row for {len(untimed)} of {len(names)} pictures (first: {untimed[0]})")
     present = set(names)
+    unread = [name for name in stamps.names if name not in present and _is_other_picture(source, name)]
+    if unread:
+        raise FormatError(
+            source.times,
+            f"names {len(unread)} files that are no pictures COLMAP reads (first: {unread[0]}): convert them to PNG or "
+            f"JPEG and name those, or take their rows out (endings: {', '.join(SUFFIXES)})",
+        )
     keep = np.array([name in present for name in stamps.names])
     return FrameStamps(
         names=tuple(name for name in stamps.names if name in present),
@@ -155,6 +162,11 @@ def _image_stamps(source: ImageFolder) -> FrameStamps:
         exposure_s=None if stamps.exposure_s is None else stamps.exposure_s[keep],
         source=stamps.source,
     )
+
+
+def _is_other_picture(source: ImageFolder, name: str) -> bool:
+    """Whether a file of that name is in the folder, with an ending that is not read."""
+    return Path(name).suffix.lower() not in SUFFIXES and (source.folder / name).is_file()
 
 
 def image_names(source: ImageFolder) -> list[str]:

@@ -19,11 +19,11 @@ SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".pgm", ".ppm")
 
 PNG = b"\x89PNG\r\n\x1a\n"
 #: Order of bytes as of ``struct``, by the beginning of a TIFF.
-_TIFF = {b"II*\0": "<", b"MM\0*": ">"}
+TIFF_ORDERS = {b"II*\0": "<", b"MM\0*": ">"}
 #: Pictures of photographs are not packed more tightly, each byte of a file for so many of pixels.
 _PACKED = 20
 #: Markers of JPEG: C4, C8 and CC are none of frames.
-_START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 START_OF_SCAN = 0xDA
 _UNREADABLE = "cannot be decoded: damaged, cut off, or no picture; take it out of the folder"
 
@@ -67,6 +67,22 @@ def read_image(path: Path) -> UInt8Array | UInt16Array:
     return image
 
 
+def read_alpha(data: bytes) -> UInt8Array | UInt16Array | None:
+    """(H, W) alpha of a PNG or TIFF that can be decoded; ``None`` where it has none."""
+    import cv2
+
+    if data[:4] in TIFF_ORDERS:
+        has_alpha = _tiff_number(data, TIFF_ORDERS[data[:4]], 277, 1) == 4  # samples of a pixel
+    else:
+        has_alpha = data.startswith(PNG) and data[25] in (4, 6)
+    if not has_alpha:
+        return None
+    image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None or image.ndim != 3 or image.shape[2] != 4:
+        return None
+    return np.ascontiguousarray(image[..., 3])
+
+
 def require_modest(path: Path, data: bytes) -> None:
     """Refuse a picture by what its header says, before it takes the memory.
 
@@ -94,8 +110,8 @@ def _weigh(data: bytes, pixels: int) -> float:
     if data.startswith(PNG):
         # with alpha it is there twice until that is dropped
         pixel_bytes = data[24] / 8 * {0: 1, 4: 7, 6: 7}.get(data[25], 3)
-    elif data[:4] in _TIFF:
-        bits, channels = (_tiff_number(data, _TIFF[data[:4]], tag, 1) for tag in (258, 277))
+    elif data[:4] in TIFF_ORDERS:
+        bits, channels = (_tiff_number(data, TIFF_ORDERS[data[:4]], tag, 1) for tag in (258, 277))
         pixel_bytes = bits / 8 * channels
     else:
         return 1.0
@@ -109,7 +125,7 @@ def _read_size(data: bytes) -> tuple[int, int] | None:
         if data.startswith(PNG) and len(data) > 25:
             return struct.unpack_from(">II", data, 16)
         if data.startswith(b"\xff\xd8"):
-            frames = (begin for marker, begin, _ in jpeg_segments(data) if marker in _START_OF_FRAME)
+            frames = (begin for marker, begin, _ in jpeg_segments(data) if marker in START_OF_FRAME)
             begin = next(frames, None)
             return None if begin is None else struct.unpack_from(">HH", data, begin + 5)[::-1]
         if data.startswith(b"BM"):
@@ -117,8 +133,8 @@ def _read_size(data: bytes) -> tuple[int, int] | None:
             return abs(width), abs(height)
         if pnm := re.match(rb"P[1-6](?:\s|#[^\n]*\n)+(\d{1,9})(?:\s|#[^\n]*\n)+(\d{1,9})\s", data[:4096]):
             return int(pnm[1]), int(pnm[2])
-        if data[:4] in _TIFF:
-            width, height = (_tiff_number(data, _TIFF[data[:4]], tag, 0) for tag in (256, 257))
+        if data[:4] in TIFF_ORDERS:
+            width, height = (_tiff_number(data, TIFF_ORDERS[data[:4]], tag, 0) for tag in (256, 257))
             return (width, height) if width and height else None
     except (struct.error, IndexError):
         pass

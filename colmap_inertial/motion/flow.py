@@ -347,9 +347,6 @@ def _measure_quick_rotation(rate: Array, width: int) -> float:
     return float(np.sqrt(np.mean(np.sort(quick**2)[: max(1, int(0.98 * len(quick)))])))
 
 
-# --- one pair of frames ----------------------------------------------------------------------------------------------
-
-
 def reduced(image: UInt8Array | UInt16Array, options: FlowOptions) -> UInt8Array:
     """The picture in which corners are tracked: (H, W), 8 bit."""
     grey = reduce_image(convert_to_grey(image), options.long_side_px)
@@ -393,6 +390,8 @@ def follow_points(
 
     Corners that were tracked come first, then features that were matched; ways that tell too little are left out.
     """
+    if before.shape != now.shape:
+        return
     to_full = np.array([shutter.width, shutter.height]) / now.shape[::-1]
     for matched in (_track_corners, _match_features):
         first, second = ((p.astype(np.float64) + 0.5) * to_full for p in matched(before, now, options))

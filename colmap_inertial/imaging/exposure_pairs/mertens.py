@@ -10,7 +10,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Float32Array
+from colmap_inertial.core.arrays import BoolArray, Float32Array
+from colmap_inertial.imaging.transfer import linear_from_srgb, srgb_from_linear
+
+#: Standard deviation by which the border of what is clipped is softened, px.
+_FEATHER_PX = 3.0
 
 
 def fuse_mertens(images: Sequence[Float32Array]) -> Float32Array:
@@ -35,3 +39,28 @@ def fuse_mertens(images: Sequence[Float32Array]) -> Float32Array:
     scaled = [np.ascontiguousarray(255 * image, dtype=np.float32) for image in images]
     merge = cv2.createMergeMertens(1.0, 1.0, 1.0)
     return np.asarray(np.clip(merge.process(scaled), 0, 1), dtype=np.float32)
+
+
+def darken_fused(fused: Float32Array, dark: Float32Array, clipped: BoolArray, gain: float) -> Float32Array:
+    """Short exposure without its noise: the fused image, as dark; the short one itself where the long one clipped.
+
+    Parameters
+    ----------
+    fused
+        (H, W) or (H, W, 3) float32, sRGB 0 to 1, as bright as the long exposure.
+    dark
+        Likewise: the short exposure as dark as it is, with the long one's colours.
+    clipped
+        (H, W) where the long exposure may have clipped.
+    gain
+        By what the short one's light is multiplied to be as bright as the long one's.
+    """
+    import cv2
+
+    reach = 2 * round(3 * _FEATHER_PX) + 1
+    grown = cv2.dilate(clipped.astype(np.float32), np.ones((reach, reach), np.uint8))
+    share = np.asarray(cv2.GaussianBlur(grown, (0, 0), _FEATHER_PX))
+    if fused.ndim == 3:
+        share = share[..., None]
+    light = srgb_from_linear(linear_from_srgb(np.clip(fused, 0, 1)) / gain)
+    return np.asarray(share * dark + (1 - share) * light, dtype=np.float32)

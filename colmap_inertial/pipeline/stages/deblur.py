@@ -10,7 +10,7 @@ import numpy as np
 
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.options import BlurRemover, DeblurMethod
-from colmap_inertial.core.threads import frames_at_once, map_in_order, threads_beside
+from colmap_inertial.core.threads import frames_at_once, map_in_order, one_blas_thread, threads_beside
 from colmap_inertial.core.types import (
     Frame,
     Projector,
@@ -103,7 +103,7 @@ class DeblurStage:
     gate
         Thresholds.
     drop
-        Whether frames that are too blurred are left out.
+        Whether frames that are too blurred are left out. Where not, they are deblurred as others are.
     method
         How blur is undone: along its path by a Wiener filter, or a half-quadratic one, or by the network DeepGyro.
     smoothing, most_smoothing_px
@@ -112,7 +112,8 @@ class DeblurStage:
     weights
         Checksum of the network; empty where there is none. It decides the frames as the options do.
     workers
-        Frames in work at once; as many as the process has processors, up to four, where absent.
+        Frames in work at once; as many as the process has processors where absent, but at most four, or 32 million
+        pixels in all where a filter undoes the blur.
     """
 
     view: GyroView
@@ -136,7 +137,7 @@ class DeblurStage:
     @classmethod
     def for_run(cls, inputs: StageInputs) -> DeblurStage | None:
         """The stage of a run, where the plan says that frames are deblurred."""
-        return cls.of_plan(inputs.plan, drop=inputs.maps, smoothing=inputs.maps)
+        return cls.of_plan(inputs.plan, drop=inputs.maps, smoothing=inputs.maps or inputs.matching)
 
     @classmethod
     def of_plan(cls, plan: ImagingPlan, *, drop: bool = True, smoothing: bool = True) -> DeblurStage | None:
@@ -162,7 +163,7 @@ class DeblurStage:
 
     def __call__(self, frames: Iterator[Frame], /) -> Iterator[Frame]:
         """Deblur the frames, in order."""
-        workers = self.workers or frames_at_once()
+        workers = self.workers or self._frames_at_once()
         remove = self._remover(workers)
         motion, camera, index = self.view.motion(), colmap_camera(self.view.camera), self.view.index()
         decision_of = {decision.name: decision for decision in self.decisions}
@@ -173,7 +174,14 @@ class DeblurStage:
                 return frame
             return self._treated(frame, decision, motion, camera, self.view.shutter(index[frame.name]), remove)
 
-        yield from map_in_order(treat, frames, workers=workers)
+        # of many small products of matrices, each in one thread
+        with one_blas_thread():
+            yield from map_in_order(treat, frames, workers=workers)
+
+    def _frames_at_once(self) -> int:
+        """Frames to work on at once; a network takes more memory than a filter."""
+        camera = self.view.camera
+        return frames_at_once(None if self.method == "deepgyro" else 1e-6 * camera.width * camera.height)
 
     def _remover(self, workers: int) -> _Remover:
         """Undoes the blur of one frame; ``workers`` call it at once."""
@@ -203,8 +211,8 @@ class DeblurStage:
             return said(decision.reason)
         if self.verdict.trusted is False:
             return said(self.verdict.reason)
-        if decision.action == "drop":
-            return replace(said(decision.reason), dropped=bool(self.drop and self.verdict.trusted))
+        if decision.action == "drop" and self.drop:
+            return replace(said(decision.reason), dropped=bool(self.verdict.trusted))
         parallax = self.parallaxes.get(frame.name)
         try:
             blur = blur_field(motion, camera, shutter, parallax=parallax)
@@ -214,6 +222,8 @@ class DeblurStage:
             return said(f"{decision.blur_px:.0f} px of blur are too long to be undone")
         image: Any = frame.image  # either of two types of pixel, which the checker would keep apart
         path = blur_path(motion, camera, shutter, parallax=parallax)
+        if self.view.sign_doubt and path.departure_px() > GATE_LIMITS.straight_px:
+            return said(f"{self.view.sign_doubt}, and with the other one the blur would be curved the other way")
         factor, reason = judge_frame(image, blur, self.verdict, self.gate, path)
         if factor is None:
             return said(reason)

@@ -22,6 +22,7 @@ from colmap_inertial.imaging.exposure_pairs import (
     better_alone,
     brightened,
     bring_together,
+    darken_fused,
     fuse_mertens,
 )
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
@@ -239,7 +240,7 @@ class ExposureStage:
         light = self.fuser.fuse(pair.short, pair.long, pair.blur)
         if self.fusion == "mertens":
             dark = brightened(frame.image, replace(pair.brightness, gain=1.0))
-            light = fuse_mertens([dark, light])
+            light = fuse_mertens([darken_fused(light, dark, pair.clipped, pair.brightness.gain), light])
         done = replace(done, fused=True, used="both", reason=_describe_pair(pair, path))
         return _replace_light(frame, light), done
 

@@ -13,15 +13,18 @@ import numpy as np
 from colmap_inertial.core.arrays import AnyArray
 from colmap_inertial.core.errors import FormatError, InertialError
 from colmap_inertial.core.summary import prints_in_lines
-from colmap_inertial.core.threads import map_in_order
+from colmap_inertial.core.threads import frames_at_once, map_in_order
 from colmap_inertial.core.types import CameraModel, Frame, Treatment
 from colmap_inertial.imaging.path_filters import smoothed
 from colmap_inertial.io.exif import carry_metadata
 from colmap_inertial.io.files import path_in, read_record, write_record
-from colmap_inertial.io.images import read_image
+from colmap_inertial.io.images import read_alpha, read_image
+from colmap_inertial.io.jpeg_coding import JPEG_LIMITS, read_jpeg_coding
 from colmap_inertial.model.copying import copy_file
 from colmap_inertial.pipeline.run.progress import Progress
 from colmap_inertial.pipeline.stages.protocols import FrameStage, KeypointStage
+
+_WITH_ALPHA = (".png", ".tif", ".tiff")
 
 
 @prints_in_lines
@@ -150,11 +153,22 @@ def write_frames(
     if paths.unsmoothed is not None:
         paths.unsmoothed.mkdir(parents=True)
     known = set(names)
-    for frame in stream:
-        if frame.name not in known or frame.name in seen:
-            raise ValueError(f"a frame stage yielded {frame.name!r}, which is no frame of the capture or came twice")
-        original = originals.pop_through(frame.name)
-        action = "dropped" if frame.dropped else _write(frame, original, paths)
+
+    def with_original() -> Iterator[tuple[Frame, AnyArray | None]]:
+        came: set[str] = set()
+        for frame in stream:
+            if frame.name not in known or frame.name in came:
+                raise ValueError(
+                    f"a frame stage yielded {frame.name!r}, which is no frame of the capture or came twice"
+                )
+            came.add(frame.name)
+            yield frame, originals.pop_through(frame.name)
+
+    def write(item: tuple[Frame, AnyArray | None]) -> tuple[Frame, str]:
+        frame, original = item
+        return frame, "dropped" if frame.dropped else _write(frame, original, paths)
+
+    for frame, action in map_in_order(write, with_original(), workers=frames_at_once()):
         seen[frame.name] = FrameRecord(
             name=frame.name,
             action=action,
@@ -204,8 +218,10 @@ def _same_memory(a: AnyArray, b: AnyArray) -> bool:
     return a.__array_interface__ == b.__array_interface__
 
 
-def encode_image(target: Path, image: AnyArray, original: Path | None = None) -> None:
+def encode_image(target: Path, image: AnyArray, original: Path | None = None, *, moved: bool = False) -> None:
     """Write an image in the format of its file name, with the metadata of the file that it was made from.
+
+    A JPEG has that one's quality and sampling of colours; PNG and TIFF keep its alpha, unless pixels have ``moved``.
 
     Raises
     ------
@@ -215,13 +231,28 @@ def encode_image(target: Path, image: AnyArray, original: Path | None = None) ->
     import cv2
 
     bgr = image if image.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2BGR)
-    options = [cv2.IMWRITE_JPEG_QUALITY, 98] if target.suffix.lower() in (".jpg", ".jpeg") else []
+    before = None if original is None else original.read_bytes()
+    options = _jpeg_options(before) if target.suffix.lower() in (".jpg", ".jpeg") else []
+    alpha = None if before is None or moved or target.suffix.lower() not in _WITH_ALPHA else read_alpha(before)
+    if alpha is not None and alpha.shape == image.shape[:2] and alpha.dtype == image.dtype:
+        bgr = np.dstack([bgr, alpha] if bgr.ndim == 3 else [bgr, bgr, bgr, alpha])
     # Through memory: cv2.imwrite reports a full disk as success.
     ok, data = cv2.imencode(target.suffix, bgr, options)
     if not ok:
         raise FormatError(target, f"OpenCV cannot write {image.dtype} images as {target.suffix}")
     encoded = data.tobytes()
-    target.write_bytes(encoded if original is None else carry_metadata(original.read_bytes(), encoded))
+    target.write_bytes(encoded if before is None else carry_metadata(before, encoded))
+
+
+def _jpeg_options(original: bytes | None) -> list[int]:
+    """OpenCV's options for a JPEG that is made of another file."""
+    import cv2
+
+    if original is None or not original.startswith(b"\xff\xd8"):
+        return [cv2.IMWRITE_JPEG_QUALITY, JPEG_LIMITS.most_quality]
+    quality, sampling = read_jpeg_coding(original)
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality]
+    return options if sampling is None else [*options, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, sampling]
 
 
 def read_frame_records(path: Path) -> tuple[FrameRecord, ...]:
@@ -287,7 +318,7 @@ def write_images(
             image: Any = read_image(source)
             for move in movers:
                 image = move(name, image)
-            encode_image(out, image, source)
+            encode_image(out, image, source, moved=True)
         else:
             copy_file(source, out, link=True)
 

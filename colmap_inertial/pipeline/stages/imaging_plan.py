@@ -35,6 +35,8 @@ class GyroView:
         Where the calibration comes from: ``"capture"``, ``"model"`` (a small one, made beforehand) or ``"pixels"``.
     notes
         What there is to say about it, in words.
+    sign_doubt
+        Why the pixels do not show that the gyroscope has the right sign; empty where they do.
     """
 
     imu: ImuRecording
@@ -43,6 +45,7 @@ class GyroView:
     camera: CameraModel
     source: str
     notes: tuple[str, ...] = ()
+    sign_doubt: str = ""
 
     def timed(self) -> CameraTimedImu:
         """The recording on the camera's clock."""
@@ -104,6 +107,7 @@ class ImagingPlan:
                 "source": view.source,
                 "notes": list(view.notes),
             },
+            "sign_doubt": None if view is None else view.sign_doubt,
             "camera": None if view is None else asdict(view.camera),
             "verdict": None if self.deblur is None else asdict(self.deblur[1]),
             "decisions": None if self.deblur is None else [asdict(decision) for decision in self.deblur[0]],
@@ -129,6 +133,7 @@ def read_plan(path: Path, imu: ImuRecording, timing: FrameTiming) -> ImagingPlan
                 timing=timing,
                 source=calibration.pop("source"),
                 notes=tuple(calibration.pop("notes")),
+                sign_doubt=values["sign_doubt"],
                 calibration=CameraImuCalibration(**calibration),
                 camera=CameraModel(**{**camera, "params": tuple(camera["params"])}),
             )

@@ -69,6 +69,8 @@ class StageInputs:
         What makes one frame of a pair of exposures; ``None`` where none are fused.
     maps
         Feed COLMAP: leave out frames that are too blurred, and show it deblurred ones smoothed.
+    matching
+        Without ``maps``: smooth deblurred frames as COLMAP would see them, all the same.
     apertures
         Folder for disparities and depths of a multi-aperture camera.
     keypoint_stages
@@ -82,6 +84,7 @@ class StageInputs:
     plan: ImagingPlan = field(default_factory=ImagingPlan)
     fuser: Fuser | None = None
     maps: bool = True
+    matching: bool = False
     apertures: Path | None = None
     keypoint_stages: Sequence[KeypointStage] = ()
     database: Path | None = None

@@ -262,8 +262,13 @@ def run_images(
     records: Sequence[FrameRecord],
     rectified: Collection[str],
     stages: Sequence[KeypointStage],
+    *,
+    smoothed: bool = False,
 ) -> Path:
-    """Images that agree with the keypoints, for whoever goes on from the model; returns their folder."""
+    """Images that agree with the keypoints, for whoever goes on from the model; returns their folder.
+
+    ``smoothed``: as COLMAP saw them.
+    """
     workspace = session.workspace
     movers = image_movers(stages)
     if rectified and not movers:
@@ -272,8 +277,11 @@ def run_images(
     names = [record.name for record in records if record.used]
 
     def work(partial: Sequence[Path]) -> None:
-        write_images(movers, names, moved, workspace.colmap_images, partial[0], session.progress, workspace.unsmoothed)
+        unsmoothed = None if smoothed else workspace.unsmoothed
+        write_images(movers, names, moved, workspace.colmap_images, partial[0], session.progress, unsmoothed)
 
-    depends = {"stages": stages if moved else (), "rectified": sorted(moved)}
+    depends: dict[str, object] = {"stages": stages if moved else (), "rectified": sorted(moved)}
+    if smoothed:
+        depends["smoothed"] = True
     session.runner.run("images", depends, [workspace.images], work, after=["frames"])
     return workspace.images

@@ -11,7 +11,13 @@ from pathlib import Path
 from colmap_inertial import __version__
 from colmap_inertial.colmap.sparse import check_pair_names
 from colmap_inertial.core.errors import FormatError, InertialError, OutputError, OutputExistsError
-from colmap_inertial.core.options import BlurRemover, ExposureOptions, FuseAperturesOptions, ReconstructOptions
+from colmap_inertial.core.options import (
+    BlurRemover,
+    DeblurPurpose,
+    ExposureOptions,
+    FuseAperturesOptions,
+    ReconstructOptions,
+)
 from colmap_inertial.core.types import Frame, FrameTiming
 from colmap_inertial.imaging.multi_aperture import refocus, require_colours
 from colmap_inertial.io.calibration import CalibrationFiles, list_paths
@@ -99,6 +105,7 @@ def deblur_capture(
     out: StrPath,
     *,
     method: BlurRemover = "wiener",
+    purpose: DeblurPurpose = "viewing",
     calibration: CalibrationFiles = None,
     rectify: bool = False,
     sheet: Path | None = None,
@@ -115,6 +122,8 @@ def deblur_capture(
         out: those that cannot be deblurred are copied.
     method
         How blur is undone.
+    purpose
+        For viewing, or for feature extraction: then deblurred frames are smoothed as ``reconstruct`` smooths them.
     calibration
         Calibration files of this device, as of ``ReconstructOptions``.
     rectify
@@ -152,7 +161,8 @@ def deblur_capture(
     with _open_session(out, loaded, options, progress, "deblur", recording.identity()) as session:
         workspace = session.workspace
         plan = run_plan(session, recording, Treatments(deblur=method, rolling_shutter=options.rolling_shutter))
-        inputs = StageInputs(recording=recording, options=options, plan=plan, maps=False)
+        for_matching = purpose == "matching"
+        inputs = StageInputs(recording=recording, options=options, plan=plan, maps=False, matching=for_matching)
         deblurred = workspace.colmap_images if rectify else workspace.images
         if not rectify:
             remove(workspace.colmap)
@@ -161,7 +171,7 @@ def deblur_capture(
         movers = default_keypoint_stages(inputs)
         rectified = rectifiable(movers, timing.names)
         if rectify:
-            run_images(session, records, rectified, movers)
+            run_images(session, records, rectified, movers, smoothed=for_matching)
         shown = _shown(records)
         if sheet is not None and shown and plan.view is not None:
             write_json(workspace.stamps / _SHEET, {"sheet": str(sheet.resolve())})

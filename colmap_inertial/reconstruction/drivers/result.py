@@ -227,7 +227,9 @@ class DeblurResult:
 
 def imaging_as_json(plan: ImagingPlan, rectified: Collection[str]) -> dict[str, object]:
     """Treatment of frames and its reasons, without single frames; and whether any was rectified."""
-    values = {key: value for key, value in plan.as_json().items() if key not in ("decisions", "parallaxes")}
+    values = {
+        key: value for key, value in plan.as_json().items() if key not in ("decisions", "parallaxes", "sign_doubt")
+    }
     values |= {"rectify": bool(rectified), "rolling_shutter": shutter_note(plan, rectified)}
     return {**values, "frames_with_translation": len(plan.parallaxes)}
 

@@ -34,7 +34,9 @@ from colmap_inertial.model import find_models, read_model, trajectory_from_model
 from colmap_inertial.motion.align import AlignOptions, align_clocks
 from colmap_inertial.motion.align.consensus import align_by_consensus
 from colmap_inertial.motion.flow import VisualRotation, check_motion, find_stabilisation
+from colmap_inertial.motion.sign import check_sign
 from colmap_inertial.pipeline.run.context import Recording, RunContext
+from colmap_inertial.pipeline.run.progress import Progress
 from colmap_inertial.pipeline.stages.frame_folder import encode_image, smooth_for_colmap
 from colmap_inertial.pipeline.stages.imaging_plan import GyroView
 from colmap_inertial.pipeline.stages.protocols import FrameStage
@@ -65,6 +67,8 @@ class PreliminaryLimits:
     #: Frames that are followed by their pixels: at most so many, not closer than this.
     flow_frames: int = 300
     flow_spacing_s: float = 0.06
+    #: Of pictures, as many tell a wrong sign.
+    sign_frames: int = 40
     #: Frames of a video are closer than this.
     video_step_s: float = 0.13
     #: A declared calibration that is as good as this needs no search.
@@ -146,7 +150,28 @@ def estimate_preliminary_calibration(recording: Recording, context: RunContext) 
                 raise NotObservableError("the pixels' motion", agreement.reason)
     if isinstance(found, NotObservableError):
         raise found
-    return PreliminaryCalibration(view=found, models=models)
+    return PreliminaryCalibration(view=_check_declared_sign(found, recording, rotation, progress), models=models)
+
+
+def _check_declared_sign(
+    view: GyroView, recording: Recording, rotation: VisualRotation | None, progress: Progress
+) -> GyroView:
+    """The view, with what there is to say about its sign; what was estimated has the right one.
+
+    Raises
+    ------
+    NotObservableError
+        Where the pictures turn the other way.
+    """
+    if view.source != "capture":
+        return view
+    if rotation is None:
+        some = sample_middle(recording.every, _LIMITS.flow_spacing_s, _LIMITS.sign_frames)
+        rotation = measure_sampled_rotation(recording.capture, recording.every, view.camera, some, progress)
+    sign = check_sign(rotation, view.motion())
+    if sign.right is False:
+        raise NotObservableError("the pixels' motion", sign.reason)
+    return view if sign.right else replace(view, sign_doubt=sign.reason)
 
 
 def survey_parts(timing: FrameTiming) -> list[list[str]]:

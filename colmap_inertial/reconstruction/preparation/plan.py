@@ -408,6 +408,8 @@ def _decided(
     used = {name: parallaxes[name] for name in sorted(_select_blurred(decisions)) if name in parallaxes}
     if used:
         note += f"; the camera's translation is counted in for {len(used)} frames"
+    if view.sign_doubt:
+        note += f"; {view.sign_doubt}, so frames with curved blur stay as they were filmed"
     if plan.method in _SAID_OF and verdict.trusted is not False:
         note += _SAID_OF[plan.method]
     return replace(plan, deblur=(decisions, verdict), parallaxes=used, deblur_note=note)
