@@ -3,6 +3,7 @@
 import shutil
 from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -24,11 +25,12 @@ from colmap_inertial.core.types import (
     Similarity,
 )
 from colmap_inertial.imaging.gate import FrameDecision, RecordingVerdict
+from colmap_inertial.imaging.psf import blur_field
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.frames import read_frame_times
 from colmap_inertial.io.trajectories import read_tum
-from colmap_inertial.model import Model, num_registered, read_model
+from colmap_inertial.model import Model, colmap_camera, num_registered, read_model
 from colmap_inertial.model.project import apply_to_project, undo_project
 from colmap_inertial.model.readout import Settled
 from colmap_inertial.model.similarities import ModelScale, plain_factor, read_similarity
@@ -407,13 +409,35 @@ def test_long_blur_is_smoothed_for_features_more_than_short_up_to_a_limit():
     assert smoothing_for(5) < smoothing_for(10) < smoothing_for(30) == smoothing_for(60) == SMOOTHING.most_px
 
 
-@pytest.mark.parametrize(("trusted", "drop", "gone"), [(True, True, True), (None, True, False), (True, False, False)])
-def test_frames_are_dropped_only_by_a_gyroscope_that_the_images_bear_out(trusted, drop, gone):
+@pytest.mark.parametrize(("trusted", "gone"), [(True, True), (None, False)])
+def test_frames_are_dropped_only_by_a_gyroscope_that_the_images_bear_out(trusted, gone):
     decision = FrameDecision(name="a.jpg", blur_px=90.0, action="drop", reason="too much blur")
     verdict = RecordingVerdict(trusted=trusted, support=9.0, extent_factor=1.0, frames=9, reason="")
-    stage = DeblurStage(view=VIEW, decisions=(decision,), verdict=verdict, drop=drop, workers=1)
+    stage = DeblurStage(view=VIEW, decisions=(decision,), verdict=verdict, workers=1)
     (frame,) = stage(iter([Frame(name="a.jpg", image=np.zeros((480, 640), np.uint8), t_s=0.5)]))
     assert frame.dropped is gone and frame.treatments[-1].reason == "too much blur"
+
+
+def panned(length_px):
+    """A picture of patches that was moved along its rows."""
+    patches = np.random.default_rng(4).uniform(30, 220, (480, 640)).astype(np.float32)
+    light = (cv2.resize(patches[:60, :80], (640, 480), interpolation=cv2.INTER_NEAREST) / 255) ** 2.2
+    kernel = np.full((1, length_px), 1 / length_px)
+    return np.rint(255 * cv2.filter2D(light, -1, kernel) ** (1 / 2.2)).astype(np.uint8)
+
+
+@pytest.mark.parametrize("doubt", ["", "nothing tells the sign"])
+def test_a_frame_that_would_be_dropped_is_deblurred_where_all_stay(doubt):
+    decision = FrameDecision(name="a.jpg", blur_px=90.0, action="drop", reason="too much blur")
+    verdict = RecordingVerdict(trusted=True, support=9.0, extent_factor=1.0, frames=9, reason="")
+    view = replace(VIEW, sign_doubt=doubt, timing=replace(TIMING, exposure_s=[0.04, 0.04]))
+    field = blur_field(view.motion(), colmap_camera(view.camera), view.shutter(0))
+    image = panned(round(float(np.median(field.extent_px()))))
+    stage = DeblurStage(view=view, decisions=(decision,), verdict=verdict, drop=False, workers=1)
+    (frame,) = stage(iter([Frame(name="a.jpg", image=image, t_s=0.5)]))
+    # the camera pans evenly: the blur is a straight line, the same for both signs
+    assert not frame.dropped and frame.treatments[-1].action == "deblurred"
+    assert np.abs(np.diff(frame.image.astype(int))).mean() > 1.1 * np.abs(np.diff(image.astype(int))).mean()
 
 
 # --- a target --------------------------------------------------------------------------------------------------------

@@ -17,12 +17,13 @@ class JpegLimits:
     #: Quality is kept between these: below, deblurred noise would show blocks; above, files grow for nothing.
     least_quality: int = 85
     most_quality: int = 98
+    #: Sampling of luminance, across and down, that OpenCV can write; chrominance has 1 x 1.
+    written: frozenset[int] = frozenset({0x11, 0x12, 0x21, 0x22, 0x41})
+    #: Marker of tables of quantisation.
+    tables_marker: int = 0xDB
 
 
 JPEG_LIMITS = JpegLimits()
-_TABLES = 0xDB
-#: Sampling of luminance, across and down, that OpenCV can write; chrominance has 1 x 1.
-_WRITTEN = {0x11, 0x12, 0x21, 0x22, 0x41}
 
 
 def read_jpeg_coding(data: bytes) -> tuple[int, int | None]:
@@ -41,7 +42,7 @@ def read_jpeg_coding(data: bytes) -> tuple[int, int | None]:
     tables: dict[int, int] = {}
     frame = b""
     for marker, begin, end in jpeg_segments(data):
-        if marker == _TABLES:
+        if marker == JPEG_LIMITS.tables_marker:
             tables |= _sum_tables(data[begin + 4 : end])
         elif marker in START_OF_FRAME:
             frame = data[begin + 4 : end]
@@ -50,7 +51,9 @@ def read_jpeg_coding(data: bytes) -> tuple[int, int | None]:
     scale = 100 * coarseness / JPEG_LIMITS.table_sum
     quality = round((200 - scale) / 2 if scale <= 100 else 5000 / scale)
     quality = min(max(quality, JPEG_LIMITS.least_quality), JPEG_LIMITS.most_quality)
-    is_written = len(components) == 3 and components[0][1] in _WRITTEN and all(c[1] == 0x11 for c in components[1:])
+    is_written = (
+        len(components) == 3 and components[0][1] in JPEG_LIMITS.written and all(c[1] == 0x11 for c in components[1:])
+    )
     return quality, components[0][1] << 16 | 0x1111 if is_written else None
 
 

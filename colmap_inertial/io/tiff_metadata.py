@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import dataclass
 
 from colmap_inertial.io.images import TIFF_ORDERS, tiff_entries
 
-#: ImageDescription, Make, Model, Orientation, DateTime, Artist, XMP, Copyright, IPTC, ICC profile.
-_CARRIED = frozenset({270, 271, 272, 274, 306, 315, 700, 33432, 33723, 34675})
-#: Directories: of EXIF, of GPS, and inside EXIF of interoperability (CIPA DC-008).
-_DIRECTORIES = frozenset({34665, 34853, 40965})
-#: Bytes of a value by its type, and those of its parts that have an order (TIFF 6.0).
-_TYPE_BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8}
-_PART_BYTES = {5: 4, 10: 4}
+
+@dataclass(frozen=True, kw_only=True)
+class TiffLayout:
+    """Entries that are carried, and sizes of values (TIFF 6.0)."""
+
+    #: ImageDescription, Make, Model, Orientation, DateTime, Artist, XMP, Copyright, IPTC, ICC profile.
+    carried: frozenset[int] = frozenset({270, 271, 272, 274, 306, 315, 700, 33432, 33723, 34675})
+    #: Directories: of EXIF, of GPS, and inside EXIF of interoperability (CIPA DC-008).
+    directories: frozenset[int] = frozenset({34665, 34853, 40965})
+    #: Bytes of a value by its type, from 0 on; those of fractions are two numbers.
+    type_bytes: tuple[int, ...] = (0, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8)
+    fractions: frozenset[int] = frozenset({5, 10})
+
+
+_LAYOUT = TiffLayout()
 
 #: Type, count and value.
 _Values = dict[int, tuple[int, int, bytes]]
@@ -33,7 +42,7 @@ def carry_tiff_metadata(original: bytes, encoded: bytes) -> bytes:
     out = bytearray(encoded)
     made = {tag: struct.pack(target + "HHI", tag, kind, n) + value for tag, (kind, n, value) in entries.items()}
     first = tiff_entries(original, source, struct.unpack_from(source + "I", original, 4)[0])
-    wanted = {tag: entry for tag, entry in first.items() if tag in _CARRIED | _DIRECTORIES}
+    wanted = {tag: entry for tag, entry in first.items() if tag in _LAYOUT.carried | _LAYOUT.directories}
     made |= _append_entries(original, wanted, source, target, out)
     following = encoded[end : end + 4]
     at = _append(_directory(made, target) + following, out)
@@ -45,20 +54,21 @@ def _append_entries(original: bytes, entries: _Values, source: str, target: str,
     """Entries of a directory in another order of bytes; values that do not fit into them are appended."""
     made = {}
     for tag, (kind, count, field) in entries.items():
-        if tag in _DIRECTORIES:
+        if tag in _LAYOUT.directories:
             inner = tiff_entries(original, source, struct.unpack(source + "I", field)[0])
             inside = _append_entries(original, inner, source, target, out)
             value = struct.pack(target + "I", _append(_directory(inside, target) + bytes(4), out))
             made[tag] = struct.pack(target + "HHI", tag, 4, 1) + value
             continue
-        size = _TYPE_BYTES.get(kind, 0) * count
+        each = _LAYOUT.type_bytes[kind] if kind < len(_LAYOUT.type_bytes) else 0
+        size = each * count
         if not size:
             continue
         at = struct.unpack(source + "I", field)[0]
         value = field[:size] if size <= 4 else original[at : at + size]
         if len(value) < size:
             continue
-        value = _reordered(value, _PART_BYTES.get(kind, _TYPE_BYTES[kind]), source != target)
+        value = _reordered(value, each // 2 if kind in _LAYOUT.fractions else each, source != target)
         if size > 4:
             value = struct.pack(target + "I", _append(value, out))
         made[tag] = struct.pack(target + "HHI", tag, kind, count) + value.ljust(4, b"\0")

@@ -7,14 +7,23 @@ saturation and a medium brightness give weights, by which the images are blended
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from colmap_inertial.core.arrays import BoolArray, Float32Array
 from colmap_inertial.imaging.transfer import linear_from_srgb, srgb_from_linear
 
-#: Standard deviation by which the border of what is clipped is softened, px.
-_FEATHER_PX = 3.0
+
+@dataclass(frozen=True, kw_only=True)
+class MertensLimits:
+    """Limits of exposure fusion."""
+
+    #: Standard deviation by which the border of what is clipped is softened, px.
+    feather_px: float = 3.0
+
+
+_LIMITS = MertensLimits()
 
 
 def fuse_mertens(images: Sequence[Float32Array]) -> Float32Array:
@@ -57,9 +66,9 @@ def darken_fused(fused: Float32Array, dark: Float32Array, clipped: BoolArray, ga
     """
     import cv2
 
-    reach = 2 * round(3 * _FEATHER_PX) + 1
+    reach = 2 * round(3 * _LIMITS.feather_px) + 1
     grown = cv2.dilate(clipped.astype(np.float32), np.ones((reach, reach), np.uint8))
-    share = np.asarray(cv2.GaussianBlur(grown, (0, 0), _FEATHER_PX))
+    share = np.asarray(cv2.GaussianBlur(grown, (0, 0), _LIMITS.feather_px))
     if fused.ndim == 3:
         share = share[..., None]
     light = srgb_from_linear(linear_from_srgb(np.clip(fused, 0, 1)) / gain)
