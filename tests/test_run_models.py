@@ -440,6 +440,21 @@ def test_a_frame_that_would_be_dropped_is_deblurred_where_all_stay(doubt):
     assert np.abs(np.diff(frame.image.astype(int))).mean() > 1.1 * np.abs(np.diff(image.astype(int))).mean()
 
 
+def test_a_frame_with_curved_blur_stays_where_nothing_tells_the_sign():
+    rate_rad_s = PANNING.gyro_rad_s + np.stack([40 * (T_S - 0.53), 0 * T_S, 0 * T_S], axis=1)
+    decision = FrameDecision(name="a.jpg", blur_px=20.0, action="deblur", reason="20 px of blur")
+    verdict = RecordingVerdict(trusted=True, support=9.0, extent_factor=1.0, frames=9, reason="")
+    timing = replace(TIMING, exposure_s=[0.04, 0.04])
+    image = panned(20)
+    for doubt in ("", "nothing tells the sign"):
+        view = replace(VIEW, imu=replace(PANNING, gyro_rad_s=rate_rad_s), timing=timing, sign_doubt=doubt)
+        stage = DeblurStage(view=view, decisions=(decision,), verdict=verdict, workers=1)
+        (frame,) = stage(iter([Frame(name="a.jpg", image=image, t_s=0.5)]))
+        assert ("curved the other way" in frame.treatments[-1].reason) == bool(doubt)
+        if doubt:
+            np.testing.assert_array_equal(frame.image, image)
+
+
 # --- a target --------------------------------------------------------------------------------------------------------
 
 
