@@ -85,6 +85,40 @@ def database_of(model, path, reach=4):
     return path
 
 
+def test_wrong_cameras_of_a_project_are_placed_by_the_matches_of_its_database(box, tmp_path):
+    names = [box.names[i] for i in (60, 90)]
+    project = altered(box, tmp_path / "project", names, 54)
+    sound = read_model(box.root / "sparse" / "0")
+    database = database_of(sound, project / "database.db")
+    before = sorted(path.name for path in project.iterdir()), database.read_bytes()
+    model = reconstructed(box, project, tmp_path / "out")
+    assert model["rotations"]["registered_again"] == names
+    assert model["rotations"]["wrong"] == model["rotations"]["left_out"] == []
+    assert max(model["rotations"]["deviations_deg"].values()) < 2
+    assert (sorted(path.name for path in project.iterdir()), database.read_bytes()) == before
+    metric = read_model(tmp_path / "out" / "sparse" / "0")
+    assert metric.num_reg_images() == 120
+    for name in names:
+        against_first = [
+            (
+                model.find_image_with_name(name).cam_from_world()
+                * model.find_image_with_name(box.names[0]).cam_from_world().inverse()
+            ).rotation
+            for model in (metric, sound)
+        ]
+        assert np.degrees((against_first[0] * against_first[1].inverse()).angle()) < 0.5
+
+
+def test_apply_does_not_bring_back_the_wrong_poses_of_cameras_that_were_registered_again(box, tmp_path):
+    name = box.names[60]
+    project = altered(box, tmp_path / "project", [name], 54)
+    database_of(read_model(box.root / "sparse" / "0"), project / "database.db")
+    assert reconstructed(box, project, tmp_path / "out")["rotations"]["registered_again"] == [name]
+    apply_to_project(project, tmp_path / "metric", read_scales([str(tmp_path / "out" / "result.json")]))
+    metric = read_model(tmp_path / "metric" / "sparse" / "0")
+    assert {image.name for image in metric.images.values()} == set(box.names) - {name}
+
+
 @pytest.mark.parametrize("wrong", [[60], [3, 61, 90]])
 def test_wrong_cameras_leave_the_metric_model_and_are_listed(box, tmp_path, wrong):
     names = [box.names[i] for i in wrong]
@@ -115,6 +149,10 @@ def test_diagnose_names_the_wrong_cameras(box, tmp_path):
     assert finding.severity == "warning"
     assert box.names[60] in finding.evidence
     assert finding.numbers["wrong"] == 1
+    assert set(finding.deviations_deg) == set(box.names)
+    assert finding.deviations_deg[box.names[60]] == pytest.approx(54, abs=1)
+    others = [deg for name, deg in finding.deviations_deg.items() if name != box.names[60]]
+    assert 0 < max(others) < 2
 
 
 def test_a_wrong_camera_is_registered_again_by_its_matches(box, tmp_path):

@@ -10,6 +10,7 @@ import errno
 import os
 import shutil
 import sqlite3
+import tempfile
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -110,6 +111,40 @@ def is_database(path: Path) -> bool:
         return path.name == "database.db" or file.read(16) == b"SQLite format 3\0"
 
 
+@contextlib.contextmanager
+def opened_read_only(database: Path) -> Iterator[sqlite3.Connection]:
+    """Open a database and leave no trace beside it, as SQLite does where the last writer kept a log ahead of writing.
+
+    One whose log still holds something is read from a copy.
+    """
+    with contextlib.ExitStack() as stack:
+        if any(database.with_name(database.name + suffix).exists() for suffix in SIDE_FILES):
+            copy = Path(stack.enter_context(tempfile.TemporaryDirectory())) / database.name
+            copy_database(database, copy)
+            uri = copy.as_uri()
+        else:
+            uri = f"{database.absolute().as_uri()}?mode=ro&immutable=1"
+        yield stack.enter_context(contextlib.closing(sqlite3.connect(uri, uri=True)))
+
+
+def find_database(project: Path, files: Sequence[Path]) -> Path | None:
+    """The database of a project that holds matches: the one in its root, or its only one; ``None`` without.
+
+    ``files`` are those of the project, relative to it.
+    """
+    named = sorted((path for path in files if path.suffix == ".db"), key=lambda path: len(path.parts))
+    found = [project / path for path in named if _has_pairs(project / path)]
+    return found[0] if len(found) == 1 or (found and found[0].parent == project) else None
+
+
+def _has_pairs(path: Path) -> bool:
+    try:
+        with opened_read_only(path) as opened:
+            return opened.execute("SELECT 1 FROM two_view_geometries LIMIT 1").fetchone() is not None
+    except (sqlite3.Error, FormatError):
+        return False  # no database, or one of another program
+
+
 def check_records(database: Path) -> None:
     """Refuse records of another size than they state: COLMAP would read or write beyond their end.
 
@@ -118,8 +153,7 @@ def check_records(database: Path) -> None:
     FormatError
         That names the table.
     """
-    uri = f"{database.absolute().as_uri()}?mode=ro"
-    with reading(database, UNREADABLE), contextlib.closing(sqlite3.connect(uri, uri=True)) as opened:
+    with reading(database, UNREADABLE), opened_read_only(database) as opened:
         columns = {row[1] for row in opened.execute("PRAGMA table_info(two_view_geometries)")}
         for table, holds in _RECORDS.items():
             if table == "two_view_geometries" and {"camera1", "camera2"} <= columns:

@@ -254,8 +254,11 @@ def _model_scale(path: Path, fields: Any, world: WorldAxes) -> ModelScale:
 
 
 def _read_left_out(path: Path, rotations: Any) -> tuple[str, ...]:
-    """Images that an estimate left out; none where it was made before cameras were compared."""
-    names = [] if rotations is None else rotations.get("left_out") if isinstance(rotations, dict) else None
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise FormatError(path, "rotations: left_out must be a list of image names")
-    return tuple(names)
+    """Images that an estimate left out, or registered again; none where it was made before cameras were compared."""
+    if rotations is None:
+        return ()
+    fields = rotations if isinstance(rotations, dict) else {}
+    names = [fields.get("left_out"), fields.get("registered_again", [])]
+    if not all(isinstance(some, list) and all(isinstance(name, str) for name in some) for some in names):
+        raise FormatError(path, "rotations: left_out and registered_again must be lists of image names")
+    return tuple(name for some in names for name in some)

@@ -138,6 +138,7 @@ def check_cameras(recorded: Recorded) -> Iterator[Finding]:
                 "judged": float(np.sum(found.judged)),
                 "median_deg": float(np.median(found.deviation_deg[found.judged & found.kept])),
             },
+            deviations_deg=found.deviations_deg,
         )
 
 

@@ -52,6 +52,8 @@ class Finding:
         The same in numbers; units are in the names.
     advice
         What to do.
+    deviations_deg
+        By image, how far its camera is turned against those around it; empty in findings about anything else.
     """
 
     code: str
@@ -59,6 +61,7 @@ class Finding:
     evidence: str
     advice: str
     numbers: Mapping[str, float] = field(default_factory=dict)
+    deviations_deg: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def sentence(self) -> str:
@@ -66,12 +69,14 @@ class Finding:
         return f"{self.evidence}; {self.advice}"
 
     def as_json(self) -> dict[str, object]:
+        deviations = {"deviations_deg": dict(self.deviations_deg)} if self.deviations_deg else {}
         return {
             "code": self.code,
             "severity": self.severity,
             "evidence": self.evidence,
             "numbers": dict(self.numbers),
             "advice": self.advice,
+            **deviations,
         }
 
 

@@ -62,6 +62,8 @@ class RotationConsensus:
         (F,) which cameras form one rigid model: 0 is the largest part, -1 a wrong camera.
     ref_from_part_xyzw
         (P, 4) rotations of the world that bring parts into agreement with the largest.
+    registered_again
+        Cameras that were wrong, and are kept where matches place them: they agree.
     """
 
     names: tuple[str, ...]
@@ -70,6 +72,7 @@ class RotationConsensus:
     deviation_deg: Array
     part: IndexArray
     ref_from_part_xyzw: Array
+    registered_again: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_fields(self, t_s=("F",), deviation_deg=("F",), ref_from_part_xyzw=("P", 4))
@@ -86,6 +89,12 @@ class RotationConsensus:
     def left_out(self) -> tuple[str, ...]:
         """Images of all other cameras."""
         return tuple(name for name, kept in zip(self.names, self.kept, strict=True) if not kept)
+
+    @property
+    def deviations_deg(self) -> dict[str, float]:
+        """By image, how far each camera that was judged is turned against those around it."""
+        each = zip(self.names, self.deviation_deg.tolist(), self.judged, strict=True)
+        return {name: deg for name, deg, judged in each if judged}
 
     @property
     def wrong(self) -> tuple[WrongCamera, ...]:
@@ -111,6 +120,7 @@ class RotationConsensus:
         """The consensus after some cameras were registered again; the others stay wrong."""
         place = {name: i for i, name in enumerate(later.names)}
         at = np.array([place.get(name, -1) for name in self.names])
+        again = (one.name for one in self.wrong if one.name in place and later.kept[place[one.name]])
         return RotationConsensus(
             names=self.names,
             t_s=self.t_s,
@@ -118,6 +128,7 @@ class RotationConsensus:
             deviation_deg=np.where(at >= 0, later.deviation_deg[at], self.deviation_deg),
             part=np.where(at >= 0, later.part[at], self.part),
             ref_from_part_xyzw=later.ref_from_part_xyzw,
+            registered_again=(*self.registered_again, *again),
         )
 
     def as_json(self) -> dict[str, object]:
@@ -130,4 +141,6 @@ class RotationConsensus:
             "wrong": [{"name": one.name, "deg": one.deviation_deg} for one in self.wrong],
             "seams": [{"before": one.before, "name": one.name, "deg": one.turn_deg} for one in self.seams],
             "left_out": list(self.left_out),
+            "registered_again": list(self.registered_again),
+            "deviations_deg": self.deviations_deg,
         }

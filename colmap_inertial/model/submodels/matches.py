@@ -20,7 +20,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.io.files import reading
 from colmap_inertial.model import points_of_features
-from colmap_inertial.model.database import UNREADABLE, check_records
+from colmap_inertial.model.database import UNREADABLE, opened_read_only
 from colmap_inertial.model.submodels.graph import Pair, SimilarityConstraint
 
 if TYPE_CHECKING:
@@ -84,13 +84,16 @@ def read_matches(database: Path, wanted: Callable[[str, str], bool]) -> Iterator
     """
     import pycolmap
 
-    check_records(database)
-    with reading(database, UNREADABLE), pycolmap.Database.open(str(database)) as opened:
-        name = {image.image_id: image.name for image in opened.read_all_images()}
-        for pair, count in zip(*opened.read_two_view_geometry_num_inliers(), strict=True):
-            i, j = pycolmap.pair_id_to_image_pair(pair)
-            if count >= LIMITS.matches and i in name and j in name and wanted(name[i], name[j]):
-                yield name[i], name[j], np.array(opened.read_two_view_geometry(i, j).inlier_matches, dtype=np.int64)
+    with reading(database, UNREADABLE), opened_read_only(database) as opened:
+        name = dict(opened.execute("SELECT image_id, name FROM images"))
+        enough = "SELECT pair_id FROM two_view_geometries WHERE rows >= ? ORDER BY pair_id"
+        for (pair,) in opened.execute(enough, (LIMITS.matches,)).fetchall():
+            first, second = (name.get(number) for number in pycolmap.pair_id_to_image_pair(pair))
+            if first is not None and second is not None and wanted(first, second):
+                rows, data = opened.execute(
+                    "SELECT rows, data FROM two_view_geometries WHERE pair_id = ?", (pair,)
+                ).fetchone()
+                yield first, second, np.frombuffer(data, dtype="<u4").reshape(rows, 2).astype(np.int64)
 
 
 def matches_between(

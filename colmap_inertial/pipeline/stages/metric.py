@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -121,16 +120,14 @@ class InertialStage:
         estimate, trajectory = self._estimate(model)
         found = estimate.rotations
         if found is not None and not found.kept.all() and estimate.verdict != "refused":
-            reconstruction, again = self._register_again(model, found)
-            if again:
+            reconstruction, placed = self._register_again(model, found)
+            if placed:
                 second, poses = self._estimate(replace(model, reconstruction=reconstruction))
                 if second.rotations is not None and second.verdict != "refused":
                     estimate, trajectory, found = second, poses, found.updated(second.rotations)
             left_out = set(found.left_out)
             trajectory = trajectory.select(np.array([name not in left_out for name in trajectory.names]))
-            model = _select_agreeing_images(
-                model, reconstruction, found, [name for name in again if name not in left_out]
-            )
+            model = _select_agreeing_images(model, reconstruction, found)
         if model.rotations is not None and estimate.rotations is not None:
             said = describe_consensus(estimate.rotations)
             notes = (*(note for note in estimate.notes if note not in said), *describe_consensus(model.rotations))
@@ -153,20 +150,18 @@ class InertialStage:
         return register_again(model.reconstruction, wrong, self.database)
 
 
-def _select_agreeing_images(
-    model: Model, reconstruction: pycolmap.Reconstruction, found: RotationConsensus, again: Sequence[str]
-) -> Model:
+def _select_agreeing_images(model: Model, reconstruction: pycolmap.Reconstruction, found: RotationConsensus) -> Model:
     """A model of the images that agree with the gyroscope; some of them may have been registered again."""
     sentences = list(describe_consensus(found))
-    if again:
-        sentences.append(f"registered again, and right now: {', '.join(again)}")
+    if found.registered_again:
+        sentences.append(f"registered again, and right now: {', '.join(found.registered_again)}")
     reason = "; ".join(sentences)
     log.info("model %d: %s", model.colmap_index, reason)
     done = Treatment(
         stage="rotations",
         reason=reason,
         action="left out" if found.left_out else "registered again",
-        values={"left_out": found.left_out, "registered_again": again},
+        values={"left_out": found.left_out, "registered_again": found.registered_again},
     )
     return replace(
         model,

@@ -46,6 +46,7 @@ from colmap_inertial.model import (
     trajectory_from_model,
 )
 from colmap_inertial.model.copying import list_tree
+from colmap_inertial.model.database import find_database
 from colmap_inertial.model.layout import read_layout
 from colmap_inertial.model.rigs import frames_of_rigs
 from colmap_inertial.model.similarities import ModelScale, read_similarity
@@ -194,7 +195,8 @@ def _reconstruct(
         poses = _trajectory(largest, timing)
         doubts = run_preflight(session, recording, given.raw, findings, force=options.force, model=poses)
         recording = dataclasses.replace(recording, doubts=doubts)
-        inputs = StageInputs(recording=recording, options=_hold_cameras(options))
+        database = find_database(project, list_tree(project, follow_links=source.follow_links)[1])
+        inputs = StageInputs(recording=recording, options=_hold_cameras(options), database=database)
         stages = insert_defaults(model_stages, default_model_stages(inputs))
         submodels = Submodels(folders=models, numbered=True, after=(), read=read)
         results, fragments, gaps = run_models(session, recording, stages, submodels, fragments=options.fragments)
