@@ -35,6 +35,7 @@ from colmap_inertial.inertial.core import parameters as par
 from colmap_inertial.inertial.core.parameters import Prior
 from colmap_inertial.inertial.core.priors import PRIORS, clock_scale_sigma, is_calibrated
 from colmap_inertial.inertial.scale._fit import Fit, fit_jointly
+from colmap_inertial.inertial.scale._gain import WrongGain, judge_gain
 from colmap_inertial.inertial.scale._setup import Data, prepare
 from colmap_inertial.inertial.scale._shape import LIMITS as SHAPE_LIMITS, ShapeFault, confirmed, suspect
 from colmap_inertial.inertial.scale._suspects import Faults, worst
@@ -69,12 +70,6 @@ class JudgementLimits:
     shortest_s: float = 6.0
     #: So many places where poses jump are said by their times.
     jumps_said: int = 5
-    #: Gravity that reads longer or shorter by this has a reason: in flights, whose motion cannot tell bias from gain,
-    #: clean recordings have 0.1 at most.
-    gravity_excess_m_s2: float = 0.25
-    #: Standard deviations between the gain that the motion shows and the one that would explain gravity: 4.1 at most in
-    #: recordings with a wrong gain, 6.5 and more in 23 of 24 clips of 20 s by a sensor with a bias of .45 m/s2.
-    told_apart: float = 4.5
 
 
 _LIMITS = JudgementLimits()
@@ -246,7 +241,7 @@ def _judged(
         reasons = (*reasons, *(() if worthless else wrong))
     else:
         bent = [fault.sentence(t_s, found.widened) for fault in shape] or _check_drift(fit.drift)
-        doubts = [*wrong, *check_clocks(clock_rate), *_checks(fit, t_s, found.undecided_gain), *bent]
+        doubts = [*wrong, *check_clocks(clock_rate), *_checks(fit, t_s, found.wrong_gain), *bent]
         verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, doubts)
     notes: tuple[str, ...] = ()
     if len(fit.jumped_s):
@@ -280,37 +275,6 @@ def _judged(
     )
 
 
-def find_undecided_gain(fit: Fit, widened: float) -> tuple[float, float]:
-    """Whether gravity's length may be the accelerometer's gain, which a motion with little rotation cannot tell from
-    bias.
-
-    Parameters
-    ----------
-    fit, widened
-        The fit, and the factor on its variances.
-
-    Returns
-    -------
-    The gain that would explain gravity's length, and what the logarithm of the scale would change by if it did; zeros
-    where gravity is as long as it should be, or the motion tells the two apart.
-    """
-    x, mean_gain = fit.estimate, np.zeros(par.N_GLOBALS)
-    mean_gain[np.arange(par.ACCEL_GAIN.start, par.ACCEL_GAIN.stop)[::4]] = 1 / 3
-    gravity = float(np.linalg.norm(x.gravity_m_s2))
-    up = -x.gravity_m_s2 / gravity @ x.world_from_imu
-    excess_m_s2 = float(np.mean(up @ x.accel_bias_m_s2 - gravity * np.einsum("ki,ij,kj->k", up, x.accel_gain, up)))
-    variance = float(mean_gain @ fit.cov @ mean_gain)
-    # without the prior, which pulls all three alike
-    information = max(1 / variance - 9 * float(mean_gain @ fit.prior_info @ mean_gain), 1e-9)
-    fitted = -float(np.trace(x.accel_gain)) / 3
-    seen, explaining = fitted / (variance * information), excess_m_s2 / gravity
-    deviations = abs(seen - explaining) * (information / widened) ** 0.5
-    if abs(excess_m_s2) < _LIMITS.gravity_excess_m_s2 or deviations > _LIMITS.told_apart:
-        return 0.0, 0.0
-    by_gain = float(fit.cov[par.SCALE] @ mean_gain) / variance
-    return explaining, by_gain * (explaining - fitted)
-
-
 @dataclass(frozen=True, kw_only=True)
 class FoundScale:
     """Scale of a fit.
@@ -321,15 +285,15 @@ class FoundScale:
         As :class:`ScaleEstimate` has them.
     widened
         Factor on variances of the fit: squares beyond their expectation, few degrees of freedom, what no model has.
-    undecided_gain
-        Of an accelerometer whose gravity is too long, 0 of others (:func:`find_undecided_gain`).
+    wrong_gain
+        Whether the accelerometer is off in gain; ``None`` of a calibrated one.
     """
 
     metres_per_unit: float
     sigma_log: float
     parts: dict[str, float]
     widened: float
-    undecided_gain: float
+    wrong_gain: WrongGain | None
 
 
 def scale_of(fit: Fit, t_s: Array, calibrated: bool, clock_rate: float = 0.0) -> FoundScale:
@@ -355,9 +319,8 @@ def scale_of(fit: Fit, t_s: Array, calibrated: bool, clock_rate: float = 0.0) ->
     variances["accel_gain"] *= fit.gain_surprise
     variances["noise_levels"] = (student * _UNIFORM * share) ** 2 + fit.level_variance
     variances["accel_gain"] += 0.0 if calibrated else PRIORS.accel_model**2
-    gain, change = (0.0, 0.0) if calibrated else find_undecided_gain(fit, widened)
-    # gain or bias, as likely
-    variances["accel_gain"] += change**2 / 2
+    wrong_gain = None if calibrated else judge_gain(fit.estimate, fit.cov, fit.prior_info, widened)
+    variances["accel_gain"] += 0.0 if wrong_gain is None else wrong_gain.variance
     variances["lens"] = PRIORS.lens**2
     variances["clocks"] = clock_scale_sigma(clock_rate) ** 2
     return FoundScale(
@@ -365,7 +328,7 @@ def scale_of(fit: Fit, t_s: Array, calibrated: bool, clock_rate: float = 0.0) ->
         sigma_log=sum(variances.values()) ** 0.5,
         parts={name: variance**0.5 for name, variance in variances.items()},
         widened=widened,
-        undecided_gain=gain,
+        wrong_gain=wrong_gain,
     )
 
 
@@ -402,7 +365,7 @@ def _refusals(fit: Fit, t_s: Array) -> list[str]:
     return out
 
 
-def _checks(fit: Fit, t_s: Array, undecided_gain: float) -> list[str]:
+def _checks(fit: Fit, t_s: Array, wrong_gain: WrongGain | None) -> list[str]:
     """Findings that make the number doubtful, in the user's words."""
     out = []
     span_s = float(t_s[-1] - t_s[0])
@@ -417,11 +380,11 @@ def _checks(fit: Fit, t_s: Array, undecided_gain: float) -> list[str]:
             f"the accelerometer seems to be off in gain by {gains} % on its axes, more than such sensors are, which "
             "is allowed for: check its unit and the strength of gravity, or calibrate it (calibrate-imu)"
         )
-    elif undecided_gain != 0:
+    elif wrong_gain is not None and wrong_gain.is_likely:
         out.append(
-            f"the accelerometer reads gravity {100 * undecided_gain:+.1f} % too long, and this motion does not tell "
-            "whether by its gain, which lengths follow, or by its bias: check its unit, turn the camera about all axes "
-            "while it moves, or calibrate it (calibrate-imu)"
+            f"the accelerometer's gain may be off by {100 * wrong_gain.gain:+.1f} %, which lengths follow (gravity "
+            f"reads {100 * wrong_gain.excess:+.1f} % too long, by gain or bias): check its unit, turn the camera about "
+            "all axes while it moves, or calibrate it (calibrate-imu)"
         )
     return out
 

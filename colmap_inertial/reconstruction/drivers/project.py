@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import fnmatch
 import functools
-import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -69,8 +68,6 @@ from colmap_inertial.reconstruction.preparation.preflight import check_imu, run_
 
 if TYPE_CHECKING:
     import pycolmap
-
-log = logging.getLogger(__name__)
 
 #: With fewer of the images found in the video, it is not theirs.
 _LEAST_SHARE = 0.5
