@@ -7,10 +7,10 @@
 ``--reconstructed`` holds InertialScale recordings (``poses.txt``, ``groundtruth.txt``). Windows: 30 keyframes at 2, 3
 and 4 a second, and video of 20, 40 and 60 s. In each, cameras are made wrong as a reconstruction makes them wrong: one
 or three of 30 turned by 10 to 90 degrees and moved, or a block of 10 to 40 % turned by 10 to 60 degrees as a whole.
-``foreign`` takes another recording's IMU. Each row: windows, how many scales are given, 95 % intervals that hold the
-truth (of all windows), trusted ones and how many of these are right, windows in which exactly the wrong cameras are
-named (or the seams, to within two cameras), sound cameras lost (%), rms error (%), median half-width (%), and
-median time.
+``moved`` are three in another place, turned rightly; ``foreign`` takes another recording's IMU. Each row: windows, how
+many scales are given, 95 % intervals that hold the truth (of all windows), trusted ones, how many of these are right,
+windows in which exactly the wrong cameras are named (or the seams, to within two cameras), sound cameras lost (%), rms
+error (%), median half-width (%), and median time.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import CameraTrajectory, ImuRecording
 from colmap_inertial.inertial.scale import estimate_scale
 
-CASES = ("clean", "one", "three", "block", "foreign")
+CASES = ("clean", "one", "three", "block", "foreign", "moved")
 #: Frames a second and length; keyframes are 30.
 KINDS = {"K2": (2.0, 15.0), "K3": (3.0, 10.0), "K4": (4.0, 7.5)} | {f"V{s}": (20.0, float(s)) for s in (20, 40, 60)}
 NOISE_M = 0.002
@@ -123,10 +123,11 @@ def damage(
 
     wrong: tuple[int, ...] = ()
     seams: tuple[int, ...] = ()
-    if case in ("one", "three"):
+    if case in ("one", "three", "moved"):
         wrong = tuple(sorted(rng.choice(n, 1 if case == "one" else 3, replace=False).tolist()))
         for i in wrong:
-            pose[i] = quat_multiply(turn(10, 90), pose[i])
+            if case != "moved":
+                pose[i] = quat_multiply(turn(10, 90), pose[i])
             away = rng.standard_normal(3)
             centre[i] += size * rng.uniform(0.1, 2) * away / np.linalg.norm(away)
     elif case == "block":
@@ -167,7 +168,9 @@ def run(task: Task) -> Outcome:
         error=None if given is None else float(np.log(given / truth)),
         sigma=estimate.sigma_log,
         wrong=wrong,
-        named=() if check is None else tuple(place[one.name] for one in check.wrong),
+        named=()
+        if check is None
+        else tuple(place[name] for name in (*(one.name for one in check.wrong), *check.moved)),
         seams=(*seams, -1, *(() if check is None else (place[one.name] for one in check.seams))),
         seconds=seconds,
         reasons=estimate.reasons,

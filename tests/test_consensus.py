@@ -165,6 +165,16 @@ def test_real_recordings_with_wrong_cameras_keep_their_scale(study, shared_data)
     assert sum(abs(outcome.error) < 1.96 * outcome.sigma for outcome in outcomes) >= 11
 
 
+def test_real_keyframes_in_another_place_are_named_and_the_scale_is_as_sure_as_without(study, shared_data):
+    tasks = study.tasks_of(shared_data / "real_imu", ["K2"], ["moved", "clean"], 1)
+    outcomes = [study.run(task) for task in tasks]
+    moved, clean = ([o for o in outcomes if o.case == case] for case in ("moved", "clean"))
+    assert sum(map(study.found, moved)) >= 5 and all(study.found(outcome) for outcome in clean)
+    given = [o for o in moved if o.error is not None]
+    assert len(given) >= 5 and sum(abs(o.error) < 1.96 * o.sigma for o in given) >= len(given) - 1
+    assert np.median([o.sigma for o in given]) < 1.5 * np.median([o.sigma for o in clean])
+
+
 def test_real_recordings_refuse_each_other_s_imu(study, shared_data):
     tasks = study.tasks_of(shared_data / "real_imu", ["K3", "V20"], ["foreign"], 1)
     assert {study.run(task).verdict for task in tasks} == {"refused"}

@@ -134,6 +134,30 @@ def test_wrong_cameras_leave_the_metric_model_and_are_listed(box, tmp_path, wron
     assert names[0] in (tmp_path / "out" / "report.html").read_text()
 
 
+def test_keyframes_in_the_wrong_place_alone_are_named_and_placed_by_matches(box, tmp_path):
+    """Turned rightly, so that the gyroscope has nothing against them; without points, whose errors would tell."""
+    every = {name for name in box.names if name not in box.names[::4]}
+    names, source = box.names[8:100:36], read_model(box.root / "sparse" / "0")
+    few = deregister_images(source, every)
+    project = tmp_path / "project"
+    (project / "sparse" / "0").mkdir(parents=True)
+    moved, rng = pycolmap.Reconstruction(few), np.random.default_rng(2)
+    for image in [moved.find_image_with_name(name) for name in names]:
+        pose, away = image.cam_from_world(), rng.standard_normal(3)
+        for k in [k for k, point in enumerate(image.points2D) if point.has_point3D()]:
+            moved.delete_observation(image.image_id, k)
+        beside = pycolmap.Rigid3d(pose.rotation, pose.translation + 2 * away / np.linalg.norm(away))
+        moved.frame(image.frame_id).set_cam_from_world(image.camera_id, beside)
+    moved.write_binary(str(project / "sparse" / "0"))
+    model = reconstructed(box, project, tmp_path / "out")
+    assert model["rotations"]["wrong"] == []
+    assert model["rotations"]["moved"] == model["rotations"]["left_out"] == names
+    database_of(few, project / "database.db")
+    model = reconstructed(box, project, tmp_path / "again")
+    assert model["rotations"]["moved"] == [] and model["rotations"]["registered_again"] == names
+    assert read_model(tmp_path / "again" / "sparse" / "0").num_reg_images() == 30
+
+
 def test_of_a_torn_model_the_largest_part_is_kept(box, tmp_path):
     names = box.names[30:60]
     project = altered(box, tmp_path / "project", names, 25, about=np.zeros(3))

@@ -62,6 +62,8 @@ class RotationConsensus:
         (F,) which cameras form one rigid model: 0 is the largest part, -1 a wrong camera.
     ref_from_part_xyzw
         (P, 4) rotations of the world that bring parts into agreement with the largest.
+    moved
+        Cameras whose rotations agree and whose positions the accelerometer contradicts.
     registered_again
         Cameras that were wrong, and are kept where matches place them: they agree.
     """
@@ -72,6 +74,7 @@ class RotationConsensus:
     deviation_deg: Array
     part: IndexArray
     ref_from_part_xyzw: Array
+    moved: tuple[str, ...] = ()
     registered_again: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -82,8 +85,8 @@ class RotationConsensus:
 
     @property
     def kept(self) -> BoolArray:
-        """(F,) cameras of the largest part."""
-        return np.asarray(self.part == 0)
+        """(F,) cameras of the largest part that were not moved."""
+        return np.asarray((self.part == 0) & ~np.isin(self.names, self.moved))
 
     @property
     def left_out(self) -> tuple[str, ...]:
@@ -120,7 +123,8 @@ class RotationConsensus:
         """The consensus after some cameras were registered again; the others stay wrong."""
         place = {name: i for i, name in enumerate(later.names)}
         at = np.array([place.get(name, -1) for name in self.names])
-        again = (one.name for one in self.wrong if one.name in place and later.kept[place[one.name]])
+        before = (*(one.name for one in self.wrong), *self.moved)
+        again = (name for name in before if name in place and later.kept[place[name]])
         return RotationConsensus(
             names=self.names,
             t_s=self.t_s,
@@ -128,6 +132,7 @@ class RotationConsensus:
             deviation_deg=np.where(at >= 0, later.deviation_deg[at], self.deviation_deg),
             part=np.where(at >= 0, later.part[at], self.part),
             ref_from_part_xyzw=later.ref_from_part_xyzw,
+            moved=(*(name for name in self.moved if name not in place), *later.moved),
             registered_again=(*self.registered_again, *again),
         )
 
@@ -140,6 +145,7 @@ class RotationConsensus:
             "median_deg": float(np.median(judged)) if len(judged) else None,
             "wrong": [{"name": one.name, "deg": one.deviation_deg} for one in self.wrong],
             "seams": [{"before": one.before, "name": one.name, "deg": one.turn_deg} for one in self.seams],
+            "moved": list(self.moved),
             "left_out": list(self.left_out),
             "registered_again": list(self.registered_again),
             "deviations_deg": self.deviations_deg,

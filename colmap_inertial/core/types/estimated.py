@@ -184,6 +184,8 @@ class ScaleEstimate:
     rotations
         Which cameras agree with the gyroscope; the estimate rests on those of the largest part. ``None`` where they
         were not compared.
+    jumped
+        Keyframes whose positions may be wrong, as they count little, or as the path jumps to and from them.
     method
         ``"spectral"`` or ``"joint"``; ``"none"`` where nothing could be estimated.
     """
@@ -206,6 +208,7 @@ class ScaleEstimate:
     parts: Mapping[str, float] | None = None
     noise: ImuNoise | None = None
     rotations: RotationConsensus | None = None
+    jumped: tuple[str, ...] = ()
     runtime_s: float = 0.0
     notes: tuple[str, ...] = ()
 

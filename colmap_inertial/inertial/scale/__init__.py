@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -34,6 +34,20 @@ from colmap_inertial.motion.align.conventions import likely_convention
 _PAUSE_S = 0.02
 #: Nor is less than this, in which gains change by less than a calibration is sure of them.
 _WARMER_K = 10.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class MovedLimits:
+    """Which cameras are in the wrong place by themselves, among keyframes; a video outvotes them."""
+
+    #: So many of them, or this share, may be.
+    most: int = 3
+    share: float = 0.1
+    #: Without them the scale's standard deviation is less than this share of what it was.
+    shrinks: float = 0.9
+
+
+_MOVED = MovedLimits()
 
 
 def remarks(trajectory: CameraTrajectory, timed: CameraTimedImu) -> tuple[str, ...]:
@@ -194,7 +208,8 @@ def _estimate_or_refuse(
         timed, consensus = align_recording(trajectory, imu, calibration, options)
         trajectory = trajectory.select(consensus.kept)
         stretched = timed.imu.repairs[len(imu.repairs) :]
-        estimate = _estimate(trajectory, timed, options)
+        estimate, moved = _estimate_without_moved(trajectory, timed, options)
+        consensus = replace(consensus, moved=moved)
         return replace(
             estimate,
             # also where there is no scale: it says what was found of camera and IMU
@@ -204,6 +219,22 @@ def _estimate_or_refuse(
         )
     except NotObservableError as error:
         return ScaleEstimate.refused(options.method, f"{error.quantity}: {error.hint}")
+
+
+def _estimate_without_moved(
+    trajectory: CameraTrajectory, timed: CameraTimedImu, options: ScaleOptions
+) -> tuple[ScaleEstimate, tuple[str, ...]]:
+    """The scale, and keyframes that it does without as it is known better so: the largest errors first hide others."""
+    moved: tuple[str, ...] = ()
+    estimate = _estimate(trajectory, timed, options)
+    most = max(_MOVED.most, _MOVED.share * len(trajectory))
+    while estimate.cov is not None and estimate.jumped and len(moved) + len(estimate.jumped) <= most:
+        names = (*moved, *estimate.jumped)
+        without = _estimate(trajectory.select(~np.isin(trajectory.names, names)), timed, options)
+        if without.cov is None or without.cov[0, 0] > _MOVED.shrinks**2 * estimate.cov[0, 0]:
+            break
+        estimate, moved = without, names
+    return estimate, moved
 
 
 def _estimate(trajectory: CameraTrajectory, timed: CameraTimedImu, options: ScaleOptions) -> ScaleEstimate:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array, BoolArray
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.types import ImuNoise, ScaleDrift
 from colmap_inertial.inertial.core import factors as fac, parameters as par
 from colmap_inertial.inertial.core.arrow import ArrowSystem, Inverse
@@ -121,6 +121,8 @@ class Fit:
         Scales of parts of the recording.
     excitation_m_s2
         Standard deviation of the camera's acceleration between nodes.
+    pose_weight
+        (K,) robust weights of the states' poses, of rotation or centre, whichever is less.
     jumped_s
         When states' poses hardly count or lie behind a break of the path, camera time.
     gain_chi2
@@ -151,6 +153,7 @@ class Fit:
     converged: bool
     drift: ScaleDrift
     excitation_m_s2: float
+    pose_weight: Array
     jumped_s: Array
     gain_chi2: float
     gain_surprise: float
@@ -193,6 +196,8 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
     states, z = states[:, :, :3], z[:, :3]
     inflation = max(1.0, *(squares / expected for squares, expected in sums.values()))
     drift = scale_drift(data, noise, at, inflation)
+    weights = [groups[name].weight for name in ("rotation", "centre")]
+    weight = np.min([one for one in weights if one is not None], axis=0)
     kinds, columns = shape.shape_columns(data.t_s, shape.camera_path(x))
     return Fit(
         estimate=x,
@@ -207,7 +212,8 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         converged=converged,
         drift=drift,
         excitation_m_s2=_excitation_m_s2(data, x),
-        jumped_s=data.t_s[np.append(False, data.broken) | _hardly_count(groups["rotation"], groups["centre"])],
+        pose_weight=weight,
+        jumped_s=data.t_s[np.append(False, data.broken) | (weight < _HARDLY)],
         gain_chi2=prior.gain_chi2(x),
         gain_surprise=_gain_surprise(at.prior, x, cov),
         variance_parts=variance_parts,
@@ -383,11 +389,6 @@ def _moment_scale(data: Data, x: Estimate) -> float:
     if not (visual_size > 0 and inertial_size > 0):
         raise np.linalg.LinAlgError("no motion")
     return float(inertial_size / visual_size)
-
-
-def _hardly_count(*groups: fac.Group | fac.Direct) -> BoolArray:
-    """(K,) which states have a pose that a robust weight all but switches off."""
-    return np.asarray(np.min([group.weight for group in groups if group.weight is not None], axis=0) < _HARDLY)
 
 
 def _excitation_m_s2(data: Data, x: Estimate) -> float:

@@ -68,6 +68,9 @@ class JudgementLimits:
     unexplained: float = 0.25
     #: Shorter clips say too little about their own noise for a number to be trusted.
     shortest_s: float = 6.0
+    #: A keyframe with a robust weight below this may be in the wrong place. Where three of 30 are, they swell the noise
+    #: so that their weights are .27 to .57; others keep .8 and more.
+    counts_little: float = 0.6
     #: So many places where poses jump are said by their times.
     jumps_said: int = 5
 
@@ -135,7 +138,16 @@ def estimate_joint(
     fit = replace(fit, variance_parts={**fit.variance_parts, "accel_faults": left_open})
     wrong = [*faults.sentences(), *_cut_off(data)]
     # what was taken from a path nobody can put back: its scale is too large by more than any interval says
-    return _judged(fit, data.t_s, timed.calibration, calibrated, wrong, shape, worthless=faults.path_is_smoothed)
+    estimate = _judged(fit, data.t_s, timed.calibration, calibrated, wrong, shape, worthless=faults.path_is_smoothed)
+    return replace(estimate, jumped=_name_jumped(fit, data, trajectory))
+
+
+def _name_jumped(fit: Fit, data: Data, trajectory: CameraTrajectory) -> tuple[str, ...]:
+    """Images by themselves that hardly count, or that the path jumps to and from; behind a break the drift is free."""
+    edges = np.concatenate([[True], data.broken, [True]])
+    little = (fit.pose_weight < _LIMITS.counts_little) & ~np.append(False, data.broken)
+    alone = (data.groups.count == 1) & (little | (edges[:-1] & edges[1:]))
+    return tuple(trajectory.names[int(np.argmin(np.abs(trajectory.t_s - t)))] for t in data.t_s[alone])
 
 
 def _prepared(trajectory: CameraTrajectory, timed: CameraTimedImu, options: JointOptions) -> tuple[Data, Prior]:

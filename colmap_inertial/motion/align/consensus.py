@@ -139,6 +139,13 @@ def describe_consensus(consensus: RotationConsensus) -> tuple[str, ...]:
         named = ", ".join(f"{one.name} ({one.deviation_deg:.0f} deg)" for one in wrong[:5])
         more = f" and {len(wrong) - 5} more" if len(wrong) > 5 else ""
         out.append(f"{len(wrong)} of {count} cameras contradict the gyroscope and were left out: {named}{more}")
+    if consensus.moved:
+        named = ", ".join(consensus.moved[:5])
+        more = f" and {len(consensus.moved) - 5} more" if len(consensus.moved) > 5 else ""
+        out.append(
+            f"{len(consensus.moved)} of {count} cameras are in another place than the accelerometer says and were left "
+            f"out: {named}{more}"
+        )
     out += [
         f"the model is torn between {seam.before} and {seam.name}: its parts are turned by {seam.turn_deg:.0f} deg "
         "against each other"

@@ -144,7 +144,7 @@ class InertialStage:
         self, model: Model, found: RotationConsensus
     ) -> tuple[pycolmap.Reconstruction, tuple[str, ...]]:
         """A model with its wrong cameras where matches place them, and which these are."""
-        wrong = {one.name for one in found.wrong}
+        wrong = {*(one.name for one in found.wrong), *found.moved}
         if not wrong or self.database is None or not self.database.is_file() or has_rigs(model.reconstruction):
             return model.reconstruction, ()
         return register_again(model.reconstruction, wrong, self.database)
