@@ -176,14 +176,12 @@ class ScaleEstimate:
     drift
         Whether the scale stays the same along the recording; ``None`` where the method does not tell.
     parts
-        What makes the interval as wide as it is: by cause (``scale.verdict.CAUSES``), the standard deviation of the
-        logarithm that it alone would leave. Their squares add up to that of ``sigma_log``. ``None`` where the method
-        does not tell.
+        By cause (``scale.verdict.CAUSES``), the standard deviation of the logarithm that it alone would leave; their
+        squares add up to that of ``sigma_log``. ``None`` where the method does not tell.
     noise
         Of the IMU, as the fit found it in the recording; ``None`` where the method does not tell.
     rotations
-        Which cameras agree with the gyroscope; the estimate rests on those of the largest part. ``None`` where they
-        were not compared.
+        Which cameras agree with the IMU; the estimate rests on those. ``None`` where they were not compared.
     jumped
         Keyframes whose positions may be wrong, as they count little, or as the path jumps to and from them.
     method
