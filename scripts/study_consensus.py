@@ -25,13 +25,14 @@ from pathlib import Path
 import numpy as np
 from bench_report import write_report
 from bench_scale import read as read_reconstructed, recordings_in
-from real_imu import RECORDINGS, Window, recorded, windows
+from real_imu import Window, windows
+from study_scale_real import read_window
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import quat_exp, quat_multiply, quat_rotate
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import CameraTrajectory, ImuRecording
+from colmap_inertial.core.types import CameraTrajectory
 from colmap_inertial.inertial.scale import estimate_scale
 
 CASES = ("clean", "one", "three", "block", "foreign", "moved")
@@ -69,15 +70,6 @@ class Outcome:
     seams: tuple[int, ...]
     seconds: float
     reasons: tuple[str, ...]
-
-
-def read_window(folder: Path, window: Window) -> tuple[CameraTrajectory, ImuRecording, float]:
-    """A window of either kind of recording, with its IMU and the true metres per unit."""
-    if window.recording in RECORDINGS:
-        return recorded(folder, window)
-    trajectory, imu, truth = read_reconstructed(folder / window.recording)
-    t_s = trajectory.t_s
-    return trajectory.select((t_s >= window.begin_s) & (t_s < window.end_s)), imu, truth
 
 
 def spread_windows(folder: Path, length_s: float, most: int) -> list[Window]:

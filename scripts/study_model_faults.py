@@ -9,7 +9,8 @@ FOLDER holds TUM-VI rooms and EuRoC flights (``real_imu.py``). Clips of 20, 40 a
 one end of the path 2, 3 or 5 % larger; ``drift`` a scale that grows by 3 or 5 % from end to end; ``stretch`` one
 direction 3 or 5 % longer, volume kept; ``moved`` centres of three cameras alone wrong by .1 m. Each row: how many,
 given, intervals that hold the truth, trusted, of these wrong and wrong by more than 1.5 times the interval, and how
-often the fault was named. True metres are those of a torn path's larger part.
+often the fault was named. True metres are those of a torn path's larger part. At last, what must be
+named: how often it is, and how often it must.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 from bench_report import write_report
-from real_imu import Window, recorded, windows
+from real_imu import HANDHELD, RECORDINGS, Window, recorded, windows
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.quantiles import Z95
@@ -44,6 +45,16 @@ FAULTS: dict[str, tuple[tuple[float, ...], tuple[str, ...]]] = {
     "stretch": ((0.03, 0.05), ("longer along", "is not the same")),
     "moved": ((0.1,), ("poses jump",)),
 }
+#: Fault, size, length of clips, recordings, and the least share that must be named.
+REQUIRED = (
+    ("torn", 0.03, 40.0, "all", 0.75),
+    ("torn", 0.03, 40.0, "by hand", 0.9),
+    ("torn", 0.05, 20.0, "all", 0.8),
+    ("drift", 0.05, 20.0, "all", 0.6),
+    ("stretch", 0.05, 60.0, "all", 0.9),
+)
+#: Of clean clips, the largest share that may be named.
+FALSE_ALARMS = 0.02
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,6 +153,29 @@ def summary(outcomes: Sequence[Outcome]) -> dict[str, float]:
     }
 
 
+def by_place(outcomes: Sequence[Outcome]) -> dict[str, list[Outcome]]:
+    """All outcomes, those by hand, and those of flights."""
+    hands = {name for name, (rig, _) in RECORDINGS.items() if rig is HANDHELD}
+    by_hand = [o for o in outcomes if o.altered.window.recording in hands]
+    return {"all": list(outcomes), "by hand": by_hand, "flown": [o for o in outcomes if o not in by_hand]}
+
+
+def print_required(outcomes: Sequence[Outcome]) -> None:
+    """What must be named against what is, where it was tried."""
+    print(f"\n{'required':<32}{'named':>7}{'n':>5}{'share':>8}{'asked':>8}")
+
+    def row(name: str, of: Sequence[Outcome], asked: str) -> None:
+        named = sum(o.named for o in of)
+        if of:
+            print(f"{name:<32}{named:7d}{len(of):5d}{named / len(of):8.2f}{asked:>8}")
+
+    for fault, size, length_s, where, least in REQUIRED:
+        key = fault, size, length_s
+        of = [o for o in outcomes if (o.altered.fault, o.altered.size, o.altered.window.length_s) == key]
+        row(f"{fault} {size:g}, {length_s:g} s, {where}", by_place(of)[where], f">= {least:g}")
+    row("false alarms", [o for o in outcomes if o.altered.fault == "clean"], f"<= {FALSE_ALARMS:g}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
@@ -159,7 +193,10 @@ def main() -> None:
     print(f"{'':<24}" + "".join(f"{name:>9}" for name in summary([])))
     for key in dict.fromkeys((o.altered.fault, o.altered.size, o.altered.window.length_s) for o in outcomes):
         of = [o for o in outcomes if (o.altered.fault, o.altered.size, o.altered.window.length_s) == key]
-        print(f"{f'{key[0]} {key[1]:g}, {key[2]:g} s':<24}" + "".join(f"{value:9d}" for value in summary(of).values()))
+        for where, some in by_place(of).items():
+            name = f"{key[0]} {key[1]:g}, {key[2]:g} s" if where == "all" else f"  {where}"
+            print(f"{name:<24}" + "".join(f"{value:9d}" for value in summary(some).values()))
+    print_required(outcomes)
     if args.json:
         write_report(args.json, {"outcomes": [asdict(outcome) | {"named": outcome.named} for outcome in outcomes]})
 

@@ -295,6 +295,8 @@ class FoundScale:
     ----------
     metres_per_unit, sigma_log, parts
         As :class:`ScaleEstimate` has them.
+    shift
+        Of the logarithm of the scale, for noise that the fitted path follows; it is in ``metres_per_unit``.
     widened
         Factor on variances of the fit: squares beyond their expectation, few degrees of freedom, what no model has.
     wrong_gain
@@ -304,6 +306,7 @@ class FoundScale:
     metres_per_unit: float
     sigma_log: float
     parts: dict[str, float]
+    shift: float
     widened: float
     wrong_gain: WrongGain | None
 
@@ -339,6 +342,7 @@ def scale_of(fit: Fit, t_s: Array, calibrated: bool, clock_rate: float = 0.0) ->
         metres_per_unit=fit.estimate.metres_per_unit * float(np.exp(shift)),
         sigma_log=sum(variances.values()) ** 0.5,
         parts={name: variance**0.5 for name, variance in variances.items()},
+        shift=shift,
         widened=widened,
         wrong_gain=wrong_gain,
     )
