@@ -9,8 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.options import ScaleOptions
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.inertial.scale._shape import ShapeFault
+from colmap_inertial.inertial.scale.posterior import FittedPath
 
 SCRIPTS = Path(__file__).parents[1] / "scripts"
 
@@ -74,6 +77,18 @@ def test_a_wrong_shape_is_named_and_the_larger_part_keeps_its_metres(outcomes, f
     large = [o for o in by_hand if o.altered.size >= 0.03]
     assert len(large) >= 6 and all(o.named and o.verdict == "weak" for o in large)
     assert all(abs(o.error) < Z95 * o.sigma for o in by_hand)
+
+
+def test_a_torn_model_is_no_part_of_a_joined_one(study, shared_data):
+    folder = shared_data / "real_imu"
+    window = next(w for w in study.windows(folder, (40.0,), (study.NOISE_M,), most=1) if w.recording == "room3")
+    trajectory, imu, truth = study.recorded(folder, window)
+    metric = replace(trajectory, cam_in_world=trajectory.cam_in_world * truth)
+    sound = FittedPath.of(metric, imu, None, ScaleOptions())
+    assert sound.scale[0] == pytest.approx(1.0, abs=0.02)
+    torn, _ = study.alter(study.Altered(window=window, fault="torn", size=0.05), metric, imu, 1.0)
+    with pytest.raises(NotObservableError, match="scale is not the same throughout"):
+        FittedPath.of(torn, imu, None, ScaleOptions())
 
 
 def test_sound_models_are_not_accused_and_single_wrong_centres_hardly_count(study, outcomes):

@@ -160,8 +160,10 @@ def _prepared(trajectory: CameraTrajectory, timed: CameraTimedImu, options: Join
     )
 
 
-def fit_path(trajectory: CameraTrajectory, timed: CameraTimedImu, options: JointOptions) -> tuple[Data, Fit, Faults]:
-    """The measurements as they came, their fit, and what was wrong with the accelerometer.
+def fit_path(
+    trajectory: CameraTrajectory, timed: CameraTimedImu, options: JointOptions
+) -> tuple[Data, Fit, tuple[str, ...]]:
+    """The measurements as they came, their fit, and what is wrong with the accelerometer or the model's shape.
 
     Raises
     ------
@@ -171,7 +173,12 @@ def fit_path(trajectory: CameraTrajectory, timed: CameraTimedImu, options: Joint
         When the data leave the system singular.
     """
     data, prior = _prepared(trajectory, timed, options)
-    return data, *_fit_soundly(data, prior, timed.imu.noise)
+    fit, faults = _fit_soundly(data, prior, timed.imu.noise)
+    calibrated = is_calibrated(timed.imu)
+    sound = faults.undone(data), faults.loosened(prior)
+    _, shape = _fit_shapely(fit, *sound, timed.imu.noise, calibrated=calibrated)
+    widened = scale_of(fit, data.t_s, calibrated).widened
+    return data, fit, (*faults.sentences(), *(fault.sentence(data.t_s, widened) for fault in shape))
 
 
 def _fit_soundly(data: Data, prior: Prior, sheet: ImuNoise | None) -> tuple[Fit, Faults]:

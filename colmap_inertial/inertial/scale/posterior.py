@@ -122,7 +122,7 @@ class FittedPath:
         Raises
         ------
         NotObservableError
-            Where nothing comes of it, or the accelerometer has faults.
+            Where nothing comes of it, or the accelerometer has faults or the model is bent or torn.
         """
         strength, sigma = strength_of_gravity(options)
         known = JointOptions(gravity_m_s2=strength, gravity_sigma_m_s2=sigma)
@@ -130,11 +130,11 @@ class FittedPath:
             timed, consensus = align_recording(trajectory, imu, calibration, options)
             trajectory = trajectory.select(consensus.kept)
             try:
-                data, fit, faults = fit_path(trajectory, timed, known)
+                data, fit, wrong = fit_path(trajectory, timed, known)
             except np.linalg.LinAlgError as error:
                 raise NotObservableError("place", "camera and IMU do not determine its motion") from error
-        if faults.values or faults.path_is_smoothed:
-            raise NotObservableError("place", "the accelerometer has faults, which count from end to end of a gap")
+        if wrong:
+            raise NotObservableError("place", f"what is wrong counts from end to end of a gap: {'; '.join(wrong)}")
         clock_rate = timed.calibration.clock_rate + fit.estimate.clock_rate
         scale = scale_of(fit, data.t_s, is_calibrated(imu), clock_rate)
         ends = (0, -1)
