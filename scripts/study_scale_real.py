@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Scale errors on recordings of other sensors: real IMUs, motion capture with errors such as a reconstruction has.
 
-    python scripts/study_scale_real.py FOLDER [--most 8] [--calibrated] [--reconstructed FOLDER] [--json FILE]
+    python scripts/study_scale_real.py FOLDER [--most 8] [--calibrated] [--remembered] [--reconstructed FOLDER]
 
 FOLDER holds TUM-VI rooms and EuRoC flights (``real_imu.py``). Whole recordings and windows of 20, 10, 5 and 3 s, with
 errors of 0, .5, 2 and 5 mm that are alike over .1, .35 or 1 s, an arbitrary scale, axes and clock. The estimator is
@@ -9,6 +9,7 @@ told nothing of it. Each row: how many, signed mean, mean and rms of the error i
 truth (of those that were given), how many are trusted and of these right, rms of error over standard deviation, median
 half-width, refusals. Errors of 0 mm are the recordings' own. With ``--calibrated`` the handheld ones alone, each with
 the accelerometer calibrated by the motion capture of the others (``capture_gains.py``).
+With ``--remembered`` each has the lever arm that ``align`` finds in another recording of the rig.
 
 Then, of 2 mm: errors of whole recordings, each by itself, and rms errors by recording with all, half and none of the
 shift for noise in the path, the best of these by the other recordings, and what it makes of the one left out.
@@ -36,8 +37,9 @@ from real_imu import HANDHELD, RECORDINGS, Window, recorded, windows
 
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import CameraTrajectory, ImuCalibration, ImuRecording
-from colmap_inertial.inertial.scale import estimate_scale, joint
+from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuCalibration, ImuRecording
+from colmap_inertial.inertial.scale import estimate_scale, joint, learn_lever_arm
+from colmap_inertial.io.calibration import calibration_prior
 
 LENGTHS_S = (np.inf, 20.0, 10.0, 5.0, 3.0)
 NOISES_M = (0.0, 0.0005, 0.002, 0.005)
@@ -89,15 +91,27 @@ def calibrations(folder: Path) -> dict[str, ImuCalibration]:
     return {name: calibration_by(folder, tuple(other for other in names if other != name)) for name in names}
 
 
+def remembered(folder: Path) -> dict[str, CameraImuCalibration]:
+    """Of each recording, what is known once the next one of its rig was aligned, with errors of 2 mm."""
+    whole = {w.recording: w for w in windows(folder, (np.inf,), (0.002,))}
+    out = {}
+    for name, (rig, _) in RECORDINGS.items():
+        of_rig = [other for other, (its, _) in RECORDINGS.items() if its is rig]
+        other = of_rig[(of_rig.index(name) + 1) % len(of_rig)]
+        trajectory, imu, _ = recorded(folder, whole[other])
+        out[name] = learn_lever_arm(calibration_prior(), estimate_scale(trajectory, imu))
+    return out
+
+
 @one_blas_thread()
-def run(task: tuple[Path, Window, ImuCalibration | None]) -> Outcome:
+def run(task: tuple[Path, Window, ImuCalibration | None, CameraImuCalibration | None]) -> Outcome:
     """Estimate the scale of a window and compare."""
-    folder, window, calibration = task
+    folder, window, calibration, known = task
     trajectory, imu, truth = read_window(folder, window)
     if calibration is not None:
         imu = calibration.corrected(imu)
     with listening() as shifts:
-        estimate = estimate_scale(trajectory, imu)
+        estimate = estimate_scale(trajectory, imu, calibration=known)
     given = estimate.metres_per_unit
     return Outcome(
         window=window,
@@ -241,17 +255,20 @@ def main() -> None:
     parser.add_argument("--most", type=int, default=8, help="windows of a length in each recording")
     parser.add_argument("--seed", type=int, default=0, help="number of the first window")
     parser.add_argument("--calibrated", action="store_true", help="handheld ones, calibrated by each other's")
+    parser.add_argument("--remembered", action="store_true", help="with the lever arm by another recording of the rig")
     parser.add_argument("--reconstructed", type=Path, help="InertialScale recordings, for the table of shifts")
     parser.add_argument("--json", type=Path, help="write every outcome")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     args = parser.parse_args()
     found = windows(args.folder, tuple(args.lengths), tuple(args.noises), most=args.most, first=args.seed)
     known = calibrations(args.folder) if args.calibrated else {}
-    tasks = [(args.folder, w, known.get(w.recording)) for w in found if not args.calibrated or w.recording in known]
+    arms = remembered(args.folder) if args.remembered else {}
+    used = [w for w in found if not args.calibrated or w.recording in known]
+    tasks = [(args.folder, w, known.get(w.recording), arms.get(w.recording)) for w in used]
     others = windows_of_reconstructed(args.reconstructed, tuple(args.lengths)) if args.reconstructed else []
     with multiprocessing.Pool(args.processes) as pool:
         outcomes = pool.map(run, tasks, chunksize=1)
-        more = pool.map(run, [(args.reconstructed, window, None) for window in others], chunksize=1)
+        more = pool.map(run, [(args.reconstructed, window, None, None) for window in others], chunksize=1)
     print(
         f"{'':<18}{'n':>4}{'signed':>8}{'mean':>7}{'rms':>7}{'inside':>8}{'trusted':>9}{'right':>7}{'z rms':>7}", end=""
     )

@@ -11,6 +11,7 @@ from box_project import shared_box
 
 from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply
 from colmap_inertial.core.options import ProjectOptions, ScaleOptions
+from colmap_inertial.core.types import CAL
 from colmap_inertial.model import read_model
 from colmap_inertial.model.deregistration import deregister_images
 from colmap_inertial.model.project import apply_to_project
@@ -210,6 +211,10 @@ def test_the_alignment_of_a_project_goes_by_its_sound_cameras(box, tmp_path):
     truth = box.recording.truth.calibration
     between = quat_multiply(found.cam_from_imu_xyzw, quat_conjugate(truth.cam_from_imu_xyzw))
     assert np.degrees(np.linalg.norm(quat_log(between))) < 0.5
+    # the lever arm comes with the scale, and is stated less surely than this recording has it
+    off_m = found.imu_in_cam_m - truth.imu_in_cam_m
+    sigma_m = np.sqrt(np.diagonal(found.cov[CAL.LEVER_ARM, CAL.LEVER_ARM]))
+    assert np.all(np.abs(off_m) < 3 * sigma_m) and np.all((sigma_m > 0.003) & (sigma_m < 0.04))
 
 
 def test_apply_leaves_the_same_images_out(box, tmp_path):

@@ -14,6 +14,7 @@ from colmap_inertial.core.options import ScaleOptions
 from colmap_inertial.core.sampling import PAUSE_STEPS, is_gap
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import (
+    CAL,
     CameraImuCalibration,
     CameraTrajectory,
     ImuCalibration,
@@ -22,6 +23,7 @@ from colmap_inertial.core.types import (
 )
 from colmap_inertial.inertial.core.priors import PRIORS
 from colmap_inertial.inertial.scale._inputs import align_recording, gravity_at_latitude_m_s2, strength_of_gravity
+from colmap_inertial.inertial.scale._sampling import describe_sampling
 from colmap_inertial.inertial.scale.verdict import verdict_of
 from colmap_inertial.io.plausible import PLAUSIBLE
 from colmap_inertial.io.pose_convention import ARRAYS, PoseConvention
@@ -48,6 +50,40 @@ class MovedLimits:
 
 
 _MOVED = MovedLimits()
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearnedLimits:
+    """How surely a recording's lever arm holds for others of the device.
+
+    Against the known arms of six recordings of real sensors, those of the fit are wrong by 2.9 times its standard
+    deviations in recordings of two minutes (rms), and 1.2 times in 20 s; by 3 mm where these are .5 mm.
+    """
+
+    sigmas: float = 2.0
+    least_m: float = 0.003
+
+
+_LEARNED = LearnedLimits()
+
+
+def learn_lever_arm(calibration: CameraImuCalibration, estimate: ScaleEstimate) -> CameraImuCalibration:
+    """A calibration with the lever arm that a scale estimate found, for other recordings of the device.
+
+    Parameters
+    ----------
+    calibration
+        Its other entries stay, without correlations with the lever arm.
+    estimate
+        Of any recording; one that was refused says nothing.
+    """
+    refined, at = estimate.calibration, CAL.LEVER_ARM
+    if estimate.verdict == "refused" or estimate.method != "joint" or refined is None:
+        return calibration
+    cov = calibration.cov.copy()
+    cov[at, :] = cov[:, at] = 0.0
+    cov[at, at] = _LEARNED.sigmas**2 * refined.cov[at, at] + _LEARNED.least_m**2 * np.eye(3)
+    return replace(calibration, imu_in_cam_m=refined.imu_in_cam_m, cov=cov)
 
 
 def remarks(trajectory: CameraTrajectory, timed: CameraTimedImu) -> tuple[str, ...]:
@@ -183,6 +219,11 @@ def estimate_scale(
     with one_blas_thread():
         estimate = _estimate_or_refuse(trajectory, imu, calibration, options)
         search = AlignOptions(max_offset_s=options.max_offset_s)
+        sampling = describe_sampling(trajectory, imu)
+        if estimate.verdict == "refused":  # which may be due to it
+            estimate = replace(estimate, reasons=(*sampling, *estimate.reasons))
+        else:
+            estimate = replace(estimate, notes=(*estimate.notes, *sampling))
         likely = likely_convention(trajectory, imu, read_as=read_as, prior=calibration, options=search)
     if likely is not None:
         reasons = (likely.sentence, *estimate.reasons)
@@ -254,6 +295,7 @@ __all__ = [
     "estimate_scale",
     "first_seconds",
     "gravity_at_latitude_m_s2",
+    "learn_lever_arm",
     "strength_of_gravity",
     "verdict_of",
 ]

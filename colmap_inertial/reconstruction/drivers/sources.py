@@ -23,7 +23,7 @@ from colmap_inertial.checks.validate import (
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError, OutputError, OutputExistsError
 from colmap_inertial.core.options import ScaleOptions, ValidateOptions
 from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate, Similarity
-from colmap_inertial.inertial.scale import estimate_scale, first_seconds
+from colmap_inertial.inertial.scale import estimate_scale, first_seconds, learn_lever_arm
 from colmap_inertial.io.calibration import (
     CalibrationFiles,
     describe_files,
@@ -212,12 +212,14 @@ def check_output(path: Path, inputs: Sequence[Path | None]) -> None:
 def align_source(source: ScaleSource, out: Path) -> CameraImuCalibration:
     """Align camera and IMU of an existing model or trajectory, and write the calibration.
 
+    Where the recording gives a scale, the lever arm is the one that came with it, for other recordings of the device.
+
     Raises
     ------
     NotObservableError
         Where no offset between the clocks is better than the rest, the camera hardly turned, or most cameras do not
-        agree with the gyroscope. Poses that fit by
-        another convention are named, also where their rotations alone would do.
+        agree with the gyroscope. Poses that fit by another convention are named, also where their rotations alone
+        would do.
     """
     check_output(out, [source.source, source.imu, source.frame_times])
     recording = load_source(source)
@@ -231,6 +233,9 @@ def align_source(source: ScaleSource, out: Path) -> CameraImuCalibration:
         raise
     _refuse_another_convention(recording, options, "rotation")
     found = dataclasses.replace(aligned.calibration, clock_rate=0.0, clock_middle_s=0.0)
+    scale = ScaleOptions(max_offset_s=options.max_offset_s)
+    estimate = estimate_scale(recording.trajectory, recording.imu, calibration=recording.calibration, options=scale)
+    found = learn_lever_arm(found, estimate)
     write_calibration(out, found)
     return found
 
