@@ -2,6 +2,7 @@
 
     python scripts/bench_dense.py FOLDER [--scenes desk seed12 seed13] [--json FILE]
     python scripts/bench_dense.py FOLDER --scenes desk --cost 640 1200
+    python scripts/bench_dense.py FOLDER --world photo [--seeds 0 1] [--widths 640 1200]
 
 FOLDER takes the captures and reconstructions; what is there already is continued. ``desk`` is the example scene, the
 others are the same recipe with another seed: another world, path and device. Each is reconstructed by ``reconstruct
@@ -13,6 +14,9 @@ recall and F at 5 and 10 mm of the fused cloud and of the mesh, and the median d
 steps. Model and truth are brought together by a similarity over the camera centres: what is measured is the dense
 reconstruction, not the scale.
 
+``--world photo``: a ray-cast desk with photographs on it (``photo_world.py``), nearly true poses, no mapping: figures
+of depth maps and fused cloud, and seconds of processor for each megapixel of depth maps.
+
 ``--cost``: for pictures of these widths, of the same scene and model, seconds of clock and processor for each megapixel
 of depth maps, and the peak memory of a process that makes them and nothing else.
 """
@@ -21,10 +25,12 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
 import json
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,14 +38,18 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 from bench_report import write_report
+from photo_world import PhotoWorld
 from scipy.spatial import cKDTree
 
+from colmap_inertial.colmap.depth_maps import fuse_maps
+from colmap_inertial.colmap.sweep_stereo import SweptWorkspace
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.types import CameraModel
 from colmap_inertial.io.files import read_json
 from colmap_inertial.model import read_model
 from colmap_inertial.model.artefacts import read_map
+from colmap_inertial.pipeline.run.context import RunContext
 from colmap_inertial.pipeline.run.workspace import Workspace
 from colmap_inertial.tools.simulate import (
     Scene,
@@ -249,6 +259,47 @@ def measure(scene: str, work: Path) -> dict[str, object]:
     }
 
 
+def photo_truth(world: PhotoWorld, depth_m: dict[str, Array]) -> Truth:
+    """Of a photographic world whose images have these true depths."""
+    points = []
+    for depth, turn, centre in zip(depth_m.values(), world.cam_from_world, world.cam_in_world, strict=True):
+        y, x = np.indices(depth.shape) + 0.5
+        points.append(_on_the_table((world.rays(x, y) * depth[..., None]).reshape(-1, 3) @ turn + centre))
+    return Truth(
+        depth_m=depth_m,
+        metres_per_unit=1.0,
+        world_from_model=np.eye(3),
+        shift_m=np.zeros(3),
+        surface_m=_seen_twice(points),
+    )
+
+
+def measure_photo(world: PhotoWorld, folder: Path) -> dict[str, object]:
+    """All figures of a photographic world; what the folder holds is made anew."""
+    shutil.rmtree(folder, ignore_errors=True)
+    truth = photo_truth(world, world.write_workspace(folder))
+    swept = SweptWorkspace(folder, folder / "raw")
+    swept.begin(None)
+    begin_s = time.process_time()
+    swept.sweep(1, lambda: None)
+    spent_s = time.process_time() - begin_s
+    fused = folder / "fused.ply"
+    fuse_maps(
+        folder,
+        swept.names,
+        (fused, folder / "fused.ply.vis"),
+        maker="plane sweep",
+        kind="geometric",
+        scratch=folder / "scratch",
+        context=RunContext(num_threads=1),
+    )
+    return {
+        "depth": dataclasses.asdict(depth_figures(folder, truth)),
+        "fused": dataclasses.asdict(surface_figures(points_of(fused), truth)),
+        "processor_s_per_megapixel": spent_s / sum(v.width * v.height / 1e6 for v in swept.sights.views),
+    }
+
+
 def cost(scene: str, work: Path, width: int) -> dict[str, float]:
     """Seconds and memory of depth maps of pictures so wide, rendered along the same path."""
     capture, out = reconstruct(scene, work)
@@ -314,10 +365,19 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--scenes", nargs="+", default=list(SCENES))
     parser.add_argument("--cost", nargs="+", type=int, default=[])
+    parser.add_argument("--world", choices=("simulated", "photo"), default="simulated")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1])
+    parser.add_argument("--widths", nargs="+", type=int, default=[640])
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     arguments.folder.mkdir(parents=True, exist_ok=True)
     found: dict[str, object] = {}
+    if arguments.world == "photo":
+        for seed, width in itertools.product(arguments.seeds, arguments.widths):
+            name = f"photo{seed}_{width}"
+            found[name] = measure_photo(PhotoWorld.of(seed, width), arguments.folder / name)
+            print(name, json.dumps(found[name], indent=1), flush=True)
+        arguments.scenes = []
     for scene in arguments.scenes:
         if arguments.cost:
             found[scene] = {width: cost(scene, arguments.folder, width) for width in arguments.cost}

@@ -22,6 +22,7 @@ SCRIPTS = str(Path(__file__).parents[1] / "scripts")
 sys.path.insert(0, SCRIPTS)
 try:
     import bench_dense as bench
+    import photo_world
 finally:
     sys.path.remove(SCRIPTS)
 
@@ -129,3 +130,48 @@ def test_shares_of_depths_are_counted(scene, tmp_path):
     assert figures.has == pytest.approx(sum(near) / every)
     assert figures.of_all == pytest.approx((sum(near[::2]) / every, sum(near) / every, sum(near) / every))
     assert figures.of_kept == pytest.approx((sum(near[::2]) / sum(near), 1, 1))
+
+
+def test_photographic_things_are_hit_where_they_are():
+    texels = np.random.default_rng(0).uniform(0, 255, (8, 8, 3))
+    cover = photo_world.Cover(texels=texels, texel_m=0.01)
+    ball = photo_world.Sphere(middle=np.array([0.1, 0.0, 0.2]), radius_m=0.1, cover=cover)
+    pillar = photo_world.Cylinder(foot=np.array([0.1, 0.0, 0.0]), radius_m=0.1, height_m=0.3, cover=cover)
+    sides = np.array([[1.0, 0, 0], [0, 0, 1.0]])
+    waves = photo_world.Sheet(corner=np.array([-0.5, 0.5, 0.0]), sides=sides, cover=cover, wave_m=0.03)
+    centre = np.array([0.05, -1.0, 0.5])
+    rng = np.random.default_rng(1)
+    rays = np.array([0.0, 1, -0.2]) + rng.uniform(-0.25, 0.25, (2000, 3)) * [1, 0, 1]
+    for thing in (ball, pillar, waves):
+        depth, along, normals = thing.hit(centre, rays)
+        hit = np.isfinite(depth)
+        assert 100 < hit.sum() < 2000
+        at = centre + rays[hit] * depth[hit][:, None]
+        if thing is ball:
+            off = np.linalg.norm(at - ball.middle, axis=1) - ball.radius_m
+        elif thing is pillar:
+            side = np.hypot(*(at - pillar.foot)[:, :2].T) - pillar.radius_m
+            off = np.where(np.abs(at[:, 2] - 0.3) < 1e-9, 0, side)
+            assert ((at[:, 2] >= -1e-9) & (at[:, 2] <= 0.3 + 1e-9)).all()
+        else:
+            a, b = at[:, 0] + 0.5, at[:, 2]
+            k = 2 * np.pi / waves.period_m
+            # its normal is -y
+            off = 0.5 - at[:, 1] - 0.03 * np.sin(k * a) * np.cos(0.6 * k * b)
+        np.testing.assert_allclose(off, 0, atol=1e-6)
+        np.testing.assert_allclose(np.linalg.norm(normals[hit], axis=1), 1)
+        if thing is not waves:
+            # the first of two crossings faces the camera
+            assert (np.sum(normals[hit] * rays[hit], axis=1) <= 1e-9).all()
+        assert along.shape == (2, 2000)
+        assert ((thing.cover.colours(along[:, hit]) >= 0) & (thing.cover.colours(along[:, hit]) <= 255)).all()
+
+
+@pytest.mark.skipif(not photo_world.PHOTOS.is_dir(), reason="needs ../shared/data/sharp_photos")
+def test_a_photographic_world_is_measured(tmp_path):
+    world = photo_world.PhotoWorld.of(1, 160, images=7)
+    figures = bench.measure_photo(world, tmp_path / "world")
+    assert figures["depth"]["has"] > 0.3
+    assert figures["depth"]["of_kept"][2] > 0.75
+    truth = bench.photo_truth(world, {f"{i:03d}.jpg": world.render(i)[1] for i in range(7)})
+    assert bench.surface_figures(truth.surface_m, truth).f == pytest.approx((1, 1), abs=1e-3)
