@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from importlib.metadata import distribution
 from pathlib import Path
 
 import pytest
@@ -42,6 +43,29 @@ def test_licences_of_what_is_compiled_in_go_along():
         assert (ROOT / name).is_file()
     text = (ROOT / "THIRD_PARTY_LICENSES.txt").read_text()
     assert "nanobind" in text and "Redistributions in binary form" in text and "robin_map" in text
+
+
+#: What GPL code in a wheel is told by: bytes of a library in it, and the names under which it is declared.
+GPL_PARTS = {
+    "CHOLMOD": ("pycolmap", b"/CHOLMOD/Supernodal/cholmod_super_numeric.c"),
+    "MatrixOps": ("pycolmap", b"/CHOLMOD/MatrixOps/"),
+    "SuiteSparseQR": ("pycolmap", b"/SPQR/Source/SuiteSparseQR.cpp"),
+    "libx264": ("av", b"libx264-"),
+    "libx265": ("av", b"libx265-"),
+}
+
+
+def test_gpl_code_that_the_dependencies_bring_is_declared():
+    """Licences: SuiteSparse's CHOLMOD/Doc/License.txt and SPQR/Doc/License.txt; x264's and x265's COPYING."""
+    for name, (package, mark) in GPL_PARTS.items():
+        libraries = [file for file in distribution(package).files or () if ".so" in file.name]
+        assert libraries
+        if not any(mark in Path(str(file.locate())).read_bytes() for file in libraries):
+            continue
+        for page in ("docs/start.md", "THIRD_PARTY_LICENSES.txt"):
+            assert name in (ROOT / page).read_text(), (page, name)
+        (line,) = [line for line in (ROOT / "pyproject.toml").read_text().splitlines() if f'  "{package}>=' in line]
+        assert "GPL" in line
 
 
 def test_links_of_the_readme_lead_to_files_and_become_addresses(tmp_path):
