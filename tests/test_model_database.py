@@ -1,15 +1,20 @@
 """Records of COLMAP's databases that would have COLMAP read or allocate beyond what is there."""
 
 import contextlib
+import dataclasses
 import shutil
 import sqlite3
+import time
 
 import numpy as np
 import pycolmap
 import pytest
 
+from colmap_inertial.colmap.given_database import read_given
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.model.database import check_records
+from colmap_inertial.io.sqlite import BOUNDS, open_foreign
+from colmap_inertial.model.database import PlacedModel, check_records, transform_database
+from colmap_inertial.model.similarities import plain_factor
 from colmap_inertial.model.submodels.matches import read_matches
 
 #: A camera that a pair stores: 25 bytes, the number of its parameters, these.
@@ -62,3 +67,68 @@ def test_records_of_another_size_are_refused_with_their_table(whole, tmp_path, t
         database.execute(f"UPDATE {table} SET {change}")
     with pytest.raises(FormatError, match=f"a record of {table} has another size"):
         check_records(path)
+
+
+#: A million million rows, from nothing.
+ENDLESS = "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n LIMIT 1000000000000) SELECT"
+CODE = {
+    "view": f"""DROP TABLE keypoints;
+        CREATE VIEW keypoints AS {ENDLESS} x AS image_id, x - x + 1 AS rows, 2 AS cols, zeroblob(8) AS data FROM n""",
+    "trigger": f"""INSERT INTO pose_priors VALUES (1, 1, 1, 0, zeroblob(24), NULL, NULL, 1);
+        CREATE TRIGGER slow AFTER UPDATE ON pose_priors BEGIN
+        SELECT count(*) FROM images a, images b WHERE a.image_id + b.image_id > ({ENDLESS} count(*) FROM n); END""",
+    "virtual table": "DROP TABLE matches; CREATE VIRTUAL TABLE matches USING fts5(pair_id, rows, cols, data)",
+}
+
+
+@pytest.fixture(params=CODE)
+def with_code(whole, tmp_path, request):
+    path = tmp_path / "database.db"
+    shutil.copyfile(whole, path)
+    with contextlib.closing(sqlite3.connect(path)) as database:
+        database.executescript(CODE[request.param])
+    return path, request.param
+
+
+def test_code_in_a_database_is_refused_before_it_runs(with_code, tmp_path):
+    path, kind = with_code
+    where = PlacedModel(index=0, centres={"a.jpg": np.zeros(3)}, sensors={})
+    for read in (
+        check_records,
+        read_given,
+        lambda path: transform_database(path, tmp_path / "copy.db", [where], {0: plain_factor(2.0)}),
+        lambda path: list(read_matches(path, lambda *_: True)),
+    ):
+        with pytest.raises(FormatError, match=f"it holds the {kind} .*, which is not run; drop it"):
+            read(path)
+
+
+def test_values_that_columns_make_up_are_bounded(whole, tmp_path):
+    path = tmp_path / "database.db"
+    shutil.copyfile(whole, path)
+    with contextlib.closing(sqlite3.connect(path)) as database:
+        database.executescript("""
+            DROP TABLE keypoints;
+            CREATE TABLE keypoints (image_id, rows, cols, data AS (zeroblob(2 * 400000000)));
+            INSERT INTO keypoints VALUES (1, 30, 2)""")
+    with pytest.raises(FormatError, match="too big"):
+        check_records(path)
+
+
+def test_what_takes_longer_than_its_size_explains_is_ended(whole, monkeypatch):
+    monkeypatch.setattr("colmap_inertial.io.sqlite.BOUNDS", dataclasses.replace(BOUNDS, seconds=0.2))
+    start_s = time.thread_time()
+    with pytest.raises(FormatError, match="takes longer than its size explains"), open_foreign(whole) as database:
+        database.execute(f"{ENDLESS} count(*) FROM n").fetchone()
+    assert time.thread_time() - start_s < 2.0
+
+
+def test_time_is_allowed_by_size(whole, tmp_path, monkeypatch):
+    path = tmp_path / "large.db"
+    shutil.copyfile(whole, path)
+    with contextlib.closing(sqlite3.connect(path)) as database, database:
+        database.execute("CREATE TABLE more AS SELECT zeroblob(30000000) AS data")
+    monkeypatch.setattr("colmap_inertial.io.sqlite.BOUNDS", dataclasses.replace(BOUNDS, seconds=-1.0))
+    check_records(path)
+    with pytest.raises(FormatError, match="takes longer"), open_foreign(whole) as database:
+        database.execute(f"{ENDLESS} count(*) FROM n").fetchone()

@@ -6,7 +6,6 @@ matter, and what pycolmap cannot read is said before pycolmap is asked: it would
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
@@ -26,6 +25,7 @@ from colmap_inertial.colmap.two_views import Features, FramePair, open_features
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.types import CameraModel
 from colmap_inertial.io.files import check_names
+from colmap_inertial.io.sqlite import open_foreign
 from colmap_inertial.model.database import SIDE_FILES, copy_database
 from colmap_inertial.pipeline.run.context import RunContext
 from colmap_inertial.pipeline.run.runner import remove
@@ -103,11 +103,8 @@ def read_given(path: Path) -> GivenDatabase:
         raise FormatError(path, "no such file: --database takes a COLMAP database")
     if any(beside.is_file() and beside.stat().st_size for beside in _side_files(path)):
         raise FormatError(path, "another program has it open, or ended while it wrote: close it there")
-    try:
-        with contextlib.closing(sqlite3.connect(f"{path.absolute().as_uri()}?immutable=1", uri=True)) as database:
-            return _read_given(database, path)
-    except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
-        raise FormatError(path, f"SQLite cannot read it: {error}") from None
+    with open_foreign(path) as database:
+        return _read_given(database, path)
 
 
 def _side_files(path: Path) -> Iterator[Path]:
@@ -158,7 +155,7 @@ def _can_match(database: sqlite3.Connection) -> bool:
 
 def can_match(database: Path) -> bool:
     """Whether pycolmap can match the descriptors of a database of ours."""
-    with contextlib.closing(sqlite3.connect(f"{database.absolute().as_uri()}?immutable=1", uri=True)) as opened:
+    with open_foreign(database) as opened:
         return _can_match(opened)
 
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import logging
-import sqlite3
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,6 +15,7 @@ from colmap_inertial.colmap.sparse import matches_every_pair
 from colmap_inertial.colmap.submaps import join_runs, map_runs, runs
 from colmap_inertial.core.errors import MappingError
 from colmap_inertial.core.options import MappingOptions
+from colmap_inertial.io.sqlite import open_foreign
 from colmap_inertial.model import find_models
 from colmap_inertial.model.soundness import check_binary_model
 from colmap_inertial.pipeline.run.context import RunContext
@@ -102,8 +101,8 @@ def map_images(
     sparse.mkdir(parents=True)
     require_room(sparse / "points3D.bin", database.stat().st_size)
     # COLMAP's own reader would write to the file
-    with contextlib.closing(sqlite3.connect(f"{database.absolute().as_uri()}?immutable=1", uri=True)) as opened:
-        (num_images,) = opened.execute("SELECT COUNT(*) FROM images").fetchone()
+    with open_foreign(database) as opened:
+        (num_images,) = opened.execute("SELECT COUNT(name) FROM images").fetchone()
     context.progress("mapping", 0, num_images)
     every_pair = matches_every_pair(num_images, options)
     near = _NEIGHBOURS * options.overlap

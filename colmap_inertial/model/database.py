@@ -6,15 +6,13 @@ pycolmap migrates every database that it opens, and no older COLMAP opens it aft
 from __future__ import annotations
 
 import contextlib
-import errno
-import os
 import shutil
 import sqlite3
 import tempfile
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -23,6 +21,7 @@ from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.types import Similarity
 from colmap_inertial.io.files import reading
+from colmap_inertial.io.sqlite import open_foreign
 
 SIDE_FILES = ("-wal", "-journal")
 _MATRIX = (
@@ -118,13 +117,12 @@ def opened_read_only(database: Path) -> Iterator[sqlite3.Connection]:
     One whose log still holds something is read from a copy.
     """
     with contextlib.ExitStack() as stack:
+        path = database
         if any(database.with_name(database.name + suffix).exists() for suffix in SIDE_FILES):
-            copy = Path(stack.enter_context(tempfile.TemporaryDirectory())) / database.name
-            copy_database(database, copy)
-            uri = copy.as_uri()
-        else:
-            uri = f"{database.absolute().as_uri()}?mode=ro&immutable=1"
-        yield stack.enter_context(contextlib.closing(sqlite3.connect(uri, uri=True)))
+            path = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="colmap-inertial-"))) / database.name
+            copy_database(database, path)
+        mode: Literal["mode=ro", "immutable=1"] = "immutable=1" if path == database else "mode=ro"
+        yield stack.enter_context(open_foreign(path, mode=mode, source=database, fault=UNREADABLE))
 
 
 def find_database(project: Path, files: Sequence[Path]) -> Path | None:
@@ -141,7 +139,7 @@ def _has_pairs(path: Path) -> bool:
     try:
         with opened_read_only(path) as opened:
             return opened.execute("SELECT 1 FROM two_view_geometries LIMIT 1").fetchone() is not None
-    except (sqlite3.Error, FormatError):
+    except FormatError:
         return False  # no database, or one of another program
 
 
@@ -151,7 +149,7 @@ def check_records(database: Path) -> None:
     Raises
     ------
     FormatError
-        That names the table.
+        That names the table; also as of :func:`~colmap_inertial.io.sqlite.open_foreign`.
     """
     with reading(database, UNREADABLE), opened_read_only(database) as opened:
         columns = {row[1] for row in opened.execute("PRAGMA table_info(two_view_geometries)")}
@@ -212,21 +210,12 @@ def transform_database(
     Raises
     ------
     FormatError
-        For a damaged database.
+        For a damaged database; also as of :func:`~colmap_inertial.io.sqlite.open_foreign`.
     """
     copy_database(source, target)
     try:
-        with contextlib.closing(sqlite3.connect(target)) as database, database:
+        with open_foreign(target, mode="mode=rw", source=source) as database, database:
             return _transform(database, source, models, similarities, prior_models, rig_models)
-    except UnicodeDecodeError as error:
-        raise FormatError(source, f"SQLite cannot read it: {error}") from None
-    except sqlite3.DatabaseError as error:
-        code = {sqlite3.SQLITE_FULL: errno.ENOSPC, sqlite3.SQLITE_IOERR: errno.EIO}.get(
-            getattr(error, "sqlite_errorcode", 0) & 0xFF
-        )
-        if code is not None:
-            raise OSError(code, os.strerror(code), str(source)) from None
-        raise FormatError(source, f"SQLite cannot read it: {error}") from None
     finally:
         target.with_name(target.name + SHARED_MEMORY).unlink(missing_ok=True)
 
