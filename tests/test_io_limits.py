@@ -6,6 +6,8 @@ import resource
 import struct
 import subprocess
 import sys
+import time
+import tracemalloc
 import zlib
 from dataclasses import fields
 
@@ -24,6 +26,7 @@ from colmap_inertial.io.frame_times import stamps_of_csv
 from colmap_inertial.io.images import _read_size, read_image
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.io.tables import read_table
+from colmap_inertial.io.toml_section import read_toml
 from colmap_inertial.io.video import video_stamps_ns
 from colmap_inertial.pipeline.run.config import read_config
 from colmap_inertial.reconstruction.drivers.capture import reconstruct
@@ -50,6 +53,61 @@ def test_a_text_of_yaml_is_no_longer_than_calibrations_are(tmp_path):
     path.write_text("a: [" + "1," * 300_000 + "1]\n")
     with pytest.raises(FormatError, match="is no calibration: its 600007 characters are more than any has"):
         read_yaml(path, "a calibration")
+
+
+PARTS = ".".join(["a"] * 6000)
+
+
+@pytest.mark.parametrize("read", [read_toml, lambda path: read_config(path, ReconstructOptions)])
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"{PARTS} = 1",
+        f"[{PARTS}]",
+        f"[[{PARTS}]]",
+        f"x = {{y = 1, {PARTS} = 1}}",
+        ". ".join(['"a"', "'b'"] * 3000) + " = 1",
+        f'x = {{a = """b"""", {PARTS} = 1}}',
+        f"x = {{a = '''b''''', {PARTS} = 1}}",
+        f'x = "#" # "\n{PARTS} = 1',
+        f'x = "\\""\n{PARTS} = 1',
+        f'x = """\\""" """\n{PARTS} = 1',
+    ],
+)
+def test_keys_of_toml_have_few_parts(tmp_path, read, text):
+    path = tmp_path / "capture.toml"
+    path.write_text(text)
+    tracemalloc.start()
+    try:
+        with pytest.raises(FormatError, match="has a key of more than 32 parts"):
+            read(path)
+        assert tracemalloc.get_traced_memory()[1] < 4e6
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("quote", ['"', "'", '"""', "'''"])
+def test_dots_in_texts_and_numbers_of_toml_are_no_parts(tmp_path, quote):
+    path = tmp_path / "capture.toml"
+    many = ", ".join(["1.5"] * 500)
+    path.write_text(f'a = {quote}{PARTS}{quote}\nb.c."d.e" = [{many}] # {PARTS}\nt = 1979-05-27 07:32:00.999\n')
+    section = read_toml(path)
+    assert section.text("a") == PARTS and section.names() == ["a", "b", "t"]
+
+
+@pytest.mark.parametrize(
+    "text", ["[" + "a." * 150_000 + "a]", "a" * 500_000, '"\\"' * 200_000, "'''" * 170_001, "[" * 500_000]
+)
+def test_a_text_of_toml_is_refused_soon(tmp_path, text):
+    path = tmp_path / "capture.toml"
+    path.write_text(text)
+    start_s = time.thread_time()
+    with pytest.raises(FormatError):
+        read_toml(path)
+    assert time.thread_time() - start_s < 5.0
+    path.write_text("#" * 2_100_000)
+    with pytest.raises(FormatError, match="has 2100000 characters; such a file has at most 2097152"):
+        read_toml(path)
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from colmap_inertial.checks.words import (
     parts_mapped_in_words,
 )
 from colmap_inertial.io.files import read_json, read_text
+from colmap_inertial.io.toml_section import parse_toml
 
 VERSION = 1
 #: Of a model in ``result.json``, what the page shows otherwise or not.
@@ -250,4 +250,4 @@ def _configuration(out: Path) -> Content:
     if not file.is_file():
         return _mark_missing("The run ended before its configuration was written.")
     text = read_text(file)
-    return {"toml": text, "values": tomllib.loads(text)}
+    return {"toml": text, "values": parse_toml(file, text)}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import tomllib
 import typing
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,7 +11,8 @@ from typing import Any, TypeVar
 
 from colmap_inertial.core.choices import check_value
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.io.files import StrPath, reader, require_regular
+from colmap_inertial.io.files import StrPath, read_bytes, reader
+from colmap_inertial.io.toml_section import parse_toml
 
 Options = TypeVar("Options")
 
@@ -57,12 +57,9 @@ def read_config(path: StrPath, cls: type[Options]) -> Options:
 def read_values(path: Path) -> dict[str, Any]:
     """Content of a TOML file, unchecked; a :class:`FormatError` for another file."""
     try:
-        require_regular(path)
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise FormatError(path, f"cannot be read: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:  # also no UTF-8, and a NUL in the path
-        raise FormatError(path, f"is not valid TOML: {error}") from error
+        return parse_toml(path, read_bytes(path).decode())
+    except UnicodeDecodeError as error:
+        raise FormatError(path, f"not valid TOML: {error}") from error
 
 
 def override_options(options: Options, values: Mapping[str, Any], path: Path) -> Options:
