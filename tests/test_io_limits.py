@@ -23,7 +23,7 @@ from colmap_inertial.core.options import ReadLimits, ReconstructOptions
 from colmap_inertial.core.threads import map_in_order
 from colmap_inertial.io.files import first_line, read_bytes, read_json, read_limits, read_yaml, reading_within
 from colmap_inertial.io.frame_times import stamps_of_csv
-from colmap_inertial.io.images import _read_size, read_image
+from colmap_inertial.io.images import _read_size, read_image, require_modest
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.io.tables import read_table
 from colmap_inertial.io.toml_section import read_toml
@@ -120,21 +120,53 @@ def test_pixels_of_more_bytes_count_more(tmp_path, depth, kind, million):
         read_image(path)
 
 
-def jpeg(width, height):
-    data = cv2.imencode(".jpg", np.zeros((16, 16, 3), np.uint8))[1].tobytes()
-    at = data.index(b"\xff\xc0") + 5
-    return data[:at] + struct.pack(">HH", height, width) + data[at + 4 :]
+def jpeg(width, height, *, progressive=False, scans=False):
+    data = cv2.imencode(".jpg", np.zeros((16, 16, 3), np.uint8), [cv2.IMWRITE_JPEG_PROGRESSIVE, int(progressive)])[
+        1
+    ].tobytes()
+    at = data.index(b"\xff\xc2" if progressive else b"\xff\xc0") + 5
+    data = data[:at] + struct.pack(">HH", height, width) + data[at + 4 :]
+    at = data.index(b"\xff\xda")
+    # the first of the colours alone
+    return data[:at] + b"\xff\xda\x00\x08\x01\x01\x00\x00\x3f\x00" + data[at + 14 :] if scans else data
 
 
-@pytest.mark.parametrize(("encode", "side"), [(png, 20000), (jpeg, 20000), (jpeg, 65535)])
-def test_a_picture_of_too_many_pixels_is_not_decoded(tmp_path, encode, side):
+def jpeg_in_scans(width, height):
+    return jpeg(width, height, scans=True)
+
+
+def jpeg_progressive(width, height):
+    return jpeg(width, height, progressive=True)
+
+
+@pytest.mark.parametrize(
+    ("encode", "side", "million"),
+    [
+        (png, 20000, 250),
+        (jpeg, 12000, 125),
+        (jpeg, 65535, 125),
+        (jpeg_progressive, 10000, 83.3),
+        (jpeg_in_scans, 10000, 83.3),
+    ],
+)
+def test_a_picture_of_too_many_pixels_is_not_decoded(tmp_path, encode, side, million):
     path = tmp_path / "large.png"
     path.write_bytes(encode(side, side))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    with pytest.raises(FormatError, match=r"large\.png: has \d+ x \d+ pixels; more than 250 million are not decoded"):
+    with pytest.raises(
+        FormatError, match=rf"large\.png: has \d+ x \d+ pixels; more than {million} million are not decoded"
+    ):
         read_image(path)
     assert read_preview(path, 100)[0] is None
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB
+
+
+@pytest.mark.parametrize("encode", [jpeg, jpeg_progressive, jpeg_in_scans])
+def test_a_photograph_of_200_million_pixels_is_no_flat_one(encode):
+    data = encode(16384, 12288)
+    with pytest.raises(FormatError, match="pixels"):
+        require_modest("flat.jpg", data)
+    require_modest("photograph.jpg", data + bytes(20_000_000))  # 0.8 bits a pixel
 
 
 KINDS = [(suffix, np.uint8) for suffix in (".png", ".jpg", ".bmp", ".pgm", ".tif")]

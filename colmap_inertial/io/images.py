@@ -22,9 +22,13 @@ PNG = b"\x89PNG\r\n\x1a\n"
 TIFF_ORDERS = {b"II*\0": "<", b"MM\0*": ">"}
 #: Pictures of photographs are not packed more tightly, each byte of a file for so many of pixels.
 _PACKED = 20
+#: Bytes of memory for each of a JPEG. Photographs of this many pixels have more than .5 bits each, or .7 in scans.
+_JPEG_PACKED = 100
 #: Markers of JPEG: C4, C8 and CC are none of frames.
 START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 START_OF_SCAN = 0xDA
+#: Progressive ones, whose coefficients the decoder holds, all of the picture.
+_PROGRESSIVE = (0xC2, 0xC6, 0xCA, 0xCE)
 _UNREADABLE = "cannot be decoded: damaged, cut off, or no picture; take it out of the folder"
 
 
@@ -104,9 +108,13 @@ def require_modest(path: Path, data: bytes) -> None:
 
 
 def _weigh(data: bytes, pixels: int) -> float:
-    """Memory of a pixel of a PNG or TIFF in pixels of three bytes: these formats compress millions of pixels to
+    """Memory of a pixel of a PNG, TIFF or JPEG in pixels of three bytes: these formats compress millions of pixels to
     nothing.
     """
+    if data.startswith(b"\xff\xd8"):
+        # decoded and with its colours in order; beside coefficients of two bytes
+        held = 3.0 if _is_in_scans(data) else 2.0
+        return held if 3 * held * pixels > _JPEG_PACKED * len(data) else 1.0
     if data.startswith(PNG):
         # with alpha it is there twice until that is dropped
         pixel_bytes = data[24] / 8 * {0: 1, 4: 7, 6: 7}.get(data[25], 3)
@@ -117,6 +125,19 @@ def _weigh(data: bytes, pixels: int) -> float:
         return 1.0
     # OpenCV holds it twice; a file that is hardly packed is as large on the disk
     return max(1.0, (2 if pixels * pixel_bytes > _PACKED * len(data) else 1) * pixel_bytes / 3)
+
+
+def _is_in_scans(data: bytes) -> bool:
+    """Whether a JPEG's pixels come in several scans: progressive, or the colours one after the other."""
+    components = 0
+    for marker, begin, _ in jpeg_segments(data):
+        if marker in _PROGRESSIVE:
+            return True
+        if marker in START_OF_FRAME:
+            components = data[begin + 9]
+        elif marker == START_OF_SCAN:
+            return data[begin + 4] < components
+    return False
 
 
 def _read_size(data: bytes) -> tuple[int, int] | None:
