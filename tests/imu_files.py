@@ -542,8 +542,14 @@ def write_video_imu_capture(folder: Path, imu: ImuRecording, frame_ns: np.ndarra
 # --- ROS -------------------------------------------------------------------------------------------------------------
 
 
-def write_rosbag(path: Path, imu: ImuRecording, *, kind: str = "ros1", apart: bool = False) -> Path:
-    """``kind`` is ros1, sqlite3 or mcap; ``apart``: one topic for each sensor, the other sensor zero."""
+def write_rosbag(
+    path: Path, imu: ImuRecording, *, kind: str = "ros1", apart: bool = False, packed_by: str = "", more: bytes = b""
+) -> Path:
+    """``kind`` is ros1, sqlite3 or mcap; ``apart``: one topic for each sensor, the other sensor zero.
+
+    ``packed_by`` is bz2 or lz4 for ros1, else zstd, of each chunk (mcap) or message (sqlite3); ``more``: a last message
+    of these bytes.
+    """
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import StoragePlugin, Writer as Writer2
     from rosbags.typesys import Stores, get_typestore
@@ -576,9 +582,18 @@ def write_rosbag(path: Path, imu: ImuRecording, *, kind: str = "ros1", apart: bo
             ("/accel/sample", imu.accel_t_s, zeros, imu.accel_m_s2),
         ]
     plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
-    with Writer1(path) if kind == "ros1" else Writer2(path, version=9, storage_plugin=plugin) as writer:
+    opened = Writer1(path) if kind == "ros1" else Writer2(path, version=9, storage_plugin=plugin)
+    if packed_by and kind == "ros1":
+        opened.set_compression(getattr(Writer1.CompressionFormat, packed_by.upper()))
+    elif packed_by:
+        from rosbags.rosbag2 import CompressionFormat, CompressionMode as modes
+
+        opened.set_compression(modes.STORAGE if kind == "mcap" else modes.MESSAGE, CompressionFormat.ZSTD)
+    with opened as writer:
         for topic, t_s, gyro, accel in series:
             connection = writer.add_connection(topic, imu_type.__msgtype__, typestore=store)
             for t, g, a in zip(stamps_ns(imu, t_s).tolist(), gyro, accel, strict=True):
                 writer.write(connection, t, packed(t, g, a))
+        if more:
+            writer.write(connection, t, more)
     return path

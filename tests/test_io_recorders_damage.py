@@ -1,7 +1,11 @@
 """Damaged recordings of cameras and apps: an error of ours that names the file, never a crash, never a hang."""
 
+import contextlib
+import dataclasses
 import resource
+import sqlite3
 import struct
+import tracemalloc
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -97,6 +101,52 @@ RECORDERS = {
     "ros 1": (alone(imu_files.write_rosbag, "a.bag"), True),
     "ros 2": (ros2, True),
 }
+
+
+PACKED = [("ros1", "bz2"), ("ros1", "lz4"), ("mcap", "zstd"), ("sqlite3", "zstd")]
+
+
+def write_packed(folder: Path, imu: ImuRecording, kind: str, packed_by: str, more: bytes = b"") -> Path:
+    name = "a.bag" if kind == "ros1" else "a"
+    return imu_files.write_rosbag(folder / name, imu, kind=kind, packed_by=packed_by, more=more)
+
+
+@pytest.mark.parametrize(("kind", "packed_by"), PACKED)
+def test_packed_ros_recordings_are_read_as_others(tmp_path: Path, imu: ImuRecording, kind: str, packed_by: str) -> None:
+    (tmp_path / "packed").mkdir()
+    whole = read_imu(write_packed(tmp_path, imu, kind, ""))
+    packed = read_imu(write_packed(tmp_path / "packed", imu, kind, packed_by))
+    for field in dataclasses.fields(ImuRecording):
+        np.testing.assert_array_equal(getattr(packed, field.name), getattr(whole, field.name))
+
+
+@pytest.mark.parametrize(("kind", "packed_by"), PACKED)
+def test_ros_recordings_that_unpack_to_much_more_are_refused(
+    tmp_path: Path, imu: ImuRecording, kind: str, packed_by: str
+) -> None:
+    path = write_packed(tmp_path, imu, kind, packed_by, bytes(200 << 20))
+    size = sum(file.stat().st_size for file in path.iterdir()) if path.is_dir() else path.stat().st_size
+    assert size < 3e6
+    tracemalloc.start()
+    try:
+        with pytest.raises(FormatError, match=r"unpacks to more than \d+ MB, out of proportion to its \d+ bytes"):
+            read_imu(path)
+        assert tracemalloc.get_traced_memory()[1] < 30e6
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_bag_whose_index_names_a_chunk_twice_is_refused(tmp_path: Path, imu: ImuRecording) -> None:
+    path = write_packed(tmp_path, imu, "ros1", "")
+    data = path.read_bytes()
+    (index,) = struct.unpack_from("<Q", data, data.index(b"index_pos=") + 10)
+    at = index  # of the one connection, then of the one chunk
+    for _ in range(2):
+        at += 4 + struct.unpack_from("<I", data, at)[0]
+    many = data.replace(b"chunk_count=\1", b"chunk_count=\5") + 4 * data[at:]
+    write_anew(path, many)
+    with pytest.raises(FormatError, match="its index names parts of it more than once"):
+        read_imu(path)
 
 
 @pytest.mark.parametrize("name", RECORDERS)
@@ -212,3 +262,14 @@ def test_a_table_said_to_be_larger_than_its_zip_takes_no_more_memory(tmp_path: P
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     assert text_of(path, info.filename) == whole
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB
+
+
+def test_a_view_in_place_of_messages_is_refused(tmp_path: Path, imu: ImuRecording) -> None:
+    path = imu_files.write_rosbag(tmp_path / "a", imu, kind="sqlite3")
+    with contextlib.closing(sqlite3.connect(next(path.glob("*.db3")))) as database:
+        database.executescript("""
+            DROP TABLE messages;
+            CREATE VIEW messages AS WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n LIMIT 1000000000000)
+            SELECT x AS id, 1 AS topic_id, x AS timestamp, zeroblob(300) AS data FROM n""")
+    with pytest.raises(FormatError, match="it holds the view 'messages', which is not run"):
+        read_imu(path)

@@ -15,6 +15,7 @@ from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError, MissingExtraError
 from colmap_inertial.core.types import ImuRecording
 from colmap_inertial.io.imu_text import build_recording
+from colmap_inertial.io.rosbag_chunks import require_modest_recording
 from colmap_inertial.io.samples import Samples, order_samples
 from colmap_inertial.io.units import SENSOR_NAMES, DeclaredUnits, Quantity
 
@@ -48,13 +49,14 @@ def read_rosbag(path: Path, units: DeclaredUnits) -> ImuRecording:
     MissingExtraError
         Where the package rosbags is not installed.
     FormatError
-        Where the recording is damaged, or holds no IMU or several.
+        Where the recording is damaged, unpacks to much more than it is, or holds no IMU or several.
     """
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise MissingExtraError("ros", f"{path} is a ROS recording") from None
+    require_modest_recording(path)
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             topics = _topics(reader)
