@@ -154,6 +154,20 @@ def test_pictures_alone_are_mapped_and_scaled(pictures, tmp_path, monkeypatch, c
     assert sorted(path.name for path in folder.iterdir()) == ["0.png", "1.png", "2.png", "3.png"]
 
 
+def test_a_model_that_a_link_leads_to_is_not_gone_on_with(pictures, tmp_path, capsys, monkeypatch):
+    folder, mapped = pictures
+    args = ["reconstruct", folder, tmp_path / "out", "--scale-from", "target", "--target", "aruco:DICT_4X4_50:0.1"]
+    monkeypatch.setattr(rooms, "validate_model", lambda *_, **__: validated(0.5, unscaled=True))
+    assert run(capsys, *args)[0] == 0
+    (tmp_path / "out" / "colmap").rename(tmp_path / "elsewhere")
+    shutil.rmtree(tmp_path / "out")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "colmap").symlink_to(tmp_path / "elsewhere")
+    code, _, err = run(capsys, *args)
+    assert code == 2 and "colmap: is a link to" in " ".join(err.split())
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["colmap"] and len(mapped) == 1
+
+
 @loop_over("content", ["[]", "{}", "3", '{"left_out": ["x"]}', '{"left_out": 3}'])
 def test_a_changed_record_of_the_mapping_is_named(pictures, tmp_path, capsys, content):
     folder, _ = pictures

@@ -502,6 +502,21 @@ def test_the_same_run_gives_the_same_bytes(full, tmp_path):
     assert first == second
 
 
+@pytest.mark.parametrize(
+    "name", ["result.json", "config.toml", "report_data", "report_data/recording.json", "validation/0"]
+)
+def test_links_in_what_the_report_is_made_of_are_refused(full, tmp_path, name):
+    out = copy_of(full, tmp_path)
+    place, elsewhere = out / name, tmp_path / "elsewhere"
+    if place.exists():
+        shutil.move(place, elsewhere)
+    place.parent.mkdir(exist_ok=True)
+    place.symlink_to(elsewhere)
+    with pytest.raises(FormatError, match=r"is a link to .*elsewhere; links in an output folder are not followed"):
+        write_report(out)
+    assert not (out / "report.html").exists() and not (out / "report.json").exists()
+
+
 def test_a_long_recording_with_several_models_stays_below_five_megabytes(tmp_path):
     out = tmp_path / "out"
     result = write_run(out, duration_s=60.0, points=30000, models=3)

@@ -299,6 +299,16 @@ def require_regular(path: Path) -> None:
         raise FormatError(path, "is a device, a pipe or a socket, not a file; copy what it gives into one")
 
 
+def refuse_link(path: Path) -> None:
+    """Raise :class:`FormatError` where a name in an output folder is a symbolic link."""
+    if path.is_symlink():
+        raise FormatError(
+            path,
+            f"is a link to {path.readlink()}; links in an output folder are not followed: remove it, or put the file "
+            "or folder itself there",
+        )
+
+
 def first_line(path: Path) -> str:
     """The beginning of a file's first line, to tell what it is; empty where it cannot be read."""
     try:

@@ -32,7 +32,7 @@ def forget_unregistered(reconstruction: pycolmap.Reconstruction) -> pycolmap.Rec
 
     if reconstruction.num_reg_frames() == reconstruction.num_frames():
         return reconstruction
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(prefix="colmap-inertial-") as folder:
         reconstruction.write_binary(folder)
         read = pycolmap.Reconstruction()
         read.read_binary(folder)

@@ -70,10 +70,13 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from colmap_inertial.checks.report.content import gather
+from colmap_inertial.checks.report.content import DATA_FOLDER, gather
 from colmap_inertial.core.errors import InertialError
 from colmap_inertial.core.printing import printable_values
-from colmap_inertial.io.files import StrPath, reading, write_json, write_text
+from colmap_inertial.io.files import StrPath, reading, refuse_link, write_json, write_text
+
+#: Files and folders of a run that its report is made of.
+_READ = ("result.json", "diagnosis.json", "config.toml", DATA_FOLDER, "validation")
 
 
 def write_report(
@@ -99,11 +102,14 @@ def write_report(
     Raises
     ------
     FormatError
-        Where the folder holds no finished run, or its files were damaged since.
+        Where the folder holds no finished run, a link in what is read, or files that were damaged since.
     OutputError
         Where it cannot be written.
     """
     out = Path(out)
+    for name in _READ:
+        for path in (out / name, *(out / name).rglob("*")):
+            refuse_link(path)
     from colmap_inertial.checks.report.run_page import run_page
 
     target = out / "report.html"

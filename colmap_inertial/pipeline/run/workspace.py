@@ -18,7 +18,7 @@ from pathlib import Path
 
 from colmap_inertial.checks.report.folders import CROPS_FOLDER, DATA_FOLDER
 from colmap_inertial.core.errors import FormatError, OutputError, OutputExistsError
-from colmap_inertial.io.files import CHANGED_RECORD, locked, read_json, reading, write_json
+from colmap_inertial.io.files import CHANGED_RECORD, locked, read_json, reading, refuse_link, write_json
 
 log = logging.getLogger(__name__)
 
@@ -227,11 +227,7 @@ def refuse_links(root: Path) -> None:
                 raise FormatError(path, "is a device, a pipe or a socket in an output folder: remove it")
             inside = os.path.commonpath((top, os.path.realpath(path))) == top
             if not inside or not any(path.is_relative_to(place) for place in _places_of_links(workspace)):
-                raise FormatError(
-                    path,
-                    f"is a link to {path.readlink()}; links in an output folder are not followed: remove it, or put "
-                    "the file or folder itself there",
-                )
+                refuse_link(path)
 
 
 def _places_of_links(workspace: Workspace) -> list[Path]:

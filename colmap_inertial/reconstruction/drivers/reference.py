@@ -38,7 +38,7 @@ from colmap_inertial.pipeline.run.colmap_settings import read_settings
 from colmap_inertial.pipeline.run.context import RunContext
 from colmap_inertial.pipeline.run.progress import Progress, counted, silent
 from colmap_inertial.pipeline.run.session import keep_colmap_quiet
-from colmap_inertial.pipeline.run.workspace import a_record_of_ours, require_apart
+from colmap_inertial.pipeline.run.workspace import a_record_of_ours, refuse_links, require_apart
 from colmap_inertial.pipeline.stages.frame_folder import encode_image, require_frames
 from colmap_inertial.reconstruction.drivers.sources import only_model, scaling
 
@@ -285,10 +285,12 @@ def reconstruct_by(
     Raises
     ------
     FormatError, MappingError, NotObservableError, OutputExistsError
-        For pictures that cannot be read or mapped, and sizes that cannot be found. COLMAP's model is kept then.
+        For links in ``out``, pictures that cannot be read or mapped, and sizes that cannot be found. COLMAP's model is
+        kept then.
     """
     capture, out = Path(capture), Path(out)
     check_reference(reference)
+    refuse_links(out)
     if options.database is not None:
         raise InertialError("--database goes with a capture whose metres come from the IMU; leave it out")
     if any("," in end for end in reference.between or ()):
