@@ -2,12 +2,13 @@
 
     python scripts/study_heal.py [--trials 200] [--seed 0] [--commands NAME ...]
 
-Needs the checkout and the extra ``dev``. Finished and half-finished folders of reconstruct (of a capture and of a
-project), deblur and batch, finished ones in which a run with other options was stopped, and what export reads, get one
-to three faults each: a file or folder is deleted, a file cut off or written over, or a link to outside planted in its
-place or beside. Then the command runs once more. Either all is as in the folder that nobody touched, byte for byte but
-for times and stamps; or it ends with exit code 2 and a sentence that says what to do, and when that is done the next
-run comes through with the same. Nothing outside is changed or copied. Exit code 1 otherwise.
+Needs the checkout and the extra ``dev``. Finished and half-finished folders of reconstruct (of a capture, of a project,
+and of pictures with ``--scale-from``), deblur and batch, finished ones in which a run with other options was stopped,
+and what export reads, get one to three faults each: a file or folder is deleted, a file cut off or written over, or a
+link to outside planted in its place or beside. Then the command runs once more. Either all is as in the folder that
+nobody touched, byte for byte but for times, stamps, logs and reports, which say what was made again (of deblur, whose
+threads do not decide, too); or it ends with exit code 2 and a sentence that says what to do, and when that is done the
+next run comes through with the same. Nothing outside is changed or copied. Exit code 1 otherwise.
 """
 
 import argparse
@@ -51,6 +52,10 @@ REFUSED = re.compile(
     r"choose a new one|rename or remove it|start (it|that|its run) again|no such folder|is missing).*",
     re.DOTALL,
 )
+
+
+#: In the first frames of the example scene.
+_BOARD = "checkerboard:8x6:0.04"
 
 
 class Stopped(BaseException):
@@ -153,6 +158,11 @@ def commands(root: Path) -> dict[str, Command]:
             ("batch", str(root / "batch.toml"), "{out}", *config),
             lambda out, stop: _half_of_a_batch(root, out, stop),
             steps=("matches", "metric"),
+        ),
+        "reference": Command(
+            ("reconstruct", str(root / "hall"), "{out}", *config, "--scale-from", "target", "--target", _BOARD),
+            lambda out, _: shutil.copytree(root / "whole" / "reference" / "colmap", out / "colmap"),
+            steps=("validation",),
         ),
         "export": Command(("export", "{out}", "{dest}", "--for", "nerfstudio"), made_in="dest", faults=EDITED),
     }

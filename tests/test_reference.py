@@ -168,6 +168,27 @@ def test_a_model_that_a_link_leads_to_is_not_gone_on_with(pictures, tmp_path, ca
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["colmap"] and len(mapped) == 1
 
 
+@pytest.mark.parametrize("change", ["delete", "write", "add"])
+def test_a_mapping_that_was_changed_since_is_not_gone_on_with(pictures, tmp_path, capsys, monkeypatch, change):
+    folder, mapped = pictures
+    args = ["reconstruct", folder, tmp_path / "out", "--scale-from", "target", "--target", "aruco:DICT_4X4_50:0.1"]
+
+    def nothing_found(*_, **__):
+        raise TargetNotFoundError("no marker was found")
+
+    monkeypatch.setattr(rooms, "validate_model", nothing_found)
+    assert run(capsys, *args)[0] == 5
+    monkeypatch.setattr(rooms, "validate_model", lambda *_, **__: validated(0.5, unscaled=True))
+    picture = tmp_path / "out" / "colmap" / "images" / ("9.png" if change == "add" else "2.png")
+    picture.unlink(missing_ok=True)
+    if change != "delete":
+        picture.write_bytes(b"other")
+    code, _, err = run(capsys, *args)
+    said = " ".join(err.split())
+    assert code == 2 and f"{picture.name} is missing or was changed since it was made; remove " in said
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["colmap"] and len(mapped) == 1
+
+
 @loop_over("content", ["[]", "{}", "3", '{"left_out": ["x"]}', '{"left_out": 3}'])
 def test_a_changed_record_of_the_mapping_is_named(pictures, tmp_path, capsys, content):
     folder, _ = pictures

@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -37,6 +38,7 @@ from colmap_inertial.model.project import apply_to_project
 from colmap_inertial.pipeline.run.colmap_settings import read_settings
 from colmap_inertial.pipeline.run.context import RunContext
 from colmap_inertial.pipeline.run.progress import Progress, counted, silent
+from colmap_inertial.pipeline.run.runner import fingerprint
 from colmap_inertial.pipeline.run.session import keep_colmap_quiet
 from colmap_inertial.pipeline.run.workspace import a_record_of_ours, refuse_links, require_apart
 from colmap_inertial.pipeline.stages.frame_folder import encode_image, require_frames
@@ -306,7 +308,8 @@ def reconstruct_by(
     if not _is_mapped(out, made_from):
         with new_folder(out) as work:
             left_out = _map(pictures, names, work / "colmap", options, progress)
-            write_json(work / "colmap" / _MADE_FROM, {**made_from, "left_out": left_out})
+            files = _contents(work / "colmap")
+            write_json(work / "colmap" / _MADE_FROM, {**made_from, "left_out": left_out, "files": files})
     left_out = read_json(out / "colmap" / _MADE_FROM)["left_out"]
     metric = out / "metric"
     found = scale_project_by(
@@ -336,12 +339,28 @@ def _is_mapped(out: Path, made_from: dict[str, object]) -> bool:
     shutil.rmtree(out / "metric", ignore_errors=True)
     if {path.name for path in out.iterdir()} != {"colmap"}:
         return False
-    with a_record_of_ours(record):
-        known = read_json(record)
-        list(map(int, known["left_out"]))
+    again = f"remove {out}, or choose another folder"
+    try:
+        with a_record_of_ours(record):
+            known = read_json(record)
+            list(map(int, known["left_out"]))
+            kept = dict(known["files"])
+    except FormatError as error:
+        raise OutputExistsError(f"{error}; {again}") from None
     if any(known.get(key) != value for key, value in made_from.items()):
         raise OutputExistsError(f"{out} holds a model of other pictures or options; choose another folder or remove it")
+    found = _contents(record.parent)
+    if changed := sorted(name for name in kept | found if kept.get(name) != found.get(name)):
+        raise OutputExistsError(f"{record.parent / changed[0]} is missing or was changed since it was made; {again}")
     return True
+
+
+def _contents(project: Path) -> dict[str, list[object]]:
+    """Size and digest of a project's files, without the record of what it was made from."""
+    rows: Any = fingerprint(project)
+    found = {Path(path).relative_to(project.resolve()).as_posix(): [size, digest] for path, size, _, digest in rows}
+    found.pop(_MADE_FROM, None)
+    return found
 
 
 def _pictures(path: Path) -> Capture:
