@@ -10,8 +10,9 @@ Needs the checkout and the extra ``dev``. Each reader of ``tests/fuzz_readers.py
 a process of its own, in which it reads one mutant after the other: with at most 1 GB more address space than at its
 start, and 10 s of processor time for each. Prints a table of readers and outcomes: ``read`` (by one of its functions at
 least); ``refused``, by an ``InertialError`` of the reader's own words; ``gated``, by the gate of all readers, which had
-none; ``foreign``, any other exception; ``hung``; ``large``, more memory asked for than there is; ``died``, the process
-ended. Exit code 1 where one of the last four is not 0. A mutant is told by its seed, reader and number: ``--only
+none; ``control``, a message that still drives a terminal as it is shown; ``foreign``, any other exception; ``hung``;
+``large``, more memory asked for than there is; ``died``, the process ended. Exit code 1 where one of the last five is
+not 0. A mutant is told by its seed, reader and number: ``--only
 NUMBER`` makes one reader's again.
 """
 
@@ -27,6 +28,7 @@ import sys
 import tempfile
 import time
 import traceback
+import unicodedata
 import zlib
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -41,10 +43,11 @@ from fuzz_readers import READERS as SINGLE, Reader, mutant
 from fuzz_steps import MORE
 
 from colmap_inertial.core.errors import InertialError
+from colmap_inertial.core.printing import printable
 from colmap_inertial.io.files import DAMAGED
 
 READERS = {**SINGLE, **MORE}
-OUTCOMES = ("read", "refused", "gated", "foreign", "hung", "large", "died")
+OUTCOMES = ("read", "refused", "gated", "control", "foreign", "hung", "large", "died")
 #: Address space beside that of a process that has read a whole file, and processor time for one mutant.
 MOST_BYTES, MOST_S = 1 << 30, 10.0
 
@@ -74,6 +77,9 @@ def outcome(reader: Reader, folder: Path, files: list[tuple[Path, bytes]], key: 
             reader.read(folder)
         return "read", ""
     except InertialError as error:
+        shown = printable(str(error))
+        if any(unicodedata.category(sign) in ("Cc", "Cf", "Cs") and sign not in "\n\t" for sign in shown):
+            return "control", f"{path.name}: {shown!r}"
         return "gated" if getattr(error, "code", "") == DAMAGED else "refused", ""
     except MemoryError:
         return "large", f"{path.name}: {traceback.format_exc()[-600:]}"
@@ -185,7 +191,7 @@ def main() -> int:
     for row in rows:
         for number, told in row.faults:
             print(f"\n{row.name}, mutant {number}: {told}")
-    return 1 if any(total[kind] for kind in ("foreign", "hung", "large", "died")) else 0
+    return 1 if any(total[kind] for kind in ("control", "foreign", "hung", "large", "died")) else 0
 
 
 if __name__ == "__main__":

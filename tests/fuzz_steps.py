@@ -1,6 +1,7 @@
 """More readers of files from outside: tables, maps, databases and records that single steps read."""
 
 import shutil
+from importlib.util import find_spec
 from pathlib import Path
 
 import imu_files
@@ -18,11 +19,13 @@ from test_splats import write_splats, write_trained
 from test_validate_lengths import PLACES, validated
 
 from colmap_inertial.checks.validate.markers import add_bars, add_check_points
+from colmap_inertial.colmap.given_database import read_given
 from colmap_inertial.colmap.two_views import open_features
 from colmap_inertial.io.calibration import read_calibrations, write_imu_calibration
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.files import write_json
 from colmap_inertial.io.frames import read_frame_timing
+from colmap_inertial.io.imu import read_frame_log, read_imu
 from colmap_inertial.io.ply import transform_ply
 from colmap_inertial.io.positions import positions_in_video
 from colmap_inertial.io.rig_calibration import read_rig_calibration
@@ -31,6 +34,7 @@ from colmap_inertial.model.database import transform_database
 from colmap_inertial.model.nerf import transform_transforms
 from colmap_inertial.model.similarities import plain_factor
 from colmap_inertial.model.submodels.matches import read_matches
+from colmap_inertial.pipeline.run.colmap_settings import read_settings
 from colmap_inertial.pipeline.stages.frame_folder import read_frame_records
 from colmap_inertial.reconstruction.preparation.geolocation import read_georeference
 from colmap_inertial.tools.batch.task import CaptureStatus, read_end, read_status, write_status
@@ -193,7 +197,47 @@ def _read_capture(folder: Path) -> None:
     each(lambda: read_frame_timing(capture), lambda: capture.apertures)
 
 
+def _given(folder: Path) -> list[Path]:
+    path = folder / "given.db"
+    with pycolmap.Database.open(str(path)) as opened:
+        camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=320, height=240, params=[300, 160, 120, 0])
+        camera.camera_id = opened.write_camera(camera)
+        rng = np.random.default_rng(2)
+        for name in ("a.jpg", "b.jpg"):
+            number = opened.write_image(pycolmap.Image(name=name, camera_id=camera.camera_id))
+            opened.write_keypoints(number, 90 * rng.random((20, 2), np.float32))
+            kind = pycolmap.FeatureExtractorType.SIFT
+            data = rng.integers(0, 255, (20, 128), np.uint8)
+            opened.write_descriptors(number, pycolmap.FeatureDescriptors(kind, data))
+        opened.write_matches(1, 2, np.tile(np.arange(20, dtype=np.uint32)[:, None], (1, 2)))
+    return [path]
+
+
+def _settings(folder: Path) -> list[Path]:
+    (folder / "project.ini").write_text("[Mapper]\ninit_num_trials=60\n[SiftExtraction]\nmax_num_features=900\n")
+    return [folder / "project.ini"]
+
+
+def _telemetry(folder: Path) -> list[Path]:
+    imu = small_recording(True)
+    return [
+        imu_files.write_insta360(
+            folder / "VID.mp4", imu, next(iter(imu_files.INSTA360S)), counts=True, readout_ms=16.5
+        ),
+        imu_files.write_runcam(folder, imu, next(iter(imu_files.RUNCAMS))),
+    ]
+
+
+def _read_telemetry(folder: Path) -> None:
+    each(*(lambda p=p: read_imu(p) for p in sorted(folder.iterdir())), lambda: read_frame_log(folder / "VID.mp4"))
+
+
+#: Of the extra ``devices``, which not every Python has.
+DEVICES = {"telemetry": Reader(_telemetry, _read_telemetry)} if find_spec("telemetry_parser") else {}
 MORE: dict[str, Reader] = {
+    **DEVICES,
+    "given database": Reader(_given, lambda folder: read_given(folder / "given.db"), cost=3.0),
+    "project.ini": Reader(_settings, lambda folder: read_settings((), folder / "project.ini")),
     "splats and meshes (ply)": Reader(_clouds, _read_clouds),
     "maps, meshes and options": Reader(_maps, _read_maps),
     "transforms.json": Reader(_nerf, _read_nerf),

@@ -156,6 +156,9 @@ TOML_VALUES = tuple(value for value in VALUES if value is not None and value != 
 
 
 def _toml(data: bytes, rng: Rng) -> bytes:
+    if rng.random() < 0.03:
+        key = ".".join(["a"] * int(_any(rng, (20, 6000, 150_000))))
+        return data + _any(rng, ("\n[{}]\n", "\n{} = 1\n", "\nx = {{ {} = 1 }}\n")).format(key).encode()
     tree = tomllib.loads(data.decode())
     _change_tree(tree, rng, TOML_VALUES)
     return _with_raw(tomli_w.dumps(tree))
@@ -239,7 +242,16 @@ def _sqlite(data: bytes, rng: Rng) -> bytes:
             row = f'rowid IN (SELECT rowid FROM "{table}" ORDER BY rowid LIMIT 1 OFFSET {int(rng.integers(0, 4))})'
             values = (None, 0, -1, 2**31, 2**62, -(2**63), 1e308, "text", CONTROL, "../../up.png")
             value = _any(rng, (*values, b"", b"\0" * 7, b"\xff" * 96))
-            match int(rng.integers(0, 8)):
+            endless = "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n LIMIT 1000000000000) SELECT"
+            match int(rng.integers(0, 10)):
+                case 8:
+                    named = ", ".join(f'x AS "{name}"' for name in columns)
+                    opened.execute(f'DROP TABLE "{table}"')
+                    opened.execute(f'CREATE VIEW "{table}" AS {endless} {named} FROM n')
+                case 9:
+                    event = _any(rng, ("INSERT", "UPDATE", "DELETE"))
+                    body = f"SELECT 1 WHERE ({endless} count(*) FROM n) > 5;"
+                    opened.execute(f'CREATE TRIGGER slow AFTER {event} ON "{table}" BEGIN {body} END')
                 case 0:
                     opened.execute(f'DELETE FROM "{table}" WHERE {row}')
                 case 1:
