@@ -110,6 +110,9 @@ def test_of_a_project_ini_counts_what_differs_and_a_setting_goes_before_it(tmp_p
     ini.write_text("[SiftMatching]\nguided_matching=1\n[Mapper]\nba_global_images_ratio=1.1\n")
     with pytest.raises(FormatError, match=r"FeatureMatching\.guided_matching\?.*Mapper\.ba_global_frames_ratio\?"):
         read_settings((), ini)
+    ini.write_text(f"[Mapper]\ninit_num_trials={'x' * 5000}\n")
+    with pytest.raises(FormatError, match="init_num_trials"):
+        read_settings((), ini)
     ini.write_text("[Mapper\n")
     with pytest.raises(FormatError, match=r"is no project\.ini"):
         read_settings((), ini)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import configparser
 import difflib
 import logging
+import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -200,7 +201,8 @@ def _read_project(path: Path) -> Iterator[str]:
 
 def _absolute(value: str, folder: Path) -> str:
     """A value of a file in which paths count from its folder."""
-    return str((folder / value).resolve()) if value and (folder / value).exists() else value
+    # the system refuses names that are too long; os.path does not raise
+    return str((folder / value).resolve()) if value and os.path.exists(folder / value) else value
 
 
 def _check(text: str) -> bool:
