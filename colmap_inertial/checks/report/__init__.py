@@ -70,7 +70,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from colmap_inertial.checks.report.content import DATA_FOLDER, gather
+from colmap_inertial.checks.report.content import gather
+from colmap_inertial.checks.report.folders import DATA_FOLDER
 from colmap_inertial.core.errors import InertialError
 from colmap_inertial.core.printing import printable_values
 from colmap_inertial.io.files import StrPath, reading, refuse_link, write_json, write_text
