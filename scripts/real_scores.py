@@ -55,7 +55,7 @@ def scores(model: Model, filmed: Filmed) -> dict[str, Any]:
         "drift_pct": 100 * (last / first - 1),
         "scale_pct": 100 * error_log,
         "scale_z": error_log / accepted.sigma_log,
-        "inside": abs(error_log) <= Z95 * accepted.sigma_log,
+        "inside": bool(abs(error_log) <= Z95 * accepted.sigma_log),
         "verdict": model.scale.verdict,
     }
     for span_s in SPANS_S:

@@ -18,7 +18,9 @@ similarity.
 (``real_world.py``) and prints of each model, before and after: errors of the path after one similarity, over 1 and
 5 s, of rotations and gravity; drift of the scale from the first to the last third; error of the scale, and over its
 standard deviation; velocity as written; normalised squares of errors of position and velocity, a third of them (1 where
-covariances are right). A recording's own scale is the error that the scale has by the true poses.
+covariances are right). A recording's own scale is the error that the scale has by the true poses. The summary says how
+often intervals of scale and readout have the true value, how often a global shutter was taken for a rolling one, and
+what ``--refine auto`` would choose; every window is refined all the same.
 """
 
 import argparse
@@ -39,7 +41,9 @@ from real_scores import covered, scores
 from real_world import World, film, worlds
 
 from colmap_inertial.core.geometry import matrix_from_quat
+from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import CameraTrajectory, FrameTiming
+from colmap_inertial.inertial.refine.judge import LIMITS
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.files import read_json
 from colmap_inertial.io.trajectories import read_inertial_scale
@@ -148,9 +152,16 @@ def filmed_window(asked: argparse.Namespace, world: World) -> dict[str, Any]:
         return out | {"said": "; ".join(model.scale.reasons)}
     out["before"] = scores(model, filmed) | covered(model, filmed)
     begin_s, processor_s = time.perf_counter(), time.process_time()
-    refined = RefineStage(**stages, refine_intrinsics=True, auto=asked.auto)(model)
+    refined = RefineStage(**stages, refine_intrinsics=True, auto=True)(model)
+    out["auto"] = refined.treatments[-1].values.get("expected")
+    out["declined"] = bool(out["auto"]) and "sigma_px" not in refined.treatments[-1].values
+    if out["declined"]:
+        # what it would have done, to judge the choice
+        begin_s, processor_s = time.perf_counter(), time.process_time()
+        refined = RefineStage(**stages, refine_intrinsics=True)(model)
     out["wall_s"], out["cpu_s"] = time.perf_counter() - begin_s, time.process_time() - processor_s
     said = refined.treatments[-1]
+    out["readout"] = _readout(said.values, world.readout_s, declared=asked.declared)
     out |= {"said": said.reason, "accepted": said.action == "refined", "values": said.values}
     if out["accepted"]:
         out["after"] = scores(refined, filmed) | covered(refined, filmed)
@@ -158,6 +169,16 @@ def filmed_window(asked: argparse.Namespace, world: World) -> dict[str, Any]:
         out["lever_mm"] = 1e3 * float(np.linalg.norm(lever))
         out["lever_z"] = (lever / said.values["imu_in_cam_sigma_m"]).tolist()
     return out
+
+
+def _readout(values: dict[str, Any], true_s: float, *, declared: bool) -> dict[str, Any]:
+    """Whether a readout was found, its error over its standard deviation, and whether the interval has the true one."""
+    found_s = float(values.get("readout_s", 0.0))
+    changed = abs(found_s) >= LIMITS.least_readout_s
+    if not changed:
+        return {"changed": False, "z": None, "inside": true_s == 0 and not declared}
+    z = (found_s - true_s) / float(values["readout_sigma_s"])
+    return {"changed": True, "z": z, "inside": abs(z) <= Z95}
 
 
 #: Of the table: columns of scores, and how they are shown.
@@ -197,34 +218,61 @@ def real_imus(asked: argparse.Namespace) -> None:
                 f"mm, {one.get('wall_s', 0):.1f} s, {one.get('cpu_s', 0):.1f} s of CPU; {one['said']}",
                 flush=True,
             )
-    summarise(results)
+    summarise(results, 1e-3 * asked.readout_ms)
     if asked.json:
         write_report(asked.json, {"windows": results})
 
 
-def summarise(results: list[dict[str, Any]]) -> None:
+def summarise(results: list[dict[str, Any]], readout_s: float) -> None:
     """What all windows come to."""
-    good = [one for one in results if one.get("accepted")]
-    if not good:
-        return
+    judged = [one for one in results if "before" in one]
+    good = [one for one in judged if one["accepted"]]
     ratio = np.array([one["before"]["path_mm"] / one["after"]["path_mm"] for one in good])
-    print(f"accepted {len(good)} of {len(results)}; path {np.median(ratio):.2f} times closer, worst {ratio.min():.2f}")
-    for when in ("before", "after"):
-        of = [one[when] for one in good]
-        scale = np.array([one["scale_pct"] for one in of])
-        trusted = np.array([one["verdict"] == "trusted" for one in of])
-        medians = {name: float(np.median([one[name] for one in of])) for name, f in COLUMNS.items() if f[-1] == "f"}
-        means = {name: float(np.mean([one[name] for one in of])) for name in of[0] if name.endswith(("nees", "inside"))}
+    if len(good):
         print(
-            f"{when}: scale {np.sqrt(np.mean(scale**2)):.2f} % rms ({int(trusted.sum())} trusted "
-            f"{np.sqrt(np.mean(scale[trusted] ** 2)):.2f} %), medians "
-            + ", ".join(f"{name} {value:.3g}" for name, value in medians.items())
-            + "; means "
-            + ", ".join(f"{name} {value:.2f}" for name, value in means.items())
+            f"accepted {len(good)} of {len(results)}; path {np.median(ratio):.2f} times closer, worst "
+            f"{ratio.min():.2f}; more than 1.2 times farther: {int(np.sum(ratio < 1 / 1.2))}"
         )
+    for name, when, some in (("before, all", "before", judged), ("before", "before", good), ("after", "after", good)):
+        if some:
+            _summarise_scores(name, [one[when] for one in some])
+    declined = [one for one in judged if one["declined"]]
+    missed = sum(one["accepted"] and one["before"]["path_mm"] > 1.05 * one["after"]["path_mm"] for one in declined)
+    chosen = [one for one in judged if not one["declined"]]
+    worse = sum(one["accepted"] and one["after"]["path_mm"] > 1.05 * one["before"]["path_mm"] for one in chosen)
+    print(
+        f"auto: refines {len(chosen)} of {len(judged)}, {worse} of them more than 1.05 times farther; "
+        f"of {len(declined)} left as they are {missed} would have come closer"
+    )
+    readouts = [one["readout"] for one in judged]
+    changed = [one for one in readouts if one["changed"]]
+    if changed:
+        z = np.array([one["z"] for one in changed])
+        print(f"readout found in {len(changed)}: {np.sqrt(np.mean(z**2)):.2f} sigma rms")
+    print(
+        f"readout inside 95 %: {sum(one['inside'] for one in readouts)} of {len(readouts)}"
+        + ("" if readout_s else f"; global shutters changed: {len(changed)}")
+    )
     own = np.array([one["recording_pct"] for one in good])
-    lever = np.concatenate([one["lever_z"] for one in good])
-    print(f"recordings' own {np.sqrt(np.mean(own**2)):.2f} % rms; lever arm {np.sqrt(np.mean(lever**2)):.2f} sigma rms")
+    lever = np.concatenate([one["lever_z"] for one in good]) if good else np.zeros(0)
+    if len(good):
+        print(f"recordings' own {np.sqrt(np.mean(own**2)):.2f} % rms; lever {np.sqrt(np.mean(lever**2)):.2f} sigma rms")
+
+
+def _summarise_scores(name: str, of: list[dict[str, Any]]) -> None:
+    scale = np.array([one["scale_pct"] for one in of])
+    trusted = np.array([one["verdict"] == "trusted" for one in of])
+    own = np.sqrt(np.mean(scale[trusted] ** 2)) if trusted.any() else np.nan
+    medians = {column: float(np.median([one[column] for one in of])) for column, f in COLUMNS.items() if f[-1] == "f"}
+    means = {n: float(np.mean([one[n] for one in of])) for n in of[0] if n.endswith(("_nees", "_inside"))}
+    inside = np.array([one["inside"] for one in of])
+    print(
+        f"{name}: scale {np.sqrt(np.mean(scale**2)):.2f} % rms, inside 95 % {inside.sum()} of {len(of)} "
+        f"({int(trusted.sum())} trusted {own:.2f} %, {inside[trusted].sum()} inside), medians "
+        + ", ".join(f"{column} {value:.3g}" for column, value in medians.items())
+        + "; means "
+        + ", ".join(f"{column} {value:.2f}" for column, value in means.items())
+    )
 
 
 def _number(image: pycolmap.Image) -> int:
@@ -243,7 +291,6 @@ def main() -> None:
     parser.add_argument("--readout-ms", type=float, default=0.0)
     parser.add_argument("--declared", action="store_true", help="the readout is known")
     parser.add_argument("--loops", action="store_true", help="points are seen again")
-    parser.add_argument("--auto", action="store_true", help="refine only where that promises something")
     parser.add_argument("--quick", action="store_true", help="six windows")
     parser.add_argument("--json", type=Path)
     asked = parser.parse_args()
