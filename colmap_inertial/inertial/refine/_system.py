@@ -48,14 +48,14 @@ class BandFactor:
         size = min(-(-max(rows, _LEAST) // state) * state, -(-count // state) * state)
         size = max(size, rows)
         blocks = np.zeros((-(-count // size), size, size))
-        i, j = np.ogrid[:size, :size]
-        # within a column, rows follow each other from the diagonal on, into the next block
-        along = (i - j) % size
-        inside = along < rows
+        # a column's rows follow each other from the diagonal on, into the next block
+        columns = np.zeros((size, 2 * size))
+        along = np.lib.stride_tricks.as_strided(columns, (size, rows), ((2 * size + 1) * 8, 8))
         for k, block in enumerate(blocks):
-            some = lower[:, k * size : (k + 1) * size]
-            wide = some.shape[1]
-            block[:, :wide] = np.where(inside[:, :wide], some[np.minimum(along, rows - 1)[:, :wide], j[:, :wide]], 0.0)
+            some = lower.T[k * size : (k + 1) * size]
+            wide = len(some)
+            along[:wide], along[wide:] = some, 0.0
+            np.add(columns[:, :size].T, columns[:, size:].T, out=block)
             if wide < size:
                 block[wide:] = 0.0
                 block[range(wide, size), range(wide, size)] = 1.0
