@@ -228,6 +228,9 @@ def test_candidates_are_the_best_of_a_frame():
     assert candidates(votes, i, j).tolist() == [True, True, True, True, True, False]
     i, j = np.zeros(5, dtype=np.intp), np.full(5, 20)
     assert candidates(np.array([30, 20, 8, 10, 9]), i, j).tolist() == [True, True, False, True, False]
+    # of equally many matches, the earlier pairs
+    assert candidates(np.full(5, 9), i, j).tolist() == [True, True, True, False, False]
+    assert candidates(i[:0], i[:0], j[:0]).tolist() == []
 
 
 def way_along(centre):

@@ -97,11 +97,13 @@ def key_frames(t_s: Array) -> IndexArray:
 
 def candidates(matches: IndexArray, i: IndexArray, j: IndexArray) -> BoolArray:
     """(M,) which pairs of frames i, j, (M,) each, have matches enough and are among the best of one of their frames."""
+    frames, pair = np.concatenate([i, j]), np.tile(np.arange(len(matches)), 2)
+    # by frame, then by matches, the most first; of equal ones, the earlier pair
+    order = np.lexsort((pair, -matches[pair], frames))
+    ranked = frames[order]
+    rank = np.arange(len(ranked)) - np.searchsorted(ranked, ranked)
     chosen = np.zeros(len(matches), dtype=np.bool_)
-    for frame in np.unique(np.concatenate([i, j])):
-        own = np.flatnonzero((i == frame) | (j == frame))
-        best = own[np.argsort(-matches[own], kind="stable")[: _LIMITS.best]]
-        chosen[best] = True
+    chosen[pair[order[rank < _LIMITS.best]]] = True
     return chosen & (matches >= _LIMITS.least_quick_matches)
 
 
