@@ -12,6 +12,7 @@ import itertools
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -79,8 +80,9 @@ class MappedCapture:
     names: Sequence[str]
     settings: ColmapSettings = NO_SETTINGS
 
+    @cached_property
     def cache(self) -> pycolmap.DatabaseCache:
-        """The matches that the mapper uses."""
+        """The matches that the mapper uses; read once for all adjustments of a join."""
         import pycolmap
 
         options = pycolmap.DatabaseCacheOptions()
@@ -234,7 +236,7 @@ def _adjust(reconstruction: pycolmap.Reconstruction, capture: MappedCapture) -> 
     options = _adjustment(pipeline, reconstruction)
     options.ceres.solver_options.max_num_iterations = CLOSURE.rounds
     pycolmap.bundle_adjustment(reconstruction, capture.settings.apply(options))
-    mapper = pycolmap.IncrementalMapper(capture.cache())
+    mapper = pycolmap.IncrementalMapper(capture.cache)
     mapper.begin_reconstruction(reconstruction)
     # COLMAP's own loop would answer no signal until its end
     options = capture.settings.apply(_adjustment(pipeline, reconstruction))
