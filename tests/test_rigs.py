@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import logging
 import shutil
 from pathlib import Path
 
@@ -41,7 +42,7 @@ class RigProject:
         return ProjectOptions(imu=self.imu, **({"frame_times": self.frame_times} | more))
 
 
-def write_rig_model(recording, folder, *, skip=()):
+def write_rig_model(recording, folder, *, skip=(), turn=TURN, shift_m=SHIFT_M):
     """COLMAP's model of frames of two cameras, ``cam0`` and ``cam1``; without some images by name."""
     rng = np.random.default_rng(3)
     truth, trajectory = recording.truth, recording.trajectory
@@ -50,7 +51,7 @@ def write_rig_model(recording, folder, *, skip=()):
     world[np.arange(POINTS), axis] = np.where(side, HIGH[axis], LOW[axis])
     placed = quat_rotate(truth.model_from_world_xyzw, world) / truth.metres_per_unit + truth.world_in_model
     model, rig = pycolmap.Reconstruction(), pycolmap.Rig(rig_id=1)
-    cam_from_rig = pycolmap.Rigid3d(TURN, SHIFT_M / truth.metres_per_unit)
+    cam_from_rig = pycolmap.Rigid3d(turn, shift_m / truth.metres_per_unit)
     for number in (1, 2):
         params = [FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2]
         camera = pycolmap.Camera(camera_id=number, model="PINHOLE", width=WIDTH, height=HEIGHT, params=params)
@@ -74,7 +75,7 @@ def write_rig_model(recording, folder, *, skip=()):
             t = trajectory.t_s[i : i + 1]
             cam = (world - truth.motion.cam_in_world_m(t)) @ matrix_from_quat(truth.motion.world_from_cam_xyzw(t))[0]
             if number == 2:
-                cam = cam @ TURN.matrix().T + SHIFT_M
+                cam = cam @ turn.matrix().T + shift_m
             with np.errstate(divide="ignore", invalid="ignore"):
                 px = FOCAL * cam[:, :2] / cam[:, 2:] + [WIDTH / 2, HEIGHT / 2]
             seen = np.flatnonzero((cam[:, 2] > 0.1) & (px > 1).all(1) & (px < [WIDTH - 1, HEIGHT - 1]).all(1))
@@ -145,6 +146,38 @@ def test_the_cameras_are_placed_in_metres_in_result_and_model(rig, metric):
         np.testing.assert_allclose(sensor["cam_from_reference_xyzw"], TURN.quat, atol=1e-9)
     page = metric.report.read_text().replace("\N{NO-BREAK SPACE}", " ")
     assert f"camera 2 is {1000 * said[0]['baseline_m']:.1f} mm from camera 1" in page
+
+
+def test_virtual_cameras_of_a_panorama_have_one_centre(rig, tmp_path):
+    """As COLMAP's example of panoramas makes them: views in several directions from one place."""
+    across = pycolmap.Rotation3d(np.array([0.0, np.pi / 2, 0.0]))
+    sparse = tmp_path / "project" / "sparse" / "0"
+    write_rig_model(rig.recording, sparse, turn=across, shift_m=np.zeros(3))
+    made = reconstruct_project(tmp_path / "project", tmp_path / "out", rig.source())
+    (model,) = made.models
+    assert model.scale.verdict == "trusted", model.scale.reasons
+    assert model.scale.ci95[0] < rig.recording.truth.metres_per_unit < model.scale.ci95[1]
+    (sensor,) = rig_sensors(read_model(model.sparse_metric))
+    assert sensor.baseline_m == 0
+    np.testing.assert_allclose(sensor.cam_from_reference_xyzw, across.quat, atol=1e-9)
+    assert "camera 2 is 0 mm from camera 1" in made.report.read_text().replace("\N{NO-BREAK SPACE}", " ")
+
+
+def test_a_wrong_frame_is_left_out_with_the_words_that_it_is_not_registered_again(rig, tmp_path, caplog):
+    model = read_model(rig.root / "sparse" / "0")
+    frame = model.frame(21)
+    off = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.0, 0.5, 0.0])), np.zeros(3))
+    frame.rig_from_world = off * frame.rig_from_world
+    sparse = tmp_path / "project" / "sparse" / "0"
+    sparse.mkdir(parents=True)
+    model.write_binary(str(sparse))
+    with caplog.at_level(logging.INFO):
+        made = reconstruct_project(tmp_path / "project", tmp_path / "out", rig.source())
+    (said,) = [done for done in made.models[0].treatments if done.stage == "rotations"]
+    assert said.action == "left out" and "images of several cameras are not registered again" in said.reason
+    kept = {image.name for image in read_model(made.models[0].sparse_metric).images.values()}
+    assert kept == {image.name for image in model.images.values()} - {"cam0/f00020.jpg", "cam1/f00020.jpg"}
+    assert "the path's covariance is that of its smoothing, without drift" in caplog.text
 
 
 def test_the_path_is_that_of_the_reference_camera_also_where_it_took_no_image(rig, metric):

@@ -155,6 +155,8 @@ def _select_agreeing_images(model: Model, reconstruction: pycolmap.Reconstructio
     sentences = list(describe_consensus(found))
     if found.registered_again:
         sentences.append(f"registered again, and right now: {', '.join(found.registered_again)}")
+    elif found.wrong and has_rigs(reconstruction):
+        sentences.append("images of several cameras are not registered again")
     reason = "; ".join(sentences)
     log.info("model %d: %s", model.colmap_index, reason)
     done = Treatment(
@@ -291,8 +293,11 @@ def _add_drift(model: Model, smoothed: SmoothedTrajectory, gravity: Array) -> tu
     assert model.similarity is not None
     seen = read_seen(model.reconstruction, model.timing)
     timed = np.isfinite(seen.t_s)
+    several = has_rigs(model.reconstruction)
+    if several:
+        log.info("several cameras took the images: the path's covariance is that of its smoothing, without drift")
     try:
-        drift = None if has_rigs(model.reconstruction) else find_drift(seen, gravity / np.linalg.norm(gravity))
+        drift = None if several else find_drift(seen, gravity / np.linalg.norm(gravity))
     except np.linalg.LinAlgError:
         drift = None
     if drift is None or int(timed.sum()) != len(smoothed.t_s):
