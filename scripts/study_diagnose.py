@@ -1,19 +1,27 @@
 """Put thirty-five faults into clean recordings: does ``diagnose`` name them, and does it accuse clean ones?
 
     python scripts/study_diagnose.py [--seed 0] [--faults NAME ...] [--shared ../shared] [--json study.json]
+    python scripts/study_diagnose.py --good [--before OTHER_PYTHON]
 
 Needs the checkout; where ``../shared`` is missing, all recordings are simulated. Each fault goes into a recording that
 the seed draws. It counts as named where its code is among the findings and no error is that neither names it nor
 follows from it. Twelve recordings without a fault, of several devices, rates and motions, must give no warning and no
 error. Exit code 1 where more than one in thirty is missed, or any clean recording is accused.
+
+``--good`` runs the command on captures that are good instead: the example scenes, EuRoC, GoPro's unstabilised clip, and
+ten simulated recordings; with ``--before``, by the Python of another checkout, too. Exit code 1 for an error, for a
+warning that was not there before, or for more than 10 s beyond it. GoPro's clip is listed apart: its drone hovers.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -418,13 +426,70 @@ def named(fault: Fault, found: Diagnosis) -> bool:
     return bool(found.codes & set(fault.codes)) and not other
 
 
+def good_sources(folder: Path, shared: Path, seed: int) -> Iterator[tuple[str, list[str]]]:
+    """Name and arguments of ``diagnose`` for each good capture."""
+    for scene in ("desk", "euroc_v101"):
+        if scene == "desk" or (shared / "data/euroc_v101").is_dir():
+            yield scene, [str(HERE / "example_scenes" / scene)]
+    for i in range(10):
+        base = simulated(seed + 100 + i, ("orbit", "walk", "roam")[i % 3], ("phone", "tablet")[i % 2])
+        imu = base.imu
+        for name, t_s, values in (
+            ("gyroscope", imu.gyro_t_s, imu.gyro_rad_s),
+            ("accelerometer", imu.accel_t_s, imu.accel_m_s2),
+        ):
+            stamps = imu.epoch_ns + np.rint(1e9 * t_s).astype(np.int64)
+            lines = [f"{t} {x:.8f} {y:.8f} {z:.8f}" for t, (x, y, z) in zip(stamps.tolist(), values, strict=True)]
+            (folder / str(i)).mkdir(exist_ok=True)
+            (folder / str(i) / f"{name}.txt").write_text("\n".join(lines))
+        poses = folder / f"{i}.txt"
+        write_tum(poses, base.trajectory)
+        yield f"{base.name} {i}", [str(poses), "--imu", str(folder / str(i))]
+    clip = shared / "data/gopro/karma.mp4"
+    if clip.is_file():
+        yield "GoPro karma (hovers)", [str(clip)]
+
+
+def run_diagnose(python: Path, source: list[str], folder: str) -> tuple[set[str], set[str], float]:
+    """Codes of errors and of warnings by the command of one Python, and how long it took."""
+    begin_s = time.monotonic()
+    words = [str(python), "-m", "colmap_inertial", "diagnose", *source, "--json", "-"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, cwd=folder)
+    seconds = time.monotonic() - begin_s
+    findings = json.loads(done.stdout)["findings"]
+    of = {severity: {f["code"] for f in findings if f["severity"] == severity} for severity in ("error", "warning")}
+    return of["error"], of["warning"], seconds
+
+
+def compare_good(shared: Path, seed: int, before: Path | None) -> int:
+    """Errors, warnings and time on good captures, by this version and an earlier one."""
+    bad = 0
+    with tempfile.TemporaryDirectory() as folder:
+        for name, source in good_sources(Path(folder), shared, seed):
+            errors, warnings, seconds = run_diagnose(Path(sys.executable), source, folder)
+            line = f"{name:28} {seconds:5.1f} s  {', '.join(sorted(errors | warnings)) or '-'}"
+            fails = bool(errors)
+            if before is not None:
+                _, warned, earlier_s = run_diagnose(before, source, folder)
+                line += f"  (before: {earlier_s:.1f} s, {', '.join(sorted(warned)) or '-'})"
+                fails = fails or bool(warnings - warned) or seconds > earlier_s + 10
+            bad += fails and not name.startswith("GoPro")
+            print(f"{'ACCUSED' if fails else 'good   '}  {line}", flush=True)
+    print(f"{bad} good captures accused")
+    return int(bad > 0)
+
+
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--faults", nargs="*", default=[], help="only those whose name begins like one of these")
     parser.add_argument("--shared", type=Path, default=HERE.parent / "shared")
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--good", action="store_true", help="run the command on good captures instead")
+    parser.add_argument("--before", type=Path, help="Python of an earlier version, to compare with")
     options = parser.parse_args(arguments)
+    if options.good:
+        return compare_good(options.shared, options.seed, options.before)
     clean = clean_recordings(options.shared, options.seed)
     rows = []
     for i, fault in enumerate(FAULTS):

@@ -2,10 +2,12 @@
 
     python scripts/study_mistakes.py [--seed 0] [--kinds units axes ...] [--reconstruct] [--json mistakes.json]
 
-Each mistake changes a copy of ``example_scenes/desk`` by a seeded draw and starts the command that a person would. It
-counts as caught where the command ends with an error before features are extracted, and its message has the words that
-lead to the remedy. Then the remedy is applied, and the check beforehand must find nothing; with ``--reconstruct`` the
-whole reconstruction must succeed. Exit code 1 where more than two mistakes are not caught.
+Each mistake changes a copy of ``example_scenes/desk`` by a seeded draw, and starts the command or the Python call that
+a person would. It counts as caught where that ends with an error before features are extracted, and the message has the
+words that lead to the remedy. Then the message is followed: numbers and settings are read from it where it gives them.
+After that, the check beforehand must find no error, and ``scale`` must find the metres of the true poses to 5 %; with
+``--reconstruct``, the whole reconstruction must succeed. A call or command whose words were wrong is made again with
+the right ones. Exit code 1 where more than two mistakes are not caught or mended.
 """
 
 from __future__ import annotations
@@ -14,13 +16,15 @@ import argparse
 import contextlib
 import csv
 import io
+import json
 import re
 import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -28,42 +32,59 @@ from bench_report import write_report
 
 from colmap_inertial.cli import main as run_command
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.errors import InertialError
+from colmap_inertial.core.options import ReconstructOptions
+from colmap_inertial.core.types import CameraTrajectory, ImuRecording
+from colmap_inertial.inertial.scale import estimate_scale
+from colmap_inertial.io.imu import read_imu
+from colmap_inertial.io.trajectories import read_tum
 
 HERE = Path(__file__).resolve().parents[1]
 DESK = HERE / "example_scenes" / "desk"
+#: Metres per unit of the poses that ``scale`` is tried on.
+TRUE_SCALE = 0.25
 Change = Callable[[Path, np.random.Generator], None]
+Mend = Callable[[Path, str], None]
+Call = Callable[[Path], object]
+RECONSTRUCT = ("reconstruct", "{scene}", "{out}")
+SCALE = ("scale", "{scene}/poses.txt", "--imu", "{scene}")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Mistake:
-    """A mistake in a copy of the scene, or in the arguments.
+    """A mistake in a copy of the scene, in the arguments of a command, or in a Python call.
 
     Attributes
     ----------
     kind, name
         What it is about, and what was done.
-    make
-        Changes the copy.
     says
         Pattern of what the message must hold.
+    make
+        Changes the copy.
     mend
-        Changes the copy as the message advises; the original's file where the advice is to give another.
-    arguments
-        Of the command; ``{scene}`` and ``{out}`` stand for the folders.
+        Changes the copy as the message, which it gets, advises.
+    arguments, again
+        Of the command, and as the message advises; ``{scene}`` and ``{out}`` stand for the folders.
+    call, call_again
+        A Python call in place of the command, and as the message advises.
     """
 
     kind: str
     name: str
     says: str
     make: Change = lambda scene, rng: None
-    mend: Change | None = None
-    arguments: tuple[str, ...] = ("reconstruct", "{scene}", "{out}")
+    mend: Mend | None = None
+    arguments: tuple[str, ...] = RECONSTRUCT
+    again: tuple[str, ...] = ()
+    call: Call | None = None
+    call_again: Call | None = None
 
 
-def text(file: str, old: str, new: str) -> Change:
+def text(file: str, old: str, new: str) -> Callable[[Path, object], None]:
     """Replace words of a file."""
 
-    def change(scene: Path, rng: np.random.Generator) -> None:
+    def change(scene: Path, _: object) -> None:
         path = scene / file
         before = path.read_text()
         assert old in before, (file, old)
@@ -72,7 +93,7 @@ def text(file: str, old: str, new: str) -> Change:
     return change
 
 
-def toml(old: str, new: str) -> Change:
+def toml(old: str, new: str) -> Callable[[Path, object], None]:
     """Replace words of capture.toml."""
     return text("capture.toml", old, new)
 
@@ -102,10 +123,10 @@ def stamps(*files: str, change: Callable[[Array, np.random.Generator], Array]) -
     return rows(*files, change=lambda table, rng: np.column_stack([change(table[:, 0], rng), table[:, 1:]]))
 
 
-def frame_times(change: Callable[[float], float], header: str = "name,t_s") -> Change:
+def frame_times(change: Callable[[float], float], header: str = "name,t_s") -> Callable[[Path, object], None]:
     """Change the times of the frames."""
 
-    def apply(scene: Path, rng: np.random.Generator) -> None:
+    def apply(scene: Path, _: object) -> None:
         path = scene / "frames.csv"
         with path.open() as file:
             table = list(csv.reader(file))[1:]
@@ -115,174 +136,427 @@ def frame_times(change: Callable[[float], float], header: str = "name,t_s") -> C
     return apply
 
 
-def original(*files: str) -> Change:
-    """Give the file as it was recorded."""
+def original(*files: str) -> Mend:
+    """Give another file, where that is the advice."""
 
-    def apply(scene: Path, rng: np.random.Generator) -> None:
+    def apply(scene: Path, _: object) -> None:
         for file in files:
             shutil.copy(DESK / file, scene / file)
 
     return apply
 
 
-def both(*changes: Change) -> Change:
-    """One change after the other."""
+def number(pattern: str, message: str) -> float:
+    """The number that a message gives."""
+    found = re.search(pattern, message)
+    assert found is not None, pattern
+    return float(found.group(1))
 
-    def apply(scene: Path, rng: np.random.Generator) -> None:
-        for change in changes:
-            change(scene, rng)
 
-    return apply
+def follow_axes(scene: Path, message: str) -> None:
+    """Write the axes that a message gives under the sensors that it names."""
+    found = re.search(r'axes = "([-xyz,]+)"( and mirrored = true)? under \[imu\.(\w+)\]( and \[imu\.(\w+)\])?', message)
+    assert found is not None, "no axes are given"
+    path = scene / "capture.toml"
+    for sensor in filter(None, (found[3], found[5])):
+        line = f'axes = "{found[1]}"\n' + ("mirrored = true\n" if found[2] else "")
+        path.write_text(path.read_text().replace(f"[imu.{sensor}]\n", f"[imu.{sensor}]\n{line}"))
+
+
+def follow_gain(scene: Path, message: str) -> None:
+    """Divide the gyroscope's numbers by the gain that a message gives."""
+    gain = number(r"the gyroscope measures ([\d.]+) times", message)
+    toml('unit = "rad/s"', f'unit = "rad/s"\ncounts_per_unit = {gain}')(scene, message)
+
+
+def follow_frame_rate(scene: Path, message: str) -> None:
+    """Time the frames by the rate that a message gives."""
+    rate = number(r"if ([\d.]+) times as many come in a second", message)
+    frame_times(lambda t_s: t_s / rate)(scene, message)
+
+
+def follow_clock_rate(scene: Path, message: str) -> None:
+    """Correct the IMU's stamps by the rate that a message gives."""
+    rate = number(r"clock runs ([-+\d.]+) % faster", message) / 100
+    rng = np.random.default_rng(0)
+    stamps("gyro.csv", "accel.csv", change=lambda t_s, _: t_s * (1 + rate))(scene, rng)
+
+
+def follow_offset(scene: Path, message: str) -> None:
+    """Leave out what a message says to leave out."""
+    path = scene / "capture.toml"
+    assert "leave out shared_clock" in message
+    path.write_text(re.sub(r"(shared_clock|gyro_time_offset_s|accel_time_offset_s) = .*\n", "", path.read_text()))
+
+
+def misspell(file: str, *words: str) -> Change:
+    """Lose a letter of one of some words, by a draw."""
+
+    def change(scene: Path, rng: np.random.Generator) -> None:
+        word = words[rng.integers(len(words))]
+        at = int(rng.integers(1, len(word)))
+        text(file, word, word[:at] + word[at + 1 :])(scene, None)
+
+    return change
+
+
+def restore_toml(scene: Path, message: str) -> None:
+    """Write a name or path of capture.toml as the files have it."""
+    shutil.copy(DESK / "capture.toml", scene / "capture.toml")
+
+
+def read_desk(scene: Path) -> tuple[CameraTrajectory, ImuRecording]:
+    return read_tum(scene / "poses.txt"), read_imu(scene)
+
+
+def scale_of(change: Callable[[CameraTrajectory, ImuRecording], tuple[CameraTrajectory, ImuRecording]]) -> Call:
+    """The scale of changed arrays; a refusal is an error, with its reasons."""
+
+    def estimate(scene: Path) -> None:
+        found = estimate_scale(*change(*read_desk(scene)))
+        if found.verdict == "refused":
+            raise InertialError("; ".join(found.reasons))
+
+    return estimate
+
+
+def imu_with(change: Callable[[ImuRecording], dict[str, Array]]) -> Call:
+    return scale_of(lambda poses, imu: (poses, replace(imu, **change(imu))))
+
+
+def poses_with(change: Callable[[CameraTrajectory], dict[str, Array]]) -> Call:
+    return scale_of(lambda poses, imu: (replace(poses, **change(poses)), imu))
+
+
+def option(**values: object) -> Call:
+    return lambda scene: ReconstructOptions(**values)  # type: ignore[arg-type]
+
+
+def checkerboard(spec: str, says: str) -> Mistake:
+    """A board in capture.toml that is none."""
+    return Mistake(
+        kind="boards",
+        name=f"target {spec}",
+        make=toml("checkerboard:8x6:0.04", spec),
+        says=says,
+        mend=toml(spec, "checkerboard:8x6:0.04"),
+    )
 
 
 GYRO_UNIT = 'columns = ["x", "y", "z"]\nunit = "rad/s"'
+RIGHT_CALL = scale_of(lambda poses, imu: (poses, imu))
 G = 9.80665
 
-MISTAKES: tuple[Mistake, ...] = (
-    Mistake(
-        kind="units",
+
+def units() -> Iterator[Mistake]:
+    unit = partial(Mistake, kind="units")
+    yield unit(
         name="gyroscope in deg/s, called rad/s",
         make=values("gyro.csv", change=lambda w, _: np.degrees(w)),
         says=r'unit = "deg/s"',
         mend=toml('unit = "rad/s"', 'unit = "deg/s"'),
-    ),
-    Mistake(
-        kind="units",
+    )
+    yield unit(
         name="gyroscope in rad/s, called deg/s",
         make=toml('unit = "rad/s"', 'unit = "deg/s"'),
         says=r'unit = "rad/s"',
         mend=toml('unit = "deg/s"', 'unit = "rad/s"'),
-    ),
-    Mistake(
-        kind="units",
+    )
+    yield unit(
         name="accelerometer in g, called m/s2",
         make=values("accel.csv", change=lambda a, _: a / G),
         says=r'unit = "g"',
         mend=toml('unit = "m/s2"', 'unit = "g"'),
-    ),
-    Mistake(
-        kind="units",
+    )
+    yield unit(
         name="accelerometer in m/s2, called g",
         make=toml('unit = "m/s2"', 'unit = "g"'),
         says=r'unit = "m/s2"',
         mend=toml('unit = "g"', 'unit = "m/s2"'),
-    ),
-    Mistake(
-        kind="units",
+    )
+    yield unit(
         name="raw counts of the gyroscope",
         make=values("gyro.csv", change=lambda w, _: np.round(w * 939.65) + 12),
         says="counts_per_unit",
         mend=toml(GYRO_UNIT, f"{GYRO_UNIT}\nzero = 12\ncounts_per_unit = 939.65"),
-    ),
-    Mistake(
-        kind="units",
+    )
+    yield unit(
         name="gyroscope with a wrong factor",
         make=values("gyro.csv", change=lambda w, rng: w * rng.uniform(1.28, 1.4)),
         says="the gyroscope measures .* times the rotation",
-        mend=original("gyro.csv"),
-    ),
-    Mistake(
-        kind="units",
+        mend=follow_gain,
+    )
+    yield unit(
         name="frame times in ms, called s",
         make=frame_times(lambda t_s: 1e3 * t_s),
         says="frames span .* in milliseconds where seconds were read",
         mend=frame_times(lambda t_ms: t_ms, "name,t_ms"),
-    ),
-    Mistake(
-        kind="units",
+    )
+    yield unit(
         name="stamps of the IMU in ms, called s",
         make=stamps("gyro.csv", "accel.csv", change=lambda t_s, _: 1e3 * t_s),
         says="set time_unit",
         mend=toml('time_unit = "s"', 'time_unit = "ms"'),
-    ),
-    Mistake(
-        kind="axes",
-        name="gyroscope's x and y exchanged",
-        make=values("gyro.csv", change=lambda w, _: w[:, [1, 0, 2]]),
-        says="mirrored",
-        mend=toml('columns = ["x", "y", "z"]\nunit = "rad/s"', 'columns = ["y", "x", "z"]\nunit = "rad/s"'),
-    ),
-    Mistake(
-        kind="axes",
+    )
+
+
+def axes() -> Iterator[Mistake]:
+    axis = partial(Mistake, kind="axes", says=r'axes = "')
+    yield axis(
+        name="two axes of the gyroscope exchanged",
+        make=values(
+            "gyro.csv", change=lambda w, rng: np.roll(np.roll(w, k := rng.integers(3), 1)[:, [1, 0, 2]], -k, 1)
+        ),
+        mend=follow_axes,
+    )
+    yield axis(
         name="an axis of the gyroscope flipped",
         make=values("gyro.csv", change=lambda w, rng: w * np.roll([-1, 1, 1], rng.integers(3))),
-        says="mirrored",
-        mend=original("gyro.csv"),
-    ),
-    Mistake(
-        kind="axes",
+        mend=follow_axes,
+    )
+    yield axis(
         name="both sensors left-handed",
         make=values("gyro.csv", "accel.csv", change=lambda w, _: w * [-1, 1, 1]),
-        says="mirrored = true",
-        mend=toml('unit = "rad/s"', 'unit = "rad/s"\naxes = "-x,y,z"\nmirrored = true'),
-    ),
-    Mistake(
-        kind="axes",
+        mend=follow_axes,
+    )
+    yield axis(
         name="gyroscope turned against the accelerometer",
-        make=values("gyro.csv", change=lambda w, _: w[:, [1, 2, 0]]),
-        says="axes",
-        mend=toml('columns = ["x", "y", "z"]\nunit = "rad/s"', 'columns = ["z", "x", "y"]\nunit = "rad/s"'),
-    ),
-    Mistake(
-        kind="axes",
+        make=values("gyro.csv", change=lambda w, rng: np.roll(w, 1 + rng.integers(2), axis=1)),
+        mend=follow_axes,
+    )
+    yield axis(
         name="gyroscope measures the opposite",
         make=values("gyro.csv", change=lambda w, _: -w),
-        says="mirrored",
-        mend=original("gyro.csv"),
-    ),
-    Mistake(
-        kind="clocks",
+        # both sensors mirrored look the same; the advice names this as the other way
+        mend=lambda scene, message: follow_axes(scene, message.split("alone measures the opposite")[1]),
+    )
+
+
+def clocks() -> Iterator[Mistake]:
+    clock = partial(Mistake, kind="clocks")
+    yield clock(
         name="clocks 565 s apart, called shared",
         make=toml("[timing]", "[timing]\nshared_clock = true"),
         says=r"565\.\d+ s apart.*shared_clock",
-        mend=toml("shared_clock = true\n", ""),
-    ),
-    Mistake(
-        kind="clocks",
+        mend=follow_offset,
+    )
+    yield clock(
         name="times by another frame rate",
         make=frame_times(lambda t_s: 1.25 * t_s),
         says="timed by another frame rate",
-        mend=original("frames.csv"),
-    ),
-    Mistake(
-        kind="clocks",
+        mend=follow_frame_rate,
+    )
+    yield clock(
         name="the clock of the IMU 3 % fast",
         make=stamps("gyro.csv", "accel.csv", change=lambda t_s, _: 1.03 * t_s),
         says="clock runs",
-        mend=original("gyro.csv", "accel.csv"),
-    ),
-    Mistake(
-        kind="clocks",
+        mend=follow_clock_rate,
+    )
+    yield clock(
         name="IMU of another recording",
         make=values("gyro.csv", "accel.csv", change=lambda w, _: w[::-1]),
         says="check that this IMU recording belongs to these images",
         mend=original("gyro.csv", "accel.csv"),
-    ),
-    Mistake(
-        kind="clocks",
+    )
+    yield clock(
         name="IMU stopped after a fifth",
         make=rows("gyro.csv", "accel.csv", change=lambda table, _: table[: len(table) // 5]),
-        says="IMU",
+        says="start the IMU before the video",
         mend=original("gyro.csv", "accel.csv"),
-    ),
-    Mistake(
-        kind="clocks",
+    )
+    yield clock(
         name="a time offset that is wrong",
         make=toml("[target]", "[calibration]\ngyro_time_offset_s = 100.0\naccel_time_offset_s = 100.0\n\n[target]"),
         says="time offset that was given",
-        mend=toml("gyro_time_offset_s = 100.0\naccel_time_offset_s = 100.0\n", ""),
-    ),
+        mend=follow_offset,
+    )
+
+
+def columns() -> Iterator[Mistake]:
+    column = partial(Mistake, kind="columns")
+    yield column(
+        name="a column that is not there",
+        make=toml(GYRO_UNIT, GYRO_UNIT.replace('"y"', '"gy"')),
+        says=r'"?gy"?.*\bx\b',
+        mend=toml('"gy"', '"y"'),
+    )
+    yield column(
+        name="raw counts in columns named *_raw",
+        make=lambda scene, rng: (
+            values("gyro.csv", change=lambda w, _: np.round(w * 939.65) + 12)(scene, rng),
+            text("gyro.csv", "t,x,y,z", "t,x_raw,y_raw,z_raw")(scene, rng),
+            toml(GYRO_UNIT, GYRO_UNIT.replace('"x", "y", "z"', '"x_raw", "y_raw", "z_raw"'))(scene, rng),
+        )[0],
+        says="zero and counts_per_unit",
+        mend=toml('"z_raw"]\nunit = "rad/s"', '"z_raw"]\nunit = "rad/s"\nzero = 12\ncounts_per_unit = 939.65'),
+    )
+    yield column(
+        name="a time column that is not there",
+        make=toml('file = "gyro.csv"\ntime = "t"', 'file = "gyro.csv"\ntime = "timestamp"'),
+        says=r"timestamp.*\bt\b",
+        mend=toml('time = "timestamp"', 'time = "t"'),
+    )
+    yield column(
+        name="gyroscope and accelerometer exchanged",
+        make=lambda scene, rng: (
+            toml('"gyro.csv"', '"other"')(scene, rng),
+            toml('"accel.csv"', '"gyro.csv"')(scene, rng),
+            toml('"other"', '"accel.csv"')(scene, rng),
+        )[0],
+        says="exchange the columns or files",
+        mend=restore_toml,
+    )
+    yield column(
+        name="a column given twice",
+        make=toml(GYRO_UNIT, GYRO_UNIT.replace('"y"', '"x"')),
+        says="twice|different columns|same column|axes",
+        mend=restore_toml,
+    )
+    yield column(
+        name="frame times without a column of names",
+        make=text("frames.csv", "name,t_s", "image,when"),
+        says="name",
+        mend=text("frames.csv", "image,when", "name,t_s"),
+    )
+
+
+def boards() -> Iterator[Mistake]:
+    yield checkerboard("checkerboard:8x6:40", "40 mm is 0.04")
+    yield checkerboard("checkerboard:8x6:40mm", "not a number")
+    yield checkerboard("chessboard:8x6:0.04", "expected checkerboard:")
+    yield checkerboard("checkerboard:8x6", "checkerboard:COLSxROWS:SQUARE_M")
+    yield checkerboard("checkerboard:8:6:0.04", "checkerboard:COLSxROWS:SQUARE_M")
+
+
+def paths() -> Iterator[Mistake]:
+    path = partial(Mistake, kind="paths")
+    yield path(
+        name="folder of images misspelt",
+        make=toml('folder = "frames"', 'folder = "frame"'),
+        says="frame",
+        mend=toml('folder = "frame"', 'folder = "frames"'),
+    )
+    yield path(
+        name="IMU file misspelt",
+        make=misspell("capture.toml", "gyro.csv", "accel.csv"),
+        says=r"no such file",
+        mend=restore_toml,
+    )
+    yield path(
+        name="capture misspelt",
+        arguments=("reconstruct", "{scene}s", "{out}"),
+        says="no such file or folder|scene",
+        again=("diagnose", "{scene}"),
+    )
+    yield path(
+        name="result into a folder with other things",
+        arguments=("reconstruct", "{scene}", "{scene}/frames"),
+        says="choose a folder outside",
+        again=("diagnose", "{scene}"),
+    )
+    yield path(
+        name="frame times of other images",
+        make=lambda scene, rng: (
+            (scene / "frames.csv").write_text((scene / "frames.csv").read_text().replace("0000", "IMG_")) and None
+        ),
+        says="IMG_|0000",
+        mend=lambda scene, message: (
+            (scene / "frames.csv").write_text((scene / "frames.csv").read_text().replace("IMG_", "0000")) and None
+        ),
+    )
+    yield path(
+        name="a model instead of a trajectory",
+        arguments=("scale", "{scene}/frames", "--imu", "{scene}"),
+        says="model|frames",
+        again=SCALE,
+    )
+
+
+def options() -> Iterator[Mistake]:
+    choice = partial(Mistake, kind="options")
+    yield choice(
+        name="--method joynt",
+        arguments=(*SCALE, "--method", "joynt"),
+        says="joint",
+        again=(*SCALE, "--method", "joint"),
+    )
+    yield choice(
+        name="--first-seconds 12",
+        arguments=(*SCALE, "--first-seconds", "12"),
+        says="--first-s",
+        again=(*SCALE, "--first-s", "12"),
+    )
+    yield choice(
+        name="--latitude-deg 478",
+        arguments=(*SCALE, "--latitude-deg", "478"),
+        says="90",
+        again=(*SCALE, "--latitude-deg", "47.8"),
+    )
+    yield choice(
+        name="--gravity-m-s2 1",
+        arguments=(*SCALE, "--gravity-m-s2", "1"),
+        says="gravity.*9\\.|9\\..*gravity|m/s2",
+        again=(*SCALE, "--gravity-m-s2", "9.81"),
+    )
+    yield choice(name="Python: world='zup'", call=option(world="zup"), says="z-up", call_again=option(world="z-up"))
+    yield choice(
+        name="Python: deblur='weiner'", call=option(deblur="weiner"), says="wiener", call_again=option(deblur="wiener")
+    )
+    yield choice(
+        name="Python: refine=True", call=option(refine=True), says="inertial", call_again=option(refine="inertial")
+    )
+
+
+def arrays() -> Iterator[Mistake]:
+    array = partial(Mistake, kind="arrays", call_again=RIGHT_CALL)
+    yield array(
+        name="stamps of the gyroscope in ns",
+        call=imu_with(lambda imu: {"gyro_t_s": 1e9 * imu.gyro_t_s, "accel_t_s": 1e9 * imu.accel_t_s}),
+        says="second|unit|ns",
+    )
+    yield array(name="times of poses in ms", call=poses_with(lambda p: {"t_s": 1e3 * p.t_s}), says="second|unit|ms")
+    yield array(
+        name="gyroscope of shape (3, N)", call=imu_with(lambda imu: {"gyro_rad_s": imu.gyro_rad_s.T}), says="shape|3\\)"
+    )
+    yield array(
+        name="gyroscope in deg/s",
+        call=imu_with(lambda imu: {"gyro_rad_s": np.degrees(imu.gyro_rad_s)}),
+        says="deg/s",
+    )
+    yield array(name="accelerometer in g", call=imu_with(lambda imu: {"accel_m_s2": imu.accel_m_s2 / G}), says="in g")
+    yield array(
+        name="quaternions that are not of unit length",
+        call=poses_with(lambda p: {"cam_from_world_xyzw": 2 * p.cam_from_world_xyzw}),
+        says="unit|norm|length",
+    )
+    yield array(
+        name="stamps out of order",
+        call=imu_with(lambda imu: {"gyro_t_s": imu.gyro_t_s[::-1].copy()}),
+        says="order|increas|ascend|grow",
+    )
+    yield array(
+        name="NaN in the accelerometer",
+        call=imu_with(
+            lambda imu: {"accel_m_s2": np.where(np.arange(len(imu.accel_t_s))[:, None] == 9, np.nan, imu.accel_m_s2)}
+        ),
+        says="finite|NaN|nan",
+    )
+
+
+MISTAKES: tuple[Mistake, ...] = tuple(
+    mistake for kind in (units, axes, clocks, columns, boards, paths, options, arrays) for mistake in kind()
 )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What came of a mistake: the message, when it came, whether it was caught, and whether its advice helped."""
+    """Message of a mistake, its time, whether it was caught and its advice helped, and what was said then."""
 
     message: str
     seconds: float
     caught: bool
     mended: bool
+    then: str
 
 
 def run(arguments: list[str]) -> tuple[int, str]:
@@ -296,23 +570,70 @@ def run(arguments: list[str]) -> tuple[int, str]:
     return 0, " ".join(said.getvalue().split())
 
 
-def try_mistake(mistake: Mistake, folder: Path, seed: int, *, reconstruct: bool = False) -> Outcome:
+def call(function: Call, scene: Path) -> tuple[int, str]:
+    """Exit code and message of a Python call: a traceback's last line, as a person reads it."""
+    try:
+        function(scene)
+    except (InertialError, TypeError, ValueError) as error:
+        return 1, f"{type(error).__name__}: {error}"
+    except (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError) as error:
+        return -1, f"UNTYPED {type(error).__name__}: {error}"
+    return 0, ""
+
+
+def write_poses(scene: Path) -> None:
+    """The true path in units of 0.25 m, as a table in TUM's format."""
+    truth = json.loads((DESK / "truth.json").read_text())
+    lines = []
+    for frame in truth["frames"]:
+        x, y, z, w = frame["cam_from_world_xyzw"]
+        at = np.array(frame["cam_in_world_m"]) / TRUE_SCALE
+        lines.append(" ".join(f"{value:.9f}" for value in (frame["t_middle_s"], *at, -x, -y, -z, w)))
+    (scene / "poses.txt").write_text("\n".join(lines) + "\n")
+
+
+def succeeds(scene: Path, folder: Path, *, reconstruct: bool) -> tuple[bool, str]:
+    """Whether a mended scene is reconstructed, or, quickly, is free of errors and has the right scale; what is said."""
+    if reconstruct:
+        code, said = run(["reconstruct", str(scene), str(folder / "mended")])
+        return code == 0, said
+    code, said = run(["diagnose", str(scene)])
+    if code:
+        return False, said
+    code, said = run(["scale", str(scene / "poses.txt"), "--imu", str(scene), "--json", str(folder / "scale.json")])
+    scale = json.loads((folder / "scale.json").read_text())["metres_per_unit"] if code == 0 else None
+    return scale is not None and abs(scale / TRUE_SCALE - 1) < 0.05, said
+
+
+def try_mistake(mistake: Mistake, folder: Path, seed: int, *, mend: bool = True, reconstruct: bool = False) -> Outcome:
     """Make a mistake, read what is said, and do what it advises."""
     scene, out = folder / "scene", folder / "out"
     shutil.copytree(DESK, scene)
-    rng = np.random.default_rng(seed)
-    mistake.make(scene, rng)
+    write_poses(scene)
+    mistake.make(scene, np.random.default_rng(seed))
     begin_s = time.monotonic()
-    code, message = run([word.format(scene=scene, out=out) for word in mistake.arguments])
+    if mistake.call is not None:
+        code, message = call(mistake.call, scene)
+    else:
+        code, message = run([word.format(scene=scene, out=out) for word in mistake.arguments])
     seconds = time.monotonic() - begin_s
     begun = (out / "colmap" / "database.db").exists()
-    caught = code != 0 and not begun and re.search(mistake.says, message) is not None
-    mended = True
-    if mistake.mend is not None:
-        mistake.mend(scene, rng)
-        words = ["reconstruct", str(scene), str(folder / "mended")] if reconstruct else ["diagnose", str(scene)]
-        mended = run(words)[0] == 0
-    return Outcome(message=message[-400:], seconds=seconds, caught=caught, mended=mended)
+    caught = code > 0 and not begun and re.search(mistake.says, message) is not None
+    mended, then = True, ""
+    if mend:
+        try:
+            if mistake.mend is not None:
+                mistake.mend(scene, message)
+                mended, then = succeeds(scene, folder, reconstruct=reconstruct)
+            if mistake.again:
+                code, then = run([word.format(scene=scene, out=folder / "again") for word in mistake.again])
+                mended = mended and code == 0
+            if mistake.call_again is not None:
+                code, then = call(mistake.call_again, scene)
+                mended = mended and code == 0
+        except (AssertionError, AttributeError) as error:
+            mended, then = False, f"the message cannot be followed: {error}"
+    return Outcome(message=message[-600:], seconds=seconds, caught=caught, mended=mended, then=then[-400:])
 
 
 def main(arguments: list[str] | None = None) -> int:

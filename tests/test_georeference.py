@@ -4,7 +4,9 @@ import csv
 import json
 import shutil
 import struct
+import sys
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import imu_files
 import numpy as np
@@ -12,16 +14,16 @@ import pytest
 from box_project import shared_box
 from test_io_recorders import recorded
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+
+from study_georeference import measure
+
+from colmap_inertial.checks.words import place_facts
 from colmap_inertial.core.errors import FormatError, NotObservableError
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.core.types import CameraTrajectory, PositionFixes
-from colmap_inertial.inertial.georeference import (
-    Georeference,
-    ecef_from_enu,
-    ecef_of_geodetic,
-    georeference,
-    georeference_of_json,
-)
+from colmap_inertial.inertial.earth import ecef_from_enu, ecef_of_geodetic, geodetic_of_ecef
+from colmap_inertial.inertial.georeference import Georeference, georeference, georeference_of_json
 from colmap_inertial.io.positions import positions_in_pictures, positions_in_video
 from colmap_inertial.model import read_model
 from colmap_inertial.reconstruction.drivers.project import reconstruct_project
@@ -38,7 +40,7 @@ def turn(angle_rad):
 
 def geodetic_of_enu(enu_m, origin):
     ecef = enu_m @ ecef_from_enu(origin[0], origin[1]).T + ecef_of_geodetic(np.array([origin]))[0]
-    return Georeference.geodetic_of_ecef(ecef)
+    return geodetic_of_ecef(ecef)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,7 +101,7 @@ def test_coordinates_are_those_of_proj():
     there = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
     ecef = ecef_of_geodetic(places)
     np.testing.assert_allclose(ecef, np.stack(there.transform(*places[:, [1, 0, 2]].T), axis=1), atol=1e-6)
-    np.testing.assert_allclose(Georeference.geodetic_of_ecef(ecef), places, atol=1e-7)
+    np.testing.assert_allclose(geodetic_of_ecef(ecef), places, atol=1e-7)
     # east, north, up of PROJ's own topocentric operation
     lat, lon, height = places[7]
     local = pyproj.Transformer.from_pipeline(f"+proj=topocentric +ellps=WGS84 +lat_0={lat} +lon_0={lon} +h_0={height}")
@@ -130,6 +132,28 @@ def test_heading_and_place_lie_within_their_intervals(errors):
     if not errors:
         assert np.median([f.residual_rms_m for f in found]) == pytest.approx(3.0, rel=0.1)
         assert np.median(sigma) < 2
+
+
+@pytest.mark.parametrize(("slow_m", "alike_s"), [(3.0, 5.0), (1.0, 20.0), (6.0, 60.0), (3.0, 300.0)])
+def test_intervals_hold_however_long_errors_are_alike(slow_m, alike_s):
+    """The study by scripts/study_georeference.py, smaller."""
+    row = measure(slow_m, alike_s, walks=12, stated=True, seed=5)
+    for name in ("place", "heading"):
+        assert row[f"{name}_covered"] >= 0.83, (name, row)
+        assert row[f"{name}_ratio"] < 4, (name, row)
+
+
+def test_a_correlation_that_the_positions_do_not_show_is_said_to_be_assumed():
+    # 90 s of errors that are alike over 300 s are a shift; ten minutes of errors alike over 5 s show it
+    short = [walk(seed, slow_m=3.0, alike_s=300.0, white_m=3.0, seconds=90).fitted() for seed in range(6)]
+    assert sum(one.alike_assumed for one in short) >= 4
+    long = [walk(seed, slow_m=3.0, alike_s=5.0, white_m=0.1, seconds=200).fitted() for seed in range(6)]
+    assert not any(one.alike_assumed for one in long)
+    assert 2.5 < np.median([one.alike_s for one in long]) < 10
+    assert (
+        "assumed" in dict(place_facts(next(one for one in short if one.alike_assumed).as_json()))["errors of positions"]
+    )
+    assert "assumed" not in dict(place_facts(long[0].as_json()))["errors of positions"]
 
 
 def late(seed, *, pace_m_s, turning, delay_s, seconds=90, rate_hz=1.0, white_m=3.0):

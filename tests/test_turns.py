@@ -94,7 +94,7 @@ def test_a_folder_of_pictures_is_compared_with_the_gyroscope(
     header = "t [s],gx [rad/s],gy [rad/s],gz [rad/s],ax [m/s2],ay [m/s2],az [m/s2]"
     np.savetxt(tmp_path / "imu.csv", table, delimiter=",", header=header, comments="", fmt="%.7g")
     assert run("diagnose", tmp_path / "capture.toml", "--json", tmp_path / "found.json") == 1
-    assert "not checked: stabilisation and focal length" in " ".join(capsys.readouterr().out.split())
+    assert "not checked" not in capsys.readouterr().out
     told = json.loads((tmp_path / "found.json").read_text())
     assert "pictures far apart" in told["checked"]
     assert [f["code"] for f in told["findings"] if f["severity"] == "error"] == ["gyro-not-in-deg"]

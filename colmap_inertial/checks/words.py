@@ -30,6 +30,10 @@ _TARGET = (
     "To be independent of motion, put a printed board into the scene and name it in capture.toml ([target]), or give "
     "metres by a length you measured: reconstruct OUT/colmap NEW_FOLDER --scale-from distance, or --scale-from target."
 )
+_MODEL = (
+    "Resolve the reasons above: look at the model first (wrong or torn poses show as jumps of the camera's path), then "
+    "at the axes, units and time stamps of the IMU."
+)
 _CHECK = "Resolve the reasons above; until then, check the model against a known length before you measure in it."
 
 
@@ -155,6 +159,11 @@ def place_facts(place: Mapping[str, Any] | None) -> Iterator[Fact]:
     yield "on the map", f"{origin['latitude_deg']:.6f}, {origin['longitude_deg']:.6f} degrees"
     yield "heading, place", f"+-{digits(heading_deg, 2)} degrees, +-{digits(position_m, 2)} m (95 %)"
     yield "by", f"{positions['used']} positions ({positions['left_out']} left out): {positions['source']}"
+    errors = place.get("errors")
+    if errors is not None:
+        assumed = " (assumed: the positions do not show it)" if errors.get("alike_assumed") else ""
+        sizes = f"{digits(errors['white_m'], 2)} m from one to the next, {digits(errors['slow_m'], 2)} m that are alike"
+        yield "errors of positions", f"{sizes} over {digits(errors['alike_s'], 2)} s{assumed}"
     if delay is not None:
         yield "lag of positions", f"{digits(delay['seconds'], 2)} s +-{digits(delay['ci95_s'], 2)} s"
     yield from (("note", note) for note in place["notes"])
@@ -182,8 +191,6 @@ def not_checked(checked: Collection[str]) -> str:
         sentences.append(
             "whether camera and gyroscope match: axes, unit and clocks (no poses, and no images that overlap enough)"
         )
-    elif "pictures far apart" in checked:
-        sentences.append("stabilisation and focal length (the images are too far apart in time)")
     return "; ".join(sentences)
 
 
@@ -339,26 +346,13 @@ def _describe_attempt(model: dict[str, Any]) -> list[str]:
 
 def _refused(model: dict[str, Any]) -> dict[str, Any]:
     summary = ["The recording does not determine the scale, so no number is given rather than a wrong one."]
-    todo = [_MOVE, _RAW, _TARGET]
-    signals = model.get("signals", {})
-    # by the accelerometer: what the camera shows has no unit without a scale
-    accel_m_s2 = signals.get("acceleration", {}).get("rms_accelerometer_m_s2")
-    if signals.get("alignment") == "not tried":
-        summary.append("The IMU recording cannot be used as it is, for the reasons below.")
-        todo = [_RAW, _TARGET]
-    elif signals.get("alignment") == "failed":
-        summary.append(
-            "Camera and IMU could not be aligned: check the reasons and the two curves of rotation below, which should "
-            "look the same."
-        )
-        todo = [_RAW, _MOVE, _TARGET]
-    elif accel_m_s2 is not None and accel_m_s2 < _LITTLE_M_S2:
-        summary.append(
-            f"The device hardly sped up or slowed down: its accelerometer measured {digits(accel_m_s2, 2)} m/s² beside "
-            f"gravity, where filming by hand usually has {_USUAL}. Motion at constant speed leaves no trace in "
-            "an accelerometer, so there was nothing to compare with the images."
-        )
-        todo = [_MOVE, _TARGET]
+    signals, findings = model.get("signals", {}), model.get("findings", ())
+    causes = [finding for finding in findings if finding["severity"] == "error"]
+    summary += [f"Found beforehand ({finding['code']}): {finding['evidence']}." for finding in causes]
+    doubts = causes or [finding for finding in findings if finding["severity"] == "warning"]
+    todo = [f"{finding['advice'][:1].upper()}{finding['advice'][1:]} ({finding['code']})." for finding in doubts]
+    summary += _describe_refusal(signals)
+    todo += [text for text in _advise_on_refusal(signals) if not causes or text is _MOVE]
     summary.append(f"COLMAP's own model ({model['sparse']}) is complete: only its size is unknown.")
     return {
         "verdict": "refused",
@@ -366,8 +360,43 @@ def _refused(model: dict[str, Any]) -> dict[str, Any]:
         "answers": [("Trusted", "no; nothing here is in metres")],
         "summary": summary,
         "tried": _describe_attempt(model),
-        "todo": todo,
+        "todo": [*todo, _TARGET],
     }
+
+
+def _describe_refusal(signals: Mapping[str, Any]) -> list[str]:
+    """Sentences on a refusal that no finding explains, by the signals of the fit."""
+    if signals.get("alignment") == "not tried":
+        return ["The IMU recording cannot be used as it is, for the reasons below."]
+    if signals.get("alignment") == "failed":
+        return [
+            "Camera and IMU could not be aligned: check the reasons and the two curves of rotation below, which should "
+            "look the same."
+        ]
+    accel_m_s2 = _acceleration_m_s2(signals)
+    if accel_m_s2 is None or accel_m_s2 >= _LITTLE_M_S2:
+        return []
+    return [
+        f"The device hardly sped up or slowed down: its accelerometer measured {digits(accel_m_s2, 2)} m/s² beside "
+        f"gravity, where filming by hand usually has {_USUAL}. Motion at constant speed leaves no trace in "
+        "an accelerometer, so there was nothing to compare with the images."
+    ]
+
+
+def _advise_on_refusal(signals: Mapping[str, Any]) -> list[str]:
+    """What to do about such a refusal: to film again only where the motion was too little."""
+    accel_m_s2 = _acceleration_m_s2(signals)
+    if signals.get("alignment") == "not tried":
+        return [_RAW]
+    if signals.get("alignment") == "failed" or (accel_m_s2 is not None and accel_m_s2 >= _LITTLE_M_S2):
+        return [_MODEL]
+    return [_MODEL] if accel_m_s2 is None else [_MOVE]
+
+
+def _acceleration_m_s2(signals: Mapping[str, Any]) -> float | None:
+    """Of the device, by the accelerometer: what the camera shows has no unit without a scale."""
+    value: float | None = signals.get("acceleration", {}).get("rms_accelerometer_m_s2")
+    return value
 
 
 def outcome_of_stop(reason: str, *, findings: bool) -> dict[str, Any]:

@@ -27,10 +27,7 @@ from colmap_inertial.core.geometry import matrix_from_quat, rotation_between
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import HeightDatum, PositionFixes
 from colmap_inertial.core.validation import check_array
-
-#: WGS84: semi-major axis and flattening.
-SEMI_MAJOR_M, FLATTENING = 6378137.0, 1 / 298.257223563
-_ECCENTRICITY2 = FLATTENING * (2 - FLATTENING)
+from colmap_inertial.inertial.earth import ecef_from_enu, ecef_of_geodetic, geodetic_of_ecef
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,11 +36,16 @@ class GeoreferenceLimits:
 
     #: Sizes of the errors on the grid (standard deviation of each horizontal coordinate), and how long they are alike.
     white_m: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0)
-    slow_m: tuple[float, ...] = (0.02, 0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
-    alike_s: tuple[float, float, float] = (30.0, 100.0, 300.0)
-    #: Prior of the slow errors: log-normal about what the receiver states, or about this, by this factor.
-    usual_slow_m: float = 2.0
-    slow_factor: float = 2.5
+    slow_m: tuple[float, ...] = (0.02, 0.1, 0.25, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0, 16.0)
+    alike_s: tuple[float, ...] = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
+    #: Prior of the slow errors: log-normal about what the receiver states, or about this, by this factor. A wider one
+    #: makes intervals too wide for errors alike over 5 to 60 s, as their short pieces look like pieces of larger and
+    #: slower ones (scripts/study_georeference.py).
+    usual_slow_m: float = 3.0
+    slow_factor: float = 1.4
+    #: The positions show over how long errors are alike where this much of the probability is on one value of the grid
+    #: and its neighbours.
+    shown: float = 0.9
     #: Prior of the delay of positions: flight controllers assume .11 to .22 s (ArduPilot's u-blox driver, PX4's
     #: EKF2_GPS_DELAY); a GoPro has .49 s (Race Technology); phones, which smooth, up to a second.
     usual_delay_s: float = 0.3
@@ -101,6 +103,8 @@ class Georeference:
         Root mean square of each horizontal coordinate's residual.
     white_m, slow_m
         Sizes of the positions' errors from one to the next, and of those that are alike over ``alike_s``.
+    alike_s, alike_assumed
+        Over how long errors are alike, and whether that is an assumption: the mean of what the positions leave open.
     length_ratio, length_ratio_sigma
         Lengths by the positions over lengths of the model: a check, never a correction.
     delay_s, delay_sigma_s
@@ -130,6 +134,7 @@ class Georeference:
     delay_sigma_s: float | None = None
     source: str = ""
     notes: tuple[str, ...] = ()
+    alike_assumed: bool = False
 
     def __post_init__(self) -> None:
         at = (self.latitude_deg, self.longitude_deg, self.height_m)
@@ -152,28 +157,12 @@ class Georeference:
 
     def geodetic(self, world_m: Array) -> Array:
         """(N, 3) latitude and longitude in degrees, and height in metres, of points of the model."""
-        return self.geodetic_of_ecef(self.ecef_m(world_m))
+        return geodetic_of_ecef(self.ecef_m(world_m))
 
     def ecef_m(self, world_m: Array) -> Array:
         """(N, 3) earth-centred coordinates of points of the model."""
         at = np.array([self.latitude_deg, self.longitude_deg, self.height_m])
         return np.asarray(self.enu_m(world_m) @ ecef_from_enu(at[0], at[1]).T + ecef_of_geodetic(at[None])[0])
-
-    @staticmethod
-    def geodetic_of_ecef(ecef_m: Array) -> Array:
-        """(N, 3) latitude, longitude, height of earth-centred coordinates (Bowring's iteration)."""
-        x, y, z = ecef_m.T
-        across = np.hypot(x, y)
-        latitude = np.arctan2(z, across * (1 - _ECCENTRICITY2))
-        for _ in range(6):
-            sine = np.sin(latitude)
-            vertical = SEMI_MAJOR_M / np.sqrt(1 - _ECCENTRICITY2 * sine**2)
-            latitude = np.arctan2(z + _ECCENTRICITY2 * vertical * sine, across)
-        sine, cosine = np.sin(latitude), np.cos(latitude)
-        vertical = SEMI_MAJOR_M / np.sqrt(1 - _ECCENTRICITY2 * sine**2)
-        # along the normal of the ellipsoid, good at the poles, too
-        height = across * cosine + z * sine - SEMI_MAJOR_M**2 / vertical
-        return np.stack([np.degrees(latitude), np.degrees(np.arctan2(y, x)), height], axis=1)
 
     def as_json(self) -> dict[str, object]:
         """Plain values, for ``result.json`` and ``georeference.json``."""
@@ -193,7 +182,12 @@ class Georeference:
             "position_ci95_m": Z95 * self.position_sigma_m,
             "positions": {"used": self.used, "left_out": self.left_out, "source": self.source},
             "residual_rms_m": self.residual_rms_m,
-            "errors": {"white_m": self.white_m, "slow_m": self.slow_m, "alike_s": self.alike_s},
+            "errors": {
+                "white_m": self.white_m,
+                "slow_m": self.slow_m,
+                "alike_s": self.alike_s,
+                "alike_assumed": self.alike_assumed,
+            },
             "delay": None
             if self.delay_s is None or self.delay_sigma_s is None
             else {"seconds": self.delay_s, "ci95_s": Z95 * self.delay_sigma_s},
@@ -228,23 +222,8 @@ def georeference_of_json(values: Mapping[str, Any]) -> Georeference:
         delay_s=None if delay is None else float(delay["seconds"]),
         delay_sigma_s=None if delay is None else float(delay["ci95_s"]) / Z95,
         notes=tuple(map(str, values["notes"])),
+        alike_assumed=bool(errors.get("alike_assumed", False)),  # earlier versions did not say
     )
-
-
-def ecef_of_geodetic(geodetic: Array) -> Array:
-    """(N, 3) earth-centred metres of latitude and longitude (degrees) and height above WGS84's ellipsoid (N, 3)."""
-    latitude, longitude = np.radians(geodetic[:, 0]), np.radians(geodetic[:, 1])
-    vertical = SEMI_MAJOR_M / np.sqrt(1 - _ECCENTRICITY2 * np.sin(latitude) ** 2)
-    across = (vertical + geodetic[:, 2]) * np.cos(latitude)
-    up = (vertical * (1 - _ECCENTRICITY2) + geodetic[:, 2]) * np.sin(latitude)
-    return np.stack([across * np.cos(longitude), across * np.sin(longitude), up], axis=1)
-
-
-def ecef_from_enu(latitude_deg: float, longitude_deg: float) -> Array:
-    """(3, 3) whose columns are east, north and up in earth-centred axes."""
-    s, c = math.sin(math.radians(latitude_deg)), math.cos(math.radians(latitude_deg))
-    t, k = math.sin(math.radians(longitude_deg)), math.cos(math.radians(longitude_deg))
-    return np.array([[-t, -s * k, c * k], [k, -s * t, c * t], [0.0, c, s]])
 
 
 def georeference(
@@ -294,12 +273,9 @@ def georeference(
     flat = level[good, 0] + 1j * level[good, 1]
     _require_heading(fit, flat)
     _require_same_path(fit)
-    cov = np.zeros((4, 4))
-    cov[:3, :3] = fit.cov
     middle_level = np.array([fit.middle.real, fit.middle.imag, float(level[good, 2].mean())])
     counted = good & heights
     up_m = float(np.mean(enu[counted, 2] - level[counted, 2])) if counted.any() else 0.0
-    cov[3, 3] = (_LIMITS.vertical**2) * max(fit.cov[1, 1], fit.cov[2, 2]) if counted.any() else 0.0
     turned = np.array([[np.cos(fit.turn), -np.sin(fit.turn), 0], [np.sin(fit.turn), np.cos(fit.turn), 0], [0, 0, 1.0]])
     at = np.array([fit.at.real, fit.at.imag, middle_level[2] + up_m])
     enu_from_world = turned @ level_from_world
@@ -313,7 +289,7 @@ def georeference(
         enu_from_world=enu_from_world,
         shift_m=at - turned @ middle_level,
         middle_in_world_m=level_from_world.T @ middle_level,
-        cov=cov,
+        cov=_add_height(fit.cov, known=bool(counted.any())),
         used=int(good.sum()),
         left_out=int((~good).sum()),
         residual_rms_m=float(np.sqrt(np.mean(np.abs(residual) ** 2) / 2)),
@@ -325,8 +301,17 @@ def georeference(
         delay_s=None if path_at is None else fit.delay_s,
         delay_sigma_s=None if path_at is None else fit.delay_sigma_s,
         source=fixes.source,
+        alike_assumed=fit.alike_assumed,
         notes=tuple(_notes(fit, fixes.height_above if counted.any() else "ellipsoid")),
     )
+
+
+def _add_height(cov: Array, *, known: bool) -> Array:
+    """(4, 4) with the variance of the height, from (3, 3) of turn, east and north."""
+    whole = np.zeros((4, 4))
+    whole[:3, :3] = cov
+    whole[3, 3] = _LIMITS.vertical**2 * max(cov[1, 1], cov[2, 2]) if known else 0.0
+    return whole
 
 
 def _convert_to_enu(fixes: PositionFixes) -> tuple[Array, Array, BoolArray]:
@@ -389,6 +374,7 @@ class _Fit:
     white_m: float
     slow_m: float
     alike_s: float
+    alike_assumed: bool
     ratio: float
     ratio_sigma: float
     delay_s: float
@@ -471,7 +457,7 @@ def _fit(paths: ComplexArray, delays_s: Array, target: ComplexArray, t_s: Array,
                 log -= 0.5 * (math.log(slow_m / usual_m) / math.log(_LIMITS.slow_factor)) ** 2
                 # where the path's middle is; its error and the turn's are not independent
                 at, arm = shift_z - turn * shift_p, -1j * turn * shift_p / np.sqrt(length)
-                sizes.append((white_m, slow_m, alike_s))
+                sizes.append((white_m, slow_m))
                 found.append((log, turn, at, arm, length, np.full(len(log), total), np.abs(along) / length))
     logs = np.array([one[0] for one in found])
     share = np.exp(logs - logs.max())
@@ -485,6 +471,7 @@ def _fit(paths: ComplexArray, delays_s: Array, target: ComplexArray, t_s: Array,
     delay_s = float(np.sum(share * delays_s))
     ratio = float(np.sum(share * ratios))
     best = sizes[int(np.argmax(logs.max(axis=1)))]
+    alike_s, alike_assumed = _judge_correlation(share.sum(axis=1).reshape(len(_LIMITS.alike_s), -1).sum(axis=1))
     return _Fit(
         turn=mean_turn,
         middle=middle,
@@ -492,9 +479,19 @@ def _fit(paths: ComplexArray, delays_s: Array, target: ComplexArray, t_s: Array,
         cov=0.5 * (cov + cov.T),
         white_m=best[0],
         slow_m=best[1],
-        alike_s=best[2],
+        alike_s=alike_s,
+        alike_assumed=alike_assumed,
         ratio=ratio,
         ratio_sigma=math.sqrt(float(np.sum(share * (1 / lengths + (ratios - ratio) ** 2)))),
         delay_s=delay_s,
         delay_sigma_s=math.sqrt(float(np.sum(share * (delays_s - delay_s) ** 2))),
     )
+
+
+def _judge_correlation(probability: Array) -> tuple[float, bool]:
+    """The mean time over which errors are alike, by its probability (K,) on the grid; whether the positions leave it
+    open.
+    """
+    near = np.convolve(probability, np.ones(3), mode="same")
+    alike_s = float(np.exp(np.sum(probability * np.log(_LIMITS.alike_s))))
+    return alike_s, bool(near[int(np.argmax(probability))] < _LIMITS.shown)

@@ -234,7 +234,7 @@ def _read_sensor_table(table: Section, quantity: Quantity) -> tuple[SensorTable,
     if not isinstance(columns, list) or len(columns) != 3 or not all(map(_is_column, columns)):
         table.fail("columns", f"must be three names, or numbers counted from 1, of x, y and z; found {columns!r}")
     if len({time, *columns}) != 4:
-        table.fail("columns", "must be three columns, and another than time")
+        table.fail("columns", "must be three columns, none of them twice, and another than time")
     x, y, z = columns
     described = SensorTable(
         file=file,

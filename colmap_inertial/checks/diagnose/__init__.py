@@ -31,6 +31,7 @@ CHECKS: tuple[Check, ...] = (
     camera.check_pose_convention,
     clocks.check_time_unit,
     camera.check_belonging,
+    imu.check_axes,
     camera.check_cameras,
     camera.check_gyro_gain,
     clocks.check_clock_rate,
@@ -80,7 +81,6 @@ def unreadable(error: InertialError) -> Finding:
         code=code,
         severity="error",
         evidence=str(error),
-        advice="correct this and run diagnose again: checks that depend on it were skipped",
     )
 
 

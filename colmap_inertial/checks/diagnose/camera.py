@@ -19,6 +19,8 @@ from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multipl
 from colmap_inertial.core.sampling import subtract_running_mean
 from colmap_inertial.core.types import CameraTrajectory, ImuRecording, RotationConsensus
 from colmap_inertial.imaging.gyro_camera import GyroCamera
+from colmap_inertial.io.plausible import best_mirrored_reading
+from colmap_inertial.io.units import Axes
 from colmap_inertial.motion.align import Alignment
 from colmap_inertial.motion.align.consensus import describe_consensus
 from colmap_inertial.motion.align.conventions import quick_accelerations
@@ -41,6 +43,13 @@ class CameraCheckLimits:
     enough_pairs: int = 12
     #: A recording that is shorter may simply not have turned enough.
     enough_s: float = 8.0
+    #: A camera-IMU rotation that is open by more (0.006 in clean recordings, 0.12 of a drone that hovers and turns in
+    #: its last second), of a camera whose median rate over such intervals is lower (0.014 there, 0.21 and more in
+    #: clean ones), has too little to rest on; in so many intervals at least.
+    open_rotation_rad: float = 0.05
+    still_rad_s: float = 0.02
+    turned_within_s: float = 1.0
+    fewest_seconds: int = 5
     #: A camera-IMU rotation known better than the first, and off by more than the second, is declared wrongly.
     known_rotation_rad: float = 0.2
     other_rotation_rad: float = 0.35
@@ -55,6 +64,9 @@ class CameraCheckLimits:
     #: video mode or a wrong factor does not.
     gyro_gain: tuple[float, float] = (0.85, 1.15)
     gain_interval_s: float = 0.5
+    #: Rotations that correlate less tell no gain; quick ones are those against the mean of so many intervals.
+    gain_correlation: float = 0.7
+    quick_intervals: int = 9
     #: The correlation of visual and inertial acceleration that tells its sign.
     opposite: float = -0.3
 
@@ -65,19 +77,21 @@ _LIMITS = CameraCheckLimits()
 _OF_THE_GYROSCOPE = frozenset({*UNIT_FACTORS, "gyro-unit", "sensors-exchanged", "dead-sensor", "dead-axis"})
 
 
-_MIRRORED = Finding(
-    code="gyro-mirrored",
-    severity="error",
-    evidence="the gyroscope fits the camera's rotation better when it is mirrored",
-    advice='give the axes of both sensors in capture.toml, for example axes = "-x,y,z" and mirrored = true under '
-    "[imu.gyro] and [imu.accel]",
-)
-
-
-_MAP_AGAIN = (
-    "look at these images: repeated texture, blur, or something that moved; leave them out, or map again with more "
-    "overlap between images"
-)
+def _find_mirroring(recorded: Recorded, imu: ImuRecording) -> Finding:
+    """A mirrored gyroscope; where the accelerometer tells that it is the only one, with its right axes."""
+    evidence = "the gyroscope fits the camera's rotation better when it is mirrored"
+    reading = best_mirrored_reading(imu) if imu.has_accel else None
+    if reading is None or np.array_equal(reading.matrix, -np.eye(3)):
+        return Finding(code="gyro-mirrored", severity="error", evidence=evidence)
+    before = np.eye(3) if recorded.gyro_axes is None else recorded.gyro_axes.matrix
+    axes = Axes(matrix=reading.matrix @ before)
+    return Finding(
+        code="gyro-mirrored",
+        severity="error",
+        evidence=evidence,
+        advice=f'set axes = "{axes}"{" and mirrored = true" if axes.is_mirrored else ""} under [imu.gyro] in '
+        "capture.toml; the accelerometer is right as it is",
+    )
 
 
 def check_belonging(recorded: Recorded) -> Iterator[Finding]:
@@ -89,7 +103,8 @@ def check_belonging(recorded: Recorded) -> Iterator[Finding]:
         return
     if isinstance(failed, Alignment) and imu is not None and turning is not None:
         if _is_mirrored(turning, imu, failed):
-            yield _MIRRORED
+            yield _find_mirroring(recorded, imu)
+        yield from _check_turned(turning, failed)
         return
     if not isinstance(failed, NotObservableError) or imu is None or turning is None or _is_explained(recorded):
         return
@@ -97,18 +112,32 @@ def check_belonging(recorded: Recorded) -> Iterator[Finding]:
         yield _unit_finding(recorded.wrong_unit)
         return
     if failed.quantity != "time offset":
-        yield Finding(
-            code="rotation-too-little",
-            severity="warning",
-            evidence=failed.hint.split(":")[0],
-            advice="turn the camera about all three axes while recording; clocks and axes cannot be checked without",
-        )
+        yield Finding(code="rotation-too-little", severity="error", evidence=failed.hint.split(":")[0])
         return
     otherwise = _find_better_fit(recorded, imu)
     if otherwise is not None:
         yield otherwise
     elif recorded.stabilisation is None or not recorded.stabilisation.stabilised:
         yield _never_fits(recorded, turning, failed)
+
+
+def _check_turned(turning: CameraTrajectory, aligned: Alignment) -> Iterator[Finding]:
+    """A camera that turned in a moment only, and otherwise stood: too little for the axes of camera and gyroscope."""
+    sigma_rad = aligned.calibration.rotation_sigma_rad
+    if sigma_rad < _LIMITS.open_rotation_rad:
+        return
+    each_s = turning.select(np.unique(turning.t_s // _LIMITS.turned_within_s, return_index=True)[1])
+    rate = np.linalg.norm(each_s.turn_rad(), axis=1) / np.diff(each_s.t_s)
+    usual = float(np.median(rate))
+    if len(rate) >= _LIMITS.fewest_seconds and usual < _LIMITS.still_rad_s:
+        yield Finding(
+            code="rotation-too-little",
+            severity="error",
+            evidence=f"the camera hardly rotates: half of the time by less than {usual:.3f} rad/s, most at "
+            f"{each_s.t_s[int(np.argmax(rate))] - turning.t_s[0]:.0f} s; how it is turned against the gyroscope is "
+            f"open by {np.degrees(sigma_rad):.0f} deg",
+            numbers={"median_rad_s": usual, "rotation_sigma_rad": sigma_rad},
+        )
 
 
 def _is_explained(recorded: Recorded) -> bool:
@@ -124,13 +153,12 @@ def check_cameras(recorded: Recorded) -> Iterator[Finding]:
     """Whether cameras of a reconstruction contradict the gyroscope."""
     found = recorded.consensus
     if isinstance(found, NotObservableError) and recorded.lacks_majority:
-        yield Finding(code="cameras-turned", severity="error", evidence=found.hint, advice=_MAP_AGAIN)
+        yield Finding(code="cameras-turned", severity="error", evidence=found.hint)
     if isinstance(found, RotationConsensus) and not found.kept.all():
         yield Finding(
             code="cameras-turned",
             severity="warning",
             evidence="; ".join(describe_consensus(found)),
-            advice=_MAP_AGAIN,
             numbers={
                 "wrong": float(len(found.wrong)),
                 "seams": float(len(found.seams)),
@@ -150,7 +178,6 @@ def _never_fits(recorded: Recorded, turning: CameraTrajectory, failed: NotObserv
             code="offset-undecided",
             severity="warning",
             evidence=f"no time offset between camera and gyroscope fits clearly better than others in {span_s:.1f} s",
-            advice="record ten seconds or more, with rotation about all three axes",
             numbers={"seconds": span_s},
         )
     if recorded.trajectory is None and not recorded.is_dense and len(turning) <= _LIMITS.enough_pairs:
@@ -159,15 +186,12 @@ def _never_fits(recorded: Recorded, turning: CameraTrajectory, failed: NotObserv
             severity="info",
             evidence=f"only {len(turning) - 1} pairs of consecutive pictures overlap enough to be compared with the "
             "gyroscope, and no time offset fits them",
-            advice="take pictures closer together, or film; after a reconstruction diagnose its model",
             numbers={"pairs": len(turning) - 1.0},
         )
     return Finding(
         code="imu-does-not-fit",
         severity="error",
         evidence=f"{failed.hint.split(':')[0]}; {recorded.clocks}",
-        advice="check that this IMU recording belongs to these images, both time stamps and their units, and the "
-        "gyroscope's columns, axes and unit",
         numbers={"seconds": span_s},
     )
 
@@ -175,7 +199,7 @@ def _never_fits(recorded: Recorded, turning: CameraTrajectory, failed: NotObserv
 def _find_better_fit(recorded: Recorded, imu: ImuRecording) -> Finding | None:
     """Find the sign, rate, frame rate or offset with which the gyroscope turns as the camera does."""
     if isinstance(recorded.align(replace(imu, gyro_rad_s=-imu.gyro_rad_s)), Alignment):
-        return _MIRRORED
+        return _find_mirroring(recorded, imu)
     elsewhere = recorded.align(imu, any_offset=True)
     if isinstance(elsewhere, Alignment):
         return offset_finding(recorded, elsewhere.calibration.clock_offset_s)
@@ -192,22 +216,10 @@ def _find_better_fit(recorded: Recorded, imu: ImuRecording) -> Finding | None:
 
 def check_gyro_gain(recorded: Recorded) -> Iterator[Finding]:
     """A gyroscope that measures far more, or less, than the camera turned: no sensor's gain is that far off."""
-    aligned, imu, turning = recorded.aligned, recorded.imu, recorded.turning
-    if not isinstance(aligned, Alignment) or imu is None or turning is None:
+    bounds = _bound_gain(recorded)
+    if bounds is None:
         return
-    # pixels that are followed lack the slow rotation, and guessed intrinsics scale what they show
-    if recorded.is_dense or (recorded.trajectory is None and recorded.camera is None):
-        return
-    motion = GyroCamera.of(imu, aligned.calibration, camera_epoch_ns=turning.epoch_ns)
-    poses = turning.select(np.unique(turning.t_s // _LIMITS.gain_interval_s, return_index=True)[1])
-    t_s = poses.t_s - aligned.calibration.drift_s(poses.t_s)
-    usable = motion.covers(t_s[:-1], t_s[1:])
-    inertial, visual = motion.turn_rad(t_s)[usable], poses.turn_rad()[usable]
-    common = float(np.sum(inertial * visual))
-    if len(visual) < _LIMITS.enough_pairs or common <= 0:
-        return
-    # noise of the images lowers the first, noise of the gyroscope raises the second
-    least, most = common / float(np.sum(visual**2)), float(np.sum(inertial**2)) / common
+    least, most = bounds
     if least > _LIMITS.gyro_gain[1] or most < _LIMITS.gyro_gain[0]:
         gain = (least * most) ** 0.5
         yield Finding(
@@ -215,10 +227,38 @@ def check_gyro_gain(recorded: Recorded) -> Iterator[Finding]:
             severity="error",
             evidence=f"the gyroscope measures {gain:.2f} times the rotation that the images show; sensors are right to "
             "a few per cent",
-            advice="check the gyroscope's unit and counts_per_unit in capture.toml, and the focal length under "
-            "[camera]; calibrate-imu measures the gain",
             numbers={"gain": gain},
         )
+
+
+def _bound_gain(recorded: Recorded) -> tuple[float, float] | None:
+    """Least and most rotation by the gyroscope per rotation in the images; ``None`` where they do not tell.
+
+    Intrinsics that are guessed scale what the images show, except about the optical axis. Pixels that are followed lack
+    the slow rotation.
+    """
+    aligned, imu, turning = recorded.aligned, recorded.imu, recorded.turning
+    if not isinstance(aligned, Alignment) or imu is None or turning is None:
+        return None
+    motion = GyroCamera.of(imu, aligned.calibration, camera_epoch_ns=turning.epoch_ns)
+    followed = recorded.trajectory is None and recorded.is_dense
+    spacing_s = _LIMITS.quick_s / 3 if followed else _LIMITS.gain_interval_s
+    poses = turning.select(np.unique(turning.t_s // spacing_s, return_index=True)[1])
+    t_s = poses.t_s - aligned.calibration.drift_s(poses.t_s)
+    usable = motion.covers(t_s[:-1], t_s[1:])
+    inertial, visual = motion.turn_rad(t_s)[usable], poses.turn_rad()[usable]
+    if len(visual) < _LIMITS.enough_pairs:
+        return None
+    if followed:
+        inertial, visual = (subtract_running_mean(turn, _LIMITS.quick_intervals) for turn in (inertial, visual))
+    if followed or (recorded.trajectory is None and recorded.camera is None):
+        inertial, visual = inertial[:, 2:], visual[:, 2:]
+    common, of_visual = float(np.sum(inertial * visual)), float(np.sum(visual**2))
+    correlation = common / max((of_visual * float(np.sum(inertial**2))) ** 0.5, 1e-12)
+    if correlation < _LIMITS.gain_correlation:
+        return None
+    # noise of the images lowers the first, noise of the gyroscope raises the second
+    return common / of_visual, float(np.sum(inertial**2)) / common
 
 
 def _unit_finding(code: str) -> Finding:
@@ -270,14 +310,12 @@ def _is_mirrored(turning: CameraTrajectory, imu: ImuRecording, aligned: Alignmen
 
 def check_stabilisation(recorded: Recorded) -> Iterator[Finding]:
     """A picture that was turned against its lens no longer belongs to the gyroscope."""
-    advice = "switch stabilisation off in the camera and record again; the scale of such a video is wrong"
     if recorded.log is not None and recorded.log.stabilised:
         said = recorded.log.stabilisation or "stabilisation was on"
         yield Finding(
             code="stabilised",
             severity="error",
             evidence=f"the recorder says that the video was stabilised in the camera ({said})",
-            advice=advice,
         )
         return
     told = recorded.stabilisation
@@ -288,7 +326,6 @@ def check_stabilisation(recorded: Recorded) -> Iterator[Finding]:
             severity="error",
             evidence=f"the pictures hold {100 * told.share:.0f} % of the quick rotation that the gyroscope measured: "
             "the video was stabilised in the camera",
-            advice=advice,
             numbers={"share": told.share},
         )
 
@@ -308,8 +345,6 @@ def check_declared_rotation(recorded: Recorded) -> Iterator[Finding]:
             code="declared-rotation",
             severity="error",
             evidence=f"camera and IMU are turned by {np.degrees(angle):.0f} deg against what is declared",
-            advice="correct cam_from_imu under [calibration]; frames that were turned upright are not in the sensor's "
-            "orientation: cut them without (ffmpeg -noautorotate)",
             numbers={"angle_deg": float(np.degrees(angle))},
         )
 
@@ -319,7 +354,7 @@ def check_focal_length(recorded: Recorded) -> Iterator[Finding]:
     aligned, rotation, imu, camera = recorded.aligned, recorded.rotation, recorded.imu, recorded.camera
     if not isinstance(aligned, Alignment) or rotation is None or imu is None or camera is None:
         return
-    if not recorded.is_dense:
+    if not recorded.is_dense or next(check_gyro_gain(recorded), None) is not None:
         return
     motion = GyroCamera.of(imu, aligned.calibration, camera_epoch_ns=rotation.epoch_ns)
     known = np.isfinite(rotation.turn_rad).all(axis=1) & motion.covers(rotation.t_s[:-1], rotation.t_s[1:])
@@ -342,7 +377,6 @@ def check_focal_length(recorded: Recorded) -> Iterator[Finding]:
             severity="error",
             evidence=f"the pictures turn {gain:.2f} times as far as the gyroscope measured: with the declared focal "
             f"length of {camera.params[0]:.0f} px, about {camera.params[0] * gain:.0f} px would fit",
-            advice="leave out [camera] to let COLMAP calibrate, or give the intrinsics of this very video mode",
             numbers={"gain": gain, "gain_sigma": sigma},
         )
 
@@ -361,7 +395,6 @@ def check_accelerometer_sign(recorded: Recorded) -> Iterator[Finding]:
             severity="error",
             evidence="the accelerometer measures the opposite of the camera's acceleration (correlation "
             f"{correlation:.2f}): its sign is flipped",
-            advice='set axes = "-x,-y,-z" and mirrored = true under [imu.accel] in capture.toml',
             numbers={"correlation": correlation},
         )
 

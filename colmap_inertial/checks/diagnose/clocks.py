@@ -46,8 +46,6 @@ def offset_finding(recorded: Recorded, offset_s: float) -> Finding:
         severity="error",
         evidence=f"camera and gyroscope fit where their stamps are {offset_s:+.3f} s apart, {stated}; "
         f"{recorded.clocks}",
-        advice="leave out shared_clock = true under [timing] in capture.toml (and any time offset), or correct the "
-        "stamps; a known offset goes under [calibration]",
         numbers={"offset_s": offset_s},
     )
 
@@ -64,8 +62,6 @@ def check_time_unit(recorded: Recorded) -> Iterator[Finding]:
         severity="error",
         evidence=f"{clocks}: the frames' times are {factor:g} times too {'long' if factor > 1 else 'short'}, and are "
         f"in {_TIME_UNITS.get(factor, 'another unit')} where seconds were read",
-        advice="name the unit of the frames' times: name,t_s or t_ms, t_us, t_ns in the CSV's header, or time_unit in "
-        "capture.toml",
         numbers={"frames_s": clocks.frames_s, "imu_s": clocks.imu_s, "factor": factor},
     )
 
@@ -93,8 +89,6 @@ def rate_finding(rate: float) -> Finding:
         severity=severity,
         evidence=f"the camera's clock runs {100 * rate:+.2f} % faster than the IMU's, and either may be wrong: lengths "
         "go with the square of time",
-        advice="give frame times as the recorder stamped them, not a frame number divided by a nominal rate; then "
-        "check the stamps of the IMU; up to 1 % is corrected",
         numbers={"rate": rate},
     )
 
@@ -106,7 +100,6 @@ def frame_rate_finding(rate: float) -> Finding:
         severity="error",
         evidence=f"the frames fit the gyroscope if {rate:.3g} times as many come in a second as are stated: they were "
         "timed by another frame rate than they were filmed with",
-        advice="give the video itself as [video], or times as the recorder stamped them",
         numbers={"rate": rate},
     )
 
@@ -133,7 +126,6 @@ def check_coverage(recorded: Recorded) -> Iterator[Finding]:
         code="imu-too-short",
         severity="error" if share < _LIMITS.least_covered else "warning",
         evidence=f"the IMU runs along with {100 * share:.0f} % of {span_s:.1f} s of frames",
-        advice="start the IMU before the video and stop it after; the scale rests on what both recorded",
         numbers={"share": share, "frames_s": span_s, "imu_s": float(end_s - begin_s)},
     )
 
@@ -167,8 +159,6 @@ def check_even_times(recorded: Recorded) -> Iterator[Finding]:
             severity="error",
             evidence=f"against the gyroscope, frame times wander by {1e3 * np.ptp(off):.0f} ms; worst "
             f"{middles[worst] - turning.t_s[0]:.0f} s after the first frame",
-            advice="time frames by the video's presentation stamps or the recorder's own times, never by counting; "
-            "frames that were dropped or repeated must not shift the rest",
             numbers={"wander_s": float(np.ptp(off)), "parts": float(len(off))},
         )
 

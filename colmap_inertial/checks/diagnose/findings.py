@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from colmap_inertial.checks.diagnose.advice import ADVICE
 from colmap_inertial.core.arrays import Int64Array
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError
@@ -51,7 +52,7 @@ class Finding:
     numbers
         The same in numbers; units are in the names.
     advice
-        What to do.
+        What to do; of the table in ``checks/diagnose/advice.py`` where nothing is given.
     deviations_deg
         By image, how far its camera is turned against those around it; empty in findings about anything else.
     """
@@ -59,14 +60,18 @@ class Finding:
     code: str
     severity: Severity
     evidence: str
-    advice: str
+    advice: str = ""
     numbers: Mapping[str, float] = field(default_factory=dict)
     deviations_deg: Mapping[str, float] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        if not self.advice:
+            object.__setattr__(self, "advice", ADVICE.get(self.code, ADVICE["unreadable"]))
+
     @property
     def sentence(self) -> str:
-        """Message and advice."""
-        return f"{self.evidence}; {self.advice}"
+        """Message, advice and code."""
+        return f"{self.evidence}; {self.advice} ({self.code})"
 
     def as_json(self) -> dict[str, object]:
         deviations = {"deviations_deg": dict(self.deviations_deg)} if self.deviations_deg else {}

@@ -58,7 +58,6 @@ def check_dropped(recorded: Recorded) -> Iterator[Finding]:
             severity="warning",
             evidence=f"{lost} frames are missing between {len(frames.t_s)} that come every {1e3 * usual_s:.1f} ms; "
             f"the longest pause is {step_s.max():.2f} s",
-            advice="nothing, where the times are right; record to a faster card or at a smaller size",
             numbers={"lost": float(lost), "longest_s": float(step_s.max())},
         )
 
@@ -81,7 +80,6 @@ def check_repeated(recorded: Recorded) -> Iterator[Finding]:
             code="frames-repeated",
             severity=severity,
             evidence=f"{count} of {len(same)} frames repeat the one before them",
-            advice="cut frames without filling up to a constant rate (ffmpeg -fps_mode passthrough)",
             numbers={"repeated": float(count), "looked_at": float(len(same))},
         )
 
@@ -113,7 +111,6 @@ def check_exposure(recorded: Recorded) -> Iterator[Finding]:
             evidence=f"{100 * share:.0f} % of the frames are blurred by more than {100 * _LIMITS.blur_share:g} % of "
             f"the picture's long side (median {100 * np.median(blur):.2f} %, exposure "
             f"{1e3 * np.median(timing.exposure_s):.1f} ms)",
-            advice="film with a shorter exposure (1/200 s or less) and more light; what is blurred is deblurred",
             numbers={"share": share, "median_blur_of_long_side": float(np.median(blur))},
         )
 
@@ -129,8 +126,7 @@ def check_readout(recorded: Recorded) -> Iterator[Finding]:
         yield Finding(
             code="readout-unknown",
             severity="warning",
-            evidence=f"{evidence}; {error.hint}",
-            advice="give readout_s under [timing] in capture.toml (0 for a global shutter), so that it is undone",
+            evidence=f"{evidence}; {error.hint.split(':')[0]}",
         )
         return
     lines = f"readout_s = {found.readout_s:.4f}"
@@ -170,7 +166,6 @@ def check_cut_from_video(recorded: Recorded) -> Iterator[Finding]:
             severity="info",
             evidence=f"{cut.doubtful} of {cut.doubtful + len(cut.found_ns)} pictures look like no frame of the video, "
             "or like several",
-            advice="name the video that the pictures were cut from",
             numbers={"pictures": float(cut.doubtful)},
         )
     if cut.quarter_turns:
@@ -178,8 +173,6 @@ def check_cut_from_video(recorded: Recorded) -> Iterator[Finding]:
             code="frames-turned",
             severity="error" if _refers_to_rows(recorded) else "info",
             evidence=f"the pictures are turned by {90 * cut.quarter_turns} deg against the sensor's rows",
-            advice="where readout, intrinsics or a calibration are declared, cut the pictures without turning them "
-            "upright (ffmpeg -noautorotate): these refer to the sensor's rows",
             numbers={"angle_deg": 90.0 * cut.quarter_turns},
         )
     elif cut.container_turn_deg % 360:
@@ -188,7 +181,6 @@ def check_cut_from_video(recorded: Recorded) -> Iterator[Finding]:
             severity="info",
             evidence=f"the video asks players to turn it by {cut.container_turn_deg} deg; the pictures are as the "
             "sensor saw them",
-            advice="nothing: readout, calibration and the IMU's axes refer to the sensor's rows; intrinsics must, too",
             numbers={"angle_deg": float(cut.container_turn_deg)},
         )
     if len(cut.found_ns) < 3:
@@ -203,7 +195,6 @@ def check_cut_from_video(recorded: Recorded) -> Iterator[Finding]:
             severity="error",
             evidence=f"the pictures' times wander by {1e3 * wander_s:.0f} ms against the presentation stamps of the "
             "video's frames that they are, as times counted from a frame rate do",
-            advice="give the presentation stamps of the frames, or the video itself as [video]",
             numbers={"wander_s": wander_s},
         )
     elif abs(start_s) > _LIMITS.start_s and abs(middle_s + start_s) < _LIMITS.start_s:
@@ -211,7 +202,6 @@ def check_cut_from_video(recorded: Recorded) -> Iterator[Finding]:
             code="container-start-ignored",
             severity="error",
             evidence=f"the pictures' times lack the {1e3 * start_s:+.0f} ms at which the video's container starts",
-            advice="add the container's start to the times, or give the video itself as [video]",
             numbers={"start_s": start_s},
         )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from colmap_inertial.core.geometry import matrix_from_quat, skew
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.sampling import MUCH_CUT, PAUSE_STEPS, find_clipped, integral_at, is_gap
 from colmap_inertial.core.types import CameraTrajectory, ImuRecording
+from colmap_inertial.io.plausible import RawImu, check_consistent
 from colmap_inertial.motion.align import Alignment
 
 
@@ -37,11 +39,6 @@ class MotionCheckLimits:
 
 _MOTION_LIMITS = MotionCheckLimits()
 
-_ADVICE = (
-    "record a clip in which the camera itself speeds up and slows down: swing it back and forth by 20 cm or more, "
-    "a few times a second or so, for ten seconds or longer"
-)
-
 
 def check_motion_content(recorded: Recorded) -> Iterator[Finding]:
     """Report motion without acceleration, which gives no scale: rest, rotation on the spot, constant velocity."""
@@ -64,7 +61,7 @@ def check_motion_content(recorded: Recorded) -> Iterator[Finding]:
         code, what = "pure-rotation", f"it only turns, by {rotated:.2f} rad/s"
     else:
         code, what = "no-acceleration", f"it turns by {rotated:.2f} rad/s, but stays in place or glides"
-    yield Finding(code=code, severity="error", evidence=f"{found}; {what}", advice=_ADVICE, numbers=numbers)
+    yield Finding(code=code, severity="error", evidence=f"{found}; {what}", numbers=numbers)
 
 
 def acceleration_rms_m_s2(imu: ImuRecording) -> float | None:
@@ -160,15 +157,22 @@ def check_plausibility(recorded: Recorded) -> Iterator[Finding]:
         yield refusal(problem)
 
 
+def check_axes(recorded: Recorded) -> Iterator[Finding]:
+    """Axes of the sensors against each other once more, where a camera confirms the gyroscope's turning."""
+    imu = recorded.imu
+    if imu is None or not imu.has_accel or recorded.implausible or not isinstance(recorded.aligned, Alignment):
+        return
+    raw = RawImu(imu=imu, path=Path("IMU"), gyro_axes=recorded.gyro_axes, accel_axes=recorded.accel_axes)
+    try:
+        check_consistent(raw, confirmed=True)
+    except FormatError as error:
+        yield refusal(error)
+
+
 def refusal(error: FormatError) -> Finding:
     """A reader's refusal, whose sentence gives what was found, then what to do."""
-    evidence, _, advice = error.reason.partition(": ")
-    return Finding(
-        code=error.code,
-        severity="error",
-        evidence=evidence,
-        advice=advice or "correct it in the file or in capture.toml",
-    )
+    evidence, _, advice = error.reason.rpartition("; " if "; " in error.reason else ": ")
+    return Finding(code=error.code, severity="error", evidence=evidence or advice, advice=advice if evidence else "")
 
 
 def check_accelerometer(recorded: Recorded) -> Iterator[Finding]:
@@ -178,7 +182,6 @@ def check_accelerometer(recorded: Recorded) -> Iterator[Finding]:
             code="no-accelerometer",
             severity="error",
             evidence="the recording holds a gyroscope alone",
-            advice="record the accelerometer too, gravity included; without it there is deblurring, but no scale",
         )
 
 
@@ -194,7 +197,6 @@ def check_repairs(recorded: Recorded) -> Iterator[Finding]:
             code=code,
             severity="info" if code in ("empty-cells", "repaired") else "warning",
             evidence="; ".join(said),
-            advice="nothing: it was repaired while reading; if there is much of it, look at the logger",
             numbers={"repairs": len(said)},
         )
 
@@ -217,7 +219,6 @@ def check_pauses(recorded: Recorded) -> Iterator[Finding]:
                 severity="error" if share > _LIMITS.most_paused else "warning",
                 evidence=f"the {sensor} pauses {len(some)} times, {some.max():.3f} s at the longest, "
                 f"{some.sum():.2f} s in all; it samples every {1e3 * usual_s:.1f} ms",
-                advice="the scale bridges it, less surely; close other apps, or log to a faster card, and record again",
                 numbers={"pauses": len(some), "longest_s": float(some.max()), "share": share},
             )
 
@@ -231,7 +232,6 @@ def check_rate(recorded: Recorded) -> Iterator[Finding]:
                 code="rate-too-low",
                 severity="error" if rate_hz < _LIMITS.too_slow_hz else "warning",
                 evidence=f"the {sensor} reads {rate_hz:.3g} times a second; a hand shakes ten times a second",
-                advice="log at 100 Hz or more, at the app's or sensor's highest rate",
                 numbers={"rate_hz": rate_hz},
             )
 
@@ -275,7 +275,6 @@ def check_scatter(recorded: Recorded) -> Iterator[Finding]:
                 severity="warning",
                 evidence=f"the {sensor} hardly scatters from sample to sample ({scatter:.1g} {_UNITS[sensor]}), though "
                 "the device moves: its readings were smoothed",
-                advice="record the raw sensor, without the app's or the device's smoothing or fusion",
                 numbers={"scatter": scatter, "moving": moving},
             )
 
@@ -298,7 +297,6 @@ def check_together(recorded: Recorded) -> Iterator[Finding]:
             code="sensors-apart",
             severity="error",
             evidence=f"gyroscope and accelerometer run together for {max(both_s, 0):.1f} s of {shorter_s:.1f} s",
-            advice="give two files of one recording, stamped by one clock",
             numbers={"together_s": float(both_s), "shorter_s": float(shorter_s)},
         )
 
@@ -315,7 +313,6 @@ def check_cut_off(recorded: Recorded) -> Iterator[Finding]:
                 severity="error" if share > MUCH_CUT else "warning",
                 evidence=f"{sum(cut.values())} of {len(values)} {sensor} samples stand at the end of the range "
                 f"({', '.join(f'{axis}: {count}' for axis, count in cut.items())})",
-                advice="move less violently, or give the sensor a wider range",
                 numbers={"samples": float(sum(cut.values())), "share": share},
             )
 
@@ -334,7 +331,6 @@ def check_resolution(recorded: Recorded) -> Iterator[Finding]:
             severity=severity,
             evidence=f"the {sensor} reads in steps of {step:.3g} {_UNITS[sensor]} "
             f"({len(np.unique(values[:, 0]))} different values on x)",
-            advice="log the sensor's full resolution; write more digits into the file",
             numbers={"step": step, "rounding_share_of_signal": share},
         )
 
@@ -359,7 +355,6 @@ def check_delay(recorded: Recorded) -> Iterator[Finding]:
             severity="error",
             evidence=f"the accelerometer's stamps are {1e3 * delay_s:+.0f} ms off the gyroscope's: there, gravity "
             f"turns against the gyroscope with a correlation of {correlation:.2f}",
-            advice="stamp both sensors by one clock, when they were sampled and not when they were written",
             numbers={"delay_s": delay_s, "correlation": correlation},
         )
 

@@ -24,7 +24,7 @@ from colmap_inertial.io.toml_section import parse_toml
 
 VERSION = 1
 #: Of a model in ``result.json``, what the page shows otherwise or not.
-_NOT_SHOWN = ("drift", "validation", "cov", "dense")
+_NOT_SHOWN = ("drift", "validation", "cov", "dense", "findings")
 
 Content = dict[str, Any]
 
@@ -58,8 +58,11 @@ def gather(
     models = sorted(done["models"], key=lambda m: (m["metres_per_unit"] is None, -m["registered_images"], m["index"]))
     full = {model["index"] for model in models[: SIZES.models]}
     project = done.get("project") is not None
-    shown = [_model(out, model, in_full=model["index"] in full, project=project) for model in models]
     findings = _findings(out)
+    found = findings.get("findings", [])
+    shown = [
+        _model(out, {**model, "findings": found}, in_full=model["index"] in full, project=project) for model in models
+    ]
     if shown:
         outcome = shown[0]["outcome"]
     else:
