@@ -489,6 +489,6 @@ def test_the_report_says_where_it_is(placed):
     result = reconstruct_project(root / "project", root / "told", source, ReconstructOptions(georeference=True))
     found = result.models[0].georeference
     page = (root / "told" / "report.html").read_text()
-    assert f"{found.latitude_deg:.6f}, {found.longitude_deg:.6f} degrees" in page
+    assert f"{found.latitude_deg:.6f}, {found.longitude_deg:.6f}°" in page
     assert f"{found.used} positions" in page
     assert "lag of positions" in page and found.delay_sigma_s < 0.31

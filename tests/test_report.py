@@ -507,6 +507,8 @@ def test_the_same_run_gives_the_same_bytes(full, tmp_path):
 )
 def test_links_in_what_the_report_is_made_of_are_refused(full, tmp_path, name):
     out = copy_of(full, tmp_path)
+    for report in ("report.html", "report.json"):
+        (out / report).unlink(missing_ok=True)
     place, elsewhere = out / name, tmp_path / "elsewhere"
     if place.exists():
         shutil.move(place, elsewhere)
