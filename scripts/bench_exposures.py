@@ -31,7 +31,7 @@ from turning_world import Turning
 
 from colmap_inertial.core.arrays import AnyArray, UInt8Array
 from colmap_inertial.core.errors import NotObservableError
-from colmap_inertial.imaging.exposure_pairs import better_alone, bring_together
+from colmap_inertial.imaging.exposure_pairs import better_alone, bring_together, replace_departures
 from colmap_inertial.imaging.restoration import Network, load_network, lsd2
 
 ROOMS = ("room1", "room3", "room5")
@@ -92,11 +92,13 @@ def _row(pair: Pair, i: int, network: Network) -> dict[str, Any]:
         row["shift_px"] = float(np.nanmedian(np.linalg.norm(pair.shift_px, axis=2)))
         row["shift_error_px"] = float(np.nanmedian(off))
     if pair.good:
-        fused = lsd2.fuse(found.short, found.long, blur=found.blur, network=network)
+        by_network = lsd2.fuse(found.short, found.long, blur=found.blur, network=network)
+        fused = replace_departures(by_network, found.short)
         row["psnr_db"] = {
             "short": psnr_db(found.short, pair.truth),
             "long": psnr_db(pair.long / 255, pair.truth),
             "long, aligned": psnr_db(found.long, pair.truth),
+            "by network": psnr_db(by_network, pair.truth),
             "fused": psnr_db(fused, pair.truth),
         }
         of = row["psnr_db"]
@@ -149,6 +151,7 @@ def _print(name: str, found: dict[str, Any]) -> None:
         "gain error %",
         "short",
         "long",
+        "by network",
         "fused",
         "gained dB",
     ):
@@ -167,7 +170,7 @@ def _print(name: str, found: dict[str, Any]) -> None:
             shown(row.get("shift_px"), 1),
             shown(row.get("shift_error_px"), 1),
             shown(row.get("gain_error_pct"), 1),
-            *(shown(psnr.get(key)) for key in ("short", "long", "fused")),
+            *(shown(psnr.get(key)) for key in ("short", "long", "by network", "fused")),
             shown(row.get("gained_db")),
         )
     Console(width=140).print(table)

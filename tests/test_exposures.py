@@ -18,6 +18,7 @@ from colmap_inertial.imaging.exposure_pairs import (
     fuse_mertens,
     gyro_shift,
     match_brightness,
+    replace_departures,
 )
 from colmap_inertial.imaging.psf import blur_field
 from colmap_inertial.imaging.transfer import linear_from_srgb, srgb_from_linear
@@ -290,3 +291,24 @@ def test_exposure_fusion_takes_lamps_of_the_short_exposure_and_none_of_its_noise
     assert (blended >= 0.98).mean() < 0.5 * (long >= 0.98).mean()
     of_noisy, of_clean = (np.diff(fuse_mertens([one, long])[wall], axis=0).std() for one in (dark, found))
     assert of_clean < 0.05 * of_noisy
+
+
+def test_a_fused_image_that_departs_from_the_short_one_gives_way_to_it():
+    """A ghost on the left is replaced; the denoised right stays, also where the short exposure is off by an offset."""
+    rng = np.random.default_rng(4)
+    y, x = np.mgrid[:96, :160].astype(np.float32)
+    truth = np.repeat((0.5 + 0.2 * np.sin(x / 9) * np.cos(y / 7))[..., None], 3, axis=2)
+    short = np.clip(truth + 0.03 * rng.standard_normal(truth.shape), 0, 1).astype(np.float32)
+    short += 0.08
+    fused = truth.astype(np.float32).copy()
+    fused[:, :60] = np.roll(truth, 12, axis=1)[:, :60]
+    found = replace_departures(fused, short)
+
+    def error(image, part):
+        return float(np.mean((image[:, part] - truth[:, part]) ** 2))
+
+    ghost, clean = slice(14, 46), slice(80, None)
+    assert error(fused, ghost) > 2 * error(short, ghost)
+    assert error(found, ghost) < 1.3 * error(short, ghost)
+    np.testing.assert_array_equal(found[:, clean], fused[:, clean])
+    np.testing.assert_array_equal(replace_departures(fused[..., 0], short[..., 0])[:, clean], fused[:, clean, 0])

@@ -26,6 +26,7 @@ from colmap_inertial.core.errors import (
     TimingError,
 )
 from colmap_inertial.core.options import ExposureOptions, ReconstructOptions
+from colmap_inertial.imaging.exposure_pairs import replace_departures
 from colmap_inertial.imaging.restoration import shipped
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frames import read_frame_timing, read_frames
@@ -492,11 +493,15 @@ def test_the_package_s_network_is_used_and_named(capture, tmp_path, monkeypatch)
     small.write_weights(tmp_path / "weights", lsd2=small.mixing(0.5))
     monkeypatch.setattr(shipped, "folder", lambda: tmp_path / "weights")
     fuse_exposures_captured(capture, tmp_path / "net", ExposureOptions(device="cpu"), progress=silent)
-    fuse_exposures_captured(capture, tmp_path / "mean", fuser=AVERAGE, progress=silent)
+    guarded = Fuser(fuse=lambda short, *other: replace_departures(average(short, *other), short), identity="guarded")
+    fuse_exposures_captured(capture, tmp_path / "mean", fuser=guarded, progress=silent)
     for name in ("000.png", "001.png"):
         two = [read(tmp_path / out / "images" / name).astype(int) for out in ("net", "mean")]
         assert np.abs(two[0] - two[1]).max() <= 1
-    assert json.loads((tmp_path / "net" / "result.json").read_text())["fuser"] == f"lsd2 {shipped.checksum('lsd2')}"
+    assert (
+        json.loads((tmp_path / "net" / "result.json").read_text())["fuser"]
+        == f"lsd2 {shipped.checksum('lsd2')}, short where departing"
+    )
 
 
 def test_the_command_fuses_and_says_what_it_did(capture, tmp_path, by_average, capsys):

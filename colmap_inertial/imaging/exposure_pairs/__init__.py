@@ -5,6 +5,7 @@
 """
 
 from colmap_inertial.imaging.exposure_pairs.alone import Alone as Alone, better_alone as better_alone
+from colmap_inertial.imaging.exposure_pairs.departure import replace_departures as replace_departures
 from colmap_inertial.imaging.exposure_pairs.mertens import darken_fused as darken_fused, fuse_mertens as fuse_mertens
 from colmap_inertial.imaging.exposure_pairs.pair import (
     Brightness as Brightness,

@@ -10,6 +10,7 @@ from colmap_inertial.core.arrays import Float32Array
 from colmap_inertial.core.options import ExposureOptions, ReconstructOptions
 from colmap_inertial.core.threads import frames_at_once, threads_beside
 from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.exposure_pairs import replace_departures
 from colmap_inertial.imaging.restoration import load_network, lsd2, shipped
 from colmap_inertial.pipeline.run.context import Recording
 from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan
@@ -37,7 +38,7 @@ class Fuser:
 
 
 def lsd2_fuser(options: ExposureOptions | None = None) -> Fuser:
-    """The network that comes with the package.
+    """The network that comes with the package, and the short exposure where its result departs too far from it.
 
     Raises
     ------
@@ -48,9 +49,9 @@ def lsd2_fuser(options: ExposureOptions | None = None) -> Fuser:
     network = load_network("lsd2", device=options.device, threads=threads_beside(frames_at_once()))
 
     def fuse(short: Float32Array, long: Float32Array, blur: BlurField | None) -> Float32Array:
-        return lsd2.fuse(short, long, blur=blur, network=network)
+        return replace_departures(lsd2.fuse(short, long, blur=blur, network=network), short)
 
-    return Fuser(fuse=fuse, identity=f"lsd2 {shipped.checksum('lsd2')}")
+    return Fuser(fuse=fuse, identity=f"lsd2 {shipped.checksum('lsd2')}, short where departing")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
