@@ -384,7 +384,7 @@ def _describe_refusal(signals: Mapping[str, Any]) -> list[str]:
 
 
 def _advise_on_refusal(signals: Mapping[str, Any]) -> list[str]:
-    """What to do about such a refusal: to film again only where the motion was too little."""
+    """Advice after such a refusal: to film again only where the motion was too little."""
     accel_m_s2 = _acceleration_m_s2(signals)
     if signals.get("alignment") == "not tried":
         return [_RAW]
@@ -394,7 +394,7 @@ def _advise_on_refusal(signals: Mapping[str, Any]) -> list[str]:
 
 
 def _acceleration_m_s2(signals: Mapping[str, Any]) -> float | None:
-    """Of the device, by the accelerometer: what the camera shows has no unit without a scale."""
+    """The device's acceleration, by the accelerometer: what the camera shows has no unit without a scale."""
     value: float | None = signals.get("acceleration", {}).get("rms_accelerometer_m_s2")
     return value
 

@@ -18,7 +18,7 @@ from colmap_inertial.imaging.transfer import linearise
 
 @dataclass(frozen=True, kw_only=True)
 class ChromaModel:
-    """How chroma is made small, and large again."""
+    """Settings of the reduction and enlargement of chroma."""
 
     #: Luma's shares of R - G and B - G beside G: ITU-R BT.709.
     red: float = 0.2126

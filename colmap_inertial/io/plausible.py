@@ -133,7 +133,7 @@ def best_mirrored_reading(imu: ImuRecording) -> Reading | None:
 
 
 def _spread(turns: Array, force: Array, readings: Sequence[Reading]) -> list[Array]:
-    """For each reading, (W,) the logarithm of the variance that it leaves of the specific force in each window."""
+    """Logarithm of the variance (W,) that each reading leaves of the specific force in each window."""
     orientations: dict[float, Array] = {}
     spread = []
     for reading in readings:

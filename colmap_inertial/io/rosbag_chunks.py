@@ -1,4 +1,4 @@
-"""What ROS recordings unpack to, told before ``rosbags`` unpacks it: it takes chunks and messages whole.
+"""Unpacked sizes of ROS recordings, checked before ``rosbags`` unpacks them: it holds chunks and messages whole.
 
 Chunks are found where ``rosbags`` finds them: by the index of a ROS 1 bag, and by the index and the order of records of
 MCAP.
@@ -22,7 +22,7 @@ from colmap_inertial.io.sqlite import open_foreign
 
 @dataclass(frozen=True, kw_only=True)
 class _Bounds:
-    """Bytes of a recording that is unpacked. A message takes up to five times its bytes as Python has it."""
+    """Bounds of a recording's unpacked bytes. A message takes up to five times its bytes in Python."""
 
     #: For each packed byte; chunks of cameras and IMUs have 2 to 10.
     ratio: int = 20
@@ -42,7 +42,7 @@ _FOOTER, _CHUNK, _CHUNK_INDEX, _SUMMARY_OFFSET = 0x02, 0x06, 0x08, 0x0E
 
 @dataclass(frozen=True, kw_only=True)
 class _Packed:
-    """Bytes of a file that are unpacked as one, by the name of their compression, and those that belong to them."""
+    """Bytes of a file that are unpacked together, with the name of their compression."""
 
     begin: int
     size: int
@@ -134,7 +134,7 @@ def _decompressors() -> dict[str, Callable[[], Any]]:
 
 
 def _unpacked(path: Path, packed: bytes, compression: str, most: int) -> int:
-    """How many bytes these are unpacked, or more than ``most``."""
+    """Number of bytes after unpacking, or more than ``most``."""
     made = _decompressors().get(compression)
     if made is None:
         raise FormatError(path, f"is packed by {compression[:40]!r}, which is not read")
@@ -197,7 +197,7 @@ def _mcap_records(file: IO[bytes], begin: int, end: int) -> Iterator[tuple[int, 
 
 
 def _mcap_ends(file: IO[bytes], size: int) -> tuple[int, int]:
-    """Where data and summary end; the data where the summary begins."""
+    """Ends of data and summary; of the data where the summary begins."""
     file.seek(size - 28)
     (summary,) = struct.unpack("<Q", file.read(8))
     return summary or size - 37, size - 37

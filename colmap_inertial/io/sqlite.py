@@ -20,7 +20,7 @@ _SQLITE = "SQLite cannot read it"
 
 @dataclass(frozen=True, kw_only=True)
 class _Bounds:
-    """What reading a database may take.
+    """Limits of the work of reading a database.
 
     SQLite's ``quick_check``, the slowest of what is asked, reads 2 GB in a second of processor time.
     """

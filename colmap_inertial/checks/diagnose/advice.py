@@ -1,4 +1,4 @@
-"""What to do about each finding: one table by code, which the terminal, the report and ``diagnosis.json`` share."""
+"""Advice for each finding: one table by code, which the terminal, the report and ``diagnosis.json`` share."""
 
 from __future__ import annotations
 

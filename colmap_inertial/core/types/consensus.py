@@ -95,7 +95,7 @@ class RotationConsensus:
 
     @property
     def deviations_deg(self) -> dict[str, float]:
-        """By image, how far each camera that was judged is turned against those around it."""
+        """Rotation of each judged camera against its neighbours, by image name."""
         each = zip(self.names, self.deviation_deg.tolist(), self.judged, strict=True)
         return {name: deg for name, deg, judged in each if judged}
 

@@ -87,7 +87,7 @@ class Trial:
         return replace(gap, sigma_m=sigma_m, sigma_deg=float(np.degrees(sigma_rad)))
 
     def reason(self, gap: Gap, pair: Pair, why_not: str = "") -> str:
-        """How a gap was joined, or why it was not."""
+        """Reason why a gap was joined, or why it was not."""
         by = [f"{gap.shared_images} images that both have"] if gap.shared_images else []
         by += [f"{gap.matched_images} images of one that match the other"] if gap.matched_images else []
         reason = why_not or (f"joined by {', '.join(by)}, and the IMU" if by else "joined by the IMU")

@@ -40,7 +40,7 @@ _WARMER_K = 10.0
 
 @dataclass(frozen=True, kw_only=True)
 class MovedLimits:
-    """Which cameras are in the wrong place by themselves, among keyframes; a video outvotes them."""
+    """Limits for cameras in the wrong place alone, among keyframes; a video outvotes them."""
 
     #: So many of them, or this share, may be.
     most: int = 3
@@ -54,7 +54,7 @@ _MOVED = MovedLimits()
 
 @dataclass(frozen=True, kw_only=True)
 class LearnedLimits:
-    """How surely a recording's lever arm holds for others of the device.
+    """Uncertainty of a recording's lever arm for other recordings of the device.
 
     Against the known arms of six recordings of real sensors, those of the fit are wrong by 2.9 times its standard
     deviations in recordings of two minutes (rms), and 1.2 times in 20 s; by 3 mm where these are .5 mm.

@@ -14,7 +14,7 @@ from colmap_inertial.inertial.core.priors import PRIORS
 
 @dataclass(frozen=True, kw_only=True)
 class SensorPriors:
-    """What accelerometers are like that nobody calibrated: sound, or off in bias, in gain, or in both.
+    """Prior of uncalibrated accelerometers: sound, or off in bias, in gain, or in both.
 
     Normal distributions; the two faults are independent.
     """

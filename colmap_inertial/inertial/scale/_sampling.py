@@ -12,7 +12,7 @@ from colmap_inertial.core.types import CameraTrajectory, ImuRecording
 
 @dataclass(frozen=True, kw_only=True)
 class SamplingLimits:
-    """What is worth a sentence."""
+    """Limits beyond which sampling is reported."""
 
     #: Scatter of stamps about an even rate: .003 ms in 14 recordings of real sensors and cameras.
     scatter_s: float = 5e-4
