@@ -1055,8 +1055,8 @@ MUTANTS = (
     ),
     Mutant(
         "pipeline/stages/frame_folder.py",
-        'action = "dropped" if frame.dropped else _write(',
-        'action = "dropped" if frame.image is None else _write(',
+        'return frame, "dropped" if frame.dropped else _write(',
+        'return frame, "dropped" if frame.image is None else _write(',
         "dropped frames are written for COLMAP",
         ("run_steps",),
     ),
@@ -1118,8 +1118,8 @@ MUTANTS = (
     ),
     Mutant(
         "pipeline/stages/deblur.py",
-        "dropped=bool(self.drop and self.verdict.trusted)",
-        "dropped=bool(self.drop)",
+        "dropped=bool(self.verdict.trusted)",
+        "dropped=True",
         "frames are dropped by a gyroscope that nothing confirms",
         ("run_models::test_frames_are_dropped_only_by_a_gyroscope_that_the_images_bear_out",),
     ),
@@ -1328,8 +1328,8 @@ MUTANTS = (
     ),
     Mutant(
         "checks/diagnose/camera.py",
-        'code="gyro-mirrored",\n    severity="error",\n',
-        'code="gyro-mirrored",\n    severity="warning",\n',
+        'return Finding(code="gyro-mirrored", severity="error", evidence=evidence)',
+        'return Finding(code="gyro-mirrored", severity="warning", evidence=evidence)',
         "a mirrored gyroscope does not stop a reconstruction",
         ("run_steps::test_a_mirrored_gyroscope_stops_a_reconstruction",),
     ),
@@ -1684,7 +1684,7 @@ MUTANTS = (
         ("georeference::test_heading_and_place_lie_within_their_intervals",),
     ),
     Mutant(
-        "inertial/georeference.py",
+        "inertial/earth.py",
         "[[-t, -s * k, c * k], [k, -s * t, c * t], [0.0, c, s]]",
         "[[-t, -s * k, c * k], [k, s * t, c * t], [0.0, c, s]]",
         "north points elsewhere away from Greenwich",

@@ -368,7 +368,7 @@ def test_a_rosbag_without_rosbags_names_the_extra(tmp_path: Path, monkeypatch, o
         return real(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(MissingExtraError, match=r"pip install 'colmap-inertial\[ros\]'"):
+    with pytest.raises(MissingExtraError, match="extra `ros`: pip install 'rosbags"):
         read_imu(path)
 
 

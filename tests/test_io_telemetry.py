@@ -69,7 +69,7 @@ def test_damage_is_an_error_of_ours(tmp_path, imu):
 def test_without_the_package_it_says_what_to_install(tmp_path, imu, monkeypatch):
     path = write_runcam(tmp_path, imu, "Mobius Maxi 4K")
     monkeypatch.setitem(sys.modules, "telemetry_parser", None)
-    with pytest.raises(MissingExtraError, match=r"colmap-inertial\[devices\]"):
+    with pytest.raises(MissingExtraError, match="extra `devices`: pip install 'telemetry-parser"):
         read_imu(path)
 
 

@@ -58,6 +58,10 @@ def centres_of(model):
     return np.array([image.projection_center() for image in images])
 
 
+def names_of(model):
+    return {model.image(i).name for i in model.reg_image_ids()}
+
+
 def error_of(centres, truth):
     """Root mean square after a similarity."""
     return float(np.sqrt(np.mean(np.sum(fitted(centres, truth)[1] ** 2, axis=1))))
@@ -276,7 +280,10 @@ def test_a_rolling_shutter_is_part_of_it(rolled):
     made, said = refined_by(tracks.imu, model, calibration=known, shutter=shutter)
     truth = tracks.motion.cam_in_world_m(tracks.timing.pose_t_s())
     assert said.action == "refined"
-    assert error_of(centres_of(made.reconstruction), truth) < 0.7 * error_of(centres_of(model.reconstruction), truth)
+    # the last image lies 0.1 m off and is left out with the scale; without that, the rest was 13 mm off before
+    kept = [name in names_of(made.reconstruction) for name in tracks.timing.names]
+    before, after = (error_of(centres_of(m.reconstruction), truth[kept]) for m in (model, made))
+    assert sum(kept) >= len(kept) - 1 and after < min(0.006, 1.1 * before)
     assert said.values["readout_s"] == pytest.approx(0.025, rel=0.03)
     assert made.motion.readout_s == said.values["readout_s"] != made.timing.readout_s
     assert not made.observed_px

@@ -29,7 +29,7 @@ def folder(shared_data):
 def outcomes(study, folder):
     """Windows of 10 and 3 s of the six recordings, with errors of 2 mm."""
     found = study.windows(folder, (10.0, 3.0), (0.002,), most=3, first=7000)
-    return [study.run((folder, window, None)) for window in found]
+    return [study.run((folder, window, None, None)) for window in found]
 
 
 def test_windows_of_other_sensors_are_not_biased_and_their_intervals_hold(study, outcomes):
@@ -68,8 +68,8 @@ def test_an_accelerometer_calibrated_by_other_recordings_gives_a_third_of_the_in
     for gain in fitted.values():
         assert np.allclose(np.diag(gain), np.mean([np.diag(g) for g in fitted.values()], axis=0), atol=0.0015)
     window = next(w for w in study.windows(folder, (np.inf,), (0.002,), first=11) if w.recording == "room1")
-    plain = study.run((folder, window, None))
-    calibrated = study.run((folder, window, gains.calibration_by(folder, ("room3", "room5"))))
+    plain = study.run((folder, window, None, None))
+    calibrated = study.run((folder, window, gains.calibration_by(folder, ("room3", "room5")), None))
     assert calibrated.verdict == "trusted"
     assert abs(calibrated.error) < study.Z95 * calibrated.sigma < 0.0045
     assert calibrated.sigma < 0.45 * plain.sigma

@@ -137,8 +137,8 @@ class Deblur(Reader):
     strong edges (slower). deepgyro: a network, which also sees what a filter makes of the picture (slower;
     needs the extra `restore`)."""
     purpose: Annotated[DeblurPurpose, arg(name="for")] = "viewing"
-    """viewing: as sharp as the method makes them. matching: deblurred frames are also smoothed, by 0.06 of their blur
-    (at most 1.2 px), as `reconstruct` shows them to COLMAP: better matches, less detail to look at."""
+    """viewing: as sharp as the method makes them. matching: smoothed a little, as `reconstruct` shows them to
+    COLMAP."""
     calibration: tuple[Path, ...] = ()
     """Calibration files of this device: from `align --out`, from `calibrate-imu --out`, or both."""
     rectify: bool = False
