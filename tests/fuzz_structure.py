@@ -235,6 +235,8 @@ def _sqlite(data: bytes, rng: Rng) -> bytes:
         opened = sqlite3.connect(file.name)
         try:
             opened.execute("PRAGMA journal_mode=MEMORY")
+            # an update may fire an endless trigger of an earlier change
+            opened.set_progress_handler(lambda: 1, 10_000_000)
             tables = [row[0] for row in opened.execute("SELECT name FROM sqlite_master WHERE type='table'")]
             table = _any(rng, [name for name in tables if not name.startswith("sqlite_")])
             columns = [row[1] for row in opened.execute(f'PRAGMA table_info("{table}")')]
