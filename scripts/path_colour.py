@@ -22,15 +22,20 @@ from rich.console import Console
 from rich.progress import track
 from turning_world import Moment, Turning, TurningCamera
 
-from colmap_inertial._kernels import _wiener
 from colmap_inertial.core.arrays import UInt8Array
-from colmap_inertial.imaging._cells import Cells
 from colmap_inertial.imaging._tiles import TiledPaths, Tiling
 from colmap_inertial.imaging.blur_path import BlurPath
-from colmap_inertial.imaging.path_filters import FILTER_MODEL, filter_along, half_quadratic, noise_along, path_wiener
+from colmap_inertial.imaging.path_filters import (
+    FILTER_MODEL,
+    blend_where_blurred,
+    filter_along,
+    half_quadratic,
+    noise_along,
+    path_wiener,
+)
 from colmap_inertial.imaging.psf import blur_path
-from colmap_inertial.imaging.transfer import decode_table, encode_table, linearise, srgb_from_linear
-from colmap_inertial.imaging.wiener import DeblurOptions, lowest_saturated_code
+from colmap_inertial.imaging.transfer import linearise, srgb_from_linear
+from colmap_inertial.imaging.wiener import DeblurOptions
 
 #: Blurs, px, and walls, of which each is seen at one instant.
 BLURS_PX, WALLS = (10.0, 20.0, 30.0), 3
@@ -39,24 +44,10 @@ _COST_PX, _REPEAT = 20.0, 7
 
 def _each_channel(image: UInt8Array, path: BlurPath, splitting: tuple[float, ...], threads: int) -> UInt8Array:
     tiling = Tiling.covering(path.width, path.height, path.extent_px())
-    paths, light, cells = tiling.paths(path), linearise(image), Cells.of(path.field())
+    paths, light = tiling.paths(path), linearise(image)
     noise = noise_along(light, tiling, paths, threads)
     sharp = filter_along(light, tiling, TiledPaths(paths, tiling.spreads(path)), noise, splitting, threads=threads)
-    result = np.empty_like(image)
-    _wiener.blend(
-        image,
-        sharp,
-        result,
-        extent_px=cells.extent_px,
-        slope=cells.slope,
-        along_y=cells.along_y,
-        fade=cells.fade,
-        decode=decode_table(image.dtype),
-        encode=encode_table(image.dtype),
-        saturated=lowest_saturated_code(image.dtype),
-        threads=threads,
-    )
-    return result
+    return blend_where_blurred(image, sharp, path, threads)
 
 
 WAYS: Mapping[str, tuple[Callable[..., UInt8Array], tuple[float, ...]]] = {

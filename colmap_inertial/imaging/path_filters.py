@@ -241,8 +241,6 @@ def _filter_light(
 def _filter_image(
     image: NDArray[Code], path: BlurPath, options: DeblurOptions, splitting: Sequence[float]
 ) -> NDArray[Code]:
-    from colmap_inertial._kernels import _wiener
-
     planes = require_planes(image, path, "path", path.extent_px())
     threads = options.threads or usable_processors()
     if planes.shape[2] == 3:
@@ -253,8 +251,14 @@ def _filter_image(
     else:
         light = linearise(planes).reshape(planes.shape)
         sharp = _filter_light(light, path, options, splitting, threads)
-    cells = Cells.of(path.field())
-    result = np.empty_like(planes)
+    return blend_where_blurred(planes, sharp, path, threads).reshape(image.shape)
+
+
+def blend_where_blurred(planes: NDArray[Code], sharp: Float32Array, path: BlurPath, threads: int) -> NDArray[Code]:
+    """Put filtered light into an image (H, W, C), without what is saturated or hardly blurred; in the image's codes."""
+    from colmap_inertial._kernels import _wiener
+
+    cells, result = Cells.of(path.field()), np.empty_like(planes)
     _wiener.blend(
         planes,
         sharp,
@@ -263,9 +267,9 @@ def _filter_image(
         slope=cells.slope,
         along_y=cells.along_y,
         fade=cells.fade,
-        decode=decode_table(image.dtype),
-        encode=encode_table(image.dtype),
-        saturated=lowest_saturated_code(image.dtype),
+        decode=decode_table(planes.dtype),
+        encode=encode_table(planes.dtype),
+        saturated=lowest_saturated_code(planes.dtype),
         threads=threads,
     )
-    return result.reshape(image.shape)
+    return result

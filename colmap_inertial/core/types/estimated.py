@@ -183,7 +183,7 @@ class ScaleEstimate:
     rotations
         Which cameras agree with the IMU; the estimate rests on those. ``None`` where they were not compared.
     jumped
-        Keyframes whose positions may be wrong, as they count little, or as the path jumps to and from them.
+        Keyframes whose positions may be wrong, as they count little, or as the path jumps there.
     method
         ``"spectral"`` or ``"joint"``; ``"none"`` where nothing could be estimated.
     """

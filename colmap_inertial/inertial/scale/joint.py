@@ -143,7 +143,7 @@ def estimate_joint(
 
 
 def _name_jumped(fit: Fit, data: Data, trajectory: CameraTrajectory) -> tuple[str, ...]:
-    """Images by themselves that hardly count, or that the path jumps to and from; behind a break the drift is free."""
+    """Images by themselves that hardly count, or at which the path jumps; behind a break the drift is free."""
     edges = np.concatenate([[True], data.broken, [True]])
     little = (fit.pose_weight < _LIMITS.counts_little) & ~np.append(False, data.broken)
     alone = (data.groups.count == 1) & (little | (edges[:-1] & edges[1:]))
