@@ -96,7 +96,7 @@ def check_rig(dataset: Path, folder: Path, most: int) -> dict[str, float | str]:
     baseline_m = float(np.linalg.norm(true[:3, 3]))
     truth = check(made.workspace.root / "sparse" / "0", dataset) if most >= 20 else {}
     return {
-        "images": made.models[0].registered_images,
+        "images": model["registered_images"],
         "verdict": model["verdict"],
         "baseline_m": sensor["baseline_m"],
         "true_baseline_m": baseline_m,
