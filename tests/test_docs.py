@@ -25,7 +25,7 @@ from test_pipeline import copy_scene
 import colmap_inertial
 from colmap_inertial.checks.report import write_report
 from colmap_inertial.cli import main, parse
-from colmap_inertial.colmap.dense import DenseResult
+from colmap_inertial.colmap.depth_maps import DenseResult
 from colmap_inertial.core.errors import InertialError, MappingError
 from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.core.types import CameraModel, FrameTiming, Treatment

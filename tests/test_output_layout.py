@@ -154,7 +154,7 @@ def dense_of(workspace, index, *, maps=False):
     if maps:
         (folder / "stereo" / "depth_maps" / "a.geometric.bin").write_text("hours")
     (folder / "fused.ply").write_text("points")
-    identity = {"model": dense_room.digest(workspace.sparse / str(index)), "max_image_size": 100}
+    identity = {"model": dense_room.digest_of_model(workspace.sparse / str(index)), "max_image_size": 100}
     (folder / "made_from.json").write_text(json.dumps(identity))
     (workspace.stamps / f"dense_{index}_fused.json").write_text("{}")
     return folder
@@ -211,7 +211,7 @@ def test_a_dense_reconstruction_that_was_cut_off_early_goes_with_its_model(works
         raise KeyboardInterrupt
 
     monkeypatch.setattr(pycolmap, "undistort_images", cut_off)
-    made_from = MadeFrom(model=dense_room.digest(models[0]), max_image_size=None, maps="plane sweep")
+    made_from = MadeFrom(model=dense_room.digest_of_model(models[0]), max_image_size=None, maps="plane sweep")
     prepared = dense_room._Prepared(names=(), made_from=made_from, has_maps=False)
     with pytest.raises(KeyboardInterrupt):
         dense_room._undistort(session, 0, workspace.images, prepared)

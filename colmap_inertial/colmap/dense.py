@@ -5,7 +5,6 @@ Depth maps are made by COLMAP's patch-match where pycolmap has CUDA, else by our
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import math
 import os
@@ -19,10 +18,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from colmap_inertial.colmap.depth_maps import (
+    DenseResult,
     MadeFrom,
-    Maker,
     choose_maker,
     coverage,
+    digest_of_model,
     find_maps,
     fuse_maps,
     map_file,
@@ -65,45 +65,6 @@ class DenseWork:
 
 
 _WORK = DenseWork()
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class DenseResult:
-    """The dense reconstruction of one model.
-
-    Attributes
-    ----------
-    folder
-        COLMAP's dense workspace.
-    images, depth_maps
-        How many undistorted images there are, and how many of them have a depth map.
-    maps
-        The method that made the depth maps: patch-match or plane sweep.
-    coverage
-        Share of the maps' pixels that have a depth.
-    fused, points
-        The point cloud (PLY); ``None`` while depth maps are missing.
-    mesh, faces
-        Its surface (PLY); ``None`` where none was asked for, or there are no points.
-    waiting
-        Why it is incomplete; empty where it is finished.
-    """
-
-    folder: Path
-    images: int
-    depth_maps: int
-    maps: Maker
-    coverage: float = 0.0
-    fused: Path | None = None
-    points: int = 0
-    mesh: Path | None = None
-    faces: int = 0
-    waiting: str = ""
-
-    def as_json(self, root: Path) -> dict[str, object]:
-        """As JSON types; paths are relative to ``root``."""
-        paths = {name: str(value.relative_to(root)) for name, value in vars(self).items() if isinstance(value, Path)}
-        return vars(self) | paths | {"waiting": self.waiting or None}
 
 
 def run_dense(session: Session, indices: Sequence[int], images: Path, options: DenseOptions) -> dict[int, DenseResult]:
@@ -249,7 +210,7 @@ def _prepare_model(session: Session, index: int, images: Path, options: DenseOpt
     reconstruction = read_model(model)
     names = tuple(sorted(reconstruction.image(i).name for i in reconstruction.reg_image_ids()))
     _check_images(images, model, reconstruction)
-    made_from, has_maps = choose_maker(folder, digest(model), options.max_image_size, session.context.colmap)
+    made_from, has_maps = choose_maker(folder, digest_of_model(model), options.max_image_size, session.context.colmap)
     return _Prepared(names=names, made_from=made_from, has_maps=has_maps)
 
 
@@ -311,15 +272,6 @@ def _undistort(session: Session, index: int, images: Path, prepared: _Prepared) 
         "images": [fingerprint(path_in(images, name, model)) for name in names],
     }
     runner.run(f"dense_{index}_undistorted", depends, [folder / "images", folder / "sparse"], work, after=["metric"])
-
-
-def digest(model: Path) -> str:
-    """Digest of a model's poses and cameras."""
-    found = hashlib.sha256()
-    for path in sorted(model.iterdir()):
-        if path.stem in ("cameras", "images", "rigs", "frames"):
-            found.update(path.read_bytes())
-    return found.hexdigest()
 
 
 def _check_images(images: Path, model: Path, reconstruction: pycolmap.Reconstruction) -> None:

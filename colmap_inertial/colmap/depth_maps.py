@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import subprocess
 import sys
@@ -70,9 +71,57 @@ class MadeFrom:
             write_json(path, values)
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DenseResult:
+    """The dense reconstruction of one model.
+
+    Attributes
+    ----------
+    folder
+        COLMAP's dense workspace.
+    images, depth_maps
+        How many undistorted images there are, and how many of them have a depth map.
+    maps
+        The method that made the depth maps: patch-match or plane sweep.
+    coverage
+        Share of the maps' pixels that have a depth.
+    fused, points
+        The point cloud (PLY); ``None`` while depth maps are missing.
+    mesh, faces
+        Its surface (PLY); ``None`` where none was asked for, or there are no points.
+    waiting
+        Why it is incomplete; empty where it is finished.
+    """
+
+    folder: Path
+    images: int
+    depth_maps: int
+    maps: Maker
+    coverage: float = 0.0
+    fused: Path | None = None
+    points: int = 0
+    mesh: Path | None = None
+    faces: int = 0
+    waiting: str = ""
+
+    def as_json(self, root: Path) -> dict[str, object]:
+        """As JSON types; paths are relative to ``root``."""
+        paths = {name: str(value.relative_to(root)) for name, value in vars(self).items() if isinstance(value, Path)}
+        return vars(self) | paths | {"waiting": self.waiting or None}
+
+
 def has_depth_maps(folder: Path) -> bool:
     """Whether a dense workspace holds depth or normal maps."""
     return any(file.is_file() for file in (folder / "stereo").glob("*_maps/**/*"))
+
+
+def digest_of_model(model: Path) -> str:
+    """Digest of a model's poses and cameras."""
+    found = hashlib.sha256()
+    for path in sorted(model.iterdir()):
+        if path.stem in ("cameras", "images", "rigs", "frames"):
+            found.update(path.read_bytes())
+    return found.hexdigest()
 
 
 def model_of(folder: Path) -> str | None:

@@ -12,9 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.arrays import Array, check_array
 from colmap_inertial.core.types import Projector
-from colmap_inertial.core.validation import check_array
 from colmap_inertial.imaging._bilinear import interpolate_nodes
 from colmap_inertial.imaging.blur_field import BlurField, check_nodes
 

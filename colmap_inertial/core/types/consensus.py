@@ -7,8 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
-from colmap_inertial.core.validation import check_fields, set_fields
+from colmap_inertial.core.arrays import Array, BoolArray, IndexArray, check_fields, set_fields
 
 
 @dataclass(frozen=True, kw_only=True)

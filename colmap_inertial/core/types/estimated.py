@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.arrays import Array, check_field, check_fields, check_increasing, set_fields
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import matrix_from_quat, rotation_between, skew
 from colmap_inertial.core.options import WorldAxes
@@ -17,7 +17,6 @@ from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.types.consensus import RotationConsensus
 from colmap_inertial.core.types.imu import CameraImuCalibration, ImuCalibration, ImuNoise
 from colmap_inertial.core.types.recorded import LengthUnit, ReadoutDirection
-from colmap_inertial.core.validation import check_field, check_fields, check_increasing, set_fields
 
 Verdict = Literal["trusted", "weak", "refused"]
 

@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.arrays import Array, check_fields
 from colmap_inertial.core.summary import prints_in_lines
-from colmap_inertial.core.validation import check_fields
 
 #: Order of the parameters in ``CameraImuCalibration.cov``. The rotation error is in the camera frame, on the left:
 #: true = exp(error) * estimate.

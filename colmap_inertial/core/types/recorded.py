@@ -8,10 +8,18 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array, BoolArray, IndexArray, Int64Array, UInt8Array, UInt16Array
+from colmap_inertial.core.arrays import (
+    Array,
+    BoolArray,
+    IndexArray,
+    Int64Array,
+    UInt8Array,
+    UInt16Array,
+    check_fields,
+    set_fields,
+)
 from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply
 from colmap_inertial.core.summary import prints_in_lines
-from colmap_inertial.core.validation import check_fields, set_fields
 
 LengthUnit = Literal["model", "m"]
 ReadoutDirection = Literal["down", "up", "right", "left"]

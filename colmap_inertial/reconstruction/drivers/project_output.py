@@ -8,8 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from colmap_inertial.colmap.dense import digest
-from colmap_inertial.colmap.depth_maps import has_depth_maps, model_of
+from colmap_inertial.colmap.depth_maps import digest_of_model, has_depth_maps, model_of
 from colmap_inertial.core.errors import OutputError, OutputExistsError
 from colmap_inertial.core.options import ProjectOptions
 from colmap_inertial.io.files import check_names, path_in, read_json, read_record, write_json, write_record
@@ -193,7 +192,7 @@ def remove_stale_dense(workspace: Workspace, models: Mapping[int, Path]) -> None
     places = [place for place in (workspace.dense, workspace.earlier) if place.is_dir()]
     if not places or workspace.dense in list_placed_paths(workspace):  # the project's own goes with its models
         return
-    digests = {index: digest(model) for index, model in models.items()}
+    digests = {index: digest_of_model(model) for index, model in models.items()}
     for folder in sorted(workspace.dense.glob("*")):
         made_from, index = model_of(folder), folder.name
         number = int(index) if index.isdecimal() and index.isascii() else -1

@@ -11,7 +11,7 @@ import numpy as np
 
 from colmap_inertial import __version__
 from colmap_inertial.checks.validate import Validation
-from colmap_inertial.colmap.dense import DenseResult
+from colmap_inertial.colmap.depth_maps import DenseResult
 from colmap_inertial.colmap.mapping import MapRecord
 from colmap_inertial.colmap.sparse import KeypointRecords, MatchRecord
 from colmap_inertial.core.errors import InertialError, NotObservableError
