@@ -1,7 +1,8 @@
 """The whole run against bare COLMAP: processor time, registered images, camera error, loops.
 
     python scripts/bench_whole.py FOLDER [--euroc DATASET] [--walk FRAMES] [--loop FRAMES] [--repeated SCENES]
-        [--drawn] [--long FRAMES ...] [--mappers {incremental,global,bare} ...] [--workers N] [--json FILE]
+        [--drawn] [--long FRAMES ...] [--density D] [--seeds SEED ...] [--workers N] [--json FILE]
+        [--mappers {incremental,one,global,bare} ...]
 
 FOLDER takes captures and reconstructions. ``--euroc``: the 100 keyframes of V1_01_easy (DATASET has ``keyframes/``,
 ``mav0/`` and ``gt/``), bare COLMAP matching every pair. ``--walk``: a simulated walk around a room back to its start
@@ -23,16 +24,18 @@ that comes back to where an earlier one was (half a metre, 20 degrees) is missed
 frames of it. Features are synthesised, so that copies look the same as they can; ``--drawn``: found in drawn pictures.
 
 ``--long``: what mapping a walk of so many frames around a room takes, which is as large as the walk is long: processor
-time, memory beyond that of what is loaded, error. ``incremental`` is ours, in parts where it is long; ``global``
-COLMAP's; ``bare`` COLMAP's incremental one with its own settings, in one go. Features are synthesised. Parts are mapped
-by ``--workers`` processes; the longest chain is this process's own time and that of as many parts, of equal length, as
-one worker maps: the time on as many idle processors. Memory is that of this process.
+time, memory beyond that of what is loaded, error. ``incremental`` is ours, in parts where it is long; ``one`` the same
+in one go; ``global`` COLMAP's; ``bare`` COLMAP's incremental one with its own settings, in one go. Features are
+synthesised, 132 a frame for each 1 of ``--density``. Parts are mapped by ``--workers`` processes; the longest chain is
+this process's own time and that of as many parts, of equal length, as one worker maps: the time on as many idle
+processors. Memory is that of this process.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
 import json
 import math
 import resource
@@ -85,8 +88,8 @@ SAME_M, BACK_M, BACK_DEG, BESIDE = 0.15, 0.5, 20.0, 4
 LOOP_DENSITY, REPEATED_DENSITY = 1.2, 1.5
 #: Of long walks.
 PACE_M_S = 0.8
-#: Ours, COLMAP's global one as we call it, and COLMAP's incremental one with its own settings.
-MAPPERS = ("incremental", "global", "bare")
+#: Ours, ours in one go, COLMAP's global one as we call it, and COLMAP's incremental one with its own settings.
+MAPPERS = ("incremental", "one", "global", "bare")
 
 
 def bare(capture: Path, out: Path, *, sequential: bool) -> None:
@@ -345,22 +348,26 @@ def loop_errors(walk: Walk, folder: Path) -> dict[str, Figures]:
     return found
 
 
-def long_walk(frames: int, folder: Path, mappers: Sequence[str], workers: int) -> dict[str, Figures]:
-    """What each mapper takes for a walk of so many frames: processor time and memory."""
+def long_walk(walk: Walk, density: float, folder: Path, mappers: Sequence[str], workers: int) -> dict[str, Figures]:
+    """What matching and each mapper take for a walk: processor time and memory."""
     keep_colmap_quiet()
-    walk = Walk(seed=100, frames=frames, frame_rate_hz=8.0, drawn=False, pace_m_s=PACE_M_S)
     write_walk(walk, folder)
     recording, context = recorded(folder), RunContext(scratch=folder, num_threads=1)
     camera, names = recording.capture.camera, recording.timing.names
     features, database = folder / "features.db", folder / "database.db"
     if not features.is_file():
-        write_features(walk, names, features, density=LOOP_DENSITY)
+        write_features(walk, names, features, density=density)
     for left in folder.glob(f"{database.name}*"):
         left.unlink()
-    begun_s = time.process_time()
+    before_mib, begun_s = peak_mib(reset=True), time.process_time()
     record = match_capture(features, database, recording, camera, MappingOptions(pairing="sequential"), context)
     found: dict[str, Figures] = {
-        "matching": {"processor_s": time.process_time() - begun_s, "verified": record.verified}
+        "matching": {
+            "processor_s": time.process_time() - begun_s,
+            "mib_a_frame": (peak_mib() - before_mib) / len(names),
+            "verified": record.verified,
+            "loops_closed": record.loops_closed,
+        }
     }
     print(json.dumps(found), flush=True)
     for mapper in mappers:
@@ -375,8 +382,10 @@ def long_walk(frames: int, folder: Path, mappers: Sequence[str], workers: int) -
     return found
 
 
-def peak_mib() -> float:
-    """The most memory that this process had; what ``getrusage`` says counts its parent's, too."""
+def peak_mib(*, reset: bool = False) -> float:
+    """The most memory that this process had, or has from now on; what ``getrusage`` says counts its parent's, too."""
+    if reset:
+        Path("/proc/self/clear_refs").write_text("5")
     (line,) = (line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
     return int(line.split()[1]) / 1024
 
@@ -403,7 +412,7 @@ def map_by(mapper: str, folder: Path, workers: int) -> Figures:
             models,
             MappingOptions(mapper="global" if mapper == "global" else "incremental", refine_intrinsics=False),
             context=RunContext(scratch=folder, num_threads=1, workers=workers),
-            in_time=list(truth),
+            in_time=[] if mapper == "one" else list(truth),
         )
         told |= {"parts": record.parts, "ends_joined": sum(met.joined for met in record.ends)}
     own_s, children = time.process_time() - begun_s, resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -440,8 +449,12 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="seed of the first scene")
     parser.add_argument("--drawn", action="store_true", help="find the scenes' features in drawn pictures")
     parser.add_argument("--long", type=int, nargs="*", default=[], help="frames")
+    parser.add_argument("--density", type=float, default=LOOP_DENSITY, help="of long walks' features")
+    parser.add_argument("--seeds", type=int, nargs="*", default=[100], help="of long walks")
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--mappers", nargs="*", choices=MAPPERS, default=MAPPERS[:2], help="of long walks")
+    parser.add_argument(
+        "--mappers", nargs="*", choices=MAPPERS, default=["incremental", "global"], help="of long walks"
+    )
     parser.add_argument("--workers", type=int, default=4, help="processes that map the parts of long walks")
     parser.add_argument("--map-by", choices=MAPPERS, help=argparse.SUPPRESS)
     parser.add_argument("--bare-sequential", type=Path, help=argparse.SUPPRESS)
@@ -473,9 +486,10 @@ def main() -> None:
         walk = Walk(seed=seed, frames=160, frame_rate_hz=3.2, laps=1.15, scene=scene, width=wide, drawn=args.drawn)
         found[folder.name] = {"scene": scene, **false_loops(walk, folder)}
         print(json.dumps({folder.name: found[folder.name]}), flush=True)
-    for frames in args.long:
-        folder = args.folder / f"long{frames}"
-        found[folder.name] = long_walk(frames, folder, args.mappers, args.workers)
+    for frames, seed in itertools.product(args.long, args.seeds):
+        folder = args.folder / f"long{frames}_seed{seed}_density{args.density:g}"
+        walk = Walk(seed=seed, frames=frames, frame_rate_hz=8.0, drawn=False, pace_m_s=PACE_M_S)
+        found[folder.name] = long_walk(walk, args.density, folder, args.mappers, args.workers)
         print(json.dumps({folder.name: found[folder.name]}, indent=1), flush=True)
     write_report(args.json, found)
 

@@ -1489,8 +1489,8 @@ MUTANTS = (
     ),
     Mutant(
         "colmap/loop_closure.py",
-        "if _work(reconstruction) <= _work_of(LONGEST):",
-        "if True:",
+        "if images > LONGEST and _work(reconstruction) <= _work_of(LONGEST):",
+        "if images > LONGEST:",
         "a large model of which all images see the same is solved directly",
         ("closing::test_a_large_model_is_solved_directly_unless_all_images_see_the_same",),
     ),
@@ -1502,11 +1502,11 @@ MUTANTS = (
         ("submaps::test_ends_of_a_lap_are_placed_by_their_matches_where_these_may_be_believed",),
     ),
     Mutant(
-        "colmap/mapping.py",
-        "if len(in_time) > LONGEST and not every_pair:",
-        "if len(in_time) >= LONGEST and not every_pair:",
-        "what is short enough for one go is mapped in parts",
-        ("submaps::test_what_is_too_long_for_one_go_is_mapped_in_parts",),
+        "colmap/submaps.py",
+        "if count < (SIZES.least_refined if refined else SIZES.least):",
+        "if count <= (SIZES.least_refined if refined else SIZES.least):",
+        "what is long enough for parts is mapped in one go",
+        ("submaps::test_what_is_long_is_mapped_in_parts", "submaps::test_a_capture_is_split_by_its_observations"),
     ),
     Mutant(
         "colmap/steps.py",

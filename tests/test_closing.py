@@ -253,10 +253,13 @@ def test_a_large_model_is_solved_directly_unless_all_images_see_the_same(tmp_pat
         ring.model.add_point3D(np.zeros(3), pycolmap.Track(elements), np.zeros(3, dtype=np.uint8))
     assert (loop_closure._work(ring.model) == loop_closure._work_of(FRAMES)) == all_see_it
     as_it_is = pycolmap.BundleAdjustmentOptions().ceres.max_num_images_direct_sparse_cpu_solver
-    adjustment = loop_closure._adjustment(ring.options, ring.model)
-    # what is small is as COLMAP has it
+    adjustment = loop_closure._adjustment(ring.options, ring.model, of_parts=False)
+    # what is small is as COLMAP has it, and a model of parts ends early
+    assert adjustment.ceres.solver_options.function_tolerance == 0
+    of_parts = loop_closure._adjustment(ring.options, ring.model, of_parts=True)
+    assert of_parts.ceres.solver_options.function_tolerance == loop_closure.CLOSURE.least_gain
     assert adjustment.ceres.max_num_images_direct_sparse_cpu_solver == as_it_is
     monkeypatch.setattr(loop_closure, "LONGEST", FRAMES - 8)
-    adjustment = loop_closure._adjustment(ring.options, ring.model)
+    adjustment = loop_closure._adjustment(ring.options, ring.model, of_parts=False)
     assert adjustment.ceres.max_num_images_direct_sparse_cpu_solver == (FRAMES if directly else as_it_is)
     assert adjustment.ceres.solver_options.function_tolerance > 0

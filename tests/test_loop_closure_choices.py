@@ -1,5 +1,6 @@
 """Which pairs of a model are torn, and what an adjustment costs: against loops."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -70,7 +71,8 @@ def test_parts_that_are_not_named_are_not_looked_at(monkeypatch):
     assert torn(monkeypatch, {("00", "15"): (0, 40)}, parts=parts) == []
 
 
-def test_links_are_counted_as_by_a_search_in_breadth():
+def test_links_are_counted_as_by_a_search_in_breadth(monkeypatch):
+    monkeypatch.setattr(loop_closure, "CLOSURE", replace(loop_closure.CLOSURE, links=3))
     rng = np.random.default_rng(2)
     names = [f"{k}" for k in range(25)]
     linked = [(names[a], names[b]) for a, b in rng.integers(0, 25, (24, 2)).tolist() if a != b]
@@ -85,8 +87,9 @@ def test_links_are_counted_as_by_a_search_in_breadth():
                 break
             reached, rounds = reached | more, rounds + 1
         expected.append(rounds)
-    assert loop_closure._hops(names, linked, asked) == expected
-    assert loop_closure._hops(names, linked, []) == []
+    within = loop_closure._within_links(names, linked, names)
+    assert [b in within[a] for a, b in asked] == [rounds <= 3 for rounds in expected]
+    assert {rounds <= 3 for rounds in expected if np.isfinite(rounds)} == {True, False}
 
 
 def test_where_all_see_the_same_the_work_is_the_sum_of_squares():

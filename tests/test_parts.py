@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 import sqlite3
 import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -12,7 +15,7 @@ from test_closing import NAMES, make
 
 from colmap_inertial.cli import main
 from colmap_inertial.cli.captures import Reconstruct
-from colmap_inertial.colmap.parts import map_parts, start_part, write_part_database
+from colmap_inertial.colmap.parts import PartJob, map_parts, start_part, write_part_database
 from colmap_inertial.core.errors import MappingError
 from colmap_inertial.core.threads import usable_processors, using_workers
 from colmap_inertial.pipeline.run.context import RunContext
@@ -36,13 +39,10 @@ def options_of(ring, begin, end):
 
 
 def jobs_in(folder: Path, ring):
-    jobs = []
-    for number, (begin, end) in enumerate(PARTS):
-        own = folder / str(number)
-        own.mkdir(parents=True)
-        write_part_database(ring.database, NAMES[begin:end], own / "part.db")
-        jobs.append((own, options_of(ring, begin, end)))
-    return jobs
+    return [
+        PartJob.prepare(ring.database, options_of(ring, begin, end), folder / str(number))
+        for number, (begin, end) in enumerate(PARTS)
+    ]
 
 
 def files(folder: Path):
@@ -57,7 +57,10 @@ def test_a_part_s_database_holds_its_own_images_and_pairs(ring, tmp_path):
         numbers = dict(opened.execute("SELECT name, image_id FROM images"))
     own = {numbers[name] for name in NAMES[5:15]}
     with pycolmap.Database.open(str(ring.database)) as whole, pycolmap.Database.open(str(tmp_path / "part.db")) as part:
-        assert [image.todict() for image in part.read_all_images()] == [i.todict() for i in whole.read_all_images()]
+        images = [image.todict() for image in whole.read_all_images() if image.image_id in own]
+        assert [image.todict() for image in part.read_all_images()] == images
+        frames = [frame.todict() for frame in whole.read_all_frames() if {d.id for d in frame.data_ids} <= own]
+        assert [frame.todict() for frame in part.read_all_frames()] == frames and len(frames) == len(own)
         assert {k for k in numbers.values() if part.num_keypoints_for_image(k)} == own
         kept = dict(zip(*part.read_two_view_geometry_num_inliers(), strict=True))
         all_pairs = dict(zip(*whole.read_two_view_geometry_num_inliers(), strict=True))
@@ -83,7 +86,7 @@ def test_models_are_those_of_the_whole_database_in_this_process_for_any_number_o
     for workers in (1, 2):
         jobs, told = jobs_in(tmp_path / f"workers{workers}", ring), []
         models = list(map_parts(jobs, tmp_path, workers=workers, registered=lambda told=told: told.append(1)))
-        assert [files(folder / "models") for folder, _ in jobs] == expected
+        assert [files(job.models) for job in jobs] == expected
         assert [{k: model.num_reg_images() for k, model in found.items()} for found in models] == [
             {0: end - begin} for begin, end in PARTS
         ]
@@ -92,7 +95,7 @@ def test_models_are_those_of_the_whole_database_in_this_process_for_any_number_o
 
 def test_a_part_that_fails_or_is_killed_is_an_error_in_a_sentence(ring, tmp_path, monkeypatch):
     broken = jobs_in(tmp_path / "broken", ring)
-    (broken[1][0] / "part.db").write_bytes(b"no database")
+    (broken[1].folder / "part.db").write_bytes(b"no database")
     with pytest.raises(MappingError, match="part 2 cannot be mapped"):
         list(map_parts(broken, tmp_path, workers=2, registered=lambda: None))
     started, popen = [], subprocess.Popen
@@ -112,18 +115,88 @@ def test_a_part_that_fails_or_is_killed_is_an_error_in_a_sentence(ring, tmp_path
     assert all(process.poll() is not None for process in started)
 
 
+def test_a_part_is_kept_unless_what_it_reads_changed_or_it_is_damaged(ring, tmp_path):
+    import pycolmap
+
+    def prepare(number: int, database=ring.database, seed: int = 3, names=NAMES[0:18]):
+        options = options_of(ring, 0, 18)
+        options.image_names, options.random_seed = names, seed
+        return PartJob.prepare(database, options, tmp_path / str(number))
+
+    (made,) = map_parts([prepare(0)], tmp_path, workers=1, registered=lambda: None)
+    assert made[0].num_reg_images() == 18
+    again, told = prepare(1), []
+    assert again.is_made() and not prepare(2, seed=4).is_made() and not prepare(3, names=NAMES[1:18]).is_made()
+    outside, inside = tmp_path / "outside.db", tmp_path / "inside.db"
+    for path, pair in ((outside, (30, 31)), (inside, (2, 3))):
+        path.write_bytes(ring.database.read_bytes())
+        with pycolmap.Database.open(str(path)) as opened:
+            opened.delete_two_view_geometry(*pair)
+    assert prepare(4, outside).is_made() and not prepare(5, inside).is_made()
+    (kept,) = map_parts([again], tmp_path, workers=1, registered=lambda: told.append(1))
+    assert len(told) == 18 and kept[0].num_reg_images() == 18 and again.folder.exists()  # nothing was started
+    points = again.models / "0" / "points3D.bin"
+    points.write_bytes(points.read_bytes()[:-9])
+    assert not again.is_made() and not again.models.exists()
+
+
+#: Maps the ring in short parts, one after the other; prints how many there are, and how many were started.
+_MAP = """
+import sys
+from dataclasses import replace
+from pathlib import Path
+from colmap_inertial.colmap import mapping, parts, submaps
+from colmap_inertial.core.options import MappingOptions
+from colmap_inertial.pipeline.run.context import RunContext
+
+submaps.SIZES = replace(submaps.SIZES, least=2, shortest=12, longest=12, shared=1 / 3)
+started, start = [], parts.start_part
+parts.start_part = lambda *args: (started.append(1), start(*args))[1]
+database, folder = Path(sys.argv[1]), Path(sys.argv[2])
+names = [f"{k:03d}.jpg" for k in range(48)]
+options = MappingOptions(overlap=3, pairing="sequential", refine_intrinsics=False)
+context = RunContext(scratch=folder, num_threads=1, workers=1)
+record = mapping.map_images(database, folder, folder / "sparse", options, context, in_time=names)
+print(record.parts, len(started))
+"""
+
+
+def test_a_run_that_was_killed_makes_only_the_missing_parts_again(ring, tmp_path):
+    def finished(folder):
+        return [path for path in folder.glob("mapped_parts/*") if len(path.name) == 32]
+
+    def start(folder):
+        folder.mkdir(exist_ok=True)
+        command = [sys.executable, "-c", _MAP, ring.database, folder]
+        return subprocess.Popen(list(map(str, command)), stdout=subprocess.PIPE, text=True)
+
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    parts, started = map(int, start(whole).communicate()[0].split())
+    assert started == parts >= 5 and not (whole / "mapped_parts").exists()
+    process = start(killed)
+    while len(finished(killed)) < 2 and process.poll() is None:
+        time.sleep(0.02)
+    process.kill()
+    process.communicate()
+    kept = len(finished(killed))
+    assert 2 <= kept < parts
+    shutil.rmtree(killed / "sparse")  # as a step's runner does
+    assert start(killed).communicate()[0].split() == [str(parts), str(parts - kept)]
+    assert files(killed / "sparse") == files(whole / "sparse") != {}
+
+
 @pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="no SIGSTOP here")
 def test_a_process_ends_with_the_one_that_started_it(ring, tmp_path):
     """Its standard input ends then, as the kernel closes it."""
-    folder, options = jobs_in(tmp_path, ring)[0]
-    process = start_part(folder, options, tmp_path)
+    job = jobs_in(tmp_path, ring)[0]
+    process = start_part(job, tmp_path)
     with process.stdout:
         assert process.stdout.read(1) == b"."  # at work
         process.send_signal(signal.SIGSTOP)
         process.stdin.close()
         process.send_signal(signal.SIGCONT)
         assert process.wait(timeout=60) == 1
-    assert not (folder / "models" / "0").exists()
+    assert not (job.folder / "models" / "0").exists() and not job.models.exists()
 
 
 def test_the_number_of_workers_is_that_of_the_command_and_no_option_of_the_result(monkeypatch):

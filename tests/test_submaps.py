@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ from test_closing import FRAMES, NAMES, make
 
 from colmap_inertial.colmap import mapping, submaps
 from colmap_inertial.colmap.loop_closure import LONGEST, LoopClosure, SubmapOverlap, merge_overlaps
-from colmap_inertial.colmap.submaps import PART, SHARED, MappedRun, join_runs, merge_parts, place_parts, runs
+from colmap_inertial.colmap.parts import write_part_database
+from colmap_inertial.colmap.submaps import MappedRun, join_runs, merge_parts, place_parts, runs, split_capture
 from colmap_inertial.core.geometry import so3_exp
 from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.model.submodels.graph import Placements, SimilarityConstraint
@@ -24,14 +26,43 @@ PARTS = [(0, 18), (12, 30), (24, 42), (36, 48)]
 
 @pytest.mark.parametrize("count", [1001, 1040, 2000, 3601, 12345])
 def test_runs_hold_every_image_and_share_some_with_the_next(count):
-    found = runs(count)
+    found = runs(count, longest=400, shared=40)
     assert found[0][0] == 0 and found[-1][1] == count
     lengths = [end - begin for begin, end in found]
-    assert max(lengths) <= PART + 1 and max(lengths) - min(lengths) <= 1 + 1
+    assert max(lengths) <= 400 + 1 and max(lengths) - min(lengths) <= 1 + 1
     for (_, end), (begin, _) in itertools.pairwise(found):
-        assert end - begin == SHARED
+        assert end - begin == 40
     # one fewer would not do
-    assert (len(found) - 1) * (PART - SHARED) + SHARED < count
+    assert (len(found) - 1) * 360 + 40 < count
+
+
+@pytest.mark.parametrize(
+    ("count", "observations", "refined", "longest", "shared"),
+    [
+        (299, 1100, False, 299, 0),
+        (300, 160, False, 200, 40),
+        (2000, 550, False, 200, 40),
+        (500, 700, False, 157, 31),
+        (500, 1100, False, 100, 20),
+        (500, 5000, False, 100, 20),
+        (500, 0, False, 200, 40),
+        (1000, 1100, True, 1000, 0),
+        (1001, 1100, True, 400, 40),
+    ],
+)
+def test_a_capture_is_split_by_its_observations(count, observations, refined, longest, shared):
+    """Parts hold 110,000 observations and 100 to 200 images, a fifth of them the next one's, too."""
+    graph = SimpleNamespace(num_observations_for_image=lambda number: observations + (-1) ** number)
+    capture = SimpleNamespace(
+        names=[f"{k}" for k in range(count)],
+        pipeline=SimpleNamespace(ba_refine_focal_length=refined),
+        cache=SimpleNamespace(correspondence_graph=graph, images=dict.fromkeys(range(count if observations else 0))),
+    )
+    found = split_capture(capture)
+    assert found[0][0] == 0 and found[-1][1] == count
+    assert max(end - begin for begin, end in found) <= longest + 1
+    assert {end - begin for (_, end), (begin, _) in itertools.pairwise(found)} == ({shared} if shared else set())
+    assert len(found) == (1 if not shared else -(-(count - shared) // (longest - shared)))
 
 
 def similarity(scale=1.0, turn_rad=(0.0, 0, 0), translation=(0.0, 0, 0)):
@@ -324,28 +355,26 @@ def test_the_largest_part_s_camera_is_that_of_all(ring, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("longest", "pairing", "in_parts"),
-    [(FRAMES - 1, "sequential", True), (FRAMES, "sequential", False), (FRAMES - 1, "exhaustive", False)],
+    ("least", "pairing", "in_parts"), [(48, "sequential", True), (49, "sequential", False), (48, "exhaustive", False)]
 )
-def test_what_is_too_long_for_one_go_is_mapped_in_parts(tmp_path, monkeypatch, longest, pairing, in_parts):
+def test_what_is_long_is_mapped_in_parts(tmp_path, monkeypatch, least, pairing, in_parts):
     import pycolmap
 
     ring = make(tmp_path, drift=1.0, wider=1.0, true_focal_px=200.0)
-    monkeypatch.setattr(mapping, "LONGEST", longest)
-    monkeypatch.setattr(mapping, "runs", lambda count: PARTS)
-    asked, told, write, incremental = [], [], submaps.write_part_database, pycolmap.incremental_mapping
+    monkeypatch.setattr(submaps, "SIZES", replace(submaps.SIZES, least=least, shortest=18, longest=18, shared=1 / 3))
+    asked, told, incremental = [], [], pycolmap.incremental_mapping
 
     def write_part(database, names, part):
         asked.append(list(names))
-        # what a kill leaves goes with the folder
-        assert part.parents[2] == tmp_path / "sparse"
-        write(database, names, part)
+        # what a kill leaves is found by the next run
+        assert part.parents[1] == tmp_path / "mapped_parts"
+        write_part_database(database, names, part)
 
     def in_one_go(*args, options, **more):
         asked.append(list(options.image_names))
         return incremental(*args, options=options, **more)
 
-    monkeypatch.setattr(submaps, "write_part_database", write_part)
+    monkeypatch.setattr("colmap_inertial.colmap.parts.write_part_database", write_part)
     monkeypatch.setattr(pycolmap, "incremental_mapping", in_one_go)
     record = mapping.map_images(
         ring.database,
@@ -355,10 +384,11 @@ def test_what_is_too_long_for_one_go_is_mapped_in_parts(tmp_path, monkeypatch, l
         context=RunContext(scratch=tmp_path, num_threads=1, progress=lambda *step: told.append(step)),
         in_time=NAMES,
     )
-    assert asked == ([NAMES[begin:end] for begin, end in PARTS] if in_parts else [[]])
-    assert len(record.seams) == (4 if in_parts else 0) and all(seam.joined for seam in record.seams)
-    made = mapping.MapRecord(mapper="incremental", models=1, parts=len(PARTS) if in_parts else 1, seams=record.seams)
-    assert record == made
+    expected = runs(FRAMES, longest=18, shared=6)
+    assert asked == ([NAMES[begin:end] for begin, end in expected] if in_parts else [[]])
+    assert bool(record.seams) == in_parts and all(seam.joined for seam in record.seams)
+    number = len(expected) if in_parts else 1
+    assert record == mapping.MapRecord(mapper="incremental", models=1, parts=number, seams=record.seams)
     model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
     assert model.num_reg_images() == FRAMES and error_m(ring, model) < 0.008
     done = [count for _, count, total in told if total == FRAMES]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -51,8 +51,8 @@ class LoopClosureLimits:
     agreeing_share: float = 0.5
     #: To move ends that are far apart takes more rounds than COLMAP's 50; 500 frames, off by a metre, took 60.
     rounds: int = 200
-    #: COLMAP's rounds end by the gradient alone, which grows with the model; of models beyond ``LONGEST``, they end
-    #: where one takes less than this share of what remains.
+    #: COLMAP's rounds end by the gradient alone, which grows with the model; of models beyond ``LONGEST`` and of those
+    #: that are made of parts, they end where one takes less than this share of what remains.
     least_gain: float = 1e-7
 
 
@@ -206,7 +206,7 @@ def merge_overlaps(
     torn = sorted(itertools.chain(*of_seam.values()), key=lambda pair: (-len(pair.points), pair.first, pair.second))
     merge_points(reconstruction, (couple for pair in torn for couple in map(tuple, pair.points.tolist())))
     try:
-        _adjust(reconstruction, capture)
+        _adjust(reconstruction, capture, of_parts=len(set(part_of.values())) > 1)
         adjusted = Submodel(reconstruction)
         agree = {seam: _agreeing_share(adjusted, pairs) for seam, pairs in of_seam.items()}
         kept = reconstruction.num_reg_images() / images
@@ -228,18 +228,18 @@ def _seam(part_of: Mapping[str, int], first: str, second: str) -> Pair:
     return min(a, b), max(a, b)
 
 
-def _adjust(reconstruction: pycolmap.Reconstruction, capture: MappedCapture) -> None:
+def _adjust(reconstruction: pycolmap.Reconstruction, capture: MappedCapture, *, of_parts: bool) -> None:
     """Adjust a model whose points were merged, and complete its points in turn, as COLMAP does at the end."""
     import pycolmap
 
     pipeline = capture.pipeline
-    options = _adjustment(pipeline, reconstruction)
+    options = _adjustment(pipeline, reconstruction, of_parts=of_parts)
     options.ceres.solver_options.max_num_iterations = CLOSURE.rounds
     pycolmap.bundle_adjustment(reconstruction, capture.settings.apply(options))
     mapper = pycolmap.IncrementalMapper(capture.cache)
     mapper.begin_reconstruction(reconstruction)
     # COLMAP's own loop would answer no signal until its end
-    options = capture.settings.apply(_adjustment(pipeline, reconstruction))
+    options = capture.settings.apply(_adjustment(pipeline, reconstruction, of_parts=of_parts))
     mapper.complete_and_merge_tracks(pipeline.get_triangulation())
     mapper.retriangulate(pipeline.get_triangulation())
     for _ in range(pipeline.ba_global_max_refinements):
@@ -268,7 +268,7 @@ def _agreeing_share(model: Submodel, torn: Sequence[_TornPair]) -> float:
 
 
 def _adjustment(
-    pipeline: pycolmap.IncrementalPipelineOptions, reconstruction: pycolmap.Reconstruction
+    pipeline: pycolmap.IncrementalPipelineOptions, reconstruction: pycolmap.Reconstruction, *, of_parts: bool
 ) -> pycolmap.BundleAdjustmentOptions:
     """Options of the adjustment of a whole model: direct, however many images, where few see the same, as along a
     chain.
@@ -276,11 +276,11 @@ def _adjustment(
     adjustment = pipeline.get_global_bundle_adjustment()
     adjustment.print_summary = False
     images = reconstruction.num_reg_images()
-    if images > LONGEST:
+    if of_parts or images > LONGEST:
         adjustment.ceres.solver_options.function_tolerance = CLOSURE.least_gain
-        # no more work than COLMAP takes on itself, where as many images as its limit is all see the same
-        if _work(reconstruction) <= _work_of(LONGEST):
-            adjustment.ceres.max_num_images_direct_sparse_cpu_solver = images
+    # no more work than COLMAP takes on itself, where as many images as its limit is all see the same
+    if images > LONGEST and _work(reconstruction) <= _work_of(LONGEST):
+        adjustment.ceres.max_num_images_direct_sparse_cpu_solver = images
     return adjustment
 
 
@@ -338,20 +338,22 @@ def _find_torn_pairs(
             limit = nearest.get(_seam(part_of, first, second), -1)
             if limit is None or abs(place[first] - place[second]) <= limit:
                 suspects.append(_TornPair(first=first, second=second, features=matches[both], points=points[both]))
-    hops = _hops(sorted(timed), linked, [(pair.first, pair.second) for pair in suspects])
-    return [pair for pair, over in zip(suspects, hops, strict=True) if over > CLOSURE.links]
+    within = _within_links(sorted(timed), linked, {pair.first for pair in suspects})
+    return [pair for pair in suspects if pair.second not in within[pair.first]]
 
 
-def _hops(names: Sequence[str], linked: Sequence[tuple[str, str]], asked: Sequence[tuple[str, str]]) -> list[float]:
-    """Number of linked pairs on the shortest path from one image to the other."""
+def _within_links(
+    names: Sequence[str], linked: Sequence[tuple[str, str]], begins: Collection[str]
+) -> dict[str, set[str]]:
+    """Images that are linked to some over no more others than neighbours are."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import dijkstra
 
-    if not asked:
-        return []
     at = {name: index for index, name in enumerate(names)}
     ends = np.array([(at[a], at[b]) for a, b in linked], dtype=np.intp).reshape(-1, 2)
     graph = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(len(at), len(at))).tocsr()
-    begin, row = np.unique([at[a] for a, _ in asked], return_inverse=True)
-    away = dijkstra(graph, directed=False, unweighted=True, indices=begin)
-    return [float(away[k, at[b]]) for k, (_, b) in zip(row.tolist(), asked, strict=True)]
+    near = {}
+    for name in begins:  # one at a time: in a long capture there are many
+        away = dijkstra(graph, directed=False, unweighted=True, indices=[at[name]], limit=CLOSURE.links)[0]
+        near[name] = {names[index] for index in np.flatnonzero(np.isfinite(away)).tolist()}
+    return near

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import itertools
 import logging
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from colmap_inertial.colmap.loop_closure import LONGEST, LoopClosure, MappedCapture, close_gaps
+from colmap_inertial.colmap.loop_closure import LoopClosure, MappedCapture, close_gaps
 from colmap_inertial.colmap.sparse import matches_every_pair
-from colmap_inertial.colmap.submaps import join_runs, map_runs, runs
+from colmap_inertial.colmap.submaps import join_runs, map_runs, split_capture
 from colmap_inertial.core.errors import MappingError
 from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.io.sqlite import open_foreign
@@ -20,6 +19,7 @@ from colmap_inertial.model import find_models
 from colmap_inertial.model.soundness import check_binary_model
 from colmap_inertial.pipeline.run.context import RunContext
 from colmap_inertial.pipeline.run.progress import Progress
+from colmap_inertial.pipeline.run.runner import remove
 from colmap_inertial.pipeline.run.workspace import require_room
 
 if TYPE_CHECKING:
@@ -30,6 +30,8 @@ log = logging.getLogger(__name__)
 #: Where cameras are known, the whole model is adjusted each time it has grown so much, as COLMAP's own settings for
 #: videos have it, and at the end; unknown cameras bend a model that is adjusted so seldom.
 _GLOBAL_RATIO = 1.4
+#: Parts of a long capture are kept there until its models are made.
+_PARTS = "mapped_parts"
 #: Images within so many times the overlap are neighbours in time.
 _NEIGHBOURS = 2
 
@@ -109,8 +111,9 @@ def map_images(
     if options.mapper == "incremental":
         pipeline = incremental_options(options.refine_intrinsics, context)
         capture = MappedCapture(database=database, pipeline=pipeline, names=in_time, settings=context.colmap)
-        if len(in_time) > LONGEST and not every_pair:
-            record = _map_in_parts(capture, images, sparse, context, near=near, loops=judged)
+        parts = [] if every_pair else split_capture(capture)
+        if len(parts) > 1:
+            record = _map_in_parts(capture, images, sparse, context, parts, near=near, loops=judged)
         else:
             nearest = None if judged and not every_pair else near
             record = _map_in_one_go(capture, images, sparse, _counter(context.progress, num_images), nearest=nearest)
@@ -129,6 +132,7 @@ def map_images(
             "COLMAP found no model: too few matches between the frames. Film with more overlap, more texture or less "
             "blur, or try --mapping.pairing exhaustive"
         )
+    remove(context.scratch / _PARTS)
     log.info("mapping: %s", record)
     return record
 
@@ -156,13 +160,18 @@ def _map_in_one_go(
 
 
 def _map_in_parts(
-    capture: MappedCapture, images: Path, sparse: Path, context: RunContext, *, near: int, loops: bool
+    capture: MappedCapture,
+    images: Path,
+    sparse: Path,
+    context: RunContext,
+    parts: Sequence[tuple[int, int]],
+    *,
+    near: int,
+    loops: bool,
 ) -> MapRecord:
     # neighbouring parts have some images both
-    parts = runs(len(capture.names))
     counted = _counter(context.progress, len(capture.names), of=sum(end - begin for begin, end in parts))
-    with tempfile.TemporaryDirectory(dir=sparse) as scratch:
-        made = map_runs(capture, images, Path(scratch), parts, workers=context.workers, registered=counted)
+    made = map_runs(capture, images, context.scratch / _PARTS, parts, workers=context.workers, registered=counted)
     models, seams = join_runs(capture, made, near=near, loops=loops) if made else ([], [])
     for number, model in enumerate(models):
         model.extract_colors_for_all_images(str(images))

@@ -1,14 +1,17 @@
-"""Mapping of a capture's parts in processes of their own.
+"""Mapping of a capture's parts in processes of their own, each of which is kept until all are made.
 
 COLMAP's incremental mapper gains nothing from threads, and a model comes out alike in any process that maps it with one
 thread. A process gets a database that holds no more than its images' keypoints and verified pairs, and writes models
-to a folder. ``python -m colmap_inertial.colmap.parts DATABASE IMAGES MODELS`` is such a process: its standard input
-brings COLMAP's options, and ends where the process that started it does.
+to a folder that is named by the hash of what the process reads: a run that was killed finds those that it finished.
+``python -m colmap_inertial.colmap.parts DATABASE IMAGES MODELS`` is such a process: its standard input brings COLMAP's
+options, and ends where the process that started it does.
 """
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import logging
 import os
 import pickle
 import queue
@@ -18,22 +21,86 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from colmap_inertial.core.errors import MappingError
+from colmap_inertial.core.errors import FormatError, MappingError
+from colmap_inertial.model.soundness import check_binary_model
+from colmap_inertial.pipeline.run.runner import remove
 
 if TYPE_CHECKING:
     import pycolmap
 
+log = logging.getLogger(__name__)
+
 #: Tables that a part's database has whole, and those of which it has its own images' rows.
-_WHOLE = ("cameras", "rigs", "rig_sensors", "frames", "frame_data", "images", "pose_priors")
+_WHOLE = ("cameras", "rigs", "rig_sensors")
 _OWN = {
-    "keypoints": "image_id IN (SELECT image_id FROM own)",
-    # COLMAP's number of a pair: 2147483647 times the smaller number of an image, plus the larger one
-    "two_view_geometries": "pair_id / 2147483647 IN (SELECT image_id FROM own)"
-    " AND pair_id % 2147483647 IN (SELECT image_id FROM own)",
+    "images": "image_id IN own",
+    "frame_data": "data_id IN own",
+    "frames": "frame_id IN (SELECT frame_id FROM main.frame_data)",
+    "pose_priors": "corr_data_id IN own",
+    "keypoints": "image_id IN own",
 }
+#: COLMAP's number of a pair is 2147483647 times the smaller number of an image, plus the larger one. The rows of an
+#: image lie next to each other, and no others are read.
+_OWN_PAIRS = """
+INSERT INTO main.two_view_geometries SELECT pairs.* FROM own CROSS JOIN whole.two_view_geometries AS pairs
+ON pairs.pair_id BETWEEN own.image_id * 2147483647 AND own.image_id * 2147483647 + 2147483646
+WHERE pairs.pair_id % 2147483647 IN own
+"""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PartJob:
+    """A part to map.
+
+    Attributes
+    ----------
+    folder
+        Folder of the work: ``part.db``, ``log.txt``.
+    options
+        COLMAP's.
+    models
+        Folder that takes the models. It is there as a whole, or not yet.
+    """
+
+    folder: Path
+    options: pycolmap.IncrementalPipelineOptions
+    models: Path
+
+    @classmethod
+    def prepare(cls, database: Path, options: pycolmap.IncrementalPipelineOptions, folder: Path) -> PartJob:
+        """Write the database of the images that the options name, into a new ``folder``; models go beside it."""
+        import pycolmap
+
+        folder.mkdir(parents=True)
+        write_part_database(database, options.image_names, folder / "part.db")
+        with open(folder / "part.db", "rb") as file:
+            key = hashlib.file_digest(file, "sha256")
+        key.update(f"{pycolmap.__version__} {options.todict()!r}".encode())
+        return cls(folder=folder, options=options, models=folder.with_name(key.hexdigest()[:32]))
+
+    def is_made(self) -> bool:
+        """Whether an earlier run made the models; remove what is damaged."""
+        try:
+            for path in self.models.iterdir():
+                check_binary_model(path)
+        except FileNotFoundError:
+            return False
+        except FormatError as error:
+            log.info("a part is mapped again: %s", error)
+            remove(self.models)
+            return False
+        return True
+
+    def read(self) -> dict[int, pycolmap.Reconstruction]:
+        """The models by number."""
+        import pycolmap
+
+        numbers = sorted(int(path.name) for path in self.models.iterdir())
+        return {number: pycolmap.Reconstruction(str(self.models / str(number))) for number in numbers}
 
 
 def write_part_database(database: Path, names: Sequence[str], part: Path) -> None:
@@ -61,25 +128,20 @@ def write_part_database(database: Path, names: Sequence[str], part: Path) -> Non
         made.execute("CREATE TEMP TABLE own (image_id INTEGER PRIMARY KEY)")
         number = "INSERT INTO own SELECT image_id FROM whole.images WHERE name = ?"
         made.executemany(number, ((name,) for name in names))
-        for table in _WHOLE:
-            made.execute(f"INSERT INTO main.{table} SELECT * FROM whole.{table}")
-        for table, rows in _OWN.items():
+        for table, rows in {**dict.fromkeys(_WHOLE, "TRUE"), **_OWN}.items():
             made.execute(f"INSERT INTO main.{table} SELECT * FROM whole.{table} WHERE {rows}")
+        made.execute(_OWN_PAIRS)
 
 
 def map_parts(
-    jobs: Sequence[tuple[Path, pycolmap.IncrementalPipelineOptions]],
-    images: Path,
-    *,
-    workers: int,
-    registered: Callable[[], None],
+    jobs: Sequence[PartJob], images: Path, *, workers: int, registered: Callable[[], None]
 ) -> Iterator[dict[int, pycolmap.Reconstruction]]:
-    """Map parts, some at a time, and yield their models in order.
+    """Map parts, some at a time, and yield their models in order; those that are made already are kept.
 
     Parameters
     ----------
     jobs
-        Of each part a folder with its ``part.db``, and COLMAP's options; models go to ``models`` in the folder.
+        The parts.
     images
         Folder of the images.
     workers
@@ -90,32 +152,36 @@ def map_parts(
     Raises
     ------
     MappingError
-        Where a process fails or is killed.
+        Where a process fails or is killed. Parts that were finished before stay.
     """
-    import pycolmap
-
     events: queue.SimpleQueue[int | None] = queue.SimpleQueue()
     running: dict[int, subprocess.Popen[bytes]] = {}
     watches: dict[int, threading.Thread] = {}
-    waiting, ended, told = deque(range(len(jobs))), set[int](), 0
+    made = {k for k, job in enumerate(jobs) if job.is_made()}
+    waiting, told = deque(k for k in range(len(jobs)) if k not in made), 0
+    for k in sorted(made):
+        log.info("part %d of %d: finished in an earlier run, kept", k + 1, len(jobs))
+        for _ in jobs[k].options.image_names:
+            registered()
     try:
         while told < len(jobs):
+            if told in made:
+                yield jobs[told].read()
+                told += 1
+                continue
             while waiting and len(running) < workers:
                 k = waiting.popleft()
-                running[k] = start_part(*jobs[k], images)
+                running[k] = start_part(jobs[k], images)
                 watches[k] = threading.Thread(target=_watch, args=(running[k], k, events), daemon=True)
                 watches[k].start()
             event = events.get()
             if event is None:
                 registered()
                 continue
-            _require_success(running.pop(event), jobs[event][0], event)
-            ended.add(event)
-            while told in ended:
-                folder = jobs[told][0] / "models"
-                numbers = sorted(int(path.name) for path in folder.iterdir())
-                yield {number: pycolmap.Reconstruction(str(folder / str(number))) for number in numbers}
-                told += 1
+            _require_success(running.pop(event), jobs[event].folder, event)
+            os.replace(jobs[event].folder / "models", jobs[event].models)
+            remove(jobs[event].folder)
+            made.add(event)
     finally:
         for k, process in running.items():
             process.kill()
@@ -123,8 +189,9 @@ def map_parts(
             watches[k].join()
 
 
-def start_part(folder: Path, options: pycolmap.IncrementalPipelineOptions, images: Path) -> subprocess.Popen[bytes]:
+def start_part(job: PartJob, images: Path) -> subprocess.Popen[bytes]:
     """Start the process of a part."""
+    folder = job.folder
     (folder / "models").mkdir()
     arguments = [str(path.absolute()) for path in (folder / "part.db", images, folder / "models")]
     with open(folder / "log.txt", "wb") as log:
@@ -138,7 +205,7 @@ def start_part(folder: Path, options: pycolmap.IncrementalPipelineOptions, image
         )
     assert process.stdin is not None
     with contextlib.suppress(BrokenPipeError):  # its end says why
-        process.stdin.write(pickle.dumps(options.todict()))
+        process.stdin.write(pickle.dumps(job.options.todict()))
         process.stdin.flush()
     return process
 

@@ -1,7 +1,8 @@
 """Mapping of long captures in overlapping parts, which are then merged to one model.
 
-COLMAP adjusts the whole model again and again while it grows, and from 1000 images on by conjugate gradients, which
-along a chain of images hardly move. Parts take as long for each image in a capture of any length.
+COLMAP adjusts the whole model again and again while it grows, so that the time for each image grows with the model, and
+from 1000 images on by conjugate gradients, which along a chain of images hardly move. Parts take as long for each image
+in a capture of any length, and are mapped at the same time.
 Points that two parts have both, in shared images and in matches between them, constrain the similarity between the two;
 together with the loops that matching closed, these place all parts. Then their points are merged, and the whole is
 adjusted. A constraint that does not fit then is left out, the worst first, and the rest is placed and adjusted again.
@@ -19,8 +20,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from colmap_inertial.colmap.loop_closure import LoopClosure, MappedCapture, SubmapOverlap, merge_overlaps
-from colmap_inertial.colmap.parts import map_parts, write_part_database
+from colmap_inertial.colmap.loop_closure import LONGEST, LoopClosure, MappedCapture, SubmapOverlap, merge_overlaps
+from colmap_inertial.colmap.parts import PartJob, map_parts
 from colmap_inertial.model.submodels.graph import (
     Convergence,
     Equations,
@@ -35,14 +36,37 @@ from colmap_inertial.model.submodels.graph import (
 )
 from colmap_inertial.model.submodels.matches import Submodel, constrain_by_points, find_common_features, matches_between
 from colmap_inertial.model.submodels.merging import merge_models
+from colmap_inertial.pipeline.run.runner import remove
 
 if TYPE_CHECKING:
     import pycolmap
 
 log = logging.getLogger(__name__)
 
-#: Images of a part at most, and of these, how many the next one has, too.
-PART, SHARED = 400, 40
+
+@dataclass(frozen=True, kw_only=True)
+class PartSizes:
+    """Sizes of parts, in images (``scripts/bench_whole.py --long 500 --density 8.55`` and ``--long 1000``)."""
+
+    #: A capture of fewer images is mapped in one go.
+    least: int = 300
+    #: Where cameras are refined, parts bend: up to COLMAP's own limit there is one, and parts are long.
+    least_refined: int = LONGEST + 1
+    longest_refined: int = 400
+    #: A part has so many observations: the mapper's time grows faster than their number.
+    observations: int = 110_000
+    #: Images of a part, whatever the observations: ends and adjustments count for more in shorter ones, while the time
+    #: that parts take does not fall any more ...
+    shortest: int = 100
+    #: ... and longer ones leave processors idle.
+    longest: int = 200
+    #: Share of its images that the next part has, too.
+    shared: float = 0.2
+    #: Images that the next part has at most.
+    most_shared: int = 40
+
+
+SIZES = PartSizes()
 #: The merged model keeps so much of the images, or parts stay apart: what only its part's seam held may go.
 LEAST_KEPT_SHARE = 0.99
 #: Squares are of shares of points' distances: the adjustment that follows corrects far more than this.
@@ -66,11 +90,24 @@ class MappedRun:
     end: int
 
 
-def runs(count: int, *, longest: int = PART, shared: int = SHARED) -> list[tuple[int, int]]:
+def runs(count: int, *, longest: int, shared: int) -> list[tuple[int, int]]:
     """Begins and ends of few runs, about equally long, that hold so many images; neighbours share some."""
     parts = max(1, -(-(count - shared) // (longest - shared)))
     begins = np.round(np.arange(parts + 1) * (count - shared) / parts).astype(int).tolist()
     return [(begin, min(count, end + shared)) for begin, end in itertools.pairwise(begins)]
+
+
+def split_capture(capture: MappedCapture) -> list[tuple[int, int]]:
+    """Begins and ends of the parts that a capture is mapped in, by its observations; one where it is short."""
+    count, refined = len(capture.names), capture.pipeline.ba_refine_focal_length
+    if count < (SIZES.least_refined if refined else SIZES.least):
+        return [(0, count)]
+    longest = SIZES.longest_refined
+    if not refined:
+        graph = capture.cache.correspondence_graph
+        observations = sum(graph.num_observations_for_image(number) for number in capture.cache.images)
+        longest = int(np.clip(SIZES.observations * count / max(observations, 1), SIZES.shortest, SIZES.longest))
+    return runs(count, longest=longest, shared=min(round(SIZES.shared * longest), SIZES.most_shared))
 
 
 def map_runs(
@@ -87,7 +124,7 @@ def map_runs(
     Parameters
     ----------
     scratch
-        An empty folder.
+        Models of the runs are kept there; those that an earlier call has left are not made again.
     parts
         Begins and ends, as :func:`runs` has them.
     workers
@@ -100,10 +137,8 @@ def map_runs(
         own = copy.copy(capture.pipeline)
         own.extract_colors, own.num_threads = False, 1
         own.image_names = list(capture.names[begin:end])
-        folder = scratch / str(number)
-        folder.mkdir()
-        write_part_database(capture.database, own.image_names, folder / "part.db")
-        jobs.append((folder, own))
+        remove(scratch / str(number))  # of a run that was killed
+        jobs.append(PartJob.prepare(capture.database, own, scratch / str(number)))
     mapped = map_parts(jobs, images, workers=workers, registered=registered)
     return [
         MappedRun(model=model, begin=begin, end=end)
