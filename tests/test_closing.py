@@ -255,9 +255,11 @@ def test_a_large_model_is_solved_directly_unless_all_images_see_the_same(tmp_pat
     as_it_is = pycolmap.BundleAdjustmentOptions().ceres.max_num_images_direct_sparse_cpu_solver
     adjustment = loop_closure._adjustment(ring.options, ring.model, of_parts=False)
     # what is small is as COLMAP has it, and a model of parts ends early
+    first_region = adjustment.ceres.solver_options.initial_trust_region_radius
     assert adjustment.ceres.solver_options.function_tolerance == 0
     of_parts = loop_closure._adjustment(ring.options, ring.model, of_parts=True)
     assert of_parts.ceres.solver_options.function_tolerance == loop_closure.CLOSURE.least_gain
+    assert of_parts.ceres.solver_options.initial_trust_region_radius > 1e5 * first_region
     assert adjustment.ceres.max_num_images_direct_sparse_cpu_solver == as_it_is
     monkeypatch.setattr(loop_closure, "LONGEST", FRAMES - 8)
     adjustment = loop_closure._adjustment(ring.options, ring.model, of_parts=False)

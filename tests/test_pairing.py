@@ -217,9 +217,9 @@ def test_few_features_do_not_rule_a_pair_out(database):
     assert few.plenty.tolist() == [True, False]
 
 
-def test_frames_a_second_apart_are_looked_at_and_at_most_a_thousand():
+def test_frames_a_second_apart_are_looked_at_however_long_the_capture():
     assert np.diff(key_frames(np.arange(100) * 0.25)).tolist() == [4] * 24
-    assert len(key_frames(np.arange(5000) * 1.0)) <= 1001
+    assert len(key_frames(np.arange(5000) * 1.0)) == 5000
 
 
 def test_candidates_are_the_best_of_a_frame():

@@ -216,7 +216,7 @@ def test_contradictions_are_those_of_a_loop_over_pairs():
     assert kept > 30 and refused > 30
 
 
-def test_frames_are_surely_apart_where_the_way_between_them_is_longer_than_what_they_see():
+def test_frames_are_surely_apart_where_the_way_between_them_is_longer_than_what_they_see(monkeypatch):
     """Each frame sees one point a metre away; at two metres and three standard deviations nothing is in common."""
     count = 300
     centre = np.stack([np.linspace(0, 8, count), np.zeros(count), np.zeros(count)], axis=1)
@@ -230,6 +230,15 @@ def test_frames_are_surely_apart_where_the_way_between_them_is_longer_than_what_
     cov = way.covariance(i, j, headings.sigma_rad(i, j))
     margin = np.abs(centre[j, 0] - centre[i, 0]) - 2.0 - 3 * np.sqrt(np.einsum("maa->m", cov))
     assert np.array_equal(apart, margin > 0) and 0.1 < apart.mean() < 0.9
+    keys = one[::3]
+    first, second = keys[np.stack(np.triu_indices(len(keys), 1))]
+    kept = (second - first >= 10) & ~apart.reshape(-1)[
+        np.ravel(first * (2 * count - first - 1) // 2 + second - first - 1)
+    ]
+    for at_once in (1, 700, 50_000):
+        monkeypatch.setattr(loops, "_LIMITS", replace(loops._LIMITS, pairs_at_once=at_once))
+        found = LoopSearch(None, (), headings, way, None, 10)._possible_loops(keys)
+        assert np.array_equal(found, np.stack([first, second])[:, kept]) and found.shape[1] > 100
     # of another part nothing is known
     split = replace(way, part=(one > count // 2).astype(int))
     other = (i <= count // 2) & (j > count // 2)

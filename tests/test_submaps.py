@@ -307,9 +307,9 @@ def test_of_neighbours_that_do_not_fit_first_pairs_far_apart_in_time_are_not_bel
     assert asked == [None, 4, "left out"] and whole.num_reg_images() == FRAMES
 
 
-@pytest.mark.parametrize(("turn_rad", "models", "not_joined"), [(1.2, [48], 1), (1.57, [12, 42], 2)])
+@pytest.mark.parametrize(("turn_rad", "models", "not_joined"), [(0.9, [48], 1), (1.2, [12, 42], 2)])
 def test_a_part_that_lies_wrong_is_not_averaged_away(ring, monkeypatch, turn_rad, models, not_joined):
-    """However often it is placed, the last part is turned; where no adjustment mends that, it stays by itself."""
+    """However often it is placed, the last part is turned; where the adjustment does not mend that, it is by itself."""
     ring, parts = ring
     bad = similarity(1.0, (0, turn_rad, 0), (3, 1, 2))
 

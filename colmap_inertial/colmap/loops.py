@@ -11,6 +11,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -32,9 +33,10 @@ from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 class LoopSearchLimits:
     """Limits of the search for loops."""
 
-    #: Frames among which loops are sought are about so far apart, and so many at most.
+    #: Frames among which loops are sought are about so far apart.
     spacing_s: float = 1.0
-    most_frames: int = 1000
+    #: Pairs of them that are looked at together: a capture of an hour has millions.
+    pairs_at_once: int = 50_000
     #: Candidates have at least so many quick matches, and are among the best so many of one of their frames.
     least_quick_matches: int = 6
     best: int = 3
@@ -86,11 +88,10 @@ class Loops:
 
 
 def key_frames(t_s: Array) -> IndexArray:
-    """Frames about a second apart, or farther in a capture that is very long."""
-    spacing_s = max(_LIMITS.spacing_s, float(t_s[-1] - t_s[0]) / _LIMITS.most_frames)
+    """Frames about a second apart."""
     kept = [0]
     for i, at_s in enumerate(t_s.tolist()):
-        if at_s - t_s[kept[-1]] >= 0.95 * spacing_s:
+        if at_s - t_s[kept[-1]] >= 0.95 * _LIMITS.spacing_s:
             kept.append(i)
     return np.array(kept, dtype=np.intp)
 
@@ -163,9 +164,7 @@ class LoopSearch:
             Pairs that somebody else matched as loops: candidates without quick matches, which bear each other out.
         """
         keys = key_frames(self.orientations.t_s)
-        i, j = keys[np.stack(np.triu_indices(len(keys), 1))]
-        i, j = (frames[j - i >= self.nearest] for frames in (i, j))
-        i, j = (frames[~apart] for apart in [self._surely_apart(i, j)] for frames in (i, j))
+        i, j = self._possible_loops(keys)
         chosen = candidates(self.covisibility.count(i, j), i, j)
         possible = set(itertools.compress(given, ~self._surely_apart(*split_pairs(given))))
         voted = possible.union(zip(i[chosen].tolist(), j[chosen].tolist(), strict=True))
@@ -201,6 +200,8 @@ class LoopSearch:
         A loop says where one of its frames is, seen from the other. The track from there to the frames of another loop
         nearby, no farther than ``nearest`` frames, is short and so precise; the other loop must agree with it.
         """
+        from scipy.spatial import cKDTree
+
         pairs = sorted(poses)
         if not pairs:
             return set()
@@ -209,18 +210,18 @@ class LoopSearch:
         ratio = np.array([poses[pair].ratio for pair in pairs])
         depth = np.array([poses[pair].depth for pair in pairs])
         matches = np.array([poses[pair].matches for pair in pairs], dtype=np.float64)
-        near = (np.abs(i[:, None] - i) <= self.nearest) & (np.abs(j[:, None] - j) <= self.nearest)
-        a, b = np.nonzero(np.triu(near, 1))
+        a, b = cKDTree(np.stack([i, j], axis=1)).query_pairs(self.nearest, p=np.inf, output_type="ndarray").T
         early, late = self._displacements(i[a], i[b]), self._displacements(j[a], j[b])
         off = step[a] + ratio[a, None] * late[0] - early[0] - step[b]
         noise = (_LIMITS.place_sigma * np.hypot(depth[a], depth[b])) ** 2
         noise = noise + (_LIMITS.length_sigma * np.linalg.norm(late[0], axis=1)) ** 2
         covariance = early[1] + ratio[a, None, None] ** 2 * late[1] + noise[:, None, None] * np.eye(3)
-        apart = _squared(off, covariance) > _LIMITS.agree_3
-        against = np.zeros((len(pairs), len(pairs)), dtype=np.bool_)
-        against[a[apart], b[apart]] = against[b[apart], a[apart]] = True
-        behind = (near & ~against) @ matches
-        rival = np.max(np.where(against, behind, 0.0), axis=1)
+        against = _squared(off, covariance) > _LIMITS.agree_3
+        behind, rival = matches.copy(), np.zeros(len(pairs))
+        for one, other in ((a, b), (b, a)):
+            np.add.at(behind, one[~against], matches[other[~against]])
+        for one, other in ((a[against], b[against]), (b[against], a[against])):
+            np.maximum.at(rival, one, behind[other])
         return set(itertools.compress(pairs, (behind >= _LIMITS.by_far * rival).tolist()))
 
     def _displacements(self, i: IndexArray, j: IndexArray) -> tuple[Array, Array]:
@@ -229,20 +230,31 @@ class LoopSearch:
         covariance = self.track.covariance(first, last, self.orientations.sigma_rad(first, last))
         return self.track.centre[j] - self.track.centre[i], covariance
 
+    def _possible_loops(self, keys: IndexArray) -> IndexArray:
+        """(2, M) pairs of key frames that are no neighbours, and do not surely show nothing in common."""
+        last = np.searchsorted(keys, keys + self.nearest)
+        possible = [np.zeros((2, 0), dtype=np.intp)]
+        rows = max(1, _LIMITS.pairs_at_once // len(keys))
+        for begin in range(0, len(keys), rows):
+            own = range(begin, min(begin + rows, len(keys)))
+            i = np.concatenate([np.full(len(keys) - last[k], keys[k]) for k in own])
+            j = np.concatenate([keys[last[k] :] for k in own])
+            possible.append(np.stack([i, j])[:, ~self._surely_apart(i, j)])
+        return np.concatenate(possible, axis=1)
+
     def _surely_apart(self, i: IndexArray, j: IndexArray) -> BoolArray:
         """(M,) whether frames i and j surely show nothing in common."""
-        depth = np.array([self.track.depth(k) for k in range(len(self.track.part))])
-        apart = np.zeros(len(i), dtype=np.bool_)
-        # a share at a time: there may be half a million
-        for some in np.array_split(np.arange(len(i)), max(1, len(i) // 50_000)):
-            apart[some] = self.orientations.see_nothing_in_common(i[some], j[some])
-            some = some[~apart[some] & self.track.known(i[some], j[some]) & np.isfinite(depth[i[some]])]
-            displacement, covariance = self._displacements(i[some], j[some])
-            sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
-            apart[some] = (
-                np.linalg.norm(displacement, axis=1) > _LIMITS.reach * depth[i[some]] + _LIMITS.sure_sigmas * sigma
-            )
+        apart = self.orientations.see_nothing_in_common(i, j)
+        some = np.flatnonzero(~apart & self.track.known(i, j) & np.isfinite(self._depths[i]))
+        displacement, covariance = self._displacements(i[some], j[some])
+        sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
+        far = _LIMITS.reach * self._depths[i[some]] + _LIMITS.sure_sigmas * sigma
+        apart[some] = np.linalg.norm(displacement, axis=1) > far
         return apart
+
+    @cached_property
+    def _depths(self) -> Array:
+        return np.array([self.track.depth(k) for k in range(len(self.track.part))])
 
     def _judge(self, pairs: Sequence[FramePair]) -> tuple[set[FramePair], dict[FramePair, LoopPose]]:
         """Pairs with verified matches; and the poses of those of them that may close a loop.
