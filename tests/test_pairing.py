@@ -629,9 +629,9 @@ def test_matches_of_moved_keypoints_are_those_of_features_found_anew(tmp_path):
         return replace(keypoints, xy_px=xy_px)
 
     def found(stages, kind):
-        features, database = tmp_path / f"{kind}_features.db", tmp_path / f"{kind}.db"
-        sparse.extract_features(desk[0].parent, cameras, features, options, keypoint_stages=stages, context=context)
-        sparse.match_features(features, database, pairs, context)
+        database = tmp_path / f"{kind}.db"
+        sparse.extract_features(desk[0].parent, cameras, database, options, keypoint_stages=stages, context=context)
+        sparse.match_pairs(database, pairs, context)
         return database
 
     def read(database):

@@ -117,7 +117,7 @@ def pictures(tmp_path, project, monkeypatch):
         path.write_bytes(b"")
 
     monkeypatch.setattr(rooms, "extract_features", lambda images, cameras, database, *_, **__: written(database))
-    monkeypatch.setattr(rooms, "match_features", lambda features, database, *_: None)
+    monkeypatch.setattr(rooms, "match_pairs", lambda database, *_: None)
     monkeypatch.setattr(rooms, "map_images", map_images)
     return folder, mapped
 
@@ -139,7 +139,9 @@ def test_pictures_alone_are_mapped_and_scaled(pictures, tmp_path, monkeypatch, c
     assert code == 0, err
     assert "lengths of 10 m are right to within" in said
     assert mapped == [["0.png", "1.png", "2.png", "3.png"]]  # not a second time
-    assert sorted(path.name for path in out.iterdir()) == ["colmap", "images", "scale.json", "sparse", "transform.json"]
+    assert sorted(path.name for path in out.iterdir()) == [
+        *("colmap", "database.db", "images", "scale.json", "sparse", "transform.json")
+    ]
     found = json.loads((out / "scale.json").read_text())
     assert found["scale_from"] == "target" and found["metres_per_unit"] == pytest.approx(0.5)
     told = " ".join(found["notes"])

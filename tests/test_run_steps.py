@@ -848,7 +848,7 @@ def test_the_largest_of_the_small_models_goes_first(tmp_path, monkeypatch):
             pycolmap.synthesize_dataset(options).write_binary(str(target / str(number)))
 
     monkeypatch.setattr(calibrate, "extract_features", lambda *args, **more: None)
-    monkeypatch.setattr(calibrate, "match_features", lambda *args, **more: None)
+    monkeypatch.setattr(calibrate, "match_pairs", lambda *args, **more: None)
     monkeypatch.setattr(calibrate, "map_images", models)
     found = calibrate._small_models(
         recording().capture, tmp_path, NAMES, tmp_path / "work", None, RunContext(scratch=tmp_path)

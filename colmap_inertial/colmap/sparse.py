@@ -303,17 +303,6 @@ def apply_keypoint_stages(database: Path, stages: Sequence[KeypointStage], *, st
     return KeypointRecords(images=tuple(records))
 
 
-def match_features(
-    features: Path,
-    database: Path,
-    pairs: Sequence[tuple[str, str]],
-    context: RunContext,
-) -> None:
-    """Match and verify the pairs in a copy of the features' database."""
-    shutil.copyfile(features, database)
-    match_pairs(database, pairs, context)
-
-
 def verify_again(
     matched: Path,
     database: Path,

@@ -19,7 +19,7 @@ from colmap_inertial.colmap.sparse import (
     extract_features,
     image_pairs,
     mapping_device,
-    match_features,
+    match_pairs,
     require_features,
 )
 from colmap_inertial.core.arrays import Array
@@ -408,10 +408,9 @@ def _map(
     require_features(context)
     for _ in counted(_written(capture, names, images), len(names), "frames", progress):
         pass
-    features, database = project / "features.db", project / "database.db"
-    extract_features(images, dict.fromkeys(names, capture.camera), features, mapping, context=context)
-    match_features(features, database, image_pairs(names, mapping), context)
-    features.unlink()
+    database = project / "database.db"
+    extract_features(images, dict.fromkeys(names, capture.camera), database, mapping, context=context)
+    match_pairs(database, image_pairs(names, mapping), context)
     refine = capture.camera is None if mapping.refine_intrinsics is None else mapping.refine_intrinsics
     made = project / "models"
     decided = dataclasses.replace(mapping, refine_intrinsics=refine)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from colmap_inertial.colmap.mapping import map_images
-from colmap_inertial.colmap.sparse import extract_features, image_pairs, match_features, verify_again
+from colmap_inertial.colmap.sparse import extract_features, image_pairs, match_pairs, verify_again
 from colmap_inertial.core.errors import FormatError, MappingError, NotObservableError
 from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.core.types import (
@@ -322,15 +322,15 @@ def _small_models(
     would be moved twice.
     """
     work.mkdir()
-    features, database, sparse = work / "features.db", work / "database.db", work / "sparse"
+    database, sparse = work / "database.db", work / "sparse"
     cameras = {name: capture.camera for name in names}
     stages = [] if view is None else [RollingShutterStage(view=view)]
     pairs = image_pairs(names, _SMALL)
     # COLMAP's matcher and mapper differ from run to run with several threads, and the rest of a run would follow them
     alone = replace(context, num_threads=1)
     if matched is None:
-        extract_features(images, cameras, features, _SMALL, keypoint_stages=stages, context=context)
-        match_features(features, database, pairs, alone)
+        extract_features(images, cameras, database, _SMALL, keypoint_stages=stages, context=context)
+        match_pairs(database, pairs, alone)
     else:
         verify_again(matched / "database.db", database, pairs, stages, alone)
     map_images(database, images, sparse, replace(_SMALL, refine_intrinsics=capture.camera is None), alone)
