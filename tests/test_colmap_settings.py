@@ -41,7 +41,7 @@ def test_a_setting_reaches_colmap_s_options():
         "GlobalMapper.ra_max_rotation_error_deg=5",
         "GlobalMapper.ba_ceres_max_num_iterations=11",
         "BundleAdjustment.refine_principal_point=1",
-        "BundleAdjustmentCeres.function_tolerance=1e-6",
+        "BundleAdjustmentCeres.function_tolerance=3e-6",
         "StereoFusion.min_num_pixels=3",
         "PatchMatchStereo.filter=false",
         "PoissonMeshing.trim=5",
@@ -60,8 +60,8 @@ def test_a_setting_reaches_colmap_s_options():
     assert pipeline.rotation_averaging.max_rotation_error_deg == 5
     assert pipeline.bundle_adjustment.ceres.solver_options.max_num_iterations == 11
     capture = MappedCapture(database=Path(), pipeline=mapper, names=(), settings=context.colmap)
-    adjustment = capture.settings.apply(_adjustment(mapper, pycolmap.Reconstruction()))
-    assert adjustment.refine_principal_point and adjustment.ceres.solver_options.function_tolerance == 1e-6
+    adjustment = capture.settings.apply(_adjustment(mapper, pycolmap.Reconstruction(), of_parts=True))
+    assert adjustment.refine_principal_point and adjustment.ceres.solver_options.function_tolerance == 3e-6
     assert context.colmap.apply(pycolmap.StereoFusionOptions()).min_num_pixels == 3
     assert not context.colmap.apply(pycolmap.PatchMatchOptions()).filter
     assert context.colmap.apply(pycolmap.PoissonMeshingOptions()).trim == 5
