@@ -352,40 +352,47 @@ def long_walk(walk: Walk, density: float, folder: Path, mappers: Sequence[str], 
     """What matching and each mapper take for a walk: processor time and memory."""
     keep_colmap_quiet()
     write_walk(walk, folder)
-    recording, context = recorded(folder), RunContext(scratch=folder, num_threads=1)
-    camera, names = recording.capture.camera, recording.timing.names
-    features, database = folder / "features.db", folder / "database.db"
-    if not features.is_file():
-        write_features(walk, names, features, density=density)
-    for left in folder.glob(f"{database.name}*"):
-        left.unlink()
-    before_mib, begun_s = peak_mib(reset=True), time.process_time()
-    record = match_capture(features, database, recording, camera, MappingOptions(pairing="sequential"), context)
-    found: dict[str, Figures] = {
-        "matching": {
-            "processor_s": time.process_time() - begun_s,
-            "mib_a_frame": (peak_mib() - before_mib) / len(names),
-            "verified": record.verified,
-            "loops_closed": record.loops_closed,
-        }
-    }
-    print(json.dumps(found), flush=True)
-    for mapper in mappers:
+    if not (folder / "features.db").is_file():
+        write_features(walk, recorded(folder).timing.names, folder / "features.db", density=density)
+    found: dict[str, Figures] = {}
+    for step in ("matching", *mappers):
         told = subprocess.run(
-            [sys.executable, __file__, "--map-by", mapper, "--workers", str(workers), folder],
+            [sys.executable, __file__, "--step", step, "--workers", str(workers), folder],
             check=True,
             stdout=subprocess.PIPE,
             text=True,
         ).stdout
-        found[mapper] = json.loads(told.splitlines()[-1])
-        print(json.dumps({mapper: found[mapper]}), flush=True)
+        found[step] = json.loads(told.splitlines()[-1])
+        print(json.dumps({step: found[step]}), flush=True)
     return found
 
 
-def peak_mib(*, reset: bool = False) -> float:
-    """The most memory that this process had, or has from now on; what ``getrusage`` says counts its parent's, too."""
-    if reset:
-        Path("/proc/self/clear_refs").write_text("5")
+def match_walk(folder: Path) -> Figures:
+    """Match a walk whose features are there: what another process of this script does."""
+    keep_colmap_quiet()
+    recording, context = recorded(folder), RunContext(scratch=folder, num_threads=1)
+    for left in folder.glob("database.db*"):
+        left.unlink()
+    before_mib, begun_s = peak_mib(), time.process_time()
+    record = match_capture(
+        folder / "features.db",
+        folder / "database.db",
+        recording,
+        recording.capture.camera,
+        MappingOptions(pairing="sequential"),
+        context,
+    )
+    return {
+        "processor_s": time.process_time() - begun_s,
+        "mib_a_frame": (peak_mib() - before_mib) / record.images,
+        "compared": record.loops_compared,
+        "verified": record.verified,
+        "loops_closed": record.loops_closed,
+    }
+
+
+def peak_mib() -> float:
+    """The most memory that this process had; what ``getrusage`` says counts its parent's, too."""
     (line,) = (line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
     return int(line.split()[1]) / 1024
 
@@ -456,15 +463,16 @@ def main() -> None:
         "--mappers", nargs="*", choices=MAPPERS, default=["incremental", "global"], help="of long walks"
     )
     parser.add_argument("--workers", type=int, default=4, help="processes that map the parts of long walks")
-    parser.add_argument("--map-by", choices=MAPPERS, help=argparse.SUPPRESS)
+    parser.add_argument("--step", choices=("matching", *MAPPERS), help=argparse.SUPPRESS)
     parser.add_argument("--bare-sequential", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--bare-exhaustive", type=Path, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.bare_sequential or args.bare_exhaustive:
         bare(args.bare_sequential or args.bare_exhaustive, args.folder, sequential=bool(args.bare_sequential))
         return
-    if args.map_by:
-        print(json.dumps(map_by(args.map_by, args.folder, args.workers)))
+    if args.step:
+        done = match_walk(args.folder) if args.step == "matching" else map_by(args.step, args.folder, args.workers)
+        print(json.dumps(done))
         return
     found: dict[str, object] = {}
     if args.euroc:
