@@ -161,6 +161,7 @@ def map_parts(
     waiting, told = deque(k for k in range(len(jobs)) if k not in made), 0
     for k in sorted(made):
         log.info("part %d of %d: finished in an earlier run, kept", k + 1, len(jobs))
+        remove(jobs[k].folder)
         for _ in jobs[k].options.image_names:
             registered()
     try:
