@@ -72,6 +72,14 @@ def test_wrong_units_are_refused_with_what_to_do(recording):
     assert estimate.verdict == "refused" and "multiply it by 9.80665" in estimate.reasons[0]
 
 
+def test_times_of_poses_in_another_unit_are_refused_before_any_search(recording, monkeypatch):
+    for search in ("align_recording", "likely_convention"):
+        monkeypatch.setattr(f"colmap_inertial.inertial.scale.{search}", lambda *_, **__: pytest.fail("searched"))
+    poses = replace(recording.trajectory, t_s=recording.trajectory.t_s * 1e3)
+    (reason,) = estimate_scale(poses, recording.imu).reasons
+    assert "divide them by 1000" in reason and "seconds" in reason
+
+
 def test_the_first_seconds_hold_nothing_of_later_frames(recording):
     cut = first_seconds(recording.trajectory, 5.0)
     assert cut.t_s[-1] <= cut.t_s[0] + 5.0 < recording.trajectory.t_s[len(cut)]

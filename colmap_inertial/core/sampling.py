@@ -13,6 +13,9 @@ GAP_S = 0.1
 #: A pause that is worth a word, even where it is shorter than that: so many times the usual step between samples.
 PAUSE_STEPS = 3.5
 
+#: Spans of two clocks that were recorded along may differ by this factor: one was started earlier or stopped later.
+UNIT_SPREAD = 5.0
+
 
 @dataclass(frozen=True, kw_only=True)
 class ClippingLimits:
@@ -43,6 +46,18 @@ def is_gap(t_s: Array, longer_than_s: float = GAP_S, *, steps: float = 0.0) -> B
     """
     step_s = np.diff(t_s)
     return np.asarray(step_s > max(longer_than_s, steps * float(np.median(step_s)) if steps else 0.0))
+
+
+def time_unit_factor(span_s: float, other_s: float) -> float | None:
+    """Power of 1000 by which a span is too long (or short) beside that of another clock; ``None`` for none.
+
+    Stamps in milliseconds that are read as seconds span a thousand times what the other clock's do.
+    """
+    ratio = span_s / other_s
+    power = round(float(np.log10(ratio)) / 3)
+    if power == 0 or not 1 / UNIT_SPREAD < ratio / 1000.0**power < UNIT_SPREAD:
+        return None
+    return 1000.0**power
 
 
 def find_clipped(values: Array) -> BoolArray:

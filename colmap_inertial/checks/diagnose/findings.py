@@ -14,6 +14,7 @@ from colmap_inertial.checks.diagnose.advice import ADVICE
 from colmap_inertial.core.arrays import Int64Array
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError
+from colmap_inertial.core.sampling import time_unit_factor
 from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.types import (
     CameraImuCalibration,
@@ -168,11 +169,7 @@ class Clocks:
     @property
     def unit_factor(self) -> float | None:
         """Power of 1000 by which the frames' span is too long (or short) for the gyroscope's; ``None`` for none."""
-        ratio = self.frames_s / self.imu_s
-        power = round(float(np.log10(ratio)) / 3)
-        if power == 0 or not 1 / UNIT_SPREAD < ratio / 1000.0**power < UNIT_SPREAD:
-            return None
-        return 1000.0**power
+        return time_unit_factor(self.frames_s, self.imu_s)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -347,7 +344,5 @@ class Recorded:
 PIXELS_EXPLAINED = 0.5
 #: Numbers of a gyroscope times this are rad/s, where they were in the other unit than they were declared in.
 UNIT_FACTORS = {"gyro-in-deg": np.pi / 180, "gyro-not-in-deg": 180 / np.pi}
-#: Frames and gyroscope of one recording last about equally long: to within this factor, where a unit is wrong.
-UNIT_SPREAD = 5.0
 #: Pictures closer together than this (median) are followed; those further apart are compared two by two.
 FOLLOWED_S = 0.15

@@ -11,7 +11,7 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.camera_clock import CameraTimedImu, epoch_shift_s
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.options import ScaleOptions
-from colmap_inertial.core.sampling import PAUSE_STEPS, is_gap
+from colmap_inertial.core.sampling import PAUSE_STEPS, is_gap, time_unit_factor
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import (
     CAL,
@@ -180,6 +180,23 @@ def check_units(imu: ImuRecording) -> list[str]:
     return out
 
 
+def check_time_unit(trajectory: CameraTrajectory, imu: ImuRecording) -> list[str]:
+    """The reason why the poses' times are in no seconds; empty where they may be.
+
+    Without it, the offset of the clocks would be searched over hours in which there is nothing to find.
+    """
+    if min(len(trajectory), len(imu.gyro_t_s)) < 2:
+        return []
+    poses_s, imu_s = float(np.ptp(trajectory.t_s)), float(np.ptp(imu.gyro_t_s))
+    factor = time_unit_factor(poses_s, imu_s) or 1.0
+    if factor < 1e3:
+        return []
+    return [
+        f"the poses span {poses_s:.4g} s and the IMU {imu_s:.4g} s: the poses' times are in ms, us or ns where seconds "
+        f"are read; divide them by {factor:g}"
+    ]
+
+
 def estimate_scale(
     trajectory: CameraTrajectory,
     imu: ImuRecording,
@@ -212,6 +229,9 @@ def estimate_scale(
     exception.
     """
     options = options or ScaleOptions()
+    other_unit = check_time_unit(trajectory, imu)
+    if other_unit:
+        return ScaleEstimate.refused(options.method, *other_unit)
     begin_s = time.perf_counter()
     if imu_calibration is not None:
         imu = imu_calibration.corrected(imu)
