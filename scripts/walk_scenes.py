@@ -15,7 +15,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from colmap_inertial.core.arrays import Array, Float32Array
+from colmap_inertial.core.arrays import Array, Float32Array, UInt8Array
 from colmap_inertial.core.geometry import quat_exp, quat_from_matrix, quat_multiply
 from colmap_inertial.core.types import CameraModel
 from colmap_inertial.io.files import write_json, write_text
@@ -236,8 +236,11 @@ def _tones(rng: np.random.Generator) -> list[tuple[float, float, float]]:
     return [(rng.uniform(0.5, 1.0), f * rng.uniform(0.9, 1.1), rng.uniform(0, 6.3)) for f in (0.3, 0.7, 1.3, 1.9)]
 
 
-def write_walk(walk: Walk, folder: Path) -> Path:
-    """The capture of a walk, unless it is there already; returns its ``capture.toml``."""
+def write_walk(walk: Walk, folder: Path, pictures: Iterator[UInt8Array] | None = None) -> Path:
+    """The capture of a walk, unless it is there already; returns its ``capture.toml``.
+
+    ``pictures``: RGB, other ones than those of the walk's scene.
+    """
     described = folder / "capture.toml"
     if described.is_file():
         return described
@@ -249,8 +252,10 @@ def write_walk(walk: Walk, folder: Path) -> Path:
     trigger_s = np.arange(walk.frames) / walk.frame_rate_hz
     names = [f"{i:06d}.jpg" for i in range(walk.frames)]
     camera = walk.camera()
-    blank = itertools.repeat(np.zeros((camera.model.height, camera.model.width, 3), dtype=np.uint8), len(names))
-    for name, picture in zip(names, _pictures(walk, motion, trigger_s) if walk.drawn else blank, strict=True):
+    if pictures is None:
+        blank = itertools.repeat(np.zeros((camera.model.height, camera.model.width, 3), dtype=np.uint8), len(names))
+        pictures = draw_pictures(walk, world_of(walk)) if walk.drawn else blank
+    for name, picture in zip(names, pictures, strict=True):
         cv2.imwrite(str(folder / "frames" / name), picture[..., ::-1])
     for sensor, t_s, values in (
         ("gyro", imu.recording.gyro_t_s, imu.recording.gyro_rad_s),
@@ -281,9 +286,10 @@ def write_walk(walk: Walk, folder: Path) -> Path:
     return described
 
 
-def _pictures(walk: Walk, motion: Motion, trigger_s: Array) -> Iterator[np.ndarray]:
+def draw_pictures(walk: Walk, world: World) -> Iterator[UInt8Array]:
+    """The pictures of a walk past a world, RGB."""
     # a third of the rays: it is features that count here; of small pictures, a quarter of these
     limits = RenderLimits(samples=4) if walk.width > 400 else RenderLimits(samples=2, samples_per_px=0.0)
-    renderer, camera = Renderer(world_of(walk), limits), walk.camera()
-    for index, t_s in enumerate(trigger_s.tolist()):
+    renderer, camera, motion = Renderer(world, limits), walk.camera(), motion_of(walk)
+    for index, t_s in enumerate((np.arange(walk.frames) / walk.frame_rate_hz).tolist()):
         yield develop(renderer.linear(camera, motion, t_s), camera, np.random.default_rng([walk.seed, 4, index]))

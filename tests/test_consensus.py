@@ -9,6 +9,7 @@ import pytest
 
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import quat_conjugate, quat_exp, quat_log, quat_multiply
+from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import RotationConsensus
 from colmap_inertial.inertial.scale import estimate_scale
 from colmap_inertial.io.files import read_record, write_record
@@ -178,3 +179,20 @@ def test_real_keyframes_in_another_place_are_named_and_the_scale_is_as_sure_as_w
 def test_real_recordings_refuse_each_other_s_imu(study, shared_data):
     tasks = study.tasks_of(shared_data / "real_imu", ["K3", "V20"], ["foreign"], 1)
     assert {study.run(task).verdict for task in tasks} == {"refused"}
+
+
+@pytest.mark.parametrize(("block", "away_m"), [(slice(25, 30), 1.0), (slice(0, 7), 3.0)])
+def test_a_block_before_the_copy_of_a_wall_is_left_out(block, away_m):
+    """More cameras of 30 than leave one by one lie in another place, turned rightly."""
+    motion = MotionOptions(kind="roam", duration_s=20.0, vigour=0.35)
+    walk = simulate_recording(RecordingOptions(motion=motion), seed=3)
+    trajectory = keyframes(walk, step=round(0.5 / np.median(np.diff(walk.trajectory.t_s))))
+    sound = estimate_scale(trajectory, walk.imu)
+    assert not sound.rotations.moved
+    centre = trajectory.cam_in_world.copy()
+    centre[block] += away_m * np.array([0.85, -0.4, 0.3]) / walk.truth.metres_per_unit
+    estimate = estimate_scale(replace(trajectory, cam_in_world=centre), walk.imu)
+    assert estimate.rotations.moved == trajectory.names[block]
+    error = np.log(estimate.accepted.metres_per_unit / walk.truth.metres_per_unit)
+    assert abs(error) < Z95 * estimate.sigma_log
+    assert estimate.sigma_log < 2 * sound.sigma_log

@@ -42,9 +42,17 @@ _WARMER_K = 10.0
 class MovedLimits:
     """Limits for cameras in the wrong place alone, among keyframes; a video outvotes them."""
 
-    #: So many of them, or this share, may be.
+    #: So many of them, or this share, may be ...
     most: int = 3
     share: float = 0.1
+    #: ... or a block of up to this share at an end, which is sought where the scale is known no better (standard
+    #: deviation), and believed where this is less than so much of it without the block, and grows no more than this
+    #: with the nearer part of it: cameras that COLMAP put before the copy of a wall
+    #: (``scripts/study_wrong_cameras.py``: a hundredth).
+    most_share: float = 0.34
+    poor_log: float = 0.05
+    shrinks_much: float = 0.33
+    grows: float = 1.5
     #: Without them the scale's standard deviation is less than this share of what it was.
     shrinks: float = 0.9
 
@@ -288,14 +296,46 @@ def _estimate_without_moved(
     """The scale, and keyframes that it does without as it is known better so: the largest errors first hide others."""
     moved: tuple[str, ...] = ()
     estimate = _estimate(trajectory, timed, options)
-    most = max(_MOVED.most, _MOVED.share * len(trajectory))
-    while estimate.cov is not None and estimate.jumped and len(moved) + len(estimate.jumped) <= most:
-        names = (*moved, *estimate.jumped)
+    at_once = int(max(_MOVED.most, _MOVED.share * len(trajectory)))
+    while estimate.cov is not None and estimate.jumped and len(moved) < at_once:
+        names = (*moved, *estimate.jumped[: at_once - len(moved)])
         without = _estimate(trajectory.select(~np.isin(trajectory.names, names)), timed, options)
         if without.cov is None or without.cov[0, 0] > _MOVED.shrinks**2 * estimate.cov[0, 0]:
             break
         estimate, moved = without, names
+    if estimate.cov is not None and (estimate.verdict == "refused" or estimate.cov[0, 0] > _MOVED.poor_log**2):
+        return _estimate_without_end(trajectory, timed, options, (estimate, moved))
     return estimate, moved
+
+
+def _estimate_without_end(
+    trajectory: CameraTrajectory,
+    timed: CameraTimedImu,
+    options: ScaleOptions,
+    found: tuple[ScaleEstimate, tuple[str, ...]],
+) -> tuple[ScaleEstimate, tuple[str, ...]]:
+    """The scale without the first or last cameras, as few as it takes, where it is far better known."""
+    best, moved = found
+    assert best.cov is not None
+    limit = _MOVED.shrinks_much**2 * float(best.cov[0, 0])
+    sound, number = ~np.isin(trajectory.names, moved), np.arange(len(trajectory))
+    left_out = moved
+    for from_end in (number, number[::-1]):
+        few, many = 0, int(_MOVED.most_share * len(trajectory))
+        without = _estimate(trajectory.select(sound & (from_end >= many)), timed, options)
+        if without.cov is None or without.verdict == "refused" or without.cov[0, 0] > limit:
+            continue
+        limit = min(limit, _MOVED.grows**2 * float(without.cov[0, 0]))
+        while many - few > 1:
+            between = (few + many) // 2
+            trial = _estimate(trajectory.select(sound & (from_end >= between)), timed, options)
+            if trial.cov is None or trial.verdict == "refused" or trial.cov[0, 0] > limit:
+                few = between
+            else:
+                many, without = between, trial
+        best, kept = without, sound & (from_end >= many)
+        left_out = tuple(name for name, is_kept in zip(trajectory.names, kept.tolist(), strict=True) if not is_kept)
+    return best, left_out
 
 
 def _estimate(trajectory: CameraTrajectory, timed: CameraTimedImu, options: ScaleOptions) -> ScaleEstimate:

@@ -143,11 +143,15 @@ def estimate_joint(
 
 
 def _name_jumped(fit: Fit, data: Data, trajectory: CameraTrajectory) -> tuple[str, ...]:
-    """Images by themselves that hardly count, or at which the path jumps; behind a break the drift is free."""
+    """Images by themselves that hardly count, or at which the path jumps, those that count least first.
+
+    Behind a break the drift is free.
+    """
     edges = np.concatenate([[True], data.broken, [True]])
     little = (fit.pose_weight < _LIMITS.counts_little) & ~np.append(False, data.broken)
     alone = (data.groups.count == 1) & (little | (edges[:-1] & edges[1:]))
-    return tuple(trajectory.names[int(np.argmin(np.abs(trajectory.t_s - t)))] for t in data.t_s[alone])
+    least_first = np.flatnonzero(alone)[np.argsort(fit.pose_weight[alone], kind="stable")]
+    return tuple(trajectory.names[int(np.argmin(np.abs(trajectory.t_s - t)))] for t in data.t_s[least_first])
 
 
 def _prepared(trajectory: CameraTrajectory, timed: CameraTimedImu, options: JointOptions) -> tuple[Data, Prior]:
