@@ -113,6 +113,18 @@ def test_few_attitudes_leave_misalignments_to_their_prior_and_say_so(attitudes):
     assert sigma.max() < 2e-3
 
 
+@pytest.mark.parametrize("seed", [1, 3, 5])
+def test_a_device_that_warms_up_is_named_and_not_good(seed):
+    imu = simulate_rests(RestOptions(), seed=seed).recording
+    warm = 1 - np.exp(-(imu.accel_t_s - imu.accel_t_s[0])[:, None] / 40)
+    drifting = dataclasses.replace(imu, accel_m_s2=imu.accel_m_s2 + 0.02 * np.array([1.0, -1, 1]) * warm)
+    found = calibrate_imu(drifting, gravity_m_s2=9.81, gravity_sigma_m_s2=5e-4)
+    assert found.verdict == "weak"
+    (named,) = (reason for reason in found.reasons if "as that of a device that warms up" in reason)
+    assert 0.015 < float(named.split("drifted by ")[1].split(" m/s2")[0]) < 0.05
+    assert not any("warms up:" in reason for reason in calibrated(simulate_rests(RestOptions(), seed=seed)).reasons)
+
+
 def test_what_is_too_little_is_refused_with_what_to_do():
     with pytest.raises(NotObservableError, match=r"still in 5 attitudes only.*six sides.*six of its edges"):
         calibrated(simulate_rests(RestOptions(attitudes=5), seed=1))

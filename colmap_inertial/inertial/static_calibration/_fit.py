@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -40,6 +40,8 @@ class FitLimits:
     iterations: int = 6
     rounds: int = 12
     settled: float = 0.01
+    #: A device that warms up settles within the recording, by so many time constants.
+    warming: float = 3.0
 
 
 _LIMITS = FitLimits()
@@ -65,6 +67,9 @@ class RestFit:
         accelerometer finds there; nan for turns that were not used.
     accel_noise, turn_noise
         Factors on the standard deviations that were known beforehand.
+    drift_m_s2, drift_p_value
+        (3,) change of the accelerometer's bias from the first rest to the last, had it been fitted along, and the
+        probability of one as large where there is none.
     """
 
     accel_gain: Array
@@ -77,6 +82,8 @@ class RestFit:
     turn_residual_rad: Array
     accel_noise: float
     turn_noise: float
+    drift_m_s2: Array
+    drift_p_value: float
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -191,7 +198,34 @@ def fit_rests(
         prior_sigma = beforehand * _widened(state.errors(gravity_m_s2) / beforehand)
         if np.allclose(before, (factor_a, factor_t), rtol=_LIMITS.settled):
             break
-    return _result(state, rests, turns, cov, freedom, (factor_a, factor_t), gravity_m_s2)
+    fit = _result(state, rests, turns, cov, freedom, (factor_a, factor_t), gravity_m_s2)
+    drift_m_s2, p_value = _find_drift(system, cov, rests, sigma_a * before[0], freedom, before)
+    return replace(fit, drift_m_s2=drift_m_s2, drift_p_value=p_value)
+
+
+def _find_drift(
+    system: _System, cov: Array, rests: Rests, sigma_m_s2: Array, freedom: Array, factors: tuple[float, float]
+) -> tuple[Array, float]:
+    """A change of the accelerometer's bias as by warming, to first order, and the probability of it by chance.
+
+    The noise that it is compared with is what is left once it is undone: it swells the noise of the fit.
+    """
+    from scipy.stats import f
+
+    middle_s = 0.5 * (rests.begin_s + rests.end_s)
+    warmed = -np.expm1(-_LIMITS.warming * (middle_s - middle_s[0]) / np.ptp(middle_s))
+    since = (warmed - warmed.mean()) / warmed[-1]
+    columns = np.zeros((len(system.residual), 3))
+    columns[system.accel_rows] = np.kron((-since / sigma_m_s2)[:, None], np.eye(3))
+    common = system.jacobian.T @ columns
+    information = columns.T @ columns - common.T @ cov @ common
+    score = columns.T @ system.residual - common.T @ cov @ (system.jacobian.T @ system.residual)
+    drift_m_s2 = np.asarray(np.linalg.solve(information, score), dtype=np.float64)
+    explained = float(score @ drift_m_s2)
+    measured = system.residual[: system.turn_rows.stop]
+    left = float(measured @ measured) - explained + _LIMITS.freedom_before * sum(factor**-2 for factor in factors)
+    count = float(freedom.sum()) - 3
+    return drift_m_s2, float(f.sf(explained / 3 / (left / count), 3, count))
 
 
 def _prior_sigma(gravity_sigma_m_s2: float) -> Array:
@@ -350,6 +384,8 @@ def _result(
         turn_residual_rad=angles,
         accel_noise=factors[0],
         turn_noise=factors[1],
+        drift_m_s2=np.zeros(3),
+        drift_p_value=1.0,
     )
 
 
