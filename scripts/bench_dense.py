@@ -9,7 +9,8 @@ others are the same recipe with another seed: another world, path and device. Ea
 --dense``, in a process of its own.
 
 Printed per scene: of all pixels whose true depth is below 2 m (exact, ``Renderer.depth_m``), the share that has a depth
-and the share within 1, 2 and 5 %, and the same of those that have one; of the table and what stands on it precision,
+and the share within 1, 2 and 5 %, and the same of those that have one; of these, the share within two standard
+deviations, by decile of the relative one; of the table and what stands on it precision,
 recall and F at 5 and 10 mm of the fused cloud and of the mesh, and the median distance from the truth; seconds of the
 steps. Model and truth are brought together by a similarity over the camera centres: what is measured is the dense
 reconstruction, not the scale.
@@ -41,7 +42,7 @@ from bench_report import write_report
 from photo_world import PhotoWorld
 from scipy.spatial import cKDTree
 
-from colmap_inertial.colmap.depth_maps import fuse_maps
+from colmap_inertial.colmap.depth_maps import fuse_maps, map_file
 from colmap_inertial.colmap.sweep_stereo import SweptWorkspace
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.geometry import matrix_from_quat
@@ -190,7 +191,7 @@ def depth_figures(folder: Path, truth: Truth) -> DepthFigures:
     total = known = 0
     hits = np.zeros(len(SHARES))
     for name, true in truth.depth_m.items():
-        path = folder / "stereo" / "depth_maps" / f"{name}.geometric.bin"
+        path = map_file(folder, "depth", name)
         found = read_map(path) * truth.metres_per_unit if path.is_file() else np.zeros(true.shape)
         near = true < NEARER_M
         total += int(near.sum())
@@ -198,6 +199,20 @@ def depth_figures(folder: Path, truth: Truth) -> DepthFigures:
         hits += [int((near & (np.abs(found - true) <= share * true)).sum()) for share in SHARES]
     shares = (tuple(float(share) for share in hits / max(count, 1)) for count in (total, known))
     return DepthFigures(has=known / total, of_all=next(shares), of_kept=next(shares))
+
+
+def sigma_coverage(folder: Path, truth: Truth) -> tuple[float, ...]:
+    """Shares of depths nearer than 2 m within two standard deviations, by decile of the relative deviation."""
+    shares, hits = [], []
+    for name, true in truth.depth_m.items():
+        depth, sigma = (read_map(map_file(folder, "depth", name, kind)) for kind in ("geometric", "sigma"))
+        known = (true < NEARER_M) & (depth > 0)
+        away_m = np.abs(depth * truth.metres_per_unit - true)[known]
+        sigma_m = sigma[known] * truth.metres_per_unit
+        shares.append(sigma_m / true[known])
+        hits.append(away_m <= 2 * sigma_m)
+    order = np.argsort(np.concatenate(shares))
+    return tuple(float(decile.mean()) for decile in np.array_split(np.concatenate(hits)[order], 10))
 
 
 def surface_figures(points: Array, truth: Truth) -> SurfaceFigures:
@@ -250,6 +265,7 @@ def measure(scene: str, work: Path) -> dict[str, object]:
     dense = result["models"][0]["dense"]
     return {
         "depth": dataclasses.asdict(depth_figures(folder, truth)),
+        "within_two_sigma_by_decile": sigma_coverage(folder, truth),
         "fused": dataclasses.asdict(surface_figures(points_of(out / dense["fused"]), truth)),
         "mesh": dataclasses.asdict(surface_figures(points_of(out / dense["mesh"]), truth)),
         "points": dense["points"],
@@ -295,6 +311,7 @@ def measure_photo(world: PhotoWorld, folder: Path) -> dict[str, object]:
     )
     return {
         "depth": dataclasses.asdict(depth_figures(folder, truth)),
+        "within_two_sigma_by_decile": sigma_coverage(folder, truth),
         "fused": dataclasses.asdict(surface_figures(points_of(fused), truth)),
         "processor_s_per_megapixel": spent_s / sum(v.width * v.height / 1e6 for v in swept.sights.views),
     }

@@ -1573,8 +1573,8 @@ MUTANTS = (
     ),
     Mutant(
         "imaging/plane_sweep/agreement.py",
-        "(count > 1)",
-        "(count > 0)",
+        "(agreeing > 0) &",
+        "",
         "depths stay that no other picture agrees with",
         ("sweep::test_depths_stay_where_another_view_agrees",),
     ),

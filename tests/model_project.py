@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 import pycolmap
 
+from colmap_inertial.model.artefacts import write_map
+
 WIDTH, HEIGHT, FOCAL = 160, 120, 150.0
 NAMES = [f"{i:03}.png" for i in range(6)]
 
@@ -113,6 +115,7 @@ def write_project(root: Path) -> None:
             pycolmap.DepthMap.from_array(depth, 0.1, 100).write(str(file))
             file = dense / "stereo" / "normal_maps" / f"{name}.{kind}.bin"
             file.write_bytes(b"%d&%d&3&" % (WIDTH, HEIGHT) + normals.astype("<f4").tobytes())
+        write_map(dense / "stereo" / "depth_maps" / f"{name}.sigma.bin", 0.01 * depth.astype("f4"))
     (dense / "stereo" / "consistency_graphs" / f"{NAMES[0]}.geometric.bin").write_bytes(b"160&120&1&" + bytes(12))
     fuse(dense, dense / "fused.ply")
     options = pycolmap.PoissonMeshingOptions()

@@ -266,7 +266,7 @@ def test_what_lies_outside_of_the_range_is_not_known():
 def test_depths_stay_where_another_view_agrees():
     exact = depth_view(REFERENCE)
     others = [depth_view(v) for v in AROUND]
-    kept = confirm_depth(exact, others)
+    kept = confirm_depth(exact, others).depth
     assert np.mean(kept > 0) > 0.9
     error = np.abs(kept / exact.depth - 1)[kept > 0]
     # depths are looked up at the nearest pixel: it may be the other side of an edge
@@ -275,16 +275,16 @@ def test_depths_stay_where_another_view_agrees():
     # wrong where nobody says so
     wrong = exact.depth.copy()
     wrong[20:50, 30:70] *= 1.2
-    judged = confirm_depth(DepthView(depth=wrong, camera=REFERENCE), others)
+    judged = confirm_depth(DepthView(depth=wrong, camera=REFERENCE), others).depth
     assert not judged[22:48, 32:68].any()
     assert np.array_equal(judged[60:, 80:], kept[60:, 80:])
     # unknown here or there
     hole = exact.depth.copy()
     hole[:45] = 0
-    assert not confirm_depth(DepthView(depth=hole, camera=REFERENCE), others)[:45].any()
+    assert not confirm_depth(DepthView(depth=hole, camera=REFERENCE), others).depth[:45].any()
     blind = [DepthView(depth=np.zeros_like(other.depth), camera=other.camera) for other in others]
-    assert not confirm_depth(exact, blind).any()
-    assert not confirm_depth(exact, []).any()
+    assert not confirm_depth(exact, blind).depth.any()
+    assert not confirm_depth(exact, []).depth.any()
 
 
 def test_it_makes_no_difference_how_many_rows_are_worked_on_at_once(monkeypatch):
@@ -293,7 +293,7 @@ def test_it_makes_no_difference_how_many_rows_are_worked_on_at_once(monkeypatch)
     for rows in (7, 10_000):
         monkeypatch.setattr(agreement, "ROWS_AT_ONCE", rows)
         monkeypatch.setattr(normals, "ROWS_AT_ONCE", rows)
-        depth = confirm_depth(exact, others)
+        depth = confirm_depth(exact, others).depth
         found.append((depth, estimate_normals(depth, REFERENCE)))
     for few, all_of_them in zip(*found, strict=True):
         assert np.array_equal(few, all_of_them)
@@ -302,7 +302,7 @@ def test_it_makes_no_difference_how_many_rows_are_worked_on_at_once(monkeypatch)
 def test_agreeing_depths_are_averaged():
     exact, other = depth_view(REFERENCE), depth_view(AROUND[0])
     off = DepthView(depth=exact.depth * np.float32(1.006), camera=REFERENCE)
-    kept = confirm_depth(off, [other])
+    kept = confirm_depth(off, [other]).depth
     ratio = (kept / exact.depth)[kept > 0]
     assert np.median(ratio) == pytest.approx(1.003, abs=7e-4)
 

@@ -20,8 +20,8 @@ from colmap_inertial.imaging.plane_sweep.tiles import cut_tiles
 
 
 def confirmed(reference, others):
-    """Pixel by pixel, through the world."""
-    kept = np.zeros(reference.depth.shape)
+    """Means, shares that agree, and shares that see something behind, pixel by pixel through the world."""
+    kept, shares, beyond = np.zeros((3, *reference.depth.shape))
 
     def ray(view, x, y):
         (fx, fy), (cx, cy) = view.focal_px, view.centre_px
@@ -48,8 +48,11 @@ def confirmed(reference, others):
             x_back, y_back, back = to_pixel(reference.camera, to_world(other.camera, u, v, there))
             if np.hypot(x_back - x, y_back - y) <= 1 and abs(back - z) <= 0.02 * z:
                 agreeing.append(back)
+            elif there / w > 1.02:
+                beyond[y, x] += 1 / len(others)
+        shares[y, x] = (len(agreeing) - 1) / len(others)
         kept[y, x] = np.mean(agreeing) if len(agreeing) > 1 else 0.0
-    return kept
+    return kept, shares, beyond
 
 
 @pytest.mark.parametrize("ahead", [False, True])
@@ -66,10 +69,14 @@ def test_depths_that_others_confirm_are_those_of_a_loop_over_pixels(ahead):
         one = depth_view(view)
         factor = np.exp(rng.normal(0, 0.01, one.depth.shape)) * np.where(rng.random(one.depth.shape) < 0.1, 0, 1)
         noisy.append(replace(one, depth=(one.depth * factor).astype("f4")))
-    found, expected = confirm_depth(noisy[0], noisy[1:]), confirmed(noisy[0], noisy[1:])
+    found, (expected, agreeing, beyond) = confirm_depth(noisy[0], noisy[1:]), confirmed(noisy[0], noisy[1:])
     # single precision decides otherwise at a threshold
-    differs = np.abs(found - expected) > 1e-4 * expected
+    differs = np.abs(found.depth - expected) > 1e-4 * expected
     assert differs.mean() < 2e-3 and (expected > 0).mean() > 0.3
+    known = noisy[0].depth > 0
+    for share, loop in ((found.agreeing, agreeing), (found.beyond, beyond)):
+        assert (np.abs(share - loop) > 1e-6)[known].mean() < 2e-3
+        assert loop.max() > 0
 
 
 def test_the_range_of_depths_by_quantiles():
@@ -177,7 +184,7 @@ def test_a_depth_in_the_plane_of_a_camera_is_confirmed_by_none():
     level = depth_view(view)
     beside = camera((0.5, 2.0, 0.0))
     flat = DepthView(depth=np.full_like(level.depth, 2.0), camera=view)
-    assert not confirm_depth(flat, [depth_view(beside)]).any()
+    assert not confirm_depth(flat, [depth_view(beside)]).depth.any()
 
 
 def plane_normal(depth, view, x, y):

@@ -96,6 +96,12 @@ def test_a_workspace_gets_maps_that_colmap_fuses(workspace, tmp_path):
             normals = read_map(map_file(workspace, "normal", name), 3)
             known = depth > 0
             assert np.median(np.abs(depth / truth - 1)[known]) < 0.01
+            # standard deviations stand beside depths, in a format that COLMAP reads
+            theirs = pycolmap.DepthMap()
+            theirs.read(str(map_file(workspace, "depth", name, "sigma")))
+            sigma = theirs.to_array()
+            assert sigma.dtype == np.float32 and np.array_equal(sigma > 0, known)
+            assert np.mean((np.abs(depth - truth) <= 2 * sigma)[known]) > 0.8
             angle = np.degrees(np.arccos(np.clip(np.sum(normals * facing, axis=-1)[known], -1, 1)))
             assert np.median(angle) < 15
     options = pycolmap.StereoFusionOptions()
@@ -150,6 +156,12 @@ def test_a_sweep_that_was_cut_off_goes_on(workspace, tmp_path, monkeypatch):
     sweep(workspace, raw)
     assert len(calls) == len(VIEWS)
     whole = {name: map_file(workspace, "depth", name).read_bytes() for name in NAMES[:-1]}
+    # one map that is missing is written again, the same
+    sigma = map_file(workspace, "depth", NAMES[1], "sigma")
+    content = sigma.read_bytes()
+    sigma.unlink()
+    sweep(workspace, raw)
+    assert sigma.read_bytes() == content and len(calls) == len(VIEWS)
     # in one go it is the same; of something else, all of it is made again
     sweep(workspace, raw, identity="other")
     assert len(calls) == 2 * len(VIEWS)

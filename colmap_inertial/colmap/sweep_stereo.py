@@ -18,6 +18,7 @@ from colmap_inertial.core.arrays import UInt8Array
 from colmap_inertial.core.geometry import opencv_px_from_colmap
 from colmap_inertial.core.threads import frames_at_once, map_in_order
 from colmap_inertial.imaging.plane_sweep import (
+    Agreement,
     DepthView,
     Partner,
     Pinhole,
@@ -26,6 +27,8 @@ from colmap_inertial.imaging.plane_sweep import (
     confirm_depth,
     depth_range,
     estimate_normals,
+    estimate_sigma,
+    keep_certain,
     score_partners,
     sweep_depth,
 )
@@ -37,6 +40,8 @@ from colmap_inertial.pipeline.run.runner import remove
 
 #: Partners to match with (fewer measure less, more cost time), and views to ask for agreement.
 PARTNERS, WITNESSES = 4, 8
+#: Maps of each picture: depths, their standard deviations, normals.
+_MAPS = ("depth", "geometric"), ("depth", "sigma"), ("normal", "geometric")
 
 
 @dataclass(frozen=True)
@@ -53,8 +58,8 @@ class SweptWorkspace:
             return
         remove(self.raw)
         for name in self.names:
-            for what in ("depth", "normal"):
-                remove(map_file(self.folder, what, name))
+            for what, kind in _MAPS:
+                remove(map_file(self.folder, what, name, kind))
         self.raw.mkdir(parents=True)
         write_json(record, content)
 
@@ -122,16 +127,27 @@ class SweptWorkspace:
             write_map(target, sweep_depth(self._grey(view), sights.views[view], partners, depths, threads=threads))
 
     def _confirm(self, view: int) -> None:
-        """The maps of one picture: depths that other pictures' depths agree with, and their normals."""
-        files = [map_file(self.folder, what, self.names[view]) for what in ("depth", "normal")]
+        """The maps of one picture: depths that other pictures' depths agree with, and are certain enough."""
+        files = [map_file(self.folder, what, self.names[view], kind) for what, kind in _MAPS]
         if not self._raw_file(view).is_file() or all(file.is_file() for file in files):
             return
+        agreement = self.compare(view)
+        sigma = estimate_sigma(agreement, self.sights.views[view], self.partners(view))
+        depth, sigma = keep_certain(agreement.depth, sigma)
+        for file, values in zip(files, (depth, sigma, estimate_normals(depth, self.sights.views[view])), strict=True):
+            write_map(file, values)
+
+    def partners(self, view: int) -> list[Pinhole]:
+        """Cameras of the pictures that a picture is matched with."""
+        scores = score_partners(self.sights, view)
+        return [self.sights.views[k] for k in choose_partners(self.sights, view, scores, PARTNERS)]
+
+    def compare(self, view: int) -> Agreement:
+        """Compare the depths of one picture with those of others."""
         scores = score_partners(self.sights, view)
         best = np.argsort(-scores, kind="stable")[:WITNESSES]
         witnesses = [int(k) for k in best if scores[k] > 0 and self._raw_file(int(k)).is_file()]
-        depth = confirm_depth(self._depth_view(view), (self._depth_view(k) for k in witnesses))
-        write_map(files[0], depth)
-        write_map(files[1], estimate_normals(depth, self.sights.views[view]))
+        return confirm_depth(self._depth_view(view), (self._depth_view(k) for k in witnesses))
 
     def _depth_view(self, view: int) -> DepthView:
         return DepthView(depth=read_map(self._raw_file(view)), camera=self.sights.views[view])

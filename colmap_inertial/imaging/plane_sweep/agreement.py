@@ -34,7 +34,24 @@ class DepthView:
     camera: Pinhole
 
 
-def confirm_depth(reference: DepthView, others: Iterable[DepthView]) -> Float32Array:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Agreement:
+    """Comparison of a picture's depths with those of other views, (H, W) each.
+
+    Attributes
+    ----------
+    depth
+        Means of the depths that agree, the reference's own among them; 0 where none does.
+    agreeing, beyond
+        Shares of the views whose depth agrees, and of those whose depth lies behind the point that they should see.
+    """
+
+    depth: Float32Array
+    agreeing: Float32Array
+    beyond: Float32Array
+
+
+def confirm_depth(reference: DepthView, others: Iterable[DepthView]) -> Agreement:
     """Keep the depths that at least one other view agrees with.
 
     A pixel is taken to the other view by its depth, and back by the depth that was found there.
@@ -45,28 +62,34 @@ def confirm_depth(reference: DepthView, others: Iterable[DepthView]) -> Float32A
         Whose depths are judged.
     others
         Views that see some of the same; read one after the other.
-
-    Returns
-    -------
-    (H, W) means of the depths that agree, the reference's own among them; 0 where none does.
     """
     depth = reference.depth
-    total, count = depth.copy(), np.ones(depth.shape, dtype=np.float32)
+    total = depth.copy()
+    agreeing, beyond = (np.zeros(depth.shape, dtype=np.float32) for _ in range(2))
+    asked = 0
     for other in others:
+        asked += 1
         there, back = other.camera.seen_from(reference.camera), reference.camera.seen_from(other.camera)
         for begin in range(0, len(depth), ROWS_AT_ONCE):
             rows = slice(begin, begin + ROWS_AT_ONCE)
-            depth_back = _transfer_there_and_back(depth[rows], begin, other.depth, there, back)
+            depth_back, ratio = _transfer_there_and_back(depth[rows], begin, other.depth, there, back)
             agrees = np.abs(depth_back - depth[rows]) <= _LIMITS.within_share * depth[rows]
             total[rows] += np.where(agrees, depth_back, 0)
-            count[rows] += agrees
-    return np.where((count > 1) & (depth > 0), total / count, 0).astype(np.float32)
+            agreeing[rows] += agrees
+            beyond[rows] += ~agrees & (ratio > 1 + _LIMITS.within_share)
+    mean = np.where((agreeing > 0) & (depth > 0), total / (agreeing + 1), 0).astype(np.float32)
+    for count in (agreeing, beyond):
+        count /= max(1, asked)
+    return Agreement(depth=mean, agreeing=agreeing, beyond=beyond)
 
 
 def _transfer_there_and_back(
     depth: Float32Array, begin: int, other: Float32Array, there: Transfer, back: Transfer
-) -> Float32Array:
-    """The depths that rows ``begin ...`` come back with, by another view's depths; nan where they do not."""
+) -> tuple[Float32Array, Float32Array]:
+    """Depths with which rows ``begin ...`` come back, nan where they do not, and ratios of the depths there.
+
+    The ratio is of the depth that was found there and the one that was expected, 0 where none was found.
+    """
     rows, columns = np.indices(depth.shape)
     y, x = (np.asarray(axis, dtype=np.float32) for axis in (rows + begin, columns))
     u, v, w = _transfer_pixels(*there, x, y, depth)
@@ -77,7 +100,9 @@ def _transfer_there_and_back(
     found = other.ravel()[at]
     x_back, y_back, depth_back = _transfer_pixels(*back, np.where(inside, u, 0), np.where(inside, v, 0), found)
     near = (x_back - x) ** 2 + (y_back - y) ** 2 <= _LIMITS.within_px**2
-    return np.where(inside & (found > 0) & near, depth_back, np.float32(np.nan))
+    met = inside & (found > 0)
+    ratio = np.divide(found, w, out=np.zeros_like(w), where=met)
+    return np.where(met & near, depth_back, np.float32(np.nan)), ratio
 
 
 def _transfer_pixels(

@@ -1,0 +1,93 @@
+"""Fit the standard deviations of swept depths on photographic worlds.
+
+    python scripts/fit_depth_sigma.py FOLDER [--fit 0 2] [--judge 1 3] [--widths 640]
+
+FOLDER takes the worlds (``photo_world.py``) and their sweeps; what is there already is used. Printed: the factors of
+``SigmaModel`` (``imaging/plane_sweep/confidence.py``), and for the worlds that judge the share of depths within twice
+their standard deviation, by decile of it.
+
+The factors are the 95 % quantile of the logarithm of errors, by iteratively reweighted least squares. Two standard
+deviations are meant to hold 95 % of the errors; errors are far from Gaussian.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from bench_dense import NEARER_M
+from photo_world import PhotoWorld
+
+from colmap_inertial.colmap.sweep_stereo import SweptWorkspace
+from colmap_inertial.core.arrays import Array
+from colmap_inertial.imaging.plane_sweep import MEASURES, measure_pixels
+
+QUANTILE, ROUNDS = 0.95, 60
+#: Added to errors before the logarithm: smaller ones are the poses'.
+FLOOR_PX = 0.02
+#: Every so many pixels are used.
+EVERY = 5
+
+
+def swept_world(folder: Path, seed: int, width: int) -> tuple[SweptWorkspace, dict[str, Array]]:
+    """A world that is rendered and swept, and its true depths by name."""
+    path = folder / f"{seed}_{width}"
+    if not (path / "truth.npz").is_file():
+        depths = PhotoWorld.of(seed, width).write_workspace(path)
+        np.savez(path / "truth.npz", allow_pickle=False, **depths)
+    swept = SweptWorkspace(path, path / "raw")
+    swept.begin(None)
+    swept.sweep(1, lambda: None)
+    with np.load(path / "truth.npz") as truth:
+        return swept, {name: truth[name] for name in swept.names}
+
+
+def collect(folder: Path, seeds: Sequence[int], widths: Sequence[int]) -> tuple[Array, Array]:
+    """(N, 5) measures of pixels that have a depth, and (N,) errors in pixels of the partners."""
+    measures, errors = [], []
+    for seed, width in itertools.product(seeds, widths):
+        swept, truth = swept_world(folder, seed, width)
+        for view, name in enumerate(swept.names):
+            agreement = swept.compare(view)
+            found, motion_px = measure_pixels(agreement, swept.sights.views[view], swept.partners(view))
+            known = np.flatnonzero((truth[name] < NEARER_M) & (agreement.depth > 0))[::EVERY]
+            measures.append(found.reshape(len(found), -1)[:, known].T.astype(np.float64))
+            away = np.abs(1 / agreement.depth.ravel()[known] - 1 / truth[name].ravel()[known])
+            errors.append(away * motion_px.ravel()[known])
+    return np.concatenate(measures), np.concatenate(errors)
+
+
+def fit_quantile(measures: Array, values: Array, quantile: float) -> Array:
+    """(F,) factors for which this share of the values lies below ``measures @ factors``."""
+    factors = np.linalg.lstsq(measures, values, rcond=None)[0]
+    for _ in range(ROUNDS):
+        away = values - measures @ factors
+        weights = np.where(away > 0, quantile, 1 - quantile) / np.maximum(np.abs(away), 0.02)
+        weighted = measures * weights[:, None]
+        factors = np.linalg.solve(weighted.T @ measures, weighted.T @ values)
+    return np.asarray(factors)
+
+
+def main() -> None:
+    """Print factors and deciles."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--fit", nargs="+", type=int, default=[0, 2])
+    parser.add_argument("--judge", nargs="+", type=int, default=[1, 3])
+    parser.add_argument("--widths", nargs="+", type=int, default=[640])
+    arguments = parser.parse_args()
+    measures, errors = collect(arguments.folder, arguments.fit, arguments.widths)
+    factors = fit_quantile(measures, np.log(errors + FLOOR_PX), QUANTILE)
+    for name, factor in zip(MEASURES, factors, strict=True):
+        print(f"    {name}: float = {factor:.3f}")
+    measures, errors = collect(arguments.folder, arguments.judge, arguments.widths)
+    twice_px = np.exp(measures @ factors)
+    for decile in np.array_split(np.argsort(twice_px), 10):
+        print(f"{twice_px[decile].mean():8.3f} px: {(errors[decile] <= twice_px[decile]).mean():.3f} within")
+
+
+if __name__ == "__main__":
+    main()
