@@ -17,12 +17,14 @@ from test_pipeline_existing import contents, run
 
 from colmap_inertial.colmap import dense as dense_stage, depth_maps
 from colmap_inertial.colmap.tsdf import require_mesh_maker, tsdf_mesh
-from colmap_inertial.core.errors import InertialError
+from colmap_inertial.core.errors import InertialError, OutputError
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.options import DenseOptions, ProjectOptions, ReconstructOptions
 from colmap_inertial.io.ply import read_ply_header
 from colmap_inertial.model import read_model
 from colmap_inertial.model.artefacts import read_map, write_map
+from colmap_inertial.pipeline.run.colmap_settings import ColmapSettings
+from colmap_inertial.pipeline.run.context import RunContext
 from colmap_inertial.reconstruction.drivers.project import reconstruct_project
 
 QUICK = ReconstructOptions(dense=True, dense_options=DenseOptions(max_image_size=96), deterministic=True)
@@ -260,6 +262,38 @@ def test_a_patch_match_that_fails_is_said(unfinished, box, monkeypatch):
     with pytest.raises(InertialError, match=r"patch-match ended with code 1: ValueError.* CUDA"):
         reconstruct_project(box.root, unfinished, source(box), QUICK)
     assert (unfinished / "sparse" / "0").is_dir()
+
+
+def test_a_mesh_of_points_is_made_apart_by_threads_that_sleep_while_they_wait(tmp_path, monkeypatch):
+    """A ball of 4,000 points; what the user sets of COLMAP's options counts."""
+    directions = np.random.default_rng(0).normal(size=(4000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    rows = np.zeros(4000, dtype=[*((axis, "<f4") for axis in ("x", "y", "z", "nx", "ny", "nz")), ("colour", "u1", 3)])
+    for i, axis in enumerate("xyz"):
+        rows[axis], rows[f"n{axis}"] = 2 * directions[:, i], directions[:, i]
+    header = ["ply", "format binary_little_endian 1.0", "element vertex 4000"]
+    header += [f"property float {axis}" for axis in ("x", "y", "z", "nx", "ny", "nz")]
+    header += [f"property uchar {colour}" for colour in ("red", "green", "blue")]
+    points, mesh = tmp_path / "points.ply", tmp_path / "mesh.ply"
+    points.write_bytes("\n".join([*header, "end_header\n"]).encode() + rows.tobytes())
+    ran, begun = subprocess.run, []
+    monkeypatch.setattr(depth_maps.subprocess, "run", lambda *a, **k: begun.append(k) or ran(*a, **k))
+    depth_maps.mesh_points(points, mesh, depth=6, trim=0, context=RunContext(num_threads=1))
+    assert begun[0]["env"]["OMP_WAIT_POLICY"] == "passive"
+    found = vertices(mesh)
+    assert len(found) > 1000
+    assert np.abs(np.linalg.norm(found, axis=1) - 2).max() < 0.05
+    # denser than anything there is
+    trimmed = RunContext(num_threads=1, colmap=ColmapSettings(("PoissonMeshing.trim=12",)))
+    depth_maps.mesh_points(points, mesh, depth=6, trim=0, context=trimmed)
+    assert len(vertices(mesh)) == 0
+
+
+def test_a_mesh_that_fails_is_said(tmp_path):
+    with pytest.raises(OutputError, match="no mesh"):
+        depth_maps.mesh_points(
+            tmp_path / "missing.ply", tmp_path / "mesh.ply", depth=6, trim=0, context=RunContext(num_threads=1)
+        )
 
 
 def need_open3d():

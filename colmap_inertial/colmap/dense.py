@@ -26,6 +26,7 @@ from colmap_inertial.colmap.depth_maps import (
     find_maps,
     fuse_maps,
     map_file,
+    mesh_points,
     patch_match,
 )
 from colmap_inertial.colmap.sweep_stereo import SweptWorkspace
@@ -36,7 +37,6 @@ from colmap_inertial.io.files import path_in, read_json, write_json
 from colmap_inertial.io.images import read_image
 from colmap_inertial.io.ply import read_ply_header
 from colmap_inertial.model import TRANSFORM_FILE, read_model
-from colmap_inertial.pipeline.run.context import RunContext
 from colmap_inertial.pipeline.run.runner import fingerprint, remove
 from colmap_inertial.pipeline.run.session import Session
 from colmap_inertial.pipeline.run.workspace import a_record_of_ours
@@ -183,7 +183,7 @@ def _densify(
     else:
         depth, trim = _choose_octree(fused, read_model(folder / "sparse"))
         depends = {"depth": depth, "trim": trim}
-        make_mesh = partial(_poisson_mesh, fused, depth=depth, trim=trim, context=context)
+        make_mesh = partial(mesh_points, fused, depth=depth, trim=trim, context=context)
     # its time does not follow from that of the depth maps: 0.4 to 4.6 times as long on two scenes
     session.progress("mesh", 0, 1)
     runner.run(
@@ -191,17 +191,6 @@ def _densify(
     )
     session.progress("mesh", 1, 1)
     return replace(result, mesh=mesh, faces=_count_elements(mesh, "face"))
-
-
-def _poisson_mesh(fused: Path, target: Path, *, depth: int, trim: float, context: RunContext) -> None:
-    """Write COLMAP's Poisson surface of a point cloud."""
-    import pycolmap
-
-    poisson = pycolmap.PoissonMeshingOptions()
-    poisson.depth, poisson.trim, poisson.num_threads = depth, trim, context.num_threads
-    pycolmap.poisson_meshing(str(fused), str(target), context.colmap.apply(poisson))
-    if not target.is_file():
-        raise OutputError(f"{fused.parent}: COLMAP wrote no mesh; is the disk full?")
 
 
 def _prepare_model(session: Session, index: int, images: Path, options: DenseOptions) -> _Prepared:

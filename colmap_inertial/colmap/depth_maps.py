@@ -30,16 +30,23 @@ _SWEPT_SIZE = 1200
 _RECORD = "made_from.json"
 #: Keys of the record that decide patch-match's maps, and what counts where an earlier version did not say.
 _MADE_FROM = (("model", None), ("max_image_size", None), ("settings", ""))
-#: Ends with the process that started it.
-_PATCH_MATCH = """
-import ctypes, signal, sys, zlib
+#: A process that ends with the one that started it.
+_BEGIN = """
+import ctypes, signal, sys
 if sys.platform == "linux":
     ctypes.CDLL(None).prctl(1, signal.SIGKILL)
 import pycolmap
 from colmap_inertial.pipeline.run.colmap_settings import ColmapSettings
+"""
+_PATCH_MATCH = """
 options = pycolmap.PatchMatchOptions()
 options.max_image_size = int(sys.argv[2])
 pycolmap.patch_match_stereo(sys.argv[1], options=ColmapSettings(tuple(sys.argv[3:])).apply(options))
+"""
+_POISSON = """
+options = pycolmap.PoissonMeshingOptions()
+options.depth, options.trim, options.num_threads = int(sys.argv[3]), float(sys.argv[4]), int(sys.argv[5])
+pycolmap.poisson_meshing(sys.argv[1], sys.argv[2], ColmapSettings(tuple(sys.argv[6:])).apply(options))
 """
 
 
@@ -206,14 +213,53 @@ def patch_match(folder: Path, max_image_size: int | None, settings: ColmapSettin
             check_map(path, 1 if "depth_maps" in path.parts else 3)
         except FormatError:
             remove(path)
-    command = [sys.executable, "-c", _PATCH_MATCH, str(folder), str(max_image_size or -1), *settings.of("stereo")]
-    done = subprocess.run(command, capture_output=True, text=True, errors="replace")
+    done = _run_apart(_PATCH_MATCH, folder, max_image_size or -1, *settings.of("stereo"))
     if done.returncode:
-        message = (done.stderr.strip().splitlines() or ["no message"])[-1]
+        message = _last_line(done)
         raise InertialError(
             f"{folder}: COLMAP's patch-match ended with code {done.returncode}: {message}. Started again, it continues "
             "with the next depth map"
         )
+
+
+def mesh_points(fused: Path, target: Path, *, depth: int, trim: float, context: RunContext) -> None:
+    """Write COLMAP's Poisson surface of a point cloud.
+
+    In a process of its own, whose threads sleep where they wait for each other: its many short loops otherwise take
+    most of their time waiting for threads that other programs keep off the processor. With two threads on two busy
+    cores and 104,000 points, 45 s and 11 s of processor time instead of 170 s and 81 s.
+
+    Parameters
+    ----------
+    fused
+        The points with normals (PLY).
+    target
+        Of the mesh (PLY).
+    depth, trim
+        Of the octree, and up to which level of density the surface is kept.
+    context
+        How the work is done.
+
+    Raises
+    ------
+    OutputError
+        Where nothing was written.
+    """
+    settings = context.colmap.of("fusion")
+    done = _run_apart(_POISSON, fused, target, depth, trim, context.num_threads, *settings)
+    if done.returncode or not target.is_file():
+        raise OutputError(f"{fused.parent}: COLMAP wrote no mesh ({_last_line(done)}); are disk or memory full?")
+
+
+def _run_apart(code: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    """Run COLMAP in a process of its own, which ends with this one."""
+    command = [sys.executable, "-c", _BEGIN + code, *map(str, arguments)]
+    waiting = os.environ | {"OMP_WAIT_POLICY": "passive"}
+    return subprocess.run(command, env=waiting, capture_output=True, text=True, errors="replace")
+
+
+def _last_line(done: subprocess.CompletedProcess[str]) -> str:
+    return (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
 
 
 def find_maps(folder: Path, names: Sequence[str]) -> tuple[str, list[str]]:
