@@ -1,7 +1,7 @@
 """What the tight refinement does to simulated walks: camera centres, drift of scale, and the calibration.
 
     python scripts/study_refine.py [--metres 100] [--readout-ms 0] [--undeclared] [--expected] [--seeds 1 2]
-        [--chance] [--spoil late] [--points-per-m 250] [--mapper] [--out F]
+        [--chance] [--auto] [--spoil late] [--points-per-m 250] [--mapper] [--out F]
     python scripts/study_refine.py --loop [--seeds 1 2]
 
 Points beside the way are tracked as features are (no pictures are rendered), and COLMAP's own bundle adjustment makes
@@ -16,6 +16,8 @@ model, from true matches of all frames that see the same, with the options that 
 falsifies the IMU: another recording's, 30 ms late, an axis of the accelerometer flipped, or 5 % more of it.
 ``--expected``: a device whose axes and gains are as far off as the refinement's priors have it, and not as a phone's:
 what tells whether the rotation's covariance is right.
+
+``--auto`` prints what ``--refine auto`` chooses and expects; every walk is refined all the same, to judge the choice.
 
 ``--chance`` prints what the refinement's covariance says of its camera centres after one similarity: the error that is
 to be expected, of it and of pictures alone, in millimetres; the normalised error of the path's shape (rms over its 12
@@ -198,7 +200,14 @@ def _drawn(cov: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def studied(
-    options: TrackOptions, seed: int, spoil: str, *, declared: bool = True, chance: bool = False, mapper: bool = False
+    options: TrackOptions,
+    seed: int,
+    spoil: str,
+    *,
+    declared: bool = True,
+    chance: bool = False,
+    mapper: bool = False,
+    auto: bool = False,
 ) -> dict[str, Any]:
     """One walk through the stages."""
     tracks = simulate_tracks(options, seed=seed)
@@ -244,11 +253,19 @@ def studied(
     out["scale"]["accel_noise"] = 0.0 if noise is None else noise.accel_density_m_s2_rthz
     out["before"] = compared(centres_of(model.reconstruction), truth)
     seconds["scale"] = time.process_time() - begin_s
-    begin_s = time.process_time()
     stage, metric = RefineStage(imu=imu, calibration=prior, refine_intrinsics=True, shutter=shutter), model
-    model = stage(metric)
+    begin_s = time.process_time()
+    model = replace(stage, auto=auto)(metric)
     seconds["refine"] = time.process_time() - begin_s
     said = model.treatments[-1]
+    out["expected"] = said.values.get("expected")
+    out["declined"] = auto and not said.action and "sigma_px" not in said.values
+    if out["declined"]:
+        # what it would have done, to judge the choice
+        out["why"], seconds["choice"], begin_s = said.reason, seconds["refine"], time.process_time()
+        model = stage(metric)
+        seconds["refine"] = time.process_time() - begin_s
+        said = model.treatments[-1]
     out |= {"after": compared(centres_of(model.reconstruction), truth), "said": said.reason, "values": said.values}
     out["accepted"], out["seconds"] = said.action == "refined", seconds
     out["gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024e-9
@@ -326,6 +343,31 @@ def told_normalised(results: list[dict[str, Any]]) -> None:
         print(f"normalised errors of {name}: {np.sqrt(np.mean(errors**2)):.2f} rms of {len(errors)}")
 
 
+def told_choices(results: list[dict[str, Any]]) -> None:
+    """What ``--refine auto`` chooses, against what the refinement does to each walk."""
+    for one in results:
+        worth, seconds = one["expected"], one["seconds"]
+        ratio = one["after"]["rms_mm"] / one["before"]["rms_mm"]
+        told = "no expectation"
+        if worth is not None:
+            told = (
+                f"expected {1e3 * worth['alone_m']:.1f} -> {1e3 * worth['refined_m']:.1f} mm, risk "
+                f"{worth['risk']:.3f}, share {worth['share']:.2f}"
+            )
+        print(
+            f"seed {one['seed']}: {'left' if one['declined'] else 'refined'}; {told}; came "
+            f"{one['before']['rms_mm']:.1f} -> {one['after']['rms_mm']:.1f} mm ({ratio:.2f}), {one['accepted']}; "
+            f"{one['frames']} frames, {one['observations']} observations, {seconds}"
+        )
+    chosen = [one["after"]["rms_mm"] / one["before"]["rms_mm"] for one in results if not one["declined"]]
+    missed = [one["after"]["rms_mm"] / one["before"]["rms_mm"] for one in results if one["declined"]]
+    print(
+        f"auto: refines {len(chosen)} of {len(results)}, worst {max(chosen, default=0):.2f} times as far off, "
+        f"{sum(r > 1.05 for r in chosen)} above 1.05; of {len(missed)} left {sum(r < 0.95 for r in missed)} would have "
+        "come closer"
+    )
+
+
 def main() -> None:
     pycolmap.logging.minloglevel = 3
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -338,6 +380,7 @@ def main() -> None:
     parser.add_argument("--points-per-m", type=float, default=TrackOptions.points_per_m)
     parser.add_argument("--mapper", action="store_true")
     parser.add_argument("--chance", action="store_true")
+    parser.add_argument("--auto", action="store_true")
     parser.add_argument("--spoil", choices=("", "other", "late", "flipped", "gain"), default="")
     parser.add_argument("--out", type=Path)
     asked = parser.parse_args()
@@ -346,7 +389,13 @@ def main() -> None:
     options = options if asked.loop else replace(options, points_per_m=asked.points_per_m)
     for seed in asked.seeds:
         one = studied(
-            options, seed, asked.spoil, declared=not asked.undeclared, chance=asked.chance, mapper=asked.mapper
+            options,
+            seed,
+            asked.spoil,
+            declared=not asked.undeclared,
+            chance=asked.chance,
+            mapper=asked.mapper,
+            auto=asked.auto,
         )
         results.append(one)
         colmap, before, after = (one[k] for k in ("colmap", "before", "after"))
@@ -367,6 +416,8 @@ def main() -> None:
     drifts = [abs(one["after"]["drift_pct"]) / max(abs(one["colmap"]["drift_pct"]), 1e-9) for one in results]
     print(f"median of the drift that is left: {np.median(drifts):.2f}")
     told_normalised(results)
+    if asked.auto:
+        told_choices(results)
     chances = [one["chance"] for one in results if "chance" in one]
     if chances:
         shape = np.sqrt(np.mean([one["shape"] ** 2 for one in chances]))

@@ -477,7 +477,7 @@ def test_the_examples_in_python_run(examples):
     folder, values = examples
     result = values["result"]
     assert {frame.action for frame in result.frames} == {"brightened"}
-    assert [treatment.stage for model in result.models for treatment in model.treatments] == ["well_seen"]
+    assert [treatment.stage for model in result.models for treatment in model.treatments] == ["refine", "well_seen"]
     assert values["estimate"].verdict == "trusted"
     assert (folder / "metric_model" / "transform.json").is_file()
     assert (folder / "project_metric" / "sparse" / "0").is_dir()

@@ -149,7 +149,7 @@ def test_what_a_visitor_s_keypoint_stage_did_is_what_the_result_says(capture, tm
     assert contents(out / "images") != contents(out / "colmap" / "images")
     # the default model stages see a model of rectified keypoints, and finish what the keypoints began
     assert models[0].rectified and not models[0].doubts
-    assert [treatment.stage for treatment in result.models[0].treatments] == ["readout"]
+    assert [treatment.stage for treatment in result.models[0].treatments] == ["readout", "refine"]
     assert stored(out)["models"][0]["readout_translation"] is not None
 
 

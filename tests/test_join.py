@@ -434,6 +434,8 @@ def test_a_project_of_two_models_becomes_one(walked, tmp_path, capsys):
     assert "Gaps between COLMAP" in (out / "report.html").read_text()
     show_result(result, tmp_path / "project")
     assert "COLMAP's models 0, 1; 1 sigma across: 1." in " ".join(capsys.readouterr().out.split())
+    # what is by itself in the project, too, keeps its shape
+    assert "not refined: its parts are in the project by themselves" in said["models"][0]["treatments"][-1]["reason"]
     # what reads models reads this one
     assert find_source(out).index == 0
     made = export_model(out, tmp_path / "path", "tum")

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -22,6 +23,7 @@ from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import read_record
 from colmap_inertial.io.trajectories import read_tum
 from colmap_inertial.model import Model, transformed
+from colmap_inertial.model.layout import find_made_from, read_layout
 from colmap_inertial.pipeline.run.context import Recording
 from colmap_inertial.pipeline.run.runner import canonical
 from colmap_inertial.pipeline.stages.defaults import default_model_stages
@@ -316,7 +318,8 @@ def test_auto_refines_where_drift_exceeds_what_is_left(walked, monkeypatch):
     tracks, model = walked
     made, said = refined_by(tracks.imu, model, auto=True)
     worth = said.values["expected"]
-    assert said.action == "refined" and worth["alone_m"] > 2**0.5 * worth["refined_m"] and worth["share"] < 0.25
+    assert said.action == "refined" and worth["risk"] < 0.05 and worth["share"] < 0.25
+    assert "expected to err by" in said.reason and "mm by images alone" in made.scale.notes[-1]
     # as far off as it was expected to be, by the truth; frames that see next to nothing are farther
     truth = tracks.motion.cam_in_world_m(tracks.timing.pose_t_s())
     before, after = (error_of(centres_of(one.reconstruction), truth) for one in (model, made))
@@ -324,14 +327,59 @@ def test_auto_refines_where_drift_exceeds_what_is_left(walked, monkeypatch):
     for name, value, why in (
         ("share", 1e-6, "of the time that features and mapping take"),
         ("most_bytes", 1, "of the time"),
+        ("least_drift", 1.0, "images hold its shape by themselves"),
+        ("most_risk", 0.0, "of such paths come out farther off"),
     ):
         monkeypatch.setattr(motion, "_LIMITS", motion.DriftLimits(**{name: value}))
         same, said = refined_by(tracks.imu, model, auto=True)
         assert why in said.reason and same.reconstruction is model.reconstruction
-    monkeypatch.undo()
-    monkeypatch.setattr(motion, "_shape_sigma", lambda *_: 1e-3)
+        # the reason is on the screen and in the report, too
+        assert same.scale.notes[-1] == f"the model was {said.reason}"
+
+
+def test_auto_leaves_a_model_that_loops_hold():
+    options = walk(24.0, points_per_m=15.0, life_s=1e3)
+    around = replace(options.motion, kind="orbit", radius_m=6.0, arc_deg=330.0, sweep_s=12.0)
+    tracks = tracks_of(replace(options, motion=around))
+    model = Model(reconstruction=adjusted(tracks.reconstruction()), colmap_index=0, timing=tracks.timing)
+    model = MetricStage(imu=tracks.imu, calibration=UNKNOWN)(model)
     same, said = refined_by(tracks.imu, model, auto=True)
-    assert "would be left" in said.reason and same.reconstruction is model.reconstruction
+    assert "images hold its shape by themselves" in said.reason and same.reconstruction is model.reconstruction
+    truth = tracks.motion.cam_in_world_m(tracks.timing.pose_t_s())
+    expected_m = said.values["expected"]["alone_m"]
+    assert 0.5 < error_of(centres_of(model.reconstruction), truth) / expected_m < 2
+
+
+@pytest.mark.parametrize("times", [1.2, 2.0, 4.0])
+def test_the_risk_is_that_of_one_normal_error_that_is_taken_away(times):
+    # along one direction, what is removed over what is left is distributed as Cauchy's
+    along = np.array([0.0, 2.0, 0.0, -1.0, 0.0, 2.0]) / 3
+    left = np.outer(along, along)
+    removed, nearer = (times**2 - 1) ** 0.5, 1 / 1.05
+    expected = np.arctan((nearer - 1) / removed) - np.arctan((-nearer - 1) / removed)
+    assert motion._risk(times**2 * left, left) == pytest.approx(expected / np.pi, abs=0.02)
+
+
+def test_auto_leaves_a_project_from_which_more_was_made(walked, tmp_path):
+    tracks, model = walked
+    same, said = refined_by(tracks.imu, model, auto=True, made_from="dense/fused.ply")
+    assert said.reason.startswith("not refined: dense/fused.ply was made from it")
+    assert same.reconstruction is model.reconstruction
+    assert refined_by(tracks.imu, model, made_from="dense/fused.ply")[1].action == "refined"
+    sparse, others = tmp_path / "sparse" / "0", tmp_path / "dense" / "sparse"
+    for folder in (sparse, others):
+        folder.mkdir(parents=True)
+        model.reconstruction.write_binary(str(folder))
+    files = [Path("sparse/0/images.bin"), Path("images/a.jpg"), Path("mesh.obj"), Path("dense/sparse/images.bin")]
+    for name in ("images/a.jpg", "mesh.obj"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("v 0 0 0\n")
+    layout = read_layout(
+        tmp_path, [Path("sparse"), Path("sparse/0"), Path("dense"), Path("dense/sparse")], one_for_all=False
+    )
+    assert find_made_from(tmp_path, layout, files[:2]) is None
+    assert find_made_from(tmp_path, layout, files[:3]) == Path("mesh.obj")
+    assert find_made_from(tmp_path, layout, files) == Path("dense/sparse/images.bin")
 
 
 @pytest.mark.parametrize("found", [(1.5e-3, 0.49e-3), (0.9e-3, 1e-5), (-5e-3, 2e-3)])
@@ -558,10 +606,12 @@ def test_without_the_option_the_model_is_what_it_was(walked):
     mapped.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.translation_m).inverse())
     model = MetricStage(imu=tracks.imu, calibration=UNKNOWN)(replace(model, reconstruction=mapped, similarity=None))
     recording = Recording.of(Capture(path="none", calibration=UNKNOWN), tracks.imu, tracks.timing, UNKNOWN)
-    stages = default_model_stages(StageInputs(recording=recording, options=ReconstructOptions(join="off")))
+    off = ReconstructOptions(join="off", refine="off")
+    stages = default_model_stages(StageInputs(recording=recording, options=off))
     assert [type(stage) for stage in stages] == [ReadoutStage, MetricStage]
-    joining = default_model_stages(StageInputs(recording=recording))
-    assert [type(stage) for stage in joining] == [ReadoutStage, MetricStage, JoinStage]
+    usual = default_model_stages(StageInputs(recording=recording))
+    assert [type(stage) for stage in usual] == [ReadoutStage, MetricStage, JoinStage, RefineStage]
+    assert usual[-1].auto
     made = Model(reconstruction=mapped, colmap_index=0, timing=tracks.timing)
     for stage in stages:
         made = stage(made)
@@ -573,6 +623,7 @@ def test_without_the_option_the_model_is_what_it_was(walked):
     assert made.scale.metres_per_unit == model.scale.metres_per_unit
     stages = default_model_stages(StageInputs(recording=recording, options=ReconstructOptions(refine="inertial")))
     assert [type(stage) for stage in stages] == [ReadoutStage, MetricStage, JoinStage, RefineStage]
+    assert not stages[-1].auto
 
 
 def test_an_existing_project_is_refined(walked, tmp_path):

@@ -896,7 +896,7 @@ def test_an_existing_project_gets_one_with_and_without_a_scale(project, tmp_path
 
 def test_a_long_path_is_said_to_bend_and_a_refined_one_how_much_it_did():
     done = {"stage": "refine", "action": "refined", "values": {"drift": [{"percent": -0.31}, {"percent": 0.2}]}}
-    left = {"stage": "refine", "action": "", "values": {}}
+    left = {"stage": "refine", "action": "", "reason": "not refined: images hold its shape", "values": {}}
     for treatments, length, said in (
         ([], 12.0, []),
         (
@@ -904,7 +904,8 @@ def test_a_long_path_is_said_to_bend_and_a_refined_one_how_much_it_did():
             85.2,
             ["The camera path is 85 m long: --refine inertial fits it to the IMU, against bending and drift."],
         ),
-        ([left], 85.2, []),
+        ([left], 12.0, []),
+        ([left], 85.2, ["The camera path is 85 m long and was not refined: images hold its shape."]),
         ([done], 12.0, ["The refinement corrected drift of the path: parts of it were stretched by -0.31 to +0.20 %."]),
     ):
         model = {"treatments": treatments, "sparse_metric": "sparse/0", "scene": {"path_length": length}}

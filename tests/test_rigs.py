@@ -13,7 +13,7 @@ from box_project import FOCAL, HEIGHT, HIGH, LOW, WIDTH
 from conftest import write_project
 
 from colmap_inertial.cli import main
-from colmap_inertial.core.errors import TimingError
+from colmap_inertial.core.errors import InertialError, TimingError
 from colmap_inertial.core.geometry import matrix_from_quat, quat_rotate
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.inertial.scale import estimate_scale
@@ -116,7 +116,7 @@ def rig(tmp_path_factory):
 @pytest.fixture(scope="module")
 def metric(rig, tmp_path_factory):
     out = tmp_path_factory.mktemp("metric") / "out"
-    return reconstruct_project(rig.root, out, rig.source(), ReconstructOptions(refine="inertial"))
+    return reconstruct_project(rig.root, out, rig.source())
 
 
 def test_a_synchronised_rig_becomes_metric_without_a_hand_on_its_times(rig, metric):
@@ -188,9 +188,13 @@ def test_the_path_is_that_of_the_reference_camera_also_where_it_took_no_image(ri
     np.testing.assert_allclose(steps, np.linalg.norm(np.diff(truth, axis=0), axis=1), atol=4e-3)
 
 
-def test_refinement_says_that_it_does_not_take_rigs(metric):
+def test_refinement_says_that_it_does_not_take_rigs(rig, metric, tmp_path):
     (said,) = [t for t in metric.models[0].treatments if t.stage == "refine"]
-    assert "several cameras took its images" in str(said)
+    assert said.reason.startswith("not refined: several cameras took its images") and not said.action
+    asked = ReconstructOptions(refine="inertial")
+    with pytest.raises(InertialError, match="models with rigs cannot be refined"):
+        reconstruct_project(rig.root, tmp_path / "out", rig.source(), asked)
+    assert not (tmp_path / "out").exists()
 
 
 def test_in_two_steps_it_is_the_same(rig, metric, tmp_path, capsys):

@@ -352,10 +352,10 @@ class ReconstructOptions(CheckedOptions):
     well enough (see --join-options); off: keep them apart."""
     join_options: JoinOptions = field(default_factory=JoinOptions)
     """Up to where they are joined."""
-    refine: RefineMethod = "off"
+    refine: RefineMethod = "auto"
     """inertial: fit image observations, rolling shutter and IMU together, which reduces bending and drift of the metric
-    model; kept only where it predicts observations better. auto: where the drift to be expected of images alone exceeds
-    what the refinement leaves, and it takes at most a quarter of the time of features, matching and mapping."""
+    model; kept only where it predicts observations better. auto: where that is expected to bring the path closer with
+    95 % probability, and takes at most a quarter of the time of features, matching and mapping; off: never."""
     world: WorldAxes = "z-up"
     """Axes of the metric model: z away from the ground, or y towards it, as COLMAP's own cameras have it."""
     georeference: bool = False

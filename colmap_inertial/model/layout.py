@@ -23,6 +23,8 @@ _SUFFIXES = (
     *(".mvs", ".nvm", ".out", ".ksplat", ".spz", ".sog", ".tum"),
 )
 _NAMES = ("georeference.json", "cameras.csv")
+#: Kinds of files that have the shape of the model that they were made from.
+_SHAPED = ("depth map", "ply", "obj", "transforms", "export")
 
 
 def foreign_kind(path: Path) -> str | None:
@@ -130,6 +132,20 @@ def read_layout(root: Path, folders: Sequence[Path], *, one_for_all: bool) -> La
         elif (root / folder / "stereo" / "depth_maps").is_dir():
             raise FormatError(root / folder, "depth maps beside several sub-models: it cannot be told whose they are")
     return Layout(submodels=submodels, owners=owners, workspaces=workspaces, placed=list(placed.values()))
+
+
+def find_made_from(root: Path, layout: Layout, files: Sequence[Path]) -> Path | None:
+    """A file of a project that carries length and is no sub-model of it: it was made from one, and has its shape.
+
+    ``files`` are those of the project, relative to it.
+    """
+    own = {*layout.submodels.values()}
+    for path in sorted(files):
+        if path.parent in layout.owners and path.parent not in own:
+            return path
+        if foreign_kind(path) or (path.parent not in own and kind_of(root / path, path) in _SHAPED):
+            return path
+    return None
 
 
 def _submodels(root: Path, models: list[Path], dense: list[Path], *, one_for_all: bool) -> dict[int, Path]:

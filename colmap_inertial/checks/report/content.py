@@ -105,10 +105,12 @@ def gather(
 def _describe_path(model: Content) -> list[str]:
     """A sentence on what the refinement changed in a model's path, or that it could be run."""
     done = [each for each in model.get("treatments", []) if each["stage"] == "refine"]
-    if not done:
+    if not done or not done[-1]["action"]:
         length = model.get("scene", {}).get("path_length")
         if model.get("sparse_metric") is None or length is None or length < SIZES.long_path_m:
             return []
+        if done:
+            return [f"The camera path is {length:.0f} m long and was {done[-1]['reason']}."]
         return [
             f"The camera path is {length:.0f} m long: --refine inertial fits it to the IMU, against bending and drift."
         ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,7 +14,12 @@ from colmap_inertial.inertial.refine.pictures import apply_noise, make_pictures,
 from colmap_inertial.inertial.refine.setup import Seen
 from colmap_inertial.inertial.refine.solve import factored
 from colmap_inertial.inertial.refine.values import N_STATE, Estimate, Problem
-from colmap_inertial.inertial.refine.world import derive_log_size, differentiate_by_centres, differentiate_by_mean_turn
+from colmap_inertial.inertial.refine.world import (
+    derive_log_size,
+    differentiate_by_centres,
+    differentiate_by_mean_turn,
+    size_of,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,16 +30,23 @@ class DriftLimits:
     most_bytes: int = 300_000_000
     #: Processor seconds: of a step of the refinement for each observation, and for each multiplication of its band; its
     #: steps; of features, matching and mapping for each image and each observation (a desk computer's core).
-    step_observation_s: float = 5e-6
-    step_product_s: float = 2.5e-10
+    step_observation_s: float = 3.4e-6
+    step_product_s: float = 1e-11
     steps: int = 40
     mapped_image_s: float = 0.4
-    mapped_observation_s: float = 1e-4
+    mapped_observation_s: float = 2e-4
+    #: Of that time what a refinement may take.
+    share: float = 0.25
     #: Frames whose centres say how much drift is expected, and observations that each of them has.
     centres: int = 40
     fewest: int = 10
-    #: Of that time what a refinement may take.
-    share: float = 0.25
+    #: A shape that errs by less than this share of its size is held by loops or by points that all images see.
+    least_drift: float = 3e-4
+    #: A walk that ends so many times as far off is worse; the largest probability of that; draws of errors, their seed.
+    farther: float = 1.05
+    most_risk: float = 0.05
+    draws: int = 4000
+    seed: int = 0
 
 
 _LIMITS = DriftLimits()
@@ -144,6 +156,9 @@ class Worth:
     alone_m, refined_m
         Standard deviation of positions for the path's shape, of pictures alone and of the refinement; 0 where that was
         not looked at.
+    risk
+        Probability that the refined path is more than 1.05 times as far off as the one before; 0 where it was not
+        looked at.
     share
         Processor time that it takes, of that of features, matching and mapping.
     reason
@@ -152,14 +167,20 @@ class Worth:
 
     alone_m: float = 0.0
     refined_m: float = 0.0
+    risk: float = 0.0
     share: float
     reason: str = ""
 
+    def describe(self) -> str:
+        """The expected errors, in words."""
+        return f"expected to err by {1e3 * self.alone_m:.2g} mm by images alone, and by {1e3 * self.refined_m:.2g} mm"
+
 
 def expect_worth(seen: Seen, problem: Problem, start: Estimate) -> Worth:
-    """Whether a refinement is expected to remove more drift than it leaves, in little time.
+    """Whether a refinement is expected to bring a path closer to the truth, surely enough and in little time.
 
-    Times are predicted from counts, so that the same model always has the same answer.
+    Times are predicted from counts, so that the same model always has the same answer, also where nobody knows how long
+    its mapping took. The error of the refined path is part of that of pictures alone; what it removes is independent.
 
     Raises
     ------
@@ -177,23 +198,23 @@ def expect_worth(seen: Seen, problem: Problem, start: Estimate) -> Worth:
         )
     pictures, x = make_pictures(seen)
     pictures = apply_noise(pictures, measure_picture_noise(pictures, x))
+    alone, size_m = _shape_cov(seen, factored(pictures, x), moving(pictures, x))
+    worth = Worth(alone_m=_sigma(alone), share=share)
+    if worth.alone_m < _LIMITS.least_drift * size_m:
+        held = f"{1e3 * worth.alone_m:.2g} mm, {100 * worth.alone_m / size_m:.2g} % of its size"
+        return replace(worth, reason=f"images hold its shape by themselves: it is expected to err by {held}")
     noise = measure_picture_noise(pictures_alone(problem, seen.observations.xy_px), start)
-    alone_m, refined_m = (
-        _shape_sigma(seen, factored(one, at), moving(one, at))
-        for one, at in ((pictures, x), (apply_noise(problem, noise), start))
-    )
-    # what it takes away, against what it leaves
-    little = alone_m**2 - refined_m**2 <= refined_m**2
-    reason = (
-        f"images alone are expected to err by {1e3 * alone_m:.2g} mm, and {1e3 * refined_m:.2g} mm would be left"
-        if little
-        else ""
-    )
-    return Worth(alone_m=alone_m, refined_m=refined_m, share=share, reason=reason)
+    problem = apply_noise(problem, noise)
+    refined, _ = _shape_cov(seen, factored(problem, start), moving(problem, start))
+    worth = replace(worth, refined_m=_sigma(refined), risk=_risk(alone, refined))
+    if worth.risk <= _LIMITS.most_risk:
+        return worth
+    why = f"it is {worth.describe()} with the IMU, but {100 * worth.risk:.0f} % of such paths come out farther off"
+    return replace(worth, reason=why)
 
 
-def _shape_sigma(seen: Seen, solved: Factored, by: Moving) -> float:
-    """Standard deviation of the centres of cameras that see enough, but for one similarity."""
+def _shape_cov(seen: Seen, solved: Factored, by: Moving) -> tuple[Array, float]:
+    """(3 K, 3 K) covariance of K centres of cameras that see enough, but for one similarity; and their size (m)."""
     centres = seen.cam_in_world
     often = np.flatnonzero(np.bincount(seen.observations.frame, minlength=len(centres)) >= _LIMITS.fewest)
     some = often[np.linspace(0, len(often) - 1, min(len(often), _LIMITS.centres)).astype(np.int64)]
@@ -202,7 +223,24 @@ def _shape_sigma(seen: Seen, solved: Factored, by: Moving) -> float:
     free[:, :, :3], free[:, :, 3], free[:, :, 4:] = np.eye(3), away, -skew(away)
     basis, _ = np.linalg.qr(free.reshape(-1, 7))
     left = np.eye(len(basis)) - basis @ basis.T
-    return float(np.sqrt(np.trace(left @ solved.centres_cov(some, by) @ left) / len(some)))
+    return left @ solved.centres_cov(some, by) @ left, size_of(centres[some])
+
+
+def _sigma(cov: Array) -> float:
+    return float(np.sqrt(3 * np.trace(cov) / len(cov)))
+
+
+def _risk(alone: Array, refined: Array) -> float:
+    """Probability that normal errors of the refined shape are farther than with what the refinement removes."""
+    rng = np.random.default_rng(_LIMITS.seed)
+
+    def draw(cov: Array) -> Array:
+        weights, ways = np.linalg.eigh(cov)
+        return rng.standard_normal((_LIMITS.draws, len(cov))) * np.sqrt(np.maximum(weights, 0)) @ ways.T
+
+    left, removed = draw(refined), draw(alone - refined)
+    before, after = np.linalg.norm(left + removed, axis=1), np.linalg.norm(left, axis=1)
+    return float(np.mean(after > _LIMITS.farther * before))
 
 
 def _drift_covs(seen: Seen, down: Array, solved: Factored, by: Moving) -> Array:

@@ -78,6 +78,9 @@ class StageInputs:
         For model stages: what keypoints went through.
     database
         For model stages: COLMAP's, of the models.
+    made_from
+        For model stages: a file of an existing project that was made from its models; empty without one, ``None`` of a
+        capture.
     """
 
     recording: Recording
@@ -89,3 +92,4 @@ class StageInputs:
     apertures: Path | None = None
     keypoint_stages: Sequence[KeypointStage] = ()
     database: Path | None = None
+    made_from: str | None = None

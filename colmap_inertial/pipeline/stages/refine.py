@@ -72,11 +72,15 @@ class RefineStage(InertialStage):
         What rectified the keypoints, where something did.
     auto
         Whether a model stays as it is where the refinement promises little, or takes long.
+    made_from
+        Of an existing project, a file that was made from its models and keeps their shape: ``auto`` leaves these as
+        they are then; empty without one, ``None`` of a capture.
     """
 
     refine_intrinsics: bool
     shutter: InvertibleStage | None = None
     auto: bool = False
+    made_from: str | None = None
     _writes: int = field(default=_WRITES, init=False, repr=False)
 
     @classmethod
@@ -89,6 +93,7 @@ class RefineStage(InertialStage):
             refine_intrinsics=cls.refines_intrinsics(inputs),
             shutter=find_inverse(inputs.keypoint_stages),
             auto=inputs.options.refine == "auto",
+            made_from=inputs.made_from,
         )
 
     @property
@@ -101,13 +106,13 @@ class RefineStage(InertialStage):
         begin_s = time.perf_counter()
         why_not = self._why_not(model)
         if why_not:
-            return _said(model, f"left as it is: {why_not}")
+            return _said(model, f"not refined: {why_not}")
         try:
             with one_blas_thread():
                 refined = self._refined(model)
         except (NotObservableError, np.linalg.LinAlgError) as error:
             hint = error.hint if isinstance(error, NotObservableError) else "camera and IMU do not determine its shape"
-            return _said(model, f"left as it is: {hint}")
+            return _said(model, f"not refined: {hint}")
         log.info("model %d: refined in %.1f s", model.colmap_index, time.perf_counter() - begin_s)
         return refined
 
@@ -128,30 +133,28 @@ class RefineStage(InertialStage):
             return "the accelerometer has faults, which its scale undid and the refinement would not"
         if model.rectified and self.shutter is None:
             return "its keypoints were moved by a stage that cannot say from where"
+        kept = f"{self.made_from} was made from it" if self.made_from else "its parts are in the project by themselves"
+        if self.auto and (self.made_from or (self.made_from is not None and model.parts)):
+            return f"{kept} and would keep their shape (--refine inertial does it all the same)"
         return ""
 
     def _refined(self, model: Model) -> Model:
         seen = remove_extremes(read_seen(model.reconstruction, model.timing))
         problem, start = make_problem(seen, model.timing, self.imu, self._known(model), self._exposed_px(model, seen))
         promised: dict[str, Any] = {}
+        chosen = ""
         if self.auto:
             worth = expect_worth(seen, problem, start)
             promised = {"expected": {name: value for name, value in asdict(worth).items() if name != "reason"}}
             if worth.reason:
-                return _said(model, f"left as it is: {worth.reason}", **promised)
+                return _said(model, f"not refined: {worth.reason}", **promised)
+            chosen = f"{worth.describe()} with the IMU; "
         declared = model.timing.readout_s is not None
         judged = refine(problem, start, seen.observations.xy_px, seen.t_s, readout_declared=declared)
-        figures = {
-            name: getattr(judged, name)
-            for name in ("accepted", "held_out", "before_px", "after_px", "change", "change_sigma", "chi2", "sigma_px")
-        }
-        figures |= promised
-        figures["accel_noise_m_s2_rthz"] = judged.accel_noise_m_s2_rthz
-        if judged.readout is not None:
-            figures |= dict(zip(("readout_s", "readout_sigma_s"), judged.readout, strict=True))
+        figures = _judged_figures(judged) | promised
         heard = (
-            f"{judged.held_out} observations that were held out: {judged.before_px:.4f} -> {judged.after_px:.4f} px; "
-            f"the IMU costs {judged.chi2:.2f} of what its noise explains"
+            f"{chosen}{judged.held_out} observations that were held out: {judged.before_px:.4f} -> "
+            f"{judged.after_px:.4f} px; the IMU costs {judged.chi2:.2f} of what its noise explains"
         )
         if not judged.accepted:
             return _said(model, f"left as it is: {judged.reason} ({heard})", **figures)
@@ -297,6 +300,15 @@ def _move_of(seen: Seen, after: Written) -> Similarity:
 
 def _moved(similarity: Similarity, move: Similarity) -> Similarity:
     return replace(compose(move, similarity), cov=similarity.cov)
+
+
+def _judged_figures(judged: Judged) -> dict[str, Any]:
+    """What a refinement is judged by."""
+    names = ("accepted", "held_out", "before_px", "after_px", "change", "change_sigma", "chi2", "sigma_px")
+    out = {name: getattr(judged, name) for name in (*names, "accel_noise_m_s2_rthz")}
+    if judged.readout is not None:
+        out |= dict(zip(("readout_s", "readout_sigma_s"), judged.readout, strict=True))
+    return out
 
 
 def _calibration_figures(judged: Judged) -> dict[str, object]:

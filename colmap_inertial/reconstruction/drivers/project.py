@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import fnmatch
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from colmap_inertial.checks.report import require_plotly
 from colmap_inertial.checks.validate import parse_target
 from colmap_inertial.colmap.tsdf import require_mesh_maker
 from colmap_inertial.core.choices import check_kind
-from colmap_inertial.core.errors import AlreadyMetricError, FormatError, InertialError, OutputError, TimingError
+from colmap_inertial.core.errors import FormatError, InertialError, TimingError
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.core.types import (
     CameraImuCalibration,
@@ -38,7 +37,6 @@ from colmap_inertial.io.video import video_stamps_ns
 from colmap_inertial.io.video_match import match_to_video
 from colmap_inertial.model import (
     TRANSFORM_FILE,
-    is_metric,
     model_format,
     num_registered,
     read_model,
@@ -46,7 +44,7 @@ from colmap_inertial.model import (
 )
 from colmap_inertial.model.copying import list_tree
 from colmap_inertial.model.database import find_database
-from colmap_inertial.model.layout import read_layout
+from colmap_inertial.model.layout import Layout
 from colmap_inertial.model.rigs import frames_of_rigs
 from colmap_inertial.model.similarities import ModelScale, read_similarity
 from colmap_inertial.pipeline.run.colmap_settings import read_settings
@@ -60,6 +58,7 @@ from colmap_inertial.pipeline.stages.inputs import StageInputs
 from colmap_inertial.pipeline.stages.protocols import ModelStage, insert_defaults
 from colmap_inertial.reconstruction.drivers.georeference import run_georeference
 from colmap_inertial.reconstruction.drivers.models import Submodels, run_dense_models, run_models, run_validation
+from colmap_inertial.reconstruction.drivers.project_models import name_made_from, read_submodels, require_refinable
 from colmap_inertial.reconstruction.drivers.project_output import place_project, require_free_names
 from colmap_inertial.reconstruction.drivers.reporting import report_result, reporting_stops, write_recording
 from colmap_inertial.reconstruction.drivers.result import Fragment, ModelResult, ReconstructResult
@@ -172,18 +171,20 @@ def _reconstruct(
     _check_options(options)
     given = _read_sources(project, source, options)
     target = None if given.capture.target is None else parse_target(given.capture.target)
-    models = _models(project, out, source.keep, follow_links=source.follow_links)
+    layout = read_submodels(project, out, source)
+    models = {index: project / folder for index, folder in layout.submodels.items()}
     require_free_names(project, Workspace(out), dense=options.dense)
     pictures = options.dense or source.exif_times or source.video is not None
     filmed = isinstance(given.capture.frames, Video)
     images = _images(project, source, needed=pictures or (options.georeference and not filmed))
+    read = functools.cache(read_model)
+    require_refinable(options, models, read)
     context, folders = RunContext.of(options, progress=progress), () if images is None else (images,)
     decides = given.source, given.capture, given.imu, given.prior, fingerprint(project), model_stages
     with (
         open_session(out, project, options, context, pictures=folders, decides=decides) as session,
         reporting_stops(session.workspace, given.capture),
     ):
-        read = functools.cache(read_model)
         timing, notes = _run_times(session, given, models, images, read)
         fixes = positions_of(given.capture, _registered(models, read), images) if options.georeference else None
         limit_s = options.scale.max_offset_s
@@ -192,9 +193,9 @@ def _reconstruct(
         poses = _trajectory(largest, timing)
         doubts = run_preflight(session, recording, given.raw, findings, force=options.force, model=poses)
         recording = dataclasses.replace(recording, doubts=doubts)
-        database = find_database(project, list_tree(project, follow_links=source.follow_links)[1])
-        inputs = StageInputs(recording=recording, options=_hold_cameras(options), database=database)
-        stages = insert_defaults(model_stages, default_model_stages(inputs))
+        stages = insert_defaults(
+            model_stages, default_model_stages(_inputs(layout, recording, project, source, options))
+        )
         submodels = Submodels(folders=models, numbered=True, after=(), read=read)
         results, fragments, gaps = run_models(session, recording, stages, submodels, fragments=options.fragments)
         read.cache_clear()
@@ -224,6 +225,18 @@ def _trajectory(model: pycolmap.Reconstruction, timing: FrameTiming) -> CameraTr
         return trajectory_from_model(model, timing)[0]
     except TimingError:
         return "untimed"
+
+
+def _inputs(
+    layout: Layout, recording: Recording, project: Path, source: ProjectOptions, options: ReconstructOptions
+) -> StageInputs:
+    """Inputs of the model stages."""
+    return StageInputs(
+        recording=recording,
+        options=_hold_cameras(options),
+        database=find_database(project, list_tree(project, follow_links=source.follow_links)[1]),
+        made_from=name_made_from(project, layout, source) if options.refine == "auto" else "",
+    )
 
 
 def _hold_cameras(options: ReconstructOptions) -> ReconstructOptions:
@@ -325,26 +338,6 @@ def _add_video(capture: Capture, video: Path, times: Path | None) -> Capture:
     return dataclasses.replace(
         capture, frames=frames if times is None else dataclasses.replace(frames, frame_times=times)
     )
-
-
-def _models(project: Path, out: Path, keep: Sequence[str], *, follow_links: bool) -> dict[int, Path]:
-    """COLMAP's sub-models by number; what would stop ``apply`` at the end is said at once."""
-    inner, outer = out.resolve(), project.resolve()
-    if inner.is_relative_to(outer) or outer.is_relative_to(inner):
-        raise OutputError(f"{out} and {project} lie within each other; choose a folder elsewhere")
-    folders = [
-        folder
-        for folder in list_tree(project, follow_links=follow_links)[0]
-        if not any(fnmatch.fnmatch(str(p), pattern) for p in (folder, *folder.parents[:-1]) for pattern in keep)
-    ]
-    for folder in (Path(), *folders):
-        if is_metric(project / folder):
-            raise AlreadyMetricError(
-                f"{project / folder} already holds a metric scale; give COLMAP's own project, or leave the folder "
-                "as it is with --keep"
-            )
-    layout = read_layout(project, folders, one_for_all=False)
-    return {index: project / folder for index, folder in layout.submodels.items()}
 
 
 def _images(project: Path, source: ProjectOptions, *, needed: bool) -> Path | None:

@@ -1,0 +1,68 @@
+"""The models of an existing project, what else was made from them, and whether they can be refined."""
+
+from __future__ import annotations
+
+import fnmatch
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from colmap_inertial.core.errors import AlreadyMetricError, InertialError, OutputError
+from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
+from colmap_inertial.model import is_metric
+from colmap_inertial.model.copying import list_tree
+from colmap_inertial.model.layout import Layout, find_made_from, read_layout
+from colmap_inertial.model.rigs import has_rigs
+
+if TYPE_CHECKING:
+    import pycolmap
+
+
+def read_submodels(project: Path, out: Path, source: ProjectOptions) -> Layout:
+    """The models of a project; what would stop ``apply`` at the end is said at once.
+
+    Raises
+    ------
+    OutputError
+        Where output folder and project lie within each other.
+    AlreadyMetricError
+        Where a model carries a similarity of ours.
+    FormatError
+        As of :func:`~colmap_inertial.model.layout.read_layout`.
+    """
+    inner, outer = out.resolve(), project.resolve()
+    if inner.is_relative_to(outer) or outer.is_relative_to(inner):
+        raise OutputError(f"{out} and {project} lie within each other; choose a folder elsewhere")
+    listed = list_tree(project, follow_links=source.follow_links)[0]
+    folders = [folder for folder in listed if not _is_kept(folder, source.keep)]
+    for folder in (Path(), *folders):
+        if is_metric(project / folder):
+            raise AlreadyMetricError(
+                f"{project / folder} already holds a metric scale; give COLMAP's own project, or leave the folder "
+                "as it is with --keep"
+            )
+    return read_layout(project, folders, one_for_all=False)
+
+
+def name_made_from(project: Path, layout: Layout, source: ProjectOptions) -> str:
+    """A file of the project that was made from its models; empty without one."""
+    listed = list_tree(project, follow_links=source.follow_links)[1]
+    made = find_made_from(project, layout, [path for path in listed if not _is_kept(path, source.keep)])
+    return "" if made is None else str(made)
+
+
+def require_refinable(
+    options: ReconstructOptions, models: Mapping[int, Path], read: Callable[[Path], pycolmap.Reconstruction]
+) -> None:
+    """Raise :class:`InertialError` where rigs are to be refined; ``auto`` leaves them as they are."""
+    rigs = [str(folder) for folder in models.values() if has_rigs(read(folder))] if options.refine == "inertial" else []
+    if rigs:
+        raise InertialError(
+            f"--refine inertial: several cameras took the images of {rigs[0]}, each with its own place beside the IMU, "
+            "and models with rigs cannot be refined; leave it out"
+        )
+
+
+def _is_kept(path: Path, keep: Sequence[str]) -> bool:
+    """Whether a path of a project stays as it is, or a folder above it does."""
+    return any(fnmatch.fnmatch(str(one), pattern) for one in (path, *path.parents[:-1]) for pattern in keep)
