@@ -166,8 +166,6 @@ def _reconstruct(
 ) -> ReconstructResult:
     warn_of_conflicts()
     _require_model(project)
-    require_plotly()
-    require_mesh_maker(options)
     _check_options(options)
     given = _read_sources(project, source, options)
     target = None if given.capture.target is None else parse_target(given.capture.target)
@@ -247,7 +245,9 @@ def _hold_cameras(options: ReconstructOptions) -> ReconstructOptions:
 
 
 def _check_options(options: ReconstructOptions) -> None:
-    """Refuse what has no meaning without mapping."""
+    """Refuse what needs a package that is not installed, and what has no meaning without mapping."""
+    require_plotly()
+    require_mesh_maker(options)
     default = ReconstructOptions()
     named = [
         f"--{group}.{f.name}"
