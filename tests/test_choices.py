@@ -96,6 +96,8 @@ def test_values_become_what_their_annotation_says():
 def test_options_in_the_place_of_others_are_refused_before_the_work(tmp_path):
     with pytest.raises(TypeError, match="give it as batch="):
         run_batch([], tmp_path / "out", BatchOptions())
+    with pytest.raises(TypeError, match=r"captures\[0\] must be a BatchCapture, not 'desk'"):
+        run_batch(["desk"], tmp_path / "out")
     with pytest.raises(TypeError, match="options must be a ReconstructOptions, not a ScaleOptions"):
         reconstruct(tmp_path, tmp_path / "out", ScaleOptions())
     with pytest.raises(TypeError, match="give it as options="):

@@ -4,7 +4,9 @@ Nothing is ever trusted and wrong. The recordings are real (30 s of one of Musta
 """
 
 import json
+import shutil
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -120,6 +122,23 @@ def test_a_wrong_file_is_an_error_that_names_the_setting(attempt, alter, setting
     code, message, estimate = attempt(alter)
     assert code == 2 and estimate is None
     assert setting in " ".join(message.split())
+
+
+def test_axes_to_write_take_the_place_of_those_declared(tmp_path, capsys):
+    desk = Path(__file__).parents[1] / "example_scenes" / "desk"
+    scene = shutil.copytree(desk, tmp_path / "desk")
+    table = (scene / "capture.toml").read_text()
+    (scene / "capture.toml").write_text(table.replace("[imu.gyro]", '[imu.gyro]\naxes = "y,z,x"'))
+    frames = json.loads((desk / "truth.json").read_text())["frames"]
+    with (tmp_path / "poses.txt").open("w") as poses:
+        for frame in frames:
+            x, y, z, w = frame["cam_from_world_xyzw"]
+            print(frame["t_middle_s"], *frame["cam_in_world_m"], -x, -y, -z, w, file=poses)
+    with pytest.raises(SystemExit) as stopped:
+        main(["scale", str(tmp_path / "poses.txt"), "--imu", str(scene)])
+    shown = capsys.readouterr()
+    assert stopped.value.code == 3
+    assert 'set axes = "x,y,z" under [imu.gyro]' in " ".join((shown.out + shown.err).replace("│", " ").split())
 
 
 @pytest.mark.parametrize(

@@ -35,10 +35,11 @@ from colmap_inertial.io.calibration import (
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.files import read_json, write_json
 from colmap_inertial.io.frames import read_frame_times
-from colmap_inertial.io.imu import is_capture, read_imu
+from colmap_inertial.io.imu import is_capture, read_raw_imu
 from colmap_inertial.io.imu_text import is_inertial_scale
 from colmap_inertial.io.pose_convention import COLMAP, INERTIAL_SCALE, TUM, PoseConvention
 from colmap_inertial.io.trajectories import read_inertial_scale, read_tum
+from colmap_inertial.io.units import Axes
 from colmap_inertial.model import (
     apply_similarity,
     downgraded,
@@ -79,7 +80,8 @@ class ScaleSource:
 class TimedPoses:
     """A trajectory with its IMU recording; ``start_s`` is when the camera began, where frame times tell.
 
-    ``read_as`` is the convention that the poses were read by.
+    ``read_as`` is the convention that the poses were read by; ``gyro_axes`` and ``accel_axes`` are mappings of axes
+    that a ``capture.toml`` applied.
     """
 
     trajectory: CameraTrajectory
@@ -89,6 +91,8 @@ class TimedPoses:
     shared_clock: bool
     start_s: float | None = None
     notes: Sequence[str] = ()
+    gyro_axes: Axes | None = None
+    accel_axes: Axes | None = None
 
 
 def load_source(source: ScaleSource) -> TimedPoses:
@@ -106,7 +110,7 @@ def load_source(source: ScaleSource) -> TimedPoses:
     if not inertial_scale:
         _require_all(source)
     notes: Sequence[str] = ()
-    start_s = None
+    start_s = gyro_axes = accel_axes = None
     read_as = TUM
     if inertial_scale:
         trajectory, imu = read_inertial_scale(path)
@@ -125,7 +129,9 @@ def load_source(source: ScaleSource) -> TimedPoses:
     else:
         trajectory = read_tum(path)
     if source.imu is not None:
-        imu = read_imu(source.imu)
+        raw = read_raw_imu(source.imu)
+        raw.check()
+        imu, gyro_axes, accel_axes = raw.imu, raw.gyro_axes, raw.accel_axes
     captures = [load_capture(p) for p in (source.imu, source.frame_times, path) if p is not None and is_capture(p)]
     shared = any(capture.shared_clock for capture in captures)
     calibration = captures[0].calibration if captures else None
@@ -143,6 +149,8 @@ def load_source(source: ScaleSource) -> TimedPoses:
         shared_clock=shared,
         start_s=start_s,
         notes=notes,
+        gyro_axes=gyro_axes,
+        accel_axes=accel_axes,
     )
 
 
@@ -282,6 +290,8 @@ def scale_source(
     told = diagnose(
         Recorded(
             imu=recording.imu,
+            gyro_axes=recording.gyro_axes,
+            accel_axes=recording.accel_axes,
             trajectory=trajectory,
             read_as=recording.read_as,
             calibration=recording.calibration,

@@ -142,6 +142,8 @@ def run_batch(
     if isinstance(captures, str | os.PathLike):
         captures = read_manifest(captures, options, allow_stages=allow_stages)
     entries = list(captures)
+    for i, entry in enumerate(entries):
+        check_kind(f"captures[{i}]", entry, BatchCapture)
     check_unique(entries, out)
     out = out.resolve()
     with _owned(out) as run:
