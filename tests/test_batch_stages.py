@@ -104,7 +104,7 @@ def test_a_manifest_s_stages_run_where_they_are_allowed(capsys, hooks, capture, 
     assert stopped.value.code == 0, capsys.readouterr().err
     every = sorted(path.name for path in (capture / "frames").iterdir())
     assert frames(out / "hall") == every[1:]
-    assert marks(out / "hall") == ["seen"]
+    assert marks(out / "hall") == ["refine", "seen"]
 
     # the same again is finished; with other stages, or none, it is another's result
     made = model_bytes(out / "hall")
@@ -128,7 +128,7 @@ def test_a_capture_s_own_stages_go_before_those_of_all(hooks, capture, tmp_path)
     theirs, own = run_batch(entries, tmp_path / "out", stages=of_all).captures
     assert (theirs.state, theirs.error) == ("failed", f"stage {of_all.code[0]}: hooks_of_mine has no shelf.nothing")
     assert own.state == "done"
-    assert marks(tmp_path / "out" / "own") == []
+    assert marks(tmp_path / "out" / "own") == ["refine"]  # the default stage alone
 
 
 def test_a_stage_that_cannot_be_had_fails_its_capture_with_a_sentence(hooks, capture, tmp_path):
