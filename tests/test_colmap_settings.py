@@ -7,6 +7,7 @@ import pycolmap
 import pytest
 
 from colmap_inertial.cli import parse
+from colmap_inertial.colmap.depth_maps import fusion_options
 from colmap_inertial.colmap.loop_closure import MappedCapture, _adjustment
 from colmap_inertial.colmap.mapping import global_options, incremental_options
 from colmap_inertial.colmap.sparse import extraction_options, matching_options, require_features, verification_options
@@ -175,10 +176,12 @@ def test_the_page_lists_what_is_set_against_colmap_s_defaults():
         **changed("TwoViewGeometry", verification_options(context)),
         **changed("Mapper", incremental_options(False, context)),
         **changed("GlobalMapper", global_options(mapping, context)),
+        **changed("StereoFusion", fusion_options("plane sweep", context)),
     }
     # threads and seeds are options of ours
     set_by_us = {name: value for name, value in set_by_us.items() if value not in ("1", "5")}
     assert {name: value for name, value in listed().items() if not name.startswith("Bundle")} == set_by_us
+    assert changed("StereoFusion", fusion_options("patch-match", context)).keys() == {"StereoFusion.num_threads"}
     pipeline = incremental_options(True, context)
     assert changed("Mapper", pipeline).keys() <= {"Mapper.num_threads", "Mapper.random_seed"}
 

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -22,6 +22,9 @@ from colmap_inertial.model.copying import copy_file
 from colmap_inertial.pipeline.run.colmap_settings import NO_SETTINGS, ColmapSettings
 from colmap_inertial.pipeline.run.context import RunContext
 from colmap_inertial.pipeline.run.runner import remove
+
+if TYPE_CHECKING:
+    import pycolmap
 
 Maker = Literal["patch-match", "plane sweep"]
 
@@ -293,6 +296,19 @@ def coverage(folder: Path, names: Sequence[str], kind: str) -> float:
     return known / pixels if pixels else 0.0
 
 
+def fusion_options(maker: Maker, context: RunContext) -> pycolmap.StereoFusionOptions:
+    """Options of COLMAP's fusion of depth maps."""
+    import pycolmap
+
+    options = pycolmap.StereoFusionOptions()
+    options.num_threads = context.num_threads
+    if maker == "plane sweep":
+        # uncertain depths are dropped already; 5, COLMAP's own, loses more points than it mends (bench_dense.py: F at
+        # 5 mm 0.861 instead of 0.846 on photographs, 0.900 instead of 0.894 on the example scene)
+        options.min_num_pixels = 3
+    return context.colmap.apply(options)
+
+
 def fuse_maps(
     folder: Path,
     names: Sequence[str],
@@ -331,13 +347,7 @@ def fuse_maps(
     """
     import pycolmap
 
-    options = pycolmap.StereoFusionOptions()
-    options.num_threads = context.num_threads
-    if maker == "plane sweep":
-        # uncertain depths are dropped already; 5, COLMAP's own, loses more points than it mends (bench_dense.py: F at
-        # 5 mm 0.861 instead of 0.846 on photographs, 0.900 instead of 0.894 on the example scene)
-        options.min_num_pixels = 3
-    options = context.colmap.apply(options)
+    options = fusion_options(maker, context)
     seen = folder
     if maker == "plane sweep":
         seen = scratch

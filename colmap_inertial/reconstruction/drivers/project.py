@@ -229,11 +229,12 @@ def _inputs(
     layout: Layout, recording: Recording, project: Path, source: ProjectOptions, options: ReconstructOptions
 ) -> StageInputs:
     """Inputs of the model stages."""
+    files = list_tree(project, follow_links=source.follow_links)[1]
     return StageInputs(
         recording=recording,
         options=_hold_cameras(options),
-        database=find_database(project, list_tree(project, follow_links=source.follow_links)[1]),
-        made_from=name_made_from(project, layout, source) if options.refine == "auto" else "",
+        database=find_database(project, files),
+        made_from=name_made_from(project, layout, files, source.keep) if options.refine == "auto" else "",
     )
 
 

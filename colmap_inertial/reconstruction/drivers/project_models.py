@@ -44,10 +44,9 @@ def read_submodels(project: Path, out: Path, source: ProjectOptions) -> Layout:
     return read_layout(project, folders, one_for_all=False)
 
 
-def name_made_from(project: Path, layout: Layout, source: ProjectOptions) -> str:
-    """A file of the project that was made from its models; empty without one."""
-    listed = list_tree(project, follow_links=source.follow_links)[1]
-    made = find_made_from(project, layout, [path for path in listed if not _is_kept(path, source.keep)])
+def name_made_from(project: Path, layout: Layout, files: Sequence[Path], keep: Sequence[str]) -> str:
+    """A file of the project that was made from its models and is not to be kept as it is; empty without one."""
+    made = find_made_from(project, layout, [path for path in files if not _is_kept(path, keep)])
     return "" if made is None else str(made)
 
 
