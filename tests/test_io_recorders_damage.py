@@ -260,7 +260,10 @@ def test_a_table_said_to_be_larger_than_its_zip_takes_no_more_memory(tmp_path: P
     at = data.index(b"PK\1\2")  # the first entry of the directory; at 20 its compressed size
     path.write_bytes(data[: at + 20] + struct.pack("<I", 2**31 - 2) + data[at + 24 :])
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    assert text_of(path, info.filename) == whole
+    try:
+        assert text_of(path, info.filename) == whole
+    except FormatError as error:  # some versions of Python refuse it themselves
+        assert "Overlapped entries" in str(error)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB
 
 
