@@ -172,6 +172,7 @@ def test_each_view_is_numbered_so_that_all_agree(small, monkeypatch, spec):
     monkeypatch.setattr(search_module, "detect", any_start)
     monkeypatch.setattr(search_module, "_spread_evenly", lambda count: list(range(count)))
     monkeypatch.setattr(search_module.Search, "look_closer", lambda self, which: None)
+    monkeypatch.setattr(search_module, "find_any_checkerboard", lambda image: None)  # the images show a 9x6 board
     result = validate_model(small.model(), small.images, target)
     assert result.views_used == 5
     assert result.rms_px < 0.5
@@ -193,6 +194,16 @@ def test_a_board_with_a_row_or_squares_too_many_is_refused_by_its_likely_size(tm
     with pytest.raises(TargetNotFoundError, match=f"{visible} inner corners is") as caught:
         validate_model(scene.model(), scene.images, parse_target(f"checkerboard:{stated}:0.04"))
     assert caught.value.exit_code == 5
+
+
+@pytest.mark.parametrize(
+    ("stated", "words"), [("6x4", "is a part of a board with 8x6"), ("5x5", "with 8x6"), ("10x8", "8x6 inner corners")]
+)
+def test_a_board_of_quite_another_size_is_refused_by_its_likely_size(tmp_path, stated, words):
+    """A 6x4 board is found in an 8x6 one, now here and now there: two images that agree by chance gave a scale."""
+    scene = Scene(tmp_path, orbit(np.random.default_rng(2), 6), SMALL, target=parse_target("checkerboard:8x6:0.04"))
+    with pytest.raises(TargetNotFoundError, match=words):
+        validate_model(scene.model(), scene.images, parse_target(f"checkerboard:{stated}:0.04"))
 
 
 def test_a_board_that_is_never_visible_is_not_found(tmp_path):

@@ -19,7 +19,7 @@ from validate_scenes import (
 from versions import version_of
 
 from colmap_inertial.checks.validate import parse_target
-from colmap_inertial.checks.validate.detect import detect, other_checkerboard
+from colmap_inertial.checks.validate.detect import detect, find_any_checkerboard
 
 CAMERA = default_camera()
 
@@ -158,4 +158,7 @@ def test_the_size_of_another_checkerboard_is_told():
     target = parse_target("checkerboard:7x5:0.03")
     rng = np.random.default_rng(9)
     image = render(CAMERA, look_at(np.array([0.0, 0.1, -0.5])), checkerboard(target), rng)
-    assert sorted(other_checkerboard(image)) == [5, 7]
+    size, xy = find_any_checkerboard(image)
+    assert sorted(size) == [5, 7]
+    right, *_ = detect(image, target)
+    assert np.abs(np.sort(xy, axis=0) - np.sort(right.xy_px, axis=0)).max() < 0.5

@@ -68,10 +68,9 @@ def _answer(signals: socket.socket) -> None:
             came += 1
             if came == 1:
                 line = "\r\033[2K" if sys.stderr.isatty() else "\n"  # in place of a bar
+                again = "Ctrl-C again" if number == signal.SIGINT else "a second signal"
                 print(
-                    f"{line}stopping, which may take some seconds (Ctrl-C again ends at once)",
-                    file=sys.stderr,
-                    flush=True,
+                    f"{line}stopping, which may take some seconds ({again} ends at once)", file=sys.stderr, flush=True
                 )
             else:
                 if sys.stderr.isatty():

@@ -13,11 +13,13 @@ import numpy as np
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_from_matrix
 from colmap_inertial.core.options import WorldAxes
+from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.types import UNDOES, ScaleEstimate, Similarity
 from colmap_inertial.io.files import StrPath, read_json, reader, reading
 from colmap_inertial.model import similarity_as_json
 
 
+@prints_in_lines
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ModelScale:
     """Similarity of one sub-model.

@@ -205,13 +205,29 @@ def detect(image: UInt8Array, target: Target, *, thorough: bool = False) -> list
     return _detect_markers(image, target)
 
 
-def other_checkerboard(image: UInt8Array) -> tuple[int, int] | None:
-    """Inner corners (columns, rows) of any checkerboard in an image, to help with a wrong description."""
+def find_any_checkerboard(image: UInt8Array) -> tuple[tuple[int, int], Array] | None:
+    """The largest checkerboard in an image, whatever its size, to help with a wrong description.
+
+    Parameters
+    ----------
+    image
+        (H, W) grey values.
+
+    Returns
+    -------
+    size
+        Inner corners, columns and rows.
+    xy_px
+        (n, 2) the corners, COLMAP's pixel coordinates.
+    """
     import cv2
 
-    small, _ = _shrink(image)
-    found, _, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), cv2.CALIB_CB_LARGER)
-    return (int(meta.shape[1]), int(meta.shape[0])) if found and meta is not None else None
+    small, factor = _shrink(image)
+    found, corners, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), cv2.CALIB_CB_LARGER)
+    if not found or meta is None:
+        return None
+    xy = (np.asarray(corners, dtype=np.float64).reshape(-1, 2) + 0.5) / factor - 0.5
+    return (int(meta.shape[1]), int(meta.shape[0])), colmap_px_from_opencv(xy)
 
 
 def _detect_checkerboards(image: UInt8Array, target: Target, thorough: bool) -> Iterator[Detection]:

@@ -20,6 +20,7 @@ from colmap_inertial.checks.validate.place import (
     explain_failure,
     median_residual_px,
     observe,
+    require_no_larger_board,
     require_no_likelier_board,
 )
 from colmap_inertial.checks.validate.result import (
@@ -97,6 +98,7 @@ def validate_model(
     search = Search(views, target, options, progress)
     search.run(images)
     placed = search.place()
+    require_no_larger_board(search)
     count = sum(len(p.chosen) for p in placed.values())
     if count < min(PLACEMENT.enough_views, 0.5 * len(search.searched)):
         require_no_likelier_board(search, count)

@@ -11,18 +11,18 @@ one that fits.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from colmap_inertial.checks.validate.detect import DETECTION, detect, other_checkerboard
+from colmap_inertial.checks.validate.detect import DETECTION, detect, find_any_checkerboard
 from colmap_inertial.checks.validate.fit import settle
 from colmap_inertial.checks.validate.observations import Observations, Placement, linearise
 from colmap_inertial.checks.validate.targets import Target, parse_target
 from colmap_inertial.checks.validate.views import Sighting, View, sight
-from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.arrays import Array, UInt8Array
 from colmap_inertial.core.errors import FormatError, NotObservableError, TargetNotFoundError
 from colmap_inertial.core.options import ValidateOptions
 
@@ -418,6 +418,28 @@ def _find_mirroring(search: Search) -> str | None:
     return None
 
 
+def require_no_larger_board(search: Search) -> None:
+    """Refuse a checkerboard that is a part of a larger one: the detector then takes another part in every image.
+
+    Raises
+    ------
+    TargetNotFoundError
+        That names the size of the larger board.
+    """
+    if search.target.kind != "checkerboard":
+        return
+    centre = {s.view: s.xy_px.mean(axis=0) for s in search.sightings}
+    images = {v: image for v, image in _images_of_hints(search).items() if v in centre}
+    area = search.target.columns * search.target.rows
+    larger = {size: votes for size, votes in _vote_on_sizes(images, centre).items() if size[0] * size[1] > area}
+    size = max(larger, key=larger.__getitem__, default=None)
+    if size is not None and larger[size] > 1 and _count_boards(images, size, search.target) >= 0.5 * len(images):
+        raise TargetNotFoundError(
+            f"{search.target.spec} is a part of a board with {size[0]}x{size[1]} inner corners: give the size of the "
+            "whole board"
+        )
+
+
 def require_no_likelier_board(search: Search, used: int) -> None:
     """Refuse a checkerboard where a size that is miscounted easily is in more of the images.
 
@@ -429,19 +451,13 @@ def require_no_likelier_board(search: Search, used: int) -> None:
     if search.target.kind != "checkerboard":
         return
     columns, rows = search.target.columns, search.target.rows
-    picked = np.unique(np.linspace(0, len(search.searched) - 1, PLACEMENT.hint_views).astype(np.intp))
-    chosen = [search.searched[i] for i in picked.tolist()]
-    images = [image for image in (search.views[v].read() for v in chosen) if not isinstance(image, str)]
-    stated = len({s.view for s in search.sightings} & set(chosen))
-    counts = {}
+    images = _images_of_hints(search)
+    stated = len({s.view for s in search.sightings} & set(images))
     # squares counted for corners first, then lines
-    for more in ((-1, -1), (1, 1), (0, -1), (-1, 0), (1, 0), (0, 1)):
-        size = (columns + more[0], rows + more[1])
-        if min(size) >= 3:
-            other = parse_target(f"checkerboard:{size[0]}x{size[1]}:{search.target.length_m}")
-            counts[size] = sum(bool(detect(image, other)) for image in images)
-    # a part of a larger board may pass for a smaller one
-    likely = max(counts, key=lambda size: (counts[size], size[0] * size[1]), default=None)
+    sizes = [(columns + x, rows + y) for x, y in ((-1, -1), (1, 1), (0, -1), (-1, 0), (1, 0), (0, 1))]
+    sizes += _largest_of(_vote_on_sizes(images, {}))
+    counts = Counter({size: _count_boards(images, size, search.target) for size in sizes if min(size) >= 3})
+    likely = next(iter(_largest_of(counts)), None)
     if likely is not None and counts[likely] > max(stated + 1, len(images) // 4):
         raise TargetNotFoundError(
             f"{search.target.spec} agrees in {used} of {len(search.searched)} images, and a board with "
@@ -450,17 +466,49 @@ def require_no_likelier_board(search: Search, used: int) -> None:
         )
 
 
+def _images_of_hints(search: Search) -> dict[int, UInt8Array]:
+    """Some of the searched images, by view."""
+    picked = np.unique(np.linspace(0, len(search.searched) - 1, PLACEMENT.hint_views).astype(np.intp))
+    images = {search.searched[i]: search.views[search.searched[i]].read() for i in picked.tolist()}
+    return {v: image for v, image in images.items() if not isinstance(image, str)}
+
+
+def _vote_on_sizes(images: Mapping[int, UInt8Array], centre: Mapping[int, Array]) -> Counter[tuple[int, int]]:
+    """In how many images a board of each size was found, the longer side first.
+
+    ``centre`` holds a point that the board must cover in a view.
+    """
+    import cv2
+
+    votes: Counter[tuple[int, int]] = Counter()
+    for v, image in images.items():
+        board = find_any_checkerboard(image)
+        if board is None:
+            continue
+        (columns, rows), xy = board
+        hull = cv2.convexHull(xy.astype(np.float32))
+        if v not in centre or cv2.pointPolygonTest(hull, centre[v].tolist(), False) >= 0:
+            votes[max(columns, rows), min(columns, rows)] += 1
+    return votes
+
+
+def _largest_of(counts: Mapping[tuple[int, int], int]) -> list[tuple[int, int]]:
+    """The size that most corners were found of, for parts of a board are in more images than the whole; or none."""
+    corners = {(columns, rows): count * columns * rows for (columns, rows), count in counts.items() if count}
+    return [max(corners, key=corners.__getitem__)] if corners else []
+
+
+def _count_boards(images: Mapping[int, UInt8Array], size: tuple[int, int], target: Target) -> int:
+    """In how many images a checkerboard of another size is."""
+    other = parse_target(f"checkerboard:{size[0]}x{size[1]}:{target.length_m}")
+    return sum(bool(detect(image, other)) for image in images.values())
+
+
 def _hint_at_absence(search: Search) -> str:
     if search.target.kind != "checkerboard":
         return "is the description right, and is the target large and sharp enough in the images?"
-    sizes: Counter[tuple[int, int]] = Counter()
-    for v in search.searched[: PLACEMENT.hint_views]:
-        image = search.views[v].read()
-        size = None if isinstance(image, str) else other_checkerboard(image)
-        if size is not None:
-            sizes[max(size), min(size)] += 1
-    if sizes:
-        size = max(sizes, key=sizes.__getitem__)
+    votes = _vote_on_sizes(_images_of_hints(search), {})
+    for size in _largest_of(votes):
         if size != tuple(sorted((search.target.columns, search.target.rows), reverse=True)):
             return f"a board with {size[0]}x{size[1]} inner corners is visible: is the size in the description right?"
     return "COLSxROWS counts inner corners, one less than squares; the whole board must be in view, with a white rim"

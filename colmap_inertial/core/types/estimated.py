@@ -122,6 +122,7 @@ _CALIBRATED: dict[str, float | None] = {
 }
 
 
+@prints_in_lines
 @dataclass(frozen=True, kw_only=True)
 class AcceptedScale:
     """The numbers of a scale that was not refused.
