@@ -18,8 +18,9 @@ from colmap_inertial import (
     reconstruct_project,
     run_batch,
 )
-from colmap_inertial.core.types import Gap, Similarity
+from colmap_inertial.core.types import AcceptedScale, Gap, Similarity
 from colmap_inertial.imaging.wiener import DeblurOptions
+from colmap_inertial.model.similarities import ModelScale
 from colmap_inertial.motion.align import AlignOptions
 from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
 from colmap_inertial.reconstruction.drivers.result import Fragment
@@ -79,6 +80,8 @@ def test_results_print_on_a_screen_and_in_a_notebook():
         Gap(first=0, second=1, seconds=2.5, reason="<b>", joined=False),
         Fragment(colmap_index=3, registered_images=2, sparse=Path("sparse/3")),
         FrameRecord(name="a.jpg", action="passed"),
+        AcceptedScale(metres_per_unit=0.5, sigma_log=0.01, ci95=(0.49, 0.51)),
+        ModelScale(similarity=None, verdict="refused", reasons=("hardly moves",)),
     ]
     for value in shown:
         assert str(value).splitlines()[0] == type(value).__name__ and len(str(value).splitlines()) <= 20
