@@ -93,7 +93,7 @@ MUTANTS = (
     ),
     Mutant(
         "inertial/scale/_suspects.py",
-        'one.name != "rate" or abs(float(one.value[0])) > least_rate',
+        'suspicion.name != "rate" or abs(float(suspicion.value[0])) > least_rate',
         "True",
         "a long recording has a clock of the accelerometer's own for a part in a million",
         ("scale_suspects::test_stamps_that_part_by_less_than_a_sample_are_of_one_clock",),
@@ -950,8 +950,8 @@ MUTANTS = (
     ),
     Mutant(
         "io/calibration.py",
-        "return replace(found, camera_imu=reset_for_recording(found.camera_imu, shared_clock=shared_clock))",
-        "return found",
+        "return replace(calibrations, camera_imu=reset_for_recording(calibrations.camera_imu",
+        "return replace(calibrations, camera_imu=(lambda kept, **_: kept)(calibrations.camera_imu",
         "another recording's time offset counts for this one",
         ("run_steps",),
     ),
@@ -1321,8 +1321,8 @@ MUTANTS = (
     ),
     Mutant(
         "io/imu_text.py",
-        "found += [(others,",
-        "found += [(not others,",
+        "readings += [(others,",
+        "readings += [(not others,",
         "the hint for a table takes a gyroscope's column for the accelerometer's",
         ("io_imu::test_an_unclear_header_is_shown_with_what_to_write",),
     ),
@@ -2031,7 +2031,7 @@ MUTANTS = (
     ),
     Mutant(
         "inertial/join/evidence.py",
-        "if one.cameras and other.cameras and not one.cameras & other.cameras:",
+        "if first.cameras and other.cameras and not first.cameras & other.cameras:",
         "if False:",
         "two cameras of one kind pass as one",
         ("join_doubt::test_pictures_of_two_cameras_stay_apart",),
@@ -2052,8 +2052,8 @@ MUTANTS = (
     ),
     Mutant(
         "inertial/refine/judge.py",
-        "abs(found[0]) < max(",
-        "abs(found[0]) < 1e6 * max(",
+        "abs(readout[0]) < max(",
+        "abs(readout[0]) < 1e6 * max(",
         "a model is refined whose images turn out to have a rolling shutter",
         ("refine_stage::test_a_readout_is_refined_with_where_images_keep_their_rolling_shutter",),
     ),

@@ -44,6 +44,19 @@ _ONE_OFF = {ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">"}
 _TURNED = {ast.Lt: ">", ast.LtE: ">", ast.Gt: "<", ast.GtE: "<", ast.Eq: "!=", ast.NotEq: "=="}
 _PAIRS = "min max, minimum maximum, nanmin nanmax, argmin argmax, any all, floor ceil, sin cos"
 _PARTNER = {a: b for pair in _PAIRS.split(", ") for a, b in (pair.split(), reversed(pair.split()))}
+#: Functions of which the order of arguments means nothing.
+_SYMMETRIC = {
+    "min",
+    "max",
+    "minimum",
+    "maximum",
+    "hypot",
+    "allclose",
+    "array_equal",
+    "logical_and",
+    "logical_or",
+    "samefile",
+}
 _DROPPED = {"sqrt", "abs", "deg2rad", "rad2deg", "radians", "degrees", "square", "log", "log1p", "expm1", "exp"}
 
 
@@ -130,7 +143,11 @@ def changes(node: ast.AST, source: Source) -> Iterator[tuple[str, ast.AST, str]]
             yield "partner", node.func, function[: -len(name)] + _PARTNER[name]
         if name in _DROPPED and len(node.args) == 1 and not node.keywords:
             yield "unit", node, f"({of(node.args[0])})"
-        if len(node.args) >= 2 and not any(isinstance(a, (ast.Starred, ast.Constant)) for a in node.args[:2]):
+        if (
+            name not in _SYMMETRIC
+            and len(node.args) >= 2
+            and not any(isinstance(a, (ast.Starred, ast.Constant)) for a in node.args[:2])
+        ):
             rest = [of(a) for a in node.args[2:]] + [of(k) for k in node.keywords]
             yield "argument order", node, f"{function}({', '.join([of(node.args[1]), of(node.args[0]), *rest])})"
     elif isinstance(node, ast.Constant) and isinstance(node.value, (int, float)) and not isinstance(node.value, bool):

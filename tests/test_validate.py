@@ -25,6 +25,7 @@ from validate_scenes import (
 )
 
 from colmap_inertial.checks.validate import (
+    failures,
     parse_target,
     place as search_module,
     validate_model,
@@ -172,7 +173,7 @@ def test_each_view_is_numbered_so_that_all_agree(small, monkeypatch, spec):
     monkeypatch.setattr(search_module, "detect", any_start)
     monkeypatch.setattr(search_module, "_spread_evenly", lambda count: list(range(count)))
     monkeypatch.setattr(search_module.Search, "look_closer", lambda self, which: None)
-    monkeypatch.setattr(search_module, "find_any_checkerboard", lambda image: None)  # the images show a 9x6 board
+    monkeypatch.setattr(failures, "find_any_checkerboard", lambda image: None)  # the images show a 9x6 board
     result = validate_model(small.model(), small.images, target)
     assert result.views_used == 5
     assert result.rms_px < 0.5

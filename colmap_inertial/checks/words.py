@@ -110,38 +110,40 @@ def place_against_tolerance(error_pct: float, tolerance_pct: float, proved: bool
     return "outside" if abs(error_pct) > tolerance_pct else "within" if proved else "not proved to be within"
 
 
-def target_facts(found: Mapping[str, Any]) -> Iterator[Fact]:
+def target_facts(validation: Mapping[str, Any]) -> Iterator[Fact]:
     """Facts from a target of known size in a model, from ``Validation.as_json()``."""
-    yield "target", found["target"]
-    if found["scale_error_pct"] is not None:
-        low, high = found["ci95_pct"]
-        error = f"{found['scale_error_pct']:+.3f} % (95 %: {low:+.3f} to {high:+.3f})"
-        place = place_against_tolerance(found["scale_error_pct"], found["tolerance_pct"], found["within_tolerance"])
-        yield "scale error", f"{error}, {place} {found['tolerance_pct']:g} %"
-    low, high = found["metres_per_unit_ci95"]
-    yield "metres per unit", f"{found['metres_per_unit']:.6g} (95 %: {low:.6g} to {high:.6g})"
-    if found["unscaled"] and found["check_error_pct"] is not None:
-        low, high = found["check_ci95_pct"]
-        yield "control against check", f"{found['check_error_pct']:+.3f} % (95 %: {low:+.3f} to {high:+.3f})"
-    lengths = found.get("lengths")
+    yield "target", validation["target"]
+    if validation["scale_error_pct"] is not None:
+        low, high = validation["ci95_pct"]
+        error = f"{validation['scale_error_pct']:+.3f} % (95 %: {low:+.3f} to {high:+.3f})"
+        place = place_against_tolerance(
+            validation["scale_error_pct"], validation["tolerance_pct"], validation["within_tolerance"]
+        )
+        yield "scale error", f"{error}, {place} {validation['tolerance_pct']:g} %"
+    low, high = validation["metres_per_unit_ci95"]
+    yield "metres per unit", f"{validation['metres_per_unit']:.6g} (95 %: {low:.6g} to {high:.6g})"
+    if validation["unscaled"] and validation["check_error_pct"] is not None:
+        low, high = validation["check_ci95_pct"]
+        yield "control against check", f"{validation['check_error_pct']:+.3f} % (95 %: {low:+.3f} to {high:+.3f})"
+    lengths = validation.get("lengths")
     if lengths is not None:
         rms_mm, largest_mm = 1000 * lengths["rms_m"], 1000 * lengths["largest_m"]
         share = lengths["longest_share"]
         of_model = "" if share is None else f", {100 * share:.2g} % of the model's diagonal"
         yield "length errors", f"rms {rms_mm:.3g} mm, largest {largest_mm:+.3g} mm of {lengths['count']}"
         yield "longest length", f"{lengths['longest_m']:.3g} m{of_model}; {lengths['directions']} directions"
-    yield "images", f"{found['views_used']} used of {found['views_searched']} searched"
-    yield "corner observations", f"{found['corners_used']} used, {found['corners_rejected']} rejected"
-    noise = (
-        f"corner noise {found['corner_noise_px']:.3f} px per coordinate, pose errors {found['pose_noise_px']:.3f} px"
-    )
-    yield "residuals", f"{found['rms_px']:.3f} px rms; {noise}"
-    known = [(f"bar {' to '.join(map(str, bar['markers']))}", bar) for bar in found.get("bars") or ()]
-    known += [(f"to {apart['other']}", apart) for apart in [found.get("apart")] if apart is not None]
+    yield "images", f"{validation['views_used']} used of {validation['views_searched']} searched"
+    yield "corner observations", f"{validation['corners_used']} used, {validation['corners_rejected']} rejected"
+    corners, poses = (f"{validation[name]:.3f} px" for name in ("corner_noise_px", "pose_noise_px"))
+    noise = f"corner noise {corners} per coordinate, pose errors {poses}"
+    yield "residuals", f"{validation['rms_px']:.3f} px rms; {noise}"
+    stated_lengths = [(f"bar {' to '.join(map(str, bar['markers']))}", bar) for bar in validation.get("bars") or ()]
+    stated_lengths += [(f"to {apart['other']}", apart) for apart in [validation.get("apart")] if apart is not None]
     yield from (
-        (of, f"{length['known_m']:.6g} m, off by {1000 * length['residual_m']:+.3g} mm") for of, length in known
+        (of, f"{length['known_m']:.6g} m, off by {1000 * length['residual_m']:+.3g} mm")
+        for of, length in stated_lengths
     )
-    points = found.get("check_points")
+    points = validation.get("check_points")
     if points is not None:
         level_mm, up_mm = 1000 * points["rmse_horizontal_m"], 1000 * points["rmse_vertical_m"]
         yield f"{len(points['points'])} check points", f"RMSE {level_mm:.3g} mm horizontal, {up_mm:.3g} mm vertical"

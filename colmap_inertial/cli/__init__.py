@@ -125,14 +125,14 @@ def _expand_options(args: Sequence[str]) -> list[str]:
     command = args[0].replace("_", "-")
     if command not in _COMMANDS:
         return list(args[1:])
-    known = _options(command)
+    options = _options(command)
     words = []
     for word in args[1:]:
         name, equals, value = word.partition("=")
         plain = "--" + name.removeprefix("--").replace("_", "-")
-        if name.startswith("--") and len(name) > 2 and plain not in known:
+        if name.startswith("--") and len(name) > 2 and plain not in options:
             last = plain.rpartition(".")[2].removeprefix("--")
-            meant = [option for option in known if option.rpartition(".")[2].removeprefix("--") == last]
+            meant = [option for option in options if option.rpartition(".")[2].removeprefix("--") == last]
             if len(meant) > 1:
                 raise InertialError(f"{args[0]}: which of {' and '.join(meant)} is meant by {name}?")
             grouped = "." in plain and "." in "".join(meant)
@@ -172,8 +172,8 @@ def _options(command: str) -> tuple[str, ...]:
     return tuple(options)
 
 
-def _suggest_nearest(word: str, known: Iterable[str]) -> str:
-    like = difflib.get_close_matches(word, list(known), n=1)
+def _suggest_nearest(word: str, choices: Iterable[str]) -> str:
+    like = difflib.get_close_matches(word, list(choices), n=1)
     return f"; did you mean {like[0]}?" if like else ""
 
 
@@ -198,7 +198,7 @@ def _move_lists_last(args: Sequence[str]) -> list[str]:
             remaining[0].lower().endswith(".json") if word == "--calibration" else _SETTING.match(remaining[0])
         ):
             lists[word].append(remaining.pop(0))
-    return [*rest, *(one for word, values in lists.items() if values for one in (word, *values))]
+    return [*rest, *(argument for word, values in lists.items() if values for argument in (word, *values))]
 
 
 def _read_default(cls: type[Speaker], args: Sequence[str]) -> Speaker | None:

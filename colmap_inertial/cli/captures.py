@@ -110,10 +110,10 @@ class Reconstruct(DeviceCommand, ConfiguredCommand):
 
         with self.progress() as screen:
             if is_project(self.capture):
-                found = scale_project_by(self.capture, self.out, self.reference, self.project, progress=screen)
+                reference = scale_project_by(self.capture, self.out, self.reference, self.project, progress=screen)
             else:
-                found = reconstruct_by(self.capture, self.out, self.reference, self.options, progress=screen)
-        self.tell(lambda: show_reference(found), found.as_json(), {"out": found.out, "exit_code": 0})
+                reference = reconstruct_by(self.capture, self.out, self.reference, self.options, progress=screen)
+        self.tell(lambda: show_reference(reference), reference.as_json(), {"out": reference.out, "exit_code": 0})
         return 0
 
 

@@ -180,12 +180,12 @@ def print_help(
     rest = [title for title in sections if sections[title] and title not in (_ARGUMENTS, _OPTIONS, _EVERYWHERE)]
     if not everything and rest:
         paragraphs = [paragraphs[0], paragraphs[-1]] if sections[_OPTIONS] else paragraphs
-        sections = {title: _shorten(found) for title, found in sections.items() if title not in rest}
+        sections = {title: _shorten(entries) for title, entries in sections.items() if title not in rest}
     for paragraph in paragraphs:
         page.paragraph(paragraph)
     pages = [("-h, --help", "The common options."), ("--help-all", "All options, by topic.")]
-    for title, found in sections.items():
-        page.group(title, found, more=pages if title == _EVERYWHERE else ())
+    for title, entries in sections.items():
+        page.group(title, entries, more=pages if title == _EVERYWHERE else ())
     if everything and not {option.group for option in options}.isdisjoint(_SPECIAL):
         page.paragraph(_SPECIAL_CAMERAS)
 

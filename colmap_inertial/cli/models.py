@@ -208,9 +208,9 @@ class Align(SourceReader):
         from colmap_inertial.reconstruction.drivers.sources import align_source
 
         self.check_json(self.source, self.imu, self.frame_times, self.out)
-        found = align_source(self.read_from(), self.out)
+        calibration = align_source(self.read_from(), self.out)
         kept = None if self.remember is None else remember(self.remember, self.out)
-        self.tell(lambda: show_calibration(found, self.source, kept), self.out, {"out": self.out, "kept": kept})
+        self.tell(lambda: show_calibration(calibration, self.source, kept), self.out, {"out": self.out, "kept": kept})
         return 0
 
 
@@ -243,10 +243,10 @@ class CalibrateImu(Reader):
         from colmap_inertial.reconstruction.drivers.device_store import calibrate_source, remember
 
         self.check_json(self.recording, self.out)
-        found = calibrate_source(self.recording, self.out, self.gravity, device=self.remember)
+        calibration = calibrate_source(self.recording, self.out, self.gravity, device=self.remember)
         kept = None if self.remember is None else remember(self.remember, self.out)
-        more = {"out": self.out, "kept": kept, "verdict": found.verdict}
-        self.tell(lambda: show_imu_calibration(found, self.recording, self.out, kept), self.out, more)
+        more = {"out": self.out, "kept": kept, "verdict": calibration.verdict}
+        self.tell(lambda: show_imu_calibration(calibration, self.recording, self.out, kept), self.out, more)
         return 0
 
 
@@ -269,9 +269,9 @@ class Diagnose(SourceReader):
         from colmap_inertial.reconstruction.drivers.diagnosis import diagnose_source
 
         with self.progress() as progress:
-            found = diagnose_source(self.read_from(), json=self.json_file, progress=progress)
-        self.tell(lambda: show_diagnosis(found, self.source), found.as_json(), written=True)
-        return 1 if found.worst == "error" else 0
+            diagnosis = diagnose_source(self.read_from(), json=self.json_file, progress=progress)
+        self.tell(lambda: show_diagnosis(diagnosis, self.source), diagnosis.as_json(), written=True)
+        return 1 if diagnosis.worst == "error" else 0
 
 
 @dataclass(frozen=True, kw_only=True)

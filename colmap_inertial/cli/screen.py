@@ -211,14 +211,14 @@ class Screen:
         """
         from rich.text import Text
 
-        found = [finding for finding in diagnosis.findings if finding.severity != "info"]
+        findings = [finding for finding in diagnosis.findings if finding.severity != "info"]
         stopping = diagnosis.stopping[0] if stops and diagnosis.stopping else None
-        for finding in found:
+        for finding in findings:
             if finding is stopping:
                 continue
             severity = (f"{finding.severity}: ", f"bold {SEVERITY_COLOUR[finding.severity]}")
-            said = Text.assemble(severity, f"{finding.evidence}; {finding.advice}", (f" ({finding.code})", "dim"))
-            self._console.print(said, soft_wrap=not self._console.is_terminal)
+            line = Text.assemble(severity, f"{finding.evidence}; {finding.advice}", (f" ({finding.code})", "dim"))
+            self._console.print(line, soft_wrap=not self._console.is_terminal)
         if diagnosis.worst == "error" and stopping is None:
             self._console.print("an error makes a scale wrong or impossible; Ctrl-C ends the run")
 
@@ -246,8 +246,10 @@ def live_progress(*, quiet: bool, verbose: bool) -> Iterator[Screen]:
         def render(self, task: Task) -> Text:
             stage: Stage = task.fields["stage"]
             seconds = task.finished_time if task.finished_time is not None else task.elapsed
-            left = "" if task.finished else stage.ends_in(time.monotonic())
-            return Text.assemble("took ", (clock(seconds or 0.0), "progress.elapsed"), f", {left}" if left else "")
+            time_left = "" if task.finished else stage.ends_in(time.monotonic())
+            return Text.assemble(
+                "took ", (clock(seconds or 0.0), "progress.elapsed"), f", {time_left}" if time_left else ""
+            )
 
     console = open_console(stderr=True, quiet=quiet)
     columns: tuple[Any, ...] = (

@@ -119,10 +119,10 @@ def show_applied(applied: Applied) -> None:
     lines: list[Line] = []
     for index, (folder, scale) in applied.models.items():
         done = "kept its own units" if scale.similarity is None else f"lengths times {scale.similarity.scale:.6g}"
-        said = Text(f"{folder}: {done}")
+        line = Text(f"{folder}: {done}")
         if scale.verdict is not None:
-            said.append_text(Text.assemble(" (", (scale.verdict, f"bold {_COLOUR[scale.verdict]}"), ")"))
-        lines.append((f"Model {index}", said))
+            line.append_text(Text.assemble(" (", (scale.verdict, f"bold {_COLOUR[scale.verdict]}"), ")"))
+        lines.append((f"Model {index}", line))
         lines += [("", reason) for reason in scale.reasons if scale.similarity is None]
     kinds: dict[str, list[str]] = {}
     for change in applied.changes:
@@ -139,15 +139,18 @@ def _describe_remembered(kept: Path | None) -> list[Line]:
     return [] if kept is None else [("remembered", f"{kept}; reconstruct and scale take it by the device's name")]
 
 
-def show_imu_calibration(found: RestCalibration, source: Path, out: Path, kept: Path | None) -> None:
+def show_imu_calibration(calibration: RestCalibration, source: Path, out: Path, kept: Path | None) -> None:
     """Print what the rests say of an IMU, with 95 % intervals."""
     from rich.text import Text
 
     from colmap_inertial.checks.report.imu_calibration import calibration_facts, gain_effect
 
-    colour = {"good": "green", "weak": "yellow"}[found.verdict]
-    lines: list[Line] = [("verdict", Text(found.verdict, f"bold {colour}")), *_label_first("reason", found.reasons)]
-    lines += [*calibration_facts(found), ("scale", gain_effect(found))]
+    colour = {"good": "green", "weak": "yellow"}[calibration.verdict]
+    lines: list[Line] = [
+        ("verdict", Text(calibration.verdict, f"bold {colour}")),
+        *_label_first("reason", calibration.reasons),
+    ]
+    lines += [*calibration_facts(calibration), ("scale", gain_effect(calibration))]
     lines += [*_label_first("written", (out, out.with_suffix(".html"))), *_describe_remembered(kept)]
     _print_panel(str(source), lines)
 
@@ -214,19 +217,19 @@ def show_nothing_to_do(workspace: Workspace) -> None:
     say(f"nothing to do: kept from the earlier run; {workspace.root} holds the result for these inputs and options")
 
 
-def show_reference(found: Reference) -> None:
+def show_reference(reference: Reference) -> None:
     """Print where a project's metres come from, and how good they are."""
     from colmap_inertial.checks.words import half_width_pct, length_in_words, scale_facts
 
     # a small target says how long things are where it lies, and no more
-    lengths = None if found.validation is None else found.validation.lengths
-    small = found.scale_from == "target" and lengths is not None and lengths.is_short
-    metres = length_in_words("trusted", half_width_pct(found.metres_per_unit, found.ci95))
-    values = {"metres_per_unit": found.metres_per_unit, "ci95": found.ci95}
+    lengths = None if reference.validation is None else reference.validation.lengths
+    small = reference.scale_from == "target" and lengths is not None and lengths.is_short
+    metres = length_in_words("trusted", half_width_pct(reference.metres_per_unit, reference.ci95))
+    values = {"metres_per_unit": reference.metres_per_unit, "ci95": reference.ci95}
     lines: list[Line] = [("metres", f"{metres}{', as far as the target reaches' if small else ''}")]
-    lines += [("from", found.made_of), *scale_facts(values), *_label_first("note", found.notes)]
-    _print_panel("Project", [*lines, ("written", str(found.out))])
-    say(f"next: {_next_to_see(found.out, None)}")
+    lines += [("from", reference.made_of), *scale_facts(values), *_label_first("note", reference.notes)]
+    _print_panel("Project", [*lines, ("written", str(reference.out))])
+    say(f"next: {_next_to_see(reference.out, None)}")
 
 
 def show_fused(lines: Sequence[str], screen: Screen) -> None:

@@ -102,13 +102,13 @@ def run_dense(session: Session, indices: Sequence[int], images: Path, options: D
     for index in indices:
         _undistort(session, index, images, prepared[index])
         count(_WORK.undistorted * images_of[index])
-    found: dict[int, DenseResult] = {}
+    results: dict[int, DenseResult] = {}
     for index in indices:
         end = done + by_image * images_of[index]
-        found[index] = _densify(session, index, prepared[index], options, count)
+        results[index] = _densify(session, index, prepared[index], options, count)
         # what was kept, or was not needed, counts as done
         count(end - done)
-    return found
+    return results
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -127,11 +127,11 @@ def has_depth_maps(folder: Path) -> bool:
 
 def digest_of_model(model: Path) -> str:
     """Digest of a model's poses and cameras."""
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for path in sorted(model.iterdir()):
         if path.stem in ("cameras", "images", "rigs", "frames"):
-            found.update(path.read_bytes())
-    return found.hexdigest()
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 def model_of(folder: Path) -> str | None:
@@ -169,9 +169,9 @@ def choose_maker(
     if not maps:
         return _plan_maps(model, max_image_size, here, settings), False
     record = folder / _RECORD
-    known = read_json(record) if record.is_file() else {}
+    stated = read_json(record) if record.is_file() else {}
     # an earlier version's record does not say: only patch-match made maps then
-    maker: Maker = "plane sweep" if known.get("maps") == "plane sweep" else "patch-match"
+    maker: Maker = "plane sweep" if stated.get("maps") == "plane sweep" else "patch-match"
     if maker == "plane sweep" and any(file.name.endswith(".photometric.bin") for file in maps):
         raise OutputExistsError(
             f"{folder / 'stereo'} holds maps of COLMAP's patch-match, but {record} says that the plane sweep made "
@@ -179,7 +179,7 @@ def choose_maker(
             "there"
         )
     wanted = _plan_maps(model, max_image_size, maker, settings)
-    if all(known.get(key, default) == getattr(wanted, key) for key, default in _MADE_FROM):
+    if all(stated.get(key, default) == getattr(wanted, key) for key, default in _MADE_FROM):
         return wanted, True
     if maker == "patch-match":
         raise OutputExistsError(
@@ -289,11 +289,11 @@ def find_maps(folder: Path, names: Sequence[str]) -> tuple[str, list[str]]:
 
 def coverage(folder: Path, names: Sequence[str], kind: str) -> float:
     """Share of the pixels of these pictures' depth maps that have a depth."""
-    known = pixels = 0
+    with_depth = pixels = 0
     for name in names:
         depth = read_map(map_file(folder, "depth", name, kind))
-        known, pixels = known + int(np.count_nonzero(depth > 0)), pixels + depth.size
-    return known / pixels if pixels else 0.0
+        with_depth, pixels = with_depth + int(np.count_nonzero(depth > 0)), pixels + depth.size
+    return with_depth / pixels if pixels else 0.0
 
 
 def fusion_options(maker: Maker, context: RunContext) -> pycolmap.StereoFusionOptions:

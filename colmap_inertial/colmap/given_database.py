@@ -82,11 +82,11 @@ class GivenDatabase:
 
     def require_size(self, name: str, width: int, height: int) -> None:
         """Raise ``FormatError`` where it has an image in another size than the capture."""
-        known = self.sizes[name]
-        if known != (width, height):
+        size = self.sizes[name]
+        if size != (width, height):
             raise FormatError(
                 self.path,
-                f"{name} is {known[0]}x{known[1]} there and {width}x{height} in the capture: give a database of the "
+                f"{name} is {size[0]}x{size[1]} there and {width}x{height} in the capture: give a database of the "
                 "images in their own size",
             )
 

@@ -309,8 +309,8 @@ def estimate_bias_correction(pairs: RayPairs, start_from_cam: Array, bias_lever_
             ratio = spread(x) / (_LIMITS.outlier * usual)
             return float(np.sum(ratio / (1 + ratio)))
 
-        found = minimize(cost, change, method="Nelder-Mead", options={"xatol": 1e-6, "fatol": 1e-6, "maxiter": 400})
-        moved, change = float(np.abs(found.x - change).max()), np.asarray(found.x)
+        minimum = minimize(cost, change, method="Nelder-Mead", options={"xatol": 1e-6, "fatol": 1e-6, "maxiter": 400})
+        moved, change = float(np.abs(minimum.x - change).max()), np.asarray(minimum.x)
         if moved < 1e-5:
             break
     least = spread(change)

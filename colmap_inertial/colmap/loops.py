@@ -218,10 +218,10 @@ class LoopSearch:
         covariance = early[1] + ratio[a, None, None] ** 2 * late[1] + noise[:, None, None] * np.eye(3)
         against = _squared(off, covariance) > _LIMITS.agree_3
         behind, rival = matches.copy(), np.zeros(len(pairs))
-        for one, other in ((a, b), (b, a)):
-            np.add.at(behind, one[~against], matches[other[~against]])
-        for one, other in ((a[against], b[against]), (b[against], a[against])):
-            np.maximum.at(rival, one, behind[other])
+        for node, other in ((a, b), (b, a)):
+            np.add.at(behind, node[~against], matches[other[~against]])
+        for node, other in ((a[against], b[against]), (b[against], a[against])):
+            np.maximum.at(rival, node, behind[other])
         return set(itertools.compress(pairs, (behind >= _LIMITS.by_far * rival).tolist()))
 
     def _displacements(self, i: IndexArray, j: IndexArray) -> tuple[Array, Array]:
@@ -292,7 +292,7 @@ class LoopSearch:
 
 def _within(step: int, pair: FramePair, others: Set[FramePair]) -> set[FramePair]:
     """Those of other pairs whose frames lie no farther than ``step`` from a pair's."""
-    return {one for one in others - {pair} if max(abs(one[0] - pair[0]), abs(one[1] - pair[1])) <= step}
+    return {near for near in others - {pair} if max(abs(near[0] - pair[0]), abs(near[1] - pair[1])) <= step}
 
 
 def _squared(off: Array, covariance: Array) -> Array:

@@ -158,17 +158,17 @@ def map_parts(
     running: dict[int, subprocess.Popen[bytes]] = {}
     watches: dict[int, threading.Thread] = {}
     made = {k for k, job in enumerate(jobs) if job.is_made()}
-    waiting, told = deque(k for k in range(len(jobs)) if k not in made), 0
+    waiting, reported = deque(k for k in range(len(jobs)) if k not in made), 0
     for k in sorted(made):
         log.info("part %d of %d: finished in an earlier run, kept", k + 1, len(jobs))
         remove(jobs[k].folder)
         for _ in jobs[k].options.image_names:
             registered()
     try:
-        while told < len(jobs):
-            if told in made:
-                yield jobs[told].read()
-                told += 1
+        while reported < len(jobs):
+            if reported in made:
+                yield jobs[reported].read()
+                reported += 1
                 continue
             while waiting and len(running) < workers:
                 k = waiting.popleft()

@@ -137,7 +137,7 @@ def link_observations(
     begin = np.concatenate([[0], np.cumsum(features)])
     total = int(begin[-1])
     none = np.zeros((0, 2), dtype=np.intp)
-    shifted = [np.asarray(found, dtype=np.intp) + begin[[i, j]] for i, j, found in matches]
+    shifted = [np.asarray(matched, dtype=np.intp) + begin[[i, j]] for i, j, matched in matches]
     both = np.concatenate([none, *shifted])
     graph = coo_matrix((np.ones(len(both), dtype=np.int8), (both[:, 0], both[:, 1])), shape=(total, total))
     _, label = connected_components(graph, directed=False)
@@ -221,8 +221,8 @@ def _find_beginning(observations: Observations, bounds: IndexArray, i: int) -> t
         _, at_a, at_b = np.intersect1d(observations.point[a], observations.point[b], return_indices=True)
         if len(at_a) < 2 * _LIMITS.least_points:
             return None
-        one, two = observations.rays[a][at_a], observations.rays[b][at_b]
-        normal = np.cross(one, two)
+        first, second = observations.rays[a][at_a], observations.rays[b][at_b]
+        normal = np.cross(first, second)
         if np.median(np.linalg.norm(normal, axis=1)) < 2 * _LIMITS.parallax_rad:
             continue
         weight = np.ones(len(normal))
@@ -230,7 +230,7 @@ def _find_beginning(observations: Observations, bounds: IndexArray, i: int) -> t
             direction = np.linalg.eigh((normal * weight[:, None]).T @ normal)[1][:, 0]
             weight = 1 / (1 + (normal @ direction / _LIMITS.off_rad) ** 2) ** 2
         # points lie before both
-        sign = np.sign(np.sum(weight * np.sum(np.cross(np.tile(direction, (len(one), 1)), two) * normal, axis=1)))
+        sign = np.sign(np.sum(weight * np.sum(np.cross(np.tile(direction, (len(first), 1)), second) * normal, axis=1)))
         return j, np.asarray(direction * (sign or 1.0))
     return None
 

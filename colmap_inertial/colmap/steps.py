@@ -58,9 +58,9 @@ def run_colmap(
     cameras = {record.name: record.camera for record in records if record.used}
 
     def features(partial: Sequence[Path]) -> None:
-        found = _find_features(workspace.colmap_images, cameras, partial[0], stages, options, context)
+        found_features = _find_features(workspace.colmap_images, cameras, partial[0], stages, options, context)
         write_gravity_priors(partial[0], gravity)
-        write_record(partial[1], found)
+        write_record(partial[1], found_features)
 
     settings = context.colmap.identity
     depends = {**_identify_extraction(options, context), "stages": stages, "gravity": gravity}
@@ -77,8 +77,8 @@ def run_colmap(
         record = workspace.stamps / "keypoints_of_features.json"
         runner.run("features", depends, [workspace.colmap_features, record], features, after=["frames"])
         shutil.copyfile(record, partial[1])
-        known = next(iter(cameras.values()), None)
-        matched = match_capture(workspace.colmap_features, partial[0], recording, known, mapping, context)
+        first_camera = next(iter(cameras.values()), None)
+        matched = match_capture(workspace.colmap_features, partial[0], recording, first_camera, mapping, context)
         write_record(partial[2], matched)
 
     def models(partial: Sequence[Path]) -> None:

@@ -48,8 +48,8 @@ def check_array(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> A
     return out
 
 
-def _fits(found: tuple[int, ...], shape: tuple[int | None, ...]) -> bool:
-    return len(found) == len(shape) and all(n is None or n == m for n, m in zip(shape, found, strict=True))
+def _fits(actual: tuple[int, ...], shape: tuple[int | None, ...]) -> bool:
+    return len(actual) == len(shape) and all(n is None or n == m for n, m in zip(shape, actual, strict=True))
 
 
 def check_field(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Array:

@@ -23,10 +23,10 @@ class CheckedOptions:
         TypeError
             With the field that is spelled nearly the same.
         """
-        known = cls.__dataclass_fields__
+        known_fields = cls.__dataclass_fields__
         for name in values:
-            if name not in known:
-                raise TypeError(f"{cls.__name__} has no field {name!r}{suggest_nearest(name, known)}")
+            if name not in known_fields:
+                raise TypeError(f"{cls.__name__} has no field {name!r}{suggest_nearest(name, known_fields)}")
         return super().__new__(cls)
 
     def __post_init__(self) -> None:
@@ -127,7 +127,7 @@ def _suggest(value: object, kinds: tuple[Any, ...]) -> str:
     return suggest_nearest(value, choices) if isinstance(value, str) else ""
 
 
-def suggest_nearest(word: str, known: Iterable[str]) -> str:
+def suggest_nearest(word: str, choices: Iterable[str]) -> str:
     """The known word that is spelled nearly the same, as the end of a sentence; empty where there is none."""
-    near = difflib.get_close_matches(word, list(known), n=1)
+    near = difflib.get_close_matches(word, list(choices), n=1)
     return f"; did you mean {near[0]!r}?" if near else ""

@@ -124,6 +124,6 @@ def fit_robust_slope(x: Array, y: Array) -> float:
     order = np.argsort(y / np.where(x == 0, np.inf, x))
     weight = np.cumsum(np.abs(x[order]))
     middle = order[np.searchsorted(weight, 0.5 * weight[-1])]
-    left = np.abs(y - y[middle] / x[middle] * x)
-    agree = left <= 3 * float(np.median(left)) / 0.6745
+    residual = np.abs(y - y[middle] / x[middle] * x)
+    agree = residual <= 3 * float(np.median(residual)) / 0.6745
     return float(y[agree] @ x[agree] / (x[agree] @ x[agree]))

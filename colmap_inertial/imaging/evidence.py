@@ -118,7 +118,7 @@ class BlurEvidence:
 
     def __add__(self, other: BlurEvidence) -> BlurEvidence:
         summed = {f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(self) if f.name != "standing"}
-        parts = [one.standing for one in (self, other) if one.standing is not None]
+        parts = [evidence.standing for evidence in (self, other) if evidence.standing is not None]
         return BlurEvidence(**summed, standing=parts[0] + parts[1] if len(parts) == 2 else next(iter(parts), None))
 
     @property
@@ -183,10 +183,10 @@ def blur_evidence(image: UInt8Array | UInt16Array, blur: BlurField | BlurPath) -
     Evidence in units of the prediction; of no tile where blur is short, or texture missing, all over.
     """
     path = BlurPath.straight(blur) if isinstance(blur, BlurField) else blur
-    found = _compute_spectra(image, path, _LIMITS.most_tiles)
-    if found is None:
+    spectra = _compute_spectra(image, path, _LIMITS.most_tiles)
+    if spectra is None:
         return BlurEvidence.nothing()
-    logarithm, vectors, paths = found
+    logarithm, vectors, paths = spectra
     cepstra, vectors = _compute_cepstra(logarithm), _find_dips(vectors, paths, logarithm.shape[1])
     values = _sample_lags(cepstra, vectors, DIRECTIONS_RAD)
     level = np.median(values[:, :, 2:-1], axis=2, keepdims=True)
@@ -224,19 +224,19 @@ def measure_blur_share(image: UInt8Array | UInt16Array, blur: BlurField | BlurPa
     About 0 also where an image is blurred otherwise: textures decide then, and tiles are many. ``None`` where there is
     too little to tell.
     """
-    found = _find_share_inputs(image, blur)
-    return None if found is None else _fit_share(*found)
+    inputs = _find_share_inputs(image, blur)
+    return None if inputs is None else _fit_share(*inputs)
 
 
 def measure_blur_shares(
     image: UInt8Array | UInt16Array, blur: BlurField | BlurPath
 ) -> tuple[float | None, float | None]:
     """`measure_blur_share`, and the share of the blur that a gyroscope with one axis flipped would predict."""
-    found = _find_share_inputs(image, blur)
-    if found is None:
+    inputs = _find_share_inputs(image, blur)
+    if inputs is None:
         return None, None
-    logarithm, vectors, paths, weight = found
-    return _fit_share(*found), _fit_share(logarithm, vectors * [1, -1], paths * [1, -1], weight)
+    logarithm, vectors, paths, weight = inputs
+    return _fit_share(*inputs), _fit_share(logarithm, vectors * [1, -1], paths * [1, -1], weight)
 
 
 def _find_share_inputs(
@@ -244,8 +244,8 @@ def _find_share_inputs(
 ) -> tuple[Float32Array, Array, Array, Array] | None:
     """Log power, chords, paths and weights of some tiles; ``None`` where there are too few to tell."""
     path = BlurPath.straight(blur) if isinstance(blur, BlurField) else blur
-    found = _compute_spectra(image, path, _LIMITS.few_tiles)
-    return None if found is None else (*found, _weigh_tiles(found[0]))
+    spectra = _compute_spectra(image, path, _LIMITS.few_tiles)
+    return None if spectra is None else (*spectra, _weigh_tiles(spectra[0]))
 
 
 def _fit_share(logarithm: Float32Array, vectors: Array, path_px: Array, weight: Array) -> float | None:
@@ -361,14 +361,14 @@ def _measure_falls(logarithm: Float32Array, vectors: Array, path_px: Array) -> t
     ring = np.rint(radius[band] * tile).astype(np.intp)
     at_ring = np.eye(ring.max() + 1)[ring]
     count = across @ at_ring
-    level, left = ((((values * across) @ at_ring) / np.maximum(count, 1))[:, ring] for values in (power, passed))
+    level, after = ((((values * across) @ at_ring) / np.maximum(count, 1))[:, ring] for values in (power, passed))
     rise = radius[band] ** 2
     above = (((np.exp(power) - noise) * rise) * across).sum(1) - _LIMITS.scatter * noise[:, 0] * np.sqrt(
         across @ rise**2
     )
     picture = np.maximum(above / (passed * across).sum(1), 0)[:, None] / rise
     counts = ~across & (count[:, ring] > 0)
-    expected = np.maximum(np.log((picture * passed + noise) / (picture * left + noise)), _LIMITS.deepest_log) * counts
+    expected = np.maximum(np.log((picture * passed + noise) / (picture * after + noise)), _LIMITS.deepest_log) * counts
     seen = (power - level) * counts
     frequencies = np.maximum(counts.sum(1), 1)
     return (

@@ -233,7 +233,7 @@ def judge_recording(evidence: Iterable[BlurEvidence], options: GateOptions | Non
     verdict = _judge_evidence(evidence, options)
     if verdict.trusted is False:
         # a sky hides what stands below it
-        standing = [one.standing for one in evidence if one.standing is not None]
+        standing = [frame.standing for frame in evidence if frame.standing is not None]
         below = _judge_evidence(standing, options)
         if below.trusted and sum(standing, BlurEvidence.nothing()).support >= options.min_recording_support:
             return below
@@ -241,8 +241,8 @@ def judge_recording(evidence: Iterable[BlurEvidence], options: GateOptions | Non
 
 
 def _judge_evidence(evidence: Sequence[BlurEvidence], options: GateOptions) -> RecordingVerdict:
-    telling = [one for one in evidence if one.enough]
-    supports = [_plausible_support(one) for one in telling]
+    telling = [frame for frame in evidence if frame.enough]
+    supports = [_plausible_support(frame) for frame in telling]
     median = float(np.median(supports)) if supports else 0.0
     together = sum(telling, BlurEvidence.nothing())
     factor = _correct_extent(together)
@@ -271,9 +271,9 @@ def _is_clear_together(telling: Sequence[BlurEvidence], together: BlurEvidence) 
     ):
         return False
     votes = [
-        one.support - one.mirrored_support
-        for one in telling
-        if one.support >= GATE_LIMITS.vote_support or one.mirrored_support >= GATE_LIMITS.vote_support
+        frame.support - frame.mirrored_support
+        for frame in telling
+        if frame.support >= GATE_LIMITS.vote_support or frame.mirrored_support >= GATE_LIMITS.vote_support
     ]
     against = sum(vote < -1 for vote in votes)
     return len(votes) - against >= max(GATE_LIMITS.fewest_frames, 3 * against)

@@ -129,8 +129,8 @@ def parallax_from_points(
     step_px = max(1, round(_LIMITS.step_share * max(width, height)))
     rows, columns = BlurField.nodes(width, height, step_px)
     nodes = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2) * step_px + 0.5
-    found: Any = cKDTree(xy).query(nodes, k=_LIMITS.neighbours)
-    away, nearest = found
+    neighbours: Any = cKDTree(xy).query(nodes, k=_LIMITS.neighbours)
+    away, nearest = neighbours
     weight = 1 / (away**2 + (0.5 * step_px) ** 2)
     smooth = (weight * inverse[nearest]).sum(axis=1) / weight.sum(axis=1)
     return Parallax(

@@ -130,14 +130,14 @@ class Noise:
     by_light: float
 
     @classmethod
-    def fitted(cls, found: Array) -> Noise:
+    def fitted(cls, measured: Array) -> Noise:
         """Fit the model to the light and the variance of (N, 2) tiles, some of which show more than noise, by least
         distances.
         """
-        if not len(found):
+        if not len(measured):
             return cls(FILTER_MODEL.least_noise**2, 0.0)
-        light, variance = found.T
-        weight = np.ones(len(found))
+        light, variance = measured.T
+        weight = np.ones(len(measured))
         dark, by_light = 0.0, 0.0
         for _ in range(10):
             mean_light, mean_variance = np.average(light, weights=weight), np.average(variance, weights=weight)
@@ -159,7 +159,7 @@ def noise_along(
     from colmap_inertial._kernels import _path
 
     most_tiles = FILTER_MODEL.chroma_noise_tiles if chroma else FILTER_MODEL.noise_tiles
-    found = _path.noise(
+    measured = _path.noise(
         light,
         paths=paths,
         window_in=tiling.window_in(),
@@ -173,7 +173,7 @@ def noise_along(
         ),
         threads=threads,
     )
-    channels = np.reshape(found, (light.shape[2], -1, 3))
+    channels = np.reshape(measured, (light.shape[2], -1, 3))
     if chroma:
         channels[..., 0] = 0
     return tuple(Noise.fitted(tiles[tiles[:, 2] >= FILTER_MODEL.noise_count, :2]) for tiles in channels)

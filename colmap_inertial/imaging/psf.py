@@ -120,8 +120,8 @@ def blur_field(
         raise NotObservableError("motion blur", _NOT_COVERED)
     x, y = _node_axes(shutter.width, shutter.height, step_px)
     rates = None if parallax is None else parallax.rate_at(x, y)[None]
-    one = _Exposures(shutter, np.array([shutter.t_s]), np.array([shutter.exposure_s]))
-    vectors = _compute_vectors(motion, camera, one, x, y, rates)[0]
+    exposure = _Exposures(shutter, np.array([shutter.t_s]), np.array([shutter.exposure_s]))
+    vectors = _compute_vectors(motion, camera, exposure, x, y, rates)[0]
     return BlurField(
         width=shutter.width,
         height=shutter.height,

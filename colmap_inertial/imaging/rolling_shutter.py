@@ -158,13 +158,13 @@ def project_by_lines(
 
     By fixed-point iteration from (N, 2) pixels near them; directions are in the frame of ``GyroCamera.start_from_cam``.
     """
-    found = start
+    xy_px_now = start
     for _ in range(_LIMITS.most_rounds):
-        then = motion.start_from_cam(shutter.middle_s(np.where(np.isfinite(found), found, start)))
-        before, found = found, np.asarray(camera.img_from_cam(np.einsum("nji,nj->ni", then, directions)))
-        if not (np.abs(found - before) > _LIMITS.settled_px).any():
+        then = motion.start_from_cam(shutter.middle_s(np.where(np.isfinite(xy_px_now), xy_px_now, start)))
+        before, xy_px_now = xy_px_now, np.asarray(camera.img_from_cam(np.einsum("nji,nj->ni", then, directions)))
+        if not (np.abs(xy_px_now - before) > _LIMITS.settled_px).any():
             break
-    return found
+    return xy_px_now
 
 
 def grid_nodes(rows: int, columns: int) -> Array:

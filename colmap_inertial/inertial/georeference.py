@@ -435,19 +435,19 @@ def _fit(paths: ComplexArray, delays_s: Array, target: ComplexArray, t_s: Array,
     apart_s = np.abs(t_s[:, None] - t_s[None, :])
     middle = complex(paths.mean())
     about, logs_of_delay = paths - middle, -0.5 * ((delays_s - _LIMITS.usual_delay_s) / _LIMITS.delay_sigma_s) ** 2
-    sizes, found = [], []
+    sizes, fits = [], []
     for alike_s in _LIMITS.alike_s:
         # in units of each position's own error, and in axes in which all sizes are independent
         values, axes = np.linalg.eigh(np.exp(-apart_s / alike_s))
-        one, z = axes.T @ (1 / relative), axes.T @ (target / relative)
+        fit, z = axes.T @ (1 / relative), axes.T @ (target / relative)
         p = (about / relative) @ axes
         for white_m in _LIMITS.white_m:
             for slow_m in _LIMITS.slow_m:
                 var = white_m**2 + slow_m**2 * np.maximum(values, 0.0)
                 weight = 1 / var
-                total = float(np.sum(weight * one**2))
-                shift_p, shift_z = p @ (weight * one) / total, complex(np.sum(weight * one * z)) / total
-                q, y = p - shift_p[:, None] * one, z - shift_z * one
+                total = float(np.sum(weight * fit**2))
+                shift_p, shift_z = p @ (weight * fit) / total, complex(np.sum(weight * fit * z)) / total
+                q, y = p - shift_p[:, None] * fit, z - shift_z * fit
                 length = np.maximum(np.abs(q) ** 2 @ weight, 1e-12)
                 along = np.conj(q) @ (weight * y)
                 turn = np.where(np.abs(along) > 0, along / np.maximum(np.abs(along), 1e-300), 1.0)
@@ -457,11 +457,11 @@ def _fit(paths: ComplexArray, delays_s: Array, target: ComplexArray, t_s: Array,
                 # where the path's middle is; its error and the turn's are not independent
                 at, arm = shift_z - turn * shift_p, -1j * turn * shift_p / np.sqrt(length)
                 sizes.append((white_m, slow_m))
-                found.append((log, turn, at, arm, length, np.full(len(log), total), np.abs(along) / length))
-    logs = np.array([one[0] for one in found])
+                fits.append((log, turn, at, arm, length, np.full(len(log), total), np.abs(along) / length))
+    logs = np.array([fit[0] for fit in fits])
     share = np.exp(logs - logs.max())
     share /= share.sum()
-    turns, ats, arms, lengths, totals, ratios = (np.array([one[k] for one in found]) for k in range(1, 7))
+    turns, ats, arms, lengths, totals, ratios = (np.array([fit[k] for fit in fits]) for k in range(1, 7))
     mean_turn, mean_at = float(np.angle(np.sum(share * turns))), complex(np.sum(share * ats))
     apart = np.stack([np.angle(turns * np.exp(-1j * mean_turn)), (ats - mean_at).real, (ats - mean_at).imag])
     arm3 = np.stack([1 / np.sqrt(lengths), arms.real, arms.imag])

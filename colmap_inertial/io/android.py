@@ -35,8 +35,8 @@ _SAME_FRAME_NS = 2_000_000
 
 def is_opencamera(path: Path) -> bool:
     """Whether ``path`` is an OpenCamera-Sensors folder, or the gyroscope's file in one."""
-    found = _gyro_files(path)
-    return bool(found) and all(_has_bare_rows(file) for file in found)
+    files = _gyro_files(path)
+    return bool(files) and all(_has_bare_rows(file) for file in files)
 
 
 def read_opencamera(path: Path, units: DeclaredUnits) -> ImuRecording:
@@ -126,13 +126,13 @@ def _gyro_files(path: Path) -> list[Path]:
 
 
 def _one_gyro_file(path: Path) -> Path:
-    found = _gyro_files(path)
-    if len(found) != 1:
-        what = ", ".join(file.name for file in found[:5]) if found else "none"
+    files = _gyro_files(path)
+    if len(files) != 1:
+        what = ", ".join(file.name for file in files[:5]) if files else "none"
         raise FormatError(
-            path, f"holds {len(found)} files *gyro.csv of OpenCamera-Sensors ({what}); give the one to read"
+            path, f"holds {len(files)} files *gyro.csv of OpenCamera-Sensors ({what}); give the one to read"
         )
-    return found[0]
+    return files[0]
 
 
 def _sibling(gyro_file: Path, ending: str) -> Path:

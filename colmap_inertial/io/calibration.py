@@ -347,21 +347,21 @@ def read_calibrations(paths: CalibrationFiles) -> Calibrations:
     FormatError
         Where two files hold the same; for a file that cannot be read.
     """
-    found: dict[str, Path] = {}
+    file_of: dict[str, Path] = {}
     for path in list_paths(paths):
         kind = calibration_kind(path)
-        if kind in found:
-            raise FormatError(path, f"and {found[kind]} both say {_WORDS[kind]}; give one of them")
-        found[kind] = path
+        if kind in file_of:
+            raise FormatError(path, f"and {file_of[kind]} both say {_WORDS[kind]}; give one of them")
+        file_of[kind] = path
     return Calibrations(
-        camera_imu=read_calibration(found[CAMERA_IMU]) if CAMERA_IMU in found else None,
-        imu=read_imu_calibration(found[IMU]) if IMU in found else None,
+        camera_imu=read_calibration(file_of[CAMERA_IMU]) if CAMERA_IMU in file_of else None,
+        imu=read_imu_calibration(file_of[IMU]) if IMU in file_of else None,
     )
 
 
 def read_for_recording(paths: CalibrationFiles, *, shared_clock: bool = False) -> Calibrations:
     """:func:`read_calibrations` as priors for another recording of the device."""
-    found = read_calibrations(paths)
-    if found.camera_imu is None:
-        return found
-    return replace(found, camera_imu=reset_for_recording(found.camera_imu, shared_clock=shared_clock))
+    calibrations = read_calibrations(paths)
+    if calibrations.camera_imu is None:
+        return calibrations
+    return replace(calibrations, camera_imu=reset_for_recording(calibrations.camera_imu, shared_clock=shared_clock))

@@ -52,7 +52,7 @@ def read_camm(path: Path, units: DeclaredUnits) -> ImuRecording:
         Where there is no gyroscope, or the file is damaged.
     """
     packets = _packets(*_open(path))
-    found: dict[int, Samples] = {}
+    samples_of: dict[int, Samples] = {}
     sensors: tuple[tuple[int, Quantity, str], ...] = (
         (_GYRO, "gyro", units.gyro or "rad/s"),
         (_ACCEL, "accel", units.accel or "m/s2"),
@@ -62,10 +62,10 @@ def read_camm(path: Path, units: DeclaredUnits) -> ImuRecording:
         if len(t_ns):
             with np.errstate(invalid="ignore"):  # a damaged file may hold signalling NaNs
                 values = data.view("<f4").astype(np.float64)
-            found[kind] = order_samples(path, quantity, unit, t_ns, values)
-    if _GYRO not in found:
+            samples_of[kind] = order_samples(path, quantity, unit, t_ns, values)
+    if _GYRO not in samples_of:
         raise FormatError(path, "its CAMM track holds no gyroscope samples (type 2)")
-    return build_recording(found[_GYRO], found.get(_ACCEL))
+    return build_recording(samples_of[_GYRO], samples_of.get(_ACCEL))
 
 
 def read_camm_frames(path: Path) -> FrameLog:
@@ -149,16 +149,16 @@ def _packets(movie: Movie, track: Track) -> dict[int, tuple[Int64Array, UInt8Arr
             raise FormatError(
                 movie.path, f"is damaged: packet {first + 1} of type {kind[first]} of its camm track is cut off"
             )
-        for wanted, found in parts.items():
+        for wanted, packets in parts.items():
             rows = np.flatnonzero(kind == wanted)
-            found.append((t_ns[rows], data[at[rows, None] + 4 + np.arange(_LENGTHS[wanted])]))
+            packets.append((t_ns[rows], data[at[rows, None] + 4 + np.arange(_LENGTHS[wanted])]))
         # an unknown type ends its sample
         more = np.flatnonzero((length >= 0) & (at + 4 + length < end))
         at, end, t_ns = (at + 4 + length)[more], end[more], t_ns[more]
     return {
         kind: (
-            np.concatenate([t for t, _ in found] or [np.zeros(0, dtype=np.int64)]),
-            np.ascontiguousarray(np.concatenate([d for _, d in found] or [np.zeros((0, _LENGTHS[kind]), np.uint8)])),
+            np.concatenate([t for t, _ in packets] or [np.zeros(0, dtype=np.int64)]),
+            np.ascontiguousarray(np.concatenate([d for _, d in packets] or [np.zeros((0, _LENGTHS[kind]), np.uint8)])),
         )
-        for kind, found in parts.items()
+        for kind, packets in parts.items()
     }

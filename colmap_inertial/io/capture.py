@@ -299,15 +299,15 @@ def _read_exposures(table: Section, capture: Capture) -> Capture:
 
 
 def _read_calibration(table: Section, capture: Capture) -> Capture:
-    found = read_calibration_table(
+    calibrations = read_calibration_table(
         table,
         body_from_cam=capture.body_from_cam,
         imu=capture.imu,
         readout_s=capture.readout_s,
         shared_clock=capture.shared_clock,
     )
-    prior = found.camera_imu or calibration_prior(shared_clock=capture.shared_clock)
-    return replace(capture, calibration=prior, imu_calibration=found.imu)
+    prior = calibrations.camera_imu or calibration_prior(shared_clock=capture.shared_clock)
+    return replace(capture, calibration=prior, imu_calibration=calibrations.imu)
 
 
 def _read_target(table: Section, capture: Capture) -> Capture:

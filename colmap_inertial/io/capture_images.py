@@ -185,8 +185,8 @@ def _aperture(name: str, role: SpectralRole, camera: MountedCamera, source: SubI
 
 def _size_of_first(source: SubImages, names: Path) -> tuple[int, int]:
     """Width and height of an aperture's first picture, where the calibration gives none."""
-    found = sorted(p.name for p in names.iterdir() if p.suffix.lower() in SUFFIXES) if names.is_dir() else []
-    for name in found:
+    image_names = sorted(p.name for p in names.iterdir() if p.suffix.lower() in SUFFIXES) if names.is_dir() else []
+    for name in image_names:
         if source.rename is None or source.rename[0] in name:
             height, width = read_image(source.path(name)).shape[:2]
             return width, height

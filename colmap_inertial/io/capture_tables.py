@@ -141,9 +141,9 @@ def read_calibration_table(
     files = table.files("file")
     if any(key in table for key in CALIBRATION_KEYS[1:]) and not all(holds_imu_alone(file) for file in files):
         table.fail("file", "gives the calibration; leave out the other keys of this table")
-    found = read_for_recording(files, shared_clock=shared_clock)
-    if found.camera_imu is not None:
-        return found
+    calibrations = read_for_recording(files, shared_clock=shared_clock)
+    if calibrations.camera_imu is not None:
+        return calibrations
     rotation, lever = _read_pose(table)
     if body_from_cam is not None and rotation is None:
         body = body_from_imu(imu) if isinstance(imu, ImuPath) else np.eye(4)
@@ -160,7 +160,7 @@ def read_calibration_table(
         readout_s=readout_s,
         **sigmas,
     )
-    return replace(found, camera_imu=calibration_prior(declared, shared_clock=shared_clock))
+    return replace(calibrations, camera_imu=calibration_prior(declared, shared_clock=shared_clock))
 
 
 def _read_pose(table: Section) -> tuple[ArrayLike | None, ArrayLike | None]:

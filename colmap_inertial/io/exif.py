@@ -110,10 +110,10 @@ def _texts(path: Path) -> dict[int, str]:
     """The text entries of a picture's EXIF directory."""
     head = read_bytes(path, HEAD_BYTES, what="picture")
     try:
-        found = _directory(head, _Tag.EXIF)
-        if found is None:
+        entries = _directory(head, _Tag.EXIF)
+        if entries is None:
             raise FormatError(path, "has no EXIF, which is to give its time; give --frame-times")
-        tiff, order, directory = found
+        tiff, order, directory = entries
         return {tag: _text(tiff, order, *entry) for tag, entry in directory.items() if entry[0] == _Type.ASCII}
     except (struct.error, KeyError):
         raise FormatError(path, "its EXIF is damaged or empty; give --frame-times") from None
@@ -157,12 +157,12 @@ def exposure_of(head: bytes) -> tuple[float | None, float | None]:
     ExposureTime is a fraction, PhotographicSensitivity a whole number (CIPA DC-008).
     """
     try:
-        found = _directory(head, _Tag.EXIF)
+        entries = _directory(head, _Tag.EXIF)
     except (struct.error, KeyError):
-        found = None
-    if found is None:
+        entries = None
+    if entries is None:
         return None, None
-    tiff, order, directory = found
+    tiff, order, directory = entries
     exposure_s = iso = None
     if _Tag.EXPOSURE_TIME in directory:
         try:
@@ -185,10 +185,10 @@ def position_of(head: bytes) -> tuple[float, float, float, float, HeightDatum] |
         nan where the height or the error is not stated (CIPA DC-008, table 15).
     """
     try:
-        found = _directory(head, _Tag.GPS)
-        if found is None:
+        entries = _directory(head, _Tag.GPS)
+        if entries is None:
             return None
-        tiff, order, gps = found
+        tiff, order, gps = entries
         latitude = _angle_deg(tiff, order, gps[_GpsTag.LATITUDE], gps[_GpsTag.LATITUDE_REF], "NS")
         longitude = _angle_deg(tiff, order, gps[_GpsTag.LONGITUDE], gps[_GpsTag.LONGITUDE_REF], "EW")
         wanted = (_GpsTag.HEIGHT, _GpsTag.ERROR)
@@ -258,14 +258,14 @@ def carry_metadata(original: bytes, encoded: bytes) -> bytes:
 
 def read_exposures_s(paths: list[Path]) -> Array | None:
     """(F,) exposure times by the EXIF of JPEG, PNG or TIFF files; ``None`` where one of them does not say."""
-    found = []
+    exposures_s = []
     for path in paths:
         with reading(path):
             exposure_s, _ = exposure_of(read_bytes(path, HEAD_BYTES, what="picture"))
         if exposure_s is None:
             return None
-        found.append(exposure_s)
-    return np.array(found)
+        exposures_s.append(exposure_s)
+    return np.array(exposures_s)
 
 
 def _is_jpeg_metadata(marker: int) -> bool:

@@ -162,10 +162,10 @@ def stamps_of_names(folder: Path, names: Sequence[str], unit: str) -> FrameStamp
     """
     tokens = []
     for name in names:
-        found = re.findall(r"\d+(?:\.\d+)?", Path(name).stem)
-        longest = [token for token in found if len(token) == max(map(len, found))]
+        numbers = re.findall(r"\d+(?:\.\d+)?", Path(name).stem)
+        longest = [token for token in numbers if len(token) == max(map(len, numbers))]
         if len(longest) != 1:
-            what = "no number" if not found else f"several numbers of one length ({', '.join(longest)})"
+            what = "no number" if not numbers else f"several numbers of one length ({', '.join(longest)})"
             raise TimingError(f'{folder / name}: the name holds {what}; times = "name" cannot time it: {_HOW}')
         tokens.append(longest[0])
     return stamps_in_order(folder, list(names), stamps_ns(folder, tokens, unit))
@@ -202,10 +202,10 @@ def stamps_of_pattern(folder: Path, names: Sequence[str], pattern: str) -> Frame
         before, after = (".*".join(map(re.escape, part.split("*"))) for part in pattern.split(f"{{{units[0]}}}"))
         tokens = []
         for name in names:
-            found = re.fullmatch(rf"{before}(\d+(?:\.\d+)?){after}", Path(name).stem)
-            if found is None:
+            match = re.fullmatch(rf"{before}(\d+(?:\.\d+)?){after}", Path(name).stem)
+            if match is None:
                 raise TimingError(f"{folder / name}: the name does not fit {pattern!r} (without folder and ending)")
-            tokens.append(found[1])
+            tokens.append(match[1])
         return stamps_in_order(folder, list(names), stamps_ns(folder, tokens, units[0]))
     if "%f" in pattern and ("%d" in pattern or "%j" in pattern):
         return stamps_in_order(folder, list(names), np.array([_date_ns(folder / n, pattern) for n in names]))

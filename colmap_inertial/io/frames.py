@@ -175,8 +175,8 @@ def image_names(source: ImageFolder) -> list[str]:
         raise FormatError(source.folder, "no such folder of pictures")
     if source.pattern is not None and (Path(source.pattern).is_absolute() or ".." in Path(source.pattern).parts):
         raise FormatError(source.folder, f"the pattern {source.pattern!r} leads out of it")
-    found = source.folder.iterdir() if source.pattern is None else source.folder.glob(source.pattern)
-    paths = [path for path in found if path.suffix.lower() in SUFFIXES and path.is_file()]
+    candidates = source.folder.iterdir() if source.pattern is None else source.folder.glob(source.pattern)
+    paths = [path for path in candidates if path.suffix.lower() in SUFFIXES and path.is_file()]
     if not paths:
         what = "holds no pictures" if source.pattern is None else f"holds no pictures that match {source.pattern!r}"
         raise FormatError(source.folder, f"{what} (endings: {', '.join(SUFFIXES)})")

@@ -81,7 +81,7 @@ def read_gopro(path: Path, units: DeclaredUnits) -> ImuRecording:
         Where there is no gyroscope, or the file is damaged.
     """
     telemetry = _Telemetry.of(path)
-    found: dict[Quantity, Samples] = {}
+    samples_of: dict[Quantity, Samples] = {}
     for key, quantity in _SENSORS.items():
         stream = telemetry.streams.get(key)
         if stream is None:
@@ -91,13 +91,13 @@ def read_gopro(path: Path, units: DeclaredUnits) -> ImuRecording:
             raise FormatError(path, f"the {key} stream has {values.shape[1]} channels, not 3")
         values = values @ _axes(path, telemetry.movie, stream).T
         unit = getattr(units, quantity) or _unit(path, stream, quantity)
-        found[quantity] = order_samples(path, quantity, unit, telemetry.times_ns(key), values)
-    if "gyro" not in found:
+        samples_of[quantity] = order_samples(path, quantity, unit, telemetry.times_ns(key), values)
+    if "gyro" not in samples_of:
         raise FormatError(
             path, "its telemetry holds no gyroscope (GYRO): HERO5 and later write one; older cameras have none"
         )
     device = _device(telemetry.movie, telemetry.streams["GYRO"])
-    read = build_recording(found["gyro"], found.get("accel"), device=device)
+    read = build_recording(samples_of["gyro"], samples_of.get("accel"), device=device)
     return replace(read, temperature_c=_temperature_c(telemetry.streams))
 
 
@@ -116,10 +116,14 @@ def read_gopro_frames(path: Path) -> FrameLog:
         stream = telemetry.streams.get(key)
         if stream is None or stream.values.shape[1] != channels:
             return None
-        found = _nearest(telemetry.times_ns(key), stream.values, frame_ns)
+        nearest = _nearest(telemetry.times_ns(key), stream.values, frame_ns)
         # directions and orientations have a length, exposures a bound; what has not is damaged
-        good = found is not None and np.isfinite(found).all() and (channels == 1 or np.linalg.norm(found, axis=1).all())
-        return found if good else None
+        good = (
+            nearest is not None
+            and np.isfinite(nearest).all()
+            and (channels == 1 or np.linalg.norm(nearest, axis=1).all())
+        )
+        return nearest if good else None
 
     exposure, iso, iso_hundreds = (of_frames(key, 1) for key in ("SHUT", "ISOE", "ISOG"))
     if iso is None and iso_hundreds is not None:
@@ -205,9 +209,9 @@ class _Telemetry:
     def of(cls, path: Path) -> _Telemetry:
         movie = read_movie(path)
         track = movie.telemetry("gpmd", "GoPro telemetry")
-        found = read_streams(path, movie.samples(track), track.offset.tolist(), _WANTED)
-        camera = next((s.device for s in found if s.key == "GYRO"), None)
-        own = {s.key: s for s in reversed(found) if camera is None or s.device == camera}
+        streams = read_streams(path, movie.samples(track), track.offset.tolist(), _WANTED)
+        camera = next((s.device for s in streams if s.key == "GYRO"), None)
+        own = {s.key: s for s in reversed(streams) if camera is None or s.device == camera}
         plain = cls(movie=movie, streams=own, payload_ns=track.t_ns)
         return replace(plain, shift_ns=plain._video_minus_stamp_ns())
 
@@ -296,14 +300,14 @@ def _device(movie: Movie, gyro: Stream) -> str:
 def _settings(movie: Movie) -> dict[str, Entry]:
     """The global settings in the file's user data; empty before HERO8."""
     raw = movie.user_data.get("GPMF", b"")
-    found: dict[str, Entry] = {}
+    settings: dict[str, Entry] = {}
     try:
         for device in entries(raw):
             if device.key == "DEVC":
-                found = {**{entry.key: entry for entry in entries(device.data)}, **found}
+                settings = {**{entry.key: entry for entry in entries(device.data)}, **settings}
     except ValueError as error:
         raise FormatError(movie.path, f"its user data (GPMF) is damaged: {error}") from None
-    return found
+    return settings
 
 
 def _readout_s(path: Path, settings: dict[str, Entry], streams: dict[str, Stream]) -> float | None:
@@ -312,14 +316,14 @@ def _readout_s(path: Path, settings: dict[str, Entry], streams: dict[str, Stream
         return None
     try:
         if "SROT" in settings:
-            found = settings["SROT"].numbers().ravel()
+            readout = settings["SROT"].numbers().ravel()
         elif "SROT" in streams:
-            found = np.median(streams["SROT"].values, axis=0)
+            readout = np.median(streams["SROT"].values, axis=0)
         else:
             return None
     except ValueError as error:
         raise FormatError(path, f"the readout time is damaged: {error}") from None
-    readout_s = float(found[0]) * 1e-3 if len(found) else np.nan
+    readout_s = float(readout[0]) * 1e-3 if len(readout) else np.nan
     return readout_s if 0 < readout_s < 0.5 else None
 
 

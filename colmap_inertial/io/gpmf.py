@@ -130,8 +130,8 @@ class Stream:
         for kind, stamps, unit_ns in (("STMP", self.stmp_us, 1000), ("TICK", self.tick_ms, 1_000_000)):
             if stamps and None not in stamps:
                 # clocks since power-on, far from overflow; a damaged one is stopped by the checks on the samples
-                found = [min(stamp or 0, 1 << 52) * unit_ns for stamp in stamps]
-                return np.array(found, dtype=np.int64), kind
+                stamps_ns = [min(stamp or 0, 1 << 52) * unit_ns for stamp in stamps]
+                return np.array(stamps_ns, dtype=np.int64), kind
         return track_ns[self.payload], "track"
 
     def sample_times_ns(self, track_ns: Int64Array) -> Int64Array:
@@ -175,20 +175,20 @@ def read_streams(path: Path, payloads: list[bytes], offsets: list[int], wanted: 
     FormatError
         Where an entry of a payload goes beyond it, or holds another kind of samples than it says.
     """
-    found: dict[tuple[str, str, str], Stream] = {}
+    streams: dict[tuple[str, str, str], Stream] = {}
     for index, payload in enumerate(payloads):
         try:
             for device in entries(payload):
                 if device.key == "DEVC" and device.type == _NESTED:
-                    _read_device(device, index, found, wanted)
+                    _read_device(device, index, streams, wanted)
         except ValueError as error:
             raise FormatError(
                 path, f"is damaged in telemetry payload {index + 1} at byte {offsets[index]}: {error}"
             ) from None
-    return list(found.values())
+    return list(streams.values())
 
 
-def _read_device(device: Entry, index: int, found: dict[tuple[str, str, str], Stream], wanted: set[str]) -> None:
+def _read_device(device: Entry, index: int, streams: dict[tuple[str, str, str], Stream], wanted: set[str]) -> None:
     identity = name = ""
     tick: dict[str, Entry] = {}
     for entry in entries(device.data):
@@ -202,7 +202,7 @@ def _read_device(device: Entry, index: int, found: dict[tuple[str, str, str], St
         elif entry.key == "STRM" and entry.type == _NESTED:
             inside = {**tick, **{item.key: item for item in entries(entry.data)}}
             for key in wanted & inside.keys():
-                stream = found.setdefault((identity, name, key), Stream(key, name))
+                stream = streams.setdefault((identity, name, key), Stream(key, name))
                 # a device with two streams of one kind keeps the first
                 if not stream.payload or stream.payload[-1] != index:
                     _append(stream, index, inside[key], inside)

@@ -242,8 +242,8 @@ def png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
 def tiff_entries(tiff: bytes, order: str, at: int) -> dict[int, tuple[int, int, bytes]]:
     """Type, count and value field of a directory's entries, by tag (TIFF 6.0); ``order`` of bytes as of ``struct``."""
     (count,) = struct.unpack_from(order + "H", tiff, at)
-    found = {}
+    entries = {}
     for i in range(count):
         tag, kind, n, value = struct.unpack_from(order + "HHI4s", tiff, at + 2 + 12 * i)
-        found[tag] = (kind, n, value)
-    return found
+        entries[tag] = (kind, n, value)
+    return entries

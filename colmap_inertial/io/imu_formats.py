@@ -156,7 +156,7 @@ def _load_other_packages() -> tuple[ImuFormat, ...]:
     from importlib.metadata import entry_points
 
     names = {*_RESERVED, *(family.name for family in _OWN)}
-    found = []
+    packages = []
     for entry in entry_points(group=ENTRY_POINTS):
         package = entry.dist.name if entry.dist is not None else entry.module
         try:
@@ -167,8 +167,8 @@ def _load_other_packages() -> tuple[ImuFormat, ...]:
             log.warning("the IMU format %s of the package %s is left out: %s", entry.name, package, _reason(error))
             continue
         names.add(family.name)
-        found.append(_guard(family, package))
-    return tuple(found)
+        packages.append(_guard(family, package))
+    return tuple(packages)
 
 
 def _load(entry: EntryPoint) -> ImuFormat:
@@ -391,7 +391,7 @@ def find_recording(path: Path) -> Recording | None:
 def _video(folder: Path, places: tuple[str, ...]) -> Path | None:
     """The one video in the first of the places that has one."""
     for place in places:
-        found = sorted(file for file in folder.glob(place.format(name=folder.name)) if file.is_file())
-        if len(found) == 1:
-            return found[0]
+        videos = sorted(file for file in folder.glob(place.format(name=folder.name)) if file.is_file())
+        if len(videos) == 1:
+            return videos[0]
     return None

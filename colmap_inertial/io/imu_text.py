@@ -84,16 +84,16 @@ def _triples(values: Array, without: set[int | None]) -> list[int]:
 def _accel(values: Array, time: int | None) -> tuple[int | None, str]:
     """Three columns whose length stays near gravity, and which leave three for the gyroscope where they can."""
     low, high = PLAUSIBLE.smallest_gravity_m_s2, PLAUSIBLE.largest_gravity_m_s2
-    found: list[tuple[bool, float, int, str]] = []
+    readings: list[tuple[bool, float, int, str]] = []
     for i in _triples(values, {time}):
         few, median = (float(v) for v in np.percentile(np.linalg.norm(values[:, i : i + 3], axis=1), [5, 50]))
         if few > PLAUSIBLE.steady_share * median:
             others = bool(_triples(values, {time, i, i + 1, i + 2}))
             units = (("m/s2", 1.0), ("g", STANDARD_GRAVITY_M_S2))
-            found += [(others, few / median, i, unit) for unit, factor in units if low <= median * factor <= high]
-    if not found:
+            readings += [(others, few / median, i, unit) for unit, factor in units if low <= median * factor <= high]
+    if not readings:
         return None, "..."
-    _, _, first, unit = max(found)
+    _, _, first, unit = max(readings)
     return first, unit
 
 
@@ -247,13 +247,13 @@ def _read_csv(path: Path, units: DeclaredUnits, noise: ImuNoise | None) -> ImuRe
         raise FormatError(path, f"no column for {', '.join(missing)} was recognised; {shown}")
 
     def unit(kind: str, axes: int, declared: str | None) -> str:
-        found = {columns[place[kind, axis]].unit for axis in range(axes)}  # type: ignore[union-attr]
+        stated_units = {columns[place[kind, axis]].unit for axis in range(axes)}  # type: ignore[union-attr]
         if declared is not None:
             return declared
-        if len(found) != 1 or None in found:
+        if len(stated_units) != 1 or None in stated_units:
             names = ", ".join(f'"{table.header[place[kind, axis]]}"' for axis in range(axes))  # type: ignore[index]
             raise FormatError(path, f"no single unit is given for {names}; {shown}")
-        return str(found.pop())
+        return str(stated_units.pop())
 
     gyro_unit, accel_unit = unit("gyro", 3, units.gyro), unit("accel", 3, units.accel)
     t_ns = table.stamps_ns(place["time", 0], unit("time", 1, None))

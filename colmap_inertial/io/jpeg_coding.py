@@ -59,9 +59,9 @@ def read_jpeg_coding(data: bytes) -> tuple[int, int | None]:
 
 def _sum_tables(segment: bytes) -> dict[int, int]:
     """Sums of the tables of a segment by their number."""
-    found, at = {}, 0
+    tables, at = {}, 0
     while at < len(segment):
         wide, number = segment[at] >> 4, segment[at] & 15
-        found[number] = sum(struct.unpack_from(">64H" if wide else "64B", segment, at + 1))
+        tables[number] = sum(struct.unpack_from(">64H" if wide else "64B", segment, at + 1))
         at += 129 if wide else 65
-    return found
+    return tables

@@ -258,8 +258,8 @@ class _Boxes:
         count = int(struct.unpack_from(">I", self.data, begin + head - 4)[0])
         dtype = np.dtype(kind)
         self.need(begin, end, head + count * columns * dtype.itemsize, f"{name} with {count} rows")
-        found = np.frombuffer(self.data, dtype, count * columns, begin + head)
-        return found.astype(np.int64).reshape(count, columns)
+        table = np.frombuffer(self.data, dtype, count * columns, begin + head)
+        return table.astype(np.int64).reshape(count, columns)
 
 
 def _shown(name: bytes) -> str:

@@ -40,24 +40,24 @@ def read_phyphox(path: Path, units: DeclaredUnits) -> ImuRecording:
         Where there is no gyroscope, or an accelerometer without gravity alone.
     """
     members = members_of(path)
-    found: dict[str, Samples] = {}
+    samples_of: dict[str, Samples] = {}
     linear = False
     for name in sorted(members):
         if not _may_be(name):
             continue
         kind = _kind(head_of(path, members[name]))
         linear = linear or kind == "linear"
-        if kind == "gyro" and "gyro" not in found:
-            found["gyro"] = _samples(path, members[name], name, "gyro", _GYRO, units.gyro or "rad/s")
-        elif kind == "accel" and "accel" not in found:
-            found["accel"] = _samples(path, members[name], name, "accel", _ACCEL, units.accel or "m/s2")
-    if "gyro" not in found:
+        if kind == "gyro" and "gyro" not in samples_of:
+            samples_of["gyro"] = _samples(path, members[name], name, "gyro", _GYRO, units.gyro or "rad/s")
+        elif kind == "accel" and "accel" not in samples_of:
+            samples_of["accel"] = _samples(path, members[name], name, "accel", _ACCEL, units.accel or "m/s2")
+    if "gyro" not in samples_of:
         raise FormatError(path, "holds no gyroscope of phyphox; record Gyroscope (and Accelerometer) in one experiment")
-    if "accel" not in found and linear:
+    if "accel" not in samples_of and linear:
         raise FormatError(
             path, "its Linear Acceleration is without gravity; record Accelerometer (acceleration with g) instead"
         )
-    return build_recording(found["gyro"], found.get("accel"), device="phyphox")
+    return build_recording(samples_of["gyro"], samples_of.get("accel"), device="phyphox")
 
 
 def _may_be(name: str) -> bool:

@@ -128,7 +128,7 @@ def best_mirrored_reading(imu: ImuRecording) -> Reading | None:
     turns, force = _windows(imu)
     if len(turns) < LIMITS.fewest_mirrored_windows:
         return None
-    readings = [one for one in _readings() if np.linalg.det(one.matrix) < 0]
+    readings = [reading for reading in _readings() if np.linalg.det(reading.matrix) < 0]
     return readings[int(np.argmin(np.mean(_spread(turns, force, readings), axis=1)))]
 
 
@@ -324,35 +324,38 @@ def check_gravity(lengths_m_s2: Array, path: Path) -> None:
     median, few = (float(value) for value in np.percentile(lengths_m_s2, [50, 5]))
     if low <= median <= high:
         return
-    found = f"the accelerometer's median length is {median:.4g} where gravity gives about 9.8 m/s2"
+    evidence = f"the accelerometer's median length is {median:.4g} where gravity gives about 9.8 m/s2"
     # Gravity keeps the length near its median; what is left without it comes near zero again and again.
     steady = few > PLAUSIBLE.steady_share * median
     if steady and low <= median * STANDARD_GRAVITY_M_S2 <= high:
         raise FormatError(
-            path, f'{found}: the numbers are in g; set unit = "g" under [imu.accel] in capture.toml', code="accel-in-g"
+            path,
+            f'{evidence}: the numbers are in g; set unit = "g" under [imu.accel] in capture.toml',
+            code="accel-in-g",
         )
     if steady and low <= median / STANDARD_GRAVITY_M_S2 <= high:
         raise FormatError(
             path,
-            f'{found}: m/s2 were converted as if they were g; set unit = "m/s2" under [imu.accel] in capture.toml',
+            f'{evidence}: m/s2 were converted as if they were g; set unit = "m/s2" under [imu.accel] in capture.toml',
             code="accel-not-in-g",
         )
     if steady and low <= 0.5 * median <= high:
         raise FormatError(
             path,
-            f"{found}: gravity was added twice, or the readings are doubled; give the accelerometer as it was logged",
+            f"{evidence}: gravity was added twice, or the readings are doubled; give the accelerometer as it was "
+            "logged",
             code="gravity-doubled",
         )
     if not steady:
         raise FormatError(
             path,
-            f"{found}: gravity was taken out (a phone's linear acceleration); give the accelerometer with gravity in "
-            "[imu.accel]",
+            f"{evidence}: gravity was taken out (a phone's linear acceleration); give the accelerometer with gravity "
+            "in [imu.accel]",
             code="gravity-removed",
         )
     raise FormatError(
         path,
-        f"{found}: the unit is wrong, or these are raw counts; set unit under [imu.accel], and {_COUNTS}",
+        f"{evidence}: the unit is wrong, or these are raw counts; set unit under [imu.accel], and {_COUNTS}",
         code="accel-unit",
     )
 
@@ -363,19 +366,19 @@ def check_rates(gyro_rad_s: Array, path: Path) -> None:
     largest = float(np.abs(gyro_rad_s).max())
     if largest <= PLAUSIBLE.largest_rate_rad_s and median <= PLAUSIBLE.largest_median_rate_rad_s:
         return
-    found = (
+    evidence = (
         f"the gyroscope reads up to {largest:.4g} rad/s, half of the time above {median:.3g} (a hand reaches about 5, "
         f"a sensor ends at {PLAUSIBLE.largest_rate_rad_s:g})"
     )
     if pi / 180 * largest > PLAUSIBLE.largest_rate_rad_s or pi / 180 * median > PLAUSIBLE.largest_median_rate_rad_s:
         raise FormatError(
             path,
-            f"{found}, too much for deg/s, too: these are raw counts; set unit under [imu.gyro], and {_COUNTS}",
+            f"{evidence}, too much for deg/s, too: these are raw counts; set unit under [imu.gyro], and {_COUNTS}",
             code="gyro-unit",
         )
     raise FormatError(
         path,
-        f'{found}: the numbers are in deg/s; set unit = "deg/s" under [imu.gyro] in capture.toml',
+        f'{evidence}: the numbers are in deg/s; set unit = "deg/s" under [imu.gyro] in capture.toml',
         code="gyro-in-deg",
     )
 
@@ -392,17 +395,18 @@ def check_consistent(raw: RawImu, *, confirmed: bool = False) -> None:
     if not readings:
         return
     best = readings[0]
-    found = "seen from the turning gyroscope gravity does not stand still, but would"
+    evidence = "seen from the turning gyroscope gravity does not stand still, but would"
     if best.factor < 1:
         raise FormatError(
             path,
-            f'{found} if the gyroscope\'s numbers were in deg/s: set unit = "deg/s" under [imu.gyro] in capture.toml',
+            f"{evidence} if the gyroscope's numbers were in deg/s: "
+            'set unit = "deg/s" under [imu.gyro] in capture.toml',
             code="gyro-in-deg",
         )
     if best.factor > 1:
         raise FormatError(
             path,
-            f'{found} at 57.3 times the rate: rad/s were converted as if they were deg/s; set unit = "rad/s" under '
+            f'{evidence} at 57.3 times the rate: rad/s were converted as if they were deg/s; set unit = "rad/s" under '
             "[imu.gyro] in capture.toml",
             code="gyro-not-in-deg",
         )
@@ -426,7 +430,7 @@ def check_consistent(raw: RawImu, *, confirmed: bool = False) -> None:
             hint += f", or {setting('accel', -other.matrix.T)}"
     raise FormatError(
         path,
-        f"{found} if the gyroscope's axes are {what}: {hint}",
+        f"{evidence} if the gyroscope's axes are {what}: {hint}",
         code="axes-mirrored" if what == "mirrored" else "axes-turned",
     )
 

@@ -24,17 +24,17 @@ def positions_in_video(video: Path) -> PositionFixes:
     FormatError
         Where there are none, or the file is damaged.
     """
-    found = None
+    positions = None
     if is_gopro(video):
-        found = read_gopro_positions(video)
+        positions = read_gopro_positions(video)
     elif is_camm(video):
-        found = read_camm_positions(video)
-    if found is None:
+        positions = read_camm_positions(video)
+    if positions is None:
         raise FormatError(
             video,
             "its telemetry holds no positions (GPS5 or GPS9 of GoPro with a fix, or CAMM): nothing to georeference by",
         )
-    return found
+    return positions
 
 
 def positions_in_pictures(folder: Path, names: Sequence[str]) -> PositionFixes:
@@ -48,8 +48,8 @@ def positions_in_pictures(folder: Path, names: Sequence[str]) -> PositionFixes:
     rows, named = [], []
     for name in names:
         path = path_in(folder, name)
-        if (found := position_of(read_bytes(path, HEAD_BYTES, what="picture"))) is not None:
-            rows.append(found)
+        if (position := position_of(read_bytes(path, HEAD_BYTES, what="picture"))) is not None:
+            rows.append(position)
             named.append(name)
     if not rows:
         raise FormatError(

@@ -227,16 +227,16 @@ def _read_model(path: Path, unit: Metres | None) -> RigCalibration:
     models = list(CAMERA_MODELS)
 
     def read_cameras(take: Callable[[str], tuple[Any, ...]]) -> dict[int, tuple[str, tuple[int, int], Any]]:
-        found = {}
+        poses_of = {}
         for _ in range(take("<Q")[0]):
             number, model, width, height = take("<IiQQ")
             if not 0 <= model < len(models):
                 raise FormatError(sheets, f"camera model {model} is unknown")
-            found[number] = models[model], (width, height), take(f"<{CAMERA_MODELS[models[model]][0]}d")
-        return found
+            poses_of[number] = models[model], (width, height), take(f"<{CAMERA_MODELS[models[model]][0]}d")
+        return poses_of
 
     def read_rigs(take: Callable[[str], tuple[Any, ...]]) -> list[dict[int, Array]]:
-        found = []
+        poses_of = []
         for _ in range(take("<Q")[0]):
             _, count = take("<II")
             poses = {}
@@ -251,15 +251,15 @@ def _read_model(path: Path, unit: Metres | None) -> RigCalibration:
                     pose[:3, 3] = _scale(unit) * np.array(translation)
                 if kind == 0:
                     poses[number] = pose
-            found.append(poses)
-        return found
+            poses_of.append(poses)
+        return poses_of
 
     cameras = _records(sheets, read_cameras)
-    found = [poses for poses in _records(rigs, read_rigs) if len(poses) > 1]
-    if len(found) != 1:
-        raise FormatError(rigs, f"holds {len(found)} rigs of several cameras; one is needed")
+    poses_of = [poses for poses in _records(rigs, read_rigs) if len(poses) > 1]
+    if len(poses_of) != 1:
+        raise FormatError(rigs, f"holds {len(poses_of)} rigs of several cameras; one is needed")
     mounted = {}
-    for number, pose in found[0].items():
+    for number, pose in poses_of[0].items():
         if number not in cameras:
             raise FormatError(sheets, f"camera {number} of the rig is missing")
         model, size, params = cameras[number]

@@ -69,7 +69,7 @@ def read_rosbag(path: Path, units: DeclaredUnits) -> ImuRecording:
     if not topics:
         raise FormatError(path, "holds no sensor_msgs/Imu messages")
     sensors: tuple[tuple[Quantity, str], ...] = (("gyro", units.gyro or "rad/s"), ("accel", units.accel or "m/s2"))
-    found: dict[str, Samples] = {}
+    samples_of: dict[str, Samples] = {}
     for quantity, unit in sensors:
         with_it = {name: topic[quantity] for name, topic in topics.items() if quantity in topic}
         if len(with_it) > 1:
@@ -79,10 +79,10 @@ def read_rosbag(path: Path, units: DeclaredUnits) -> ImuRecording:
                 f"rosbags-convert --src {path.name} --dst one --include-topic {next(iter(with_it))}",
             )
         for t_ns, values in with_it.values():
-            found[quantity] = order_samples(path, quantity, unit, t_ns, values)
-    if "gyro" not in found:
+            samples_of[quantity] = order_samples(path, quantity, unit, t_ns, values)
+    if "gyro" not in samples_of:
         raise FormatError(path, f"none of its IMU topics ({', '.join(topics)}) has a gyroscope that moves")
-    return build_recording(found["gyro"], found.get("accel"))
+    return build_recording(samples_of["gyro"], samples_of.get("accel"))
 
 
 _Series = tuple[Int64Array, Array]
@@ -102,11 +102,11 @@ def _topics(reader: AnyReader) -> dict[str, dict[str, _Series]]:
         if len(stamps[connection.topic]) == 1:
             covariances = {"gyro": message.angular_velocity_covariance, "accel": message.linear_acceleration_covariance}
             absent[connection.topic] = {name for name, cov in covariances.items() if cov[0] == -1}
-    found: dict[str, dict[str, _Series]] = {}
+    topics: dict[str, dict[str, _Series]] = {}
     for topic, values in rows.items():
         t_ns, numbers = np.array(stamps[topic], dtype=np.int64), np.array(values)
         parts = {"gyro": numbers[:, :3], "accel": numbers[:, 3:]}
-        found[topic] = {
+        topics[topic] = {
             name: (t_ns, part) for name, part in parts.items() if name not in absent[topic] and np.any(part != 0)
         }
-    return found
+    return topics

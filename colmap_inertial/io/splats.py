@@ -76,8 +76,8 @@ def sh_rotation(rotation: Array, degree: int) -> Array:
     turn = math.pi * (1 + math.sqrt(5)) * index
     around = np.sqrt(1 - z * z)
     before = np.stack([around * np.cos(turn), around * np.sin(turn), z], axis=-1)
-    found, *_ = np.linalg.lstsq(sh_basis(before @ rotation.T, degree), sh_basis(before, degree), rcond=None)
-    return np.asarray(found)
+    rotation_of_sh, *_ = np.linalg.lstsq(sh_basis(before @ rotation.T, degree), sh_basis(before, degree), rcond=None)
+    return np.asarray(rotation_of_sh)
 
 
 def fault_of_splats(names: set[str]) -> str | None:

@@ -91,11 +91,11 @@ def _refuse_code(database: sqlite3.Connection, named: Path, fault: str) -> None:
     query = (
         "SELECT type, name FROM sqlite_master WHERE type NOT IN ('table', 'index') OR (type = 'table' AND rootpage = 0)"
     )
-    found = database.execute(query).fetchone()
-    if found is not None:
-        kind = "virtual table" if found[0] == "table" else found[0]
+    row = database.execute(query).fetchone()
+    if row is not None:
+        kind = "virtual table" if row[0] == "table" else row[0]
         raise FormatError(
             named,
-            f"{fault}: it holds the {kind} {str(found[1])[:80]!r}, which is not run; drop it "
+            f"{fault}: it holds the {kind} {str(row[1])[:80]!r}, which is not run; drop it "
             f"(DROP {kind.split()[-1].upper()})",
         )

@@ -202,7 +202,7 @@ def _require_one_width(path: Path, lines: list[str], numbers: Int64Array, delimi
     most = read_limits().table_columns
     widths = [_width(line, delimiter, most) for line in lines]
     if widths.count(width) != len(widths):
-        wrong = next(i for i, found in enumerate(widths) if found != width)
+        wrong = next(i for i, width_i in enumerate(widths) if width_i != width)
         reason = f"{widths[wrong]} cells where the other lines have {width}"
         raise FormatError(path, reason, line=int(numbers[wrong]))
 

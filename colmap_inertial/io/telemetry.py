@@ -59,17 +59,17 @@ def read_telemetry(path: Path, units: DeclaredUnits) -> ImuRecording:
     FormatError
         Where it cannot read the recording, or finds no gyroscope in it.
     """
-    camera, found = _parsed(path)
-    gyro = _samples(path, found, "gyro", units.gyro)
+    camera, groups = _parsed(path)
+    gyro = _samples(path, groups, "gyro", units.gyro)
     if gyro is None:
         raise FormatError(path, f"holds no gyroscope; {camera} writes one where gyro data is switched on")
-    return build_recording(gyro, _samples(path, found, "accel", units.accel), device=camera)
+    return build_recording(gyro, _samples(path, groups, "accel", units.accel), device=camera)
 
 
 def read_telemetry_frames(path: Path) -> FrameLog | None:
     """The readout that an Insta360 states of its frames; ``None`` where it states none."""
-    _, found = _parsed(path)
-    metadata = found.get("Default", {}).get("Metadata")
+    _, groups = _parsed(path)
+    metadata = groups.get("Default", {}).get("Metadata")
     readout_s = 1e-3 * float(metadata.get("rolling_shutter_time") or 0.0) if isinstance(metadata, dict) else 0.0
     if not 0 < readout_s < _LONGEST_READOUT_S:
         return None
@@ -90,16 +90,16 @@ def _parsed(path: Path) -> tuple[str, dict[str, dict[str, Any]]]:
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
         raise FormatError(path, f"telemetry-parser cannot read it: {str(error) or type(error).__name__}") from None
-    found: dict[str, dict[str, Any]] = {}
+    groups: dict[str, dict[str, Any]] = {}
     for part in parts:
         for group, tags in part.items():
-            found.setdefault(group, {}).update(tags)
+            groups.setdefault(group, {}).update(tags)
     camera, model = (str(name or "") for name in (parser.camera, parser.model))
-    return model if model.lower().startswith(camera.lower()) else f"{camera} {model}".strip(), found
+    return model if model.lower().startswith(camera.lower()) else f"{camera} {model}".strip(), groups
 
 
-def _samples(path: Path, found: dict[str, dict[str, Any]], quantity: Quantity, declared: str | None) -> Samples | None:
-    tags = found.get({"gyro": "Gyroscope", "accel": "Accelerometer"}[quantity], {})
+def _samples(path: Path, groups: dict[str, dict[str, Any]], quantity: Quantity, declared: str | None) -> Samples | None:
+    tags = groups.get({"gyro": "Gyroscope", "accel": "Accelerometer"}[quantity], {})
     rows = tags.get("Data")
     if not rows:
         return None

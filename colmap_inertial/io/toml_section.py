@@ -101,8 +101,8 @@ class Section:
 
     def table(self, key: str) -> Section:
         """The table under ``key``; an empty one where it is absent."""
-        found = self.section(key)
-        return Section(self.path, key, {}, self._text) if found is None else found
+        section = self.section(key)
+        return Section(self.path, key, {}, self._text) if section is None else section
 
     def text(self, key: str) -> str | None:
         """A text, not empty."""

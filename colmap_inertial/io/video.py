@@ -53,17 +53,17 @@ def video_stamps_ns(path: Path) -> Int64Array:
     container, stream = _open(path)
     with container:
         packets = _convert_errors(path, container.demux(stream))
-        found = [(packet.pts, packet.is_discard) for packet in packets if packet.size > 0]
+        packet_stamps = [(packet.pts, packet.is_discard) for packet in packets if packet.size > 0]
         listed, time_base, duration_s = stream.frames, stream.time_base, _read_duration_s(stream)
         kind = container.format.name
-    stamps = [stamp for stamp, is_discarded in found if not is_discarded]
+    stamps = [stamp for stamp, is_discarded in packet_stamps if not is_discarded]
     known = [stamp for stamp in stamps if stamp is not None]
     t_ns = np.zeros(0, dtype=np.int64)
     if time_base is not None:
         t_ns = np.array(sorted(_ns(stamp, time_base.numerator, time_base.denominator) for stamp in known), np.int64)
     last = f", the last at {t_ns[-1] * 1e-9:.3f} s" if len(t_ns) else ""
-    if len(found) < listed:
-        missing = _count_lost(path, kind, listed, listed - len(found))
+    if len(packet_stamps) < listed:
+        missing = _count_lost(path, kind, listed, listed - len(packet_stamps))
         if missing:
             held = f"it holds {listed - missing} of the {listed} frames that its index lists"
             raise FormatError(path, f"is cut off: {held}{last}")

@@ -138,12 +138,12 @@ def match_to_video(
         raise FormatError(video, "holds no video frames")
     nearest = {turn: np.median(np.minimum(c.distance[:, 0], 1.0)) for turn, c in turns.items()}
     turn = min(nearest, key=lambda t: nearest[t])
-    found, doubtful = _decide(turns[turn], names)
-    return VideoMatch(t_ns=found, doubtful=doubtful, quarter_turns=turn)
+    time_of, doubtful = _decide(turns[turn], names)
+    return VideoMatch(t_ns=time_of, doubtful=doubtful, quarter_turns=turn)
 
 
 def _decide(candidates: _Candidates, names: Sequence[str]) -> tuple[dict[str, int], dict[str, str]]:
-    found: dict[str, int] = {}
+    time_of: dict[str, int] = {}
     doubtful: dict[str, str] = {}
     for i, name in enumerate(names):
         if candidates.distance[i, 0] > np.sqrt(1 - _LIMITS.same_correlation):
@@ -151,12 +151,12 @@ def _decide(candidates: _Candidates, names: Sequence[str]) -> tuple[dict[str, in
         elif candidates.fraction_to_next(i) > _LIMITS.largest_fraction:
             doubtful[name] = "looks like several frames of the video"
         else:
-            found[name] = int(candidates.t_ns[i, 0])
-    several = {t_ns for t_ns, count in Counter(found.values()).items() if count > 1}
-    for name in [name for name, t_ns in found.items() if t_ns in several]:
-        del found[name]
+            time_of[name] = int(candidates.t_ns[i, 0])
+    several = {t_ns for t_ns, count in Counter(time_of.values()).items() if count > 1}
+    for name in [name for name, t_ns in time_of.items() if t_ns in several]:
+        del time_of[name]
         doubtful[name] = "is the same frame as another picture"
-    return found, doubtful
+    return time_of, doubtful
 
 
 def _thumbnail(grey: UInt8Array, side: int) -> UInt8Array:

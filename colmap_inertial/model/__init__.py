@@ -274,7 +274,7 @@ def trajectory_from_model(
     t_of = dict(zip(timing.names, timing.pose_t_s(), strict=True))
     frames = list_posed_frames(reconstruction)
     named = [(next((image.name for image in frame.images if image.name in t_of), ""), frame) for frame in frames]
-    timed = sorted(((name, frame) for name, frame in named if name), key=lambda one: float(t_of[one[0]]))
+    timed = sorted(((name, frame) for name, frame in named if name), key=lambda entry: float(t_of[entry[0]]))
     if len(timed) < 2:
         example = frames[0].images[0].name if frames else "none"
         raise TimingError(

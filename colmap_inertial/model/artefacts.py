@@ -41,9 +41,9 @@ def check_map(path: Path, channels: int) -> int:
     match = re.match(rb"(\d{1,9})&(\d{1,9})&(\d{1,3})&", head)
     if match is None:
         raise FormatError(path, "not a depth or normal map of COLMAP: it does not begin with width&height&channels&")
-    width, height, found = (int(text) for text in match.groups())
-    if found != channels:
-        raise FormatError(path, f"its header says {found} channels instead of {channels}")
+    width, height, channel_count = (int(text) for text in match.groups())
+    if channel_count != channels:
+        raise FormatError(path, f"its header says {channel_count} channels instead of {channels}")
     if width == 0 or height == 0:
         raise FormatError(path, f"its header says {width} x {height} pixels")
     size, expected = path.stat().st_size, match.end() + 4 * width * height * channels
@@ -90,21 +90,21 @@ def transform_options(source: Path, target: Path, similarity: Similarity) -> tup
     for number, line in enumerate(source.read_bytes().splitlines(keepends=True), 1):
         if header := re.match(rb"\s*\[([^\]]*)\]", line):
             section = header[1].decode("latin-1").strip()
-        found = re.match(rb"(\s*([\w.]+)\s*=\s*)(.*?)(\s*)$", line, re.DOTALL)
-        if found is not None:
-            key = found[2].decode("latin-1").rpartition(".")
+        match = re.match(rb"(\s*([\w.]+)\s*=\s*)(.*?)(\s*)$", line, re.DOTALL)
+        if match is not None:
+            key = match[2].decode("latin-1").rpartition(".")
             where, name = key[0] or section, key[2]
-            if name in _BOX_KEYS and found[3]:
+            if name in _BOX_KEYS and match[3]:
                 raise FormatError(
                     source, f"{name}: a bounding box cannot be transformed; leave the file out with --keep", line=number
                 )
             if name in _DEPTH_KEYS and where.startswith("PatchMatch"):
                 try:
-                    value = float(found[3])
+                    value = float(match[3])
                 except ValueError:
                     raise FormatError(source, f"{name} is no number", line=number) from None
                 if value > 0:
-                    line = found[1] + repr(value * similarity.scale).encode() + found[4]
+                    line = match[1] + repr(value * similarity.scale).encode() + match[4]
                     changed.append(f"{where}.{name}")
         lines.append(line)
     target.write_bytes(b"".join(lines))
@@ -124,16 +124,16 @@ def transform_obj(source: Path, target: Path, similarity: Similarity) -> tuple[s
     changed: set[bytes] = set()
     with open(source, "rb") as file, open(target, "wb") as out:
         for number, line in enumerate(_lines(source, file), 1):
-            found = re.match(rb"(\s*(vn?)[ \t]+)(\S+)([ \t]+)(\S+)([ \t]+)(\S+)(.*)$", line, re.DOTALL)
-            if found is not None:
+            match = re.match(rb"(\s*(vn?)[ \t]+)(\S+)([ \t]+)(\S+)([ \t]+)(\S+)(.*)$", line, re.DOTALL)
+            if match is not None:
                 try:
-                    xyz = np.array([float(found[i]) for i in (3, 5, 7)])
+                    xyz = np.array([float(match[i]) for i in (3, 5, 7)])
                 except ValueError:
                     raise FormatError(source, f"not three numbers: {line[:60]!r}", line=number) from None
-                matrix, offset = parts[found[2]]
+                matrix, offset = parts[match[2]]
                 x, y, z = (repr(value).encode() for value in (matrix @ xyz + offset).tolist())
-                line = b"".join((found[1], x, found[4], y, found[6], z, found[8]))
-                changed.add(found[2])
+                line = b"".join((match[1], x, match[4], y, match[6], z, match[8]))
+                changed.add(match[2])
             elif line.split(maxsplit=1)[:1] in ([b"v"], [b"vn"]):
                 raise FormatError(source, "a vertex or normal without three numbers", line=number)
             out.write(line)

@@ -131,8 +131,8 @@ def find_database(project: Path, files: Sequence[Path]) -> Path | None:
     ``files`` are those of the project, relative to it.
     """
     named = sorted((path for path in files if path.suffix == ".db"), key=lambda path: len(path.parts))
-    found = [project / path for path in named if _has_pairs(project / path)]
-    return found[0] if len(found) == 1 or (found and found[0].parent == project) else None
+    databases = [project / path for path in named if _has_pairs(project / path)]
+    return databases[0] if len(databases) == 1 or (databases and databases[0].parent == project) else None
 
 
 def _has_pairs(path: Path) -> bool:

@@ -48,17 +48,17 @@ def cameras_are_those_of(path: Path, placed: Sequence[PlacedModel]) -> bool:
     if values is None:
         return False
     back = np.linalg.inv(_applied(path, values))
-    found = {
+    centre_of = {
         PurePosixPath(str(frame.get("file_path", ""))).name: (back @ _matrix(path, frame["transform_matrix"]))[:3, 3]
         for frame in values["frames"]
     }
     # some leave out the ending
-    found |= {PurePosixPath(name).stem: centre for name, centre in found.items()}
+    centre_of |= {PurePosixPath(name).stem: centre for name, centre in centre_of.items()}
     for model in placed:
         pairs = []
         for name, centre in model.centres.items():
             image = PurePosixPath(name)
-            if (written := found.get(image.name, found.get(image.stem))) is not None:
+            if (written := centre_of.get(image.name, centre_of.get(image.stem))) is not None:
                 pairs.append((centre, written))
         enough = 2 * len(pairs) >= min(len(model.centres), len(values["frames"])) > 0
         if enough and model.has_cameras_at(pairs):

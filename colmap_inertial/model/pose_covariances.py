@@ -48,14 +48,16 @@ def pose_covariances(reconstruction: pycolmap.Reconstruction, frames: Sequence[P
         seen = sum(len(image.get_observation_points2D()) for image in frame.images)
         if seen < _LIMITS.fewest_observations:
             return None
-        told = [
+        informations = [
             _pose_information(reconstruction.camera(image.camera_id), image, frame.pose, place)
             for image in frame.images
             if image.num_points3D
         ]
-        variance_px2 = told[0][1]
+        variance_px2 = informations[0][1]
         try:
-            root = np.linalg.inv(np.linalg.cholesky(sum(variance_px2 / own_px2 * one for one, own_px2 in told)))
+            root = np.linalg.inv(
+                np.linalg.cholesky(sum(variance_px2 / own_px2 * information for information, own_px2 in informations))
+            )
         except np.linalg.LinAlgError:
             return None
         covariances.append(variance_px2 * (root.T @ root))

@@ -250,9 +250,9 @@ class _Work:
         if inner.is_relative_to(outer) or outer.is_relative_to(inner):
             raise OutputError(f"{out} and {project} lie within each other; choose a folder elsewhere")
         self._project, self._out, self._keep = project, out, tuple(keep)
-        found = list_tree(project, follow_links=follow_links)
+        tree = list_tree(project, follow_links=follow_links)
         self.folders, self._files, self._links = (
-            [p for p in paths if not any(fnmatch.fnmatch(p.parts[0], pattern) for pattern in beside)] for paths in found
+            [p for p in paths if not any(fnmatch.fnmatch(p.parts[0], pattern) for pattern in beside)] for paths in tree
         )
         self._changes: list[Change] = []
         self._databases: dict[str, dict[str, Any]] = {}
@@ -441,9 +441,9 @@ class _Work:
 
     def _record(self, applied: Applied, common: Similarity | None) -> dict[str, object]:
         """The content of ``transform.json``."""
-        found = [scale.similarity for _, scale in applied.models.values() if scale.similarity is not None]
-        same = common or (found[0] if len(applied.models) == 1 else None)
-        whole = {"provenance": "; ".join(s.provenance for s in found)} if same is None else similarity_as_json(same)
+        given = [scale.similarity for _, scale in applied.models.values() if scale.similarity is not None]
+        same = common or (given[0] if len(applied.models) == 1 else None)
+        whole = {"provenance": "; ".join(s.provenance for s in given)} if same is None else similarity_as_json(same)
         return {
             **whole,
             "one_for_all": common is not None,

@@ -154,7 +154,7 @@ def intrinsics_sigma(reconstruction: pycolmap.Reconstruction) -> dict[int, Array
     covariance = pycolmap.estimate_ba_covariance(wanted, model, adjuster)
     if covariance is None:
         return {}
-    found = {}
+    sigma_of = {}
     for number in {model.image(i).camera_id for i in image_ids}:
         camera = model.camera(number)
         block = covariance.get_other_params_cov(camera.params)
@@ -164,8 +164,8 @@ def intrinsics_sigma(reconstruction: pycolmap.Reconstruction) -> dict[int, Array
             continue
         sigma = np.full(len(free), np.nan)
         sigma[free] = noise_px * np.sqrt(np.diag(block))
-        found[number] = sigma
-    return found
+        sigma_of[number] = sigma
+    return sigma_of
 
 
 def _noise_px(reconstruction: pycolmap.Reconstruction) -> float | None:

@@ -180,15 +180,15 @@ def read_scales(sources: Sequence[str], *, world: WorldAxes = "z-up") -> dict[in
     NotObservableError
         When every scale was refused.
     """
-    found: dict[int | None, ModelScale] = {}
+    scales: dict[int | None, ModelScale] = {}
     for source in sources:
         for key, scale in _scales_of(source, world):
-            if key in found or (None in found) != (key is None and bool(found)):
+            if key in scales or (None in scales) != (key is None and bool(scales)):
                 raise InertialError(f"{source}: two scales for one model; give each as NUMBER=FILE")
-            found[key] = scale
-    if found and all(scale.similarity is None for scale in found.values()):
-        raise NotObservableError("scale", "; ".join(reason for scale in found.values() for reason in scale.reasons))
-    return found
+            scales[key] = scale
+    if scales and all(scale.similarity is None for scale in scales.values()):
+        raise NotObservableError("scale", "; ".join(reason for scale in scales.values() for reason in scale.reasons))
+    return scales
 
 
 def _scales_of(source: str, world: WorldAxes) -> list[tuple[int | None, ModelScale]]:

@@ -373,9 +373,9 @@ def _estimate_pair_rotation(
         centre = 0.5 * size[None]
         beside = np.asarray(camera.cam_from_img(np.concatenate([centre, centre + size / now[0].shape[::-1]])))[:, :2]
         pixel_rad = float(np.linalg.norm(np.diff(beside, axis=0))) / np.sqrt(2)
-        found = _fit_rate(first, second, span_s, pixel_rad)
-        if found is not None and found[2] >= options.min_support:
-            rate, sigma_rad_s, count = found
+        fitted = _fit_rate(first, second, span_s, pixel_rad)
+        if fitted is not None and fitted[2] >= options.min_support:
+            rate, sigma_rad_s, count = fitted
             place = np.stack([(p[ok] / size - 0.5)[:, ::-1] for p in points], axis=1)
             some = np.unique(np.linspace(0, len(place) - 1, min(len(place), _LIMITS.most_tracks)).astype(np.intp))
             tracks = Tracks(place=place[some], rays=np.stack([first[some, :2], second[some, :2]], axis=1))

@@ -78,7 +78,7 @@ def follow_pairs(
         shutter = FrameShutter.of(timing, index[frame.name], width=width, height=height)
         now = reduced(frame.image, options)
         if before is not None and before[0] in firsts and index[frame.name] == index[before[0]] + 1:
-            found = next(follow_points(before[1], now, shutter, options), None)
-            if found is not None:
-                yield FollowedPair(name=before[0], shutters=(before[2], shutter), points=np.stack(found))
+            followed = next(follow_points(before[1], now, shutter, options), None)
+            if followed is not None:
+                yield FollowedPair(name=before[0], shutters=(before[2], shutter), points=np.stack(followed))
         before = frame.name, now, shutter

@@ -131,8 +131,10 @@ def _estimate_rotation(first: _Features, second: _Features) -> tuple[Array, int]
 
     if min(len(first.rays), len(second.rays)) < _LIMITS.least_matches:
         return None
-    found: Any = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first.descriptors, second.descriptors, k=2)
-    pairs = np.array([(m.queryIdx, m.trainIdx) for m, other in found if m.distance < _LIMITS.ratio * other.distance])
+    neighbours: Any = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first.descriptors, second.descriptors, k=2)
+    pairs = np.array(
+        [(m.queryIdx, m.trainIdx) for m, other in neighbours if m.distance < _LIMITS.ratio * other.distance]
+    )
     if len(pairs) < _LIMITS.least_matches:
         return None
     a, b = first.rays[pairs[:, 0]], second.rays[pairs[:, 1]]

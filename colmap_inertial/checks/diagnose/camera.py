@@ -151,22 +151,22 @@ def _is_explained(recorded: Recorded) -> bool:
 
 def check_cameras(recorded: Recorded) -> Iterator[Finding]:
     """Whether cameras of a reconstruction contradict the gyroscope."""
-    found = recorded.consensus
-    if isinstance(found, NotObservableError) and recorded.lacks_majority:
-        yield Finding(code="cameras-turned", severity="error", evidence=found.hint)
-    if isinstance(found, RotationConsensus) and not found.kept.all():
+    consensus = recorded.consensus
+    if isinstance(consensus, NotObservableError) and recorded.lacks_majority:
+        yield Finding(code="cameras-turned", severity="error", evidence=consensus.hint)
+    if isinstance(consensus, RotationConsensus) and not consensus.kept.all():
         yield Finding(
             code="cameras-turned",
             severity="warning",
-            evidence="; ".join(describe_consensus(found)),
+            evidence="; ".join(describe_consensus(consensus)),
             numbers={
-                "wrong": float(len(found.wrong)),
-                "seams": float(len(found.seams)),
-                "left_out": float(np.sum(~found.kept)),
-                "judged": float(np.sum(found.judged)),
-                "median_deg": float(np.median(found.deviation_deg[found.judged & found.kept])),
+                "wrong": float(len(consensus.wrong)),
+                "seams": float(len(consensus.seams)),
+                "left_out": float(np.sum(~consensus.kept)),
+                "judged": float(np.sum(consensus.judged)),
+                "median_deg": float(np.median(consensus.deviation_deg[consensus.judged & consensus.kept])),
             },
-            deviations_deg=found.deviations_deg,
+            deviations_deg=consensus.deviations_deg,
         )
 
 
@@ -207,9 +207,9 @@ def _find_better_fit(recorded: Recorded, imu: ImuRecording) -> Finding | None:
     for tried in (*(1 + rate for rate in _LIMITS.tried_rates), *_LIMITS.tried_frame_rates):
         # a frame of the same motion lasts longer, so that it turns slower
         slower = replace(imu, gyro_t_s=begin_s + (imu.gyro_t_s - begin_s) * tried, gyro_rad_s=imu.gyro_rad_s / tried)
-        found = recorded.align(slower)
-        if isinstance(found, Alignment):
-            rate = tried * (1 + found.calibration.clock_rate)
+        alignment = recorded.align(slower)
+        if isinstance(alignment, Alignment):
+            rate = tried * (1 + alignment.calibration.clock_rate)
             return rate_finding(rate - 1) if abs(tried - 1) < _LIMITS.wrong_frame_rate else frame_rate_finding(rate)
     return None
 
@@ -264,17 +264,17 @@ def _bound_gain(recorded: Recorded) -> tuple[float, float] | None:
 def _unit_finding(code: str) -> Finding:
     factor = UNIT_FACTORS[code]
     if factor < 1:
-        found = "the gyroscope turns as the camera does, but 57.3 times as far: its numbers are in deg/s"
+        evidence = "the gyroscope turns as the camera does, but 57.3 times as far: its numbers are in deg/s"
         unit = "deg/s"
     else:
-        found = (
+        evidence = (
             "the gyroscope turns as the camera does, but a 57.3th as far: rad/s were converted as if they were deg/s"
         )
         unit = "rad/s"
     return Finding(
         code=code,
         severity="error",
-        evidence=found,
+        evidence=evidence,
         advice=f'set unit = "{unit}" under [imu.gyro] in capture.toml',
         numbers={"gain": 1 / factor},
     )
@@ -311,22 +311,27 @@ def _is_mirrored(turning: CameraTrajectory, imu: ImuRecording, aligned: Alignmen
 def check_stabilisation(recorded: Recorded) -> Iterator[Finding]:
     """A picture that was turned against its lens no longer belongs to the gyroscope."""
     if recorded.log is not None and recorded.log.stabilised:
-        said = recorded.log.stabilisation or "stabilisation was on"
+        description = recorded.log.stabilisation or "stabilisation was on"
         yield Finding(
             code="stabilised",
             severity="error",
-            evidence=f"the recorder says that the video was stabilised in the camera ({said})",
+            evidence=f"the recorder says that the video was stabilised in the camera ({description})",
         )
         return
-    told = recorded.stabilisation
+    stabilisation = recorded.stabilisation
     # numbers in another unit look like it
-    if told is not None and told.stabilised and told.share is not None and recorded.wrong_unit is None:
+    if (
+        stabilisation is not None
+        and stabilisation.stabilised
+        and stabilisation.share is not None
+        and recorded.wrong_unit is None
+    ):
         yield Finding(
             code="stabilised",
             severity="error",
-            evidence=f"the pictures hold {100 * told.share:.0f} % of the quick rotation that the gyroscope measured: "
-            "the video was stabilised in the camera",
-            numbers={"share": told.share},
+            evidence=f"the pictures hold {100 * stabilisation.share:.0f} % of the quick rotation that the gyroscope "
+            "measured: the video was stabilised in the camera",
+            numbers={"share": stabilisation.share},
         )
 
 

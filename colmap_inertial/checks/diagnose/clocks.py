@@ -144,10 +144,10 @@ def check_even_times(recorded: Recorded) -> Iterator[Finding]:
         inside = np.flatnonzero((turning.t_s >= begin_s) & (turning.t_s < begin_s + _LIMITS.part_s))
         middle_s = begin_s + 0.5 * _LIMITS.part_s
         drift_s = float(aligned.calibration.drift_s(middle_s))
-        found = _part_offset_s(turning.select(inside), motion, drift_s)
-        if found is not None:
+        part_offset_s = _part_offset_s(turning.select(inside), motion, drift_s)
+        if part_offset_s is not None:
             middles.append(middle_s)
-            offsets.append(found)
+            offsets.append(part_offset_s)
     if len(offsets) < 3:
         return
     off = np.array(offsets)
@@ -169,16 +169,16 @@ def _part_offset_s(part: CameraTrajectory, motion: GyroCamera, drift_s: float) -
         return None
     visual = part.turn_rad()
     shifts = np.arange(-_LIMITS.part_reach_s, _LIMITS.part_reach_s + 1e-9, _LIMITS.part_step_s)
-    left = np.full(len(shifts), np.inf)
+    residual = np.full(len(shifts), np.inf)
     t_s = part.t_s - drift_s - shifts[:, None]
     covered = motion.covers(t_s[:, 0], t_s[:, -1])
     difference = visual - motion.turn_rad(t_s[covered])
     spread = difference - difference.mean(axis=1, keepdims=True)
-    left[covered] = np.median(np.sum(spread**2, axis=2), axis=1)
-    best = int(np.argmin(left))
+    residual[covered] = np.median(np.sum(spread**2, axis=2), axis=1)
+    best = int(np.argmin(residual))
     energy = float(np.median(np.sum((visual - visual.mean(axis=0)) ** 2, axis=1)))
-    if best in (0, len(left) - 1) or not np.isfinite(left[best - 1 : best + 2]).all():
+    if best in (0, len(residual) - 1) or not np.isfinite(residual[best - 1 : best + 2]).all():
         return None
-    if left[best] > (1 - _LIMITS.part_explained) * energy:
+    if residual[best] > (1 - _LIMITS.part_explained) * energy:
         return None
     return float(shifts[best])

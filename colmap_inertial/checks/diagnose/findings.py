@@ -220,8 +220,8 @@ class Recorded:
         """Reasons why a reader would refuse the inertial samples."""
         if self.imu is None:
             return ()
-        found = RawImu(imu=self.imu, path=Path("IMU"), gyro_axes=self.gyro_axes, accel_axes=self.accel_axes).problems()
-        return tuple(found)
+        raw = RawImu(imu=self.imu, path=Path("IMU"), gyro_axes=self.gyro_axes, accel_axes=self.accel_axes)
+        return tuple(raw.problems())
 
     @property
     def is_dense(self) -> bool:
@@ -250,10 +250,15 @@ class Recorded:
 
         Where its cameras cannot be aligned all together, of those that agree with the gyroscope.
         """
-        found, imu, poses = self.consensus, self.imu, self.trajectory
-        if imu is not None and poses is not None and isinstance(found, RotationConsensus) and not found.kept.all():
+        consensus, imu, poses = self.consensus, self.imu, self.trajectory
+        if (
+            imu is not None
+            and poses is not None
+            and isinstance(consensus, RotationConsensus)
+            and not consensus.kept.all()
+        ):
             together = self._align(poses, imu, self.calibration, self.max_offset_s)
-            return poses if isinstance(together, Alignment) else poses.select(found.kept)
+            return poses if isinstance(together, Alignment) else poses.select(consensus.kept)
         if self.trajectory is not None or self.rotation is None:
             return self.trajectory
         try:
@@ -318,10 +323,10 @@ class Recorded:
         if self.clocks is not None and (self.clocks.unit_factor or 0) > 1:
             # hours of offsets to search, for frames that mostly have no gyroscope beside them
             return NotObservableError("time offset", str(self.clocks))
-        known = self.calibration
-        if any_offset and known is not None:
-            known = reset_for_recording(known)
-        return self._align(self.turning, imu, known, None if any_offset else self.max_offset_s)
+        prior = self.calibration
+        if any_offset and prior is not None:
+            prior = reset_for_recording(prior)
+        return self._align(self.turning, imu, prior, None if any_offset else self.max_offset_s)
 
     def _align(
         self,

@@ -121,7 +121,7 @@ def check_readout(recorded: Recorded) -> Iterator[Finding]:
         return
     evidence = "nothing says whether the camera has a rolling shutter, as nearly all phones do"
     try:
-        found = _readout(recorded)
+        readout = _readout(recorded)
     except NotObservableError as error:
         yield Finding(
             code="readout-unknown",
@@ -129,16 +129,16 @@ def check_readout(recorded: Recorded) -> Iterator[Finding]:
             evidence=f"{evidence}; {error.hint.split(':')[0]}",
         )
         return
-    lines = f"readout_s = {found.readout_s:.4f}"
-    if found.direction != "down":
-        lines += f' and readout_direction = "{found.direction}"'
+    lines = f"readout_s = {readout.readout_s:.4f}"
+    if readout.direction != "down":
+        lines += f' and readout_direction = "{readout.direction}"'
     yield Finding(
         code="readout-unknown",
         severity="warning",
-        evidence=f"{evidence}; by the pictures and the gyroscope, reading a frame takes {found}"
-        + ("" if found.readout_s else ", as a global shutter"),
+        evidence=f"{evidence}; by the pictures and the gyroscope, reading a frame takes {readout}"
+        + ("" if readout.readout_s else ", as a global shutter"),
         advice=f"write {lines} under [timing] in capture.toml, so that it is undone",
-        numbers={"readout_s": found.readout_s, "readout_sigma_s": found.sigma_s, "pairs": float(found.pairs)},
+        numbers={"readout_s": readout.readout_s, "readout_sigma_s": readout.sigma_s, "pairs": float(readout.pairs)},
     )
 
 

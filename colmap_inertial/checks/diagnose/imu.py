@@ -52,7 +52,7 @@ def check_motion_content(recorded: Recorded) -> Iterator[Finding]:
     if accel is None or accel > _MOTION_LIMITS.least_accel_m_s2 + _MOTION_LIMITS.accel_per_turn_m_s * rotated:
         return
     numbers = {"acceleration_rms_m_s2": accel, "turning_rms_rad_s": rotated}
-    found = f"the camera's acceleration is {accel:.3f} m/s2 (rms) once gravity is out"
+    evidence = f"the camera's acceleration is {accel:.3f} m/s2 (rms) once gravity is out"
     if recorded.trajectory is not None and _glides(recorded.trajectory):
         code, what = "constant-velocity", "it glides at constant speed"
     elif rotated < _MOTION_LIMITS.rotated_rad_s:
@@ -61,7 +61,7 @@ def check_motion_content(recorded: Recorded) -> Iterator[Finding]:
         code, what = "pure-rotation", f"it only turns, by {rotated:.2f} rad/s"
     else:
         code, what = "no-acceleration", f"it turns by {rotated:.2f} rad/s, but stays in place or glides"
-    yield Finding(code=code, severity="error", evidence=f"{found}; {what}", numbers=numbers)
+    yield Finding(code=code, severity="error", evidence=f"{evidence}; {what}", numbers=numbers)
 
 
 def acceleration_rms_m_s2(imu: ImuRecording) -> float | None:
@@ -88,8 +88,8 @@ def acceleration_rms_m_s2(imu: ImuRecording) -> float | None:
     columns = np.concatenate([(turn @ force[..., None]), turn @ lever, turn], axis=-1)
     time = np.linspace(-1, 1, steps)
     even, _ = np.linalg.qr(np.stack([np.ones(steps), time, time**2], axis=1))
-    left = columns - np.einsum("kp,lp,wlij->wkij", even, even, columns)
-    y, x = left[..., 0].ravel(), left[..., 1:].reshape(-1, 6)
+    residual = columns - np.einsum("kp,lp,wlij->wkij", even, even, columns)
+    y, x = residual[..., 0].ravel(), residual[..., 1:].reshape(-1, 6)
     rest = y - x @ np.linalg.lstsq(x, y, rcond=1e-6)[0]
     # the median over windows: a moment of lifting the camera does not make a recording lively
     energy = np.sum(rest.reshape(len(starts), -1) ** 2, axis=1) / steps
@@ -192,12 +192,12 @@ def check_repairs(recorded: Recorded) -> Iterator[Finding]:
     by_code: dict[str, list[str]] = {}
     for repair in recorded.imu.repairs:
         by_code.setdefault(getattr(repair, "code", "repaired"), []).append(str(repair))
-    for code, said in by_code.items():
+    for code, sentences in by_code.items():
         yield Finding(
             code=code,
             severity="info" if code in ("empty-cells", "repaired") else "warning",
-            evidence="; ".join(said),
-            numbers={"repairs": len(said)},
+            evidence="; ".join(sentences),
+            numbers={"repairs": len(sentences)},
         )
 
 

@@ -59,9 +59,9 @@ def gather(
     full = {model["index"] for model in models[: SIZES.models]}
     project = done.get("project") is not None
     findings = _findings(out)
-    found = findings.get("findings", [])
+    listed = findings.get("findings", [])
     shown = [
-        _model(out, {**model, "findings": found}, in_full=model["index"] in full, project=project) for model in models
+        _model(out, {**model, "findings": listed}, in_full=model["index"] in full, project=project) for model in models
     ]
     if shown:
         outcome = shown[0]["outcome"]
@@ -168,8 +168,8 @@ def _model(out: Path, model: Content, *, in_full: bool, project: bool) -> Conten
 
 
 def _validation(out: Path, model: Content, *, project: bool) -> Content:
-    found = model.get("validation")
-    if found is None:
+    validation = model.get("validation")
+    if validation is None:
         if model["metres_per_unit"] is None:
             return _mark_missing("Without a scale there is nothing to measure a target with.")
         if project:
@@ -177,20 +177,20 @@ def _validation(out: Path, model: Content, *, project: bool) -> Content:
                 "No target was named, or the project's images are not at hand (then the notes say so)."
             )
         return _mark_missing("The capture names no target of known size ([target] in capture.toml).")
-    if "error" in found:
-        return _mark_missing(f"The target could not be measured: {found['error']}.")
+    if "error" in validation:
+        return _mark_missing(f"The target could not be measured: {validation['error']}.")
     folder = out / "validation" / str(model["index"])
     images = sorted(folder.glob("*.jpg")) if folder.is_dir() else []
     chosen = [str(images[i].relative_to(out)) for i in strided(len(images), SIZES.target_images)]
-    return {**found, "pictures": chosen}
+    return {**validation, "pictures": chosen}
 
 
 def _findings(out: Path) -> Content:
     file = out / "diagnosis.json"
     if not file.is_file():
         return _mark_missing("The recording was not checked before the reconstruction, or the findings were not kept.")
-    found = read_json(file)
-    return {"checked": found["checked"], "findings": found["findings"]}
+    diagnosis = read_json(file)
+    return {"checked": diagnosis["checked"], "findings": diagnosis["findings"]}
 
 
 def _summarise_recording(recording: Content) -> Content:

@@ -196,13 +196,13 @@ def spectra(spectrum: dict[str, Any], *, unit: str, factor: float = 1.0) -> Figu
         trace["line"] = {"color": colour, "width": width}
         trace["opacity"] = 0.45 if width > 2 else 1.0
         data.append(trace)
-    left = [trace["y"] for trace in data if trace["yaxis"] == "y"]
+    left_traces = [trace["y"] for trace in data if trace["yaxis"] == "y"]
     x = axis("frequency (Hz)", **_decades([trace["x"] for trace in data]))
     more: Figure = {"showlegend": True}
     if other:
         right = _right_axis("model units/s²/√Hz", "y", **_decades([data[-1]["y"]]))
         more |= {"yaxis2": right, "margin": {"r": 58}}
-    return {"data": data, "layout": layout(360, x, axis(f"{unit}/√Hz", **_decades(left)), **more)}
+    return {"data": data, "layout": layout(360, x, axis(f"{unit}/√Hz", **_decades(left_traces)), **more)}
 
 
 def _decades(columns: Sequence[Sequence[float | None]]) -> Figure:

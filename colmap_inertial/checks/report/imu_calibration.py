@@ -45,26 +45,26 @@ def calibration_page(found: RestCalibration, *, source: str) -> str:
     )
 
 
-def gain_effect(found: RestCalibration) -> str:
+def gain_effect(rests: RestCalibration) -> str:
     """A sentence on how the calibration changes the interval of a scale."""
-    pct = 100 * Z95 * found.calibration.gain_sigma
-    known = (
+    pct = 100 * Z95 * rests.calibration.gain_sigma
+    evidence = (
         f"the accelerometer's gain is known to +-{pct:.2g} % in every direction (95 %; without calibration to +-1 %)"
     )
-    if found.calibration.gain_sigma > KNOWN_GAIN:
-        return f"{known}; that is too little to lower the floor of a scale's interval"
+    if rests.calibration.gain_sigma > KNOWN_GAIN:
+        return f"{evidence}; that is too little to lower the floor of a scale's interval"
     before, after = (100 * Z95 * model_scale_sigma(calibrated) for calibrated in (False, True))
-    return f"{known}; the floor of a scale's interval falls from +-{before:.1g} % to +-{after:.1g} %"
+    return f"{evidence}; the floor of a scale's interval falls from +-{before:.1g} % to +-{after:.1g} %"
 
 
-def calibration_facts(found: RestCalibration) -> list[Fact]:
+def calibration_facts(rests: RestCalibration) -> list[Fact]:
     """Rests, gravity and the sensors' gains and biases with 95 % intervals."""
-    calibration = found.calibration
-    turns = np.degrees(found.turn_residual_rad[np.isfinite(found.turn_residual_rad)])
+    calibration = rests.calibration
+    turns = np.degrees(rests.turn_residual_rad[np.isfinite(rests.turn_residual_rad)])
     values = [
-        ("rests", f"{len(found.rests)} in {calibration.attitudes} attitudes"),
-        ("gravity error, as read", f"{found.rms_pct(found.before_m_s2):.2g} % rms"),
-        ("gravity error, corrected", f"{found.rms_pct(found.after_m_s2):.2g} % rms"),
+        ("rests", f"{len(rests.rests)} in {calibration.attitudes} attitudes"),
+        ("gravity error, as read", f"{rests.rms_pct(rests.before_m_s2):.2g} % rms"),
+        ("gravity error, corrected", f"{rests.rms_pct(rests.after_m_s2):.2g} % rms"),
         ("strength of gravity", f"{calibration.gravity_m_s2:.5f} m/s2"),
     ]
     if calibration.temperature_c is not None:
@@ -104,9 +104,9 @@ def _dots(series: list[tuple[str, str, Array, Array, list[str]]], title: str) ->
     return {"data": data, "layout": shape}
 
 
-def _parameters(found: RestCalibration) -> list[tuple[str, str, str]]:
+def _parameters(rests: RestCalibration) -> list[tuple[str, str, str]]:
     """Name, value and 95 % of each parameter that was estimated."""
-    calibration = found.calibration
+    calibration = rests.calibration
     sigma = np.sqrt(np.diagonal(calibration.cov))
     rows = []
     kinds = (

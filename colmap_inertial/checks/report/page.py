@@ -147,8 +147,8 @@ def _gauge_at(pct: float) -> float:
 def embed_images(out: Path, paths: Sequence[str], captions: Sequence[str] | None = None) -> list[tuple[str, str]]:
     """Caption (by default the file's name) and data URL of each image; those that are gone are left out."""
     named = zip(captions or [Path(path).stem for path in paths], paths, strict=True)
-    found = ((caption, _data_url(path_in(out, path))) for caption, path in named)
-    return [(caption, url) for caption, url in found if url is not None]
+    embedded = ((caption, _data_url(path_in(out, path))) for caption, path in named)
+    return [(caption, url) for caption, url in embedded if url is not None]
 
 
 def _data_url(path: Path) -> str | None:

@@ -93,9 +93,9 @@ def signal_record(
         imu, aligned = timed.imu, GyroCamera.from_timed(timed)
     record["rotation"] = _compare_rotations(trajectory, imu, rates, aligned, start_s)
     if estimate.rotations is not None:
-        found = estimate.rotations
-        deviation = np.where(found.judged, found.deviation_deg, np.nan)
-        record["rotation"]["deviation_deg"] = thinned(found.t_s - start_s, deviation)
+        consensus = estimate.rotations
+        deviation = np.where(consensus.judged, consensus.deviation_deg, np.nan)
+        record["rotation"]["deviation_deg"] = thinned(consensus.t_s - start_s, deviation)
     no_accel = "The recording has no accelerometer."
     if aligned is None or calibration is None:
         why = "Camera and IMU could not be aligned, so their {} cannot be compared."
@@ -169,11 +169,11 @@ def _compare_rotations(
     both = np.isfinite(by_gyro).all(axis=1)
     if not both.any():
         return record
-    left = (rates.rate_rad_s - by_gyro)[both]
+    difference = (rates.rate_rad_s - by_gyro)[both]
     record["after"] = {
         "camera": [thinned(times, column) for column in rates.rate_rad_s.T],
         "gyroscope": [thinned(times, column) for column in by_gyro.T],
-        "rms_difference_rad_s": _rms(left),
+        "rms_difference_rad_s": _rms(difference),
         "rms_rate_rad_s": _rms(by_gyro[both]),
     }
     return record
@@ -186,9 +186,9 @@ def _rms(vectors: Array) -> float:
 def _average_windows(t_s: Array, values: Array, width_s: float) -> tuple[Array, Array]:
     """Means of samples (N, 3) over windows of equal length."""
     place = np.floor((t_s - t_s[0]) / width_s).astype(np.intp)
-    found, index, count = np.unique(place, return_inverse=True, return_counts=True)
-    sums = np.stack([np.bincount(index, column, len(found)) for column in values.T], axis=1)
-    return t_s[0] + (found + 0.5) * width_s, sums / count[:, None]
+    windows, index, count = np.unique(place, return_inverse=True, return_counts=True)
+    sums = np.stack([np.bincount(index, column, len(windows)) for column in values.T], axis=1)
+    return t_s[0] + (windows + 0.5) * width_s, sums / count[:, None]
 
 
 def _compare_rotation_spectra(rates: _Rates, aligned: GyroCamera) -> Record:
@@ -281,8 +281,8 @@ class _Accelerations:
 
 
 def _collect_spectra(**signals: tuple[Array, Array]) -> Record:
-    found = {name: _estimate_spectrum(*signal) for name, signal in signals.items()}
-    curves = {name: curve for name, curve in found.items() if curve is not None}
+    spectra = {name: _estimate_spectrum(*signal) for name, signal in signals.items()}
+    curves = {name: curve for name, curve in spectra.items() if curve is not None}
     return {"curves": curves} if curves else {"missing": "The recording is too short for a spectrum."}
 
 
@@ -321,9 +321,9 @@ def _estimate_spectrum(t_s: Array, values: Array) -> Record | None:
     hz = hz[1:]
     edges = np.geomspace(hz[0], hz[-1] * 1.0001, SETTINGS.bins + 1)
     place = np.searchsorted(edges, hz, side="right")
-    found, index, members = np.unique(place, return_inverse=True, return_counts=True)
-    mean = np.sqrt(np.bincount(index, density**2, len(found)) / members)
-    return {"hz": rounded(np.bincount(index, hz, len(found)) / members, 4), "density": rounded(mean, 4)}
+    bins, index, members = np.unique(place, return_inverse=True, return_counts=True)
+    mean = np.sqrt(np.bincount(index, density**2, len(bins)) / members)
+    return {"hz": rounded(np.bincount(index, hz, len(bins)) / members, 4), "density": rounded(mean, 4)}
 
 
 def _welch(values: Array, step_s: float, count: int) -> tuple[Array, Array]:

@@ -336,10 +336,10 @@ def _dictionary(target: Target) -> Any:
 
 def _find_markers(image: UInt8Array, target: Target, border_bits: int, count: int) -> tuple[Array, IndexArray]:
     """Corners (n, 4, 2) in OpenCV's pixels and numbers (n,) of the markers below ``count``."""
-    found, numbers, _ = _detector(target, border_bits, image).detectMarkers(image)
+    quads, numbers, _ = _detector(target, border_bits, image).detectMarkers(image)
     if numbers is None or len(numbers) == 0:
         return np.zeros((0, 4, 2)), np.zeros(0, dtype=np.intp)
-    corners, number = np.array(found, dtype=np.float64).reshape(-1, 4, 2), np.asarray(numbers).ravel().astype(np.intp)
+    corners, number = np.array(quads, dtype=np.float64).reshape(-1, 4, 2), np.asarray(numbers).ravel().astype(np.intp)
     keep = (number < count) & (_side_px(corners) >= DETECTION.smallest_marker_px)
     return corners[keep], number[keep]
 
@@ -370,15 +370,15 @@ def _split_copies(corners: Array, number: IndexArray, layout_m: Array) -> list[I
         return [np.arange(len(number))] if len(number) else []
     centre_m = layout_m.mean(axis=1)
     reach = 3 * np.median(np.linalg.norm(layout_m[:, 1] - layout_m[:, 0], axis=1))
-    left, out = set(range(len(number))), []
-    while left:
-        group = [min(left)]
-        left -= set(group)
+    remaining, out = set(range(len(number))), []
+    while remaining:
+        group = [min(remaining)]
+        remaining -= set(group)
         while True:
             source, image = layout_m[number[group]].reshape(-1, 2), corners[group].reshape(-1, 2)
             homography = cv2.findHomography(source, image)[0]
             best: tuple[float, int] | None = None
-            for i in left:
+            for i in remaining:
                 near = np.linalg.norm(centre_m[number[group]] - centre_m[number[i]], axis=1).min()
                 if homography is None or number[i] in number[group] or near > reach:
                     continue
@@ -389,7 +389,7 @@ def _split_copies(corners: Array, number: IndexArray, layout_m: Array) -> list[I
             if best is None:
                 break
             group.append(best[1])
-            left.discard(best[1])
+            remaining.discard(best[1])
         out.append(np.array(group))
     return out
 
@@ -426,12 +426,12 @@ def _detect_charuco(image: UInt8Array, target: Target) -> list[Detection]:
         layout_m = np.array(board.getObjPoints(), dtype=np.float64)[:, :, :2]
         for pick in _split_copies(corners, number, layout_m):
             quads = [corners[i].astype(np.float32).reshape(1, 4, 2) for i in pick]
-            xy, found, _, _ = detector.detectBoard(
+            xy, numbers, _, _ = detector.detectBoard(
                 image, markerCorners=quads, markerIds=number[pick].astype(np.int32).reshape(-1, 1)
             )
-            if found is None or len(found) < 4:
+            if numbers is None or len(numbers) < 4:
                 continue
-            which = np.asarray(found).ravel().astype(np.intp)
+            which = np.asarray(numbers).ravel().astype(np.intp)
             start = np.asarray(xy, dtype=np.float64).reshape(-1, 2)
             grid = np.full((target.rows - 1, target.columns - 1, 2), np.nan)
             grid.reshape(-1, 2)[which] = start
@@ -450,9 +450,9 @@ def _detect_markers(image: UInt8Array, target: Target) -> list[Detection]:
     corners, number = _find_markers(image, target, 1, len(target.part) // 4)
     dictionary = _dictionary(target)
     out = []
-    for quad, one in zip(corners, number.tolist(), strict=True):
-        bits = dictionary.generateImageMarker(one, dictionary.markerSize + 2) > 127
+    for quad, marker in zip(corners, number.tolist(), strict=True):
+        bits = dictionary.generateImageMarker(marker, dictionary.markerSize + 2) > 127
         refined = refine_marker(image, quad, bits)
         if refined is not None:
-            out.append(Detection(part=one, corner=4 * one + np.arange(4), xy_px=colmap_px_from_opencv(refined)))
+            out.append(Detection(part=marker, corner=4 * marker + np.arange(4), xy_px=colmap_px_from_opencv(refined)))
     return out

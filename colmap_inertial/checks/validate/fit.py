@@ -207,10 +207,10 @@ def estimate_ratio(n: Normal) -> Array:
 
     starts = [np.full(len(unit), np.log(r)) for r in (0.3, 10.0, 300.0, 1e4)]
     start = min(starts, key=lambda x: cost(x)[0])
-    found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=[(low, high)] * len(unit))
-    if compute_restricted_likelihood(n, none)[0] - found.fun < FIT.pose_error_evidence:
+    minimum = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=[(low, high)] * len(unit))
+    if compute_restricted_likelihood(n, none)[0] - minimum.fun < FIT.pose_error_evidence:
         return none
-    return np.where(np.exp(found.x) < FIT.negligible_ratio, 0.0, unit * np.exp(found.x))
+    return np.where(np.exp(minimum.x) < FIT.negligible_ratio, 0.0, unit * np.exp(minimum.x))
 
 
 def satterthwaite_dof(n: Normal, ratio: Array, corner_var: float, dof: float) -> float:

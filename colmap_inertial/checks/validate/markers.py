@@ -60,11 +60,11 @@ def add_check_points(validation: Validation, path: Path) -> Validation:
         For too few points.
     """
     centres, to_metres = marker_centres(validation), _get_metres_per_unit(validation)
-    names, known, measured, sigmas = [], [], [], []
+    names, stated, measured, sigmas = [], [], [], []
     for line, row in _read_rows(path, ("marker", "x", "y", "z")):
         marker = _find_marker(centres, row["marker"], path, line)
         names.append(marker)
-        known.append([_read_number(row, axis, path, line) for axis in "xyz"])
+        stated.append([_read_number(row, axis, path, line) for axis in "xyz"])
         measured.append(centres[marker] * to_metres)
         if row.get("sigma_m"):
             sigmas.append(_read_number(row, "sigma_m", path, line))
@@ -72,18 +72,18 @@ def add_check_points(validation: Validation, path: Path) -> Validation:
         raise NotObservableError(
             "accuracy of points", f"{path} has {len(names)} check points; {FIT.least_points} are needed, apart in space"
         )
-    residual = _move_onto(np.array(measured), np.array(known)) - np.array(known)
+    residual = _move_onto(np.array(measured), np.array(stated)) - np.array(stated)
     sigma_m = float(np.sqrt(np.mean(np.square(sigmas)))) if len(sigmas) == len(names) else None
     rmse = np.sqrt(np.mean(residual**2, axis=0))
     both = 0.0 if sigma_m is None else sigma_m
-    found = CheckPoints(
+    check_points = CheckPoints(
         points=tuple(CheckPoint(marker=n, residual_m=r) for n, r in zip(names, residual, strict=True)),
         rmse_m=rmse,
         rmse_horizontal_m=float(np.hypot(np.hypot(rmse[0], rmse[1]), np.sqrt(2) * both)),
         rmse_vertical_m=float(np.hypot(rmse[2], both)),
         sigma_m=sigma_m,
     )
-    return replace(validation, check_points=found)
+    return replace(validation, check_points=check_points)
 
 
 def add_other_target(

@@ -10,6 +10,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from colmap_inertial.checks.validate.detect import DETECTION
+from colmap_inertial.checks.validate.failures import (
+    explain_failure,
+    require_no_larger_board,
+    require_no_likelier_board,
+)
 from colmap_inertial.checks.validate.fit import FIT, ScaleFit, fit_scale
 from colmap_inertial.checks.validate.observations import Observations, Placement, triangulate
 from colmap_inertial.checks.validate.place import (
@@ -17,11 +22,8 @@ from colmap_inertial.checks.validate.place import (
     PartPlacement,
     Progress,
     Search,
-    explain_failure,
     median_residual_px,
     observe,
-    require_no_larger_board,
-    require_no_likelier_board,
 )
 from colmap_inertial.checks.validate.result import (
     Corner,
@@ -150,8 +152,8 @@ def _reject_outliers(search: Search, placed: dict[int, PartPlacement]) -> tuple[
 
 
 def _measure_diagonal(model: Path | pycolmap.Reconstruction) -> float | None:
-    found = read_model(model) if isinstance(model, Path) else model
-    return model_diagonal(np.array([point.xyz for point in found.points3D.values()]).reshape(-1, 3))
+    reconstruction = read_model(model) if isinstance(model, Path) else model
+    return model_diagonal(np.array([point.xyz for point in reconstruction.points3D.values()]).reshape(-1, 3))
 
 
 def _measure(
@@ -173,7 +175,7 @@ def _measure(
     seen[obs.corner] = True
     control_corner = target.control(seen)
     sets = [_fit_set(obs, fit, pick[obs.corner]) for pick in (control_corner, ~control_corner)]
-    control, check = (_make_set_scale(found, of_target) for found in sets)
+    control, check = (_make_set_scale(markers, of_target) for markers in sets)
     check_error, check_ci = _compare_sets(*sets)
     if check_error is None:
         reasons.append("too few corners to keep a control and a check set apart")
@@ -349,7 +351,7 @@ def _triangulate_corners(target: Target, obs: Observations, fit: ScaleFit) -> Ar
 def _measure_distances(target: Target, position: Array, control: BoolArray, to_metres: float) -> tuple[Distance, ...]:
     out = []
     for a, b in target.pairs(np.isfinite(position[:, 0])).tolist():
-        known = float(np.linalg.norm(target.corners_m[a] - target.corners_m[b]))
+        stated_m = float(np.linalg.norm(target.corners_m[a] - target.corners_m[b]))
         measured = float(np.linalg.norm(position[a] - position[b]))
         belongs: DistanceSet = "mixed"
         if control[a] == control[b]:
@@ -357,9 +359,9 @@ def _measure_distances(target: Target, position: Array, control: BoolArray, to_m
         out.append(
             Distance(
                 pair=(target.label(a), target.label(b)),
-                known_m=known,
+                known_m=stated_m,
                 measured=measured,
-                residual_m=measured * to_metres - known,
+                residual_m=measured * to_metres - stated_m,
                 set=belongs,
             )
         )
@@ -383,14 +385,14 @@ def _collect_views(
             if s.view == v:
                 seen.update(zip(search.target.relabelings[numbering][s.corner].tolist(), s.xy_px, strict=True))
         observed = np.array([seen[c] for c in obs.corner[mine].tolist()])
-        left = [seen[c] for c in everything.corner[everything.view == v].tolist() if c not in obs.corner[mine]]
+        unused = [seen[c] for c in everything.corner[everything.view == v].tolist() if c not in obs.corner[mine]]
         out.append(
             ViewResiduals(
                 name=search.views[int(v)].name,
                 corner=obs.corner[mine],
                 observed_px=observed,
                 projected_px=observed - residual,
-                rejected_px=np.array(left).reshape(-1, 2),
+                rejected_px=np.array(unused).reshape(-1, 2),
                 rms_px=_rms(residual),
             )
         )

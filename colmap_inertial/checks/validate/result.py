@@ -397,20 +397,20 @@ class Validation:
     @property
     def doubts(self) -> tuple[str, ...]:
         """Why the target may not be the stated one: few images agree, or its lengths do not."""
-        found = []
+        doubts = []
         if self.views_used < FIT.enough_views:
-            found.append(
+            doubts.append(
                 f"only {self.views_used} of {self.views_searched} images agree on the target, which proves no size: "
                 "check its columns and rows, or take it from more sides"
             )
         lengths = self.lengths
         if lengths is not None and abs(lengths.largest_m) > self.tolerance_pct / 100 * lengths.longest_m:
-            found.append(
+            doubts.append(
                 f"its lengths do not agree: one is off by {1000 * lengths.largest_m:+.3g} mm, more than "
                 f"{self.tolerance_pct:g} % of the longest, {1000 * lengths.longest_m:.4g} mm: check its columns, rows "
                 "and that it is flat"
             )
-        return tuple(found)
+        return tuple(doubts)
 
     def as_json(self) -> dict[str, Any]:
         """Everything but pixel coordinates, ready for ``json.dump``."""

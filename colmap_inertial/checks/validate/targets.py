@@ -328,13 +328,13 @@ def _make_markers(spec: str, dictionary: str, side_m: float) -> Target:
     # OpenCV's order: clockwise in the image from the marker's upper left corner
     count = DICTIONARIES[dictionary]
     row, column = np.tile([0, 0, 1, 1], count), np.tile([0, 1, 1, 0], count)
-    one = _centre(column[:4] * side_m, row[:4] * side_m)
+    corners = _centre(column[:4] * side_m, row[:4] * side_m)
     return Target(
         spec=spec,
         kind="aruco",
         length_m=side_m,
         dictionary=dictionary,
-        corners_m=np.tile(one, (count, 1)),
+        corners_m=np.tile(corners, (count, 1)),
         part=np.repeat(np.arange(count), 4),
         row=row,
         column=column,

@@ -122,7 +122,7 @@ class RotationConsensus:
         """The consensus after some cameras were registered again; the others stay wrong."""
         place = {name: i for i, name in enumerate(later.names)}
         at = np.array([place.get(name, -1) for name in self.names])
-        before = (*(one.name for one in self.wrong), *self.moved)
+        before = (*(camera.name for camera in self.wrong), *self.moved)
         again = (name for name in before if name in place and later.kept[place[name]])
         return RotationConsensus(
             names=self.names,

@@ -129,30 +129,30 @@ def register(
     levels = [_Level.of(short, long, clipped, side, step_px) for side in sides]
     judge = levels[-1]
     none = Registered(shift_px=zero, by_gyro=False, by_pixels=False, agreement=judge.agreement(zero), untouched=0.0)
-    found = none = replace(none, untouched=none.agreement)
+    best_mapping = none = replace(none, untouched=none.agreement)
     if start_px is not None:
         gyro = np.where(np.isfinite(start_px), start_px, 0.0)
         # the gyroscope is believed unless the images clearly say otherwise
-        found = replace(none, shift_px=gyro, by_gyro=True, agreement=judge.agreement(gyro))
-        better = found if judge.flat() else _refine(found, np.eye(3), levels)
-        if better.agreement >= found.agreement + _LIMITS.worth_from_gyro:
-            found = better
+        best_mapping = replace(none, shift_px=gyro, by_gyro=True, agreement=judge.agreement(gyro))
+        better = best_mapping if judge.flat() else _refine(best_mapping, np.eye(3), levels)
+        if better.agreement >= best_mapping.agreement + _LIMITS.worth_from_gyro:
+            best_mapping = better
     if judge.flat():
-        return found
-    alike = judge.alike(found.shift_px)
+        return best_mapping
+    alike = judge.alike(best_mapping.shift_px)
     worth = 0.0 if start_px is None else _WORTH_AGAINST_GYRO[alike]
-    least = judge.score(found) + worth
+    least = judge.score(best_mapping) + worth
     for turns_deg in (USUAL_TURNS_DEG, OTHER_TURNS_DEG):
         if least >= _LIMITS.never_better or (alike and turns_deg is OTHER_TURNS_DEG):
             break
         guesses = _guess_mappings(none, levels, turns_deg)
         refined = [none, *(_refine(none, guess, levels) for guess in guesses)]
         # repeated detail agrees in many places; what is coarser tells them apart
-        best = max(refined, key=lambda one: judge.score(one) + _score_coarsely(levels[0], one))
+        best = max(refined, key=lambda candidate: judge.score(candidate) + _score_coarsely(levels[0], candidate))
         if (score := judge.score(best)) > least:
-            found, least = best, score
-            alike = judge.alike(found.shift_px)
-    return replace(found, alike=alike)
+            best_mapping, least = best, score
+            alike = judge.alike(best_mapping.shift_px)
+    return replace(best_mapping, alike=alike)
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,10 +199,10 @@ class _Level:
         moved, tells = self.moved(shift_px)
         return _correlate(self.short, moved, tells)
 
-    def score(self, found: Registered) -> float:
+    def score(self, mapping: Registered) -> float:
         """The agreement times the root of what tells in common: of little, chance agrees more."""
-        _, tells = self.moved(found.shift_px)
-        return found.agreement * float(np.sqrt(tells.mean() / max(float(self.tells.mean()), 1e-6)))
+        _, tells = self.moved(mapping.shift_px)
+        return mapping.agreement * float(np.sqrt(tells.mean() / max(float(self.tells.mean()), 1e-6)))
 
     def flat(self) -> bool:
         """Whether there is nothing to align, so that nothing contradicts either."""
@@ -210,10 +210,10 @@ class _Level:
 
     def alike(self, shift_px: Array) -> bool:
         """Whether details agree all over, in most parts of the image independently."""
-        found = self._correlate_parts(shift_px)
-        if len(found) < _LIMITS.least_parts:
+        parts = self._correlate_parts(shift_px)
+        if len(parts) < _LIMITS.least_parts:
             return self.agreement(shift_px) >= _LIMITS.alike_as_a_whole
-        mean, spread = float(found.mean()), float(found.std()) / np.sqrt(len(found))
+        mean, spread = float(parts.mean()), float(parts.std()) / np.sqrt(len(parts))
         return bool(mean >= _LIMITS.alike and mean >= _LIMITS.alike_sigmas * spread)
 
     def _correlate_parts(self, shift_px: Array) -> Array:
@@ -221,13 +221,13 @@ class _Level:
         moved, tells = self.moved(shift_px)
         height, width = self.short.shape
         side = max(16, max(height, width) // _LIMITS.parts_along)
-        found = []
+        parts = []
         for top in range(0, height - side + 1, side):
             for left in range(0, width - side + 1, side):
                 part = (slice(top, top + side), slice(left, left + side))
                 if tells[part].mean() >= _LIMITS.telling_part:
-                    found.append(_correlate(self.short[part], moved[part], tells[part]))
-        return np.array(found)
+                    parts.append(_correlate(self.short[part], moved[part], tells[part]))
+        return np.array(parts)
 
 
 def _correlate(a: Float32Array, b: Float32Array, weights: Float32Array) -> float:
@@ -244,7 +244,7 @@ def _guess_mappings(start: Registered, levels: list[_Level], turns_deg: Sequence
     """(3, 3) mappings, px of the full images, from the short one to where the long one may lie: the best few."""
     coarse, finer = levels[0], levels[min(1, len(levels) - 1)]
     scale = _scale_about_corner(coarse.scale)
-    found = places(
+    peaks = places(
         coarse.short,
         np.ones_like(coarse.tells),
         coarse.long,
@@ -253,21 +253,21 @@ def _guess_mappings(start: Registered, levels: list[_Level], turns_deg: Sequence
         turns_deg=turns_deg,
     )
     ranked = []
-    for guess in (np.eye(3), *(np.linalg.inv(scale) @ place.mapping @ scale for place in found)):
+    for guess in (np.eye(3), *(np.linalg.inv(scale) @ place.mapping @ scale for place in peaks)):
         mapping: Array | None = guess
         for level in (coarse, finer):
             mapping = None if mapping is None else _maximise_correlation(level, start, mapping, _SHIFT)
-        for one in (guess, mapping):
-            shift = None if one is None else _apply_mapping(one, start, finer.step_px)
-            if one is not None and shift is not None:
+        for candidate in (guess, mapping):
+            shift = None if candidate is None else _apply_mapping(candidate, start, finer.step_px)
+            if candidate is not None and shift is not None:
                 moved = replace(start, shift_px=shift, agreement=finer.agreement(shift))
-                ranked.append((finer.score(moved) + _score_coarsely(coarse, moved), one))
+                ranked.append((finer.score(moved) + _score_coarsely(coarse, moved), candidate))
     ranked.sort(key=lambda pair: -pair[0])
-    return [one for _, one in ranked[: _LIMITS.closer_looks]]
+    return [candidate for _, candidate in ranked[: _LIMITS.closer_looks]]
 
 
-def _score_coarsely(coarse: _Level, found: Registered) -> float:
-    return coarse.score(replace(found, agreement=coarse.agreement(found.shift_px)))
+def _score_coarsely(coarse: _Level, mapping: Registered) -> float:
+    return coarse.score(replace(mapping, agreement=coarse.agreement(mapping.shift_px)))
 
 
 def _apply_mapping(mapping: Array, start: Registered, step_px: int) -> Array | None:
@@ -314,10 +314,10 @@ def _generalise_mapping(start: Registered, guess: Array, levels: list[_Level]) -
     steps = [(level, _SHIFT) for level in levels]
     steps += [(levels[-1], kind) for kind in (cv2.MOTION_EUCLIDEAN, cv2.MOTION_HOMOGRAPHY)]
     for level, kind in steps:
-        found = _maximise_correlation(level, start, mapping, kind)
-        if found is None:
+        general = _maximise_correlation(level, start, mapping, kind)
+        if general is None:
             break
-        mapping = found
+        mapping = general
         if level is levels[-1]:
             yield mapping
 

@@ -78,7 +78,7 @@ def places(
     import cv2
 
     height, width = first.shape
-    found: list[Place] = []
+    peaks: list[Place] = []
     for degrees in turns_deg:
         turn = np.eye(3)
         turn[:2] = cv2.getRotationMatrix2D((0.5 * (width - 1), 0.5 * (height - 1)), degrees, 1.0)
@@ -94,12 +94,12 @@ def places(
             row, column = np.unravel_index(np.argmax(scores), scores.shape)
             dy, dx = shifts[0][row], shifts[1][column]
             shift = np.array([[1, 0, dx], [0, 1, dy], [0, 0, 1.0]])
-            found.append(Place(mapping=turn @ shift, score=float(scores[row, column])))
+            peaks.append(Place(mapping=turn @ shift, score=float(scores[row, column])))
             near = (np.abs(shifts[0] - dy) < _LIMITS.apart_px)[:, None] & (np.abs(shifts[1] - dx) < _LIMITS.apart_px)
             scores[near] = -1.0
     chosen: list[Place] = []
     middle = np.array([0.5 * width, 0.5 * height, 1.0])
-    for place in sorted(found, key=lambda one: -one.score):
+    for place in sorted(peaks, key=lambda peak: -peak.score):
         there = (place.mapping @ middle)[:2]
         if all(np.linalg.norm(there - (other.mapping @ middle)[:2]) >= _LIMITS.apart_px for other in chosen):
             chosen.append(place)

@@ -105,13 +105,13 @@ def _split_bands(image: Float32Array) -> list[tuple[float, float]]:
 
     point = np.zeros((129, 129), dtype=np.float32)
     point[64, 64] = 1.0
-    found, before, spread = [], image, point
+    bands, before, spread = [], image, point
     for k in range(_LIMITS.bands):
         sigma = _LIMITS.finest_px * 2**k
         after, wider = (cv2.GaussianBlur(picture, (0, 0), sigma) for picture in (image, point))
-        found.append((float(np.var(before - after)), float(np.sum((spread - wider) ** 2))))
+        bands.append((float(np.var(before - after)), float(np.sum((spread - wider) ** 2))))
         before, spread = after, wider
-    return found
+    return bands
 
 
 def _estimate_noise_variance(image: Float32Array) -> float:

@@ -62,9 +62,9 @@ def fill_hidden(values: Float32Array, seen: BoolArray, guide: Float32Array, disp
         kept_rows, kept_columns = [], []
         for start in range(0, len(rows), _LIMITS.chunk):
             y, x = rows[start : start + _LIMITS.chunk], columns[start : start + _LIMITS.chunk]
-            found, weight = _fit_neighbours(values, seen, guide, disparity_px, y, x, spacing)
+            fitted, weight = _fit_neighbours(values, seen, guide, disparity_px, y, x, spacing)
             enough = weight > _LIMITS.enough_weight
-            result[y[enough], x[enough]] = found[enough]
+            result[y[enough], x[enough]] = fitted[enough]
             kept_rows.append(y[~enough])
             kept_columns.append(x[~enough])
         rows, columns = np.concatenate(kept_rows), np.concatenate(kept_columns)
@@ -102,8 +102,8 @@ def _fit_neighbours(
     mean_guide, mean_value = (share * of_guide).sum(axis=1), (share * of_values).sum(axis=1)
     variance = (share * of_guide**2).sum(axis=1) - mean_guide**2
     covariance = (share * of_guide * of_values).sum(axis=1) - mean_guide * mean_value
-    found = mean_value + covariance / (np.maximum(variance, 0) + _LIMITS.flat_variance) * (here - mean_guide)
-    return np.clip(found, 0, 1).astype(np.float32), total.astype(np.float32)
+    fitted = mean_value + covariance / (np.maximum(variance, 0) + _LIMITS.flat_variance) * (here - mean_guide)
+    return np.clip(fitted, 0, 1).astype(np.float32), total.astype(np.float32)
 
 
 def _fit_line(values: Float32Array, guide: Float32Array) -> tuple[float, float]:

@@ -58,13 +58,13 @@ def light_cost(
     if len(wanted) < 100:
         return None
     for _ in range(_ROUNDS):
-        found = np.linalg.lstsq(unknown[used], wanted[used])[0]
-        residual = np.abs(unknown @ found - wanted)
+        light = np.linalg.lstsq(unknown[used], wanted[used])[0]
+        residual = np.abs(unknown @ light - wanted)
         scale = max(1.0, 1.4826 * float(np.median(residual)))
         used = residual < 3 * scale
     blend = np.zeros(len(codes) + 1)
-    for role, weight in zip(_NEEDED, (*found[:3], -1.0), strict=True):
+    for role, weight in zip(_NEEDED, (*light[:3], -1.0), strict=True):
         blend[means[role]] += weight / len(means[role])
-    blend[-1] = found[3]
+    blend[-1] = light[3]
     table = most * (1 - np.exp(-((np.arange(256) / (_WIDE * scale)) ** 2)))
     return LightCost(blend=np.rint(256 * blend).astype(np.int32), table=np.asarray(np.rint(table), dtype=np.uint8))

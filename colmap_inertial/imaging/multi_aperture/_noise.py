@@ -73,5 +73,5 @@ def smoothing(codes: UInt8Array, noise_codes: float) -> tuple[float, int]:
     variance = cv2.blur(image * image, (5, 5)) - mean * mean
     if float(np.median(variance)) * 25 / 24 - noise_codes**2 > (_LIMITS.stands_out * noise_codes) ** 2:
         return 0.0, round(noise_codes)
-    left = noise_codes / (2 * np.sqrt(np.pi) * width_px)
-    return width_px, round(_LIMITS.telling_sigmas * np.sqrt(2) * left)
+    remaining = noise_codes / (2 * np.sqrt(np.pi) * width_px)
+    return width_px, round(_LIMITS.telling_sigmas * np.sqrt(2) * remaining)

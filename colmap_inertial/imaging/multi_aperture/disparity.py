@@ -106,8 +106,8 @@ def estimate_disparity(
         rough = _match_roughly(reference, others, canvas, low, high, threads)
         light = light_cost(codes, canvas, rough, roles, MOST)
     views = Views(reference=reference, others=others, tables=tables, least=least, light=light)
-    found, total = match(views, canvas, candidates(low, high, options.step_px), threads=threads)
-    return _check_disparities(found, total, canvas, threads, even=bool(np.ptp(reference) == 0))
+    disparity, total = match(views, canvas, candidates(low, high, options.step_px), threads=threads)
+    return _check_disparities(disparity, total, canvas, threads, even=bool(np.ptp(reference) == 0))
 
 
 def _prepare_codes(planes: Sequence[AnyArray], canvas: Rectified) -> tuple[UInt8Array, int]:
@@ -126,14 +126,14 @@ def _prepare_codes(planes: Sequence[AnyArray], canvas: Rectified) -> tuple[UInt8
 
 
 def _check_disparities(
-    found: Float32Array, least: UInt16Array, canvas: Rectified, threads: int, *, even: bool
+    disparity: Float32Array, least: UInt16Array, canvas: Rectified, threads: int, *, even: bool
 ) -> Disparity:
     """The disparities without what is wrong, and what the views see of them."""
     import cv2
 
-    bits = _find_visibility(found, least, canvas, threads)
+    bits = _find_visibility(disparity, least, canvas, threads)
     measured = (bits == 3).any(axis=0)
-    filled = background(found, measured)
+    filled = background(disparity, measured)
     smooth = np.asarray(cv2.medianBlur(filled, 3))
     visible = (_find_visibility(smooth, least, canvas, threads) & 1).astype(bool)
     return Disparity(disparity_px=smooth, measured=measured & (not even), visible=visible)
@@ -180,9 +180,9 @@ def _estimate_range_px(
     by = _choose_shrink(reference)
     small = canvas.shrunk(by)
     low, high = (share * canvas.width / by for share in _LIMITS.shares)
-    found, least = match(_shrink_views(reference, others, by), small, candidates(low, high, 0.5), threads=threads)
-    measured = (_find_visibility(found, least, small, threads) == 3).any(axis=0)
-    used = found[measured] if measured.any() else found
+    disparity, least = match(_shrink_views(reference, others, by), small, candidates(low, high, 0.5), threads=threads)
+    measured = (_find_visibility(disparity, least, small, threads) == 3).any(axis=0)
+    used = disparity[measured] if measured.any() else disparity
     limits = by * np.quantile(used, (_LIMITS.outliers, 1 - _LIMITS.outliers))
     return float(limits[0] - _LIMITS.margin_px), float(limits[1] + _LIMITS.margin_px)
 
@@ -203,8 +203,8 @@ def _match_roughly(
 
     by = _choose_shrink(reference)
     spaced = candidates(low_px / by, high_px / by, 0.5)
-    found, _ = match(_shrink_views(reference, others, by), canvas.shrunk(by), spaced, threads=threads)
-    return np.asarray(by * cv2.resize(found, reference.shape[::-1], interpolation=cv2.INTER_LINEAR))
+    disparity, _ = match(_shrink_views(reference, others, by), canvas.shrunk(by), spaced, threads=threads)
+    return np.asarray(by * cv2.resize(disparity, reference.shape[::-1], interpolation=cv2.INTER_LINEAR))
 
 
 def _make_cost_tables(

@@ -115,7 +115,7 @@ def fuse_with(
     planes: Sequence[AnyArray],
     rig: ApertureRig,
     canvas: Rectified,
-    found: Disparity,
+    disparity: Disparity,
     options: ApertureOptions | None = None,
 ) -> Fused:
     """:func:`fuse_apertures` with disparities that are known already.
@@ -132,7 +132,7 @@ def fuse_with(
     top = np.float32(np.iinfo(planes[0].dtype).max)
     reference = rig.apertures[0]
     shape = (reference.camera.height, reference.camera.width)
-    grid = _Grid(canvas, shape, found)
+    grid = _Grid(canvas, shape, disparity)
     guide = planes[0].astype(np.float32) / top
     hidden = np.zeros(shape, dtype=bool)
     roles: dict[SpectralRole, Float32Array] = {}
@@ -170,16 +170,16 @@ def fuse_with(
 class _Grid:
     """The reference's pixels, with disparities, and where they lie in the other images."""
 
-    def __init__(self, canvas: Rectified, shape: tuple[int, int], found: Disparity) -> None:
-        self.canvas, self.found = canvas, found
+    def __init__(self, canvas: Rectified, shape: tuple[int, int], disparity: Disparity) -> None:
+        self.canvas, self.found = canvas, disparity
         height, width = shape
         if canvas.canvas_from_reference is None:
             x, y = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in (width, height)))
         else:
             x, y = np.moveaxis(canvas.canvas_from_reference, -1, 0)
         self.x, self.y = x, y
-        self.disparity_px: Float32Array = self._nearest(found.disparity_px)
-        self.measured: BoolArray = self._nearest(found.measured)
+        self.disparity_px: Float32Array = self._nearest(disparity.disparity_px)
+        self.measured: BoolArray = self._nearest(disparity.measured)
 
     def _nearest(self, values: AnyArray) -> AnyArray:
         if self.canvas.canvas_from_reference is None:

@@ -97,11 +97,11 @@ def _transfer_there_and_back(
     column, row = np.rint(u), np.rint(v)
     inside = (depth > 0) & (w > 0) & (column >= 0) & (row >= 0) & (column < wide) & (row < high)
     at = np.where(inside, row, 0).astype(np.intp) * wide + np.where(inside, column, 0).astype(np.intp)
-    found = other.ravel()[at]
-    x_back, y_back, depth_back = _transfer_pixels(*back, np.where(inside, u, 0), np.where(inside, v, 0), found)
+    sampled = other.ravel()[at]
+    x_back, y_back, depth_back = _transfer_pixels(*back, np.where(inside, u, 0), np.where(inside, v, 0), sampled)
     near = (x_back - x) ** 2 + (y_back - y) ** 2 <= _LIMITS.within_px**2
-    met = inside & (found > 0)
-    ratio = np.divide(found, w, out=np.zeros_like(w), where=met)
+    met = inside & (sampled > 0)
+    ratio = np.divide(sampled, w, out=np.zeros_like(w), where=met)
     return np.where(met & near, depth_back, np.float32(np.nan)), ratio
 
 

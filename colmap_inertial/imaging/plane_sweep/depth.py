@@ -112,11 +112,11 @@ def sweep_depth(
     with np.errstate(divide="ignore"):
         place = (1 / coarse.astype(np.float64) - sweep.inverse[0]) / (sweep.inverse[1] - sweep.inverse[0])
     tiles = list(cut_tiles(np.where(coarse > 0, place, np.nan), (camera.height, camera.width), len(sweep.inverse)))
-    found = np.empty(codes.shape, dtype=np.float32)
+    inverse = np.empty(codes.shape, dtype=np.float32)
     parts = map_in_order(sweep.of_tile, tiles, workers=threads or usable_processors())
     for tile, part in zip(tiles, parts, strict=True):
-        found[tile.inner_rows, tile.inner_columns] = part[tile.kept]
-    return found
+        inverse[tile.inner_rows, tile.inner_columns] = part[tile.kept]
+    return inverse
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -168,8 +168,8 @@ class _Sweep:
         """Depths of candidates, counted from the first of some; the best one at an end may lie beyond."""
         known = (best > 0) & (best < candidates.stop - candidates.start - 1)
         step = self.inverse[1] - self.inverse[0]
-        found = self.inverse[0] + step * (best.astype(np.float64) + candidates.start)
-        return np.where(known, 1 / found, 0).astype(np.float32)
+        inverse = self.inverse[0] + step * (best.astype(np.float64) + candidates.start)
+        return np.where(known, 1 / inverse, 0).astype(np.float32)
 
 
 def _halve_codes(codes: UInt8Array) -> UInt8Array:

@@ -75,10 +75,10 @@ def _fit_rows(known: BoolArray, middle: Float32Array, room: Float32Array, begin:
             )
             same = np.abs(away) <= tolerance
             away *= same
-            one = same.view(np.uint8)
+            same_bytes = same.view(np.uint8)
             for total, factor in ((count, 1), (sx, dx), (sy, dy), (sxx, dx * dx), (sxy, dx * dy), (syy, dy * dy)):
                 if factor:
-                    total += np.float32(factor) * one
+                    total += np.float32(factor) * same_bytes
             for total, factor in ((sq, 1), (sxq, dx), (syq, dy)):
                 if factor:
                     total += np.float32(factor) * away

@@ -66,10 +66,10 @@ def cut_tiles(coarse: Array, shape: tuple[int, int], count: int) -> Iterator[Til
     down, across = (small / whole for small, whole in zip(coarse.shape, shape, strict=True))
     for inner_rows, rows in _cut_side(shape[0]):
         for inner_columns, columns in _cut_side(shape[1]):
-            found = coarse[_scale_slice(rows, down), _scale_slice(columns, across)]
-            known = found[np.isfinite(found)]
+            coarse_tile = coarse[_scale_slice(rows, down), _scale_slice(columns, across)]
+            known = coarse_tile[np.isfinite(coarse_tile)]
             candidates = slice(0, count)
-            if len(known) >= max(1.0, _LIMITS.least_known * found.size):
+            if len(known) >= max(1.0, _LIMITS.least_known * coarse_tile.size):
                 low, high = np.quantile(known, (_LIMITS.low_share, _LIMITS.high_share))
                 first, last = int(np.floor(low)) - _LIMITS.beyond, int(np.ceil(high)) + _LIMITS.beyond + 1
                 more = max(0, _LIMITS.fewest - (last - first))

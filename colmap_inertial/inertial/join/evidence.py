@@ -84,11 +84,13 @@ class Evidence:
     incompatible: dict[Pair, str]
 
     @classmethod
-    def of(cls, submodels: Sequence[FittedSubmodel], imu: ImuRecording, found: Sequence[PlacedImages] = ()) -> Evidence:
+    def of(
+        cls, submodels: Sequence[FittedSubmodel], imu: ImuRecording, placed_images: Sequence[PlacedImages] = ()
+    ) -> Evidence:
         """All evidence of a recording as it was read."""
         links, shared = find_links(submodels), find_shared(submodels)
         streams = SensorStreams.from_recording(imu, imu.gyro_t_s, imu.accel_t_s)
-        by_images = {pair_of(one) for one in shared}
+        by_images = {pair_of(constraint) for constraint in shared}
         usable = [
             link
             for link in links
@@ -103,40 +105,46 @@ class Evidence:
             links=tuple(links),
             usable=tuple(usable),
             shared=tuple(shared),
-            matched=tuple(find_matched(submodels, found)),
+            matched=tuple(find_matched(submodels, placed_images)),
             incompatible=incompatible_pairs(submodels, shared),
         )
 
 
 def find_links(submodels: Sequence[FittedSubmodel]) -> list[ImuLink]:
     """The IMU from any node to the next one in time, where that belongs to another submodel."""
-    t_s = np.concatenate([one.path.nodes_s for one in submodels])
-    nodes = [(k, node) for k, one in enumerate(submodels) for node in range(len(one.path.nodes_s))]
-    found: dict[Pair, list[tuple[float, ImuLink]]] = {}
+    t_s = np.concatenate([submodel.path.nodes_s for submodel in submodels])
+    nodes = [(k, node) for k, submodel in enumerate(submodels) for node in range(len(submodel.path.nodes_s))]
+    links_of: dict[Pair, list[tuple[float, ImuLink]]] = {}
     for i, j in pairwise(np.argsort(t_s, kind="stable").tolist()):
         (a, from_node), (b, to_node) = nodes[i], nodes[j]
         if a != b and t_s[j] > t_s[i]:
             link = ImuLink(first=a, second=b, from_node=from_node, to_node=to_node)
-            found.setdefault(pair_of(link), []).append((float(t_s[j] - t_s[i]), link))
-    return [link for links in found.values() for _, link in sorted(links, key=lambda one: one[0])[: LIMITS.links]]
+            links_of.setdefault(pair_of(link), []).append((float(t_s[j] - t_s[i]), link))
+    return [
+        link
+        for links in links_of.values()
+        for _, link in sorted(links, key=lambda submodel: submodel[0])[: LIMITS.links]
+    ]
 
 
 def find_shared(submodels: Sequence[FittedSubmodel]) -> list[SimilarityConstraint]:
     """Constraints by images that two submodels have both, without those that contradict most of the others."""
     out = []
-    for (a, one), (b, other) in combinations(enumerate(submodels), 2):
+    for (a, first), (b, other) in combinations(enumerate(submodels), 2):
         place = {name: i for i, name in enumerate(other.trajectory.names)}
-        both = [(i, place[name]) for i, name in enumerate(one.trajectory.names) if name in place]
+        both = [(i, place[name]) for i, name in enumerate(first.trajectory.names) if name in place]
         images = np.array(both, dtype=np.int64).reshape(-1, 2)
         poses = [_poses(submodels[k], images[:, i]) for i, k in enumerate((a, b))]
-        out.append(_constraint(submodels, (a, b), images, (poses[0], poses[1]), one.trajectory.t_s[images[:, 0]]))
+        out.append(_constraint(submodels, (a, b), images, (poses[0], poses[1]), first.trajectory.t_s[images[:, 0]]))
     return [constraint for constraint in out if constraint is not None]
 
 
-def find_matched(submodels: Sequence[FittedSubmodel], found: Sequence[PlacedImages]) -> list[SimilarityConstraint]:
+def find_matched(
+    submodels: Sequence[FittedSubmodel], placed_images: Sequence[PlacedImages]
+) -> list[SimilarityConstraint]:
     """Constraints by images of one submodel that matches place in another."""
-    place_of, out = {one.number: k for k, one in enumerate(submodels)}, []
-    for placed in found:
+    place_of, out = {item.number: k for k, item in enumerate(submodels)}, []
+    for placed in placed_images:
         if placed.first not in place_of or placed.second not in place_of:
             continue
         k, own = place_of[placed.first], place_of[placed.second]
@@ -150,8 +158,8 @@ def find_matched(submodels: Sequence[FittedSubmodel], found: Sequence[PlacedImag
         if constraint is not None:
             out.append(constraint)
     # one's images in the other and the other's in it are the same matches, read twice
-    times = Counter(pair_of(one) for one in out)
-    return [one.weighted(1 / times[pair_of(one)]) for one in out]
+    times = Counter(pair_of(item) for item in out)
+    return [item.weighted(1 / times[pair_of(item)]) for item in out]
 
 
 def _poses(submodel: FittedSubmodel, images: Int64Array) -> tuple[Array, Array]:
@@ -194,7 +202,7 @@ def _constraint(
 
 def _agreeing(rotations: Array, centres: Array, own_centres: Array) -> tuple[BoolArray, Array]:
     """(n,) which of n images lie in two submodels as most of them do, and (3, 3) the rotation between the two."""
-    angles = [np.linalg.norm(so3_log(one.T @ rotations), axis=1) for one in rotations]
+    angles = [np.linalg.norm(so3_log(rotation.T @ rotations), axis=1) for rotation in rotations]
     middle = int(np.argmin([np.median(of_one) for of_one in angles]))
     away = centres - own_centres @ rotations[middle].T
     offsets = np.linalg.norm(away - np.median(away, axis=0), axis=1)
@@ -224,21 +232,21 @@ def overlaps(submodels: Sequence[FittedSubmodel], link: ImuLink) -> bool:
 
 def incompatible_pairs(submodels: Sequence[FittedSubmodel], shared: Sequence[SimilarityConstraint]) -> dict[Pair, str]:
     """Reasons why pairs of submodels cannot be one model, whatever the IMU measured."""
-    agree, out = {pair_of(one) for one in shared}, {}
-    for (a, one), (b, other) in combinations(enumerate(submodels), 2):
-        both = len(set(one.trajectory.names) & set(other.trajectory.names))
-        if one.cameras and other.cameras and not one.cameras & other.cameras:
+    agree, out = {pair_of(constraint) for constraint in shared}, {}
+    for (a, first), (b, other) in combinations(enumerate(submodels), 2):
+        both = len(set(first.trajectory.names) & set(other.trajectory.names))
+        if first.cameras and other.cameras and not first.cameras & other.cameras:
             out[a, b] = "the two models are of different cameras"
-        elif both > LIMITS.most_shared * min(len(one.trajectory.names), len(other.trajectory.names)):
+        elif both > LIMITS.most_shared * min(len(first.trajectory.names), len(other.trajectory.names)):
             out[a, b] = f"{both} images are in both: they are two models of the same part of the recording"
         elif both >= LIMITS.images and (a, b) not in agree:
             out[a, b] = f"the {both} images in both models have different relative poses in the two"
     return out
 
 
-def mounting_differs(one: FittedSubmodel, other: FittedSubmodel) -> bool:
+def mounting_differs(first: FittedSubmodel, second: FittedSubmodel) -> bool:
     """Whether the relative pose of camera and IMU differs between two submodels."""
-    (a, b), at = (submodel.path.at(np.array([0])) for submodel in (one, other)), np.r_[-MOUNTING:0]
+    (a, b), at = (submodel.path.at(np.array([0])) for submodel in (first, second)), np.r_[-MOUNTING:0]
     away = np.concatenate([so3_log(a.cam_from_imu @ b.cam_from_imu.T), a.imu_in_cam_m - b.imu_in_cam_m])
     cov = a.cov[np.ix_(at, at)] + b.cov[np.ix_(at, at)]
     return float(away @ np.linalg.solve(cov, away)) > chi2_limit(MOUNTING, real=True)
@@ -258,7 +266,7 @@ def clocks_differ(submodels: Sequence[FittedSubmodel], link: ImuLink) -> bool:
 
 def times_counted(submodels: Sequence[FittedSubmodel]) -> float:
     """How often readings are counted: those of an overlap in time are in each fit."""
-    spans = sorted((float(one.path.nodes_s[0]), float(one.path.nodes_s[-1])) for one in submodels)
+    spans = sorted((float(submodel.path.nodes_s[0]), float(submodel.path.nodes_s[-1])) for submodel in submodels)
     covered_s, reached_s = 0.0, -np.inf
     for begin_s, end_s in spans:
         covered_s += max(0.0, end_s - max(begin_s, reached_s))

@@ -38,7 +38,7 @@ def join_models(
     models: Sequence[Model],
     submodels: Sequence[FittedSubmodel],
     group: JoinedGroup,
-    found: Sequence[PlacedImages],
+    placed_images: Sequence[PlacedImages],
     *,
     world: WorldAxes,
 ) -> Model:
@@ -48,7 +48,7 @@ def join_models(
     ----------
     models, submodels
         All that were judged, in the order that the group's members are places of.
-    found
+    placed_images
         Images of one model that matches place in another.
     world
         Where gravity points.
@@ -70,7 +70,7 @@ def join_models(
             by = _world_jacobian(similarity.translation_m)
             cov = cov + by @ shared @ by.T
             cov = 0.5 * (cov + cov.T)
-            middles = [one.trajectory.cam_in_world.mean(axis=0) for one in (fitted[0], submodel)]
+            middles = [member.trajectory.cam_in_world.mean(axis=0) for member in (fitted[0], submodel)]
             sigma_m, sigma_rad = worst(relative_cov(fitted, placed, middles, (0, k)))
         else:
             # the first one's up and scale are as uncertain as before, at most
@@ -92,7 +92,7 @@ def join_models(
     reason = f"joined of COLMAP's models {numbers}, {sum(part.images for part in about)} images"
     scale = _scale_of(members, about, float(np.linalg.norm(placed.gravity_m_s2)) * DOWN_IN_WORLD[world])
     return replace(
-        _merged(members, moves, fitted, group, found),
+        _merged(members, moves, fitted, group, placed_images),
         scale=replace(scale, notes=(*scale.notes, f"the model was {reason}")),
         similarity=replace(about[0].similarity, provenance=f"{first.similarity.provenance}; {reason}"),
         treatments=(
@@ -117,19 +117,21 @@ def _merged(
     moves: Sequence[Similarity],
     fitted: Sequence[FittedSubmodel],
     group: JoinedGroup,
-    found: Sequence[PlacedImages],
+    placed_images: Sequence[PlacedImages],
 ) -> Model:
     """The first model with all images and points of a group, those that matches say are one as one."""
     agreeing = {
-        (one.first, one.second): {fitted[one.first].trajectory.names[i] for i in one.images[:, 0].tolist()}
-        for one in group.shared
+        (constraint.first, constraint.second): {
+            fitted[constraint.first].trajectory.names[i] for i in constraint.images[:, 0].tolist()
+        }
+        for constraint in group.shared
     }
     pieces = [transformed(model.reconstruction, move) for model, move in zip(members, moves, strict=True)]
     whole, points = merge_models(pieces, agreeing=agreeing)
     number = {model.colmap_index: of_model for model, of_model in zip(members, points, strict=True)}
     same = [
         (number[placed.first][a], number[placed.second][b])
-        for placed in found
+        for placed in placed_images
         if {(placed.first, placed.second), (placed.second, placed.first)} & group.matched
         for a, b in placed.matches.tolist()
         if a in number[placed.first] and b in number[placed.second]

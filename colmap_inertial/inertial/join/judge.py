@@ -134,7 +134,7 @@ class _Judgement:
             return f"it would bring together models {numbers}, which contradict each other"
         if members not in self.trials:
             # what contradicts fewer submodels contradicts more of them
-            kept = [one for one in self.evidence.matched if pair_of(one) not in self.left_out]
+            kept = [constraint for constraint in self.evidence.matched if pair_of(constraint) not in self.left_out]
             self.trials[members] = _try_with_matches(self.evidence, members, kept)
         trial = self.trials[members]
         inside = (trial.described(gap, pair) for pair, gap in self.gaps.items() if gap.joined and pair in pairs)
@@ -145,10 +145,10 @@ class _Judgement:
         groups: dict[int, tuple[int, ...]] = {k: (k,) for k in range(len(self.evidence.submodels))}
         joined = [pair for pair, gap in self.gaps.items() if gap.joined]
         for pair in sorted(joined, key=lambda pair: self.gaps[pair].sigma_m or 0.0):
-            one, other = (groups[k] for k in pair)
-            if one == other:
+            first, second = (groups[k] for k in pair)
+            if first == second:
                 continue
-            members = tuple(sorted(one + other))
+            members = tuple(sorted(first + second))
             reason = self.try_group(members)
             if reason:
                 reason = f"with the parts that either is joined to: {reason}"
@@ -178,7 +178,10 @@ class _Judgement:
 
 
 def join_submodels(
-    submodels: Sequence[FittedSubmodel], imu: ImuRecording, limits: JoinOptions, found: Sequence[PlacedImages] = ()
+    submodels: Sequence[FittedSubmodel],
+    imu: ImuRecording,
+    limits: JoinOptions,
+    placed_images: Sequence[PlacedImages] = (),
 ) -> Joined:
     """Join submodels whose relative poses are known accurately enough.
 
@@ -193,13 +196,13 @@ def join_submodels(
         The IMU recording, as it was read.
     limits
         Up to where gaps are closed.
-    found
+    placed_images
         Images of one submodel that matches place in another. They count beside the IMU, and where they agree with it:
         what looks the same may be a copy.
     """
     if len(submodels) < 2:
         return Joined()
-    evidence = Evidence.of(submodels, imu, found)
+    evidence = Evidence.of(submodels, imu, placed_images)
     judgement = _Judgement(evidence, limits)
     ties = {*map(pair_of, evidence.links), *map(pair_of, evidence.shared), *evidence.incompatible}
     for pair in sorted(ties):
@@ -209,12 +212,12 @@ def join_submodels(
 
 
 def _of(ties: Sequence[ImuLink] | Sequence[SimilarityConstraint], pair: Pair) -> list[ImuLink | SimilarityConstraint]:
-    return [one for one in ties if pair_of(one) == pair]
+    return [tie for tie in ties if pair_of(tie) == pair]
 
 
 def _count_images(constraints: Sequence[SimilarityConstraint], pair: Pair) -> int:
     """Number of images of a pair that measured some constraints."""
-    return sum(len(one.images) for one in constraints if pair_of(one) == pair)
+    return sum(len(constraint.images) for constraint in constraints if pair_of(constraint) == pair)
 
 
 def _gap(evidence: Evidence, pair: Pair) -> Gap:
@@ -242,20 +245,24 @@ def _gap(evidence: Evidence, pair: Pair) -> Gap:
 
 def _try_with_matches(evidence: Evidence, members: Sequence[int], matched: Sequence[SimilarityConstraint]) -> Trial:
     """Place some submodels by all that ties them and by matches; without those of pairs that contradict the rest."""
-    inside = [one for one in matched if one.first in members and one.second in members]
+    inside = [constraint for constraint in matched if constraint.first in members and constraint.second in members]
     if inside:
         trial = _try(evidence, members, inside)
         if not trial.contradiction:
             return trial
     best = _try(evidence, members)
-    pairs = {pair_of(one) for one in inside}
+    pairs = {pair_of(constraint) for constraint in inside}
     if len(pairs) > 1 and not best.contradiction:
         # pairs that were tried by themselves agree with what ties them: they come first, then what shows most
         tied = {*map(pair_of, evidence.usable), *map(pair_of, evidence.shared)}
         for pair in sorted(pairs, key=lambda pair: (pair not in tied, -_count_images(inside, pair), pair)):
-            trial = _try(evidence, members, (*best.matched, *(one for one in inside if pair_of(one) == pair)))
+            trial = _try(
+                evidence,
+                members,
+                (*best.matched, *(constraint for constraint in inside if pair_of(constraint) == pair)),
+            )
             best = best if trial.contradiction else trial
-    return replace(best, left_out=frozenset(pairs - {pair_of(one) for one in best.matched}))
+    return replace(best, left_out=frozenset(pairs - {pair_of(constraint) for constraint in best.matched}))
 
 
 def _try(evidence: Evidence, members: Sequence[int], matched: Collection[SimilarityConstraint] = ()) -> Trial:
@@ -264,7 +271,7 @@ def _try(evidence: Evidence, members: Sequence[int], matched: Collection[Similar
     links = among(evidence.usable, members)
     images = among([*evidence.shared, *matched], members)
     ties: list[ImuLink | SimilarityConstraint] = [*links, *images]
-    if any(mounting_differs(submodels[i], submodels[j]) for i, j in {pair_of(one) for one in ties}):
+    if any(mounting_differs(submodels[i], submodels[j]) for i, j in {pair_of(constraint) for constraint in ties}):
         return Trial(contradiction=_OTHER_MOUNTING)
     if any(clocks_differ(submodels, link) for link in links):
         return Trial(contradiction=_OTHER_IMU)
@@ -277,13 +284,15 @@ def _try(evidence: Evidence, members: Sequence[int], matched: Collection[Similar
         fits_none = "no relative pose of the two models fits the IMU's motion between them"
         return Trial(contradiction=_OTHER_IMU if device_chi2 > chi2_limit(device_dof, real=True) else fits_none)
     # heading and place are all that submodels do not know of each other
-    dof = max(1, round(9 * len(links) + sum(one.equations for one in images)) - 4 * (len(members) - 1))
+    dof = max(1, round(9 * len(links) + sum(constraint.equations for constraint in images)) - 4 * (len(members) - 1))
     chi2 = max(0.0, placed.squares - device_chi2)
     inflation = max(1.0, chi2 / dof, device_chi2 / device_dof) * times_counted(submodels)
     placed = replace(placed, inflation=inflation)
     sigmas: dict[Pair, tuple[float, float]] = {}
     farthest = 0.0
-    for tie, misfit in zip(ties, [*placed.misfits, *(_misfit(placed, one) for one in images)], strict=True):
+    for tie, misfit in zip(
+        ties, [*placed.misfits, *(_misfit(placed, constraint) for constraint in images)], strict=True
+    ):
         cov = tie_cov(submodels, placed, tie)
         farthest = max(farthest, float(misfit @ np.linalg.solve(cov, misfit)))
         a, b = pair_of(tie)

@@ -166,12 +166,12 @@ class Problem:
     ) -> None:
         self.submodels, self.streams, self.links, self.constraints = submodels, streams, links, constraints
         self.held = held
-        used: list[set[int]] = [{0, len(one.path.nodes_s) - 1} for one in submodels]
+        used: list[set[int]] = [{0, len(submodel.path.nodes_s) - 1} for submodel in submodels]
         for link in links:
             for k, node in link.ends:
                 used[k].add(node)
         self.nodes = [np.array(sorted(of_one), dtype=np.int64) for of_one in used]
-        self.fits = [one.path.at(nodes) for one, nodes in zip(submodels, self.nodes, strict=True)]
+        self.fits = [submodel.path.at(nodes) for submodel, nodes in zip(submodels, self.nodes, strict=True)]
         # the scale, first of what a submodel has for itself, is a column of its placement
         sizes = [post.NODE * len(nodes) + post.OWN - 1 for nodes in self.nodes]
         self.begin = (PLACEMENT * len(submodels) + np.concatenate([[0], np.cumsum(sizes)])).astype(int).tolist()
@@ -324,8 +324,8 @@ class Problem:
 
     def _noise(self, link: ImuLink) -> ImuNoise:
         """Noise of the IMU between two submodels: that of the noisier one."""
-        one, other = (vars(self.submodels[k].path.noise.imu_over_seconds()) for k in (link.first, link.second))
-        return ImuNoise(**{name: max(one[name], other[name]) for name in one})
+        first, second = (vars(self.submodels[k].path.noise.imu_over_seconds()) for k in (link.first, link.second))
+        return ImuNoise(**{name: max(first[name], second[name]) for name in first})
 
     def misfit(self, state: Placements, link: ImuLink) -> Array:
         """(6,) by how much two submodels as they lie contradict the motion between them, at one link's ends."""
@@ -409,7 +409,7 @@ def place_submodels(problem: Problem, *, by_imu: bool = True) -> Placed:
     change = state.change[own + post.GRAVITY.start : own + post.GRAVITY.stop]
     return Placed(
         places=state,
-        origins=np.array([one.path.origin for one in problem.submodels]),
+        origins=np.array([submodel.path.origin for submodel in problem.submodels]),
         cov=cov[: PLACEMENT * count, : PLACEMENT * count],
         gravity_m_s2=problem.fits[problem.held].gravity_m_s2 + change,
         squares=squares,
@@ -423,12 +423,12 @@ def _information(cov: Array) -> Array:
     return np.asarray(np.linalg.inv(cov + 1e-9 * np.diag(sigma**2)), dtype=np.float64)
 
 
-def _device_offset(one: Posterior, other: Posterior) -> Array:
+def _device_offset(first: Posterior, second: Posterior) -> Array:
     """(25,) what one submodel has of the device, less what another one has."""
     out = np.zeros(post.SHARED)
-    out[post.ACCEL_DELAY] = one.accel_delay_s - other.accel_delay_s
-    out[post.GYRO_GAIN] = (one.gyro_gain - other.gyro_gain).ravel()
-    out[post.ACCEL_GAIN] = (one.accel_gain - other.accel_gain).ravel()
-    out[post.ROTATION] = so3_log(one.cam_from_imu @ other.cam_from_imu.T)
-    out[post.LEVER] = one.imu_in_cam_m - other.imu_in_cam_m
+    out[post.ACCEL_DELAY] = first.accel_delay_s - second.accel_delay_s
+    out[post.GYRO_GAIN] = (first.gyro_gain - second.gyro_gain).ravel()
+    out[post.ACCEL_GAIN] = (first.accel_gain - second.accel_gain).ravel()
+    out[post.ROTATION] = so3_log(first.cam_from_imu @ second.cam_from_imu.T)
+    out[post.LEVER] = first.imu_in_cam_m - second.imu_in_cam_m
     return out

@@ -52,9 +52,9 @@ def tie_cov(submodels: Sequence[FittedSubmodel], placed: Placed, tie: ImuLink | 
     if isinstance(tie, ImuLink):
         nodes = [tie.from_node, tie.to_node]
     else:
-        ends_s = [one.trajectory.t_s[i] for one, i in zip(members, images, strict=True)]
-        nodes = [int(np.argmin(np.abs(one.path.nodes_s - t_s))) for one, t_s in zip(members, ends_s, strict=True)]
-    points = [one.trajectory.cam_in_world[i] for one, i in zip(members, images, strict=True)]
+        ends_s = [member.trajectory.t_s[i] for member, i in zip(members, images, strict=True)]
+        nodes = [int(np.argmin(np.abs(member.path.nodes_s - t_s))) for member, t_s in zip(members, ends_s, strict=True)]
+    points = [member.trajectory.cam_in_world[i] for member, i in zip(members, images, strict=True)]
     return relative_cov(submodels, placed, points, pair, nodes)
 
 

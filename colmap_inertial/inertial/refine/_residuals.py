@@ -74,7 +74,7 @@ class Poses:
 
     def of(self, index: Int64Array) -> Poses:
         """Those of other observations, by number."""
-        return Poses(**{one.name: getattr(self, one.name)[index] for one in fields(self)})
+        return Poses(**{field.name: getattr(self, field.name)[index] for field in fields(self)})
 
 
 def poses_at(problem: Problem, x: Estimate, frame: Int64Array, line: Array) -> Poses:

@@ -221,8 +221,8 @@ class System:
         )
         system.corner[:seen, :seen] += corner
         system.rhs_shared[:seen] += rhs_shared
-        for one in rows.values():
-            system._add(one)
+        for block in rows.values():
+            system._add(block)
         band[:, 0] *= 1 + damping
         system.corner[np.diag_indices(shared)] *= 1 + damping
         return system

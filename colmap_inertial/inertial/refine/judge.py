@@ -159,7 +159,7 @@ def refine(
         raise NotObservableError("refinement", why)
     alone = pictures_alone(problem, at_once_px)
     noise = measure_picture_noise(alone, start)
-    problem, alone = (apply_noise(one, noise) for one in (problem, alone))
+    problem, alone = (apply_noise(each, noise) for each in (problem, alone))
     kept = ~_chosen(problem.observations)
     seen_alone, seen = solve(_part(alone, kept), start), solve(_part(problem, kept), start)
     # pictures alone may fit worse than with a rolling shutter: the IMU's own squares are the least that it costs
@@ -280,15 +280,15 @@ def _test_readout(
         prior=replace(problem.prior, info=info, mean=replace(problem.prior.mean, readout_s=0.0)),
     )
     without = solve(_part(still, kept), replace(seen.estimate, readout_s=0.0))
-    found = _readout(_part(problem, kept), seen.estimate)
-    if found is None or abs(found[0]) < max(LIMITS.least_readout_s, LIMITS.sure_sigma * found[1]):
+    readout = _readout(_part(problem, kept), seen.estimate)
+    if readout is None or abs(readout[0]) < max(LIMITS.least_readout_s, LIMITS.sure_sigma * readout[1]):
         return None, still, without
     better = evaluate_held_out(still, without.estimate, still.observations.select(~kept)) - evaluate_held_out(
         problem, seen.estimate, observations.select(~kept)
     )
     if len(better) < 2 or better.mean() < LIMITS.better_sigma * better.std(ddof=1) / len(better) ** 0.5:
         return None, still, without
-    return found, problem, seen
+    return readout, problem, seen
 
 
 def _doubt(alone: Solution, seen: Solution, chi2: float, change: float, spread: float) -> str:
@@ -339,7 +339,7 @@ def drift_map(
     solved, by
         The information at ``x``, and the camera's motion there.
     """
-    before, after = (move_to_middle_lines(problem, one).cam_in_world for one in (start, x))
+    before, after = (move_to_middle_lines(problem, estimate).cam_in_world for estimate in (start, x))
     timed = np.isfinite(t_s)
     first_s, last_s = float(t_s[timed].min()), float(t_s[timed].max())
     edges = np.linspace(first_s, last_s, max(1, round((last_s - first_s) / LIMITS.part_s)) + 1).tolist()

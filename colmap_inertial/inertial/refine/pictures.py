@@ -67,14 +67,14 @@ def remove_extremes(seen: Seen) -> Seen:
 
     Beside their observations, rounding hides what the others tell.
     """
-    one = seen.observations
-    away = seen.points[one.point] - seen.cam_in_world[one.frame]
-    depth = np.einsum("ni,ni->n", seen.cam_from_world[one.frame, 2], away)
+    observed = seen.observations
+    away = seen.points[observed.point] - seen.cam_in_world[observed.frame]
+    depth = np.einsum("ni,ni->n", seen.cam_from_world[observed.frame, 2], away)
     extent = float(np.linalg.norm(np.ptp(seen.cam_in_world, axis=0)))
     wrong = (depth < extent / _EXTREME) | (depth > extent * _EXTREME)
-    kept = np.bincount(one.point, wrong, minlength=len(seen.points)) == 0
-    mine = kept[one.point]
-    observations = replace(one.select(mine), point=np.cumsum(kept)[one.point[mine]] - 1)
+    kept = np.bincount(observed.point, wrong, minlength=len(seen.points)) == 0
+    mine = kept[observed.point]
+    observations = replace(observed.select(mine), point=np.cumsum(kept)[observed.point[mine]] - 1)
     return replace(
         seen,
         point_ids=tuple(np.array(seen.point_ids)[kept].tolist()),

@@ -146,10 +146,10 @@ def lines_of(seen: Seen, timing: FrameTiming, xy_px: Array) -> Array:
     if timing.readout_s == 0:
         return out
     index = {name: i for i, name in enumerate(timing.names)}
-    one = replace(timing, readout_s=0.5)  # of any length: shares are asked for
+    long_readout = replace(timing, readout_s=0.5)  # of any length: shares are asked for
     for i, camera in enumerate(seen.cameras):
         mine = seen.camera_of[seen.observations.frame] == i
-        shutter = FrameShutter.of(one, next(iter(index.values())), width=camera.width, height=camera.height)
+        shutter = FrameShutter.of(long_readout, next(iter(index.values())), width=camera.width, height=camera.height)
         out[mine] = (shutter.middle_s(xy_px[mine]) - shutter.reference_s()) / 0.5
     return out
 

@@ -76,7 +76,7 @@ def _evaluate(problem: Problem, x: Estimate, observations: Observations) -> _Poi
     projected = project(problem, x, observations)
     rows, offset = all_rows(problem, x), prior_offset(problem, x)
     cost = float(np.sum(robust_cost(projected.residual, problem.sigma_px, problem.robust_px)))
-    cost += 0.5 * sum(float(np.sum(one.residual**2)) for one in rows.values())
+    cost += 0.5 * sum(float(np.sum(block.residual**2)) for block in rows.values())
     # a point that a step brings behind the camera must not look like a gain
     cost += float(np.sum(~projected.seen)) * (problem.robust_px / problem.sigma_px) ** 2 * 5
     cost += 0.5 * float(offset @ problem.prior.info @ offset)
@@ -175,20 +175,20 @@ def _promised(
     change += by.by_shared @ shared[: by.by_shared.shape[2]]
     change += np.einsum("nri,ni->nr", by.by_point, points[observations.point])
     total = -float(np.sum(change * residual)) - 0.5 * float(np.sum(change**2))
-    for one in at.rows.values():
-        count = len(one.residual)
-        moved = np.einsum("nri,ni->nr", one.here, states[:count])
-        if one.after is not None:
-            moved += np.einsum("nri,ni->nr", one.after, states[1:])
-        if one.by_shared is not None:
-            moved += one.by_shared @ shared
-        total -= float(np.sum(moved * one.residual)) + 0.5 * float(np.sum(moved**2))
+    for block in at.rows.values():
+        count = len(block.residual)
+        moved = np.einsum("nri,ni->nr", block.here, states[:count])
+        if block.after is not None:
+            moved += np.einsum("nri,ni->nr", block.after, states[1:])
+        if block.by_shared is not None:
+            moved += block.by_shared @ shared
+        total -= float(np.sum(moved * block.residual)) + 0.5 * float(np.sum(moved**2))
     info = problem.prior.info
     return total - float(shared @ info @ (at.offset + 0.5 * shared))
 
 
 def _solution(at: _Point, steps: int, *, converged: bool) -> Solution:
-    squares = {name: float(np.sum(one.residual**2)) for name, one in at.rows.items()}
+    squares = {name: float(np.sum(block.residual**2)) for name, block in at.rows.items()}
     return Solution(estimate=at.estimate, cost=at.cost, squares=squares, steps=steps, converged=converged)
 
 

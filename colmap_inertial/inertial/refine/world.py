@@ -138,8 +138,8 @@ def _doubts(first: AcceptedScale, move: Similarity, problem: Problem, x: Estimat
     out, gains = [], x.columns.accel_gain
     errors = x.accel_gain.ravel()
     if errors @ problem.prior.info[gains, gains] @ errors > LARGEST_GAIN_CHI2:
-        said = ", ".join(f"{-100 * gain:+.1f}" for gain in np.diagonal(x.accel_gain))
-        out.append(f"the refinement finds the accelerometer off in gain by {said} % on its axes: calibrate it")
+        gains_pct = ", ".join(f"{-100 * gain:+.1f}" for gain in np.diagonal(x.accel_gain))
+        out.append(f"the refinement finds the accelerometer off in gain by {gains_pct} % on its axes: calibrate it")
     if abs(np.log(move.scale)) > Z95 * first.sigma_log:
         out.append(
             f"the refinement's scale is {100 * (move.scale - 1):+.1f} % from the first one, which said "

@@ -104,14 +104,14 @@ def remarks(trajectory: CameraTrajectory, timed: CameraTimedImu) -> tuple[str, .
     """
     gyro_s, accel_s = timed.gyro_t_s, timed.accel_t_s
     covered = (max(gyro_s[0], accel_s[0]), min(gyro_s[-1], accel_s[-1]))
-    said = (
+    causes = (
         _far_apart(trajectory, timed),
         _pauses("gyroscope", gyro_s, trajectory),
         _pauses("accelerometer", accel_s, trajectory),
         _uncovered(trajectory, covered),
         _warmer(timed.imu),
     )
-    return tuple(sentence for sentence in said if sentence)
+    return tuple(sentence for sentence in causes if sentence)
 
 
 def _far_apart(trajectory: CameraTrajectory, timed: CameraTimedImu) -> str:
@@ -312,10 +312,10 @@ def _estimate_without_end(
     trajectory: CameraTrajectory,
     timed: CameraTimedImu,
     options: ScaleOptions,
-    found: tuple[ScaleEstimate, tuple[str, ...]],
+    estimated: tuple[ScaleEstimate, tuple[str, ...]],
 ) -> tuple[ScaleEstimate, tuple[str, ...]]:
     """The scale without the first or last cameras, as few as it takes, where it is far better known."""
-    best, moved = found
+    best, moved = estimated
     assert best.cov is not None
     limit = _MOVED.shrinks_much**2 * float(best.cov[0, 0])
     sound, number = ~np.isin(trajectory.names, moved), np.arange(len(trajectory))

@@ -58,12 +58,12 @@ def scale_drift(data: Data, noise: Noise, optimum: _Optimum, inflation: float) -
     for i, (first, last) in enumerate(zip(*nodes, strict=True)):
         columns[first:last, :, i] = path[first] - path[first:last]
         columns[last:, :, i] = path[first] - path[last]
-    found = optimum.score(columns, data, noise)
+    score = optimum.score(columns, data, noise)
     # All parts together are the scale itself, so that only contrasts between parts are known
     contrasts = np.linalg.qr(np.column_stack([np.ones(parts), np.eye(parts)[:, 1:]]))[0][:, 1:]
-    cov = np.linalg.inv(contrasts.T @ found.information @ contrasts) * inflation
+    cov = np.linalg.inv(contrasts.T @ score.information @ contrasts) * inflation
     # The columns are those of u, the inverse of the metres per unit
-    log_ratio = (cov / inflation) @ (contrasts.T @ -found.score)
+    log_ratio = (cov / inflation) @ (contrasts.T @ -score.score)
     tested = np.linalg.inv(cov + tolerated_log**2 * np.eye(parts - 1))
     chi2 = float(log_ratio @ tested @ log_ratio)
     middle_s = 0.5 * (edges_s[1:] + edges_s[:-1])
@@ -197,7 +197,7 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
     inflation = max(1.0, *(squares / expected for squares, expected in sums.values()))
     drift = scale_drift(data, noise, at, inflation)
     weights = [groups[name].weight for name in ("rotation", "centre")]
-    weight = np.min([one for one in weights if one is not None], axis=0)
+    weight = np.min([each for each in weights if each is not None], axis=0)
     kinds, columns = shape.shape_columns(data.t_s, shape.camera_path(x))
     return Fit(
         estimate=x,

@@ -97,17 +97,19 @@ def columns(data: Data, x: Estimate, imu: fac.Group) -> tuple[dict[str, slice], 
     )
     nodes_s = node_stamps(data, x)
     where: dict[str, slice] = {}
-    found: list[Preintegrated] = []
+    perturbed: list[Preintegrated] = []
     for name, changes in perturbations(accel, par.middle_s(data.t_s)).items():
-        where[name] = slice(len(found), len(found) + len(changes))
+        where[name] = slice(len(perturbed), len(perturbed) + len(changes))
         # increments are linear in the readings of the accelerometer
-        found += [
+        perturbed += [
             preintegrate(
                 nodes_s, SensorStreams(gyro=data.streams.gyro, accel=accel.with_samples(accel.t_s, change)), errors
             )
             for change in changes
         ]
-    by = np.stack([np.concatenate([np.zeros((k, 3)), -pre.velocity, -pre.position], axis=1) for pre in found], axis=2)
+    by = np.stack(
+        [np.concatenate([np.zeros((k, 3)), -pre.velocity, -pre.position], axis=1) for pre in perturbed], axis=2
+    )
     return where, np.asarray(imu.root @ by)
 
 
@@ -139,7 +141,7 @@ def suspicions(
     return out
 
 
-def worst(found: list[Suspicion], accel: SensorStream, known: Collection[str] = ()) -> Suspicion | None:
+def worst(suspicions: list[Suspicion], accel: SensorStream, known: Collection[str] = ()) -> Suspicion | None:
     """The strongest suspicion that is more than chance, None where there is none.
 
     Of what is ``known`` to be wrong already, more than half a standard deviation that is left counts. Stamps that part
@@ -148,12 +150,16 @@ def worst(found: list[Suspicion], accel: SensorStream, known: Collection[str] = 
     """
     least_rate = float(np.median(np.diff(accel.t_s)) / np.ptp(accel.t_s))
 
-    def counts(one: Suspicion) -> bool:
-        if one.name in known:
-            return one.chi2 > _LEFT_CHI2 * len(one.value)
-        return one.chi2 > _LARGEST_CHI2 and (one.name != "rate" or abs(float(one.value[0])) > least_rate)
+    def counts(suspicion: Suspicion) -> bool:
+        if suspicion.name in known:
+            return suspicion.chi2 > _LEFT_CHI2 * len(suspicion.value)
+        return suspicion.chi2 > _LARGEST_CHI2 and (
+            suspicion.name != "rate" or abs(float(suspicion.value[0])) > least_rate
+        )
 
-    return max(filter(counts, found), key=lambda one: (not _is_of_path(one), one.chi2), default=None)
+    return max(
+        filter(counts, suspicions), key=lambda suspicion: (not _is_of_path(suspicion), suspicion.chi2), default=None
+    )
 
 
 def _is_of_path(suspicion: Suspicion) -> bool:

@@ -134,7 +134,7 @@ def estimate_joint(
         return ScaleEstimate.refused("joint", error.hint)
     except np.linalg.LinAlgError:
         return ScaleEstimate.refused("joint", f"camera and IMU do not determine a scale together: {_RECORD_INSTEAD}")
-    left_open = sum(one.scale_variance for one in fit.suspicions if one.name in faults.values)
+    left_open = sum(suspicion.scale_variance for suspicion in fit.suspicions if suspicion.name in faults.values)
     fit = replace(fit, variance_parts={**fit.variance_parts, "accel_faults": left_open})
     wrong = [*faults.sentences(), *_cut_off(data)]
     # what was taken from a path nobody can put back: its scale is too large by more than any interval says
@@ -194,11 +194,11 @@ def _fit_soundly(data: Data, prior: Prior, sheet: ImuNoise | None) -> tuple[Fit,
             # not from the start: on its way a fit passes gains that it would not find back from
             prior = replace(prior, heavy_gains=True)
             fit = fit_jointly(sound, faults.loosened(prior), sheet)
-        found = worst(fit.suspicions, data.streams.accel, faults.values)
+        suspicion = worst(fit.suspicions, data.streams.accel, faults.values)
         # a fit of what does not belong together explains nothing
-        if found is None or _refusals(fit, data.t_s):
+        if suspicion is None or _refusals(fit, data.t_s):
             break
-        faults = faults.with_found(found)
+        faults = faults.with_found(suspicion)
         if faults.path_is_smoothed:
             break
         sound = faults.undone(data)
@@ -256,15 +256,15 @@ def _judged(
     squares = sum(s for s, _ in fit.sums.values())
     expected = sum(e for _, e in fit.sums.values())
     clock_rate = calibration.clock_rate + x.clock_rate
-    found = scale_of(fit, t_s, calibrated, clock_rate)
-    metres_per_unit, sigma_log = found.metres_per_unit, found.sigma_log
+    scale = scale_of(fit, t_s, calibrated, clock_rate)
+    metres_per_unit, sigma_log = scale.metres_per_unit, scale.sigma_log
     refusals = [*_refusals(fit, t_s), *(wrong if worthless else ())]
     verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, refusals=refusals)
     if verdict == "refused":
         reasons = (*reasons, *(() if worthless else wrong))
     else:
-        bent = [fault.sentence(t_s, found.widened) for fault in shape] or _check_drift(fit.drift)
-        doubts = [*wrong, *check_clocks(clock_rate), *_checks(fit, t_s, found.wrong_gain), *bent]
+        bent = [fault.sentence(t_s, scale.widened) for fault in shape] or _check_drift(fit.drift)
+        doubts = [*wrong, *check_clocks(clock_rate), *_checks(fit, t_s, scale.wrong_gain), *bent]
         verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, doubts)
     notes: tuple[str, ...] = ()
     if len(fit.jumped_s):
@@ -293,7 +293,7 @@ def _judged(
         dof=max(1, round(expected)),
         excitation_m_s2=fit.excitation_m_s2,
         drift=fit.drift,
-        parts=None if refused else found.parts,
+        parts=None if refused else scale.parts,
         noise=fit.noise.imu_over_seconds(),
     )
 

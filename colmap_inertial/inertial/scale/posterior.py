@@ -246,8 +246,10 @@ class FittedPath:
         moved = [along[NODE * i : NODE * (i + 1)] for i in range(n)]
         nodes_of = np.array(moved).reshape(n, NODE)
         guess = self._aligned
-        found = np.concatenate([[x.accel_delay_s], x.gyro_gain.ravel(), x.accel_gain.ravel(), np.zeros(3), np.zeros(3)])
-        found[LEVER] = x.imu_in_cam_m - guess.imu_in_cam_m
+        shared = np.concatenate(
+            [[x.accel_delay_s], x.gyro_gain.ravel(), x.accel_gain.ravel(), np.zeros(3), np.zeros(3)]
+        )
+        shared[LEVER] = x.imu_in_cam_m - guess.imu_in_cam_m
         # of the rotation, and of the offset, the alignment by the very data is all that was there before
         info = np.zeros_like(mean)
         kept = np.r_[np.arange(ROTATION.start), np.arange(LEVER.start, LEVER.stop)]
@@ -270,7 +272,7 @@ class FittedPath:
             since_middle_s=t_s[nodes] - par.middle_s(t_s),
             cov=cov,
             prior_info=info,
-            prior_offset=found,
+            prior_offset=shared,
         )
 
 

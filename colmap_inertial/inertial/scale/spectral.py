@@ -214,14 +214,14 @@ def _noise_of(data: Spectra, state: _State, before: _Noise) -> _Noise:
 
     least = 2 * np.log(_LEAST_NOISE)
     start = np.array([max(float(np.log(before.inertial[0])), least), 1.0])
-    found = minimize(
+    minimum = minimize(
         cost,
         start,
         method="Nelder-Mead",
         bounds=[(least, 10.0), (0.0, 10.0)],
         options={"xatol": 0.02, "fatol": 0.02, "initial_simplex": start + np.array([[0, 0], [2.0, 0], [0, 2.0]])},
     )
-    level, factor = np.exp(found.x)
+    level, factor = np.exp(minimum.x)
     return _Noise(inertial=np.full(len(power), level), visual=factor * data.visual_noise)
 
 

@@ -196,9 +196,9 @@ def parts_in_words(parts: Mapping[str, float]) -> tuple[str, str]:
     """
     whole = sum(sigma**2 for sigma in parts.values()) ** 0.5
     largest = sorted(parts.items(), key=lambda part: -part[1])
-    said = [
+    words = [
         f"{CAUSES[name].words} +-{100 * half_width(sigma):.2g} %"
         for name, sigma in largest
         if sigma >= _WORTH_SAYING * whole
     ]
-    return f"{', '.join(said)}; they combine as root sum of squares", CAUSES[largest[0][0]].advice
+    return f"{', '.join(words)}; they combine as root sum of squares", CAUSES[largest[0][0]].advice

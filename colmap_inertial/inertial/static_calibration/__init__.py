@@ -191,7 +191,7 @@ def _judged(
             f"the attitudes are too much alike: the accelerometer's gain along {_listed(unknown)} stays unknown. Each "
             f"axis must point up once and down once: {_HOW}",
         )
-    weak, said = [], []
+    weak, notes = [], []
     count = rests.attitudes
     if count < FULL_ATTITUDES:
         weak.append(
@@ -230,11 +230,11 @@ def _judged(
         )
     if gravity_sigma_m_s2 > 2e-3:
         part = 196 * gravity_sigma_m_s2 / calibration.gravity_m_s2
-        said.append(
+        notes.append(
             f"the strength of gravity is assumed, which alone makes the gains uncertain by +-{part:.1g} %: give the "
             "latitude (and the height) of the place"
         )
-    return ("weak" if weak else "good"), (*weak, *said)
+    return ("weak" if weak else "good"), (*weak, *notes)
 
 
 def _listed(axes: list[str]) -> str:

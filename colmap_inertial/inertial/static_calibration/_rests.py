@@ -88,14 +88,14 @@ def candidate_rests(imu: ImuRecording) -> list[Rests]:
     if not whole.any():
         return []
     quiet_accel, quiet_gyro = (float(np.quantile(var[whole], _LIMITS.quietest)) for var in (accel_var, gyro_var))
-    found = []
+    rests = []
     for multiple in _LIMITS.multiples:
         still = whole & (accel_var <= min(multiple**2 * quiet_accel, _LIMITS.held_m_s2**2))
         still &= gyro_var <= min(multiple**2 * quiet_gyro, _LIMITS.held_rad_s**2)
         spans = _spans(t_s, still)
         if len(spans) > 0:
-            found.append(_averaged(imu, spans))
-    return found
+            rests.append(_averaged(imu, spans))
+    return rests
 
 
 def _window_variance(t_s: Array, values: Array) -> tuple[Array, Array] | None:

@@ -332,7 +332,7 @@ def chained(
     )
     placed = {held}
     while len(placed) < len(start.scale):
-        tie = next((one for one in ties if (one.first in placed) != (one.second in placed)), None)
+        tie = next((link for link in ties if (link.first in placed) != (link.second in placed)), None)
         if tie is None:
             raise ValueError("every submodel must be tied to the held one")
         new = tie.second if tie.first in placed else tie.first
@@ -344,5 +344,5 @@ def chained(
 def among(ties: Iterable[Tie], members: Sequence[int]) -> list[Tie]:
     """Constraints within a group, by places in the group."""
     index: Mapping[int, int] = {k: i for i, k in enumerate(members)}
-    inside = (one for one in ties if one.first in index and one.second in index)
-    return [replace(one, first=index[one.first], second=index[one.second]) for one in inside]
+    inside = (tie for tie in ties if tie.first in index and tie.second in index)
+    return [replace(tie, first=index[tie.first], second=index[tie.second]) for tie in inside]

@@ -94,9 +94,9 @@ def _add_camera(whole: pycolmap.Reconstruction, model: pycolmap.Reconstruction, 
 
     camera, cameras = model.camera(number), whole.cameras
 
-    def same(one: pycolmap.Camera) -> bool:
-        sizes = (one.model, one.width, one.height) == (camera.model, camera.width, camera.height)
-        return sizes and np.array_equal(one.params, camera.params)
+    def same(candidate: pycolmap.Camera) -> bool:
+        sizes = (candidate.model, candidate.width, candidate.height) == (camera.model, camera.width, camera.height)
+        return sizes and np.array_equal(candidate.params, camera.params)
 
     first = [i for i in (number, *sorted(cameras)) if i in cameras and same(cameras[i])]
     if first and number in cameras:

@@ -75,8 +75,8 @@ def align_camera_imu(
 
     As :func:`align_clocks`, without the clock rate: for clocks that keep step, which all but action cameras' do.
     """
-    found = align_clocks(trajectory, imu, prior=prior, options=options).calibration
-    return replace(found, clock_rate=0.0, clock_middle_s=0.0)
+    calibration = align_clocks(trajectory, imu, prior=prior, options=options).calibration
+    return replace(calibration, clock_rate=0.0, clock_middle_s=0.0)
 
 
 @one_blas_thread()
@@ -254,26 +254,26 @@ class _Search:
         t_s = trajectory.t_s
         if t_s[-1] - t_s[0] < 2 * _PART_S:
             return None
-        found: list[tuple[float, ClockFit]] = []
+        fits: list[tuple[float, ClockFit]] = []
         for begin_s in np.linspace(t_s[0], t_s[-1] - _PART_S, _PARTS):
             part = trajectory.select((t_s >= begin_s) & (t_s <= begin_s + _PART_S))
             if len(part) >= 5:
                 fit = self.whole(part)
                 if isinstance(fit, ClockFit):
-                    found.append((begin_s + 0.5 * _PART_S, fit))
+                    fits.append((begin_s + 0.5 * _PART_S, fit))
         best: tuple[int, float, float] | None = None
-        for i, (time_i, fit_i) in enumerate(found):
-            for time_j, fit_j in found[i + 1 :]:
+        for i, (time_i, fit_i) in enumerate(fits):
+            for time_j, fit_j in fits[i + 1 :]:
                 rate = (fit_j.offset_s - fit_i.offset_s) / (time_j - time_i)
                 at_zero_s = fit_i.offset_s - rate * time_i
-                agreeing = sum(abs(fit.offset_s - at_zero_s - rate * time) < _UNSTEADY_S for time, fit in found)
+                agreeing = sum(abs(fit.offset_s - at_zero_s - rate * time) < _UNSTEADY_S for time, fit in fits)
                 if abs(rate) <= _FASTEST_DRIFT and (best is None or agreeing > best[0]):
                     best = (agreeing, rate, at_zero_s)
-        if best is None or best[0] < max(2, (len(found) + 1) // 2):
+        if best is None or best[0] < max(2, (len(fits) + 1) // 2):
             return None
         _, rate, at_zero_s = best
         middle_s = middle_of_overlap(trajectory, self.path.t_s, at_zero_s + rate * 0.5 * float(t_s[0] + t_s[-1]))
-        return replace(found[0][1], offset_s=at_zero_s + rate * middle_s), rate
+        return replace(fits[0][1], offset_s=at_zero_s + rate * middle_s), rate
 
 
 __all__ = [

@@ -136,7 +136,7 @@ def describe_consensus(consensus: RotationConsensus) -> tuple[str, ...]:
     out = []
     wrong, count = consensus.wrong, len(consensus.names)
     if wrong:
-        named = ", ".join(f"{one.name} ({one.deviation_deg:.0f} deg)" for one in wrong[:5])
+        named = ", ".join(f"{camera.name} ({camera.deviation_deg:.0f} deg)" for camera in wrong[:5])
         more = f" and {len(wrong) - 5} more" if len(wrong) > 5 else ""
         out.append(f"{len(wrong)} of {count} cameras contradict the gyroscope and were left out: {named}{more}")
     if consensus.moved:

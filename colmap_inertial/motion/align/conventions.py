@@ -130,7 +130,7 @@ class LikelyConvention:
         fits = "the IMU fits the camera's motion if"
         if len(self.written_as) > 1:
             fits = "the gyroscope fits the camera's rotations if"
-        return f"{fits} {', or '.join(_difference(self.read_as, one) for one in self.written_as)}"
+        return f"{fits} {', or '.join(_difference(self.read_as, convention) for convention in self.written_as)}"
 
     @property
     def advice(self) -> str:
@@ -222,8 +222,8 @@ def likely_convention(
     candidates = _evaluate_conventions(trajectory, imu, read_as, prior, fit)
     if not candidates:
         return None
-    best = max(candidates, key=lambda one: one.evidence)
-    as_read = next((one for one in candidates if one.convention == read_as), None)
+    best = max(candidates, key=lambda candidate: candidate.evidence)
+    as_read = next((candidate for candidate in candidates if candidate.convention == read_as), None)
     ahead = np.inf if as_read is None else best.evidence - as_read.evidence
     if ahead < margin or (best.steadiness < _STEADY and best.explained < _BEYOND_DOUBT):
         return None
@@ -233,8 +233,8 @@ def likely_convention(
         explains = best.acceleration - best.still >= margin
         if lead < -margin or (lead < margin and not explains):
             return None
-    equal = tuple(one.convention for one in candidates if best.evidence - one.evidence < margin)
-    as_positions = tuple(one for one in equal if one.position == read_as.position)
+    equal = tuple(candidate.convention for candidate in candidates if best.evidence - candidate.evidence < margin)
+    as_positions = tuple(candidate for candidate in equal if candidate.position == read_as.position)
     return LikelyConvention(read_as=read_as, written_as=as_positions or equal, log_likelihood=float(ahead))
 
 

@@ -238,13 +238,13 @@ def most_likely(chain_of: Callable[[Array], Chain], start: Array, *, expected: A
         return -chain_of(logs).log_likelihood + 0.5 * float(np.sum(((logs - expected) / spread) ** 2))
 
     simplex = np.concatenate([start[None], start + 1.5 * np.eye(len(start))])
-    found = minimize(
+    minimum = minimize(
         cost,
         start,
         method="Nelder-Mead",
         options={"xatol": 0.1, "fatol": 0.1, "maxiter": 150, "initial_simplex": simplex},
     )
-    return np.asarray(found.x)
+    return np.asarray(minimum.x)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -422,8 +422,8 @@ class _Model:
             return 0.5 * (freedom * np.log(variance(chain)) + 3 * chain.log_determinant)
 
         bounds = (np.log(_LIMITS.shortest), np.log(_LIMITS.longest))
-        found = minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 0.02})
-        constant = float(np.exp(found.x))
+        minimum = minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 0.02})
+        constant = float(np.exp(minimum.x))
         return constant, self.chain(constant, variance(self.chain(constant, 1.0)))
 
 

@@ -266,8 +266,8 @@ def _remove_outliers(model: _Model, limit: float) -> tuple[_Model, Array]:
         wrong, jumped = chain.outlier_statistics()
         left_out, jumps = worst_outliers(model.t_s, wrong, jumped, limit=limit, reach=_LIMITS.reach_s)
         left_out, jumps = model.left_out | left_out, model.jumps | jumps
-        found = left_out.sum() + jumps.sum()
-        if found == model.left_out.sum() + model.jumps.sum() or found > _LIMITS.most_outliers * len(model.t_s):
+        removed = left_out.sum() + jumps.sum()
+        if removed == model.left_out.sum() + model.jumps.sum() or removed > _LIMITS.most_outliers * len(model.t_s):
             break
         model = replace(model, left_out=left_out, jumps=jumps)
     return model, logs

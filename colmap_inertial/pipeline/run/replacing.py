@@ -74,11 +74,11 @@ def replace_result(workspace: Workspace) -> None:
         if not beside.result.is_file():
             return
         write_json(record, {"earlier": _entries(workspace), "new": _entries(beside)})
-    said, earlier = read_json(record), workspace.stamps / _EARLIER
+    record_now, earlier = read_json(record), workspace.stamps / _EARLIER
     workspace.unfinish()
-    for name in sorted({*said["earlier"], *said["new"]} - {workspace.result.name}):
+    for name in sorted({*record_now["earlier"], *record_now["new"]} - {workspace.result.name}):
         here, new, aside = (root / name for root in (workspace.root, beside.root, earlier))
-        if os.path.lexists(here) and (os.path.lexists(new) or name not in said["new"]):
+        if os.path.lexists(here) and (os.path.lexists(new) or name not in record_now["new"]):
             remove(aside)
             aside.parent.mkdir(parents=True, exist_ok=True)
             os.replace(here, aside)
@@ -106,11 +106,11 @@ def moved(value: T, source: Path, target: Path) -> T:
         changed = target / value.relative_to(source) if value.is_relative_to(source) else value
     elif dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.init}
-        new = {name: moved(one, source, target) for name, one in fields.items()}
-        if any(new[name] is not one for name, one in fields.items()):
+        new = {name: moved(item, source, target) for name, item in fields.items()}
+        if any(new[name] is not item for name, item in fields.items()):
             changed = dataclasses.replace(value, **new)
     elif type(value) is tuple:
-        items = tuple(moved(one, source, target) for one in changed)
+        items = tuple(moved(item, source, target) for item in changed)
         changed = items if any(new is not old for new, old in zip(items, changed, strict=True)) else value
     return cast(T, changed)
 
@@ -141,7 +141,7 @@ def _link_file(source: str | Path, target: str | Path) -> None:
 
 
 def _flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    found: dict[str, Any] = {}
+    flat: dict[str, Any] = {}
     for key, value in table.items():
-        found |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {prefix + key: value}
-    return found
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {prefix + key: value}
+    return flat

@@ -174,10 +174,10 @@ class _File:
         try:
             stat = path.lstat()
             same = (stat.st_size, stat.st_ctime_ns) == (self.size, self.changed_ns)
-            found = self if same else _File.of(root, path)
+            current = self if same else _File.of(root, path)
         except (OSError, FormatError):
             return None
-        return found if (found.size, found.digest) == (self.size, self.digest) else None
+        return current if (current.size, current.digest) == (self.size, self.digest) else None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,11 +196,11 @@ class _Stamp:
 
 def _files_in(root: Path, paths: Iterable[Path]) -> tuple[_File, ...]:
     """Some files and folders, which need not be there, and the files in them."""
-    found = {path for path in paths if os.path.lexists(path)}
-    for folder in [path for path in found if path.is_dir() and not path.is_symlink()]:
+    files = {path for path in paths if os.path.lexists(path)}
+    for folder in [path for path in files if path.is_dir() and not path.is_symlink()]:
         for here, folders, names in os.walk(folder):
-            found |= {Path(here, name) for name in (*folders, *names)}
-    return tuple(_File.of(root, path) for path in sorted(found))
+            files |= {Path(here, name) for name in (*folders, *names)}
+    return tuple(_File.of(root, path) for path in sorted(files))
 
 
 def find_loss(workspace: Workspace, steps: Iterable[str], *, but: Iterable[Path] = ()) -> str:
@@ -232,8 +232,8 @@ def find_change(workspace: Workspace, paths: Iterable[Path]) -> Path | None:
     stamps = filter(None, map(_read_stamp, workspace.stamps.glob("*.json")))
     known = {file.name: file for stamp in stamps for file in stamp.files}
     root, inside = workspace.root, (path for path in paths if path.is_relative_to(workspace.root))
-    found = ((path, known.get(path.relative_to(root).as_posix())) for path in inside)
-    return next((path for path, file in found if file is not None and file.now(root) is None), None)
+    pairs = ((path, known.get(path.relative_to(root).as_posix())) for path in inside)
+    return next((path for path, file in pairs if file is not None and file.now(root) is None), None)
 
 
 class StepRunner:

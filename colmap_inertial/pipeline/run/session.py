@@ -222,17 +222,17 @@ _PROVIDERS: Mapping[str, tuple[str, ...]] = {
 
 def conflicts() -> list[str]:
     """A sentence for each module that several installed distributions bring, on what to do."""
-    found = []
+    clashes = []
     for module, names in _PROVIDERS.items():
         there = [f"{name} {version}" for name in names if (version := _version(name)) is not None]
         if len(there) > 1:
             kept = there[-1].split()[0] if module == "pycolmap" else there[0].split()[0]
-            every = " ".join(one.split()[0] for one in there)
-            found.append(
+            every = " ".join(word.split()[0] for word in there)
+            clashes.append(
                 f"{' and '.join(there)} are installed, and each brings the module {module}: the files of the last one "
                 f"overwrote the others'; keep one of them: pip uninstall {every}; pip install {kept}"
             )
-    return found
+    return clashes
 
 
 def warn_of_conflicts() -> None:

@@ -190,8 +190,8 @@ class ExposureStage:
             if done is None:
                 yield frame
                 continue
-            said = Treatment(stage="exposures", reason=done.reason, values={"pair": asdict(done)})
-            yield replace(frame, treatments=(*frame.treatments, said))
+            treatment = Treatment(stage="exposures", reason=done.reason, values={"pair": asdict(done)})
+            yield replace(frame, treatments=(*frame.treatments, treatment))
 
     def _gyro(self) -> Callable[[str], PairGyro | None]:
         """The gyroscope's part for each name."""
@@ -255,10 +255,10 @@ def _alone(
         if alone.used == "long"
         else f"the short exposure, {alone.gain:.3g} times as bright"
     )
-    said = replace(done, used=alone.used, reason=f"is {what}, and not fused: {why}")
+    treated = replace(done, used=alone.used, reason=f"is {what}, and not fused: {why}")
     if alone.used == "short":
-        said = replace(said, gain=alone.gain)
-    return _replace_light(frame, alone.image), said
+        treated = replace(treated, gain=alone.gain)
+    return _replace_light(frame, alone.image), treated
 
 
 def _replace_light(frame: Frame, light: Float32Array) -> Frame:
@@ -320,9 +320,11 @@ def _describe_pair(pair: ExposurePair, path: Path) -> str:
         if used
     ]
     aligned = f"aligned by {' and '.join(by)}" if by else "not aligned: no shift makes them agree better"
-    said = f"fused with {path.name}, which has {pair.brightness.gain:.3g} times the light; {aligned}"
+    description = f"fused with {path.name}, which has {pair.brightness.gain:.3g} times the light; {aligned}"
     if pair.gyro_note and pair.gyro_note != "no gyroscope":
-        said += f" ({pair.gyro_note})"
+        description += f" ({pair.gyro_note})"
     if pair.brightness.contradicts:
-        said += f"; exposure times and sensitivities say {pair.brightness.stated:.3g} times, which the pixels do not"
-    return said
+        description += (
+            f"; exposure times and sensitivities say {pair.brightness.stated:.3g} times, which the pixels do not"
+        )
+    return description

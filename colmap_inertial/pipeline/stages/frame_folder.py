@@ -108,13 +108,13 @@ class _Originals:
 
     def pop_through(self, name: str) -> AnyArray | None:
         """The original of ``name``; forgets it and, as order is kept, every frame before it."""
-        found = None
+        original = None
         for known in list(self._arrays):
             array = self._arrays.pop(known)
             if known == name:
-                found = array
+                original = array
                 break
-        return found
+        return original
 
 
 def write_frames(
@@ -197,8 +197,8 @@ def _write(frame: Frame, original: AnyArray | None, paths: FramePaths) -> str:
         shutil.copyfile(source, target)
     else:
         encode_image(target, frame.image, source)
-    said = [treatment.action for treatment in frame.treatments if treatment.action]
-    return "passed" if passed else (said or ["changed"])[-1]
+    actions = [treatment.action for treatment in frame.treatments if treatment.action]
+    return "passed" if passed else (actions or ["changed"])[-1]
 
 
 def smooth_for_colmap(frame: Frame) -> AnyArray:

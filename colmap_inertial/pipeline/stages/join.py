@@ -82,9 +82,9 @@ class JoinStage(InertialStage):
                 why_not[model.colmap_index] = hint
             else:
                 of_part.append(model)
-        found = self._found(of_part)
+        placed = self._found(of_part)
         with one_blas_thread():
-            joined = join_submodels(parts, self.imu, self.limits, found)
+            joined = join_submodels(parts, self.imu, self.limits, placed)
         between = joined.gaps
         if self._lacks_database():
             # the same stage with its matches would have joined otherwise: the result has to say so
@@ -98,7 +98,7 @@ class JoinStage(InertialStage):
         made: dict[int, Model] = {}
         gone: set[int] = set()
         for group in joined.groups:
-            whole = join_models(of_part, parts, group, found, world=self.world)
+            whole = join_models(of_part, parts, group, placed, world=self.world)
             made[whole.colmap_index] = whole
             gone |= {of_part[k].colmap_index for k in group.members[1:]}
         kept = [made.get(m.colmap_index, m) for m in models if m.colmap_index not in gone]

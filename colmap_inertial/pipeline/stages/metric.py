@@ -118,19 +118,22 @@ class InertialStage:
         agree then stay. Where the scale is refused, the model is as it was.
         """
         estimate, trajectory = self._estimate(model)
-        found = estimate.rotations
-        if found is not None and not found.kept.all() and estimate.verdict != "refused":
-            reconstruction, placed = self._register_again(model, found)
+        consensus = estimate.rotations
+        if consensus is not None and not consensus.kept.all() and estimate.verdict != "refused":
+            reconstruction, placed = self._register_again(model, consensus)
             if placed:
                 second, poses = self._estimate(replace(model, reconstruction=reconstruction))
                 if second.rotations is not None and second.verdict != "refused":
-                    estimate, trajectory, found = second, poses, found.updated(second.rotations)
-            left_out = set(found.left_out)
+                    estimate, trajectory, consensus = second, poses, consensus.updated(second.rotations)
+            left_out = set(consensus.left_out)
             trajectory = trajectory.select(np.array([name not in left_out for name in trajectory.names]))
-            model = _select_agreeing_images(model, reconstruction, found)
+            model = _select_agreeing_images(model, reconstruction, consensus)
         if model.rotations is not None and estimate.rotations is not None:
-            said = describe_consensus(estimate.rotations)
-            notes = (*(note for note in estimate.notes if note not in said), *describe_consensus(model.rotations))
+            description = describe_consensus(estimate.rotations)
+            notes = (
+                *(note for note in estimate.notes if note not in description),
+                *describe_consensus(model.rotations),
+            )
             estimate = replace(estimate, rotations=model.rotations, notes=notes)
         return model, estimate, trajectory
 
@@ -141,34 +144,36 @@ class InertialStage:
         return replace(estimate, notes=(*estimate.notes, *notes)), trajectory
 
     def _register_again(
-        self, model: Model, found: RotationConsensus
+        self, model: Model, consensus: RotationConsensus
     ) -> tuple[pycolmap.Reconstruction, tuple[str, ...]]:
         """A model with its wrong cameras where matches place them, and which these are."""
-        wrong = {*(one.name for one in found.wrong), *found.moved}
+        wrong = {*(camera.name for camera in consensus.wrong), *consensus.moved}
         if not wrong or self.database is None or not self.database.is_file() or has_rigs(model.reconstruction):
             return model.reconstruction, ()
         return register_again(model.reconstruction, wrong, self.database)
 
 
-def _select_agreeing_images(model: Model, reconstruction: pycolmap.Reconstruction, found: RotationConsensus) -> Model:
+def _select_agreeing_images(
+    model: Model, reconstruction: pycolmap.Reconstruction, consensus: RotationConsensus
+) -> Model:
     """A model of the images that agree with the gyroscope; some of them may have been registered again."""
-    sentences = list(describe_consensus(found))
-    if found.registered_again:
-        sentences.append(f"registered again, and right now: {', '.join(found.registered_again)}")
-    elif found.wrong and has_rigs(reconstruction):
+    sentences = list(describe_consensus(consensus))
+    if consensus.registered_again:
+        sentences.append(f"registered again, and right now: {', '.join(consensus.registered_again)}")
+    elif consensus.wrong and has_rigs(reconstruction):
         sentences.append("images of several cameras are not registered again")
     reason = "; ".join(sentences)
     log.info("model %d: %s", model.colmap_index, reason)
     done = Treatment(
         stage="rotations",
         reason=reason,
-        action="left out" if found.left_out else "registered again",
-        values={"left_out": found.left_out, "registered_again": found.registered_again},
+        action="left out" if consensus.left_out else "registered again",
+        values={"left_out": consensus.left_out, "registered_again": consensus.registered_again},
     )
     return replace(
         model,
-        reconstruction=deregister_images(reconstruction, found.left_out),
-        rotations=found,
+        reconstruction=deregister_images(reconstruction, consensus.left_out),
+        rotations=consensus,
         treatments=(*model.treatments, done),
     )
 
@@ -265,9 +270,9 @@ def write_trajectory(path: Path, model: Model, trajectory: CameraTrajectory, imu
         # these poses contain the IMU already: smoothing them again would be worse and overconfident
         solved = model.motion.of(trajectory.names, trajectory.cam_in_world)
         write_tum(path, trajectory)
-        told = [i for i, name in enumerate(trajectory.names) if name in solved.cov]
-        cov = np.array([solved.cov[trajectory.names[i]] for i in told]).reshape(-1, 9, 9)
-        _write_covariance(target, trajectory.t_s[told] + trajectory.epoch_ns * 1e-9, cov[:, :6, :6], cov[:, 6:, 6:])
+        with_cov = [i for i, name in enumerate(trajectory.names) if name in solved.cov]
+        cov = np.array([solved.cov[trajectory.names[i]] for i in with_cov]).reshape(-1, 9, 9)
+        _write_covariance(target, trajectory.t_s[with_cov] + trajectory.epoch_ns * 1e-9, cov[:, :6, :6], cov[:, 6:, 6:])
         unknown = np.full(3, np.nan)
         velocity = np.array([solved.velocity_in_world.get(name, unknown) for name in trajectory.names])
     else:

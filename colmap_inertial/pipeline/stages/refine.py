@@ -269,17 +269,17 @@ def _rolling(x: Estimate, rolling: bool) -> str:
 
 def _motion(seen: Seen, centres: Array, judged: Judged, *, calibrated: bool, readout_s: float | None) -> SolvedMotion:
     """The camera's motion in the model that is written; with what lens and accelerometer leave of its scale."""
-    velocity, told = judged.velocity_m_s, np.array(list(judged.motion_covs), dtype=np.int64)
+    velocity, with_cov = judged.velocity_m_s, np.array(list(judged.motion_covs), dtype=np.int64)
     covs = add_scale(
         np.array(list(judged.motion_covs.values())).reshape(-1, 9, 9),
         model_scale_sigma(calibrated) ** 2,
-        centres[told] - centres[0],
-        velocity[told],
+        centres[with_cov] - centres[0],
+        velocity[with_cov],
     )
     return SolvedMotion(
         cam_in_world=dict(zip(seen.names, centres, strict=True)),
         velocity_in_world={seen.names[i]: velocity[i] for i in np.flatnonzero(np.isfinite(velocity).all(axis=1))},
-        cov={seen.names[i]: cov for i, cov in zip(told.tolist(), covs, strict=True)},
+        cov={seen.names[i]: cov for i, cov in zip(with_cov.tolist(), covs, strict=True)},
         readout_s=readout_s,
     )
 

@@ -44,14 +44,14 @@ class RollingShutterStage:
         """Move the keypoints of one image."""
         name = keypoints.name
         if not self.covers(name):
-            said = Treatment(stage="rolling_shutter", reason="the gyroscope does not cover the whole readout")
-            return replace(keypoints, treatments=(*keypoints.treatments, said))
-        said = Treatment(stage="rolling_shutter", reason="undone by the gyroscope", action="rectified")
+            treatment = Treatment(stage="rolling_shutter", reason="the gyroscope does not cover the whole readout")
+            return replace(keypoints, treatments=(*keypoints.treatments, treatment))
+        treatment = Treatment(stage="rolling_shutter", reason="undone by the gyroscope", action="rectified")
         return replace(
             keypoints,
             xy_px=self.moved(name, keypoints.xy_px),
             rectified=True,
-            treatments=(*keypoints.treatments, said),
+            treatments=(*keypoints.treatments, treatment),
         )
 
     def moved(self, name: str, xy_px: Array) -> Array:
@@ -66,8 +66,8 @@ class RollingShutterStage:
             return xy_px
         shutter = self.view.shutter(index[name])
         reference = motion.start_from_cam(np.array(shutter.reference_s()))
-        found = project_by_lines(rays(camera, xy_px) @ reference.T, xy_px, motion, camera, shutter)
-        return np.where(np.isfinite(found), found, xy_px)
+        exposed_px = project_by_lines(rays(camera, xy_px) @ reference.T, xy_px, motion, camera, shutter)
+        return np.where(np.isfinite(exposed_px), exposed_px, xy_px)
 
     def move_image(self, name: str, image: Any, /) -> Any:
         """The pixels of one image as a global shutter would have taken them."""

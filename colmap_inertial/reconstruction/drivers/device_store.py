@@ -171,7 +171,7 @@ def calibrate_source(
         if problems:
             raise FormatError(raw.path, "; ".join(problems))
     gravity_m_s2, sigma = strength_of_gravity(gravity or GravityOptions())
-    found = calibrate_imu(imu, gravity_m_s2=gravity_m_s2, gravity_sigma_m_s2=sigma, device=device)
-    write_imu_calibration(out, found.calibration)
-    write_text(page, calibration_page(found, source=str(recording.resolve())))
-    return found
+    calibration = calibrate_imu(imu, gravity_m_s2=gravity_m_s2, gravity_sigma_m_s2=sigma, device=device)
+    write_imu_calibration(out, calibration.calibration)
+    write_text(page, calibration_page(calibration, source=str(recording.resolve())))
+    return calibration

@@ -51,10 +51,10 @@ def diagnose_source(
     """
     if json is not None:
         check_output(json, [source.source, source.imu, source.frame_times])
-    found = diagnose(collect(source, progress))
+    diagnosis = diagnose(collect(source, progress))
     if json is not None:
-        write_json(json, found.as_json())
-    return found
+        write_json(json, diagnosis.as_json())
+    return diagnosis
 
 
 def collect(source: ScaleSource, progress: Progress) -> Recorded:

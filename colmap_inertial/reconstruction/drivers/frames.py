@@ -243,7 +243,9 @@ def run_frames(
 def stages_of_refined(stages: Sequence[KeypointStage], models: Sequence[ModelResult]) -> list[KeypointStage]:
     """The stages with clocks, readout and camera as the largest model that was refined has them."""
     for model in models:
-        refined = next((one for one in model.treatments if one.action and "readout_s" in one.values), None)
+        refined = next(
+            (treatment for treatment in model.treatments if treatment.action and "readout_s" in treatment.values), None
+        )
         if refined is None or model.sparse_metric is None or model.scale.calibration is None:
             continue
         readout_s = refined.values["readout_s"]

@@ -62,17 +62,17 @@ def run_georeference(
         for index, folder in metric.items():
             path, _ = trajectory_from_model(read_model(folder), timing, covariances=False)
             try:
-                found = georeference_path(fixes, path, -DOWN_IN_WORLD[world])
+                georeference = georeference_path(fixes, path, -DOWN_IN_WORLD[world])
             except NotObservableError as error:
                 outcomes.append(_Outcome(index=index, unobservable=error.quantity, hint=error.hint))
                 written.append({"model": index, "error": str(error)})
             else:
-                outcomes.append(_Outcome(index=index, found=found))
+                outcomes.append(_Outcome(index=index, found=georeference))
                 written.append(
                     {
                         "model": index,
-                        **found.as_json(),
-                        "cameras": cameras_as_json(found, path.names, path.cam_in_world),
+                        **georeference.as_json(),
+                        "cameras": cameras_as_json(georeference, path.names, path.cam_in_world),
                     }
                 )
         write_record(partial[0], _Outcomes(models=tuple(outcomes)))
@@ -80,7 +80,7 @@ def run_georeference(
 
     depends = {"fixes": fixes, "timing": timing, "world": world}
     session.runner.run("georeference", depends, [record, workspace.georeference], work, after=("metric",))
-    known = {one.index: one.outcome() for one in read_record(record, _Outcomes).models}
+    known = {entry.index: entry.outcome() for entry in read_record(record, _Outcomes).models}
     for index, outcome in known.items():
         if isinstance(outcome, Georeference):
             width_deg = Z95 * outcome.heading_sigma_deg

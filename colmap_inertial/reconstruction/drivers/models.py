@@ -123,7 +123,7 @@ def run_models(
     """
     workspace, submodels = session.workspace, submodels or Submodels()
     rectified, numbered = submodels.rectified, submodels.numbered
-    found = find_models(workspace.colmap_sparse) if submodels.folders is None else submodels.folders
+    folders = find_models(workspace.colmap_sparse) if submodels.folders is None else submodels.folders
     record = workspace.stamps / "models.json"
 
     def work(partial: Sequence[Path]) -> None:
@@ -131,10 +131,10 @@ def run_models(
             remove(path)
         for path in workspace.report_data.glob("model_*.json"):
             remove(path)
-        kept, left_out = _select_models(found, keep=fragments)
+        kept, left_out = _select_models(folders, keep=fragments)
         read_in = (
             Model(
-                reconstruction=submodels.read(found[number]),
+                reconstruction=submodels.read(folders[number]),
                 colmap_index=number,
                 timing=recording.timing,
                 rectified=rectified,
@@ -143,8 +143,8 @@ def run_models(
             for number in kept
         )
         place_of = {number: number if numbered else place for place, number in enumerate(kept)}
-        made, gaps = _run_stages(session, recording, stages, read_in, place_of, found, numbered=numbered)
-        small = [replace(one, sparse=_within(workspace.root, one.sparse)) for one in left_out]
+        made, gaps = _run_stages(session, recording, stages, read_in, place_of, folders, numbered=numbered)
+        small = [replace(fragment, sparse=_within(workspace.root, fragment.sparse)) for fragment in left_out]
         write_record(partial[0], _Made(models=tuple(made), fragments=tuple(small), gaps=gaps))
 
     def beside() -> Iterable[Path]:
@@ -156,24 +156,31 @@ def run_models(
         "rectified": rectified,
         "fragments": fragments,
         "numbered": numbered,
-        "found": [] if submodels.after else [fingerprint(folder) for folder in found.values()],
+        "found": [] if submodels.after else [fingerprint(folder) for folder in folders.values()],
     }
     session.runner.run("metric", depends, [record], work, after=submodels.after, beside=beside)
-    said = read_record(record, _Made)
+    record_made = read_record(record, _Made)
     models = tuple(
-        ModelResult(**{f.name: getattr(one, f.name) for f in fields(one)}).within(workspace.root) for one in said.models
+        ModelResult(**{f.name: getattr(fragment, f.name) for f in fields(fragment)}).within(workspace.root)
+        for fragment in record_made.models
     )
-    remove_stale_dense(workspace, {one.index: one.sparse_metric for one in models if one.sparse_metric is not None})
-    return models, tuple(replace(one, sparse=workspace.root / one.sparse) for one in said.fragments), said.gaps
+    remove_stale_dense(
+        workspace, {fragment.index: fragment.sparse_metric for fragment in models if fragment.sparse_metric is not None}
+    )
+    return (
+        models,
+        tuple(replace(fragment, sparse=workspace.root / fragment.sparse) for fragment in record_made.fragments),
+        record_made.gaps,
+    )
 
 
-def _select_models(found: Mapping[int, Path], *, keep: bool) -> tuple[list[int], list[Fragment]]:
+def _select_models(folders: Mapping[int, Path], *, keep: bool) -> tuple[list[int], list[Fragment]]:
     """COLMAP's numbers of the models to continue with, the largest first; and what is too small."""
-    sizes = {number: num_registered(folder) for number, folder in found.items()}
-    order = sorted(found, key=lambda number: (-sizes[number], number))
+    sizes = {number: num_registered(folder) for number, folder in folders.items()}
+    order = sorted(folders, key=lambda number: (-sizes[number], number))
     least = 0.0 if keep else max(_LIMITS.fewest_images, _LIMITS.least_share * sizes[order[0]])
     kept = [number for number in order if number == order[0] or sizes[number] >= least]
-    left_out = [Fragment(colmap_index=n, registered_images=sizes[n], sparse=found[n]) for n in order if n not in kept]
+    left_out = [Fragment(colmap_index=n, registered_images=sizes[n], sparse=folders[n]) for n in order if n not in kept]
     for fragment in left_out:
         log.info("COLMAP's model %d is a fragment of %d images", fragment.colmap_index, fragment.registered_images)
     return kept, left_out
@@ -185,7 +192,7 @@ def _run_stages(
     stages: Sequence[ModelStage],
     models: Iterator[Model],
     place_of: Mapping[int, int],
-    found: Mapping[int, Path],
+    folders: Mapping[int, Path],
     *,
     numbered: bool,
 ) -> tuple[list[ScaledModel], tuple[Gap, ...]]:
@@ -204,19 +211,19 @@ def _run_stages(
         for done, model in enumerate(models):
             session.progress("metric", done, len(place_of))
             # COLMAP's own counts, whatever the stages make of the model
-            one = ScaledModel(
+            scaled = ScaledModel(
                 index=place_of[model.colmap_index],
                 colmap_index=model.colmap_index,
                 scale=_refused("not looked at"),
                 summary=summarize(model.reconstruction),
-                sparse=_within(session.workspace.root, found[model.colmap_index]),
+                sparse=_within(session.workspace.root, folders[model.colmap_index]),
             )
             reason = _too_few_timed(model)
             if reason is None:
-                yield one, _after(stages[:at], model)
+                yield scaled, _after(stages[:at], model)
             else:
                 untimed.append(reason)
-                yield replace(one, scale=_refused(str(reason))), None
+                yield replace(scaled, scale=_refused(str(reason))), None
 
     going: Iterable[_Begun] = begun()
     gaps: tuple[Gap, ...] = ()
@@ -227,14 +234,14 @@ def _run_stages(
             staged = {model.colmap_index: model for _, model in going if model is not None}
         going, gaps = _joined(joining, going, numbered=numbered)
     made: list[ScaledModel] = []
-    for one, model in going:
+    for scaled, model in going:
         if model is None:
-            log.info("model %d: refused %s", one.index, "; ".join(one.scale.reasons))
-            made.append(one)
+            log.info("model %d: refused %s", scaled.index, "; ".join(scaled.scale.reasons))
+            made.append(scaled)
             continue
-        made.append(_placed(session, recording, one, _after(stages[at + 1 :], model)))
+        made.append(_placed(session, recording, scaled, _after(stages[at + 1 :], model)))
         if numbered:
-            _write_parts(session, model, staged, found)
+            _write_parts(session, model, staged, folders)
     if len(untimed) == len(place_of):
         raise untimed[0]
     session.progress("metric", len(place_of), len(place_of))
@@ -243,17 +250,17 @@ def _run_stages(
 
 def _joined(joining: JoiningStage, begun: Sequence[_Begun], *, numbered: bool) -> tuple[list[_Begun], tuple[Gap, ...]]:
     """Run a stage on all models at once, the largest first; numbers of models that were joined become free."""
-    of_number = {one.colmap_index: one for one, _ in begun}
+    of_number = {scaled.colmap_index: scaled for scaled, _ in begun}
     models, gaps = joining.join_models([model for _, model in begun if model is not None])
-    left: list[_Begun] = [(one, None) for one, model in begun if model is None]
+    left: list[_Begun] = [(scaled, None) for scaled, model in begun if model is None]
     for model in models:
-        one = of_number[model.colmap_index]
-        left.append((replace(one, summary=summarize(model.reconstruction)) if model.parts else one, model))
+        scaled = of_number[model.colmap_index]
+        left.append((replace(scaled, summary=summarize(model.reconstruction)) if model.parts else scaled, model))
     left.sort(key=lambda each: (-each[0].summary["registered_images"], each[0].colmap_index))
-    return [(one if numbered else replace(one, index=i), model) for i, (one, model) in enumerate(left)], gaps
+    return [(scaled if numbered else replace(scaled, index=i), model) for i, (scaled, model) in enumerate(left)], gaps
 
 
-def _write_parts(session: Session, model: Model, staged: Mapping[int, Model], found: Mapping[int, Path]) -> None:
+def _write_parts(session: Session, model: Model, staged: Mapping[int, Model], folders: Mapping[int, Path]) -> None:
     """The other parts of a joined model by themselves, in its world: what a project made from them goes by them.
 
     As the stages before the joining left them.
@@ -265,7 +272,7 @@ def _write_parts(session: Session, model: Model, staged: Mapping[int, Model], fo
             own = transformed(own, undoing(before.similarity))
         target = session.workspace.sparse / str(part.colmap_index)
         moved = transformed(own, part.similarity)
-        write_model(moved, target, part.similarity, suffix=model_format(found[part.colmap_index]))
+        write_model(moved, target, part.similarity, suffix=model_format(folders[part.colmap_index]))
 
 
 def _others(model: Model | ScaledModel) -> list[JoinedPart]:
@@ -280,7 +287,7 @@ def _after(stages: Sequence[ModelStage], model: Model) -> Model:
     return model
 
 
-def _placed(session: Session, recording: Recording, one: ScaledModel, model: Model) -> ScaledModel:
+def _placed(session: Session, recording: Recording, scaled: ScaledModel, model: Model) -> ScaledModel:
     """A model that went through the stages, written to where it stays, with its path."""
     workspace = session.workspace
     if model.scale is None:
@@ -291,23 +298,23 @@ def _placed(session: Session, recording: Recording, one: ScaledModel, model: Mod
     if similarity is not None and scale.verdict != model.scale.verdict:
         similarity = replace(similarity, provenance=f"{similarity.provenance}; {scale.verdict}: {scale.reasons[0]}")
     model = replace(model, scale=scale, similarity=similarity)
-    one = replace(one, scale=scale, treatments=model.treatments, parts=model.parts)
+    scaled = replace(scaled, scale=scale, treatments=model.treatments, parts=model.parts)
     # the smoother weighs by them; of a model whose motion a stage solved for, nothing is smoothed
     poses, _ = trajectory_from_model(model.reconstruction, model.timing, covariances=model.motion is None)
     if model.similarity is not None:
-        target = workspace.sparse / str(one.index)
-        suffix = model_format(workspace.root / one.sparse) or ".bin"
+        target = workspace.sparse / str(scaled.index)
+        suffix = model_format(workspace.root / scaled.sparse) or ".bin"
         write_model(model.reconstruction, target, model.similarity, suffix=suffix)
         poses = metric_trajectory(poses)
         rig = rig_sensors(model.reconstruction)
-        one = replace(one, sparse_metric=_within(workspace.root, target), rig=rig)
+        scaled = replace(scaled, sparse_metric=_within(workspace.root, target), rig=rig)
         if scale.calibration is not None and gravity_in_model(model) is not None:
-            trajectory = workspace.trajectory(one.index, first=not any(workspace.root.glob("trajectory*.tum")))
+            trajectory = workspace.trajectory(scaled.index, first=not any(workspace.root.glob("trajectory*.tum")))
             write_trajectory(trajectory, model, poses, recording.imu)
-            one = replace(one, trajectory=_within(workspace.root, trajectory))
-    write_model_record(workspace, one.index, model, poses, recording.imu)
-    log.info("model %d: %s %s", one.index, scale.verdict, "; ".join(scale.reasons))
-    return one
+            scaled = replace(scaled, trajectory=_within(workspace.root, trajectory))
+    write_model_record(workspace, scaled.index, model, poses, recording.imu)
+    log.info("model %d: %s %s", scaled.index, scale.verdict, "; ".join(scale.reasons))
+    return scaled
 
 
 def _within(root: Path, path: Path) -> Path:
@@ -370,7 +377,7 @@ def run_validation(
         def work(partial: Sequence[Path], metric: Path = metric, pictures: Path = pictures) -> None:
             remove(pictures)
             try:
-                found = validate_model(
+                validation = validate_model(
                     metric, images, target, progress=lambda done, total: session.progress("validation", done, total)
                 )
             except TargetNotFoundError as error:
@@ -378,8 +385,8 @@ def run_validation(
             except NotObservableError as error:
                 write_record(partial[0], _Checked(unobservable=error.quantity, error=error.hint))
             else:
-                write_overlays(found, images, pictures)
-                write_record(partial[0], _Checked(found=found))
+                write_overlays(validation, images, pictures)
+                write_record(partial[0], _Checked(found=validation))
 
         record = session.workspace.stamps / f"validated_{model.index}.json"
         after = ["metric", *session.runner.of("frames", "images")]
@@ -387,8 +394,8 @@ def run_validation(
         step = f"validation_{model.index}"
         session.runner.run(step, depends, [record], work, after=after, beside=partial(list, [pictures]))
         check = read_record(record, _Checked).outcome()
-        said = f"scale error {check.scale_error_pct:+.3f} %" if isinstance(check, Validation) else str(check)
-        log.info("model %d: %s against %s", model.index, said, target.spec)
+        outcome = f"scale error {check.scale_error_pct:+.3f} %" if isinstance(check, Validation) else str(check)
+        log.info("model %d: %s against %s", model.index, outcome, target.spec)
         checked.append(replace(model, validation=check))
     return tuple(checked)
 

@@ -382,14 +382,14 @@ def _run_times(
         "inputs": [fingerprint(path) for path in inputs if path is not None],
     }
     session.runner.run("times", depends, [session.workspace.frames], work)
-    found = read_record(session.workspace.frames, _Times)
-    return found.timing, found.notes
+    times = read_record(session.workspace.frames, _Times)
+    return times.timing, times.notes
 
 
 def _registered(models: dict[int, Path], read: Callable[[Path], pycolmap.Reconstruction]) -> list[str]:
     """Names of all images of the models."""
-    found = [read(folder) for folder in models.values()]
-    return sorted({model.image(i).name for model in found for i in model.reg_image_ids()})
+    reconstructions = [read(folder) for folder in models.values()]
+    return sorted({model.image(i).name for model in reconstructions for i in model.reg_image_ids()})
 
 
 def _times(
@@ -471,8 +471,10 @@ def _scales(results: Sequence[ModelResult], fragments: Sequence[Fragment]) -> di
     """Similarity of each sub-model of the project, by COLMAP's number."""
     small = "a fragment of {} images: too small to be made metric (--fragments does it all the same)"
     scales: dict[int | None, ModelScale] = {
-        one.colmap_index: ModelScale(similarity=None, verdict="refused", reasons=(small.format(one.registered_images),))
-        for one in fragments
+        fragment.colmap_index: ModelScale(
+            similarity=None, verdict="refused", reasons=(small.format(fragment.registered_images),)
+        )
+        for fragment in fragments
     }
     for result in results:
         similarity = None

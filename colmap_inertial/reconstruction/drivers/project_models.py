@@ -64,4 +64,4 @@ def require_refinable(
 
 def _is_kept(path: Path, keep: Sequence[str]) -> bool:
     """Whether a path of a project stays as it is, or a folder above it does."""
-    return any(fnmatch.fnmatch(str(one), pattern) for one in (path, *path.parents[:-1]) for pattern in keep)
+    return any(fnmatch.fnmatch(str(part), pattern) for part in (path, *path.parents[:-1]) for pattern in keep)

@@ -144,7 +144,7 @@ def scale_project_by(
         if validation.check_error_pct is not None:
             notes.append(f"corners that the scale does not rest on are {validation.check_error_pct:+.2g} % off")
         notes += (*validation.doubts, *validation.reasons)
-    found = Reference(
+    by_reference = Reference(
         out=out,
         scale_from=reference.scale_from,
         metres_per_unit=scale,
@@ -162,8 +162,8 @@ def scale_project_by(
         follow_links=source.follow_links,
         progress=lambda done, total: progress("apply", done, total),
     )
-    write_json(out / REFERENCE_FILE, found.as_json())
-    return found
+    write_json(out / REFERENCE_FILE, by_reference.as_json())
+    return by_reference
 
 
 def check_reference(reference: ReferenceOptions) -> None:
@@ -245,11 +245,11 @@ def _place(text: str, validation: Validation | None) -> tuple[Array, float]:
 def _noise(validation: Validation, marker: int) -> float:
     """Standard deviation of a marker's centre along a line: from how far its corners are from a square's."""
     corners: Sequence[Array] = [c.in_model for c in validation.corners if c.name.startswith(f"marker{marker}.")]
-    found, square = np.array(corners), validation.target.corners_m[:4] / validation.metres_per_unit
-    found = found - found.mean(axis=0)
-    u, _, vt = np.linalg.svd(square.T @ found)
+    measured, square = np.array(corners), validation.target.corners_m[:4] / validation.metres_per_unit
+    measured = measured - measured.mean(axis=0)
+    u, _, vt = np.linalg.svd(square.T @ measured)
     turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    residual = found - square @ turn
+    residual = measured - square @ turn
     # 12 coordinates less 6 of place and turn; the centre is the mean of four corners
     return float(np.sqrt(np.sum(residual**2) / 6) / 2)
 
@@ -312,23 +312,23 @@ def reconstruct_by(
             write_json(work / "colmap" / _MADE_FROM, {**made_from, "left_out": left_out, "files": files})
     left_out = read_json(out / "colmap" / _MADE_FROM)["left_out"]
     metric = out / "metric"
-    found = scale_project_by(
+    scaled = scale_project_by(
         out / "colmap", metric, reference, ProjectOptions(link=True, keep=(_MADE_FROM,)), progress=progress
     )
-    notes = (*found.notes, "no IMU was used: frames are as they were filmed, with any blur and rolling shutter")
+    notes = (*scaled.notes, "no IMU was used: frames are as they were filmed, with any blur and rolling shutter")
     if left_out:
         notes = (
             *notes,
             f"COLMAP made {len(left_out)} more models, of {', '.join(map(str, left_out))} images: left out",
         )
-    found = dataclasses.replace(found, out=out, notes=notes)
+    scaled = dataclasses.replace(scaled, out=out, notes=notes)
     (metric / _MADE_FROM).unlink()
-    write_json(metric / "scale.json", found.as_json())
+    write_json(metric / "scale.json", scaled.as_json())
     # the scale last: where it stands, everything does
     for path in sorted(metric.iterdir(), key=lambda path: path.name == "scale.json"):
         path.rename(out / path.name)
     metric.rmdir()
-    return found
+    return scaled
 
 
 def _is_mapped(out: Path, made_from: dict[str, object]) -> bool:
@@ -349,8 +349,8 @@ def _is_mapped(out: Path, made_from: dict[str, object]) -> bool:
         raise OutputExistsError(f"{error}; {again}") from None
     if any(known.get(key) != value for key, value in made_from.items()):
         raise OutputExistsError(f"{out} holds a model of other pictures or options; choose another folder or remove it")
-    found = _contents(record.parent)
-    if changed := sorted(name for name in kept | found if kept.get(name) != found.get(name)):
+    contents = _contents(record.parent)
+    if changed := sorted(name for name in kept | contents if kept.get(name) != contents.get(name)):
         raise OutputExistsError(f"{record.parent / changed[0]} is missing or was changed since it was made; {again}")
     return True
 
@@ -358,9 +358,9 @@ def _is_mapped(out: Path, made_from: dict[str, object]) -> bool:
 def _contents(project: Path) -> dict[str, list[object]]:
     """Size and digest of a project's files, without the record of what it was made from."""
     rows: Any = fingerprint(project)
-    found = {Path(path).relative_to(project.resolve()).as_posix(): [size, digest] for path, size, _, digest in rows}
-    found.pop(_MADE_FROM, None)
-    return found
+    contents = {Path(path).relative_to(project.resolve()).as_posix(): [size, digest] for path, size, _, digest in rows}
+    contents.pop(_MADE_FROM, None)
+    return contents
 
 
 def _pictures(path: Path) -> Capture:

@@ -266,11 +266,11 @@ def _change(first: CameraImuCalibration, refined: CameraImuCalibration | None) -
     }
 
 
-def measurement_as_json(found: Validation | Georeference | InertialError | None) -> dict[str, Any] | None:
+def measurement_as_json(measurement: Validation | Georeference | InertialError | None) -> dict[str, Any] | None:
     """Measurement in a model, or the reason why there is none."""
-    if found is None:
+    if measurement is None:
         return None
-    return {"error": str(found)} if isinstance(found, InertialError) else found.as_json()
+    return {"error": str(measurement)} if isinstance(measurement, InertialError) else measurement.as_json()
 
 
 def _part_as_json(part: JoinedPart) -> dict[str, object]:

@@ -240,12 +240,12 @@ def align_source(source: ScaleSource, out: Path) -> CameraImuCalibration:
         _refuse_another_convention(recording, options, error.quantity)
         raise
     _refuse_another_convention(recording, options, "rotation")
-    found = dataclasses.replace(aligned.calibration, clock_rate=0.0, clock_middle_s=0.0)
+    calibration = dataclasses.replace(aligned.calibration, clock_rate=0.0, clock_middle_s=0.0)
     scale = ScaleOptions(max_offset_s=options.max_offset_s)
     estimate = estimate_scale(recording.trajectory, recording.imu, calibration=recording.calibration, options=scale)
-    found = learn_lever_arm(found, estimate)
-    write_calibration(out, found)
-    return found
+    calibration = learn_lever_arm(calibration, estimate)
+    write_calibration(out, calibration)
+    return calibration
 
 
 def _refuse_another_convention(recording: TimedPoses, options: AlignOptions, quantity: str) -> None:
@@ -287,7 +287,7 @@ def scale_source(
         trajectory = first_seconds(trajectory, first_s, start_s=recording.start_s)
     limit_s = largest_offset_s(recording.shared_clock, options.max_offset_s)
     options = dataclasses.replace(options, max_offset_s=limit_s)
-    told = diagnose(
+    diagnosis = diagnose(
         Recorded(
             imu=recording.imu,
             gyro_axes=recording.gyro_axes,
@@ -298,7 +298,7 @@ def scale_source(
             max_offset_s=limit_s,
         )
     )
-    doubts = tuple(finding.sentence for finding in told.stopping)
+    doubts = tuple(finding.sentence for finding in diagnosis.stopping)
     if doubts and not force:
         estimate = ScaleEstimate.refused("none", *doubts)
     else:
@@ -450,9 +450,9 @@ def scaling(metres_per_unit: float, sigma_log: float, provenance: str) -> Simila
 
 def _metres_apart(text: str) -> tuple[float, float | None]:
     """A length, and its standard deviation where that is said."""
-    length, said, sigma = text.partition("+-")
+    length, length_m, sigma = text.partition("+-")
     try:
-        metres, sigma_m = float(length), float(sigma) if said else None
+        metres, sigma_m = float(length), float(sigma) if length_m else None
     except ValueError:
         metres, sigma_m = float("nan"), None
     if not 0 < metres < float("inf") or (sigma_m is not None and not 0 < sigma_m < metres):

@@ -127,30 +127,30 @@ def estimate_preliminary_calibration(recording: Recording, context: RunContext) 
     declared = rotation_rad <= _LIMITS.good_rotation_rad and offset_s <= _LIMITS.good_offset_s
     along = sample_middle(every, _LIMITS.flow_spacing_s, _LIMITS.flow_frames)
     rotation = measure_sampled_rotation(capture, every, camera, along, progress) if is_video else None
-    found: GyroView | NotObservableError
+    view: GyroView | NotObservableError
     models: tuple[pycolmap.Reconstruction, ...] = ()
     if declared:
         notes = () if capture.camera is not None else (f"the focal length was guessed: {camera.params[0]:.0f} px",)
-        found = GyroView(
+        view = GyroView(
             imu=recording.imu, timing=timing, calibration=recording.prior, camera=camera, source="capture", notes=notes
         )
     else:
-        found, models = _calibrate_by_model(recording, context)
-        if isinstance(found, NotObservableError):
+        view, models = _calibrate_by_model(recording, context)
+        if isinstance(view, NotObservableError):
             rotation = rotation or measure_sampled_rotation(capture, every, camera, along, progress)
-            found = _calibrate_by_pixels(rotation, recording, camera, found)
+            view = _calibrate_by_pixels(rotation, recording, camera, view)
     if rotation is not None:
-        known_s = None if isinstance(found, NotObservableError) else found.motion().offset_s
+        known_s = None if isinstance(view, NotObservableError) else view.motion().offset_s
         stabilised = find_stabilisation(rotation, recording.imu, offset_s=known_s)
         if stabilised.stabilised:
             raise NotObservableError("the pixels' motion", stabilised.reason)
-        if not isinstance(found, NotObservableError):
-            agreement = check_motion(rotation, found.motion())
+        if not isinstance(view, NotObservableError):
+            agreement = check_motion(rotation, view.motion())
             if agreement.agrees is False:
                 raise NotObservableError("the pixels' motion", agreement.reason)
-    if isinstance(found, NotObservableError):
-        raise found
-    return PreliminaryCalibration(view=_check_declared_sign(found, recording, rotation, progress), models=models)
+    if isinstance(view, NotObservableError):
+        raise view
+    return PreliminaryCalibration(view=_check_declared_sign(view, recording, rotation, progress), models=models)
 
 
 def _check_declared_sign(
@@ -208,12 +208,12 @@ def survey(
         work = Path(folder)
         images = _image_folder(capture, view.timing, names, work, stages)
         try:
-            found = _small_models(capture, images, names, work / "0", view, context.reporting(step))
+            models = _small_models(capture, images, names, work / "0", view, context.reporting(step))
         except (MappingError, FormatError) as error:
             log.info("no survey: %s", error)
-            found = ()
+            models = ()
     context.progress("survey", 1, 1)
-    return found
+    return models
 
 
 def _sigmas(calibration: CameraImuCalibration) -> tuple[float, float]:
@@ -236,10 +236,10 @@ def _calibrate_by_pixels(
 def _aligned(trajectory: CameraTrajectory, recording: Recording, camera: CameraModel, source: str) -> GyroView:
     options = AlignOptions(max_offset_s=recording.max_offset_s)
     if source == "pixels":
-        found = align_clocks(trajectory, recording.imu, prior=recording.prior, options=options)
+        alignment = align_clocks(trajectory, recording.imu, prior=recording.prior, options=options)
     else:
-        found, _ = align_by_consensus(trajectory, recording.imu, prior=recording.prior, options=options)
-    rotation_rad, offset_s = _sigmas(found.calibration)
+        alignment, _ = align_by_consensus(trajectory, recording.imu, prior=recording.prior, options=options)
+    rotation_rad, offset_s = _sigmas(alignment.calibration)
     if rotation_rad > _LIMITS.usable_rotation_rad or offset_s > _LIMITS.usable_offset_s:
         raise NotObservableError(
             "camera-IMU calibration",
@@ -247,7 +247,7 @@ def _aligned(trajectory: CameraTrajectory, recording: Recording, camera: CameraM
             f"{1e3 * offset_s:.0f} ms, which is too little: give [calibration] in capture.toml",
         )
     return GyroView(
-        imu=recording.imu, timing=recording.timing, calibration=found.settled(), camera=camera, source=source
+        imu=recording.imu, timing=recording.timing, calibration=alignment.settled(), camera=camera, source=source
     )
 
 

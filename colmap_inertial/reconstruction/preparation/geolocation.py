@@ -113,17 +113,17 @@ def read_georeference(path: Path, index: int) -> Georeference | None:
     if not path.is_file():
         return None
     with a_record_of_ours(path):
-        found = next((one for one in read_json(path)["models"] if one["model"] == index), None)
-        if found is None:
+        entry = next((candidate for candidate in read_json(path)["models"] if candidate["model"] == index), None)
+        if entry is None:
             return None
-        if "error" in found:
-            raise NotObservableError("heading", str(found["error"]))
-        return georeference_of_json(found)
+        if "error" in entry:
+            raise NotObservableError("heading", str(entry["error"]))
+        return georeference_of_json(entry)
 
 
-def cameras_as_json(found: Georeference, names: Sequence[str], centres: Array) -> list[dict[str, object]]:
+def cameras_as_json(georeference: Georeference, names: Sequence[str], centres: Array) -> list[dict[str, object]]:
     """Positions of all images."""
     return [
         {"name": name, "latitude_deg": latitude, "longitude_deg": longitude, "height_m": height}
-        for name, (latitude, longitude, height) in zip(names, found.geodetic(centres).tolist(), strict=True)
+        for name, (latitude, longitude, height) in zip(names, georeference.geodetic(centres).tolist(), strict=True)
     ]

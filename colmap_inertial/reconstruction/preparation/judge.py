@@ -88,7 +88,7 @@ def judge_frames(
     verdict = judged(looked)
     factors: tuple[float, ...] = _LIMITS.exposure_factors
     if verdict.trusted is True:
-        long_blur = np.median([one.blur_px for one in looked]) >= 2 * GATE_LIMITS.must_show_px
+        long_blur = np.median([frame.blur_px for frame in looked]) >= 2 * GATE_LIMITS.must_show_px
         factors = tuple(factor for factor in factors if factor < 1 and long_blur)
     return _correct_exposures(verdict, looked, factors, look)
 
@@ -107,18 +107,18 @@ class Looked:
     @property
     def shows(self) -> bool:
         """Whether it confirms the gyroscope."""
-        one = self.evidence
+        evidence = self.evidence
         if (
             self.is_mostly_sky
             and self.gain >= GATE_LIMITS.least_share
             and (self.share or 0.0) >= GATE_LIMITS.least_share
         ):
             return True
-        if not one.extent_is_plausible:
+        if not evidence.extent_is_plausible:
             return False
-        other = float(one.sigmas[:, 2:-1].max())
+        other = float(evidence.sigmas[:, 2:-1].max())
         faint = self.share is not None and self.share >= GATE_LIMITS.least_share and other < _LIMITS.other_support
-        return one.support >= GateOptions().min_support or faint
+        return evidence.support >= GateOptions().min_support or faint
 
     @property
     def gain(self) -> float:
@@ -160,18 +160,18 @@ def _correct_exposures(
     look: Callable[[float], Sequence[Looked]],
 ) -> RecordingVerdict:
     """The verdict, or where all exposure times are wrong by one factor, that of the pictures with it corrected."""
-    best, deepest = verdict, _together([one.evidence for one in looked])
+    best, deepest = verdict, _together([frame.evidence for frame in looked])
     for factor in factors:
         others = look(factor)
-        evidence = [one.evidence for one in others]
-        found, support = judged(others), _together(evidence)
-        if found.trusted is True and support >= _LIMITS.exposure_support and support > deepest:
-            whole = factor * found.extent_factor
+        evidence = [frame.evidence for frame in others]
+        corrected, support = judged(others), _together(evidence)
+        if corrected.trusted is True and support >= _LIMITS.exposure_support and support > deepest:
+            whole = factor * corrected.extent_factor
             reason = (
                 f"the images confirm the gyroscope's blur ({support:.0f} standard deviations), but for its extent, "
                 f"which is multiplied by {whole:.2f}: the exposure times are wrong by this factor"
             )
-            best, deepest = replace(found, extent_factor=whole, reason=reason), support
+            best, deepest = replace(corrected, extent_factor=whole, reason=reason), support
     return best
 
 
@@ -181,15 +181,15 @@ def _together(evidence: Sequence[BlurEvidence]) -> float:
 
 def judged(looked: Sequence[Looked]) -> RecordingVerdict:
     """Joint evidence of frames, and whether nearly each of them confirms the blur."""
-    return judge_each_frame(judge_sky(judge_recording([one.evidence for one in looked]), looked), looked)
+    return judge_each_frame(judge_sky(judge_recording([frame.evidence for frame in looked]), looked), looked)
 
 
 def judge_sky(verdict: RecordingVerdict, looked: Sequence[Looked]) -> RecordingVerdict:
     """The verdict; or trust, where the frames are mostly sky and what stands below it falls off as it should."""
-    gains = np.array([one.gain for one in looked if one.is_mostly_sky and np.isfinite(one.gain)])
+    gains = np.array([frame.gain for frame in looked if frame.is_mostly_sky and np.isfinite(frame.gain)])
     if verdict.trusted is not False or len(gains) < max(_LIMITS.sky_frames, len(looked) / 2):
         return verdict
-    shown = sum(one.is_mostly_sky and one.shows for one in looked)
+    shown = sum(frame.is_mostly_sky and frame.shows for frame in looked)
     sigmas = float(gains.mean() / max(gains.std(ddof=1) / np.sqrt(len(gains)), 1e-9))
     if shown < _LIMITS.sky_share * len(gains) or sigmas < _LIMITS.sky_sigmas:
         return verdict
@@ -203,9 +203,9 @@ def judge_each_frame(verdict: RecordingVerdict, looked: Sequence[Looked]) -> Rec
     This happens where the camera moves close to objects: translation blurs them, too, and the gyroscope does not
     measure it.
     """
-    telling = [one for one in looked if one.evidence.enough and one.blur_px >= GATE_LIMITS.must_show_px]
-    shown = sum(one.shows for one in telling)
-    skies = 2 * sum(one.is_mostly_sky for one in telling) > len(telling)
+    telling = [frame for frame in looked if frame.evidence.enough and frame.blur_px >= GATE_LIMITS.must_show_px]
+    shown = sum(frame.shows for frame in telling)
+    skies = 2 * sum(frame.is_mostly_sky for frame in telling) > len(telling)
     most = _LIMITS.trusted_share_of_skies if skies else _LIMITS.trusted_share
     if verdict.trusted is not True or shown >= most * len(telling):
         return verdict

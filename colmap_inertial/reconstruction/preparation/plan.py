@@ -183,7 +183,7 @@ def plan_imaging(recording: Recording, context: RunContext, asked: Treatments) -
     if not plan.rectify and no_gyro:
         return replace(plan, deblur_note=_describe_fusion(no_gyro))
     try:
-        found = estimate_preliminary_calibration(recording, context)
+        calibration = estimate_preliminary_calibration(recording, context)
     except NotObservableError as error:
         if asked.by_name(deblur=not why_not, rectify=plan.rectify):
             raise
@@ -192,25 +192,25 @@ def plan_imaging(recording: Recording, context: RunContext, asked: Treatments) -
             deblur_note=_describe_fusion(str(error)) if asked.pairs else why_not or untreated,
             rolling_shutter_note=untreated if plan.rectify else plan.rolling_shutter_note,
         )
-    plan = replace(plan, view=found.view)
+    plan = replace(plan, view=calibration.view)
     if asked.pairs:
         return replace(plan, deblur_note=_describe_fusion(no_gyro))
     if why_not:
         return plan
 
     def models(names: Sequence[str], plan: ImagingPlan | None) -> tuple[pycolmap.Reconstruction, ...]:
-        if plan is None and found.models:
-            return found.models
+        if plan is None and calibration.models:
+            return calibration.models
         stage = None if plan is None else DeblurStage.of_plan(plan, drop=False)
-        return survey(capture, found.view, names, [] if stage is None else [stage], context)
+        return survey(capture, calibration.view, names, [] if stage is None else [stage], context)
 
     def sliding(parts: Sequence[Sequence[str]]) -> list[bool]:
-        camera = found.view.camera
+        camera = calibration.view.camera
         return translating_segments(
-            recording, camera, parts, _limit_px(camera), context.progress, motion=found.view.motion()
+            recording, camera, parts, _limit_px(camera), context.progress, motion=calibration.view.motion()
         )
 
-    return _deblurring(plan, found.view, capture, models, sliding, context.progress)
+    return _deblurring(plan, calibration.view, capture, models, sliding, context.progress)
 
 
 def _no_rectifying(timing: FrameTiming, asked: Treatments) -> str:

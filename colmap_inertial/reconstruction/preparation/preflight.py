@@ -178,10 +178,10 @@ def find_in_video(capture: Capture, timing: FrameTiming, progress: Progress) -> 
         video, capture.frames.folder, names, progress=lambda seen: progress("video", seen, len(stamps_ns))
     )
     stated_ns = {timing.names[i]: timing.epoch_ns + round(float(timing.t_s[i]) * 1e9) for i in index}
-    found = [name for name in names if name in match.t_ns]
+    matched = [name for name in names if name in match.t_ns]
     return FramesInVideo(
-        stated_ns=np.array([stated_ns[name] for name in found], dtype=np.int64),
-        found_ns=np.array([match.t_ns[name] for name in found], dtype=np.int64),
+        stated_ns=np.array([stated_ns[name] for name in matched], dtype=np.int64),
+        found_ns=np.array([match.t_ns[name] for name in matched], dtype=np.int64),
         video_start_ns=int(stamps_ns[0]),
         quarter_turns=match.quarter_turns,
         container_turn_deg=next(decode_grey(video))[1],

@@ -338,18 +338,18 @@ def _clocks(recording: Recording, progress: Progress) -> _Clocks:
         rotation = measure_sampled_rotation(capture, timing, camera, indices, progress, stage="clocks")
         options = AlignOptions(max_offset_s=recording.max_offset_s)
         aligned = align_clocks(rotation.trajectory(), imu, prior=prior, options=options)
-        found, on_rate, rates, rate_sigma = aligned.calibration, imu, "", 0.0
+        calibration, on_rate, rates, rate_sigma = aligned.calibration, imu, "", 0.0
         if aligned.drifts() or not (capture.shared_clock or offset_sigma_s <= _LIMITS.offset_s):
             # what one clock stamped has one rate; another is corrected even where it may be zero: what is left of it is
             # then as small as its deviation says
             rate_sigma = aligned.clock_rate_sigma
-            on_rate = CameraTimedImu.from_recording(imu, found, timing.epoch_ns).imu
-            rates = f", with rates {1e6 * found.clock_rate:+.0f} ppm apart, to {1e6 * rate_sigma:.0f} ppm"
-        sigma_s = found.clock_sigma_s
-        turned = found.rotation_sigma_rad
+            on_rate = CameraTimedImu.from_recording(imu, calibration, timing.epoch_ns).imu
+            rates = f", with rates {1e6 * calibration.clock_rate:+.0f} ppm apart, to {1e6 * rate_sigma:.0f} ppm"
+        sigma_s = calibration.clock_sigma_s
+        turned = calibration.rotation_sigma_rad
         # what translation does to pixels looks like a bias of the gyroscope
-        found = replace(found, gyro_bias_rad_s=prior.gyro_bias_rad_s)
-        motion = GyroCamera.of(on_rate, found, camera_epoch_ns=timing.epoch_ns)
+        calibration = replace(calibration, gyro_bias_rad_s=prior.gyro_bias_rad_s)
+        motion = GyroCamera.of(on_rate, calibration, camera_epoch_ns=timing.epoch_ns)
         agreement = check_motion(rotation, motion)
         if turned > _LIMITS.rotation_rad or sigma_s > _LIMITS.offset_s or agreement.agrees is not True:
             raise NotObservableError("clock offset", agreement.reason)
@@ -364,11 +364,11 @@ def _clocks(recording: Recording, progress: Progress) -> _Clocks:
         oriented=True,
         camera=camera if capture.camera is not None else _correct_focal(camera, agreement.gain),
         note=f"the clocks' offset was found by following pixels, to {1e3 * sigma_s:.1f} ms{rates}",
-        offset_s=found.clock_offset_s,
+        offset_s=calibration.clock_offset_s,
         offset_sigma_s=sigma_s,
         offset_from="pixels",
         rate_sigma=rate_sigma,
-        middle_s=found.clock_middle_s,
+        middle_s=calibration.clock_middle_s,
     )
 
 

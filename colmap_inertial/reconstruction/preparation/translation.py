@@ -183,9 +183,9 @@ def _measure_parallax(model: pycolmap.Reconstruction, view: GyroView) -> Iterato
         points = np.unique(np.concatenate([seen[n] for n in near]), axis=0)
         in_cam = (points - path.cam_in_world[i]) @ rotation[i].T
         velocity = rotation[i] @ path.velocity_in_world[i]
-        found = parallax_from_points(in_cam, velocity, camera, width=width, height=height)
-        if found is not None:
-            yield view.timing.names[k], float(away_s[near[0]]), found
+        parallax = parallax_from_points(in_cam, velocity, camera, width=width, height=height)
+        if parallax is not None:
+            yield view.timing.names[k], float(away_s[near[0]]), parallax
 
 
 def _points_seen(model: pycolmap.Reconstruction, trajectory: CameraTrajectory, factor: float) -> list[Array]:

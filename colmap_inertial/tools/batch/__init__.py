@@ -240,7 +240,7 @@ class _Batch:
     def follow(self, pending: dict[str, Pending]) -> None:
         """Wait until all are done, and tell what becomes of them."""
         while pending:
-            for name in [name for name, one in pending.items() if one.done()]:
+            for name in [name for name, future in pending.items() if future.done()]:
                 self._end(name, pending.pop(name))
             # the running ones, and the next to run: reading thousands of files takes its time
             running = [name for name in pending if self._known[name].state == "running"]
@@ -250,7 +250,7 @@ class _Batch:
                 if status is not None and status.state == "running":
                     self._set(status)
             until = time.monotonic() + BATCH_TIMING.progress_s
-            while pending and time.monotonic() < until and not any(one.done() for one in pending.values()):
+            while pending and time.monotonic() < until and not any(future.done() for future in pending.values()):
                 time.sleep(BATCH_TIMING.done_s)
 
     def _end(self, name: str, pending: Pending) -> None:

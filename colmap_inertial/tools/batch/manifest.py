@@ -126,8 +126,8 @@ def _refuse_stages(captures: Sequence[BatchCapture], path: Path) -> None:
 
 
 def _list_captures(folder: Path, options: ReconstructOptions) -> list[BatchCapture]:
-    found = sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
-    return [BatchCapture(name=path.name, path=path, options=options) for path in found]
+    folders = sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+    return [BatchCapture(name=path.name, path=path, options=options) for path in folders]
 
 
 def _read_captures(path: Path, options: ReconstructOptions) -> list[BatchCapture]:

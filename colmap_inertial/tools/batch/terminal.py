@@ -34,11 +34,11 @@ def live_batch(*, quiet: bool = False) -> Iterator[Watch]:
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), *clock)
     bars = Progress(*columns, console=console, disable=not console.is_terminal)
     running = {}
-    told: set[str] = set()
+    reported: set[str] = set()
 
     def watch(status: CaptureStatus, /) -> None:
-        if status.findings and status.name not in told:
-            told.add(status.name)
+        if status.findings and status.name not in reported:
+            reported.add(status.name)
             for finding in status.findings:
                 # what ends a capture is in its last line, too
                 if status.error is None or finding.partition(": ")[2].partition("; ")[0] not in status.error:

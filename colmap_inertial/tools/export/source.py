@@ -113,15 +113,15 @@ class ExportSource:
             for name in changed:
                 bent = self.treated[name][1]
                 filmed[name] = Picture(path=capture.path, filmed=True, agrees=not bent)
-        found = {name: filmed.get(name) or self._picture(places.rectified, folders, name) for name in names}
-        changed_since = find_change(Workspace(out), (picture.path for picture in found.values()))
+        picture_of = {name: filmed.get(name) or self._picture(places.rectified, folders, name) for name in names}
+        changed_since = find_change(Workspace(out), (picture.path for picture in picture_of.values()))
         if changed_since is not None:
             raise FormatError(
                 changed_since,
                 "is not as its run wrote it: start that again, it makes it again; or say where the pictures are: "
                 "--image-folder",
             )
-        return found
+        return picture_of
 
     def _picture(self, rectified: Path, folders: tuple[Path, ...], name: str) -> Picture:
         paths = (path_in(folder, name, self.found.folder) for folder in folders if folder.is_dir())
@@ -161,18 +161,18 @@ def read_source(
         Where the model has no scale.
     """
     with explaining_losses(Workspace(out)):
-        found = find_source(out, model, images=image_folder)
-        if found.scale.unit != "m" and not unscaled:
-            why = "; ".join(found.scale.reasons) or "this model was never given one"
+        source = find_source(out, model, images=image_folder)
+        if source.scale.unit != "m" and not unscaled:
+            why = "; ".join(source.scale.reasons) or "this model was never given one"
             raise NotObservableError("scale", f"{why}; --unscaled exports it in its own units")
-        reconstruction = read_model(found.folder)
-        down, motion = found.down_in_world, None
-        if found.scale.unit == "m" and found.trajectory is not None and motion_file(found.trajectory).is_file():
-            motion = read_record(motion_file(found.trajectory), CameraMotion)
+        reconstruction = read_model(source.folder)
+        down, motion = source.down_in_world, None
+        if source.scale.unit == "m" and source.trajectory is not None and motion_file(source.trajectory).is_file():
+            motion = read_record(motion_file(source.trajectory), CameraMotion)
         return ExportSource(
-            found=found,
+            found=source,
             model=reconstruction,
-            up_in_world=_up(found, reconstruction),
+            up_in_world=_up(source, reconstruction),
             gravity_in_world_m_s2=down,
             motion=motion,
             treated=_treated(Workspace(out)),
@@ -229,11 +229,11 @@ def _times(source: ExportSource) -> list[tuple[float, str]]:
     return [(t, name) for t, name in zip(source.motion.t_s.tolist(), source.motion.names, strict=True) if name in names]
 
 
-def _up(found: ViewSource, model: pycolmap.Reconstruction) -> Array | None:
+def _up(source: ViewSource, model: pycolmap.Reconstruction) -> Array | None:
     """Against gravity; of an axis that gravity lies on, the one that the pictures' upper edges point along."""
-    if found.down_in_world is not None:
-        return 0.0 - found.down_in_world / np.linalg.norm(found.down_in_world)  # no -0.0
-    if not found.gravity_on_axis:
+    if source.down_in_world is not None:
+        return 0.0 - source.down_in_world / np.linalg.norm(source.down_in_world)  # no -0.0
+    if not source.gravity_on_axis:
         return None
     rotations = [model.image(i).cam_from_world().rotation.matrix() for i in model.reg_image_ids()]
     edges = -np.mean(rotations, axis=0)[1]
@@ -270,7 +270,7 @@ def flat_names(names: Iterable[str]) -> dict[str, str]:
     dict
         The new name of each, in the order of the names.
     """
-    found: dict[str, str] = {}
+    name_of: dict[str, str] = {}
     taken: set[str] = set()
     tried: dict[str, int] = {}
     for name in sorted(names):
@@ -284,8 +284,8 @@ def flat_names(names: Iterable[str]) -> dict[str, str]:
             candidate = f"{stem}_{number}"
         tried[stem.lower()] = number
         taken.add(candidate.lower())
-        found[name] = candidate + suffix
-    return found
+        name_of[name] = candidate + suffix
+    return name_of
 
 
 #: What says up where gravity is unknown: z, as trainers' viewers have it.

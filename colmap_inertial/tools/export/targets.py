@@ -76,7 +76,7 @@ def exposures_of(
     if motion.exposure_s is None and any(not picture.sharpened for picture in pictures.values()):
         notes.append("exposure times are not known and count as 0: blur is not modelled")
     place = {name: i for i, name in enumerate(motion.names)}
-    found = {}
+    exposures = {}
     for image in map(model.image, model.reg_image_ids()):
         index = place.get(image.name)
         if index is None:
@@ -86,18 +86,18 @@ def exposures_of(
         exposed = 0.0 if motion.exposure_s is None or picture.sharpened else float(motion.exposure_s[index])
         left_s = 0.0 if picture.rectified else readout_s
         rotation = image.cam_from_world().rotation.matrix()
-        found[image.name] = Exposure(
+        exposures[image.name] = Exposure(
             velocity_in_cam_m_s=rotation @ motion.velocity_in_world_m_s[index],
             angular_velocity_in_cam_rad_s=motion.angular_velocity_in_cam_rad_s[index],
             exposure_s=exposed,
             readout_s=left_s * share,
             late_s=left_s * late,
         )
-    if not found:
+    if not exposures:
         raise NotObservableError("camera motion", "none of the model's images has a velocity")
-    if motion.exposure_s is not None and len({one.exposure_s for one in found.values()}) > 1:
+    if motion.exposure_s is not None and len({exposure.exposure_s for exposure in exposures.values()}) > 1:
         notes.append("exposure times differ between pictures; the program takes one for all, their median")
-    return found
+    return exposures
 
 
 def _require_motion(motion: CameraMotion | None, pictures: Mapping[str, Picture]) -> CameraMotion:
@@ -271,8 +271,8 @@ def _write_las(content: ExportContent, folder: Path) -> None:
 
 
 def _write_tum(content: ExportContent, folder: Path) -> None:
-    found = content.source.found
-    write_tum(folder / "trajectory.tum", smooth_path(found.trajectory, found.folder))
+    source = content.source.found
+    write_tum(folder / "trajectory.tum", smooth_path(source.trajectory, source.folder))
 
 
 def _write_csv(content: ExportContent, folder: Path) -> None:
@@ -281,8 +281,8 @@ def _write_csv(content: ExportContent, folder: Path) -> None:
 
 
 def _write_gltf(content: ExportContent, folder: Path) -> None:
-    found = content.source.found
-    path = None if found.trajectory is None else smooth_path(found.trajectory, found.folder)
+    source = content.source.found
+    path = None if source.trajectory is None else smooth_path(source.trajectory, source.folder)
     write_gltf(folder / "scene.glb", content.views, path, content.xyz, content.rgb, content.up_in_world)
 
 

@@ -145,8 +145,8 @@ def add_velocities(content: Mapping[str, Any], exposures: Mapping[str, Exposure]
     times = [exposures[frame["file_path"].removeprefix("images/")] for frame in frames]
     return {
         **content,
-        "exposure_time": float(np.median([one.exposure_s for one in times])),
-        "rolling_shutter_time": float(np.median([one.readout_s for one in times])),
+        "exposure_time": float(np.median([time.exposure_s for time in times])),
+        "rolling_shutter_time": float(np.median([time.readout_s for time in times])),
         "frames": frames,
     }
 

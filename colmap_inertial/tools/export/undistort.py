@@ -95,9 +95,9 @@ class Undistortion:
             pinhole = CameraModel(
                 model="PINHOLE", width=width, height=height, params=(fx, fy, 0.5 * width, 0.5 * height)
             )
-            found = cls(camera, pinhole)
-            if found.is_inside():
-                return found
+            undistortion = cls(camera, pinhole)
+            if undistortion.is_inside():
+                return undistortion
             half = half * (1 - _LIMITS.shrink)
         raise FormatError(where, f"{named}: its lens cannot be undistorted")
 

@@ -225,15 +225,15 @@ def export_model(
         target.write(content, partial)
         if target.pictures:
             write_pictures(_jobs(content, partial / "images", filmed), len(content.pictures), progress)
-        found = source.found
+        source_view = source.found
         made = Exported(
             folder=folder,
             program=program,
             command=target.command_line(folder),
             says=target.says,
-            model=found.index,
-            others=found.others,
-            unit=found.scale.unit,
+            model=source_view.index,
+            others=source_view.others,
+            unit=source_view.scale.unit,
             images=len(content.views) if target.has_images else 0,
             points=len(content.xyz) if target.has_points else 0,
             notes=tuple(content.notes),

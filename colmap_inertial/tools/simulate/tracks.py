@@ -142,10 +142,10 @@ class Tracks:
                 keypoints[:, :2], keypoints[:, 2], keypoints[:, 5] = xy_px[mine], 1.0, 1.0
                 opened.write_keypoints(image, keypoints)
             for first, second in np.argwhere(np.triu(self._in_common(), 1) >= fewest).tolist():
-                _, one, other = np.intersect1d(
+                _, at_first, at_second = np.intersect1d(
                     self.point[of_frame[first]], self.point[of_frame[second]], return_indices=True
                 )
-                matches = np.stack([one, other], axis=1).astype(np.uint32)
+                matches = np.stack([at_first, at_second], axis=1).astype(np.uint32)
                 opened.write_matches(first + 1, second + 1, matches)
                 geometry = pycolmap.TwoViewGeometry(
                     config=pycolmap.TwoViewGeometryConfiguration.CALIBRATED, inlier_matches=matches

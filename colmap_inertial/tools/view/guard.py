@@ -106,10 +106,10 @@ class Guard:
         A page that had its own name lead here (DNS rebinding) would pass for one of ours; an address cannot be made to
         do so. Any port: it may have been forwarded.
         """
-        found = _HOST.fullmatch(host)
-        if found is None:
+        match = _HOST.fullmatch(host)
+        if match is None:
             return False
-        name = (found[1] or found[2]).lower()
+        name = (match[1] or match[2]).lower()
         known = {"localhost", self.host.lower()}
         if not is_loopback(self.host):
             own = socket.gethostname().lower()

@@ -232,14 +232,14 @@ class Viewer:
         if camera is not None:
             self._choose(camera, event.client)
 
-    def _pick(self, found: int | None) -> None:
+    def _pick(self, index: int | None) -> None:
         with self._lock:
             if len(self._picked) == 2:
                 self._clear()
-            if found is None:
+            if index is None:
                 self._measured.content = "No point there; click closer to one."
                 return
-            self._picked.append(self._candidates[found])
+            self._picked.append(self._candidates[index])
             points = np.array(self._picked)
             ends = self._drawing.points("/measure/ends", points, RED, 0.012 * self.scene.reach)
             if len(points) == 1:

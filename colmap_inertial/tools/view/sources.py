@@ -244,7 +244,7 @@ def _find_in_project(out: Path, index: int | None, given: tuple[Path, ...]) -> V
         scale = replace(scale, unit="m", metres_per_unit=similarity.scale, relative_ci95=ci95)
         on_axis = bool(similarity.cov[1:4, 1:4].any())
     single, beside = len(models) == 1, _image_folders(folder)
-    linked = [one for one in beside if _leads_out(out, one)]
+    linked = [candidate for candidate in beside if _leads_out(out, candidate)]
     if linked and not given:
         raise FormatError(
             linked[0], f"is a link out of the project; give {linked[0].resolve()} as --images (export: --image-folder)"
@@ -255,7 +255,7 @@ def _find_in_project(out: Path, index: int | None, given: tuple[Path, ...]) -> V
         others=tuple(models),
         scale=scale,
         gravity_on_axis=on_axis,
-        images=(*given, *(one for one in beside if one not in linked)),
+        images=(*given, *(candidate for candidate in beside if candidate not in linked)),
         fused=_beside(out, chosen, single, "fused.ply"),
         mesh=_beside(out, chosen, single, "meshed-tsdf.ply") or _beside(out, chosen, single, "meshed-poisson.ply"),
     )
