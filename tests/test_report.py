@@ -215,6 +215,8 @@ def test_logarithmic_equal_and_coloured_axes_of_stills():
     axis = choose_axis({"type": "log"}, [[0.1, None, 100.0]], 0.0, 300.0, pad=0.0)
     assert [axis.place(v) for v in (0.1, 1.0, 100.0)] == pytest.approx([0, 100, 300]) and axis.place(0.0) is None
     assert [text for _, text in axis.ticks(50.0)] == ["0.1", "1", "10", "100"]
+    names = choose_axis({"type": "category"}, [["a", "b", "a"]], 0.0, 300.0, pad=0.0)
+    assert (names.low, names.high) == (-0.5, 1.5)  # each in the middle of its half
     x, y = (choose_axis({"range": [0, 10 * n]}, [], 0.0, 100.0, pad=0.0) for n in (1, 2))
     x, y = equalise(x, y)
     assert x.px_per_unit == y.px_per_unit == 5 and (x.begin, x.end) == (25.0, 75.0)

@@ -41,6 +41,7 @@ def test_a_verdict_needs_a_positive_scale():
         verdict_of(-1.0, 0.1)
     with pytest.raises(ValueError, match="sigma_log"):
         verdict_of(1.0, float("nan"))
+    assert verdict_of(2.0, 0.0)[:2] == ("trusted", (2.0, 2.0))
 
 
 def test_gravity_agrees_with_the_wgs84_table():

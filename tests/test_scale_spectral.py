@@ -121,6 +121,22 @@ def test_noise_of_the_positions_does_not_shrink_the_scale():
     assert abs(np.mean(errors)) < 0.007
 
 
+def test_noise_of_the_positions_has_the_spectrum_that_is_stated():
+    """White noise through the smoother and its second derivative, against the formula, to 2.5 Hz."""
+    sfm = SfmOptions(position_white_m=0.02, position_correlated_m=0.0)
+    simulated = simulate_recording(RecordingOptions(motion=MotionOptions(duration_s=60.0), sfm=sfm), seed=3)
+    signals = Signals.of(simulated.trajectory, timed(simulated.trajectory, simulated.imu, known(simulated)))
+    rng, pieces, power = np.random.default_rng(0), signals.pieces.copy(), []
+    for _ in range(20):
+        noise = signals.smoother.noise_sigma * rng.normal(size=(len(signals.t_s), 3))
+        pieces[:, 0] = signals.smoother.accelerations_of(noise)
+        spectra = replace(signals, pieces=pieces).spectra(2.5)
+        power.append(np.mean(np.abs(spectra.visual) ** 2, axis=1))
+    for low_hz in (0.5, 1.0, 1.5, 2.0):
+        band = (spectra.frequency_hz > low_hz) & (spectra.frequency_hz < low_hz + 0.5)
+        assert np.mean(power, axis=0)[band].sum() == pytest.approx(spectra.visual_noise[band].sum(), rel=0.1)
+
+
 def test_gravity_s_strength_is_held_at_what_was_given(handheld):
     estimate = spectral(handheld.trajectory, handheld.imu, known(handheld), SpectralOptions(gravity_m_s2=9.78))
     assert np.linalg.norm(estimate.gravity_in_world_m_s2) == pytest.approx(9.78)

@@ -94,6 +94,15 @@ def test_the_interval_allows_for_pose_errors_of_the_model(errors):
     assert np.median([fit.noise.corner_px for fit in fits]) == pytest.approx(0.3, rel=0.05)
 
 
+def test_the_degrees_of_freedom_are_those_of_the_scatter_of_the_variance():
+    """A variance with d degrees of freedom scatters by 2 / d of its square; 40 fits say so to a quarter."""
+    rng = np.random.default_rng(31)
+    poses = orbit(np.random.default_rng(7), 12)
+    fits = [fit_scale(simulate(rng, 12, poses=poses, orbit_rad=2e-3, range_m=2e-3), START) for _ in range(40)]
+    variance = np.array([fit.sigma_log**2 for fit in fits])
+    assert np.median([fit.dof for fit in fits]) == pytest.approx(2 * variance.mean() ** 2 / variance.var(), rel=0.3)
+
+
 def test_treating_corners_as_independent_would_not():
     rng = np.random.default_rng(3)
     observations = [simulate(rng, 12, orbit_rad=6e-4, range_m=6e-4) for _ in range(24)]
