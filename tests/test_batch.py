@@ -19,6 +19,7 @@ import pycolmap
 import pytest
 from batch_captures import TINY, model_bytes, tiny_capture
 from cases import loop_over
+from json_schemas import find_violations
 
 from colmap_inertial.cli import main, parse
 from colmap_inertial.core.errors import FormatError, InertialError, MissingExtraError, OutputExistsError
@@ -195,6 +196,7 @@ def test_one_broken_capture_does_not_stop_the_rest_and_finished_ones_are_not_run
     assert float(rows["hall"]["ci95_low"]) < float(rows["hall"]["metres_per_unit"]) < float(rows["hall"]["ci95_high"])
     assert (rows["broken"]["state"], rows["broken"]["exit_code"]) == ("failed", "2")
     stored = json.loads((out / "summary.json").read_text())
+    assert find_violations("summary", stored) == []
     assert (stored["done"], stored["failed"], stored["interrupted"]) == (1, 1, 0)
     assert read_status(out / "status" / "hall.json") == result.captures[1]
     assert not (out / "status" / "run").exists()

@@ -18,6 +18,7 @@ import imu_files
 import numpy as np
 import pytest
 from batch_captures import FRAMES, TINY, tiny_capture
+from json_schemas import find_violations, read_schema
 from jsonschema import Draft202012Validator
 from report_runs import write_run
 from test_pipeline import copy_scene
@@ -445,18 +446,6 @@ def test_every_reason_in_the_text_is_one_that_is_printed():
     assert [phrase for phrase in phrases if not any(phrase in text for text in texts)] == []
 
 
-def schema(name: str) -> Draft202012Validator:
-    content = json.loads((DOCS / "schemas" / f"{name}.schema.json").read_text())
-    Draft202012Validator.check_schema(content)
-    return Draft202012Validator(content)
-
-
-def wrong(name: str, content: object) -> list[str]:
-    """Where a JSON does not have the form that its schema describes."""
-    found = schema(name).iter_errors(content)
-    return [f"{'/'.join(map(str, e.absolute_path))}: {e.message[:300]}" for e in found]
-
-
 @pytest.fixture(scope="module")
 def examples(tmp_path_factory, project):
     """The folder in which the page on Python says that its examples stand, and what they leave in it."""
@@ -507,8 +496,8 @@ def test_results_have_the_form_that_their_schemas_describe(examples, project, tm
     folder, _ = examples
     for run in ("out", "out_hooks"):
         for name in ("result", "report", "diagnosis"):
-            assert wrong(name, json.loads((folder / run / f"{name}.json").read_text())) == []
-    content = schema("result").schema
+            assert find_violations(name, json.loads((folder / run / f"{name}.json").read_text())) == []
+    content = read_schema("result").schema
     treatment = Draft202012Validator({**content["$defs"]["treatment"], "$defs": content["$defs"]})
     frames, keypoints = (
         json.loads((folder / "out_hooks" / f"{name}.json").read_text()) for name in ("frames", "keypoints")
@@ -531,10 +520,10 @@ def test_results_have_the_form_that_their_schemas_describe(examples, project, tm
             main(list(map(str, args)))
         assert stopped.value.code == code, args
     for name in ("scale", "short", "spectral"):
-        assert wrong("scale", json.loads((tmp_path / f"{name}.json").read_text())) == []
-    assert wrong("diagnosis", json.loads((tmp_path / "diagnosis.json").read_text())) == []
+        assert find_violations("scale", json.loads((tmp_path / f"{name}.json").read_text())) == []
+    assert find_violations("diagnosis", json.loads((tmp_path / "diagnosis.json").read_text())) == []
     for name in ("result", "report"):
-        assert wrong(name, json.loads((tmp_path / "project" / f"{name}.json").read_text())) == []
+        assert find_violations(name, json.loads((tmp_path / "project" / f"{name}.json").read_text())) == []
 
 
 def test_a_stopped_run_and_one_with_every_section_fit_the_schema_of_the_report(tmp_path):
@@ -544,7 +533,7 @@ def test_a_stopped_run_and_one_with_every_section_fit_the_schema_of_the_report(t
         content = json.loads((tmp_path / kind / "report.json").read_text())
         for finding in content["findings"]["findings"]:
             finding.setdefault("numbers", {})  # the fixture's is shorter than those of diagnose
-        assert wrong("report", content) == []
+        assert find_violations("report", content) == []
 
     capture = tiny_capture(tmp_path / "capture")
     for path in (capture / "frames").iterdir():
@@ -552,7 +541,7 @@ def test_a_stopped_run_and_one_with_every_section_fit_the_schema_of_the_report(t
     with pytest.raises(MappingError):
         reconstruct(capture, tmp_path / "out", TINY)
     for name in ("report", "diagnosis"):
-        assert wrong(name, json.loads((tmp_path / "out" / f"{name}.json").read_text())) == []
+        assert find_violations(name, json.loads((tmp_path / "out" / f"{name}.json").read_text())) == []
 
 
 def test_what_is_done_to_frames_has_the_form_that_the_schema_describes(imu, tmp_path):
@@ -583,7 +572,7 @@ def test_what_is_done_to_frames_has_the_form_that_the_schema_describes(imu, tmp_
         },
     )
     parts = json.loads((tmp_path / "parts.json").read_text())
-    content = schema("result").schema
+    content = read_schema("result").schema
     fields = content["properties"]
     for name, form in (
         ("imaging", fields["imaging"]),

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import small_networks as small
 from exposure_scenes import GAIN, LONG_S, SHORT_S, psnr_db, write_pair_capture
-from jsonschema import Draft202012Validator
+from json_schemas import find_violations
 from test_pipeline import contents
 
 from colmap_inertial.cli import main
@@ -229,9 +229,7 @@ def test_pairs_become_pictures_of_the_short_ones_names(written, tmp_path):
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     assert result["fuser"] == "average" and "aligned by the gyroscope and the pixels" in result["note"]
     assert [frame["name"] for frame in result["frames"]] == ["000.png", "001.png", "002.png"]
-    form = json.loads((DOCS / "schemas" / "exposures.schema.json").read_text())
-    Draft202012Validator.check_schema(form)
-    assert [error.message for error in Draft202012Validator(form).iter_errors(result)] == []
+    assert find_violations("exposures", result) == []
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("years of work")
     with pytest.raises(OutputExistsError):

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cases import loop_over
+from json_schemas import find_violations
 
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.types import CALIBRATION_PARAMETERS, CameraImuCalibration
@@ -42,6 +43,7 @@ def sd_of_delay(calibration: CameraImuCalibration) -> float:
 
 def test_the_file_keeps_every_bit(tmp_path: Path) -> None:
     write_calibration(tmp_path / "c.json", known())
+    assert find_violations("calibration", tmp_path / "c.json") == []
     back = read_calibration(tmp_path / "c.json")
     for name, value in vars(known()).items():
         np.testing.assert_array_equal(getattr(back, name), value)

@@ -15,6 +15,7 @@ import numpy as np
 import pycolmap
 import pytest
 from conftest import write_anew
+from json_schemas import find_violations
 from model_project import HEIGHT, NAMES, WIDTH, fuse, prior_rows, write_project
 from test_io_fuzz import refusals
 from test_io_ply import SIMILARITY
@@ -282,6 +283,7 @@ def test_depth_ranges_of_option_files_scale_and_automatic_ones_stay(made):
 def test_everything_else_is_copied_and_the_record_says_what_was_done(made):
     before, after = digest(made / "project"), digest(made / "metric")
     record = json.loads((made / "metric" / "transform.json").read_text())
+    assert find_violations("transform", record) == []
     changed = {f["path"] for f in record["files"]}
     for path, data in before.items():
         if path not in changed and str(Path(path).parent) not in changed:
@@ -386,6 +388,7 @@ def test_a_refused_sub_model_keeps_its_units(two_models, tmp_path):
     for name in ("sparse/1/points3D.txt", "dense/stereo/depth_maps/a.geometric.bin", "dense/sparse/points3D.bin"):
         assert (tmp_path / "metric" / name).read_bytes() == (two_models / name).read_bytes()
     record = json.loads((tmp_path / "metric" / "transform.json").read_text())
+    assert find_violations("transform", record) == []
     assert [m["similarity"] is None for m in record["models"]] == [False, True]
     assert not (tmp_path / "metric" / "sparse" / "1" / "transform.json").exists()
 

@@ -8,6 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pycolmap
 import pytest
+from json_schemas import read_schema
+from jsonschema import Draft202012Validator
 from refine_walk import problem_of, tracks_of, walk
 
 from colmap_inertial import read_model, reconstruct_project
@@ -164,6 +166,8 @@ def test_a_walk_bends_less(walked):
     assert said.values["after_px"] < said.values["before_px"]
     assert said.values["chi2"] < 1.5
     assert len(said.values["drift"]) == 2
+    form = Draft202012Validator(read_schema("result").schema["$defs"]["refine"])
+    assert [error.message for error in form.iter_errors(json.loads(json.dumps(said.values)))] == []
     assert made.scale.notes[-1] == f"the model was {said.reason}"
     json.dumps(said.values)
     # the model is as whole as before
