@@ -170,6 +170,17 @@ def test_what_was_undone_is_suspected_no_more(recording):
     assert again["axes"] < 0.1 * found.chi2
 
 
+def test_the_delay_of_an_undone_filter_is_as_uncertain_as_its_time_constant():
+    """The variances of two independent delays add up: 3 ms known before, 4 ms of the filter."""
+    info = np.eye(par.N_GLOBALS)
+    info[par.ACCEL_DELAY, par.ACCEL_DELAY] = 0.003**-2
+    prior = par.Prior(mean=None, info=info, gravity_m_s2=9.8, gravity_sigma_m_s2=0.02)
+    loosened = Faults(values={"bandwidth": np.array([-0.5 * 0.004**2])}).loosened(prior)
+    assert loosened.info[par.ACCEL_DELAY, par.ACCEL_DELAY] ** -0.5 == pytest.approx(0.005)
+    assert np.array_equal(np.delete(loosened.info, par.ACCEL_DELAY, axis=0), np.delete(info, par.ACCEL_DELAY, axis=0))
+
+
+
 def test_stamps_that_part_by_less_than_a_sample_are_of_one_clock():
     t_s = np.linspace(0, 2000, 400_001)
     accel = SensorStream.from_samples(t_s, np.zeros((len(t_s), 3)))
