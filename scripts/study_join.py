@@ -14,6 +14,10 @@ falsifies what cannot be joined: another recording's IMU within the gap, an IMU 
 a later part that moved elsewhere in between (the device thrown, or a part of another recording), a clock that loses a
 fifth of a second within the gap.
 
+Of walks that become one model, the covariances of the whole path (``trajectory_cov.npz``) are judged as well: squared
+errors of positions, rotations and velocities over three times their expectation, on average over the path, and the
+share of positions within their 95 % region.
+
 ``--back``: a third of the way around a ring and back past the same walls, cut in two. What both parts saw is matched in
 COLMAP's database, and each gap is told twice: by the IMU alone, and by matches, too.
 
@@ -34,7 +38,7 @@ import pycolmap
 from bench_scale import recordings_in
 from study_refine import adjusted
 
-from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, so3_log
+from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, so3_exp, so3_log
 from colmap_inertial.core.options import JoinOptions, ScaleOptions
 from colmap_inertial.core.types import ImuRecording
 from colmap_inertial.inertial.join.evidence import find_links
@@ -43,11 +47,12 @@ from colmap_inertial.inertial.join.placement import FittedSubmodel, ImuLink, Pla
 from colmap_inertial.inertial.join.relative_poses import end_images, tie_cov
 from colmap_inertial.inertial.scale.posterior import FittedPath
 from colmap_inertial.io.calibration import calibration_prior
-from colmap_inertial.io.trajectories import read_inertial_scale
-from colmap_inertial.model import Model
+from colmap_inertial.io.files import read_json
+from colmap_inertial.io.trajectories import read_inertial_scale, read_tum
+from colmap_inertial.model import Model, trajectory_from_model
 from colmap_inertial.model.submodels.matches import PlacedImages, place_images
 from colmap_inertial.pipeline.stages.join import JoinStage
-from colmap_inertial.pipeline.stages.metric import MetricStage
+from colmap_inertial.pipeline.stages.metric import MetricStage, metric_trajectory, write_trajectory
 from colmap_inertial.tools.simulate.motion import MotionOptions
 from colmap_inertial.tools.simulate.tracks import TrackOptions, Tracks, simulate_tracks
 
@@ -225,6 +230,44 @@ def come_back(gap_s: float, seed: int, limits: JoinOptions) -> list[dict[str, An
     return out
 
 
+def judge_path(
+    model: Model, imu: ImuRecording, truth: Callable[[np.ndarray], tuple[np.ndarray, ...]]
+) -> dict[str, float]:
+    """Errors of a joined path over its covariances; the truth is in a world with z up, and has velocities."""
+    trajectory = metric_trajectory(trajectory_from_model(model.reconstruction, model.timing)[0])
+    with tempfile.TemporaryDirectory() as folder:
+        write_trajectory(Path(folder) / "trajectory.tum", model, trajectory, imu)
+        stored = np.load(Path(folder) / "trajectory_cov.npz")
+        path = read_tum(Path(folder) / "trajectory.tum")
+        velocity = read_json(Path(folder) / "trajectory_motion.json")["velocity_in_world_m_s"]
+    if str(stored["relative_to"]) != "first image":
+        return {}
+    true, centres, speeds = truth(path.t_s + 1e-9 * path.epoch_ns)
+    rotation = matrix_from_quat(path.cam_from_world_xyzw).transpose(0, 2, 1)
+    # the first camera has its place and heading
+    turn = true[0] @ rotation[0].T
+    heading = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
+    world_from_true = so3_exp(np.array([0.0, 0.0, -heading]))
+    cov = stored["cov"]
+    errors = {
+        "position": (
+            path.cam_in_world - path.cam_in_world[0] - (centres - centres[0]) @ world_from_true.T,
+            cov[:, :3, :3],
+        ),
+        "velocity": (np.array(velocity) - speeds @ world_from_true.T, cov[:, 3:6, 3:6]),
+        "rotation": (
+            np.array([so3_log(a @ (world_from_true @ b).T) for a, b in zip(rotation, true, strict=True)]),
+            stored["rotation_cov"],
+        ),
+    }
+    squares = {
+        name: np.einsum("ti,ti->t", error[1:], np.linalg.solve(cov[1:], error[1:, :, None])[..., 0])
+        for name, (error, cov) in errors.items()
+    }
+    shares = {f"nees_{name}": float(np.mean(values)) / 3 for name, values in squares.items()}
+    return {**shares, "inside_path": float(np.mean(squares["position"] < CHI2_95))}
+
+
 def studied(parts: int, gap_s: float, seed: int, spoil: str, limits: JoinOptions) -> list[dict[str, Any]]:
     """One walk, its gaps."""
     spans = [(k * (PART_S + gap_s), k * (PART_S + gap_s) + PART_S) for k in range(parts)]
@@ -247,6 +290,9 @@ def studied(parts: int, gap_s: float, seed: int, spoil: str, limits: JoinOptions
     out = judged(fitted, imu, limits, truth)
     for one in out:
         one |= {"seed": seed, "gap_s": gap_s}
+    whole, _ = stage.join_models(usable)
+    if out and len(whole) == 1:
+        out[0] |= judge_path(whole[0], imu, lambda t_s: (*truth(t_s), tracks.motion.at(t_s).velocity_in_world_m_s))
     if len(usable) < len(models):
         refused = [model.colmap_index for model in models if model.similarity is None]
         out.append({"seed": seed, "gap_s": gap_s, "joined": False, "reason": f"scale of {refused} refused"})
@@ -287,6 +333,8 @@ def main() -> None:
                     )
                 if one.get("sigma_m") is not None:
                     found += f"sigma {100 * one['sigma_m']:.1f} cm {one['sigma_deg']:.2f} deg, chi2 {one['chi2']:.1f}; "
+                if "inside_path" in one:
+                    found += f"path {one['nees_position']:.2f}; "
                 print(f"{gap_s:g} s, {one['seed']}: {found}{one['reason']}", flush=True)
                 if asked.out is not None:
                     asked.out.write_text(json.dumps(results, indent=1))
@@ -309,6 +357,15 @@ def told_of(what: str, gaps: list[dict[str, Any]]) -> None:
             f"{inside[1]} of {len(told)}"
         )
     print(line, flush=True)
+    paths = [one for one in gaps if "inside_path" in one]
+    if paths:
+        mean = {name: np.mean([one[name] for one in paths]) for name in paths[0] if name.startswith("nees_")}
+        words = ", ".join(f"{name.removeprefix('nees_')} {value:.2f}" for name, value in mean.items())
+        inside = 100 * np.mean([one["inside_path"] for one in paths])
+        print(
+            f"  {len(paths)} joined paths, squared errors over their expectation: {words}; {inside:.0f} % inside",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -180,7 +180,6 @@ def test_the_delay_of_an_undone_filter_is_as_uncertain_as_its_time_constant():
     assert np.array_equal(np.delete(loosened.info, par.ACCEL_DELAY, axis=0), np.delete(info, par.ACCEL_DELAY, axis=0))
 
 
-
 def test_stamps_that_part_by_less_than_a_sample_are_of_one_clock():
     t_s = np.linspace(0, 2000, 400_001)
     accel = SensorStream.from_samples(t_s, np.zeros((len(t_s), 3)))

@@ -74,6 +74,8 @@ class Model:
         By image name, (N, 2) where its keypoints were when COLMAP mapped them, where a stage moved them since.
     parts
         What it was joined of; empty where it is one of COLMAP's models.
+    joined_covs
+        Of a joined model, (6, 6) covariances of images' positions and rotations against the first image, by name.
     motion
         How the camera moved, where a stage solved for it; without it, the path is smoothed.
     """
@@ -89,6 +91,7 @@ class Model:
     treatments: tuple[Treatment, ...] = ()
     observed_px: Mapping[str, Array] = field(default_factory=dict)
     parts: tuple[JoinedPart, ...] = ()
+    joined_covs: Mapping[str, Array] = field(default_factory=dict)
     motion: SolvedMotion | None = None
 
     def scaled(self, estimate: ScaleEstimate, similarity: Similarity | None) -> Model:

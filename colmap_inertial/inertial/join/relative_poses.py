@@ -64,6 +64,8 @@ def relative_cov(
     points: Sequence[Array],
     pair: tuple[int, int],
     nodes: Sequence[int] = (),
+    *,
+    swung: Array | None = None,
 ) -> Array:
     """(6, 6) covariance of rotation and position of one submodel's point as seen from another one's.
 
@@ -75,15 +77,17 @@ def relative_cov(
         Places of the two.
     nodes
         Of each, the node by which the visual pose there is uncertain; without, the submodels' places alone count.
+    swung
+        (3, 3) projection to the part of the first submodel's rotation that the other one is seen by; not given, all.
     """
     here, there = (placed.points(k, point[None])[0] for k, point in zip(pair, points, strict=True))
-    by = np.zeros((6, 14))
+    by, swung = np.zeros((6, 14)), np.eye(3) if swung is None else swung
     for columns, k, at, sign in ((columns_of(0), pair[0], here, -1.0), (columns_of(1), pair[1], there, 1.0)):
         arm = at - placed.places.translation[k]
-        by[:3, columns][:, 1:4] = sign * np.eye(3)
+        by[:3, columns][:, 1:4] = np.eye(3) if sign > 0 else -swung
         by[3:, columns] = sign * np.c_[arm, -skew(arm), np.eye(3)]
     # as seen from the first: its own rotation swings the other around it
-    by[3:, 1:4] += skew(there - here)
+    by[3:, 1:4] += skew(there - here) @ swung
     rows = np.r_[columns_of(pair[0]), columns_of(pair[1])]
     cov = placed.inflation * by @ placed.cov[np.ix_(rows, rows)] @ by.T
     # lens and accelerometer leave a share of any length, of all submodels alike

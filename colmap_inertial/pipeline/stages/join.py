@@ -20,6 +20,7 @@ from colmap_inertial.model import Model, trajectory_from_model
 from colmap_inertial.model.rigs import has_rigs
 from colmap_inertial.model.submodels.matches import PlacedImages, place_images
 from colmap_inertial.pipeline.stages.inputs import StageInputs
+from colmap_inertial.pipeline.stages.joined_path import find_joined_covs
 from colmap_inertial.pipeline.stages.metric import InertialStage, metric_trajectory
 
 if TYPE_CHECKING:
@@ -99,6 +100,8 @@ class JoinStage(InertialStage):
         gone: set[int] = set()
         for group in joined.groups:
             whole = join_models(of_part, parts, group, placed, world=self.world)
+            with one_blas_thread():
+                whole = replace(whole, joined_covs=find_joined_covs(whole, of_part, parts, group))
             made[whole.colmap_index] = whole
             gone |= {of_part[k].colmap_index for k in group.members[1:]}
         kept = [made.get(m.colmap_index, m) for m in models if m.colmap_index not in gone]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,8 +28,8 @@ from colmap_inertial.core.types import (
     Treatment,
 )
 from colmap_inertial.imaging.gyro_camera import GyroCamera
-from colmap_inertial.inertial.refine.motion import find_drift
-from colmap_inertial.inertial.refine.setup import read_seen
+from colmap_inertial.inertial.refine.motion import PictureDrift, find_drift
+from colmap_inertial.inertial.refine.setup import Seen, read_seen
 from colmap_inertial.inertial.scale import estimate_scale
 from colmap_inertial.io.calibration import SIGMAS
 from colmap_inertial.io.files import write_record
@@ -253,8 +254,8 @@ def write_trajectory(path: Path, model: Model, trajectory: CameraTrajectory, imu
     path
         ``trajectory*.tum``; the covariance goes to ``trajectory*_cov.npz`` with ``t_s`` (T,), ``cov`` (T, 9, 9) of
         position, velocity and acceleration, of a refined model (K, 6, 6) of position and velocity, at 400 images at
-        most; ``rotation_cov`` (T, 3, 3), world, left; and what positions and rotations are ``relative_to``. None of a
-        joined one that was not refined. Velocities by frame go to :func:`motion_file`.
+        most; ``rotation_cov`` (T, 3, 3), world, left; and what positions and rotations are ``relative_to``. Velocities
+        by frame go to :func:`motion_file`.
     model
         A model that a stage made metric.
     trajectory
@@ -279,12 +280,12 @@ def write_trajectory(path: Path, model: Model, trajectory: CameraTrajectory, imu
         smoothed = smooth_path(trajectory, imu, estimate, gravity)
         write_tum(path, smoothed)
         velocity = smoothed.velocity_in_world
-        if model.parts:
+        cov, rotation = _add_drift(model, smoothed, gravity)
+        if model.parts and rotation is None:
             # smoothing knows nothing of how surely each part was placed
             log.info("%s: no covariance of a joined path is written; result.json has that of each part", path.name)
             target.unlink(missing_ok=True)
         else:
-            cov, rotation = _add_drift(model, smoothed, gravity)
             _write_covariance(target, smoothed.t_s + smoothed.epoch_ns * 1e-9, cov, rotation)
     write_record(motion_file(path), _motion(model, trajectory, velocity, imu, estimate.calibration))
 
@@ -301,19 +302,35 @@ def _add_drift(model: Model, smoothed: SmoothedTrajectory, gravity: Array) -> tu
     several = has_rigs(model.reconstruction)
     if several:
         log.info("several cameras took the images: the path's covariance is that of its smoothing, without drift")
-    try:
-        drift = None if several else find_drift(seen, gravity / np.linalg.norm(gravity))
-    except np.linalg.LinAlgError:
-        drift = None
+    drift, similarity_cov = None, model.similarity.cov.copy()
+    if model.parts:
+        drift = _joined_drift(seen, model.joined_covs)
+    elif not several:
+        try:
+            drift = find_drift(seen, gravity / np.linalg.norm(gravity))
+        except np.linalg.LinAlgError:
+            drift = None
     if drift is None or int(timed.sum()) != len(smoothed.t_s):
         return smoothed.cov, None
     velocity = np.zeros_like(seen.cam_in_world)
     local = np.zeros((len(velocity), 3, 3))
     velocity[timed], local[timed] = smoothed.velocity_in_world, smoothed.cov[:, 3:6, 3:6]
-    motion = drift.motion_covs(model.similarity.cov, velocity, local)[timed]
+    if model.parts:
+        # the scales of the parts are in the covariance of positions
+        local += similarity_cov[0, 0] * velocity[:, :, None] * velocity[:, None, :]
+        similarity_cov[0] = similarity_cov[:, 0] = 0.0
+    motion = drift.motion_covs(similarity_cov, velocity, local)[timed]
     cov = np.zeros_like(smoothed.cov)
     cov[:, :6, :6], cov[:, 6:, 6:] = motion[:, :6, :6], smoothed.cov[:, 6:, 6:]
     return cov, motion[:, 6:, 6:]
+
+
+def _joined_drift(seen: Seen, covs: Mapping[str, Array]) -> PictureDrift | None:
+    """Covariance of a joined path; ``None`` where that of an image is unknown."""
+    if not all(name in covs for name in seen.names):
+        return None
+    cov = np.array([covs[name] for name in seen.names])
+    return PictureDrift(names=seen.names, cam_in_world=seen.cam_in_world, cov=cov)
 
 
 def _write_covariance(target: Path, t_s: Array, cov: Array, rotation: Array | None) -> None:
