@@ -3,6 +3,7 @@
     python scripts/study_join.py [--parts 2] [--gaps 1 2 4] [--seeds 1 2] [--spoil thrown] [--sigma-m .1] [--out F]
     python scripts/study_join.py --back [--gaps 2 4] [--seeds 1 2]
     python scripts/study_join.py --recordings FOLDER [--begins 6 25]
+    python scripts/study_join.py --real FOLDER [--gaps 1 2 4] [--sigma-m .5] [--sigma-deg 3]
 
 Points beside the way are tracked as features are (no pictures are rendered), and nothing is seen for some seconds.
 COLMAP's own bundle adjustment makes a model of each part, with its errors, in a world and units of its own; each gets
@@ -22,7 +23,9 @@ share of positions within their 95 % region.
 COLMAP's database, and each gap is told twice: by the IMU alone, and by matches, too.
 
 ``--recordings`` cuts real ones instead (a folder of InertialScale, as ``bench_scale.py`` takes it): two parts from so
-many seconds on, each fitted by itself; the truth is the path of the whole recording in its true scale.
+many seconds on, each fitted by itself; the truth is the path of the whole recording in its true scale. ``--real`` cuts
+windows of real IMUs with motion capture (``real_imu.py``), with pose errors of 2 mm; the truth is the motion capture.
+Printed at last: errors over their standard deviations, rms over all gaps.
 """
 
 import argparse
@@ -36,6 +39,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 from bench_scale import recordings_in
+from real_imu import Window, recorded, windows
 from study_refine import adjusted
 
 from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, so3_exp, so3_log
@@ -163,15 +167,15 @@ def error_across(
     away = poses[0][0].T @ (poses[1][1] - poses[0][1]) - true[0].T @ (centres[1] - centres[0])
     error = np.concatenate([poses[0][0] @ so3_log(turn), poses[0][0] @ away])
     cov = tie_cov(parts, placed, link)
-    inside = [
-        bool(error[part] @ np.linalg.solve(cov[part, part], error[part]) < CHI2_95)
-        for part in (slice(3, 6), slice(0, 3))
+    squares = [
+        float(error[part] @ np.linalg.solve(cov[part, part], error[part])) for part in (slice(3, 6), slice(0, 3))
     ]
     return {
         "error_m": float(np.linalg.norm(error[3:])),
         "error_deg": float(np.degrees(np.linalg.norm(error[:3]))),
-        "inside_m": inside[0],
-        "inside_deg": inside[1],
+        "inside_m": squares[0] < CHI2_95,
+        "inside_deg": squares[1] < CHI2_95,
+        "squares": squares,
     }
 
 
@@ -192,6 +196,26 @@ def cut_recording(folder: Path, begin_s: float, gap_s: float, limits: JoinOption
     out = judged(fitted, imu, limits, truth)
     for one in out:
         one |= {"seed": f"{folder.name} from {begin_s:g} s", "gap_s": gap_s}
+    return out
+
+
+def cut_window(folder: Path, window: Window, gap_s: float, limits: JoinOptions) -> list[dict[str, Any]]:
+    """The first and the last ``PART_S`` of a window of a real IMU, with the motion capture as poses."""
+    path, imu, metres = recorded(folder, window)
+    true, _, _ = recorded(folder, replace(window, noise_m=0.0))
+    fitted = []
+    for k in range(2):
+        first_s = path.t_s[0] + k * (PART_S + gap_s)
+        part = path.select((path.t_s >= first_s) & (path.t_s <= first_s + PART_S))
+        fitted.append(FittedSubmodel(number=k, trajectory=part, path=FittedPath.of(part, imu, None, ScaleOptions())))
+
+    def truth(t_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        at = np.searchsorted(true.t_s, t_s - 1e-6)
+        return matrix_from_quat(true.cam_from_world_xyzw[at]).transpose(0, 2, 1), metres * true.cam_in_world[at]
+
+    out = judged(fitted, imu, limits, truth)
+    for one in out:
+        one |= {"seed": f"{window.recording} from {window.begin_s:.0f} s", "gap_s": gap_s}
     return out
 
 
@@ -310,6 +334,7 @@ def main() -> None:
     parser.add_argument("--sigma-deg", type=float, default=JoinOptions.sigma_deg)
     parser.add_argument("--back", action="store_true")
     parser.add_argument("--recordings", type=Path)
+    parser.add_argument("--real", type=Path)
     parser.add_argument("--begins", type=float, nargs="+", default=[6.0, 25.0])
     parser.add_argument("--out", type=Path)
     asked = parser.parse_args()
@@ -317,6 +342,9 @@ def main() -> None:
     for gap_s in asked.gaps:
         if asked.back:
             walks = (come_back(gap_s, seed, limits) for seed in asked.seeds)
+        elif asked.real is not None:
+            cut = windows(asked.real, (2 * PART_S + gap_s,), (0.002,))
+            walks = (cut_window(asked.real, window, gap_s, limits) for window in cut)
         elif asked.recordings is None:
             walks = (studied(asked.parts, gap_s, seed, asked.spoil, limits) for seed in asked.seeds)
         else:
@@ -352,8 +380,10 @@ def told_of(what: str, gaps: list[dict[str, Any]]) -> None:
     if told:
         median = [float(np.median([one[name] for one in told])) for name in ("error_m", "error_deg")]
         inside = [sum(one[name] for one in told) for name in ("inside_m", "inside_deg")]
+        over = np.sqrt(np.mean([one["squares"] for one in told], axis=0) / 3)
         line += (
-            f"; median error {100 * median[0]:.1f} cm {median[1]:.2f} deg; within the 95 % region {inside[0]} and "
+            f"; over sigma (rms) position {over[0]:.2f}, direction {over[1]:.2f}; median error {100 * median[0]:.1f} cm "
+            f"{median[1]:.2f} deg; within the 95 % region {inside[0]} and "
             f"{inside[1]} of {len(told)}"
         )
     print(line, flush=True)
