@@ -383,7 +383,8 @@ def told_of(what: str, gaps: list[dict[str, Any]]) -> None:
         over = np.sqrt(np.mean([one["squares"] for one in told], axis=0) / 3)
         line += (
             f"; over sigma (rms) position {over[0]:.2f}, direction {over[1]:.2f}; median error "
-            f"{100 * median[0]:.1f} cm {median[1]:.2f} deg; within the 95 % region {inside[0]} and {inside[1]} of {len(told)}"
+            f"{100 * median[0]:.1f} cm {median[1]:.2f} deg; within the 95 % region {inside[0]} and {inside[1]} "
+            f"of {len(told)}"
         )
     print(line, flush=True)
     paths = [one for one in gaps if "inside_path" in one]
