@@ -177,7 +177,7 @@ def match_capture(
             counts |= search.close_loops(match, doubtful=doubtful, neighbours=near_pairs, given=loops).counts()
     context.progress("matches", done, done)
     record = MatchRecord(
-        device=context.device,
+        device=context.device if context.executable is None else context.executable.device,
         pairing="exhaustive" if pairs.every else "sequential",
         images=len(names),
         pairs=pairs.count,

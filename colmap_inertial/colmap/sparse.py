@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Literal, TypeVar
 
 import numpy as np
 
+from colmap_inertial.colmap.installed import InstalledColmap
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, InertialError, MappingError, OutputError
 from colmap_inertial.core.options import MappingOptions
@@ -151,7 +152,7 @@ def extract_features(
 
     pycolmap.set_random_seed(context.seed)
     for batch, reader in register_images(images, cameras, database, context):
-        require_room(database, len(batch) * options.max_num_features * _FEATURE_BYTES)
+        require_room_for_features(database, len(batch), options)
         with writing_database(database):
             pycolmap.extract_features(
                 str(database),
@@ -163,6 +164,11 @@ def extract_features(
                 device=pycolmap.Device(context.device),
             )
     return apply_keypoint_stages(database, keypoint_stages)
+
+
+def require_room_for_features(database: Path, images: int, options: MappingOptions) -> None:
+    """Raise ``OutputError`` where the features of so many images may find no room in a database."""
+    require_room(database, images * options.max_num_features * _FEATURE_BYTES)
 
 
 def register_images(
@@ -341,11 +347,17 @@ def match_pairs(
     total = done + sum(map(_batch_work, batches)) if total is None else total
     pycolmap.set_random_seed(context.seed)
     with tempfile.TemporaryDirectory(dir=context.scratch) as folder:
-        listed = Path(folder) / "pairs.txt"
+        listed, theirs = Path(folder) / "pairs.txt", Path(folder) / "installed.db"
+        installed = None
+        if context.executable is not None and pairs:
+            installed = InstalledColmap(executable=context.executable, context=context)
+            installed.copy_features(database, theirs)
         for batch in batches:
             context.progress("matches", done, total)
             require_room(database, len(batch) * _PAIR_BYTES)
             listed.write_text("".join(f"{a} {b}\n" for a, b in batch))
+            if installed is not None:
+                installed.match(database, theirs, batch)
             with writing_database(database):
                 pycolmap.match_image_pairs(
                     str(database),

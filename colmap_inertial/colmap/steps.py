@@ -3,19 +3,29 @@
 from __future__ import annotations
 
 import shutil
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from colmap_inertial.colmap.given_database import import_features, read_given
+from colmap_inertial.colmap.given_database import GivenDatabase, import_features, read_given
+from colmap_inertial.colmap.installed import InstalledColmap
 from colmap_inertial.colmap.mapping import MapRecord, map_images
 from colmap_inertial.colmap.pairing import match_capture
-from colmap_inertial.colmap.sparse import KeypointRecords, MatchRecord, extract_features, write_gravity_priors
+from colmap_inertial.colmap.sparse import (
+    KeypointRecords,
+    MatchRecord,
+    extract_features,
+    require_room_for_features,
+    write_gravity_priors,
+)
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.errors import FormatError, MappingError
 from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.core.types import CameraModel
 from colmap_inertial.io.files import read_record, write_record
 from colmap_inertial.pipeline.run.context import Recording, RunContext
+from colmap_inertial.pipeline.run.executable import ColmapExecutable
 from colmap_inertial.pipeline.run.runner import fingerprint
 from colmap_inertial.pipeline.run.session import Session
 from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
@@ -113,13 +123,35 @@ def _find_features(
     options: ReconstructOptions,
     context: RunContext,
 ) -> KeypointRecords:
-    """Features of the images into a new database: found here, or those of a database that is given."""
-    if options.database is None:
+    """Features of the images into a new database: found here, by an installed COLMAP, or those of a given database."""
+    if options.database is not None:
+        given, rectified = read_given(options.database), options.database_images == "rectified"
+        return import_features(
+            given, images, cameras, database, keypoint_stages=stages, rectified=rectified, context=context
+        )
+    if context.executable is None:
         return extract_features(images, cameras, database, options.mapping, keypoint_stages=stages, context=context)
-    given, rectified = read_given(options.database), options.database_images == "rectified"
-    return import_features(
-        given, images, cameras, database, keypoint_stages=stages, rectified=rectified, context=context
-    )
+    with tempfile.TemporaryDirectory(dir=context.scratch) as folder:
+        found = Path(folder) / "installed.db"
+        require_room_for_features(found, len(cameras), options.mapping)
+        installed = InstalledColmap(executable=context.executable, context=context)
+        installed.find_features(images, list(cameras), found, options.mapping)
+        given = _read_found(found, list(cameras), context.executable)
+        return import_features(
+            given, images, cameras, database, keypoint_stages=stages, rectified=False, context=context
+        )
+
+
+def _read_found(database: Path, names: Sequence[str], executable: ColmapExecutable) -> GivenDatabase:
+    try:
+        found = read_given(database)
+    except FormatError as error:
+        reason = error.reason.partition(":")[0]  # the rest is advice on --database
+        raise MappingError(f"{executable.path}: the database that it wrote cannot be used: {reason}") from error
+    missing = sorted(set(names) - found.sizes.keys())
+    if missing:
+        raise MappingError(f"{executable.path}: no features of {missing[0]}, nor of {len(missing) - 1} other images")
+    return found
 
 
 def _identify_extraction(options: ReconstructOptions, context: RunContext) -> dict[str, object]:

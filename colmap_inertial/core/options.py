@@ -339,6 +339,9 @@ class ReconstructOptions(CheckedOptions):
     """Options of COLMAP's own, each as SECTION.option=value, such as Mapper.init_num_trials=100."""
     colmap_project: Path | None = None
     """A project.ini of COLMAP: what differs in it from COLMAP's defaults is used; --colmap goes before it."""
+    colmap_executable: Path | None = None
+    """An installed COLMAP (3.8 or newer, as one with CUDA) that finds and matches features in place of pycolmap, which
+    verifies matches and maps. Pairs are chosen and keypoints corrected as ever."""
     database: Path | None = None
     """A COLMAP database of the capture's images, which is used as far as it goes: keypoints of any kind, matches,
     verified pairs. It is only read."""

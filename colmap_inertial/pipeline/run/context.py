@@ -13,11 +13,10 @@ from colmap_inertial.io.calibration import CalibrationFiles, largest_offset_s, r
 from colmap_inertial.io.capture import Capture, Video
 from colmap_inertial.io.files import path_in
 from colmap_inertial.pipeline.run.colmap_settings import NO_SETTINGS, ColmapSettings, read_settings
+from colmap_inertial.pipeline.run.executable import ColmapExecutable, Device, read_executable
 from colmap_inertial.pipeline.run.progress import Progress, silent
 from colmap_inertial.pipeline.run.runner import fingerprint
 
-#: What COLMAP finds and matches features on.
-Device = Literal["cpu", "cuda"]
 Features = Literal["sift", "aliked"]
 
 
@@ -122,6 +121,8 @@ class RunContext:
         What COLMAP finds and matches.
     colmap
         What the user set of COLMAP's own options.
+    executable
+        An installed COLMAP that finds and matches features; ``None`` where pycolmap does.
     workers
         Processes that map parts of a long capture at a time.
     progress
@@ -134,6 +135,7 @@ class RunContext:
     device: Device = "cpu"
     features: Features = "sift"
     colmap: ColmapSettings = NO_SETTINGS
+    executable: ColmapExecutable | None = None
     workers: int = field(default_factory=worker_processes)
     progress: Progress = silent
 
@@ -142,12 +144,18 @@ class RunContext:
         """Settings from the options of a reconstruction; an ``InertialError`` for options that COLMAP does not have."""
         num_threads = 1 if options.deterministic else -1
         settings = read_settings(options.colmap, options.colmap_project)
+        executable = None
+        if options.colmap_executable is not None:
+            executable = read_executable(
+                options.colmap_executable, options.mapping, settings, deterministic=options.deterministic
+            )
         return cls(
             num_threads=num_threads,
             seed=options.seed,
             device=device,
             features=options.mapping.features,
             colmap=settings,
+            executable=executable,
             progress=progress,
         )
 
@@ -157,4 +165,7 @@ class RunContext:
 
     def identity(self) -> dict[str, object]:
         """Settings that decide a result, without listeners and places."""
-        return {name: getattr(self, name) for name in ("num_threads", "seed", "device", "features")}
+        values: dict[str, object] = {
+            name: getattr(self, name) for name in ("num_threads", "seed", "device", "features")
+        }
+        return values if self.executable is None else {**values, "executable": self.executable.identity()}

@@ -28,6 +28,7 @@ from colmap_inertial.io.frames import picture_folders, read_frames
 from colmap_inertial.io.imu import read_raw_capture_imu
 from colmap_inertial.io.plausible import RawImu
 from colmap_inertial.pipeline.run.context import Recording, RunContext, correct_imu, prior_calibration
+from colmap_inertial.pipeline.run.executable import Device
 from colmap_inertial.pipeline.run.progress import Progress, silent
 from colmap_inertial.pipeline.run.runner import remove
 from colmap_inertial.pipeline.run.session import Session, open_session, warn_of_conflicts
@@ -211,7 +212,9 @@ def _reconstruct(
 ) -> ReconstructResult:
     given = _read(path, options, stages)
     capture, used_calibration = given.capture, describe_files(options.calibration)
-    device = mapping_device(options.mapping, deterministic=options.deterministic)
+    device: Device = "cpu"  # of pycolmap, which only verifies where an installed COLMAP does the rest
+    if options.colmap_executable is None:
+        device = mapping_device(options.mapping, deterministic=options.deterministic)
     context = RunContext.of(options, device=device, progress=progress)
     require_features(context)
     decides, pictures = (given.recording.identity(), stages), picture_folders(capture)

@@ -257,6 +257,7 @@ def _check_options(options: ReconstructOptions) -> None:
         if getattr(getattr(options, group), f.name) != getattr(getattr(default, group), f.name)
         and not (f.name == "refine_intrinsics" and options.refine != "off")
     ]
+    named += ["--colmap-executable"] if options.colmap_executable is not None else []
     settings = read_settings(options.colmap, options.colmap_project)
     named += [f"--colmap {text}" for text in settings.of("features", "matches", "mapping", "adjustment")]
     named += ["--database"] if options.database is not None else []

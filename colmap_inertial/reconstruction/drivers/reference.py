@@ -293,6 +293,8 @@ def reconstruct_by(
     capture, out = Path(capture), Path(out)
     check_reference(reference)
     refuse_links(out)
+    if options.colmap_executable is not None:
+        raise InertialError("--colmap-executable goes with a capture whose metres come from the IMU; leave it out")
     if options.database is not None:
         raise InertialError("--database goes with a capture whose metres come from the IMU; leave it out")
     if any("," in end for end in reference.between or ()):

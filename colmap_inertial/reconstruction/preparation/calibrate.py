@@ -327,7 +327,7 @@ def _small_models(
     stages = [] if view is None else [RollingShutterStage(view=view)]
     pairs = image_pairs(names, _SMALL)
     # COLMAP's matcher and mapper differ from run to run with several threads, and the rest of a run would follow them
-    alone = replace(context, num_threads=1)
+    alone = replace(context, num_threads=1, executable=None)
     if matched is None:
         extract_features(images, cameras, database, _SMALL, keypoint_stages=stages, context=context)
         match_pairs(database, pairs, alone)
