@@ -1,4 +1,4 @@
-"""Features and matches by an installed COLMAP: a real one, one of today's names and tables, and what goes wrong."""
+"""Features, matches and models by an installed COLMAP: a real one, one of today's names and tables, and failures."""
 
 import contextlib
 import dataclasses
@@ -11,6 +11,7 @@ import sys
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from test_given_database import is_right, keypoints_of
@@ -19,6 +20,7 @@ from test_pipeline import QUICK, copy_scene
 from colmap_inertial.cli import main
 from colmap_inertial.core.errors import FormatError, InertialError, MappingError
 from colmap_inertial.core.options import MappingOptions, ProjectOptions, ReconstructOptions, ReferenceOptions
+from colmap_inertial.pipeline.run import executable
 from colmap_inertial.pipeline.run.colmap_settings import read_settings
 from colmap_inertial.pipeline.run.executable import read_executable
 from colmap_inertial.reconstruction.drivers.capture import reconstruct
@@ -28,6 +30,11 @@ from colmap_inertial.reconstruction.drivers.reference import reconstruct_by
 COLMAP = shutil.which("colmap")
 needs_colmap = pytest.mark.skipif(COLMAP is None, reason="no colmap is installed")
 
+SMALL = [
+    word
+    for name in ("max_num_features", "first_octave", "max_image_size")
+    for word in (f"--mapping.{name.replace('_', '-')}", str(getattr(QUICK.mapping, name)))
+]
 #: A COLMAP of 4.x: its command line, on pycolmap.
 NEWER = f"""#!{sys.executable}
 import sys
@@ -43,12 +50,14 @@ if words == ["-h"]:
         "SiftExtraction.first_octave SiftExtraction.peak_threshold",
         "matches_importer": "database_path match_list_path match_type FeatureMatching.use_gpu "
         "FeatureMatching.num_threads FeatureMatching.skip_geometric_verification SiftMatching.max_ratio",
+        "mapper": "database_path image_path output_path Mapper.ba_refine_focal_length Mapper.ba_global_frames_ratio",
     }}
     print("Options:", *(f"  --{{name}} arg (=1)" for name in names[command].split()), sep="\\n")
     sys.exit()
 import pycolmap
 given = dict(zip([w.removeprefix("--") for w in words[::2]], words[1::2]))
 database = given["database_path"]
+pycolmap.set_random_seed(0)
 pycolmap.Database.open(database).close()
 if command == "feature_extractor":
     options = pycolmap.FeatureExtractionOptions()
@@ -56,9 +65,18 @@ if command == "feature_extractor":
     options.max_image_size = int(given["FeatureExtraction.max_image_size"])
     options.sift.max_num_features = int(given["SiftExtraction.max_num_features"])
     options.sift.first_octave = int(given["SiftExtraction.first_octave"])
-    options.sift.peak_threshold = float(given["SiftExtraction.peak_threshold"])
+    options.sift.peak_threshold = float(given.get("SiftExtraction.peak_threshold", options.sift.peak_threshold))
     names = open(given["image_list_path"]).read().split()
     pycolmap.extract_features(database, given["image_path"], names, extraction_options=options)
+if command == "mapper":
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads, options.random_seed = 1, 0
+    options.ba_refine_focal_length = options.ba_refine_extra_params = given["Mapper.ba_refine_focal_length"] == "True"
+    options.ba_global_frames_ratio = float(given["Mapper.ba_global_frames_ratio"])
+    tell = lambda: print("Registering image #1", flush=True)
+    pycolmap.incremental_mapping(
+        database, given["image_path"], given["output_path"], options=options, next_image_callback=tell
+    )
 if command == "matches_importer":
     options = pycolmap.FeatureMatchingOptions()
     options.num_threads = 1
@@ -70,7 +88,8 @@ if command == "matches_importer":
 OLDER = r"""#!/bin/sh
 case "$1 $2" in
 "help "*) printf 'COLMAP 3.8 -- Structure-from-Motion\n   (Commit Unknown on Unknown with CUDA)\n'; exit ;;
-*" -h") for name in database_path image_path image_list_path match_list_path match_type SiftExtraction.use_gpu \
+*" -h") for name in database_path image_path image_list_path match_list_path match_type output_path \
+  SiftExtraction.use_gpu Mapper.ba_global_images_ratio \
   SiftExtraction.max_image_size SiftExtraction.max_num_features SiftMatching.use_gpu; do echo "  --$name arg"; done
   exit ;;
 esac
@@ -93,8 +112,8 @@ def names(capture):
     return sorted(file.name for file in (capture / "frames").iterdir())
 
 
-def run(capture, out, executable, **more):
-    return reconstruct(capture, out, dataclasses.replace(QUICK, colmap_executable=Path(executable), **more))
+def run(capture, out, path, **more):
+    return reconstruct(capture, out, dataclasses.replace(QUICK, colmap_executable=Path(path), **more))
 
 
 def tables_of(path):
@@ -111,6 +130,11 @@ def test_an_installed_colmap_finds_and_matches_features(capture, names, tmp_path
     assert result.matching.given == 0 and result.matching.device == "cpu"
     assert "Processed file [16/16]" in (tmp_path / "out/.stages/feature_extractor.txt").read_text()
     assert "Elapsed time" in (tmp_path / "out/.stages/matches_importer.txt").read_text()
+    assert "Registering image #" in (tmp_path / "out/.stages/mapper.txt").read_text()
+    assert sorted(path.name for path in (result.workspace.colmap_sparse / "0").iterdir()) == [
+        *("cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin")
+    ]
+    assert "COLMAP 3." in (tmp_path / "out/log.txt").read_text()
     assert not [path for path in (tmp_path / "out").rglob("*") if path.name.startswith(("tmp", "installed"))]
     # a pair without matches has a row, too; features are not those of pycolmap
     own = reconstruct(capture, tmp_path / "own", QUICK)
@@ -132,6 +156,18 @@ def test_its_keypoints_are_moved_before_its_matches_are_verified(capture, names,
         before, after = (keypoints_of(done.workspace.colmap_database, name) for done in (plain, moved))
         np.testing.assert_allclose(after[:, :2] - before[:, :2], [[3, -2]] * len(before), atol=1e-3)
     is_right(plain, names)
+
+
+@needs_colmap
+def test_frames_without_texture_give_no_model(tmp_path, capsys):
+    capture, rng = copy_scene(tmp_path / "noise", first=5), np.random.default_rng(0)
+    for path in (capture / "frames").iterdir():
+        cv2.imwrite(str(path), rng.integers(0, 255, cv2.imread(str(path)).shape, dtype=np.uint8))
+    with pytest.raises(SystemExit) as stopped:
+        main(["reconstruct", str(capture), str(tmp_path / "out"), "--colmap-executable", COLMAP, *SMALL])
+    assert stopped.value.code == 4
+    told = capsys.readouterr().err
+    assert "COLMAP found no model" in told and "Traceback" not in told
 
 
 def test_options_and_tables_of_todays_colmap_are_used(capture, names, tmp_path):
@@ -168,13 +204,18 @@ def test_device_and_names_are_those_that_it_has(tmp_path):
     with pytest.raises(InertialError, match="--deterministic goes with pycolmap alone"):
         read(older, deterministic=True)
     assert read(older, device="cpu").device == "cpu"
-    settings = read_settings(("FeatureExtraction.max_image_size=99",), None)
-    assert read(older).arguments("feature_extractor", {"use_gpu": 1, "first_octave": 0}, settings) == {
+    settings = ("FeatureExtraction.max_image_size=99",)
+    assert read(older, settings=settings).arguments("feature_extractor", {"use_gpu": 1, "first_octave": 0}) == {
         "SiftExtraction.use_gpu": 1,
         "SiftExtraction.max_image_size": "99",
     }
     with pytest.raises(InertialError, match=r"COLMAP 3\.8 .* has no such option; did you mean SiftExtraction.max_n"):
         read(older, settings=("SiftExtraction.max_num_orientations=1",))
+    mapper = read(older).arguments("mapper", {"ba_global_frames_ratio": 1.4, "ba_refine_focal_length": False})
+    assert mapper == {"Mapper.ba_global_images_ratio": 1.4}
+    assert read(older, settings=("GlobalMapper.ba_ceres_max_num_iterations=9", "TwoViewGeometry.max_error=3"))
+    with pytest.raises(InertialError, match=r"Mapper\.init_num_trials=9: COLMAP 3\.8 .* has no such option"):
+        read(older, settings=("Mapper.init_num_trials=9",))
     newer = program(tmp_path / "newer", NEWER)
     assert read(newer).device == "cpu"
     with pytest.raises(InertialError, match=r"--mapping.device cuda: .*newer is built without CUDA"):
@@ -210,7 +251,8 @@ def test_one_that_may_not_be_run_or_hangs_is_refused(capture, tmp_path, monkeypa
     path.chmod(0o644)
     with pytest.raises(FormatError, match=r"may not be run: make it executable \(chmod \+x\)"):
         run(capture, tmp_path / "out", path)
-    monkeypatch.setattr("colmap_inertial.pipeline.run.executable._HELP_S", 0.2)
+    limits = dataclasses.replace(executable._LIMITS, help_s=0.2)
+    monkeypatch.setattr(executable, "_LIMITS", limits)
     with pytest.raises(FormatError, match="is not COLMAP: no help"):
         read(program(path, "#!/bin/sh\nsleep 100 &\nwait"))
 
@@ -251,7 +293,7 @@ if command == "matches_importer":
     sys.exit()
 import pycolmap
 """,
-        ).replace('given["SiftExtraction.peak_threshold"]', "0.01"),
+        ),
     )
     with pytest.raises(MappingError, match="its database cannot be used here: no such table: matches"):
         run(capture, tmp_path / "out", path)
@@ -271,11 +313,9 @@ def test_it_goes_with_captures_and_the_imu_alone(capture, project, tmp_path):
 def test_it_ends_with_the_run_which_then_continues(capture, names, tmp_path, by):
     wait = f"import os, time\nif command == 'matches_importer' and not os.path.exists({str(tmp_path / 'go')!r}):\n"
     wait += f"    open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid()))\n    time.sleep(100)\nimport pycolmap\n"
-    text = NEWER.replace("import pycolmap\n", wait).replace('given["SiftExtraction.peak_threshold"]', "0.01")
+    text = NEWER.replace("import pycolmap\n", wait)
     path = program(tmp_path / "colmap", text)
-    words = ["reconstruct", capture, tmp_path / "out", "--colmap-executable", path]
-    for name in ("max_num_features", "first_octave", "max_image_size"):
-        words += [f"--mapping.{name.replace('_', '-')}", str(getattr(QUICK.mapping, name))]
+    words = ["reconstruct", capture, tmp_path / "out", "--colmap-executable", path, *SMALL]
     with subprocess.Popen([sys.executable, "-m", "colmap_inertial", *words], stderr=subprocess.PIPE) as process:
         end_s = time.monotonic() + 120
         while not (tmp_path / "pid").exists() or not (tmp_path / "pid").read_text():

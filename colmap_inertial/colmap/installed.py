@@ -1,4 +1,4 @@
-"""Features and matches by an installed COLMAP, in a database that it made itself.
+"""Features, matches and models by an installed COLMAP, in a database that it made itself.
 
 COLMAP of an earlier version does not open a database that pycolmap has opened. So there are two, and rows go between
 them: what both have in common, with the same numbers of cameras, images and pairs.
@@ -9,22 +9,31 @@ from __future__ import annotations
 import contextlib
 import re
 import sqlite3
+import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from colmap_inertial.core.errors import MappingError
 from colmap_inertial.core.options import MappingOptions
-from colmap_inertial.pipeline.run.context import RunContext
+from colmap_inertial.model.soundness import check_binary_model
 from colmap_inertial.pipeline.run.executable import ColmapExecutable
+from colmap_inertial.pipeline.run.progress import Progress
 
-#: Tables of images and features, in an order in which none refers to a later one. Earlier versions have fewer.
-_FEATURE_TABLES = ("rigs", "rig_sensors", "cameras", "frames", "frame_data", "images", "keypoints", "descriptors")
+if TYPE_CHECKING:
+    import pycolmap
+
+#: Tables of images and of their features, in an order in which none refers to a later one; earlier versions have fewer.
+_IMAGE_TABLES = ("rigs", "rig_sensors", "cameras", "frames", "frame_data", "images")
+_FEATURE_TABLES = (*_IMAGE_TABLES, "keypoints", "descriptors")
+_VERIFIED_TABLES = (*_IMAGE_TABLES, "keypoints", "two_view_geometries")
 _MATCH_COLUMNS = "pair_id, rows, cols, data"
 _PROCESSED = re.compile(r"Processed file \[(\d+)/\d+\]")
+_REGISTERED, _NO_MODEL = "Registering image #", "failed to create sparse model"
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class InstalledColmap:
     """An installed COLMAP at work in a run.
 
@@ -32,22 +41,17 @@ class InstalledColmap:
     ----------
     executable
         The program.
-    context
-        How the work is done; the logs of its commands are kept in ``scratch``.
+    scratch
+        A folder for temporary files; the logs of its commands stay there.
     """
 
     executable: ColmapExecutable
-    context: RunContext
+    scratch: Path
 
-    def find_features(self, images: Path, names: Sequence[str], database: Path, options: MappingOptions) -> None:
-        """Find the features of images.
-
-        Parameters
-        ----------
-        images, names
-            Folder, and names in it.
-        database
-            A path that does not exist; this COLMAP's own database.
+    def find_features(
+        self, images: Path, names: Sequence[str], database: Path, options: MappingOptions, progress: Progress
+    ) -> None:
+        """Find the features of images; ``database`` does not exist, and becomes one of its own.
 
         Raises
         ------
@@ -59,7 +63,6 @@ class InstalledColmap:
             own["max_image_size"] = options.max_image_size
         listed = database.with_suffix(".txt")
         listed.write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
-        progress = self.context.progress
 
         def tell(line: str) -> None:
             if (found := _PROCESSED.search(line)) is not None:
@@ -70,34 +73,24 @@ class InstalledColmap:
         self._run("feature_extractor", files, own, tell)
 
     def copy_features(self, database: Path, theirs: Path) -> None:
-        """Make a database of this COLMAP's own with the images and features of ours, which nobody has open.
+        """Make a database of its own of images and features of ours, which nobody has open.
 
         Raises
         ------
         MappingError
             Where its tables cannot be filled.
         """
-        self._run("database_creator", {"database_path": theirs}, {})
-        with self._both(database, theirs) as (ours, copy):
-            for table in _FEATURE_TABLES:
-                known = _columns(ours, table)
-                common = [f'"{column}"' for column in _columns(copy, table) if column in known]
-                if common:
-                    rows = ours.execute(f"SELECT {', '.join(common)} FROM {table}")
-                    marks = ", ".join("?" * len(common))
-                    copy.executemany(f"INSERT INTO {table} ({', '.join(common)}) VALUES ({marks})", rows)
+        self._copy(database, theirs, _FEATURE_TABLES)
 
     def match(self, database: Path, theirs: Path, pairs: Sequence[tuple[str, str]]) -> None:
-        """Match pairs that have no matches yet, for verification.
+        """Match pairs, by names of images, that have no matches yet.
 
         Parameters
         ----------
         database
-            Ours, which nobody has open; it takes the matches.
+            Ours, which nobody has open; it takes the matches, which pycolmap verifies.
         theirs
             By :meth:`copy_features`.
-        pairs
-            Names of images.
 
         Raises
         ------
@@ -116,7 +109,6 @@ class InstalledColmap:
         listed = theirs.with_suffix(".txt")
         listed.write_text("".join(f"{a} {b}\n" for a, b in asked.values()), encoding="utf-8")
         files = {"database_path": theirs, "match_list_path": listed, "match_type": "pairs"}
-        # pycolmap verifies them, with its options
         self._run("matches_importer", files, {"skip_geometric_verification": 1})
         with self._both(database, theirs) as (ours, found):
             rows = {row[0]: row for row in found.execute(f"SELECT {_MATCH_COLUMNS} FROM matches")}
@@ -126,6 +118,61 @@ class InstalledColmap:
             for table in ("matches", "two_view_geometries"):
                 found.execute(f"DELETE FROM {table}")
 
+    def map(
+        self,
+        database: Path,
+        images: Path,
+        sparse: Path,
+        options: pycolmap.IncrementalPipelineOptions,
+        registered: Callable[[], None],
+    ) -> dict[int, pycolmap.Reconstruction]:
+        """Map images of a database of ours; models are written to ``sparse/0``, ``sparse/1``, ... as pycolmap has them.
+
+        There are none where it finds none.
+
+        Parameters
+        ----------
+        options
+            Those that differ from COLMAP's defaults here are used, where it has them.
+        registered
+            Is called for each image that it registers.
+
+        Raises
+        ------
+        MappingError
+            Where it fails.
+        """
+        import pycolmap
+
+        names = ("ba_refine_focal_length", "ba_refine_extra_params", "ba_global_frames_ratio", "ba_global_points_ratio")
+        own = {name: getattr(options, name) for name in (*names, "random_seed")}
+        own |= {f"abs_pose_{name[3:]}": getattr(options, name) for name in names[:2]}
+        models = {}
+        with tempfile.TemporaryDirectory(dir=self.scratch) as folder:
+            theirs, made = Path(folder) / "installed.db", Path(folder) / "models"
+            self._copy(database, theirs, _VERIFIED_TABLES)
+            made.mkdir()
+            files = {"database_path": theirs, "image_path": images, "output_path": made}
+            said: list[str] = []
+
+            def hear(line: str) -> None:
+                if _REGISTERED in line:
+                    registered()
+                elif _NO_MODEL in line:
+                    said.append(line)
+
+            try:
+                self._run("mapper", files, own, hear)
+            except MappingError:
+                if not said:
+                    raise
+            for number in sorted(int(path.name) for path in made.iterdir() if path.name.isdigit()):
+                check_binary_model(made / str(number))
+                models[number] = pycolmap.Reconstruction(str(made / str(number)))
+                (sparse / str(number)).mkdir()
+                models[number].write_binary(str(sparse / str(number)))
+        return models
+
     def _run(
         self,
         command: str,
@@ -133,20 +180,28 @@ class InstalledColmap:
         own: Mapping[str, object],
         heard: Callable[[str], None] = lambda _: None,
     ) -> None:
-        work = {"use_gpu": int(self.executable.device == "cuda"), "num_threads": self.context.num_threads}
-        named = self.executable.arguments(command, {**work, **own}, self.context.colmap)
-        self.executable.run(command, {**files, **named}, self.context.scratch / f"{command}.txt", heard)
+        use_gpu = int(self.executable.device == "cuda")
+        named = self.executable.arguments(command, {"use_gpu": use_gpu, **own})
+        self.executable.run(command, {**files, **named}, self.scratch / f"{command}.txt", heard)
+
+    def _copy(self, database: Path, theirs: Path, tables: Sequence[str]) -> None:
+        """Make a database of its own, with what it has of some of our tables."""
+        self._run("database_creator", {"database_path": theirs}, {})
+        with self._both(database, theirs) as (ours, copy):
+            for table in tables:
+                known = _columns(ours, table)
+                common = [f'"{column}"' for column in _columns(copy, table) if column in known]
+                if common:
+                    rows = ours.execute(f"SELECT {', '.join(common)} FROM {table}")
+                    marks = ", ".join("?" * len(common))
+                    copy.executemany(f"INSERT INTO {table} ({', '.join(common)}) VALUES ({marks})", rows)
 
     @contextlib.contextmanager
     def _both(self, ours: Path, theirs: Path) -> Iterator[tuple[sqlite3.Connection, sqlite3.Connection]]:
-        """Both databases, open in one transaction each."""
+        """Both databases, each in a transaction."""
+        opened = [contextlib.closing(sqlite3.connect(path)) for path in (ours, theirs)]
         try:
-            with (
-                contextlib.closing(sqlite3.connect(ours)) as first,
-                contextlib.closing(sqlite3.connect(theirs)) as second,
-                first,
-                second,
-            ):
+            with opened[0] as first, opened[1] as second, first, second:
                 yield first, second
         except sqlite3.Error as error:
             raise MappingError(

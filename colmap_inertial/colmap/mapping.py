@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from colmap_inertial.colmap.installed import InstalledColmap
 from colmap_inertial.colmap.loop_closure import LoopClosure, MappedCapture, close_gaps
 from colmap_inertial.colmap.sparse import matches_every_pair
 from colmap_inertial.colmap.submaps import join_runs, map_runs, split_capture
@@ -116,7 +117,15 @@ def map_images(
             record = _map_in_parts(capture, images, sparse, context, parts, near=near, loops=judged)
         else:
             nearest = None if judged and not every_pair else near
-            record = _map_in_one_go(capture, images, sparse, _counter(context.progress, num_images), nearest=nearest)
+            counted = _counter(context.progress, num_images)
+            if context.executable is None:
+                models = pycolmap.incremental_mapping(
+                    str(database), str(images), str(sparse), options=pipeline, next_image_callback=counted
+                )
+            else:
+                installed = InstalledColmap(executable=context.executable, scratch=context.scratch)
+                models = installed.map(database, images, sparse, pipeline, counted)
+            record = _close_models(capture, models, sparse, nearest=nearest)
     else:
         models = pycolmap.global_mapping(
             str(database), str(images), str(sparse), options=global_options(options, context)
@@ -137,18 +146,9 @@ def map_images(
     return record
 
 
-def _map_in_one_go(
-    capture: MappedCapture, images: Path, sparse: Path, registered: Callable[[], None], *, nearest: int | None
+def _close_models(
+    capture: MappedCapture, models: Mapping[int, pycolmap.Reconstruction], sparse: Path, *, nearest: int | None
 ) -> MapRecord:
-    import pycolmap
-
-    models = pycolmap.incremental_mapping(
-        str(capture.database),
-        str(images),
-        str(sparse),
-        options=capture.pipeline,
-        next_image_callback=registered,
-    )
     ends = []
     for number, model in models.items() if capture.names else ():
         closure = close_gaps(capture, model, nearest=nearest)

@@ -350,7 +350,7 @@ def match_pairs(
         listed, theirs = Path(folder) / "pairs.txt", Path(folder) / "installed.db"
         installed = None
         if context.executable is not None and pairs:
-            installed = InstalledColmap(executable=context.executable, context=context)
+            installed = InstalledColmap(executable=context.executable, scratch=context.scratch)
             installed.copy_features(database, theirs)
         for batch in batches:
             context.progress("matches", done, total)

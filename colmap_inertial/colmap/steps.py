@@ -134,8 +134,8 @@ def _find_features(
     with tempfile.TemporaryDirectory(dir=context.scratch) as folder:
         found = Path(folder) / "installed.db"
         require_room_for_features(found, len(cameras), options.mapping)
-        installed = InstalledColmap(executable=context.executable, context=context)
-        installed.find_features(images, list(cameras), found, options.mapping)
+        installed = InstalledColmap(executable=context.executable, scratch=context.scratch)
+        installed.find_features(images, list(cameras), found, options.mapping, context.progress)
         given = _read_found(found, list(cameras), context.executable)
         return import_features(
             given, images, cameras, database, keypoint_stages=stages, rectified=False, context=context

@@ -340,8 +340,8 @@ class ReconstructOptions(CheckedOptions):
     colmap_project: Path | None = None
     """A project.ini of COLMAP: what differs in it from COLMAP's defaults is used; --colmap goes before it."""
     colmap_executable: Path | None = None
-    """An installed COLMAP (3.8 or newer, as one with CUDA) that finds and matches features in place of pycolmap, which
-    verifies matches and maps. Pairs are chosen and keypoints corrected as ever."""
+    """An installed COLMAP (3.8 or newer), such as one with CUDA, which finds and matches features and maps. pycolmap
+    verifies matches, and maps long captures (in parts) and with --mapping.mapper global."""
     database: Path | None = None
     """A COLMAP database of the capture's images, which is used as far as it goes: keypoints of any kind, matches,
     verified pairs. It is only read."""

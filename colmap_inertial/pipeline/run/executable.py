@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import difflib
+import logging
 import os
 import re
 import signal
@@ -24,6 +25,8 @@ from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.core.printing import printable
 from colmap_inertial.pipeline.run.colmap_settings import ColmapSettings, Step
 from colmap_inertial.pipeline.run.runner import fingerprint
+
+_logger = logging.getLogger(__name__)
 
 #: What COLMAP finds and matches features on.
 Device = Literal["cpu", "cuda"]
@@ -50,6 +53,7 @@ class _Command:
 
 _COMMANDS = {
     "database_creator": _Command(needs=("database_path",)),
+    "mapper": _Command(needs=("database_path", "image_path", "output_path"), step="mapping", sections=("Mapper",)),
     "feature_extractor": _Command(
         needs=("database_path", "image_path", "image_list_path"),
         step="features",
@@ -61,18 +65,29 @@ _COMMANDS = {
         sections=("FeatureMatching", "SiftMatching"),
     ),
 }
-#: Matches are verified by pycolmap, with its options.
-_NOT_TAKEN = "TwoViewGeometry."
+#: What pycolmap does.
+_NOT_TAKEN = ("TwoViewGeometry.", "GlobalMapper.")
 _VERSION = re.compile(r"COLMAP (\d[\w.-]*)")
 _OPTION = re.compile(r"^\s*--([\w.]+)", re.MULTILINE)
-#: A help that takes longer or is longer is none of COLMAP's.
-_HELP_S, _HELP_BYTES = 30.0, 1 << 20
-#: A command that is asked to end is killed after so long.
-_END_S = 5.0
-#: Of a command that failed, so many lines are told; and of its lines, so many bytes.
-_TOLD_LINES, _LINE_BYTES = 3, 4096
-#: Linux's PR_SET_PDEATHSIG: the signal that a process gets when the one that started it ends.
-_PARENT_DEATH_SIGNAL = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Limits:
+    """Limits of what a program may take and say."""
+
+    #: A help that takes longer or is longer is none of COLMAP's.
+    help_s: float = 30.0
+    help_bytes: int = 1 << 20
+    #: A program that is asked to end is killed after so long.
+    end_s: float = 5.0
+    #: Of one that failed, so many lines are told; longer lines are cut.
+    told_lines: int = 3
+    line_bytes: int = 4096
+    #: Linux's PR_SET_PDEATHSIG: the signal that a process gets when the one that started it ends.
+    parent_death_signal: int = 1
+
+
+_LIMITS = _Limits()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,18 +104,21 @@ class ColmapExecutable:
         What it finds and matches features on.
     options
         Names of its options, by command.
+    settings
+        What the user set of them.
     """
 
     path: Path
     version: str
     device: Device
     options: Mapping[str, frozenset[str]]
+    settings: ColmapSettings
 
     def identity(self) -> list[object]:
         """Values that decide what it makes."""
         return [self.version, self.device, *fingerprint(self.path)]
 
-    def arguments(self, command: str, own: Mapping[str, object], settings: ColmapSettings) -> dict[str, object]:
+    def arguments(self, command: str, own: Mapping[str, object]) -> dict[str, object]:
         """Options of a command by their names there: of ours, those that it has; and those that the user set.
 
         Raises
@@ -110,7 +128,7 @@ class ColmapExecutable:
         """
         step, known = _COMMANDS[command].step, self.options[command]
         named = {found: value for name, value in own.items() if (found := self._find(command, name))}
-        for text in settings.of(step) if step else ():
+        for text in self.settings.of(step) if step else ():
             name, _, value = text.partition("=")
             if name.startswith(_NOT_TAKEN):
                 continue
@@ -123,7 +141,9 @@ class ColmapExecutable:
         return named
 
     def _find(self, command: str, option: str) -> str | None:
+        """The name of an option in this version; before there were rigs, frames were images."""
         names = [f"{section}.{option}" for section in _COMMANDS[command].sections]
+        names += [name.replace("frames", "images") for name in names] + [option]
         return next((name for name in names if name in self.options[command]), None)
 
     def run(
@@ -149,9 +169,10 @@ class ColmapExecutable:
         MappingError
             Where it fails or is killed, with its last lines.
         """
+        _logger.info("%s %s (COLMAP %s), into %s", self.path, command, self.version, log)
         log.unlink(missing_ok=True)  # it may be a link to an earlier run's
         words = [word for name, value in arguments.items() for word in (f"--{name}", str(value))]
-        last: deque[str] = deque(maxlen=_TOLD_LINES)
+        last: deque[str] = deque(maxlen=_LIMITS.told_lines)
         with open(log, "w", encoding="utf-8") as file, _started([str(self.path), command, *words]) as process:
             for line in _lines(process):
                 file.write(line + "\n")
@@ -206,19 +227,19 @@ def read_executable(
         if missing:
             raise FormatError(path, f"COLMAP {version[1]}: its {name} has no {', '.join(missing)}, needed here")
     device: Device = "cuda" if has_cuda and mapping.device != "cpu" else "cpu"
-    executable = ColmapExecutable(path=path, version=version[1], device=device, options=options)
+    executable = ColmapExecutable(path=path, version=version[1], device=device, options=options, settings=settings)
     for name in _COMMANDS:
-        executable.arguments(name, {}, settings)
+        executable.arguments(name, {})
     return executable
 
 
 def _ask(path: Path, *words: str) -> str:
     with _started([str(path), *words]) as process:
-        timer = threading.Timer(_HELP_S, _end, [process])
+        timer = threading.Timer(_LIMITS.help_s, _end, [process])
         timer.start()
         try:
             assert process.stdout is not None
-            text = process.stdout.read(_HELP_BYTES)
+            text = process.stdout.read(_LIMITS.help_bytes)
         finally:
             timer.cancel()
     return printable(text.decode(errors="replace"))
@@ -226,7 +247,7 @@ def _ask(path: Path, *words: str) -> str:
 
 def _lines(process: subprocess.Popen[bytes]) -> Iterator[str]:
     assert process.stdout is not None
-    for line in iter(lambda: process.stdout.readline(_LINE_BYTES), b""):  # type: ignore[union-attr]
+    for line in iter(lambda: process.stdout.readline(_LIMITS.line_bytes), b""):  # type: ignore[union-attr]
         yield printable(line.decode(errors="replace").rstrip())
 
 
@@ -242,7 +263,7 @@ def _started(words: Sequence[str]) -> Iterator[subprocess.Popen[bytes]]:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             start_new_session=True,
-            preexec_fn=lambda: libc.prctl(_PARENT_DEATH_SIGNAL, signal.SIGKILL),
+            preexec_fn=lambda: libc.prctl(_LIMITS.parent_death_signal, signal.SIGKILL),
         )
     except OSError as error:
         raise FormatError(words[0], f"cannot be run: {error.strerror}; give COLMAP's program") from error
@@ -260,6 +281,6 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGTERM)
         try:
-            process.wait(_END_S)
+            process.wait(_LIMITS.end_s)
         except subprocess.TimeoutExpired:
             os.killpg(process.pid, signal.SIGKILL)
