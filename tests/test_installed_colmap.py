@@ -229,7 +229,7 @@ def test_device_and_names_are_those_that_it_has(tmp_path):
     [
         (None, "no such file: --colmap-executable takes"),
         ("#!/bin/sh\necho hello", "is not COLMAP: `help` prints 'hello'"),
-        ("#!/bin/sh\nexit 1", "is not COLMAP: no help"),
+        ("#!/bin/sh\nexit 1", "is not COLMAP: `help` prints 'nothing'"),
         ("#!/bin/sh\nexec yes", "is not COLMAP: `help` prints 'y'"),
         ("#!/bin/sh\nexec head -c 3000000 /dev/urandom", "is not COLMAP"),
         ("#!/no/such/shell\n", "cannot be run: No such file"),
@@ -253,7 +253,7 @@ def test_one_that_may_not_be_run_or_hangs_is_refused(capture, tmp_path, monkeypa
         run(capture, tmp_path / "out", path)
     limits = dataclasses.replace(executable._LIMITS, help_s=0.2)
     monkeypatch.setattr(executable, "_LIMITS", limits)
-    with pytest.raises(FormatError, match="is not COLMAP: no help"):
+    with pytest.raises(FormatError, match="is not COLMAP: `help` prints 'nothing'"):
         read(program(path, "#!/bin/sh\nsleep 100 &\nwait"))
 
 

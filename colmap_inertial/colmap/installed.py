@@ -20,6 +20,7 @@ from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.model.soundness import check_binary_model
 from colmap_inertial.pipeline.run.executable import ColmapExecutable
 from colmap_inertial.pipeline.run.progress import Progress
+from colmap_inertial.pipeline.run.workspace import require_room
 
 if TYPE_CHECKING:
     import pycolmap
@@ -64,13 +65,13 @@ class InstalledColmap:
         listed = database.with_suffix(".txt")
         listed.write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
 
-        def tell(line: str) -> None:
-            if (found := _PROCESSED.search(line)) is not None:
-                progress("features", min(int(found[1]), len(names)), len(names))
+        def read_line(line: str) -> None:
+            if (processed := _PROCESSED.search(line)) is not None:
+                progress("features", min(int(processed[1]), len(names)), len(names))
 
         progress("features", 0, len(names))
         files = {"database_path": database, "image_path": images, "image_list_path": listed}
-        self._run("feature_extractor", files, own, tell)
+        self._run("feature_extractor", files, own, read_line)
 
     def copy_features(self, database: Path, theirs: Path) -> None:
         """Make a database of its own of images and features of ours, which nobody has open.
@@ -110,13 +111,13 @@ class InstalledColmap:
         listed.write_text("".join(f"{a} {b}\n" for a, b in asked.values()), encoding="utf-8")
         files = {"database_path": theirs, "match_list_path": listed, "match_type": "pairs"}
         self._run("matches_importer", files, {"skip_geometric_verification": 1})
-        with self._both(database, theirs) as (ours, found):
-            rows = {row[0]: row for row in found.execute(f"SELECT {_MATCH_COLUMNS} FROM matches")}
+        with self._both(database, theirs) as (ours, matched):
+            rows = {row[0]: row for row in matched.execute(f"SELECT {_MATCH_COLUMNS} FROM matches")}
             # pycolmap would match a pair without a row again
             filled = [rows.get(pair, (pair, 0, 2, b"")) for pair in asked]
             ours.executemany(f"INSERT INTO matches ({_MATCH_COLUMNS}) VALUES (?, ?, ?, ?)", filled)
             for table in ("matches", "two_view_geometries"):
-                found.execute(f"DELETE FROM {table}")
+                matched.execute(f"DELETE FROM {table}")
 
     def map(
         self,
@@ -153,18 +154,18 @@ class InstalledColmap:
             self._copy(database, theirs, _VERIFIED_TABLES)
             made.mkdir()
             files = {"database_path": theirs, "image_path": images, "output_path": made}
-            said: list[str] = []
+            without_model: list[str] = []
 
-            def hear(line: str) -> None:
+            def read_line(line: str) -> None:
                 if _REGISTERED in line:
                     registered()
                 elif _NO_MODEL in line:
-                    said.append(line)
+                    without_model.append(line)
 
             try:
-                self._run("mapper", files, own, hear)
+                self._run("mapper", files, own, read_line)
             except MappingError:
-                if not said:
+                if not without_model:
                     raise
             for number in sorted(int(path.name) for path in made.iterdir() if path.name.isdigit()):
                 check_binary_model(made / str(number))
@@ -178,14 +179,15 @@ class InstalledColmap:
         command: str,
         files: Mapping[str, object],
         own: Mapping[str, object],
-        heard: Callable[[str], None] = lambda _: None,
+        read_line: Callable[[str], None] = lambda _: None,
     ) -> None:
         use_gpu = int(self.executable.device == "cuda")
         named = self.executable.arguments(command, {"use_gpu": use_gpu, **own})
-        self.executable.run(command, {**files, **named}, self.scratch / f"{command}.txt", heard)
+        self.executable.run(command, {**files, **named}, self.scratch / f"{command}.txt", read_line)
 
     def _copy(self, database: Path, theirs: Path, tables: Sequence[str]) -> None:
         """Make a database of its own, with what it has of some of our tables."""
+        require_room(theirs, database.stat().st_size)
         self._run("database_creator", {"database_path": theirs}, {})
         with self._both(database, theirs) as (ours, copy):
             for table in tables:

@@ -132,26 +132,26 @@ def _find_features(
     if context.executable is None:
         return extract_features(images, cameras, database, options.mapping, keypoint_stages=stages, context=context)
     with tempfile.TemporaryDirectory(dir=context.scratch) as folder:
-        found = Path(folder) / "installed.db"
-        require_room_for_features(found, len(cameras), options.mapping)
+        theirs = Path(folder) / "installed.db"
+        require_room_for_features(theirs, len(cameras), options.mapping)
         installed = InstalledColmap(executable=context.executable, scratch=context.scratch)
-        installed.find_features(images, list(cameras), found, options.mapping, context.progress)
-        given = _read_found(found, list(cameras), context.executable)
+        installed.find_features(images, list(cameras), theirs, options.mapping, context.progress)
+        given = _read_extracted(theirs, list(cameras), context.executable)
         return import_features(
             given, images, cameras, database, keypoint_stages=stages, rectified=False, context=context
         )
 
 
-def _read_found(database: Path, names: Sequence[str], executable: ColmapExecutable) -> GivenDatabase:
+def _read_extracted(database: Path, names: Sequence[str], executable: ColmapExecutable) -> GivenDatabase:
     try:
-        found = read_given(database)
+        given = read_given(database)
     except FormatError as error:
         reason = error.reason.partition(":")[0]  # the rest is advice on --database
         raise MappingError(f"{executable.path}: the database that it wrote cannot be used: {reason}") from error
-    missing = sorted(set(names) - found.sizes.keys())
+    missing = sorted(set(names) - given.sizes.keys())
     if missing:
         raise MappingError(f"{executable.path}: no features of {missing[0]}, nor of {len(missing) - 1} other images")
-    return found
+    return given
 
 
 def _identify_extraction(options: ReconstructOptions, context: RunContext) -> dict[str, object]:

@@ -122,7 +122,7 @@ class RunContext:
     colmap
         What the user set of COLMAP's own options.
     executable
-        An installed COLMAP that finds and matches features; ``None`` where pycolmap does.
+        An installed COLMAP that finds and matches features and maps; ``None`` where pycolmap does.
     workers
         Processes that map parts of a long capture at a time.
     progress

@@ -80,8 +80,8 @@ class _Limits:
     help_bytes: int = 1 << 20
     #: A program that is asked to end is killed after so long.
     end_s: float = 5.0
-    #: Of one that failed, so many lines are told; longer lines are cut.
-    told_lines: int = 3
+    #: Of one that failed, so many lines are shown; longer lines are cut.
+    shown_lines: int = 3
     line_bytes: int = 4096
     #: Linux's PR_SET_PDEATHSIG: the signal that a process gets when the one that started it ends.
     parent_death_signal: int = 1
@@ -127,17 +127,17 @@ class ColmapExecutable:
             For a setting that this COLMAP does not have.
         """
         step, known = _COMMANDS[command].step, self.options[command]
-        named = {found: value for name, value in own.items() if (found := self._find(command, name))}
+        named = {there: value for name, value in own.items() if (there := self._find(command, name))}
         for text in self.settings.of(step) if step else ():
             name, _, value = text.partition("=")
             if name.startswith(_NOT_TAKEN):
                 continue
-            found = name if name in known else self._find(command, name.partition(".")[2])
-            if found is None:
+            there = name if name in known else self._find(command, name.partition(".")[2])
+            if there is None:
                 near = difflib.get_close_matches(name, known, n=1)
                 hint = f"; did you mean {near[0]}?" if near else ""
                 raise InertialError(f"--colmap {text}: COLMAP {self.version} ({self.path}) has no such option{hint}")
-            named[found] = value
+            named[there] = value
         return named
 
     def _find(self, command: str, option: str) -> str | None:
@@ -151,7 +151,7 @@ class ColmapExecutable:
         command: str,
         arguments: Mapping[str, object],
         log: Path,
-        heard: Callable[[str], None] = lambda _: None,
+        read_line: Callable[[str], None] = lambda _: None,
     ) -> None:
         """Run a command; it ends with this process, and where this raises.
 
@@ -161,7 +161,7 @@ class ColmapExecutable:
             Values by names of options.
         log
             A file that takes what it prints; an earlier one is replaced.
-        heard
+        read_line
             Is called with each line.
 
         Raises
@@ -172,18 +172,18 @@ class ColmapExecutable:
         _logger.info("%s %s (COLMAP %s), into %s", self.path, command, self.version, log)
         log.unlink(missing_ok=True)  # it may be a link to an earlier run's
         words = [word for name, value in arguments.items() for word in (f"--{name}", str(value))]
-        last: deque[str] = deque(maxlen=_LIMITS.told_lines)
+        last: deque[str] = deque(maxlen=_LIMITS.shown_lines)
         with open(log, "w", encoding="utf-8") as file, _started([str(self.path), command, *words]) as process:
             for line in _lines(process):
                 file.write(line + "\n")
                 if line.strip():
                     last.append(line.strip())
-                heard(line)
+                read_line(line)
             code = process.wait()
         if code:
             what = f"was killed (signal {-code})" if code < 0 else f"failed with exit code {code}"
-            said = " | ".join(last) or "it printed nothing"
-            raise MappingError(f"{self.path} {command} (COLMAP {self.version}) {what}: {said}; all of it is in {log}")
+            output = " | ".join(last) or "it printed nothing"
+            raise MappingError(f"{self.path} {command} (COLMAP {self.version}) {what}: {output}; all of it is in {log}")
 
 
 def read_executable(
@@ -216,8 +216,8 @@ def read_executable(
     about = _ask(path, "help")
     version = _VERSION.search(about)
     if version is None:
-        said = about.strip().splitlines()
-        raise FormatError(path, f"is not COLMAP: `help` prints {said[0][:80]!r}" if said else "is not COLMAP: no help")
+        lines = about.strip().splitlines() or ["nothing"]
+        raise FormatError(path, f"is not COLMAP: `help` prints {lines[0][:80]!r}")
     has_cuda = re.search(r"\bwith CUDA\b", about) is not None
     if mapping.device == "cuda" and not has_cuda:
         raise InertialError(f"--mapping.device cuda: {path} is built without CUDA; leave it out")
