@@ -339,6 +339,15 @@ def test_jumps_of_the_poses_are_outvoted():
     assert np.abs(errors_in_sigmas(calibration, simulated.truth.calibration)).max() < 4.0
 
 
+def test_five_poses_are_compared_and_four_are_too_few():
+    simulated = simulate_recording(RecordingOptions(imu=STATED), seed=8)
+    with pytest.raises(NotObservableError, match="4 poses are too few"):
+        align_camera_imu(simulated.trajectory.select(np.arange(4)), simulated.imu)
+    with pytest.raises(NotObservableError) as refused:
+        align_camera_imu(simulated.trajectory.select(np.arange(5)), simulated.imu)
+    assert "poses are too few" not in str(refused.value)
+
+
 # --- priors and ranges
 
 

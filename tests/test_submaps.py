@@ -16,7 +16,14 @@ from colmap_inertial.colmap.parts import write_part_database
 from colmap_inertial.colmap.submaps import MappedRun, join_runs, merge_parts, place_parts, runs, split_capture
 from colmap_inertial.core.geometry import so3_exp
 from colmap_inertial.core.options import MappingOptions
-from colmap_inertial.model.submodels.graph import Placements, SimilarityConstraint
+from colmap_inertial.model.submodels.graph import (
+    PLACEMENT,
+    Convergence,
+    Equations,
+    Placements,
+    SimilarityConstraint,
+    minimised,
+)
 from colmap_inertial.model.submodels.matches import Submodel, constrain_by_points, find_common_features
 from colmap_inertial.pipeline.run.context import RunContext
 
@@ -450,3 +457,27 @@ def test_a_misplaced_part_does_not_fit_whatever_comes_of_the_adjustment(ring, tu
     met = merge_overlaps(ring.capture(), whole, part_of=part_of, nearest=nearest)
     assert met.seams.keys() == nearest.keys() and all(set(one.images) <= set(NAMES) for one in met.seams.values())
     assert met.kept < 0.99 and not all(one.joined for one in met.seams.values())
+
+
+def test_places_that_settle_are_given_and_those_that_do_not_are_refused():
+    """A minimum is reached in one step; equations whose step never shrinks have none."""
+    target = np.arange(1.0, PLACEMENT + 1)
+
+    def drawn_to_target(state: Placements) -> Equations:
+        equations = Equations(PLACEMENT)
+        off = target * [0, 0, 0, 0, 1, 1, 1] - state.change
+        equations.add(off, np.arange(PLACEMENT), -np.eye(PLACEMENT))
+        return equations
+
+    def fleeing(state: Placements) -> Equations:
+        equations = Equations(PLACEMENT)
+        equations.add(np.ones(PLACEMENT), np.arange(PLACEMENT), -np.eye(PLACEMENT))
+        equations.squares = float(np.sum(state.change**2))
+        return equations
+
+    limits = Convergence(rounds=5, step=1e-9, squares=1e-12, squares_share=0.0)
+    start = Placements.at_origin(np.ones(1))
+    placed, cov, squares = minimised(start, drawn_to_target, limits)
+    assert np.allclose(placed.translation, [[5, 6, 7]]) and np.allclose(cov, np.eye(PLACEMENT)) and squares < 1e-20
+    with pytest.raises(np.linalg.LinAlgError, match="do not converge"):
+        minimised(start, fleeing, limits)
