@@ -13,6 +13,7 @@ import os
 import re
 import signal
 import subprocess
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -254,16 +255,15 @@ def _lines(process: subprocess.Popen[bytes]) -> Iterator[str]:
 @contextlib.contextmanager
 def _started(words: Sequence[str]) -> Iterator[subprocess.Popen[bytes]]:
     """A process whose output is one pipe; it has ended afterwards."""
-    libc = ctypes.CDLL(None)
     try:
-        # a session of its own keeps the terminal's Ctrl-C away; the kernel ends it where this process is killed
+        # a session of its own keeps the terminal's Ctrl-C away
         process = subprocess.Popen(
             words,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             start_new_session=True,
-            preexec_fn=lambda: libc.prctl(_LIMITS.parent_death_signal, signal.SIGKILL),
+            preexec_fn=_end_with_parent(),
         )
     except OSError as error:
         raise FormatError(words[0], f"cannot be run: {error.strerror}; give COLMAP's program") from error
@@ -272,6 +272,14 @@ def _started(words: Sequence[str]) -> Iterator[subprocess.Popen[bytes]]:
             yield process
         finally:
             _end(process)
+
+
+def _end_with_parent() -> Callable[[], object] | None:
+    """What a child calls so that the kernel ends it where this process is killed; Linux alone has that."""
+    if not sys.platform.startswith("linux"):
+        return None
+    libc = ctypes.CDLL(None)
+    return lambda: libc.prctl(_LIMITS.parent_death_signal, signal.SIGKILL)
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
