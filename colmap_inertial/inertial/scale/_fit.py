@@ -218,7 +218,7 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         gain_surprise=_gain_surprise(at.prior, x, cov),
         variance_parts=variance_parts,
         suspicions=suspicions,
-        shape=shape.find_faults(kinds, at.score(columns, data, noise)),
+        shape=shape.find_faults(kinds, at.score(columns, data, noise), shaken=levels.vibrates(data)),
         system=at.system,
         rate_rad_s=at.pre.rate_rad_s,
         prior_info=at.prior.info,

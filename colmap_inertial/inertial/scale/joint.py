@@ -37,7 +37,7 @@ from colmap_inertial.inertial.core.priors import PRIORS, clock_scale_sigma, is_c
 from colmap_inertial.inertial.scale._fit import Fit, fit_jointly
 from colmap_inertial.inertial.scale._gain import WrongGain, judge_gain
 from colmap_inertial.inertial.scale._setup import Data, prepare
-from colmap_inertial.inertial.scale._shape import LIMITS as SHAPE_LIMITS, ShapeFault, confirmed, judge_breaks, suspect
+from colmap_inertial.inertial.scale._shape import LIMITS as SHAPE_LIMITS, ShapeFault, confirmed, suspect
 from colmap_inertial.inertial.scale._suspects import Faults, worst
 from colmap_inertial.inertial.scale.verdict import check_clocks, scale_drifts, student_factor, verdict_of
 
@@ -215,15 +215,13 @@ def _fit_shapely(
     # wrong gains look like a stretch
     sound = fit.gain_chi2 <= par.LARGEST_GAIN_CHI2 and not _refusals(fit, data.t_s)
     while sound and len(found) < SHAPE_LIMITS.most:
-        now = scale_of(fit, data.t_s, calibrated)
-        off_in_gain = now.wrong_gain is not None and now.wrong_gain.is_likely
-        suspected = suspect([one for one in fit.shape if one.kind != "stretch" or not off_in_gain], now.widened)
+        suspected = suspect(fit.shape, scale_of(fit, data.t_s, calibrated).widened)
         if suspected is None:
             break
         mended = replace(data.groups, centre=suspected.undo(data.t_s, data.groups.centre))
         trial_data = replace(data, groups=mended)
         trial = fit_jointly(trial_data, prior, sheet)
-        fault = confirmed(suspected, fit.shape, trial.shape, scale_of(trial, data.t_s, calibrated).widened)
+        fault = confirmed(suspected, trial.shape, scale_of(trial, data.t_s, calibrated).widened)
         if fault is None:
             break
         data, fit = trial_data, trial
@@ -349,8 +347,6 @@ def scale_of(fit: Fit, t_s: Array, calibrated: bool, clock_rate: float = 0.0) ->
     variances["accel_gain"] += 0.0 if calibrated else PRIORS.accel_model**2
     wrong_gain = None if calibrated else judge_gain(fit.estimate, fit.cov, fit.prior_info, widened)
     variances["accel_gain"] += 0.0 if wrong_gain is None else wrong_gain.variance
-    torn = judge_breaks(fit.shape, widened)
-    variances["model_shape"] = variances.get("model_shape", 0.0) + (0.0 if torn is None else torn.variance)
     variances["lens"] = PRIORS.lens**2
     variances["clocks"] = clock_scale_sigma(clock_rate) ** 2
     return FoundScale(

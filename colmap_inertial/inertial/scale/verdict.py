@@ -171,7 +171,7 @@ CAUSES: dict[str, Cause] = {
         words="what was undone of the accelerometer's faults", advice="record what is undone here rightly"
     ),
     "model_shape": Cause(
-        words="whether the model's scale is the same throughout", advice="close loops, and film what overlaps more"
+        words="what was undone of the model's wrong shape", advice="close loops, and film what overlaps more"
     ),
     "noise_levels": Cause(words="how little the clip says of its own noise", advice="record longer"),
 }
