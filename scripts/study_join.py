@@ -44,7 +44,7 @@ from study_refine import adjusted
 
 from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, so3_exp, so3_log
 from colmap_inertial.core.options import JoinOptions, ScaleOptions
-from colmap_inertial.core.types import ImuRecording
+from colmap_inertial.core.types import CameraTrajectory, ImuRecording
 from colmap_inertial.inertial.join.evidence import find_links
 from colmap_inertial.inertial.join.judge import join_submodels
 from colmap_inertial.inertial.join.placement import FittedSubmodel, ImuLink, Placed
@@ -179,30 +179,10 @@ def error_across(
     }
 
 
-def cut_recording(folder: Path, begin_s: float, gap_s: float, limits: JoinOptions) -> list[dict[str, Any]]:
-    """Two parts of a real recording."""
-    path, imu = read_inertial_scale(folder)
-    metres = float((folder / "groundtruth.txt").read_text())
-    fitted = []
-    for k in range(2):
-        first_s = path.t_s[0] + begin_s + k * (PART_S + gap_s)
-        part = path.select((path.t_s >= first_s) & (path.t_s <= first_s + PART_S))
-        fitted.append(FittedSubmodel(number=k, trajectory=part, path=FittedPath.of(part, imu, None, ScaleOptions())))
-
-    def truth(t_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        at = np.searchsorted(path.t_s, t_s - 1e-6)
-        return matrix_from_quat(path.cam_from_world_xyzw[at]).transpose(0, 2, 1), metres * path.cam_in_world[at]
-
-    out = judged(fitted, imu, limits, truth)
-    for one in out:
-        one |= {"seed": f"{folder.name} from {begin_s:g} s", "gap_s": gap_s}
-    return out
-
-
-def cut_window(folder: Path, window: Window, gap_s: float, limits: JoinOptions) -> list[dict[str, Any]]:
-    """The first and the last ``PART_S`` of a window of a real IMU, with the motion capture as poses."""
-    path, imu, metres = recorded(folder, window)
-    true, _, _ = recorded(folder, replace(window, noise_m=0.0))
+def judge_cut(
+    path: CameraTrajectory, true: CameraTrajectory, imu: ImuRecording, metres: float, gap_s: float, limits: JoinOptions
+) -> list[dict[str, Any]]:
+    """Two parts of a path, from its begin on; the truth has the path's world, unit (``metres``) and clock."""
     fitted = []
     for k in range(2):
         first_s = path.t_s[0] + k * (PART_S + gap_s)
@@ -213,10 +193,24 @@ def cut_window(folder: Path, window: Window, gap_s: float, limits: JoinOptions) 
         at = np.searchsorted(true.t_s, t_s - 1e-6)
         return matrix_from_quat(true.cam_from_world_xyzw[at]).transpose(0, 2, 1), metres * true.cam_in_world[at]
 
-    out = judged(fitted, imu, limits, truth)
-    for one in out:
-        one |= {"seed": f"{window.recording} from {window.begin_s:.0f} s", "gap_s": gap_s}
-    return out
+    return judged(fitted, imu, limits, truth)
+
+
+def cut_recording(folder: Path, begin_s: float, gap_s: float, limits: JoinOptions) -> list[dict[str, Any]]:
+    """Two parts of a real recording."""
+    path, imu = read_inertial_scale(folder)
+    metres = float((folder / "groundtruth.txt").read_text())
+    path = path.select(path.t_s >= path.t_s[0] + begin_s)
+    named = {"seed": f"{folder.name} from {begin_s:g} s", "gap_s": gap_s}
+    return [gap | named for gap in judge_cut(path, path, imu, metres, gap_s, limits)]
+
+
+def cut_window(folder: Path, window: Window, gap_s: float, limits: JoinOptions) -> list[dict[str, Any]]:
+    """The first and the last ``PART_S`` of a window of a real IMU, with the motion capture as poses."""
+    path, imu, metres = recorded(folder, window)
+    true, _, _ = recorded(folder, replace(window, noise_m=0.0))
+    named = {"seed": f"{window.recording} from {window.begin_s:.0f} s", "gap_s": gap_s}
+    return [gap | named for gap in judge_cut(path, true, imu, metres, gap_s, limits)]
 
 
 def ring(seconds: float) -> TrackOptions:

@@ -10,10 +10,10 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import matrix_from_quat, skew
 from colmap_inertial.inertial.join.placement import FittedSubmodel
 from colmap_inertial.inertial.join.relative_poses import JoinedGroup, relative_cov
-from colmap_inertial.inertial.refine.motion import PictureDrift, find_drift
+from colmap_inertial.inertial.refine.motion import PictureDrift
 from colmap_inertial.inertial.refine.setup import read_seen
 from colmap_inertial.model import Model
-from colmap_inertial.pipeline.stages.metric import gravity_in_model
+from colmap_inertial.pipeline.stages.metric import find_path_drift, gravity_in_model
 
 
 def find_joined_covs(
@@ -73,7 +73,4 @@ def find_joined_covs(
 def _drift_of(model: Model) -> PictureDrift | None:
     gravity = gravity_in_model(model)
     assert gravity is not None
-    try:
-        return find_drift(read_seen(model.reconstruction, model.timing), gravity / np.linalg.norm(gravity))
-    except np.linalg.LinAlgError:
-        return None
+    return find_path_drift(read_seen(model.reconstruction, model.timing), gravity)

@@ -306,10 +306,7 @@ def _add_drift(model: Model, smoothed: SmoothedTrajectory, gravity: Array) -> tu
     if model.parts:
         drift = _joined_drift(seen, model.joined_covs)
     elif not several:
-        try:
-            drift = find_drift(seen, gravity / np.linalg.norm(gravity))
-        except np.linalg.LinAlgError:
-            drift = None
+        drift = find_path_drift(seen, gravity)
     if drift is None or int(timed.sum()) != len(smoothed.t_s):
         return smoothed.cov, None
     velocity = np.zeros_like(seen.cam_in_world)
@@ -323,6 +320,14 @@ def _add_drift(model: Model, smoothed: SmoothedTrajectory, gravity: Array) -> tu
     cov = np.zeros_like(smoothed.cov)
     cov[:, :6, :6], cov[:, 6:, 6:] = motion[:, :6, :6], smoothed.cov[:, 6:, 6:]
     return cov, motion[:, 6:, 6:]
+
+
+def find_path_drift(seen: Seen, gravity: Array) -> PictureDrift | None:
+    """Drift of a metric path; ``None`` where pictures do not determine it, or that takes too much work."""
+    try:
+        return find_drift(seen, gravity / np.linalg.norm(gravity))
+    except np.linalg.LinAlgError:
+        return None
 
 
 def _joined_drift(seen: Seen, covs: Mapping[str, Array]) -> PictureDrift | None:
