@@ -42,6 +42,7 @@ from bench_scale import recordings_in
 from real_imu import Window, recorded, windows
 from study_refine import adjusted
 
+from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, so3_exp, so3_log
 from colmap_inertial.core.options import JoinOptions, ScaleOptions
 from colmap_inertial.core.types import CameraTrajectory, ImuRecording
@@ -187,7 +188,11 @@ def judge_cut(
     for k in range(2):
         first_s = path.t_s[0] + k * (PART_S + gap_s)
         part = path.select((path.t_s >= first_s) & (path.t_s <= first_s + PART_S))
-        fitted.append(FittedSubmodel(number=k, trajectory=part, path=FittedPath.of(part, imu, None, ScaleOptions())))
+        try:
+            fit = FittedPath.of(part, imu, None, ScaleOptions())
+        except NotObservableError as error:
+            return [{"joined": False, "reason": str(error)}]
+        fitted.append(FittedSubmodel(number=k, trajectory=part, path=fit))
 
     def truth(t_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         at = np.searchsorted(true.t_s, t_s - 1e-6)
