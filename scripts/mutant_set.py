@@ -1873,11 +1873,11 @@ MUTANTS = (
         ("join_matched::test_matches_place_a_part_better_than_the_imu_alone",),
     ),
     Mutant(
-        "inertial/refine/_system.py",
-        "                inverse += along.T @ after @ along",
-        "                inverse += along.T @ along",
+        "inertial/refine/_panels.py",
+        "            here = inverse.T @ inverse - along.T @ beside",
+        "            here = inverse.T @ inverse",
         "a frame's covariance does not know of later frames",
-        ("refine_banded::test_solutions_and_marginals_are_those_of_the_dense_inverse",),
+        ("refine_panels::test_solutions_and_marginals_are_those_of_the_dense_inverse",),
     ),
     Mutant(
         "inertial/refine/pictures.py",

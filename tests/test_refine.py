@@ -1,16 +1,20 @@
 """Bundle adjustment with the IMU and the rolling shutter in it."""
 
+import functools
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from refine_walk import PINHOLE, known_of, nudged, problem_of, tracks_of, walk
 
+from colmap_inertial._kernels import _inertial
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import so3_log
-from colmap_inertial.inertial.refine import _residuals, judge, pictures, setup, solve as solver
+from colmap_inertial.inertial.refine import _residuals, _system, judge, pictures, setup, solve as solver
+from colmap_inertial.inertial.refine._panels import Layout
 from colmap_inertial.inertial.refine._residuals import moving
-from colmap_inertial.inertial.refine._system import Order, System
+from colmap_inertial.inertial.refine._system import System
 from colmap_inertial.inertial.refine.motion import find_motion_covs
 from colmap_inertial.inertial.refine.solve import _evaluate, _plausible, _weighted, evaluate_held_out, factored, solve
 from colmap_inertial.inertial.refine.values import FreeCamera
@@ -148,18 +152,24 @@ def dense(problem, at, by, residual):
     return info, rhs
 
 
+@pytest.mark.parametrize("instruction_set", _inertial.instruction_sets())
 @pytest.mark.parametrize("folded", [False, True])
-def test_the_compiled_step_and_covariance_are_those_of_the_whole_system(folded):
+def test_the_compiled_step_and_covariance_are_those_of_the_whole_system(folded, instruction_set, monkeypatch):
+    kernel = functools.partial(_inertial.reduce_points, instruction_set=instruction_set)
+    monkeypatch.setattr(_system, "_inertial", SimpleNamespace(reduce_points=kernel))
     options = walk(4.0, readout_s=0.02, points_per_m=30.0, frame_rate_hz=3.0)
     problem, start, _ = problem_of(tracks_of(options), options)
     x = nudged(start, np.random.default_rng(2))
     at = _evaluate(problem, x, problem.observations)
     by, residual = _weighted(problem, at)
-    order = Order.of(problem.observations, len(x.velocity_m_s))
+    layout = Layout.of(problem.observations, len(x.velocity_m_s))
     if folded:
-        order = Order(place=np.random.default_rng(0).permutation(len(order.place)), width=15 * len(order.place) - 1)
+        count = len(layout.place)
+        layout = Layout.make(
+            np.random.default_rng(0).permutation(count), 15, *np.indices((count, count)).reshape(2, -1)
+        )
     prior = (problem.prior.info, -problem.prior.info @ at.offset)
-    system = System.build(order, problem.observations, by, residual, at.rows, prior, damping=0.0)
+    system = System.build(layout, problem.observations, by, residual, at.rows, prior, damping=0.0)
     solved = system.factored()
     states, shared, points = solved.step(system, problem.observations, by)
     info, rhs = dense(problem, at, by, residual)
@@ -175,18 +185,19 @@ def test_the_compiled_step_and_covariance_are_those_of_the_whole_system(folded):
 
 
 def test_frames_stand_in_order_of_time_unless_a_loop_closes():
-    options = walk(12.0, points_per_m=40.0)
+    options = walk(40.0, points_per_m=20.0)
     problem, start, _ = problem_of(tracks_of(options), options)
     frames, observations = len(start.velocity_m_s), problem.observations
-    plain = Order.of(observations, frames)
-    assert plain.width < 0.8 * 15 * frames
+    plain = Layout.of(observations, frames)
+    assert np.array_equal(plain.place, np.arange(frames))
+    assert plain.size_bytes < 0.6 * 8 * (15 * frames) ** 2
     # the last frame sees what the first saw
     first = np.flatnonzero(observations.frame == 0)[0]
     frame = observations.frame.copy()
     frame[np.flatnonzero(observations.point == observations.point[first])[-1]] = frames - 1
-    closed = Order.of(replace(observations, frame=frame), frames)
+    closed = Layout.of(replace(observations, frame=frame), frames)
     assert sorted(closed.place) == list(range(frames))
-    assert closed.width < 15 * (frames - 1)
+    assert not np.array_equal(closed.place, np.arange(frames))
 
 
 def test_a_walk_is_found_from_a_start_that_is_off(small):
@@ -405,8 +416,8 @@ def test_what_a_small_step_promises_is_what_it_gives(small, share):
     _, problem, start, _ = small
     at = _evaluate(problem, nudged(start, np.random.default_rng(11), 3e-4), problem.observations)
     by, residual = _weighted(problem, at)
-    order = Order.of(problem.observations, len(start.velocity_m_s))
-    system = solver._built(problem, order, at, by, residual, 1e-4)
+    layout = Layout.of(problem.observations, len(start.velocity_m_s))
+    system = solver._built(problem, layout, at, by, residual, 1e-4)
     step = tuple(share * part for part in solver._step(system, problem.observations, by))
     promised = solver._promised(problem, at, by, residual, step, problem.observations)
     gained = at.cost - _evaluate(problem, at.estimate.moved(*step), problem.observations).cost
@@ -460,7 +471,7 @@ def test_the_drift_map_names_what_was_stretched_and_how_sure_it_is(small, monkey
     # by the whole covariance
     n, shared = solved.solved.shape[0], start.columns.count
     cov = np.concatenate(solved.solve(np.eye(n, n + shared), np.eye(shared, n + shared, n)))
-    first, last = 15 * solved.order.place[[0, -1]]
+    first, last = 15 * solved.layout.place[[0, -1]]
     jacobian = np.zeros((9, n + shared))
     jacobian[:, last : last + 15], jacobian[:, n:] = by.by_state[-1], by.by_shared[-1]
     jacobian[:3, first : first + 15] -= by.by_state[0, :3]

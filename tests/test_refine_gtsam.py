@@ -119,7 +119,7 @@ def sigmas_of(problem, x):
     found = factored(problem, x)
     n = found.solved.shape[0]
     states, _ = found.solve(np.eye(n), np.zeros((x.columns.count, n)))
-    columns = N_STATE * found.order.place[:, None] + np.arange(N_STATE)
+    columns = N_STATE * found.layout.place[:, None] + np.arange(N_STATE)
     return states, columns, np.sqrt(np.diagonal(states))[columns]
 
 

@@ -83,24 +83,30 @@ def whiten_tridiagonal(diagonal: Array, below: Array, sides: Array) -> float:
 def reduce_points(
     *,
     first: Int64Array,
-    column: Int64Array,
+    place: Int64Array,
     by_frame: Array,
     by_shared: Array,
     by_point: Array,
     residual: Array,
     damping: float,
-    band: Array,
+    wide: int,
+    pitch: int,
+    offset: Int64Array,
+    end: Int64Array,
+    values: Array,
     border: Array,
     corner: Array,
     rhs: Array,
     rhs_shared: Array,
     inverse: Array,
     pull: Array,
+    instruction_set: str = "",
 ) -> bool:
-    """Add the normal equations of a bundle adjustment without its P points; False where they lie outside the band.
+    """Add the normal equations of a bundle adjustment without its P points; False where they lie outside the panels.
 
-    Observations (M), point by point from `first` (P + 1): their frames' `column`, derivatives (M, 2, 9), (M, 2, q),
-    (M, 2, 3) and residuals (M, 2). The band (n, width + 1) has the lower triangle, column by column.
+    Observations (M), point by point from `first` (P + 1): the `place` of their frames in the order, derivatives
+    (M, 2, 9), (M, 2, q), (M, 2, 3) and residuals (M, 2). Row i of the frame at place a, column j of that at place b up
+    to a stands at `offset[b] + (wide a + i) pitch + j` of the `values`, for a before `end[b]`.
     """
 
 def instruction_sets() -> list[str]:

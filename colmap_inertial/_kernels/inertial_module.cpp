@@ -1,7 +1,7 @@
 #include "arrays.h"
 #include "arrow_simd.h"
 #include "dispatch.h"
-#include "points.h"
+#include "points_simd.h"
 #include "preintegration.h"
 
 #include <nanobind/stl/optional.h>
@@ -23,6 +23,7 @@ template <int N>
 using Results = Of<double, N>;
 
 const Tables<ArrowSimd> SIMD_TABLES = TABLES_OF(arrow);
+const Tables<PointsSimd> POINTS = TABLES_OF(points);
 
 struct Free {
     void operator()(void *memory) const { std::free(memory); }
@@ -184,25 +185,38 @@ double whiten_tridiagonal(Doubles<1> diagonal, Doubles<1> below, Results<2> side
 }
 
 // Adds the normal equations of a bundle adjustment without its points; see the stub.
-bool reduce_points_of(Of<const int64_t, 1> first, Of<const int64_t, 1> column, Doubles<3> by_frame,
-                      Doubles<3> by_shared, Doubles<3> by_point, Doubles<2> residual, double damping, Results<2> band,
+bool reduce_points_of(Of<const int64_t, 1> first, Of<const int64_t, 1> place, Doubles<3> by_frame,
+                      Doubles<3> by_shared, Doubles<3> by_point, Doubles<2> residual, double damping, size_t wide,
+                      size_t pitch, Of<const int64_t, 1> offset, Of<const int64_t, 1> end, Results<1> values,
                       Results<2> border, Results<2> corner, Results<1> rhs, Results<1> rhs_shared, Results<3> inverse,
-                      Results<2> pull) {
-    const size_t m = column.shape(0), n = rhs.shape(0), q = rhs_shared.shape(0), p = pull.shape(0);
+                      Results<2> pull, const std::string &instruction_set) {
+    const size_t m = place.shape(0), n = rhs.shape(0), q = rhs_shared.shape(0), p = pull.shape(0), f = n / STATE;
     check(is(by_frame, m, 2, FRAME) && is(by_shared, m, 2, q) && is(by_point, m, 2, 3) && is(residual, m, 2),
           "derivatives: not of one size");
-    check(
-        is(border, n, q) && is(corner, q, q) && is(inverse, p, 3, 3) && is(first, p + 1) && is(band, n, band.shape(1)),
-        "results: not of the size of the derivatives");
-    check(first(0) == 0 && size_t(first(p)) == m && band.shape(1) >= size_t(STATE), "first: not up to the last one");
-    for (size_t i = 0; i < p; ++i) check(first(i) <= first(i + 1), "first: must not fall");
-    for (size_t i = 0; i < m; ++i) check(column(i) >= 0 && size_t(column(i) + STATE) <= n, "column: outside the band");
-    const Seen seen{ptrdiff_t(p), ptrdiff_t(q), first.data(), column.data(), by_frame.data(), by_shared.data(),
-                    by_point.data(), residual.data(), damping};
-    const Reduced out{ptrdiff_t(band.shape(1)), band.data(), border.data(), corner.data(),
+    check(is(border, n, q) && is(corner, q, q) && is(inverse, p, 3, 3) && is(first, p + 1) && n == f * STATE,
+          "results: not of the size of the derivatives");
+    check(first(0) == 0 && size_t(first(p)) == m, "first: not up to the last one");
+    int64_t most = 0;
+    for (size_t i = 0; i < p; ++i) {
+        check(first(i) <= first(i + 1), "first: must not fall");
+        most = std::max(most, first(i + 1) - first(i));
+    }
+    for (size_t i = 0; i < m; ++i) check(place(i) >= 0 && size_t(place(i)) < f, "place: not of a frame");
+    check(is(offset, f) && is(end, f) && wide >= FRAME && wide <= STATE && pitch >= wide, "panels: of another size");
+    for (size_t i = 0; i < f; ++i) {
+        check(end(i) > int64_t(i) && end(i) <= int64_t(1) << 32, "end: not after the place");
+        check(offset(i) + int64_t(wide * i * pitch) >= 0 &&
+                  offset(i) + int64_t((wide * size_t(end(i)) - 1) * pitch + FRAME) <= int64_t(values.shape(0)),
+              "offset: outside the panels");
+    }
+    const Seen seen{ptrdiff_t(p), ptrdiff_t(q), first.data(), place.data(), by_frame.data(), by_shared.data(),
+                    by_point.data(), residual.data(), ptrdiff_t(wide), damping};
+    const Reduced out{ptrdiff_t(pitch), values.data(), offset.data(), end.data(), border.data(), corner.data(),
                       rhs.data(), rhs_shared.data(), inverse.data(), pull.data()};
+    const PointsSimd &simd = POINTS.require(instruction_set);
+    std::vector<double> work(simd.work(seen, most));
     nb::gil_scoped_release release;
-    return reduce_points(seen, out);
+    return simd.reduce(seen, out, work.data());
 }
 
 }  // namespace
@@ -230,10 +244,11 @@ NB_MODULE(_inertial, module) {
                nb::arg("rate").noconvert());
     module.def("whiten_tridiagonal", &whiten_tridiagonal, nb::arg("diagonal"), nb::arg("below"),
                nb::arg("sides").noconvert());
-    module.def("reduce_points", &reduce_points_of, nb::kw_only(), nb::arg("first"), nb::arg("column"),
+    module.def("reduce_points", &reduce_points_of, nb::kw_only(), nb::arg("first"), nb::arg("place"),
                nb::arg("by_frame"), nb::arg("by_shared"), nb::arg("by_point"), nb::arg("residual"), nb::arg("damping"),
-               nb::arg("band").noconvert(), nb::arg("border").noconvert(), nb::arg("corner").noconvert(),
+               nb::arg("wide"), nb::arg("pitch"), nb::arg("offset"), nb::arg("end"), nb::arg("values").noconvert(),
+               nb::arg("border").noconvert(), nb::arg("corner").noconvert(),
                nb::arg("rhs").noconvert(), nb::arg("rhs_shared").noconvert(), nb::arg("inverse").noconvert(),
-               nb::arg("pull").noconvert());
+               nb::arg("pull").noconvert(), nb::arg("instruction_set") = "");
     module.def("instruction_sets", [] { return SIMD_TABLES.names(); });
 }

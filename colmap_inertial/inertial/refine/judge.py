@@ -9,8 +9,9 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.inertial.refine._panels import Layout
 from colmap_inertial.inertial.refine._residuals import Moving, moving
-from colmap_inertial.inertial.refine._system import Factored, Order
+from colmap_inertial.inertial.refine._system import Factored
 from colmap_inertial.inertial.refine.motion import find_motion_covs
 from colmap_inertial.inertial.refine.pictures import apply_noise, measure_picture_noise, pictures_alone
 from colmap_inertial.inertial.refine.setup import NO_READOUT_S, move_to_middle_lines
@@ -153,7 +154,7 @@ def refine(
     NotObservableError
         Where it would take too much memory.
     """
-    needed = Order.of(problem.observations, len(t_s)).size_bytes
+    needed = Layout.of(problem.observations, len(t_s)).size_bytes
     if needed > LIMITS.most_bytes:
         why = f"frames far apart see the same points, and solving for all at once takes {1e-9 * needed:.1f} GB"
         raise NotObservableError("refinement", why)

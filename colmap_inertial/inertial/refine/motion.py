@@ -8,8 +8,9 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.geometry import skew
+from colmap_inertial.inertial.refine._panels import Layout
 from colmap_inertial.inertial.refine._residuals import CENTRE, N_MOVING, SPEED, TURN, Moving, moving
-from colmap_inertial.inertial.refine._system import Factored, Order
+from colmap_inertial.inertial.refine._system import Factored
 from colmap_inertial.inertial.refine.pictures import apply_noise, make_pictures, measure_picture_noise, pictures_alone
 from colmap_inertial.inertial.refine.setup import Seen
 from colmap_inertial.inertial.refine.solve import factored
@@ -140,7 +141,7 @@ def find_drift(seen: Seen, down: Array) -> PictureDrift | None:
     problem, x = make_pictures(seen)
     if not len(problem.observations.point):
         return None
-    if Order.of(problem.observations, len(seen.names)).size_bytes > _LIMITS.most_bytes:
+    if Layout.of(problem.observations, len(seen.names)).size_bytes > _LIMITS.most_bytes:
         return None
     problem = apply_noise(problem, measure_picture_noise(problem, x))
     solved, by = factored(problem, x), moving(problem, x)
@@ -188,11 +189,11 @@ def expect_worth(seen: Seen, problem: Problem, start: Estimate) -> Worth:
         Where nothing determines the path.
     """
     frames, observations = len(seen.names), len(problem.observations.frame)
-    order = Order.of(problem.observations, frames)
-    products = N_STATE * frames * float(order.width) ** 2
+    layout = Layout.of(problem.observations, frames)
+    products = layout.products
     needed_s = _LIMITS.steps * (_LIMITS.step_observation_s * observations + _LIMITS.step_product_s * products)
     share = needed_s / (_LIMITS.mapped_image_s * frames + _LIMITS.mapped_observation_s * observations)
-    if share > _LIMITS.share or order.size_bytes > _LIMITS.most_bytes:
+    if share > _LIMITS.share or layout.size_bytes > _LIMITS.most_bytes:
         return Worth(
             share=share, reason=f"it would take {100 * share:.0f} % of the time that features and mapping take"
         )

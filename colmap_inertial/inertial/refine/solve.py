@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.inertial.refine._panels import Layout
 from colmap_inertial.inertial.refine._residuals import (
     Derivatives,
     Projected,
@@ -17,7 +18,7 @@ from colmap_inertial.inertial.refine._residuals import (
     prior_offset,
     project,
 )
-from colmap_inertial.inertial.refine._system import Factored, Order, System
+from colmap_inertial.inertial.refine._system import Factored, System
 from colmap_inertial.inertial.refine.values import N_STATE, Estimate, Observations, Problem
 
 _MAX_STEPS = 40
@@ -102,22 +103,22 @@ def _informing(problem: Problem, at: _Point) -> tuple[Derivatives, Array]:
     return by, residual / root
 
 
-def _built(problem: Problem, order: Order, at: _Point, by: Derivatives, residual: Array, damping: float) -> System:
+def _built(problem: Problem, layout: Layout, at: _Point, by: Derivatives, residual: Array, damping: float) -> System:
     info = problem.prior.info
-    return System.build(order, problem.observations, by, residual, at.rows, (info, -info @ at.offset), damping=damping)
+    return System.build(layout, problem.observations, by, residual, at.rows, (info, -info @ at.offset), damping=damping)
 
 
 def solve(problem: Problem, start: Estimate) -> Solution:
     """Refine an estimate."""
     observations = problem.observations
-    order = Order.of(observations, len(start.velocity_m_s))
+    layout = Layout.of(observations, len(start.velocity_m_s))
     at, damping, growth = _evaluate(problem, start, observations), _FIRST_DAMPING, 2.0
     converged, steps = False, 0
     for steps in range(1, _MAX_STEPS + 1):
         by, residual = _weighted(problem, at)
         gained = pushed = False
         while not gained and damping < _MOST_DAMPING:
-            system = _built(problem, order, at, by, residual, damping)
+            system = _built(problem, layout, at, by, residual, damping)
             step = _step(system, observations, by)
             if step is None:
                 damping, growth = damping * growth, 2 * growth
@@ -194,16 +195,16 @@ def _solution(at: _Point, steps: int, *, converged: bool) -> Solution:
 
 def factored(problem: Problem, x: Estimate) -> Factored:
     """The information at an estimate, for covariances."""
-    order = Order.of(problem.observations, len(x.velocity_m_s))
+    layout = Layout.of(problem.observations, len(x.velocity_m_s))
     at = _evaluate(problem, x, problem.observations)
-    return _built(problem, order, at, *_informing(problem, at), 0.0).factored()
+    return _built(problem, layout, at, *_informing(problem, at), 0.0).factored()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Linearised:
     """Observations at an estimate: what is solved for again and again with other noise of the IMU."""
 
-    order: Order
+    layout: Layout
     projected: Projected
     by: Derivatives
     residual: Array
@@ -219,7 +220,7 @@ class Linearised:
             offset=prior_offset(problem, x),
             cost=np.nan,
         )
-        system = _built(problem, self.order, at, self.by, self.residual, 0.0)
+        system = _built(problem, self.layout, at, self.by, self.residual, 0.0)
         solved = system.factored()
         states, shared, _ = solved.step(system, observations, self.by)
         return solved, states, shared
@@ -229,8 +230,8 @@ def linearised(problem: Problem, x: Estimate) -> Linearised:
     """The observations at an estimate."""
     at = _evaluate(problem, x, problem.observations)
     by, residual = _informing(problem, at)
-    order = Order.of(problem.observations, len(x.velocity_m_s))
-    return Linearised(order=order, projected=at.projected, by=by, residual=residual, estimate=x)
+    layout = Layout.of(problem.observations, len(x.velocity_m_s))
+    return Linearised(layout=layout, projected=at.projected, by=by, residual=residual, estimate=x)
 
 
 def evaluate_held_out(problem: Problem, x: Estimate, observations: Observations) -> Array:
@@ -318,7 +319,7 @@ def _apply_rows(rows: Rows, states: Array, shared: Array) -> Array:
 def _followed(rows: Rows, values: Array, solved: Factored) -> Array:
     """(N, r, k) of values the part that the fit follows: derivatives, covariance, derivatives."""
     assert rows.after is not None and rows.by_shared is not None
-    place, count = solved.order.place, values.shape[2]
+    place, count = solved.layout.place, values.shape[2]
     sides = np.zeros((len(place), N_STATE, count))
     sides[place[:-1]] += rows.here.transpose(0, 2, 1) @ values
     sides[place[1:]] += rows.after.transpose(0, 2, 1) @ values

@@ -1,4 +1,4 @@
-"""The band's factor, against dense algebra."""
+"""The factor of the states' information in panels, against dense algebra."""
 
 from dataclasses import replace
 
@@ -7,9 +7,8 @@ import pytest
 from refine_walk import problem_of, tracks_of, walk
 
 from colmap_inertial.core.geometry import so3_log
-from colmap_inertial.inertial.refine import _system
+from colmap_inertial.inertial.refine._panels import Layout, PanelFactor
 from colmap_inertial.inertial.refine._residuals import moving, project
-from colmap_inertial.inertial.refine._system import BandFactor
 from colmap_inertial.inertial.refine.motion import find_drift, find_motion_covs
 from colmap_inertial.inertial.refine.pictures import make_pictures
 from colmap_inertial.inertial.refine.setup import move_to_middle_lines, read_seen
@@ -17,22 +16,47 @@ from colmap_inertial.inertial.refine.solve import factored, solve
 from colmap_inertial.inertial.refine.world import derive_log_size, find_world
 
 
-@pytest.mark.parametrize(("states", "reach"), [(1, 1), (7, 2), (23, 4), (24, 24), (60, 9)])
-def test_solutions_and_marginals_are_those_of_the_dense_inverse(states, reach, monkeypatch):
-    monkeypatch.setattr(_system, "_LEAST", 12)
-    rng, count, width = np.random.default_rng(states), 3 * states, min(3 * reach, 3 * states) - 1
-    row, column = np.indices((count, count))
-    matrix = np.where(np.abs(row - column) <= width, rng.standard_normal((count, count)), 0.0)
-    matrix = 0.5 * (matrix + matrix.T) + 2 * width * np.eye(count) + np.eye(count)
-    band = np.zeros((count, width + 1))
-    for below in range(width + 1):
-        band[: count - below, below] = np.diagonal(matrix, -below)
-    factor, inverse = BandFactor.of(band, 3), np.linalg.inv(matrix)
-    rhs = rng.standard_normal((count, 4))
-    assert factor.solve(rhs) == pytest.approx(inverse @ rhs, abs=1e-9)
-    expected = inverse.reshape(states, 3, states, 3)[np.arange(states), :, np.arange(states)]
-    assert factor.marginals(3) == pytest.approx(expected, abs=1e-9)
-    assert factor.log_determinant() == pytest.approx(np.linalg.slogdet(matrix)[1])
+@pytest.mark.parametrize(
+    ("frames", "reach", "state", "wide", "group"),
+    [(1, 1, 5, 3, 3), (7, 2, 5, 3, 3), (23, 4, 5, 3, 4), (24, 24, 5, 3, 4), (60, 9, 5, 5, 8), (61, 15, 15, 9, 12)],
+)
+def test_solutions_and_marginals_are_those_of_the_dense_inverse(frames, reach, state, wide, group):
+    """Frames see as far as ``reach``, each otherwise; numbers that are not wide are coupled with neighbours alone."""
+    rng = np.random.default_rng(frames)
+    pairs = [(a, b) for a in range(frames) for b in range(a + 1) if a - b < max(2, rng.integers(1, reach + 2))]
+    both = np.array([*pairs, *(pair[::-1] for pair in pairs)])
+    place = rng.permutation(frames) if wide == state else np.arange(frames)
+    layout = Layout.make(place, wide, *both.T, state=state, group=group)
+    matrix = np.zeros((frames, state, frames, state))
+    for a, b in pairs:
+        block = rng.standard_normal((state, state))
+        if a - b > 1:
+            block[wide:] = block[:, wide:] = 0.0
+        matrix[a, :, b] += block
+        matrix[b, :, a] += block.T
+    whole = matrix.reshape(frames * state, -1)
+    whole += np.abs(whole).sum(axis=1).max() * np.eye(len(whole))
+    values = np.zeros(layout.size_bytes // 8)
+    (own, lower), (following, _), diagonal = layout.entries
+    values[own] = matrix[np.arange(frames), :, np.arange(frames)].ravel()[lower]
+    values[following] = matrix[np.arange(1, frames), :, np.arange(frames - 1)].ravel()
+    values[diagonal[whole.shape[0] :]] = 1.0
+    offset, end = layout.offsets
+    for a, b in pairs:
+        if a - b > 1:
+            first, last = sorted((place[a], place[b]))
+            assert last < end[first]
+            block = matrix[a, :wide, b, :wide] if place[a] == last else matrix[a, :wide, b, :wide].T
+            at = offset[first] + (wide * last + np.arange(wide)[:, None]) * group * wide + np.arange(wide)
+            values[at] = block
+    order = (np.argsort(place)[:, None] * state + np.arange(state)).ravel()
+    inverse = np.linalg.inv(whole[np.ix_(order, order)])
+    factor = PanelFactor.of(layout, values)
+    rhs = rng.standard_normal((len(whole), 4))
+    assert factor.solve(rhs) == pytest.approx(inverse @ rhs, abs=1e-12)
+    expected = inverse.reshape(frames, state, frames, state)[np.arange(frames), :, np.arange(frames)]
+    assert factor.marginals() == pytest.approx(expected, abs=1e-12)
+    assert factor.log_determinant() == pytest.approx(np.linalg.slogdet(whole)[1])
 
 
 def test_a_position_s_covariance_against_the_first_is_that_of_both():
@@ -102,5 +126,7 @@ def test_a_path_of_pictures_is_as_unsure_as_models_of_other_noise_differ():
 
 
 def test_what_is_not_positive_is_refused():
+    nobody = np.zeros(0, dtype=np.int64)
+    layout = Layout.make(np.arange(1), 2, nobody, nobody, state=2, group=1)
     with pytest.raises(np.linalg.LinAlgError):
-        BandFactor.of(np.array([[1.0, 2.0], [1.0, 0.0]]), 1)
+        PanelFactor.of(layout, np.array([1.0, 0.0, 2.0, 1.0]))
