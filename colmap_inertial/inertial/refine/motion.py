@@ -29,11 +29,11 @@ class DriftLimits:
 
     #: Normal equations of pictures alone, for a covariance: more take longer than a scale is worth.
     most_bytes: int = 300_000_000
-    #: Processor seconds: of a step of the refinement for each observation, and for each multiplication of its band; its
+    #: Processor seconds: of a step of the refinement for each observation, and for each product of its factor; its
     #: steps; of features, matching and mapping for each image and each observation (a desk computer's core).
-    step_observation_s: float = 3.4e-6
-    step_product_s: float = 1e-11
-    steps: int = 40
+    step_observation_s: float = 2.5e-6
+    step_product_s: float = 3.2e-11
+    steps: int = 55
     mapped_image_s: float = 0.4
     mapped_observation_s: float = 2e-4
     #: Of that time what a refinement may take.
