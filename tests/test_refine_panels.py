@@ -59,6 +59,20 @@ def test_solutions_and_marginals_are_those_of_the_dense_inverse(frames, reach, s
     assert factor.log_determinant() == pytest.approx(np.linalg.slogdet(whole)[1])
 
 
+def test_marginals_of_a_long_walk_stay_those_of_its_solutions():
+    """Rounding would grow from group to group, and make covariances of a thousand frames negative."""
+    options = walk(240.0, points_per_m=30.0)
+    problem, start, _ = problem_of(tracks_of(options), options)
+    states = factored(problem, start).states
+    found = states.marginals()
+    for k in (0, 5, 100):
+        rhs = np.zeros((len(found), 15, 15))
+        rhs[k] = np.eye(15)
+        expected = states.solve(rhs.reshape(-1, 15)).reshape(rhs.shape)[k]
+        unit = np.sqrt(np.diagonal(expected))
+        assert np.abs((found[k] - expected) / np.outer(unit, unit)).max() < 1e-9
+
+
 def test_a_position_s_covariance_against_the_first_is_that_of_both():
     options = walk(3.0, readout_s=0.02, points_per_m=60.0)
     problem, start, _ = problem_of(tracks_of(options), options)

@@ -299,6 +299,8 @@ class PanelFactor:
             inner = after[np.ix_(reach, reach)]
             beside = -inner @ along
             here = inverse.T @ inverse - along.T @ beside
+            # rounding would grow from group to group where it is not the same on both sides
+            here = 0.5 * (here + here.T)
             blocks = np.zeros((group, layout.state, group, layout.state))
             split = [(slice(first, None), layout.wide, slice(0, layout.wide))]
             split += [(slice(0, first), layout.narrow, slice(layout.wide, None))] if first else []
