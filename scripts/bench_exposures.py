@@ -1,4 +1,4 @@
-"""Pairs of a short and a long exposure of all sorts: how many are refused, blended wrongly, or made worse.
+"""Exposure pairs of all kinds: how many are refused, blended wrongly, or worse than an input.
 
     python scripts/bench_exposures.py [--photos FOLDER] [--motion FOLDER] [--pairs N] [--wrong N] [--width PX]
         [--triplets FOLDER] [--json FILE]

@@ -1,4 +1,4 @@
-"""Quality and cost of deblurring and of undoing the rolling shutter, against the usual ways, in one run.
+"""Quality and cost of deblurring and of rolling-shutter correction, against other methods.
 
     python scripts/bench_imaging.py [--photos FOLDER] [--scenes N] [--colmap] [--only SECTION ...] [--json FILE]
 

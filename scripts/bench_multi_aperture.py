@@ -1,4 +1,4 @@
-"""Quality and cost of multi-aperture fusion against the usual ways, in one run.
+"""Quality and cost of multi-aperture fusion, against other methods.
 
     python scripts/bench_multi_aperture.py [--data FOLDER] [--only SECTION ...] [--work FOLDER] [--json FILE]
 

@@ -1,4 +1,4 @@
-"""Blur along the gyroscope's path: what each method is worth, on photographs and motion that nothing was made with.
+"""Deblurring along the gyroscope's path, by method: matches, PSNR, gate, cost and reconstructions.
 
     python scripts/bench_path.py --photos FOLDER --motion FOLDER [--every S] [--most N] [--exposures S ...]
         [--methods NAME ...] [--octaves 0 -1] [--only SECTION ...] [--cache FOLDER] [--json FILE]

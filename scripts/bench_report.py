@@ -1,4 +1,4 @@
-"""What benchmarks and studies share: machine, versions and commit of a run, written beside its figures."""
+"""Machine, versions and commit of a run, written beside its figures."""
 
 from __future__ import annotations
 

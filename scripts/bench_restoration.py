@@ -1,4 +1,4 @@
-"""Pictures restored by networks against the usual ways, in one run: DeepGyro and LSD2.
+"""The networks DeepGyro and LSD2 against other methods.
 
     python scripts/bench_restoration.py --photos FOLDER [--scenes N] [--only SECTION ...] [--weights FILE ...]
         [--sheet FILE.png] [--json FILE]

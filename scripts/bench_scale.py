@@ -1,4 +1,4 @@
-"""Scale errors on InertialScale recordings, by method and window, beside the published ones.
+"""Scale errors on InertialScale recordings by method and window, beside published ones.
 
     python scripts/bench_scale.py FOLDER [--figure FILE.png] [--json FILE] [--sensitivity]
 

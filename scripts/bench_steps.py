@@ -1,4 +1,4 @@
-"""What each step of a run keeps busy: seconds of clock and processor, and how many threads had work.
+"""Load of each step of a run: elapsed and processor time, and how many threads worked.
 
     python scripts/bench_steps.py CAPTURE OUT [--json FILE] [-- OPTIONS OF RECONSTRUCT ...]
 

@@ -1,4 +1,4 @@
-"""The whole run against bare COLMAP: processor time, registered images, camera error, loops.
+"""Whole runs against plain COLMAP: processor time, registered images, camera error, loops.
 
     python scripts/bench_whole.py FOLDER [--euroc DATASET] [--walk FRAMES] [--loop FRAMES] [--repeated SCENES]
         [--drawn] [--long FRAMES ...] [--density D] [--seeds SEED ...] [--workers N] [--json FILE]

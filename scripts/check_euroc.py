@@ -1,4 +1,4 @@
-"""Compare a metric model of EuRoC V1_01_easy with motion capture: scale error, up axis, camera centres.
+"""A metric model of EuRoC V1_01_easy against motion capture: scale error, up axis, camera centres.
 
     python scripts/check_euroc.py OUT/sparse/0 DATASET
 

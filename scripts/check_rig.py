@@ -1,4 +1,4 @@
-"""A real stereo rig in metres: EuRoC's keyframes of both cameras, mapped by COLMAP with a rig of unknown extrinsics.
+"""EuRoC's stereo keyframes as a COLMAP rig of unknown extrinsics: the baseline in metres against its calibration.
 
     python scripts/check_rig.py DATASET FOLDER [--frames 100]
 

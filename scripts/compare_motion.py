@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Compare simulated handheld motion with real motion capture, band by band.
+"""Simulated handheld motion against motion capture, by frequency band.
 
     python scripts/compare_motion.py ../shared/data/tumvi_mocap [--plot motion.png]
 

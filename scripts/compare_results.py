@@ -1,4 +1,4 @@
-"""Whether two checkouts give the same results: runs a fixed list of jobs with each, and compares all that they write.
+"""Results of two checkouts on a fixed list of jobs, compared value by value.
 
     python scripts/compare_results.py prepare INPUTS                once, in a checkout's folder: scenes and projects
     python scripts/compare_results.py run FOLDER INPUTS [--quick]   with the python of each checkout, a FOLDER for each

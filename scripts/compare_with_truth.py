@@ -1,4 +1,4 @@
-"""Compare a finished reconstruction of a simulated capture with its checkerboard and with the truth.
+"""A finished reconstruction of a simulated capture against its checkerboard and the truth.
 
     python scripts/compare_with_truth.py OUT CAPTURE_FOLDER
 

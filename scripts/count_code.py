@@ -1,4 +1,4 @@
-"""Lines of code, functions with many parameters, and type tests of stages, of this checkout and a commit before it.
+"""Code lines, functions with many parameters and type tests of stages, of this checkout and an earlier commit.
 
     python scripts/count_code.py [--against COMMIT] [--parameters 8]
 

@@ -1,6 +1,6 @@
-"""Write the pages that are generated: fields of the JSON files, and the constants of the code.
+"""Write the generated pages: fields of JSON files, constants, scripts.
 
-    python scripts/make_reference.py            # writes docs/reference/*.md and docs/dev/constants.md
+    python scripts/make_reference.py            # writes docs/reference/*.md, docs/dev/constants.md and scripts.md
     python scripts/make_reference.py --check    # exit code 1 where one of them is stale
 
 Fields come from ``docs/schemas/*.schema.json``. Constants are numbers that the package names at the top level of a
@@ -261,9 +261,29 @@ def constants_page() -> str:
     return "\n".join(lines) + "\n"
 
 
+def scripts_page() -> str:
+    """The page of all scripts that are run by themselves, with the first sentence of each."""
+    lines = [
+        "# Scripts",
+        "",
+        NOTE,
+        "Benchmarks and studies print tables, and write JSON with machine and versions. `--help` has the options.",
+        "",
+        "| script | prints or does |",
+        "|---|---|",
+    ]
+    for path in sorted((ROOT / "scripts").glob("*.py")):
+        tree = ast.parse(path.read_text())
+        runs = any(isinstance(node, ast.If) and "__main__" in ast.unparse(node.test) for node in tree.body)
+        if runs:
+            first = (ast.get_docstring(tree) or "").split("\n\n")[0].replace("\n", " ").replace("``", "`")
+            lines.append(f"| `scripts/{path.name}` | {first.removesuffix('.')} |")
+    return "\n".join(lines) + "\n"
+
+
 def pages() -> dict[Path, str]:
     """Every generated page and its text."""
-    made = {DOCS / "dev" / "constants.md": constants_page()}
+    made = {DOCS / "dev" / "constants.md": constants_page(), DOCS / "dev" / "scripts.md": scripts_page()}
     for path in sorted(DOCS.glob("schemas/*.schema.json")):
         made[DOCS / "reference" / f"{path.name.removesuffix('.schema.json')}.md"] = reference_page(path)
     return made

@@ -1,4 +1,4 @@
-"""The package's structure in numbers: rooms, imports, sizes of functions, constants, names, words, tests.
+"""Structure of the package in numbers: imports, sizes of functions, constants, names, words, tests.
 
     python scripts/measure_structure.py [--root DIR] [--before DIR] [--cases] [--list NUMBER]
 

@@ -1,4 +1,4 @@
-"""Faults put into the package one at a time: does a test notice?
+"""Listed faults put into the package one at a time, and the tests that catch them.
 
     python scripts/mutants.py [--only ROOM] [--sample N [--seed S]] [--list] [--json FILE]
 

@@ -1,4 +1,4 @@
-"""Faults drawn at random from the package's source: what share of them do the tests notice?
+"""Faults drawn at random from the package's source, and the share that the tests catch.
 
     python scripts/random_mutants.py map FILE
     python scripts/random_mutants.py draw --map FILE [--count 300] [--seed S] [--room ROOM] [--list]

@@ -1,4 +1,4 @@
-"""Pictures of a report as people meet it: desk, phone, dark screen, without scripts, and on paper.
+"""Screenshots of a report: desk, phone, dark, without scripts, and on paper.
 
     python scripts/shoot_report.py OUT/report.html FOLDER
 

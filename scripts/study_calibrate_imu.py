@@ -1,4 +1,4 @@
-"""Whether intervals of ``calibrate-imu`` hold, and how good its calibrations are: simulated phones, and an Xsens.
+"""Coverage and accuracy of ``calibrate-imu`` on simulated phones and an Xsens.
 
 Prints four tables: simulated phones in twelve attitudes (coverage of the 95 % intervals by kind of parameter, errors),
 with slowly changing biases and without; phones in six to eight attitudes; and, where ``--xsens`` names the table, real

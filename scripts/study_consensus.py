@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Scales of models in which cameras are wrong: how many are given, right and trusted, and which cameras are lost.
+"""Models with wrong cameras: how many scales are given, right and trusted, and which cameras are lost.
 
     python scripts/study_consensus.py [--tracked FOLDER] [--reconstructed FOLDER] [--cases one three] [--json FILE]
 

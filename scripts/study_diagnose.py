@@ -1,4 +1,4 @@
-"""Put thirty-five faults into clean recordings: does ``diagnose`` name them, and does it accuse clean ones?
+"""Thirty-five faults in recordings: which ones ``diagnose`` names, and false alarms on clean recordings.
 
     python scripts/study_diagnose.py [--seed 0] [--faults NAME ...] [--shared ../shared] [--json study.json]
     python scripts/study_diagnose.py --good [--before OTHER_PYTHON]

@@ -1,4 +1,4 @@
-"""Take away disk, quota, memory and descriptors from commands at work, kill them, and start them again.
+"""Full disks, quotas, exhausted memory and kills during commands, and what a restart makes of them.
 
     python scripts/study_faults.py [--faults 60] [--seed 0] [--commands NAME ...]
 

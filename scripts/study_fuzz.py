@@ -1,4 +1,4 @@
-"""Damage every reader's files in thousands of ways: only errors of our own may come out, soon, and in little memory.
+"""Damaged files of every reader: only errors of our own may come out, soon, in little memory.
 
     python scripts/study_fuzz.py [--mutants 24000] [--least 0] [--seed 0] [--readers NAME ...] [--processes 2]
 

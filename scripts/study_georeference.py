@@ -1,4 +1,4 @@
-"""Georeference walks whose positions have errors alike for a known time: do the intervals hold, and how wide are they?
+"""Georeferencing with correlated position errors: coverage and width of the intervals.
 
     python scripts/study_georeference.py [--walks 40] [--sizes 1 3 6] [--alike-s 1 5 20 60 200 300] [--unstated]
         [--seed 0] [--json study.json]

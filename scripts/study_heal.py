@@ -1,4 +1,4 @@
-"""Damage output folders at random, run their command again, and compare with a folder that nobody touched.
+"""Damaged output folders: the next run against one in a folder that nobody touched.
 
     python scripts/study_heal.py [--trials 200] [--seed 0] [--commands NAME ...]
 

@@ -1,4 +1,4 @@
-"""Walks cut into two or three models by seconds without texture: how well the IMU brings them together again.
+"""Walks cut into two or three models: errors and coverage after joining by the IMU.
 
     python scripts/study_join.py [--parts 2] [--gaps 1 2 4] [--seeds 1 2] [--spoil thrown] [--sigma-m .1] [--out F]
     python scripts/study_join.py --back [--gaps 2 4] [--seeds 1 2]

@@ -1,4 +1,4 @@
-"""Kill ``reconstruct --deterministic`` at random moments, restart it, and compare with an undisturbed run.
+"""``reconstruct --deterministic`` killed at random moments and restarted, against an undisturbed run.
 
     python scripts/study_kill.py [CAPTURE] [--kills 20] [--seed 0]
 

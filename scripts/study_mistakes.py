@@ -1,4 +1,4 @@
-"""Make mistakes that people make, and look at what is said, when, and whether following the advice gives a run.
+"""Mistakes of users: what is said, when, and whether following the advice gives a run.
 
     python scripts/study_mistakes.py [--seed 0] [--kinds units axes ...] [--reconstruct] [--json mistakes.json]
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""What is said of models, clocks and sensors that are wrong, on real recordings that were altered.
+"""Wrong models, clocks and sensors, made from real recordings: what is named, and what is trusted.
 
     python scripts/study_model_faults.py FOLDER [--faults clock gain bias wxyz torn ...] [--json FILE]
 

@@ -1,4 +1,4 @@
-"""How near the times left come that the terminal shows: a run is timed, and its bars are played again.
+"""Times left that the terminal showed, over those that were left.
 
     python scripts/study_progress.py example_scenes/desk out/timed --dense --record desk.json
     python scripts/study_progress.py --replay desk.json euroc.json

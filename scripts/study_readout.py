@@ -1,4 +1,4 @@
-"""Film points with a rolling shutter of known readout: is it found, and is it as sure as it says?
+"""Readout estimation on points filmed with a rolling shutter: error and coverage.
 
     python scripts/study_readout.py [--motions orbit roam walk pure_rotation] [--readouts-ms 0 10 20 33] [--seeds 3]
                                     [--first-seed 0] [--seconds 5] [--direction down] [--json study.json]

@@ -1,4 +1,4 @@
-"""What the tight refinement does to simulated walks: camera centres, drift of scale, and the calibration.
+"""Refinement of simulated walks: camera centres, drift of scale, calibration.
 
     python scripts/study_refine.py [--metres 100] [--readout-ms 0] [--undeclared] [--expected] [--seeds 1 2]
         [--chance] [--auto] [--spoil late] [--points-per-m 250] [--mapper] [--out F]

@@ -1,4 +1,4 @@
-"""What the tight refinement does to real recordings.
+"""Refinement of real recordings, and of real motion and IMUs with synthetic points.
 
     python scripts/study_refine_real.py --euroc DATASET FOLDER
     python scripts/study_refine_real.py --recordings FOLDER [--noise-px 10]

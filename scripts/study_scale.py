@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Monte-Carlo study of the joint scale estimator on simulated recordings, against an independent bound.
+"""Coverage of the joint scale's intervals on simulated recordings, against the Cramer-Rao bound.
 
     python scripts/study_scale.py [--runs 1000] [--stressed 300] [--unobservable 200] [--faulty 300]
                                   [--json study.json]

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Scale errors on recordings of other sensors: real IMUs, motion capture with errors such as a reconstruction has.
+"""Scale errors, coverage and verdicts on real IMUs with motion capture.
 
     python scripts/study_scale_real.py FOLDER [--most 8] [--calibrated] [--remembered] [--reconstructed FOLDER]
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""COLMAP projects in which cameras are wrong as COLMAP makes them, through ``reconstruct``.
+"""COLMAP projects in which COLMAP placed cameras wrong: what ``reconstruct`` makes of them.
 
     python scripts/study_wrong_cameras.py FOLDER [--projects copies0 blurred1 ...] [--json FILE]
 

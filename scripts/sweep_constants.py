@@ -1,4 +1,4 @@
-"""Every deciding constant at half and at double its value: which figures of a benchmark change?
+"""Each deciding constant at half and at double its value: which figures of a benchmark change.
 
     python scripts/sweep_constants.py {scale,blur} [--shared ../shared/data] [--workers N] [--only TEXT] [--json FILE]
 

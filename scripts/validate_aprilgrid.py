@@ -1,4 +1,4 @@
-"""Map real stereo pairs of an AprilGrid from its tag corners, scale the model by the tags, and print the baseline.
+"""Real stereo pairs of an AprilGrid, mapped and scaled by its tags: the baseline in metres.
 
     python scripts/validate_aprilgrid.py DATA [--pairs N]
 
