@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,21 @@ SPANS_S = (1.0, 5.0)
 TRUTH_M = 5e-4
 #: 95 % quantile of chi-square with three degrees of freedom.
 CHI2_95 = 7.815
+
+
+def select_registered(model: Model, filmed: Filmed) -> Filmed:
+    """What was filmed by the images that a model has: cameras that contradict the gyroscope are left out of it."""
+    present = {model.reconstruction.image(number).name for number in model.reconstruction.reg_image_ids()}
+    keep = np.array([name in present for name in filmed.timing.names])
+    timing = filmed.timing
+    names = tuple(name for name in timing.names if name in present)
+    return replace(
+        filmed,
+        timing=replace(timing, names=names, t_s=timing.t_s[keep]),
+        world_from_cam=filmed.world_from_cam[keep],
+        centre_m=filmed.centre_m[keep],
+        velocity_m_s=filmed.velocity_m_s[keep],
+    )
 
 
 def poses_of(model: Model, names: Sequence[str]) -> tuple[Array, Array]:

@@ -37,7 +37,7 @@ from bench_report import write_report
 from bench_scale import recordings_in
 from bench_whole import euroc_capture
 from check_euroc import check, similarity
-from real_scores import covered, scores
+from real_scores import covered, scores, select_registered
 from real_world import World, film, worlds
 
 from colmap_inertial.core.geometry import matrix_from_quat
@@ -150,6 +150,7 @@ def filmed_window(asked: argparse.Namespace, world: World) -> dict[str, Any]:
     out["recording_pct"] = 100 * filmed.recording_log
     if model.similarity is None:
         return out | {"said": "; ".join(model.scale.reasons)}
+    filmed = select_registered(model, filmed)
     out["before"] = scores(model, filmed) | covered(model, filmed)
     begin_s, processor_s = time.perf_counter(), time.process_time()
     refined = RefineStage(**stages, refine_intrinsics=True, auto=True)(model)
