@@ -1271,7 +1271,7 @@ MUTANTS = (
         ("pipeline_imaging::test_the_metric_model_lacks_the_camera_s_translation_within_the_readout_too",),
     ),
     Mutant(
-        "reconstruction/drivers/sources.py",
+        "reconstruction/drivers/paths.py",
         "if known is not None and target == known.resolve():",
         "if known is not None and path == known:",
         "an input that is named another way is written over",

@@ -18,7 +18,7 @@ from colmap_inertial.imaging.gyro_camera import FrameShutter
 from colmap_inertial.io.gopro import _stabilisation
 from colmap_inertial.motion.align._fit import _noise_of
 from colmap_inertial.motion.align.conventions import quick_accelerations
-from colmap_inertial.reconstruction.drivers.sources import only_model
+from colmap_inertial.reconstruction.drivers.paths import only_model
 from colmap_inertial.reconstruction.preparation.plan import _most_turned_rad
 from colmap_inertial.reconstruction.preparation.selection import _slots
 from colmap_inertial.tools.simulate import RecordingOptions, simulate_recording

@@ -54,7 +54,7 @@ from colmap_inertial.pipeline.stages.inputs import Fuser, StageInputs
 from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage
 from colmap_inertial.reconstruction.drivers import frames as framing, project as existing, project_output
 from colmap_inertial.reconstruction.drivers.frames import run_frames, run_images
-from colmap_inertial.reconstruction.drivers.sources import check_output
+from colmap_inertial.reconstruction.drivers.paths import check_output
 from colmap_inertial.reconstruction.preparation import calibrate, plan as imaging, sampling
 from colmap_inertial.reconstruction.preparation.judge import Looked, judge_each_frame, judge_sky
 from colmap_inertial.reconstruction.preparation.plan import Treatments, plan_imaging, run_plan

@@ -20,7 +20,7 @@ from colmap_inertial.checks.validate.result import check_lengths, model_diagonal
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError
 from colmap_inertial.core.geometry import quat_exp, quat_rotate
 from colmap_inertial.core.options import ValidateOptions
-from colmap_inertial.reconstruction.drivers.sources import KnownLengths, validate_source
+from colmap_inertial.reconstruction.drivers.validation import KnownLengths, validate_source
 
 SIDE_M = 0.1
 PLACES = {0: (0, 0, 0), 1: (2, 0, 0), 2: (0, 3, 0.5), 3: (2, 3, 1), 7: (1, 1, 2)}

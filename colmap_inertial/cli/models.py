@@ -314,7 +314,7 @@ class Validate(Reader):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.reconstruction.drivers.sources import KnownLengths, ValidationOutputs, validate_source
+        from colmap_inertial.reconstruction.drivers.validation import KnownLengths, ValidationOutputs, validate_source
 
         result = validate_source(
             self.model,

@@ -65,7 +65,7 @@ class Speaker:
     def check_json(self, *inputs: Path | None) -> None:
         """Refuse, before the work, a file for the JSON that is an input or not of ours."""
         if self.json_file is not None:
-            from colmap_inertial.reconstruction.drivers.sources import check_output
+            from colmap_inertial.reconstruction.drivers.paths import check_output
 
             check_output(self.json_file, inputs)
 

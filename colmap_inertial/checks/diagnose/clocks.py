@@ -107,7 +107,8 @@ def frame_rate_finding(rate: float) -> Finding:
 def check_coverage(recorded: Recorded) -> Iterator[Finding]:
     """An IMU that was started late or stopped early."""
     imu = recorded.imu
-    frames = recorded.timing or recorded.trajectory
+    # poses may be of a part of the images
+    frames = recorded.trajectory or recorded.timing
     if imu is None or frames is None or len(frames.t_s) < 3 or wrong_time_unit(recorded):
         return
     sensors = [imu.gyro_t_s, imu.accel_t_s] if imu.has_accel else [imu.gyro_t_s]

@@ -20,7 +20,7 @@ from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.files import read_text, write_text
 from colmap_inertial.io.imu import read_raw_capture_imu, read_raw_imu
 from colmap_inertial.io.plausible import check_alive
-from colmap_inertial.reconstruction.drivers.sources import check_output
+from colmap_inertial.reconstruction.drivers.paths import check_output
 
 #: A camera-IMU rotation that is known better than this was stated by the capture.
 _STATED_RAD = 1.0

@@ -42,7 +42,8 @@ from colmap_inertial.pipeline.run.runner import fingerprint
 from colmap_inertial.pipeline.run.session import keep_colmap_quiet
 from colmap_inertial.pipeline.run.workspace import a_record_of_ours, refuse_links, require_apart
 from colmap_inertial.pipeline.stages.frame_folder import encode_image, require_frames
-from colmap_inertial.reconstruction.drivers.sources import only_model, scaling
+from colmap_inertial.reconstruction.drivers.paths import only_model
+from colmap_inertial.reconstruction.drivers.validation import scaling
 
 #: What the folder keeps beside the project: where its metres come from.
 REFERENCE_FILE = "scale.json"

@@ -7,43 +7,29 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
-from colmap_inertial.checks.diagnose import Recorded, diagnose
-from colmap_inertial.checks.validate import (
-    Target,
-    Validation,
-    add_bars,
-    add_check_points,
-    add_other_target,
-    parse_target,
-    validate_model,
-    write_overlays,
-)
-from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError, OutputError, OutputExistsError
-from colmap_inertial.core.options import ScaleOptions, ValidateOptions
-from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate, Similarity
+from colmap_inertial.checks.diagnose import diagnose
+from colmap_inertial.core.errors import FormatError, NotObservableError
+from colmap_inertial.core.options import ScaleOptions
+from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate
 from colmap_inertial.inertial.scale import estimate_scale, first_seconds, learn_lever_arm
 from colmap_inertial.io.calibration import (
     CalibrationFiles,
+    Calibrations,
     describe_files,
     largest_offset_s,
     list_paths,
     read_for_recording,
     write_calibration,
 )
-from colmap_inertial.io.capture import load_capture
-from colmap_inertial.io.files import read_json, write_json
+from colmap_inertial.io.capture import Capture, load_capture
+from colmap_inertial.io.files import write_json
 from colmap_inertial.io.frames import read_frame_times
 from colmap_inertial.io.imu import is_capture, read_raw_imu
 from colmap_inertial.io.imu_text import is_inertial_scale
-from colmap_inertial.io.pose_convention import COLMAP, INERTIAL_SCALE, TUM, PoseConvention
-from colmap_inertial.io.trajectories import read_inertial_scale, read_tum
-from colmap_inertial.io.units import Axes
+from colmap_inertial.io.pose_convention import COLMAP, INERTIAL_SCALE, TUM
+from colmap_inertial.io.trajectories import read_inertial_scale_poses, read_tum
 from colmap_inertial.model import (
-    apply_similarity,
     downgraded,
-    find_models,
     is_metric,
     read_model,
     trajectory_from_model,
@@ -52,6 +38,9 @@ from colmap_inertial.model.rigs import frames_of_rigs
 from colmap_inertial.motion.align import AlignOptions
 from colmap_inertial.motion.align.consensus import align_by_consensus
 from colmap_inertial.motion.align.conventions import likely_convention
+from colmap_inertial.pipeline.run.progress import silent
+from colmap_inertial.reconstruction.drivers.paths import check_output, only_model
+from colmap_inertial.reconstruction.preparation.preflight import CheckInputs, TolerantReader, measure_recording
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,21 +67,36 @@ class ScaleSource:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TimedPoses:
-    """A trajectory with its IMU recording; ``start_s`` is when the camera began, where frame times tell.
+    """A trajectory with its IMU recording.
 
-    ``read_as`` is the convention that the poses were read by; ``gyro_axes`` and ``accel_axes`` are mappings of axes
-    that a ``capture.toml`` applied.
+    ``checked`` is what the check beforehand looks at; ``imu`` is corrected by its own calibration, where there is one.
+    ``start_s`` is when the camera began, where frame times tell.
     """
 
     trajectory: CameraTrajectory
-    read_as: PoseConvention
     imu: ImuRecording
-    calibration: CameraImuCalibration | None
+    checked: CheckInputs
     shared_clock: bool
     start_s: float | None = None
     notes: Sequence[str] = ()
-    gyro_axes: Axes | None = None
-    accel_axes: Axes | None = None
+
+    @property
+    def calibration(self) -> CameraImuCalibration | None:
+        return self.checked.prior
+
+
+def brings_imu(source: ScaleSource) -> bool:
+    """Whether poses and IMU lie in one folder, as InertialScale writes them.
+
+    Raises
+    ------
+    FormatError
+        Where there is no source.
+    """
+    path = source.source
+    if not path.exists():
+        raise FormatError(path, "no such file or folder")
+    return path.is_dir() and is_inertial_scale(path)
 
 
 def load_source(source: ScaleSource) -> TimedPoses:
@@ -103,55 +107,101 @@ def load_source(source: ScaleSource) -> TimedPoses:
     FormatError, TimingError
         For what is missing or cannot be read, naming the flag to give.
     """
-    path = source.source
-    if not path.exists():
-        raise FormatError(path, "no such file or folder")
-    inertial_scale = path.is_dir() and is_inertial_scale(path)
-    if not inertial_scale:
+    if not brings_imu(source):
         _require_all(source)
+    checked, notes = read_source(source)
+    for error in checked.refused:
+        raise error
+    raw, trajectory, timing = checked.raw, checked.trajectory, checked.timing
+    assert raw is not None and isinstance(trajectory, CameraTrajectory)
+    raw.check()
+    captures = _captures(source)
+    of_imu = _read_calibrations(source, captures).imu
+    return TimedPoses(
+        trajectory=trajectory,
+        imu=raw.imu if of_imu is None else of_imu.corrected(raw.imu),
+        checked=checked,
+        shared_clock=_shares_clock(captures),
+        start_s=None if timing is None else float(timing.pose_t_s()[0]),
+        notes=notes,
+    )
+
+
+def read_source(source: ScaleSource) -> tuple[CheckInputs, Sequence[str]]:
+    """Read what there is of poses and the IMU recorded along, with notes; what cannot be read is among the refused.
+
+    Raises
+    ------
+    FormatError
+        Where a folder is not one model, or nothing gives its times.
+    """
+    path, reader = source.source, TolerantReader()
+    trajectory = timing = capture = None
     notes: Sequence[str] = ()
-    start_s = gyro_axes = accel_axes = None
-    read_as = TUM
-    if inertial_scale:
-        trajectory, imu = read_inertial_scale(path)
+    captures = _captures(source)
+    if brings_imu(source):
         read_as = INERTIAL_SCALE
+        trajectory = reader.attempt(lambda: read_inertial_scale_poses(path))
     elif path.is_dir():
-        times = source.frame_times or source.imu
-        assert times is not None
-        folder = only_model(path)
-        model = read_model(folder)
-        timing = read_frame_times(times, frames_of_rigs([model]))
-        trajectory, notes = trajectory_from_model(model, timing)
         read_as = COLMAP
-        start_s = float(timing.pose_t_s()[0])
+        folder, times = only_model(path), _find_times(source)
+        if times is None:
+            raise FormatError(path, "a COLMAP model has no frame times: give --frame-times, a CSV with name,t_s")
+        model = read_model(folder)
+        capture = captures[0] if captures else None
+        timing = reader.attempt(lambda: read_frame_times(times, frames_of_rigs([model])))
+        if timing is not None:
+            known = timing
+            trajectory, notes = reader.attempt(lambda: trajectory_from_model(model, known)) or (None, ())
         if is_metric(folder):
             notes = (*notes, "this model is metric already: a scale of 1 says that it is right")
     else:
-        trajectory = read_tum(path)
-    if source.imu is not None:
-        raw = read_raw_imu(source.imu)
-        raw.check()
-        imu, gyro_axes, accel_axes = raw.imu, raw.gyro_axes, raw.accel_axes
-    captures = [load_capture(p) for p in (source.imu, source.frame_times, path) if p is not None and is_capture(p)]
-    shared = any(capture.shared_clock for capture in captures)
-    calibration = captures[0].calibration if captures else None
-    of_imu = captures[0].imu_calibration if captures else None
-    files = read_for_recording(source.calibration, shared_clock=shared)
-    calibration, of_imu = files.camera_imu or calibration, files.imu or of_imu
-    if of_imu is not None:
-        imu = of_imu.corrected(imu)
-        calibration = None if calibration is None else of_imu.loosened(calibration)
-    return TimedPoses(
+        read_as = TUM
+        trajectory = reader.attempt(lambda: read_tum(path))
+    raw = reader.attempt(lambda: read_raw_imu(path if source.imu is None else source.imu))
+    files = _read_calibrations(source, captures)
+    prior = files.camera_imu
+    checked = CheckInputs(
+        raw=raw,
+        capture=capture,
+        timing=timing,
         trajectory=trajectory,
         read_as=read_as,
-        imu=imu,
-        calibration=calibration,
-        shared_clock=shared,
-        start_s=start_s,
-        notes=notes,
-        gyro_axes=gyro_axes,
-        accel_axes=accel_axes,
+        prior=prior if prior is None or files.imu is None else files.imu.loosened(prior),
+        max_offset_s=largest_offset_s(_shares_clock(captures)),
+        refused=tuple(reader.refused),
     )
+    return checked, notes
+
+
+def _captures(source: ScaleSource) -> list[Capture]:
+    """The captures that a source names."""
+    paths = (source.imu, source.frame_times, source.source)
+    return [load_capture(path) for path in paths if path is not None and is_capture(path)]
+
+
+def _shares_clock(captures: Sequence[Capture]) -> bool:
+    return any(capture.shared_clock for capture in captures)
+
+
+def _read_calibrations(source: ScaleSource, captures: Sequence[Capture]) -> Calibrations:
+    """Calibrations of a device: of the files that were given, else of the first capture."""
+    files = read_for_recording(source.calibration, shared_clock=_shares_clock(captures))
+    if not captures:
+        return files
+    return dataclasses.replace(
+        files,
+        camera_imu=files.camera_imu or captures[0].calibration,
+        imu=files.imu or captures[0].imu_calibration,
+    )
+
+
+def _find_times(source: ScaleSource) -> Path | None:
+    """What gives the times of a model's images: what was given, else the IMU's capture, where it has frames."""
+    imu = source.imu
+    if source.frame_times is not None or imu is None:
+        return source.frame_times
+    return imu if is_capture(imu) and load_capture(imu).frames is not None else None
 
 
 def _require_all(source: ScaleSource) -> None:
@@ -161,60 +211,10 @@ def _require_all(source: ScaleSource) -> None:
         only_model(path)
     if source.imu is None:
         missing.append("the IMU recording: give --imu PATH")
-    if path.is_dir() and source.frame_times is None and not (source.imu is not None and is_capture(source.imu)):
+    if path.is_dir() and _find_times(source) is None:
         missing.append("the times of its images: give --frame-times, a CSV with name,t_s")
     if missing:
         raise FormatError(path, f"needs {'; and '.join(missing)}")
-
-
-def only_model(path: Path) -> Path:
-    """The one model in a folder.
-
-    Raises
-    ------
-    FormatError
-        Where there are several, or none; of a project, with the place of its models.
-    """
-    try:
-        models = find_models(path)
-    except FormatError:
-        if not (path / "sparse").is_dir():
-            raise
-        inside = next(iter(find_models(path / "sparse").values()))
-        raise FormatError(path, f"is a whole project: give one of its models, {inside}") from None
-    if len(models) > 1:
-        raise FormatError(
-            path, f"holds {len(models)} models; give one of them, for example {next(iter(models.values()))}"
-        )
-    return next(iter(models.values()))
-
-
-#: One of these is in every JSON file that a command writes.
-_OURS = frozenset({"metres_per_unit", "cam_from_imu_xyzw", "accel_gain", "findings", "out", "exit_code"})
-
-
-def check_output(path: Path, inputs: Sequence[Path | None]) -> None:
-    """Refuse, before any work, an output that would replace anything but an earlier result of ours.
-
-    Raises
-    ------
-    OutputError
-    """
-    if not path.parent.is_dir():
-        raise OutputError(f"{path.parent} is no folder; create it first")
-    if path.is_dir():
-        raise OutputError(f"{path} is a folder; name a file in it")
-    target = path.resolve()
-    for known in inputs:
-        if known is not None and target == known.resolve():
-            raise OutputExistsError(f"{path} is an input; choose another name for the result")
-    if path.exists():
-        try:
-            keys = set(read_json(path))
-        except FormatError:
-            keys = set()
-        if not keys & _OURS:
-            raise OutputExistsError(f"{path} exists and is no earlier result; choose another name or remove it")
 
 
 def align_source(source: ScaleSource, out: Path) -> CameraImuCalibration:
@@ -250,7 +250,11 @@ def align_source(source: ScaleSource, out: Path) -> CameraImuCalibration:
 
 def _refuse_another_convention(recording: TimedPoses, options: AlignOptions, quantity: str) -> None:
     likely = likely_convention(
-        recording.trajectory, recording.imu, read_as=recording.read_as, prior=recording.calibration, options=options
+        recording.trajectory,
+        recording.imu,
+        read_as=recording.checked.read_as,
+        prior=recording.calibration,
+        options=options,
     )
     if likely is not None:
         raise NotObservableError(quantity, likely.sentence)
@@ -287,23 +291,18 @@ def scale_source(
         trajectory = first_seconds(trajectory, first_s, start_s=recording.start_s)
     limit_s = largest_offset_s(recording.shared_clock, options.max_offset_s)
     options = dataclasses.replace(options, max_offset_s=limit_s)
-    diagnosis = diagnose(
-        Recorded(
-            imu=recording.imu,
-            gyro_axes=recording.gyro_axes,
-            accel_axes=recording.accel_axes,
-            trajectory=trajectory,
-            read_as=recording.read_as,
-            calibration=recording.calibration,
-            max_offset_s=limit_s,
-        )
-    )
+    checked = dataclasses.replace(recording.checked, trajectory=trajectory, max_offset_s=limit_s)
+    diagnosis = diagnose(measure_recording(checked, silent))
     doubts = tuple(finding.sentence for finding in diagnosis.stopping)
     if doubts and not force:
         estimate = ScaleEstimate.refused("none", *doubts)
     else:
         estimate = estimate_scale(
-            trajectory, recording.imu, calibration=recording.calibration, options=options, read_as=recording.read_as
+            trajectory,
+            recording.imu,
+            calibration=recording.calibration,
+            options=options,
+            read_as=recording.checked.read_as,
         )
         estimate = downgraded(estimate, doubts)
     notes = (*estimate.notes, *recording.imu.repairs, *recording.notes)
@@ -316,145 +315,3 @@ def scale_source(
 def scale_as_json(estimate: ScaleEstimate, calibration: CalibrationFiles = None) -> dict[str, object]:
     """Output of ``scale --json``: the estimate, and the calibration files that it used."""
     return {**estimate.as_json(), "calibration_files": describe_files(calibration)}
-
-
-@dataclass(frozen=True, kw_only=True)
-class ValidationOutputs:
-    """Output files of a validation.
-
-    Attributes
-    ----------
-    json, pictures
-        The result, and frames with the corners drawn in.
-    apply
-        The model in metres, scaled by the control distances; for a model without a unit only.
-    """
-
-    json: Path | None = None
-    pictures: Path | None = None
-    apply: Path | None = None
-
-    def check(self, model: Path, *, unscaled: bool) -> None:
-        """Refuse, before any work, what would replace something; raises :class:`InertialError`."""
-        if self.json is not None:
-            check_output(self.json, [model])
-        folder = self.pictures
-        if folder is not None and folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
-            raise OutputExistsError(f"{folder} exists; name a new folder for the pictures")
-        if self.apply is not None and self.apply.exists():
-            raise OutputExistsError(f"{self.apply} exists; name a new folder for the metric model")
-        if self.apply is not None and not unscaled:
-            raise InertialError("--apply scales a model that claims no unit: add --unscaled")
-
-
-@dataclass(frozen=True, kw_only=True)
-class KnownLengths:
-    """Known lengths in a scene beside the target.
-
-    Attributes
-    ----------
-    bars, check_points
-        Tables of distances between markers, and of their coordinates.
-    other
-        Specification of a second target in the scene, and the metres between the middles of both, as ``4.03`` or
-        ``4.03+-0.002`` with how well they are known.
-    """
-
-    bars: Path | None = None
-    check_points: Path | None = None
-    other: tuple[str, str] | None = None
-
-    def second_target(self, first: Target) -> tuple[Target, float, float | None] | None:
-        """The second target, metres between both, and their standard deviation; ``None`` without one.
-
-        Raises
-        ------
-        InertialError
-            Where the kinds of the targets do not go with what is known.
-        """
-        if (self.bars is not None or self.check_points is not None) and first.kind != "aruco":
-            raise InertialError(
-                "--bars and --check-points name markers: give a target of markers, as aruco:DICT:SIDE_M"
-            )
-        if self.other is None:
-            return None
-        second = parse_target(self.other[0])
-        metres, sigma_m = _metres_apart(self.other[1])
-        if "aruco" in (first.kind, second.kind):
-            raise InertialError("--other-target is for two boards; distances between single markers go into --bars")
-        if second.spec == first.spec:
-            raise InertialError("--other-target must be another board than --target: nobody could tell them apart")
-        return second, metres, sigma_m
-
-
-def validate_source(
-    model: Path,
-    images: Path,
-    target: str,
-    options: ValidateOptions,
-    outputs: ValidationOutputs = ValidationOutputs(),
-    known: KnownLengths = KnownLengths(),
-) -> Validation:
-    """Measure a target in a model and write what was found.
-
-    Parameters
-    ----------
-    model, images, target
-        COLMAP model folder, folder of its images, specification of the target.
-    options
-        Of the validation.
-    outputs
-        Where to write it.
-    known
-        What else is known of the scene.
-
-    Raises
-    ------
-    InertialError
-        When ``apply`` is asked for and cannot be done; see also :func:`validate_model`.
-    """
-    parsed = parse_target(target)
-    outputs.check(model, unscaled=options.unscaled)
-    folder = only_model(model)
-    second = known.second_target(parsed)
-    result = validate_model(folder, images, parsed, options)
-    if second is not None:
-        result = add_other_target(result, validate_model(folder, images, second[0], options), second[1], second[2])
-    if known.bars is not None:
-        result = add_bars(result, known.bars)
-    if known.check_points is not None:
-        result = add_check_points(result, known.check_points)
-    if outputs.apply is not None:
-        if result.control is None:
-            raise InertialError("too few corners to keep control and check distances apart; --apply needs more views")
-        low, high = result.control.ci95
-        sigma_log = np.log(high / low) / (2 * 1.96)
-        provenance = f"control distances of {parsed.spec}"
-        apply_similarity(folder, outputs.apply, scaling(result.control.metres_per_unit, sigma_log, provenance))
-    if outputs.json is not None:
-        write_json(outputs.json, result.as_json())
-    if outputs.pictures is not None:
-        write_overlays(result, images, outputs.pictures)
-    return result
-
-
-def scaling(metres_per_unit: float, sigma_log: float, provenance: str) -> Similarity:
-    """A similarity that only scales."""
-    cov = np.zeros((7, 7))
-    cov[0, 0] = sigma_log**2
-    rotation = np.array([0.0, 0.0, 0.0, 1.0])
-    return Similarity(
-        scale=metres_per_unit, rotation_xyzw=rotation, translation_m=np.zeros(3), cov=cov, provenance=provenance
-    )
-
-
-def _metres_apart(text: str) -> tuple[float, float | None]:
-    """A length, and its standard deviation where that is said."""
-    length, length_m, sigma = text.partition("+-")
-    try:
-        metres, sigma_m = float(length), float(sigma) if length_m else None
-    except ValueError:
-        metres, sigma_m = float("nan"), None
-    if not 0 < metres < float("inf") or (sigma_m is not None and not 0 < sigma_m < metres):
-        raise InertialError(f'--other-target ... "{text}": write metres between the two middles, as in 4.03+-0.002')
-    return metres, sigma_m

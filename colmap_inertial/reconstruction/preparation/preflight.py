@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 
 from colmap_inertial.checks.diagnose import Diagnosis, FramesInVideo, Recorded, diagnose
-from colmap_inertial.core.errors import FormatError, NotObservableError
+from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError, TimingError
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import CameraTrajectory, FrameTiming
+from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, FrameTiming
 from colmap_inertial.io.capture import Capture, ImageFolder
 from colmap_inertial.io.files import write_json
 from colmap_inertial.io.plausible import RawImu
-from colmap_inertial.io.pose_convention import COLMAP
+from colmap_inertial.io.pose_convention import COLMAP, PoseConvention
 from colmap_inertial.io.video import decode_grey, video_stamps_ns
 from colmap_inertial.io.video_match import match_to_video
 from colmap_inertial.model import colmap_camera
@@ -33,6 +33,7 @@ from colmap_inertial.reconstruction.preparation.sampling import (
 )
 
 log = logging.getLogger(__name__)
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,35 +78,81 @@ def check_imu(raw: RawImu, *, force: bool) -> RawImu:
     return raw
 
 
-def preflight(
-    recording: Recording,
-    raw: RawImu,
-    progress: Progress,
-    *,
-    model: CameraTrajectory | Literal["untimed"] | None = None,
-) -> Diagnosis:
-    """The checks before a reconstruction, which are those of ``diagnose``; of a ``model``, by its trajectory."""
-    capture, timing = recording.capture, recording.timing
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CheckInputs:
+    """The data of a recording that are checked before any work: the same for every command.
+
+    Attributes
+    ----------
+    raw
+        The IMU before any calibration of its own: the checks are about the sensor.
+    capture
+        What describes the images; ``None`` for poses that were not made from them, as those of a table.
+    timing
+        Of the images.
+    trajectory, read_as
+        Poses of a reconstruction, and the convention that they were read by; ``"untimed"`` where its images have no
+        times. Without one, the images themselves are measured.
+    prior, max_offset_s
+        What is known of camera and IMU, and the largest offset between their clocks.
+    refused
+        What could not be read, and why.
+    """
+
+    raw: RawImu | None
+    capture: Capture | None = None
+    timing: FrameTiming | None = None
+    trajectory: CameraTrajectory | Literal["untimed"] | None = None
+    read_as: PoseConvention = COLMAP
+    prior: CameraImuCalibration | None = None
+    max_offset_s: float | None = None
+    refused: tuple[InertialError, ...] = ()
+
+
+class TolerantReader:
+    """Reads what can be read, and keeps the reasons for what cannot."""
+
+    def __init__(self, refused: Sequence[InertialError] = ()) -> None:
+        self.refused = list(refused)
+
+    def attempt(self, read: Callable[[], T]) -> T | None:
+        """What ``read`` returns; ``None`` where the input is wrong."""
+        try:
+            return read()
+        except (FormatError, TimingError) as error:
+            self.refused.append(error)
+            return None
+
+
+def measure_recording(inputs: CheckInputs, progress: Progress) -> Recorded:
+    """Measure what the checks look at: ``diagnose``, ``scale``, and each reconstruction before its work.
+
+    Images that cannot be read are among what was refused; the rest is measured all the same.
+    """
+    reader = TolerantReader(inputs.refused)
+    capture, timing, poses, raw = inputs.capture, inputs.timing, inputs.trajectory, inputs.raw
+    log_ = None if capture is None else capture.frame_log
     rotation = in_video = None
-    if model is None and (capture.frame_log is None or not capture.frame_log.stabilised):
-        rotation = measure_images(capture, timing, progress)
-        in_video = find_in_video(capture, timing, progress)
-    return diagnose(
-        Recorded(
-            imu=raw.imu,
-            gyro_axes=raw.gyro_axes,
-            accel_axes=raw.accel_axes,
-            timing=timing,
-            log=capture.frame_log,
-            is_capture=model is None,
-            rotation=rotation,
-            camera=capture.camera,
-            calibration=recording.prior,
-            trajectory=None if isinstance(model, str) else model,
-            read_as=COLMAP,
-            max_offset_s=recording.max_offset_s,
-            in_video=in_video,
-        )
+    if poses is None and capture is not None and timing is not None:
+        # turns in pictures that the camera stabilised are not the camera's
+        if log_ is None or not log_.stabilised:
+            rotation = reader.attempt(lambda: measure_images(capture, timing, progress))
+        in_video = reader.attempt(lambda: find_in_video(capture, timing, progress))
+    return Recorded(
+        refused=tuple(reader.refused),
+        imu=None if raw is None else raw.imu,
+        gyro_axes=None if raw is None else raw.gyro_axes,
+        accel_axes=None if raw is None else raw.accel_axes,
+        timing=timing,
+        log=log_,
+        is_capture=capture is not None and poses is None,
+        rotation=rotation,
+        camera=None if capture is None else capture.camera,
+        calibration=inputs.prior,
+        trajectory=None if isinstance(poses, str) else poses,
+        read_as=inputs.read_as,
+        max_offset_s=inputs.max_offset_s,
+        in_video=in_video,
     )
 
 
@@ -120,13 +167,28 @@ def run_preflight(
 ) -> tuple[str, ...]:
     """The checks, written down and told to ``findings``; the doubts of a run that is forced to go on.
 
+    Of a ``model``, its poses are checked in place of the images.
+
     Raises
     ------
+    FormatError, TimingError
+        Where images cannot be read.
     NotObservableError
         As :func:`stop_or_doubt`.
     """
-    diagnosis = preflight(recording, raw, session.progress, model=model)
+    inputs = CheckInputs(
+        raw=raw,
+        capture=recording.capture,
+        timing=recording.timing,
+        trajectory=model,
+        prior=recording.prior,
+        max_offset_s=recording.max_offset_s,
+    )
+    recorded = measure_recording(inputs, session.progress)
+    diagnosis = diagnose(recorded)
     write_json(session.workspace.diagnosis, diagnosis.as_json())
+    for error in recorded.refused:
+        raise error
     findings(diagnosis)
     return stop_or_doubt(diagnosis, force=force)
 
