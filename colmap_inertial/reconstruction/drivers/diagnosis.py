@@ -11,7 +11,6 @@ from colmap_inertial.io.files import write_json
 from colmap_inertial.io.frames import read_frame_timing
 from colmap_inertial.io.imu import is_capture, read_raw_capture_imu, read_raw_imu
 from colmap_inertial.io.imu_formats import find_recording
-from colmap_inertial.io.pose_convention import ARRAYS
 from colmap_inertial.pipeline.run.context import prior_calibration
 from colmap_inertial.pipeline.run.progress import Progress
 from colmap_inertial.reconstruction.drivers.paths import check_output
@@ -79,8 +78,8 @@ def _describes_frames(path: Path) -> bool:
 
 def _read_imu(path: Path) -> CheckInputs:
     reader = TolerantReader()
-    raw = reader.attempt(lambda: read_raw_imu(path))
-    return CheckInputs(raw=raw, read_as=ARRAYS, refused=tuple(reader.refused))
+    # arguments are read in order: the reason for a refusal is there by the second
+    return CheckInputs(raw=reader.attempt(lambda: read_raw_imu(path)), refused=tuple(reader.refused))
 
 
 def _read_capture(capture: Capture, calibration: CalibrationFiles) -> CheckInputs:

@@ -115,13 +115,12 @@ def load_source(source: ScaleSource) -> TimedPoses:
     raw, trajectory, timing = checked.raw, checked.trajectory, checked.timing
     assert raw is not None and isinstance(trajectory, CameraTrajectory)
     raw.check()
-    captures = _captures(source)
-    of_imu = _read_calibrations(source, captures).imu
+    files, shared_clock = _read_calibrations(source)
     return TimedPoses(
         trajectory=trajectory,
-        imu=raw.imu if of_imu is None else of_imu.corrected(raw.imu),
+        imu=raw.imu if files.imu is None else files.imu.corrected(raw.imu),
         checked=checked,
-        shared_clock=_shares_clock(captures),
+        shared_clock=shared_clock,
         start_s=None if timing is None else float(timing.pose_t_s()[0]),
         notes=notes,
     )
@@ -138,7 +137,6 @@ def read_source(source: ScaleSource) -> tuple[CheckInputs, Sequence[str]]:
     path, reader = source.source, TolerantReader()
     trajectory = timing = capture = None
     notes: Sequence[str] = ()
-    captures = _captures(source)
     if brings_imu(source):
         read_as = INERTIAL_SCALE
         trajectory = reader.attempt(lambda: read_inertial_scale_poses(path))
@@ -148,7 +146,7 @@ def read_source(source: ScaleSource) -> tuple[CheckInputs, Sequence[str]]:
         if times is None:
             raise FormatError(path, "a COLMAP model has no frame times: give --frame-times, a CSV with name,t_s")
         model = read_model(folder)
-        capture = captures[0] if captures else None
+        capture = next(iter(_captures(source)), None)
         timing = reader.attempt(lambda: read_frame_times(times, frames_of_rigs([model])))
         if timing is not None:
             known = timing
@@ -159,7 +157,7 @@ def read_source(source: ScaleSource) -> tuple[CheckInputs, Sequence[str]]:
         read_as = TUM
         trajectory = reader.attempt(lambda: read_tum(path))
     raw = reader.attempt(lambda: read_raw_imu(path if source.imu is None else source.imu))
-    files = _read_calibrations(source, captures)
+    files, shared_clock = _read_calibrations(source)
     prior = files.camera_imu
     checked = CheckInputs(
         raw=raw,
@@ -168,7 +166,7 @@ def read_source(source: ScaleSource) -> tuple[CheckInputs, Sequence[str]]:
         trajectory=trajectory,
         read_as=read_as,
         prior=prior if prior is None or files.imu is None else files.imu.loosened(prior),
-        max_offset_s=largest_offset_s(_shares_clock(captures)),
+        max_offset_s=largest_offset_s(shared_clock),
         refused=tuple(reader.refused),
     )
     return checked, notes
@@ -180,20 +178,15 @@ def _captures(source: ScaleSource) -> list[Capture]:
     return [load_capture(path) for path in paths if path is not None and is_capture(path)]
 
 
-def _shares_clock(captures: Sequence[Capture]) -> bool:
-    return any(capture.shared_clock for capture in captures)
-
-
-def _read_calibrations(source: ScaleSource, captures: Sequence[Capture]) -> Calibrations:
-    """Calibrations of a device: of the files that were given, else of the first capture."""
-    files = read_for_recording(source.calibration, shared_clock=_shares_clock(captures))
-    if not captures:
-        return files
-    return dataclasses.replace(
-        files,
-        camera_imu=files.camera_imu or captures[0].calibration,
-        imu=files.imu or captures[0].imu_calibration,
-    )
+def _read_calibrations(source: ScaleSource) -> tuple[Calibrations, bool]:
+    """Calibrations of a device, of the given files or else the first capture; whether camera and IMU share a clock."""
+    captures = _captures(source)
+    shared_clock = any(capture.shared_clock for capture in captures)
+    files = read_for_recording(source.calibration, shared_clock=shared_clock)
+    for capture in captures[:1]:
+        of_device = files.camera_imu or capture.calibration
+        files = dataclasses.replace(files, camera_imu=of_device, imu=files.imu or capture.imu_calibration)
+    return files, shared_clock
 
 
 def _find_times(source: ScaleSource) -> Path | None:
