@@ -36,15 +36,18 @@ class GeoreferenceLimits:
     #: Sizes of the errors on the grid (standard deviation of each horizontal coordinate), and how long they are alike.
     white_m: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0)
     slow_m: tuple[float, ...] = (0.02, 0.1, 0.25, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0, 16.0)
-    alike_s: tuple[float, ...] = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
+    #: In steps of 10^(1/4): with steps of 10^(1/2), the mean over them gives errors alike over 5 s half-widths of up to
+    #: 3.5 times the rms in place of 2.9 (scripts/study_georeference.py).
+    alike_s: tuple[float, ...] = (1.0, 1.8, 3.2, 5.6, 10.0, 18.0, 32.0, 56.0, 100.0, 180.0, 320.0, 560.0, 1000.0)
     #: Prior of the slow errors: log-normal about what the receiver states, or about this, by this factor. A wider one
     #: makes intervals too wide for errors alike over 5 to 60 s, as their short pieces look like pieces of larger and
     #: slower ones (scripts/study_georeference.py).
     usual_slow_m: float = 3.0
     slow_factor: float = 1.4
-    #: The positions show over how long errors are alike where this much of the probability is on one value of the grid
-    #: and its neighbours.
+    #: The positions show over how long errors are alike where this much of the probability is within this factor of the
+    #: most probable value.
     shown: float = 0.9
+    shown_within: float = 3.3
     #: Prior of the delay of positions: flight controllers assume .11 to .22 s (ArduPilot's u-blox driver, PX4's
     #: EKF2_GPS_DELAY); a GoPro has .49 s (Race Technology); phones, which smooth, up to a second.
     usual_delay_s: float = 0.3
@@ -435,55 +438,54 @@ def _fit(paths: ComplexArray, delays_s: Array, target: ComplexArray, t_s: Array,
     apart_s = np.abs(t_s[:, None] - t_s[None, :])
     middle = complex(paths.mean())
     about, logs_of_delay = paths - middle, -0.5 * ((delays_s - _LIMITS.usual_delay_s) / _LIMITS.delay_sigma_s) ** 2
-    sizes, fits = [], []
+    white_m, slow_m = (sizes.ravel() for sizes in np.meshgrid(_LIMITS.white_m, _LIMITS.slow_m))
+    prior = -0.5 * (np.log(slow_m / usual_m) / math.log(_LIMITS.slow_factor)) ** 2
+    fits = []
     for alike_s in _LIMITS.alike_s:
         # in units of each position's own error, and in axes in which all sizes are independent
         values, axes = np.linalg.eigh(np.exp(-apart_s / alike_s))
         fit, z = axes.T @ (1 / relative), axes.T @ (target / relative)
         p = (about / relative) @ axes
-        for white_m in _LIMITS.white_m:
-            for slow_m in _LIMITS.slow_m:
-                var = white_m**2 + slow_m**2 * np.maximum(values, 0.0)
-                weight = 1 / var
-                total = float(np.sum(weight * fit**2))
-                shift_p, shift_z = p @ (weight * fit) / total, complex(np.sum(weight * fit * z)) / total
-                q, y = p - shift_p[:, None] * fit, z - shift_z * fit
-                length = np.maximum(np.abs(q) ** 2 @ weight, 1e-12)
-                along = np.conj(q) @ (weight * y)
-                turn = np.where(np.abs(along) > 0, along / np.maximum(np.abs(along), 1e-300), 1.0)
-                left = float(np.sum(weight * np.abs(y) ** 2)) + length - 2 * np.abs(along)
-                log = -float(np.sum(np.log(var))) - 0.5 * left - math.log(total) - 0.5 * np.log(length) + logs_of_delay
-                log -= 0.5 * (math.log(slow_m / usual_m) / math.log(_LIMITS.slow_factor)) ** 2
-                # where the path's middle is; its error and the turn's are not independent
-                at, arm = shift_z - turn * shift_p, -1j * turn * shift_p / np.sqrt(length)
-                sizes.append((white_m, slow_m))
-                fits.append((log, turn, at, arm, length, np.full(len(log), total), np.abs(along) / length))
-    logs = np.array([fit[0] for fit in fits])
+        # columns are sizes, rows are delays
+        var = white_m**2 + slow_m**2 * np.maximum(values, 0.0)[:, None]
+        weight = 1 / var
+        total = fit**2 @ weight
+        shift_p, shift_z = (p * fit) @ weight / total, (z * fit) @ weight / total
+        length = np.maximum(np.abs(p) ** 2 @ weight - total * np.abs(shift_p) ** 2, 1e-12)
+        along = (np.conj(p) * z) @ weight - total * np.conj(shift_p) * shift_z
+        turn = np.where(np.abs(along) > 0, along / np.maximum(np.abs(along), 1e-300), 1.0)
+        left = np.abs(z) ** 2 @ weight - total * np.abs(shift_z) ** 2 + length - 2 * np.abs(along)
+        log = prior - np.sum(np.log(var), axis=0) - 0.5 * left - np.log(total) - 0.5 * np.log(length)
+        # where the path's middle is; its error and the turn's are not independent
+        at, arm = shift_z - turn * shift_p, -1j * turn * shift_p / np.sqrt(length)
+        total = np.broadcast_to(total, length.shape)
+        fits.append((log + logs_of_delay[:, None], turn, at, arm, length, total, np.abs(along) / length))
+    logs, turns, ats, arms, lengths, totals, ratios = map(np.array, zip(*fits, strict=True))
     share = np.exp(logs - logs.max())
     share /= share.sum()
-    turns, ats, arms, lengths, totals, ratios = (np.array([fit[k] for fit in fits]) for k in range(1, 7))
     mean_turn, mean_at = float(np.angle(np.sum(share * turns))), complex(np.sum(share * ats))
     apart = np.stack([np.angle(turns * np.exp(-1j * mean_turn)), (ats - mean_at).real, (ats - mean_at).imag])
     arm3 = np.stack([1 / np.sqrt(lengths), arms.real, arms.imag])
-    cov = np.einsum("kt,ikt,jkt->ij", share, arm3, arm3) + np.einsum("kt,ikt,jkt->ij", share, apart, apart)
+    cov = np.einsum("atk,iatk,jatk->ij", share, arm3, arm3) + np.einsum("atk,iatk,jatk->ij", share, apart, apart)
     cov += np.diag([0.0, 1.0, 1.0]) * float(np.sum(share / totals))
-    delay_s = float(np.sum(share * delays_s))
+    of_delay = share.sum(axis=(0, 2))
+    delay_s = float(of_delay @ delays_s)
     ratio = float(np.sum(share * ratios))
-    best = sizes[int(np.argmax(logs.max(axis=1)))]
-    alike_s, alike_assumed = _judge_correlation(share.sum(axis=1).reshape(len(_LIMITS.alike_s), -1).sum(axis=1))
+    best = int(np.argmax(logs.max(axis=(0, 1))))
+    alike_s, alike_assumed = _judge_correlation(share.sum(axis=(1, 2)))
     return _Fit(
         turn=mean_turn,
         middle=middle,
         at=mean_at,
         cov=0.5 * (cov + cov.T),
-        white_m=best[0],
-        slow_m=best[1],
+        white_m=float(white_m[best]),
+        slow_m=float(slow_m[best]),
         alike_s=alike_s,
         alike_assumed=alike_assumed,
         ratio=ratio,
         ratio_sigma=math.sqrt(float(np.sum(share * (1 / lengths + (ratios - ratio) ** 2)))),
         delay_s=delay_s,
-        delay_sigma_s=math.sqrt(float(np.sum(share * (delays_s - delay_s) ** 2))),
+        delay_sigma_s=math.sqrt(float(of_delay @ (delays_s - delay_s) ** 2)),
     )
 
 
@@ -491,6 +493,6 @@ def _judge_correlation(probability: Array) -> tuple[float, bool]:
     """The mean time over which errors are alike, by its probability (K,) on the grid; whether the positions leave it
     open.
     """
-    near = np.convolve(probability, np.ones(3), mode="same")
-    alike_s = float(np.exp(np.sum(probability * np.log(_LIMITS.alike_s))))
-    return alike_s, bool(near[int(np.argmax(probability))] < _LIMITS.shown)
+    log_alike = np.log(_LIMITS.alike_s)
+    near = np.abs(log_alike - log_alike[int(np.argmax(probability))]) < math.log(_LIMITS.shown_within)
+    return float(np.exp(np.sum(probability * log_alike))), bool(np.sum(probability[near]) < _LIMITS.shown)
