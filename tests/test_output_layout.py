@@ -427,7 +427,8 @@ def test_the_screen_says_the_layout_in_a_line(workspace, capsys):
     show_result(ReconstructResult(workspace=workspace, models=(model,), seconds={}), Path("capture"))
     said = capsys.readouterr().out.splitlines()[-2]
     assert said == f"no scale was accepted, so nothing here is in metres; COLMAP's own model: {model.sparse}"
-    for folder in (workspace.images, workspace.sparse):
+    # the workspace of an interrupted dense reconstruction is none
+    for folder in (workspace.images, workspace.sparse, workspace.dense / "0"):
         folder.mkdir(parents=True)
     metric = ModelResult(**{**vars(model), "sparse_metric": workspace.sparse / "0"})
     show_result(ReconstructResult(workspace=workspace, models=(metric,), seconds={}), Path("capture"))

@@ -55,10 +55,15 @@ def finished(tmp_path_factory):
     root = tmp_path_factory.mktemp("desk")
     capture = copy_scene(root / "capture", first=30, target=True)
     before = contents(capture)
-    stages = []
-    result = reconstruct(capture, root / "out", FINE, progress=lambda stage, done, total: stages.append((stage, done)))
+    steps = []
+    result = reconstruct(capture, root / "out", FINE, progress=lambda *step: steps.append(step))
     assert contents(capture) == before
-    assert list(dict(stages)) == ["check", "frames", "features", "matches", "mapping", "images", "metric", "validation"]
+    stages = list(dict.fromkeys(stage for stage, _, _ in steps))
+    assert stages == ["check", "frames", "features", "matches", "mapping", "images", "metric", "validation"]
+    # how much there is to match is said from the start, and hardly changes
+    totals = [total for stage, _, total in steps if stage == "matches"]
+    assert max(totals) / totals[-1] < 1.5
+    assert min(totals) == totals[-1]
     return capture, root / "out", result
 
 

@@ -328,7 +328,9 @@ def _describe_layout(result: ReconstructResult) -> str:
         return f"no scale was accepted, so nothing here is in metres; COLMAP's own model: {', '.join(sorted(where))}"
     if result.project_metric is not None:
         return f"{workspace.root} is the whole project in metres"
-    made = [path.name for path in (workspace.images, workspace.sparse, workspace.dense) if path.is_dir()]
+    # an interrupted dense reconstruction leaves a workspace, which is none
+    dense = [workspace.dense] if any(model.dense is not None for model in result.models) else []
+    made = [path.name for path in (workspace.images, workspace.sparse, *dense) if path.is_dir()]
     return f"{workspace.root} is a COLMAP project in metres ({', '.join(made)}); in COLMAP's units: {workspace.colmap}"
 
 

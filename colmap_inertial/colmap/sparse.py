@@ -334,7 +334,7 @@ def match_pairs(
     Parameters
     ----------
     done, total
-        Work before (:func:`matching_work`), and in all; 0 where that is unknown, by default that of these pairs.
+        Work before (:func:`matching_work`), and in all, by default that of these pairs.
 
     Returns
     -------
