@@ -144,9 +144,8 @@ def match_capture(
     pairs = _Pairs.of(database, names, options)
     close = pairs.where(pairs.close)
     # how many of the others are worth matching is not known yet: most, in all captures tried (0.7 and more)
-    first = [name_pairs(names, several) for several in (close, pairs.where(pairs.rest))]
-    done = match_pairs(database, first[0], context, total=sum(map(matching_work, first)) + 1)
-    matched = len(close)
+    first, rest = (name_pairs(names, several) for several in (close, pairs.where(pairs.rest)))
+    done, matched = match_pairs(database, first, context, total=matching_work([*first, *rest]) + 1), len(close)
 
     def match(more: Sequence[FramePair]) -> None:
         nonlocal matched, done

@@ -84,11 +84,10 @@ def _read_imu(path: Path) -> CheckInputs:
 
 def _read_capture(capture: Capture, calibration: CalibrationFiles) -> CheckInputs:
     reader = TolerantReader()
-    timing = raw = None
+    timing = None
     if capture.frames is not None:
         timing = reader.attempt(lambda: add_stated_exposures(capture, read_frame_timing(capture)))
-    if capture.imu is not None:
-        raw = reader.attempt(lambda: read_raw_capture_imu(capture))
+    raw = None if capture.imu is None else reader.attempt(lambda: read_raw_capture_imu(capture))
     return CheckInputs(
         raw=raw,
         capture=capture,
