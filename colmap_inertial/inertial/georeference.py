@@ -39,11 +39,12 @@ class GeoreferenceLimits:
     #: In steps of 10^(1/4): with steps of 10^(1/2), the mean over them gives errors alike over 5 s half-widths of up to
     #: 3.5 times the rms in place of 2.9 (scripts/study_georeference.py).
     alike_s: tuple[float, ...] = (1.0, 1.8, 3.2, 5.6, 10.0, 18.0, 32.0, 56.0, 100.0, 180.0, 320.0, 560.0, 1000.0)
-    #: Prior of the slow errors: log-normal about what the receiver states, or about this, by this factor. A wider one
-    #: makes intervals too wide for errors alike over 5 to 60 s, as their short pieces look like pieces of larger and
-    #: slower ones (scripts/study_georeference.py).
-    usual_slow_m: float = 3.0
+    #: Prior of the slow errors: log-normal about what the receiver states, by this factor. A wider one makes intervals
+    #: too wide for errors alike over 5 to 60 s, as their short pieces look like pieces of larger and slower ones. Where
+    #: nothing is stated: about this size (m), by this factor; by 1.4, intervals hold in .63 for errors of 6 m
+    #: (scripts/study_georeference.py --unstated).
     slow_factor: float = 1.4
+    unstated_slow: tuple[float, float] = (3.0, 2.5)
     #: The positions show over how long errors are alike where this much of the probability is within this factor of the
     #: most probable value.
     shown: float = 0.9
@@ -432,14 +433,14 @@ def _fit_delay(
 def _fit(paths: ComplexArray, delays_s: Array, target: ComplexArray, t_s: Array, stated_m: Array) -> _Fit:
     """The mean over all sizes of errors and the delays given; plane points as complex numbers."""
     stated = stated_m[np.isfinite(stated_m) & (stated_m > 0)]
-    usual_m = float(np.median(stated)) if len(stated) else _LIMITS.usual_slow_m
+    usual_m, factor = (float(np.median(stated)), _LIMITS.slow_factor) if len(stated) else _LIMITS.unstated_slow
     # a receiver that is less sure of some positions than of others is right about that
     relative = np.where(np.isfinite(stated_m) & (stated_m > 0), stated_m / usual_m, 1.0)
     apart_s = np.abs(t_s[:, None] - t_s[None, :])
     middle = complex(paths.mean())
     about, logs_of_delay = paths - middle, -0.5 * ((delays_s - _LIMITS.usual_delay_s) / _LIMITS.delay_sigma_s) ** 2
     white_m, slow_m = (sizes.ravel() for sizes in np.meshgrid(_LIMITS.white_m, _LIMITS.slow_m))
-    prior = -0.5 * (np.log(slow_m / usual_m) / math.log(_LIMITS.slow_factor)) ** 2
+    prior = -0.5 * (np.log(slow_m / usual_m) / math.log(factor)) ** 2
     fits = []
     for alike_s in _LIMITS.alike_s:
         # in units of each position's own error, and in axes in which all sizes are independent
