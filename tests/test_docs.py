@@ -34,9 +34,10 @@ from colmap_inertial.imaging.gate import RecordingVerdict
 from colmap_inertial.imaging.parallax import Parallax
 from colmap_inertial.imaging.selection import Chosen
 from colmap_inertial.io.calibration import calibration_prior
-from colmap_inertial.io.capture import Capture, Video, load_capture
+from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.capture_tables import ImuTables
 from colmap_inertial.io.files import write_json
+from colmap_inertial.io.frame_sources import Video
 from colmap_inertial.io.frames import read_frame_times
 from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.io.imu_formats import imu_formats

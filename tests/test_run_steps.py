@@ -34,9 +34,10 @@ from colmap_inertial.core.threads import map_in_order
 from colmap_inertial.core.types import CALIBRATION_PARAMETERS, CameraModel, FrameTiming, ImuRecording, Treatment
 from colmap_inertial.imaging.gate import RecordingVerdict
 from colmap_inertial.io.calibration import Declared, calibration_prior, write_calibration
-from colmap_inertial.io.capture import Capture, ImageFolder
+from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.capture_images import LongExposures, SubImages
 from colmap_inertial.io.files import write_json
+from colmap_inertial.io.frame_sources import ImageFolder
 from colmap_inertial.io.video_match import VideoMatch
 from colmap_inertial.model import TRANSFORM_FILE
 from colmap_inertial.model.similarities import ModelScale, plain_factor

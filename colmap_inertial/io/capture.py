@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 
@@ -38,55 +38,12 @@ from colmap_inertial.io.capture_tables import (
     read_imu_table,
 )
 from colmap_inertial.io.files import StrPath, reader, require_utf8
+from colmap_inertial.io.frame_sources import IMAGES_KEYS, ImageFolder, Video, read_image_folder, read_video
 from colmap_inertial.io.gcsv import is_gcsv, read_gcsv_frames
 from colmap_inertial.io.imu_formats import Recording, find_recording, refuse_video
 from colmap_inertial.io.imu_text import is_inertial_scale
 from colmap_inertial.io.toml_section import Section, read_toml
-from colmap_inertial.io.units import TIME_UNITS_NS
 from colmap_inertial.io.video import readout_of_video
-
-
-@dataclass(frozen=True, kw_only=True)
-class ImageFolder:
-    """Frames as pictures in a folder.
-
-    Attributes
-    ----------
-    folder, pattern
-        Files that match; ``None`` takes every picture in the folder itself.
-    times
-        ``"name"`` or a CSV file; ``None`` where nothing was said.
-    time_unit
-        Of the names, or of the CSV where its header does not say.
-    video
-        What the pictures were cut from, where known; only ``diagnose`` looks at it.
-    """
-
-    folder: Path
-    pattern: str | None = None
-    times: Literal["name"] | Path | None = None
-    time_unit: str | None = None
-    video: Path | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Video:
-    """Frames as a video.
-
-    Attributes
-    ----------
-    file
-        The video.
-    frame_times, time_unit
-        The recorder's own frame times, one for each frame, in place of the presentation stamps.
-    frames_per_s
-        Use about this many; ``None`` uses all.
-    """
-
-    file: Path
-    frame_times: Path | None = None
-    time_unit: str | None = None
-    frames_per_s: float | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -212,28 +169,13 @@ def _read_capture_toml(path: Path) -> Capture:
 
 
 def _read_images(table: Section, capture: Capture) -> Capture:
-    folder = table.require("folder", table.file("folder"))
-    pattern = table.text("pattern")
-    times: Literal["name"] | Path | None = "name" if table.text("times") == "name" else table.file("times")
-    unit = table.choice("time_unit", TIME_UNITS_NS)
-    if times == "name" and unit is None:
-        table.fail("times", f'"name" needs time_unit, one of {", ".join(TIME_UNITS_NS)}')
-    if pattern is not None and (Path(pattern).is_absolute() or ".." in Path(pattern).parts):
-        table.fail("pattern", f"must stay inside folder, found {pattern!r}")
-    frames = ImageFolder(folder=folder, pattern=pattern, times=times, time_unit=unit, video=table.file("video"))
-    return replace(capture, frames=frames)
+    return replace(capture, frames=read_image_folder(table))
 
 
 def _read_video(table: Section, capture: Capture) -> Capture:
     if capture.frames is not None:
         table.fail(None, "a capture has [images] or [video], not both")
-    frames = Video(
-        file=table.require("file", table.file("file")),
-        frame_times=table.file("frame_times"),
-        time_unit=table.choice("time_unit", TIME_UNITS_NS),
-        frames_per_s=table.positive("frames_per_s"),
-    )
-    return replace(capture, frames=frames)
+    return replace(capture, frames=read_video(table, "file"))
 
 
 def _read_imu(table: Section, capture: Capture) -> Capture:
@@ -339,7 +281,7 @@ class CaptureSection:
 
 #: In the order in which they are read.
 SECTIONS = (
-    CaptureSection(name="images", keys=("folder", "pattern", "times", "time_unit", "video"), read=_read_images),
+    CaptureSection(name="images", keys=IMAGES_KEYS, read=_read_images),
     CaptureSection(
         name="video", keys=("file", "frame_times", "time_unit", "frames_per_s"), read=_read_video, short="file"
     ),

@@ -11,8 +11,9 @@ import numpy as np
 from colmap_inertial.core.arrays import IndexArray, Int64Array, UInt8Array, UInt16Array
 from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.core.types import Frame, FrameLog, FrameTiming
-from colmap_inertial.io.capture import Capture, ImageFolder, Video, load_capture
+from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.files import StrPath, path_in, reading
+from colmap_inertial.io.frame_sources import ImageFolder, Video
 from colmap_inertial.io.frame_times import NO_RIGS, FrameStamps, stamps_of_csv, stamps_of_log, stamps_of_names
 from colmap_inertial.io.images import SUFFIXES, grey_8bit, read_image
 from colmap_inertial.io.video import decode_reduced, decode_video, frame_name, reduced, video_stamps_ns

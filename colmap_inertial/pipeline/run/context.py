@@ -10,8 +10,9 @@ from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.core.threads import worker_processes
 from colmap_inertial.core.types import CameraImuCalibration, FrameTiming, ImuRecording
 from colmap_inertial.io.calibration import CalibrationFiles, largest_offset_s, read_calibrations, read_for_recording
-from colmap_inertial.io.capture import Capture, Video
+from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import path_in
+from colmap_inertial.io.frame_sources import Video
 from colmap_inertial.pipeline.run.colmap_settings import NO_SETTINGS, ColmapSettings, read_settings
 from colmap_inertial.pipeline.run.executable import ColmapExecutable, Device, read_executable
 from colmap_inertial.pipeline.run.progress import Progress, silent

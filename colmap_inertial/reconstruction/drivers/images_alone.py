@@ -21,8 +21,9 @@ from colmap_inertial.core.options import (
 from colmap_inertial.core.types import Frame, FrameTiming
 from colmap_inertial.imaging.multi_aperture import refocus, require_colours
 from colmap_inertial.io.calibration import CalibrationFiles, list_paths
-from colmap_inertial.io.capture import Capture, ImageFolder, load_capture
+from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.files import StrPath, path_in, read_json, structured, write_json
+from colmap_inertial.io.frame_sources import ImageFolder
 from colmap_inertial.io.frames import image_names, picture_folders, read_frame_timing, read_frames
 from colmap_inertial.io.images import read_image
 from colmap_inertial.io.imu import read_capture_imu
