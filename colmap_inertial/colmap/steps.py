@@ -12,6 +12,7 @@ from colmap_inertial.colmap.given_database import GivenDatabase, import_features
 from colmap_inertial.colmap.installed import InstalledColmap
 from colmap_inertial.colmap.mapping import MapRecord, map_images
 from colmap_inertial.colmap.pairing import match_capture
+from colmap_inertial.colmap.rigs import FIXED_POSES, find_rig_poses, match_rig_images, poses_are_known, write_rig
 from colmap_inertial.colmap.sparse import (
     KeypointRecords,
     MatchRecord,
@@ -21,12 +22,14 @@ from colmap_inertial.colmap.sparse import (
 )
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, MappingError
-from colmap_inertial.core.options import ReconstructOptions
+from colmap_inertial.core.options import MappingOptions, ReconstructOptions
 from colmap_inertial.core.types import CameraModel
+from colmap_inertial.io.capture_rig import RigCamera
 from colmap_inertial.io.files import read_record, write_record
+from colmap_inertial.model import find_models, read_model
 from colmap_inertial.pipeline.run.context import Recording, RunContext
 from colmap_inertial.pipeline.run.executable import ColmapExecutable
-from colmap_inertial.pipeline.run.runner import fingerprint
+from colmap_inertial.pipeline.run.runner import fingerprint, remove
 from colmap_inertial.pipeline.run.session import Session
 from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
 from colmap_inertial.pipeline.stages.protocols import KeypointStage
@@ -66,9 +69,14 @@ def run_colmap(
     """
     workspace, runner, mapping, context = session.workspace, session.runner, options.mapping, session.context
     cameras = {record.name: record.camera for record in records if record.used}
+    refine = mapping.refine_intrinsics
+    if refine is None:
+        refine = any(camera is None for camera in cameras.values())
+    decided_mapping, rig = replace(mapping, refine_intrinsics=refine), recording.capture.rig
 
     def features(partial: Sequence[Path]) -> None:
-        found_features = _find_features(workspace.colmap_images, cameras, partial[0], stages, options, context)
+        folders = [camera.name for camera in rig]
+        found_features = _find_features(workspace.colmap_images, cameras, partial[0], stages, options, context, folders)
         write_gravity_priors(partial[0], gravity)
         write_record(partial[1], found_features)
 
@@ -80,6 +88,8 @@ def run_colmap(
         "pairing": [mapping.pairing, mapping.overlap],
         "gyroscope": [recording.imu, recording.timing, recording.prior, recording.max_offset_s],
     }
+    if rig:
+        pairing["rig"] = [rig, decided_mapping, settings("mapping")]
     outputs = [workspace.colmap_database, workspace.keypoints, workspace.matches]
 
     def matches(partial: Sequence[Path]) -> None:
@@ -89,19 +99,22 @@ def run_colmap(
         shutil.copyfile(record, partial[1])
         first_camera = next(iter(cameras.values()), None)
         matched = match_capture(workspace.colmap_features, partial[0], recording, first_camera, mapping, context)
+        if rig:
+            matched = match_rig_images(partial[0], matched, recording.timing.names, rig, context)
+            _add_rig(partial[0], workspace.colmap_images, decided_mapping, rig, context)
         write_record(partial[2], matched)
 
     def models(partial: Sequence[Path]) -> None:
-        refine = mapping.refine_intrinsics
-        if refine is None:
-            refine = any(camera is None for camera in cameras.values())
+        with_rig = context
+        if rig and poses_are_known(rig):
+            with_rig = replace(context, colmap=context.colmap.after(FIXED_POSES))
         record = map_images(
             workspace.colmap_database,
             workspace.colmap_images,
             partial[0],
-            replace(mapping, refine_intrinsics=refine),
-            context,
-            in_time=recording.timing.names,
+            decided_mapping,
+            with_rig,
+            in_time=() if rig else recording.timing.names,
         )
         write_record(partial[1], record)
 
@@ -115,6 +128,23 @@ def run_colmap(
     )
 
 
+def _add_rig(
+    database: Path, images: Path, mapping: MappingOptions, rig: Sequence[RigCamera], context: RunContext
+) -> None:
+    """Make the cameras of a database a rig, with declared poses, or those of a model without a rig.
+
+    COLMAP's mapper needs poses to begin with; where they are not declared, it refines them.
+    """
+    poses = {camera.name: camera.cam_from_reference for camera in rig if camera.cam_from_reference is not None}
+    if not poses_are_known(rig):
+        apart = context.scratch / "mapped_apart"
+        remove(apart)
+        map_images(database, images, apart, mapping, context)
+        poses = find_rig_poses((read_model(folder) for folder in find_models(apart).values()), rig)
+        remove(apart)
+    write_rig(database, rig, poses)
+
+
 def _find_features(
     images: Path,
     cameras: Mapping[str, CameraModel | None],
@@ -122,15 +152,21 @@ def _find_features(
     stages: Sequence[KeypointStage],
     options: ReconstructOptions,
     context: RunContext,
+    rig: Sequence[str],
 ) -> KeypointRecords:
-    """Features of the images into a new database: found here, by an installed COLMAP, or those of a given database."""
+    """Features of the images into a new database: found here, by an installed COLMAP, or those of a given database.
+
+    A rig, whose other cameras' folders are named, has features that are found here.
+    """
     if options.database is not None:
         given, rectified = read_given(options.database), options.database_images == "rectified"
         return import_features(
             given, images, cameras, database, keypoint_stages=stages, rectified=rectified, context=context
         )
     if context.executable is None:
-        return extract_features(images, cameras, database, options.mapping, keypoint_stages=stages, context=context)
+        return extract_features(
+            images, cameras, database, options.mapping, keypoint_stages=stages, context=context, rig=rig
+        )
     with tempfile.TemporaryDirectory(dir=context.scratch) as folder:
         theirs = Path(folder) / "installed.db"
         require_room_for_features(theirs, len(cameras), options.mapping)

@@ -26,6 +26,7 @@ from colmap_inertial.io.capture_images import (
     read_apertures_table,
     read_exposures_table,
 )
+from colmap_inertial.io.capture_rig import RigCamera, read_rig_table
 from colmap_inertial.io.capture_tables import (
     CALIBRATION_KEYS,
     CAMERA_KEYS,
@@ -84,6 +85,8 @@ class Capture:
         The sub-images that are fused to one frame; ``frames`` and ``camera`` are the reference aperture's.
     exposures
         The long exposures beside ``frames``, which are the short ones.
+    rig
+        Cameras that are fixed to the one of ``frames``.
     """
 
     path: Path
@@ -103,6 +106,7 @@ class Capture:
     frame_log: FrameLog | None = None
     apertures: ApertureImages | None = None
     exposures: LongExposures | None = None
+    rig: tuple[RigCamera, ...] = ()
 
     @property
     def image_folder(self) -> Path | None:
@@ -240,6 +244,17 @@ def _read_exposures(table: Section, capture: Capture) -> Capture:
     return replace(capture, exposures=read_exposures_table(table, capture.image_folder))
 
 
+def _read_rig(table: Section, capture: Capture) -> Capture:
+    if capture.frames is None:
+        table.fail(None, "belongs to [images] or [video], the main camera's, which is missing")
+    if capture.apertures is not None or capture.exposures is not None:
+        table.fail(None, "a capture has [rig], [apertures] or [exposures], not several of them")
+    rig = read_rig_table(table, body_from_cam=capture.body_from_cam)
+    if rig.reference is not None and capture.camera is not None:
+        table.fail("calibration", "gives the main camera, too; leave out [camera]")
+    return replace(capture, rig=rig.cameras, camera=rig.reference or capture.camera)
+
+
 def _read_calibration(table: Section, capture: Capture) -> Capture:
     calibrations = read_calibration_table(
         table,
@@ -295,6 +310,7 @@ SECTIONS = (
     CaptureSection(name="camera", keys=CAMERA_KEYS, read=_read_camera),
     CaptureSection(name="apertures", keys=None, read=_read_apertures),
     CaptureSection(name="exposures", keys=EXPOSURES_KEYS, read=_read_exposures),
+    CaptureSection(name="rig", keys=None, read=_read_rig),
     CaptureSection(name="calibration", keys=CALIBRATION_KEYS, read=_read_calibration, is_always_read=True),
     CaptureSection(name="target", keys=("spec",), read=_read_target),
 )

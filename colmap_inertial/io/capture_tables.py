@@ -173,7 +173,7 @@ def _read_pose(table: Section) -> tuple[ArrayLike | None, ArrayLike | None]:
         return xyzw, lever
     if xyzw is not None:
         table.fail("cam_from_imu_xyzw", "and cam_from_imu say the same; leave one out")
-    cam_from_imu = _check_transform(table, matrix)
+    cam_from_imu = check_transform(table, "cam_from_imu", matrix)
     if len(matrix) > 3 and lever is not None:
         table.fail("imu_in_cam_m", "and the last column of cam_from_imu say the same; leave one out")
     return quat_from_matrix(cam_from_imu[:3, :3]), cam_from_imu[:3, 3] if len(matrix) > 3 else lever
@@ -191,16 +191,17 @@ def body_from_imu(imu: ImuPath) -> Array:
     return sensor_yaml.read_body_from_sensor(sheet)
 
 
-def _check_transform(table: Section, rows: list[list[float]]) -> Array:
+def check_transform(table: Section, key: str, rows: list[list[float]]) -> Array:
+    """(4, 4) rotation and translation of a 3x3 or 4x4 matrix under a key."""
     shape = (len(rows), len(rows[0]) if rows else 0)
     if shape not in ((3, 3), (4, 4)):
-        table.fail("cam_from_imu", f"must be a 3x3 or 4x4 matrix, found {shape[0]}x{shape[1]}")
+        table.fail(key, f"must be a 3x3 or 4x4 matrix, found {shape[0]}x{shape[1]}")
     matrix = np.eye(4)
     matrix[: shape[0], : shape[1]] = rows
     if not sensor_yaml.is_rotation(matrix[:3, :3]):
-        table.fail("cam_from_imu", "is not a rotation: rows must be perpendicular, of length 1, and right-handed")
+        table.fail(key, "is not a rotation: rows must be perpendicular, of length 1, and right-handed")
     if not np.allclose(matrix[3], [0, 0, 0, 1]):
-        table.fail("cam_from_imu", "must have 0, 0, 0, 1 as its last row")
+        table.fail(key, "must have 0, 0, 0, 1 as its last row")
     return matrix
 
 

@@ -54,7 +54,7 @@ def read_frames(
             timing = _timing(capture, stamps)
         return timing, _decode_video(capture, capture.frames, timing, source_ns, _places(timing, only))
     timing = read_frame_timing(capture)
-    return timing, _decode_images(capture, timing, _places(timing, only))
+    return timing, decode_images(capture, timing, _places(timing, only))
 
 
 def read_reduced(capture: Capture, names: Collection[str], long_side_px: int) -> Iterator[tuple[str, UInt8Array]]:
@@ -118,13 +118,14 @@ def read_frame_times(path: StrPath, first_of: Mapping[str, str] = NO_RIGS) -> Fr
 
 
 def picture_folders(capture: Capture) -> tuple[Path, ...]:
-    """All folders that pictures of a capture are read from; empty where they come from a video."""
-    if not isinstance(capture.frames, ImageFolder):
-        return ()
-    more = [] if capture.apertures is None else [source.folder for source in capture.apertures.sources]
+    """All folders that pictures of a capture are read from; empty where they come from videos."""
+    folders = [capture.frames.folder] if isinstance(capture.frames, ImageFolder) else []
+    if capture.apertures is not None:
+        folders += [source.folder for source in capture.apertures.sources]
     if capture.exposures is not None:
-        more.append(capture.exposures.source.folder)
-    return tuple(dict.fromkeys([capture.frames.folder, *more]))
+        folders.append(capture.exposures.source.folder)
+    folders += [camera.frames.folder for camera in capture.rig if isinstance(camera.frames, ImageFolder)]
+    return tuple(dict.fromkeys(folders))
 
 
 def _timing(capture: Capture, stamps: FrameStamps) -> FrameTiming:
@@ -184,9 +185,10 @@ def image_names(source: ImageFolder) -> list[str]:
     return sorted(path.relative_to(source.folder).as_posix() for path in paths)
 
 
-def _decode_images(capture: Capture, timing: FrameTiming, places: IndexArray) -> Iterator[Frame]:
+def decode_images(capture: Capture, timing: FrameTiming, places: IndexArray | None = None) -> Iterator[Frame]:
+    """Pictures of a capture's folder that a timing names, or those of them at some places; see :func:`read_frames`."""
     assert isinstance(capture.frames, ImageFolder)
-    for i in places.tolist():
+    for i in range(len(timing.names)) if places is None else places.tolist():
         path = path_in(capture.frames.folder, timing.names[i])
         yield _frame(capture, timing, i, path, read_image(path))
 

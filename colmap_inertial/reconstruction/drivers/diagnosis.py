@@ -19,6 +19,7 @@ from colmap_inertial.io.imu_formats import find_recording
 from colmap_inertial.io.imu_text import is_inertial_scale
 from colmap_inertial.io.plausible import RawImu
 from colmap_inertial.io.pose_convention import ARRAYS, COLMAP, INERTIAL_SCALE, TUM, PoseConvention
+from colmap_inertial.io.rig_frames import pair_rig_frames
 from colmap_inertial.io.trajectories import read_inertial_scale_poses, read_tum
 from colmap_inertial.model import read_model, trajectory_from_model
 from colmap_inertial.model.rigs import frames_of_rigs
@@ -170,6 +171,7 @@ def _read_capture(capture: Capture, calibration: CalibrationFiles, progress: Pro
         known = timing
         rotation = reading.attempt(lambda: measure_images(capture, known, progress))
         in_video = reading.attempt(lambda: find_in_video(capture, known, progress))
+        reading.attempt(lambda: pair_rig_frames(capture, known))
     return _recorded(
         reading,
         imu=None if capture.imu is None else lambda: read_raw_capture_imu(capture),

@@ -148,6 +148,8 @@ def deblur_capture(
     loaded = replace(load_capture(Path(capture)), exposures=None)
     if loaded.frames is None:
         raise FormatError(loaded.path, "has no frames: add [images] or [video]")
+    if loaded.rig:
+        raise FormatError(loaded.path, "frames of a rig's cameras are not deblurred: take [rig] out")
     if sheet is not None:
         _require_free_sheet(sheet, Path(out))
     imu = read_capture_imu(loaded)

@@ -382,6 +382,8 @@ def _pictures(path: Path) -> Capture:
         raise FormatError(path, "has no pictures: add [images] or [video]")
     if capture.apertures is not None or capture.exposures is not None:
         raise FormatError(path, "--scale-from target or distance takes plain pictures: fuse them first")
+    if capture.rig:
+        raise FormatError(path, "--scale-from target or distance takes one camera: take [rig] out")
     if isinstance(capture.frames, Video) and capture.frames.frames_per_s is None:
         capture = dataclasses.replace(capture, frames=dataclasses.replace(capture.frames, frames_per_s=_FRAMES_PER_S))
     return capture
