@@ -20,8 +20,8 @@ import yaml
 from check_euroc import check
 
 from colmap_inertial import MappingOptions, ProjectOptions, ReconstructOptions, reconstruct, reconstruct_project
-from colmap_inertial.io.sensor_yaml import read_camera
 from colmap_inertial.core.geometry import quat_from_matrix, quat_log, quat_multiply
+from colmap_inertial.io.sensor_yaml import read_camera
 
 CAMERAS = ("cam0", "cam1")
 #: Frames so many places apart are matched, images of one frame as well.
