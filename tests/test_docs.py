@@ -387,7 +387,7 @@ def test_the_reference_names_every_format_and_every_key():
     page = (DOCS / "capture-toml.md").read_text()
     assert {f.name for f in imu_formats() if f"`{f.name}`" not in page} == set()
     keys = set()
-    for file in ("capture.py", "capture_tables.py", "frame_sources.py", "capture_rig.py"):
+    for file in ("capture.py", "capture_tables.py", "camera_table.py", "frame_sources.py", "capture_rig.py"):
         if file == "capture_rig.py":
             page += (DOCS / "special-cameras.md").read_text()
         source = (ROOT / "colmap_inertial" / "io" / file).read_text()

@@ -67,12 +67,9 @@ def run_colmap(
     MappingError
         When COLMAP finds no model.
     """
-    workspace, runner, mapping, context = session.workspace, session.runner, options.mapping, session.context
+    workspace, runner, context = session.workspace, session.runner, session.context
     cameras = {record.name: record.camera for record in records if record.used}
-    refine = mapping.refine_intrinsics
-    if refine is None:
-        refine = any(camera is None for camera in cameras.values())
-    decided_mapping, rig = replace(mapping, refine_intrinsics=refine), recording.capture.rig
+    mapping, rig = _decide_refinement(options.mapping, cameras), recording.capture.rig
 
     def features(partial: Sequence[Path]) -> None:
         folders = [camera.name for camera in rig]
@@ -89,7 +86,7 @@ def run_colmap(
         "gyroscope": [recording.imu, recording.timing, recording.prior, recording.max_offset_s],
     }
     if rig:
-        pairing["rig"] = [rig, decided_mapping, settings("mapping")]
+        pairing["rig"] = [rig, mapping, settings("mapping")]
     outputs = [workspace.colmap_database, workspace.keypoints, workspace.matches]
 
     def matches(partial: Sequence[Path]) -> None:
@@ -101,31 +98,35 @@ def run_colmap(
         matched = match_capture(workspace.colmap_features, partial[0], recording, first_camera, mapping, context)
         if rig:
             matched = match_rig_images(partial[0], matched, recording.timing.names, rig, context)
-            _add_rig(partial[0], workspace.colmap_images, decided_mapping, rig, context)
+            _add_rig(partial[0], workspace.colmap_images, mapping, rig, context)
         write_record(partial[2], matched)
 
     def models(partial: Sequence[Path]) -> None:
-        with_rig = context
-        if rig and poses_are_known(rig):
-            with_rig = replace(context, colmap=context.colmap.after(FIXED_POSES))
-        record = map_images(
-            workspace.colmap_database,
-            workspace.colmap_images,
-            partial[0],
-            decided_mapping,
-            with_rig,
-            in_time=() if rig else recording.timing.names,
-        )
+        database, images, own = workspace.colmap_database, workspace.colmap_images, _keep_poses(context, rig)
+        in_time = () if rig else recording.timing.names
+        record = map_images(database, images, partial[0], mapping, own, in_time=in_time)
         write_record(partial[1], record)
 
     runner.run("matches", pairing, outputs, matches, after=["frames"])
-    decided = {"mapping": mapping, "colmap": settings("mapping", "adjustment")}
+    decided = {"mapping": options.mapping, "colmap": settings("mapping", "adjustment")}
     runner.run("mapping", decided, [workspace.colmap_sparse, workspace.mapped], models, after=["matches"])
     return (
         read_record(workspace.keypoints, KeypointRecords),
         read_record(workspace.matches, MatchRecord),
         read_record(workspace.mapped, MapRecord),
     )
+
+
+def _decide_refinement(mapping: MappingOptions, cameras: Mapping[str, CameraModel | None]) -> MappingOptions:
+    """Refine the cameras where that was asked for, or else where one is unknown."""
+    unknown = any(camera is None for camera in cameras.values())
+    return mapping if mapping.refine_intrinsics is not None else replace(mapping, refine_intrinsics=unknown)
+
+
+def _keep_poses(context: RunContext, rig: Sequence[RigCamera]) -> RunContext:
+    """The context in which the mapper keeps declared poses of a rig's cameras, unless the user set otherwise."""
+    known = bool(rig) and poses_are_known(rig)
+    return replace(context, colmap=context.colmap.after(FIXED_POSES)) if known else context
 
 
 def _add_rig(

@@ -19,6 +19,7 @@ from colmap_inertial.core.geometry import quat_from_matrix
 from colmap_inertial.core.types import CameraImuCalibration, CameraModel, FrameLog, ImuCalibration, ReadoutDirection
 from colmap_inertial.io import sensor_yaml
 from colmap_inertial.io.calibration import Declared, calibration_prior
+from colmap_inertial.io.camera_table import CAMERA_KEYS, read_camera_table
 from colmap_inertial.io.capture_images import (
     EXPOSURES_KEYS,
     ApertureImages,
@@ -29,13 +30,11 @@ from colmap_inertial.io.capture_images import (
 from colmap_inertial.io.capture_rig import RigCamera, read_rig_table
 from colmap_inertial.io.capture_tables import (
     CALIBRATION_KEYS,
-    CAMERA_KEYS,
     IMU_KEYS,
     ImuPath,
     ImuTables,
     body_from_imu,
     read_calibration_table,
-    read_camera_table,
     read_imu_table,
 )
 from colmap_inertial.io.files import StrPath, reader, require_utf8

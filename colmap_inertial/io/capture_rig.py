@@ -29,7 +29,9 @@ Without a calibration of all cameras:
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import get_args
 
 import numpy as np
@@ -37,8 +39,9 @@ import numpy as np
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.types import CameraModel
-from colmap_inertial.io.capture_tables import CAMERA_KEYS, check_transform, read_camera_table
-from colmap_inertial.io.frame_sources import ImageFolder, Video, read_image_folder, read_video
+from colmap_inertial.io.camera_table import CAMERA_KEYS, check_transform, read_camera_table
+from colmap_inertial.io.files import path_in
+from colmap_inertial.io.frame_sources import ImageFolder, Video, image_names, read_image_folder, read_video
 from colmap_inertial.io.rig_calibration import Metres, MountedCamera, RigCalibration, read_rig_calibration
 from colmap_inertial.io.toml_section import Section
 
@@ -84,6 +87,17 @@ class RigTable:
 
     reference: CameraModel | None
     cameras: tuple[RigCamera, ...]
+
+
+def rig_files(rig: Iterable[RigCamera]) -> list[Path]:
+    """Files of the images and videos of a rig's cameras."""
+    files: list[Path] = []
+    for source in (camera.frames for camera in rig):
+        if isinstance(source, ImageFolder):
+            files += [path_in(source.folder, name) for name in image_names(source)]
+        else:
+            files.append(source.file)
+    return files
 
 
 def read_rig_table(table: Section, *, body_from_cam: Array | None) -> RigTable:

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.io.images import SUFFIXES
 from colmap_inertial.io.toml_section import Section
 from colmap_inertial.io.units import TIME_UNITS_NS
 
@@ -77,3 +79,17 @@ def read_video(table: Section, key: str) -> Video:
         time_unit=table.choice("time_unit", TIME_UNITS_NS),
         frames_per_s=table.positive("frames_per_s"),
     )
+
+
+def image_names(source: ImageFolder) -> list[str]:
+    """Names relative to the folder, with forward slashes, as COLMAP has them."""
+    if not source.folder.is_dir():
+        raise FormatError(source.folder, "no such folder of pictures")
+    if source.pattern is not None and (Path(source.pattern).is_absolute() or ".." in Path(source.pattern).parts):
+        raise FormatError(source.folder, f"the pattern {source.pattern!r} leads out of it")
+    candidates = source.folder.iterdir() if source.pattern is None else source.folder.glob(source.pattern)
+    paths = [path for path in candidates if path.suffix.lower() in SUFFIXES and path.is_file()]
+    if not paths:
+        what = "holds no pictures" if source.pattern is None else f"holds no pictures that match {source.pattern!r}"
+        raise FormatError(source.folder, f"{what} (endings: {', '.join(SUFFIXES)})")
+    return sorted(path.relative_to(source.folder).as_posix() for path in paths)

@@ -13,7 +13,7 @@ from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.core.types import Frame, FrameLog, FrameTiming
 from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.files import StrPath, path_in, reading
-from colmap_inertial.io.frame_sources import ImageFolder, Video
+from colmap_inertial.io.frame_sources import ImageFolder, Video, image_names
 from colmap_inertial.io.frame_times import NO_RIGS, FrameStamps, stamps_of_csv, stamps_of_log, stamps_of_names
 from colmap_inertial.io.images import SUFFIXES, grey_8bit, read_image
 from colmap_inertial.io.video import decode_reduced, decode_video, frame_name, reduced, video_stamps_ns
@@ -169,20 +169,6 @@ def _image_stamps(source: ImageFolder) -> FrameStamps:
 def _is_other_picture(source: ImageFolder, name: str) -> bool:
     """Whether a file of that name is in the folder, with an ending that is not read."""
     return Path(name).suffix.lower() not in SUFFIXES and (source.folder / name).is_file()
-
-
-def image_names(source: ImageFolder) -> list[str]:
-    """Names relative to the folder, with forward slashes, as COLMAP has them."""
-    if not source.folder.is_dir():
-        raise FormatError(source.folder, "no such folder of pictures")
-    if source.pattern is not None and (Path(source.pattern).is_absolute() or ".." in Path(source.pattern).parts):
-        raise FormatError(source.folder, f"the pattern {source.pattern!r} leads out of it")
-    candidates = source.folder.iterdir() if source.pattern is None else source.folder.glob(source.pattern)
-    paths = [path for path in candidates if path.suffix.lower() in SUFFIXES and path.is_file()]
-    if not paths:
-        what = "holds no pictures" if source.pattern is None else f"holds no pictures that match {source.pattern!r}"
-        raise FormatError(source.folder, f"{what} (endings: {', '.join(SUFFIXES)})")
-    return sorted(path.relative_to(source.folder).as_posix() for path in paths)
 
 
 def decode_images(capture: Capture, timing: FrameTiming, places: IndexArray | None = None) -> Iterator[Frame]:

@@ -15,12 +15,20 @@ from colmap_inertial.core.types import Frame, FrameTiming
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.capture_rig import RigCamera
 from colmap_inertial.io.files import path_in
-from colmap_inertial.io.frame_sources import ImageFolder
+from colmap_inertial.io.frame_sources import ImageFolder, image_names
 from colmap_inertial.io.frame_times import SAME_MOMENT_NS
-from colmap_inertial.io.frames import decode_images, image_names, read_frame_timing, read_frames
+from colmap_inertial.io.frames import decode_images, read_frame_timing, read_frames
 
-#: With fewer of the main camera's frames in all cameras, clocks or names do not belong together.
-_LEAST_SHARE = 0.5
+
+@dataclass(frozen=True, kw_only=True)
+class RigFrameLimits:
+    """Limits for images of cameras that belong together."""
+
+    #: With a smaller share of the main camera's frames in all cameras, clocks or names do not belong together.
+    least_share: float = 0.5
+
+
+_LIMITS = RigFrameLimits()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -75,17 +83,6 @@ def image_name(camera: RigCamera, frame: str) -> str:
     return f"{camera.name}/{frame}"
 
 
-def rig_files(capture: Capture) -> list[Path]:
-    """Files of the other cameras of a capture's rig."""
-    files: list[Path] = []
-    for source in (camera.frames for camera in capture.rig):
-        if isinstance(source, ImageFolder):
-            files += [path_in(source.folder, name) for name in image_names(source)]
-        else:
-            files.append(source.file)
-    return files
-
-
 def pair_rig_frames(capture: Capture, timing: FrameTiming) -> RigFrames:
     """Find the images of all cameras that belong together.
 
@@ -98,13 +95,13 @@ def pair_rig_frames(capture: Capture, timing: FrameTiming) -> RigFrames:
     """
     own_names = tuple(_find_own(capture, camera, timing) for camera in capture.rig)
     for camera, own in zip(capture.rig, own_names, strict=True):
-        if len(own) < _LEAST_SHARE * len(timing.names):
+        if len(own) < _LIMITS.least_share * len(timing.names):
             raise TimingError(_describe_missing(capture, camera, own, timing))
         taken = next((name for name in timing.names if name.startswith(f"{camera.name}/")), None)
         if taken is not None:
             raise TimingError(f"[rig.{camera.name}]: the main camera's image {taken} lies in a folder of that name")
     alone = tuple(name for name in timing.names if not all(name in own for own in own_names))
-    if len(alone) > (1 - _LEAST_SHARE) * len(timing.names):
+    if len(alone) > (1 - _LIMITS.least_share) * len(timing.names):
         raise TimingError(f"[rig]: {len(alone)} of {len(timing.names)} frames are not of all cameras")
     return RigFrames(capture=capture, own_names=own_names, alone=alone)
 

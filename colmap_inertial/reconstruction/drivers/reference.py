@@ -29,8 +29,8 @@ from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.files import StrPath, path_in, read_json, write_json
-from colmap_inertial.io.frame_sources import ImageFolder, Video
-from colmap_inertial.io.frames import image_names, read_frames
+from colmap_inertial.io.frame_sources import ImageFolder, Video, image_names
+from colmap_inertial.io.frames import read_frames
 from colmap_inertial.io.imu import is_capture
 from colmap_inertial.io.mp4 import is_mp4
 from colmap_inertial.model import find_models, read_model
