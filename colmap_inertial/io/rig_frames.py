@@ -91,7 +91,7 @@ def pair_rig_frames(capture: Capture, timing: FrameTiming) -> RigFrames:
     Raises
     ------
     FormatError, TimingError
-        Where images cannot be read, the names collide, or fewer than half of the frames are of all cameras.
+        Where images cannot be read, the names collide, or fewer than half of the frames have an image of a camera.
     """
     own_names = tuple(_find_own(capture, camera, timing) for camera in capture.rig)
     for camera, own in zip(capture.rig, own_names, strict=True):
@@ -101,8 +101,6 @@ def pair_rig_frames(capture: Capture, timing: FrameTiming) -> RigFrames:
         if taken is not None:
             raise TimingError(f"[rig.{camera.name}]: the main camera's image {taken} lies in a folder of that name")
     alone = tuple(name for name in timing.names if not all(name in own for own in own_names))
-    if len(alone) > (1 - _LIMITS.least_share) * len(timing.names):
-        raise TimingError(f"[rig]: {len(alone)} of {len(timing.names)} frames are not of all cameras")
     return RigFrames(capture=capture, own_names=own_names, alone=alone)
 
 
