@@ -552,7 +552,7 @@ def colmap(workspace, monkeypatch):
     """COLMAP's steps without COLMAP: what they were given, and which of them worked."""
     given = {}
 
-    def extract(images, cameras, database, options, *, keypoint_stages, context):
+    def extract(images, cameras, database, options, *, keypoint_stages, context, rig):
         given["images"] = list(cameras)
         database.write_text("features")
         return KeypointRecords()
@@ -576,9 +576,8 @@ def colmap(workspace, monkeypatch):
         session.runner.run("frames", {"option": frames}, [workspace.images], lambda partial: partial[0].mkdir())
         options = replace(ReconstructOptions(), mapping=MappingOptions(overlap=overlap))
         names = tuple(record.name for record in records if record.used)
-        seen = SimpleNamespace(
-            timing=FrameTiming(names=names, t_s=np.arange(len(names)) * 0.1), imu=None, prior=None, max_offset_s=None
-        )
+        timing, capture = FrameTiming(names=names, t_s=np.arange(len(names)) * 0.1), SimpleNamespace(rig=())
+        seen = SimpleNamespace(capture=capture, timing=timing, imu=None, prior=None, max_offset_s=None)
         steps.run_colmap(session, seen, records, [], gravity or {}, options)
         return session.runner.worked
 
