@@ -1,10 +1,11 @@
 """EuRoC's stereo keyframes as a COLMAP rig of unknown extrinsics: the baseline in metres against its calibration.
 
-    python scripts/check_rig.py DATASET FOLDER [--frames 100]
+    python scripts/check_rig.py DATASET FOLDER [--frames 100] [--capture {declared,found}]
 
 DATASET has ``keyframes/`` and ``mav0/`` of EuRoC V1_01_easy. COLMAP maps the images of both cameras, derives the rig
-from that model and maps again with it; ``reconstruct`` gets this project, the IMU and the times of all images. FOLDER
-takes the work and is made. Printed: the distance and rotation between the cameras against the calibration of the data
+from that model and maps again with it; ``reconstruct`` gets this project, the IMU and the times of all images. With
+``--capture``, it gets a capture with a rig in its place, whose extrinsics are declared or to be found. FOLDER takes the
+work and is made. Printed: the distance and rotation between the cameras against the calibration of the data
 set, the scale's interval and verdict, and the scale error against motion capture.
 """
 
@@ -18,8 +19,9 @@ import pycolmap
 import yaml
 from check_euroc import check
 
-from colmap_inertial import ProjectOptions, reconstruct_project
+from colmap_inertial import MappingOptions, ProjectOptions, ReconstructOptions, reconstruct, reconstruct_project
 from colmap_inertial.core.geometry import quat_from_matrix, quat_log, quat_multiply
+from colmap_inertial.io.sensor_yaml import read_camera
 
 CAMERAS = ("cam0", "cam1")
 #: Frames so many places apart are matched, images of one frame as well.
@@ -82,12 +84,38 @@ def write_project(dataset: Path, project: Path, most: int) -> Path:
     return times
 
 
-def check_rig(dataset: Path, folder: Path, most: int) -> dict[str, float | str]:
+def write_capture(dataset: Path, capture: Path, most: int, *, declared: bool) -> Path:
+    """A capture of both cameras, which gives the pose of the second one or not; returns its capture.toml."""
+    stamps = sorted(path.name.split("_")[0] for path in (dataset / "keyframes").glob("*_0.jpg"))[:most]
+    for number, camera in enumerate(CAMERAS):
+        (capture / camera).mkdir(parents=True)
+        for stamp in stamps:
+            shutil.copy(dataset / "keyframes" / f"{stamp}_{number}.jpg", capture / camera / f"{stamp}.jpg")
+    sheets = [(dataset / "mav0" / camera / "sensor.yaml").resolve() for camera in CAMERAS]
+    second = f'sensor_yaml = "{sheets[1]}"'
+    if not declared:  # the sheet would give the pose
+        model = read_camera(sheets[1])
+        second = f'model = "{model.model}"\nwidth = {model.width}\nheight = {model.height}\n'
+        second += f'params = {list(model.params)}\npixel_origin = "corner"'
+    (capture / "capture.toml").write_text(
+        f'[images]\nfolder = "cam0"\ntimes = "name"\ntime_unit = "ns"\n[camera]\nsensor_yaml = "{sheets[0]}"\n'
+        f'[imu]\npath = "{(dataset / "mav0" / "imu0").resolve()}"\n[timing]\nreadout_s = 0\nshared_clock = true\n'
+        f'[rig.cam1]\nfolder = "cam1"\n[rig.cam1.camera]\n{second}\n'
+    )
+    return capture / "capture.toml"
+
+
+def check_rig(dataset: Path, folder: Path, most: int, capture: str | None = None) -> dict[str, float | str]:
     """The figures that are printed."""
     folder.mkdir(parents=True)
-    times = write_project(dataset, folder / "project", most)
-    source = ProjectOptions(imu=dataset / "mav0" / "imu0", frame_times=times)
-    made = reconstruct_project(folder / "project", folder / "out", source)
+    if capture is None:
+        times = write_project(dataset, folder / "project", most)
+        source = ProjectOptions(imu=dataset / "mav0" / "imu0", frame_times=times)
+        made = reconstruct_project(folder / "project", folder / "out", source)
+    else:
+        toml = write_capture(dataset, folder / "capture", most, declared=capture == "declared")
+        mapping = MappingOptions(pairing="sequential", overlap=OVERLAP)
+        made = reconstruct(toml, folder / "out", ReconstructOptions(deterministic=True, mapping=mapping))
     model = json.loads((made.workspace.root / "result.json").read_text())["models"][0]
     (sensor,) = model["rig"]
     true = true_cam1_from_cam0(dataset)
@@ -111,8 +139,9 @@ def main() -> None:
     parser.add_argument("dataset", type=Path)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--frames", type=int, default=100)
+    parser.add_argument("--capture", choices=("declared", "found"))
     given = parser.parse_args()
-    for name, value in check_rig(given.dataset, given.folder, given.frames).items():
+    for name, value in check_rig(given.dataset, given.folder, given.frames, given.capture).items():
         print(f"{name:<22} {value if isinstance(value, str) else format(value, '.5g')}")
 
 

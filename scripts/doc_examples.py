@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = ("README.md", "docs/python.md", "docs/imaging.md", "docs/special-cameras.md")
+PAGES = ("README.md", "docs/python.md", "docs/imaging.md")
 #: Paths as text, and plain numbers of a scale that was not refused.
 MORE = """\
 import colmap_inertial as ci

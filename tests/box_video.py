@@ -102,6 +102,36 @@ def _picture(atlas: np.ndarray, rotation: np.ndarray, centre: np.ndarray, rays: 
     return cv2.remap(atlas, map_x, map_y, cv2.INTER_LINEAR)
 
 
+def _write_clip(path: Path, scene: Scene, exposure_s: float, cam_from_reference: np.ndarray) -> None:
+    """Film what a camera sees that is fixed to the one whose poses the motion has."""
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    rays = np.stack([(x - WIDTH / 2) / FOCAL, (y - HEIGHT / 2) / FOCAL, np.ones_like(x)])
+    rays = rays.reshape(3, -1).astype(np.float32)
+    atlas, frame_rate_hz = _atlas(scene.recipe.seed), scene.recipe.frame_rate_hz
+    reference_from_cam = np.linalg.inv(cam_from_reference)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=Fraction(frame_rate_hz).limit_denominator(1001))
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        stream.options = {"crf": "16", "threads": "1"}
+        stream.codec_context.time_base = stream.time_base = Fraction(1, 90000)
+        for t_s in scene.trigger_s:
+            total = np.zeros((HEIGHT, WIDTH), np.float32)
+            for k in range(_SAMPLES):
+                rotation, centre = _pose(scene, t_s + exposure_s * (k + 0.5) / _SAMPLES)
+                place = centre + rotation @ reference_from_cam[:3, 3]
+                total += _picture(atlas, rotation @ reference_from_cam[:3, :3], place, rays)
+            grey = np.rint(total / _SAMPLES).astype(np.uint8)
+            frame = av.VideoFrame.from_ndarray(np.repeat(grey[..., None], 3, axis=2), format="rgb24")
+            frame.pts, frame.time_base = round(t_s * 90000), Fraction(1, 90000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+
+
+def film_beside(video: BoxVideo, name: str, cam_from_reference: np.ndarray) -> None:
+    """Write ``clip_NAME.mp4`` of a second camera that is fixed to the first; (4, 4) in metres."""
+    _write_clip(video.folder / f"clip_{name}.mp4", video.scene, video.exposure_s, cam_from_reference)
+
+
 def film(
     folder: Path,
     motion: MotionOptions,
@@ -115,25 +145,8 @@ def film(
     model = CameraModel(model="SIMPLE_PINHOLE", width=WIDTH, height=HEIGHT, params=(FOCAL, WIDTH / 2, HEIGHT / 2))
     camera = ShutterCamera(model=model, exposure_s=exposure_s)
     scene = make_scene(SceneRecipe(motion=motion, frame_rate_hz=frame_rate_hz, camera=camera, format="h264", seed=seed))
-    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    rays = np.stack([(x - WIDTH / 2) / FOCAL, (y - HEIGHT / 2) / FOCAL, np.ones_like(x)])
-    rays = rays.reshape(3, -1).astype(np.float32)
-    atlas = _atlas(seed)
     folder.mkdir(parents=True)
-    with av.open(str(folder / "clip.mp4"), "w") as container:
-        stream = container.add_stream("libx264", rate=Fraction(frame_rate_hz).limit_denominator(1001))
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
-        stream.options = {"crf": "16", "threads": "1"}
-        stream.codec_context.time_base = stream.time_base = Fraction(1, 90000)
-        for t_s in scene.trigger_s:
-            total = np.zeros((HEIGHT, WIDTH), np.float32)
-            for k in range(_SAMPLES):
-                total += _picture(atlas, *_pose(scene, t_s + exposure_s * (k + 0.5) / _SAMPLES), rays)
-            grey = np.rint(total / _SAMPLES).astype(np.uint8)
-            frame = av.VideoFrame.from_ndarray(np.repeat(grey[..., None], 3, axis=2), format="rgb24")
-            frame.pts, frame.time_base = round(t_s * 90000), Fraction(1, 90000)
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
+    _write_clip(folder / "clip.mp4", scene, exposure_s, np.eye(4))
     imu = scene.imu.recording
     for name, times, values in (("gyro", imu.gyro_t_s, imu.gyro_rad_s), ("accel", imu.accel_t_s, imu.accel_m_s2)):
         rows = [f"{t:.7f},{a:.6f},{b:.6f},{c:.6f}" for t, (a, b, c) in zip(times, values, strict=True)]

@@ -34,9 +34,10 @@ from colmap_inertial.imaging.gate import RecordingVerdict
 from colmap_inertial.imaging.parallax import Parallax
 from colmap_inertial.imaging.selection import Chosen
 from colmap_inertial.io.calibration import calibration_prior
-from colmap_inertial.io.capture import Capture, Video, load_capture
+from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.capture_tables import ImuTables
 from colmap_inertial.io.files import write_json
+from colmap_inertial.io.frame_sources import Video
 from colmap_inertial.io.frames import read_frame_times
 from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.io.imu_formats import imu_formats
@@ -386,7 +387,9 @@ def test_the_reference_names_every_format_and_every_key():
     page = (DOCS / "capture-toml.md").read_text()
     assert {f.name for f in imu_formats() if f"`{f.name}`" not in page} == set()
     keys = set()
-    for file in ("capture.py", "capture_tables.py"):
+    for file in ("capture.py", "capture_tables.py", "camera_table.py", "frame_sources.py", "capture_rig.py"):
+        if file == "capture_rig.py":
+            page += (DOCS / "special-cameras.md").read_text()
         source = (ROOT / "colmap_inertial" / "io" / file).read_text()
         reads = r"(?:file|text|number|numbers|matrix|choice|boolean|integer|positive|raw)"
         keys |= set(re.findall(rf'\.{reads}\("([a-z_]+)"', source))
@@ -619,7 +622,7 @@ def test_images_are_written_out_of_a_bag(tmp_path, monkeypatch):
 def test_the_examples_pass_a_type_checker(tmp_path):
     """As a user's editor sees them: pyright's rules, and the package as it is typed. ``scripts/test.sh`` asks mypy."""
     written = write_examples(tmp_path)
-    assert [path.name for path in written if "colmap_inertial" not in path.read_text()] == [] and len(written) == 4
+    assert [path.name for path in written if "colmap_inertial" not in path.read_text()] == [] and len(written) == 3
     if importlib.util.find_spec("basedpyright") is None:
         pytest.skip("basedpyright is not installed (extra complete)")
     settings = {"include": ["."], "typeCheckingMode": "standard", "extraPaths": [str(ROOT)]}

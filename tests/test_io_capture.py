@@ -10,8 +10,9 @@ from test_io_imu import HEADER, handheld, rows, write_csv
 
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.io.calibration import Declared, calibration_prior, write_calibration
-from colmap_inertial.io.capture import ImageFolder, Video, load_capture
+from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.capture_tables import ImuPath, ImuTables
+from colmap_inertial.io.frame_sources import ImageFolder, Video
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.io.sensor_yaml import CAMERA_MODELS
 

@@ -13,7 +13,8 @@ from cases import loop_over
 from colmap_inertial.core.errors import FormatError, MissingExtraError, TimingError
 from colmap_inertial.core.types import FrameLog, ImuRecording
 from colmap_inertial.inertial.scale import estimate_scale
-from colmap_inertial.io.capture import ImuPath, Video, load_capture
+from colmap_inertial.io.capture import ImuPath, load_capture
+from colmap_inertial.io.frame_sources import Video
 from colmap_inertial.io.frames import read_frame_timing, read_frames
 from colmap_inertial.io.imu import read_capture_imu, read_frame_log, read_imu
 from colmap_inertial.io.imu_formats import imu_formats

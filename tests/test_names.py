@@ -15,10 +15,10 @@ from colmap_inertial.checks.validate.views import load_views
 from colmap_inertial.colmap.dense import _check_images
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.types import Frame, FrameTiming
-from colmap_inertial.io.capture import ImageFolder
 from colmap_inertial.io.capture_images import SubImages
 from colmap_inertial.io.exif import stamps_of_exif
 from colmap_inertial.io.files import check_names, path_in
+from colmap_inertial.io.frame_sources import ImageFolder
 from colmap_inertial.model import read_model
 from colmap_inertial.pipeline.run.progress import silent
 from colmap_inertial.pipeline.stages.frame_folder import FramePaths, write_frames, write_images

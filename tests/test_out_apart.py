@@ -5,8 +5,9 @@ from batch_captures import TINY, tiny_capture
 
 from colmap_inertial.cli import main
 from colmap_inertial.core.errors import FormatError, OutputError
-from colmap_inertial.io.capture import ImageFolder, load_capture
-from colmap_inertial.io.frames import image_names, picture_folders
+from colmap_inertial.io.capture import load_capture
+from colmap_inertial.io.frame_sources import ImageFolder, image_names
+from colmap_inertial.io.frames import picture_folders
 from colmap_inertial.pipeline.run.session import open_session
 from colmap_inertial.reconstruction.drivers.capture import reconstruct
 

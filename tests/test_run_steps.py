@@ -34,9 +34,10 @@ from colmap_inertial.core.threads import map_in_order
 from colmap_inertial.core.types import CALIBRATION_PARAMETERS, CameraModel, FrameTiming, ImuRecording, Treatment
 from colmap_inertial.imaging.gate import RecordingVerdict
 from colmap_inertial.io.calibration import Declared, calibration_prior, write_calibration
-from colmap_inertial.io.capture import Capture, ImageFolder
+from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.capture_images import LongExposures, SubImages
 from colmap_inertial.io.files import write_json
+from colmap_inertial.io.frame_sources import ImageFolder
 from colmap_inertial.io.video_match import VideoMatch
 from colmap_inertial.model import TRANSFORM_FILE
 from colmap_inertial.model.similarities import ModelScale, plain_factor
@@ -551,7 +552,7 @@ def colmap(workspace, monkeypatch):
     """COLMAP's steps without COLMAP: what they were given, and which of them worked."""
     given = {}
 
-    def extract(images, cameras, database, options, *, keypoint_stages, context):
+    def extract(images, cameras, database, options, *, keypoint_stages, context, rig):
         given["images"] = list(cameras)
         database.write_text("features")
         return KeypointRecords()
@@ -575,9 +576,8 @@ def colmap(workspace, monkeypatch):
         session.runner.run("frames", {"option": frames}, [workspace.images], lambda partial: partial[0].mkdir())
         options = replace(ReconstructOptions(), mapping=MappingOptions(overlap=overlap))
         names = tuple(record.name for record in records if record.used)
-        seen = SimpleNamespace(
-            timing=FrameTiming(names=names, t_s=np.arange(len(names)) * 0.1), imu=None, prior=None, max_offset_s=None
-        )
+        timing, capture = FrameTiming(names=names, t_s=np.arange(len(names)) * 0.1), SimpleNamespace(rig=())
+        seen = SimpleNamespace(capture=capture, timing=timing, imu=None, prior=None, max_offset_s=None)
         steps.run_colmap(session, seen, records, [], gravity or {}, options)
         return session.runner.worked
 

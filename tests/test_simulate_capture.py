@@ -1,5 +1,6 @@
 """A simulated capture is what our own readers read, and what its truth says."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -205,3 +206,23 @@ def test_the_committed_scene_agrees_with_its_truth():
         turned = quat_multiply(turned, step)
     a, b = truth.trajectory.cam_from_world_xyzw[4:6]
     np.testing.assert_allclose(quat_log(turned), quat_log(quat_multiply(a, quat_conjugate(b))), atol=0.02)
+
+
+def test_synchronised_cameras_are_described_as_a_rig(tmp_path):
+    right = replace(CAMERA, cam_in_body_m=(0.1, 0.02, 0.0), body_from_cam_xyzw=(0.0, 0.1, 0.0, np.sqrt(0.99)))
+    later = replace(right, delay_s=0.01)
+    recipe = replace(RECIPE, motion=replace(RECIPE.motion, duration_s=0.5), rig={"right": right, "later": later})
+    write_capture(recipe, tmp_path / "c")
+    (camera,) = load_capture(tmp_path / "c").rig
+    assert camera.name == "right" and camera.camera.params == CAMERA.model.params
+    truth = json.loads((tmp_path / "c" / "truth.json").read_text())
+    first, second = (read_pose(frames[0]) for frames in (truth["frames"], truth["rig"]["right"]["frames"]))
+    np.testing.assert_allclose(camera.cam_from_reference @ first, second, atol=1e-9)
+
+
+def read_pose(frame):
+    """(4, 4) cam_from_world."""
+    pose = np.eye(4)
+    pose[:3, :3] = matrix_from_quat(np.array(frame["cam_from_world_xyzw"]))
+    pose[:3, 3] = -pose[:3, :3] @ frame["cam_in_world_m"]
+    return pose

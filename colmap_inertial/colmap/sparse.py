@@ -6,7 +6,7 @@ import contextlib
 import itertools
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeVar
@@ -132,6 +132,7 @@ def extract_features(
     *,
     keypoint_stages: Sequence[KeypointStage] = (),
     context: RunContext,
+    rig: Sequence[str] = (),
 ) -> KeypointRecords:
     """SIFT on all images, one COLMAP camera for each distinct set of intrinsics, then the keypoint stages.
 
@@ -143,6 +144,8 @@ def extract_features(
         Intrinsics by image name; ``None`` lets COLMAP guess them (from EXIF, else from the image size).
     database
         A path that does not exist yet.
+    rig
+        Folders of images whose cameras are COLMAP cameras of their own, whatever their intrinsics.
 
     Returns
     -------
@@ -151,7 +154,7 @@ def extract_features(
     import pycolmap
 
     pycolmap.set_random_seed(context.seed)
-    for batch, reader in register_images(images, cameras, database, context):
+    for batch, reader in register_images(images, cameras, database, context, rig):
         require_room_for_features(database, len(batch), options)
         with writing_database(database):
             pycolmap.extract_features(
@@ -172,16 +175,22 @@ def require_room_for_features(database: Path, images: int, options: MappingOptio
 
 
 def register_images(
-    images: Path, cameras: Mapping[str, CameraModel | None], database: Path, context: RunContext
+    images: Path,
+    cameras: Mapping[str, CameraModel | None],
+    database: Path,
+    context: RunContext,
+    rig: Sequence[str] = (),
 ) -> Iterator[tuple[list[str], pycolmap.ImageReaderOptions]]:
     """Enter images and their cameras into a database, a batch at a time; each with the options to read its images."""
     import pycolmap
 
-    groups: dict[CameraModel | None, list[str]] = {}
+    groups: dict[tuple[str, CameraModel | None], list[str]] = {}
     for name, camera in cameras.items():
-        groups.setdefault(_intern(camera, groups), []).append(name)
+        folder = name.partition("/")[0]
+        known = _intern(camera, [model for _, model in groups])
+        groups.setdefault((folder if folder in rig else "", known), []).append(name)
     done = 0
-    for camera, names in groups.items():
+    for (_, camera), names in groups.items():
         reader = context.colmap.apply(pycolmap.ImageReaderOptions())
         if camera is not None:
             colmap_camera(camera)  # raises on wrong parameters before any work
@@ -248,7 +257,7 @@ def verification_options(context: RunContext) -> pycolmap.TwoViewGeometryOptions
     return context.colmap.apply(verification)
 
 
-def _intern(camera: CameraModel | None, known: Mapping[CameraModel | None, list[str]]) -> CameraModel | None:
+def _intern(camera: CameraModel | None, known: Iterable[CameraModel | None]) -> CameraModel | None:
     """The equal camera among the known ones, so that frames of one device share one COLMAP camera."""
     return next((k for k in known if k is not None and camera is not None and vars(k) == vars(camera)), camera)
 

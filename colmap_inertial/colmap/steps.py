@@ -12,6 +12,7 @@ from colmap_inertial.colmap.given_database import GivenDatabase, import_features
 from colmap_inertial.colmap.installed import InstalledColmap
 from colmap_inertial.colmap.mapping import MapRecord, map_images
 from colmap_inertial.colmap.pairing import match_capture
+from colmap_inertial.colmap.rigs import FIXED_POSES, find_rig_poses, match_rig_images, poses_are_known, write_rig
 from colmap_inertial.colmap.sparse import (
     KeypointRecords,
     MatchRecord,
@@ -21,12 +22,14 @@ from colmap_inertial.colmap.sparse import (
 )
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, MappingError
-from colmap_inertial.core.options import ReconstructOptions
+from colmap_inertial.core.options import MappingOptions, ReconstructOptions
 from colmap_inertial.core.types import CameraModel
+from colmap_inertial.io.capture_rig import RigCamera
 from colmap_inertial.io.files import read_record, write_record
+from colmap_inertial.model import find_models, read_model
 from colmap_inertial.pipeline.run.context import Recording, RunContext
 from colmap_inertial.pipeline.run.executable import ColmapExecutable
-from colmap_inertial.pipeline.run.runner import fingerprint
+from colmap_inertial.pipeline.run.runner import fingerprint, remove
 from colmap_inertial.pipeline.run.session import Session
 from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
 from colmap_inertial.pipeline.stages.protocols import KeypointStage
@@ -64,11 +67,13 @@ def run_colmap(
     MappingError
         When COLMAP finds no model.
     """
-    workspace, runner, mapping, context = session.workspace, session.runner, options.mapping, session.context
+    workspace, runner, context = session.workspace, session.runner, session.context
     cameras = {record.name: record.camera for record in records if record.used}
+    mapping, rig = _decide_refinement(options.mapping, cameras), recording.capture.rig
 
     def features(partial: Sequence[Path]) -> None:
-        found_features = _find_features(workspace.colmap_images, cameras, partial[0], stages, options, context)
+        folders = [camera.name for camera in rig]
+        found_features = _find_features(workspace.colmap_images, cameras, partial[0], stages, options, context, folders)
         write_gravity_priors(partial[0], gravity)
         write_record(partial[1], found_features)
 
@@ -80,6 +85,8 @@ def run_colmap(
         "pairing": [mapping.pairing, mapping.overlap],
         "gyroscope": [recording.imu, recording.timing, recording.prior, recording.max_offset_s],
     }
+    if rig:
+        pairing["rig"] = [rig, mapping, settings("mapping")]
     outputs = [workspace.colmap_database, workspace.keypoints, workspace.matches]
 
     def matches(partial: Sequence[Path]) -> None:
@@ -89,30 +96,54 @@ def run_colmap(
         shutil.copyfile(record, partial[1])
         first_camera = next(iter(cameras.values()), None)
         matched = match_capture(workspace.colmap_features, partial[0], recording, first_camera, mapping, context)
+        if rig:
+            matched = match_rig_images(partial[0], matched, recording.timing.names, rig, context)
+            _add_rig(partial[0], workspace.colmap_images, mapping, rig, context)
         write_record(partial[2], matched)
 
     def models(partial: Sequence[Path]) -> None:
-        refine = mapping.refine_intrinsics
-        if refine is None:
-            refine = any(camera is None for camera in cameras.values())
-        record = map_images(
-            workspace.colmap_database,
-            workspace.colmap_images,
-            partial[0],
-            replace(mapping, refine_intrinsics=refine),
-            context,
-            in_time=recording.timing.names,
-        )
+        database, images, own = workspace.colmap_database, workspace.colmap_images, _keep_poses(context, rig)
+        in_time = () if rig else recording.timing.names
+        record = map_images(database, images, partial[0], mapping, own, in_time=in_time)
         write_record(partial[1], record)
 
     runner.run("matches", pairing, outputs, matches, after=["frames"])
-    decided = {"mapping": mapping, "colmap": settings("mapping", "adjustment")}
+    decided = {"mapping": options.mapping, "colmap": settings("mapping", "adjustment")}
     runner.run("mapping", decided, [workspace.colmap_sparse, workspace.mapped], models, after=["matches"])
     return (
         read_record(workspace.keypoints, KeypointRecords),
         read_record(workspace.matches, MatchRecord),
         read_record(workspace.mapped, MapRecord),
     )
+
+
+def _decide_refinement(mapping: MappingOptions, cameras: Mapping[str, CameraModel | None]) -> MappingOptions:
+    """Refine the cameras where that was asked for, or else where one is unknown."""
+    unknown = any(camera is None for camera in cameras.values())
+    return mapping if mapping.refine_intrinsics is not None else replace(mapping, refine_intrinsics=unknown)
+
+
+def _keep_poses(context: RunContext, rig: Sequence[RigCamera]) -> RunContext:
+    """The context in which the mapper keeps declared poses of a rig's cameras, unless the user set otherwise."""
+    known = bool(rig) and poses_are_known(rig)
+    return replace(context, colmap=context.colmap.after(FIXED_POSES)) if known else context
+
+
+def _add_rig(
+    database: Path, images: Path, mapping: MappingOptions, rig: Sequence[RigCamera], context: RunContext
+) -> None:
+    """Make the cameras of a database a rig, with declared poses, or those of a model without a rig.
+
+    COLMAP's mapper needs poses to begin with; where they are not declared, it refines them.
+    """
+    poses = {camera.name: camera.cam_from_reference for camera in rig if camera.cam_from_reference is not None}
+    if not poses_are_known(rig):
+        apart = context.scratch / "mapped_apart"
+        remove(apart)
+        map_images(database, images, apart, mapping, context)
+        poses = find_rig_poses((read_model(folder) for folder in find_models(apart).values()), rig)
+        remove(apart)
+    write_rig(database, rig, poses)
 
 
 def _find_features(
@@ -122,15 +153,21 @@ def _find_features(
     stages: Sequence[KeypointStage],
     options: ReconstructOptions,
     context: RunContext,
+    rig: Sequence[str],
 ) -> KeypointRecords:
-    """Features of the images into a new database: found here, by an installed COLMAP, or those of a given database."""
+    """Features of the images into a new database: found here, by an installed COLMAP, or those of a given database.
+
+    A rig, whose other cameras' folders are named, has features that are found here.
+    """
     if options.database is not None:
         given, rectified = read_given(options.database), options.database_images == "rectified"
         return import_features(
             given, images, cameras, database, keypoint_stages=stages, rectified=rectified, context=context
         )
     if context.executable is None:
-        return extract_features(images, cameras, database, options.mapping, keypoint_stages=stages, context=context)
+        return extract_features(
+            images, cameras, database, options.mapping, keypoint_stages=stages, context=context, rig=rig
+        )
     with tempfile.TemporaryDirectory(dir=context.scratch) as folder:
         theirs = Path(folder) / "installed.db"
         require_room_for_features(theirs, len(cameras), options.mapping)

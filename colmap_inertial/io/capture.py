@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from colmap_inertial.core.geometry import quat_from_matrix
 from colmap_inertial.core.types import CameraImuCalibration, CameraModel, FrameLog, ImuCalibration, ReadoutDirection
 from colmap_inertial.io import sensor_yaml
 from colmap_inertial.io.calibration import Declared, calibration_prior
+from colmap_inertial.io.camera_table import CAMERA_KEYS, read_camera_table
 from colmap_inertial.io.capture_images import (
     EXPOSURES_KEYS,
     ApertureImages,
@@ -26,67 +27,23 @@ from colmap_inertial.io.capture_images import (
     read_apertures_table,
     read_exposures_table,
 )
+from colmap_inertial.io.capture_rig import RigCamera, read_rig_table
 from colmap_inertial.io.capture_tables import (
     CALIBRATION_KEYS,
-    CAMERA_KEYS,
     IMU_KEYS,
     ImuPath,
     ImuTables,
     body_from_imu,
     read_calibration_table,
-    read_camera_table,
     read_imu_table,
 )
 from colmap_inertial.io.files import StrPath, reader, require_utf8
+from colmap_inertial.io.frame_sources import IMAGES_KEYS, ImageFolder, Video, read_image_folder, read_video
 from colmap_inertial.io.gcsv import is_gcsv, read_gcsv_frames
 from colmap_inertial.io.imu_formats import Recording, find_recording, refuse_video
 from colmap_inertial.io.imu_text import is_inertial_scale
 from colmap_inertial.io.toml_section import Section, read_toml
-from colmap_inertial.io.units import TIME_UNITS_NS
 from colmap_inertial.io.video import readout_of_video
-
-
-@dataclass(frozen=True, kw_only=True)
-class ImageFolder:
-    """Frames as pictures in a folder.
-
-    Attributes
-    ----------
-    folder, pattern
-        Files that match; ``None`` takes every picture in the folder itself.
-    times
-        ``"name"`` or a CSV file; ``None`` where nothing was said.
-    time_unit
-        Of the names, or of the CSV where its header does not say.
-    video
-        What the pictures were cut from, where known; only ``diagnose`` looks at it.
-    """
-
-    folder: Path
-    pattern: str | None = None
-    times: Literal["name"] | Path | None = None
-    time_unit: str | None = None
-    video: Path | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Video:
-    """Frames as a video.
-
-    Attributes
-    ----------
-    file
-        The video.
-    frame_times, time_unit
-        The recorder's own frame times, one for each frame, in place of the presentation stamps.
-    frames_per_s
-        Use about this many; ``None`` uses all.
-    """
-
-    file: Path
-    frame_times: Path | None = None
-    time_unit: str | None = None
-    frames_per_s: float | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -127,6 +84,8 @@ class Capture:
         The sub-images that are fused to one frame; ``frames`` and ``camera`` are the reference aperture's.
     exposures
         The long exposures beside ``frames``, which are the short ones.
+    rig
+        Cameras that are fixed to the one of ``frames``.
     """
 
     path: Path
@@ -146,6 +105,7 @@ class Capture:
     frame_log: FrameLog | None = None
     apertures: ApertureImages | None = None
     exposures: LongExposures | None = None
+    rig: tuple[RigCamera, ...] = ()
 
     @property
     def image_folder(self) -> Path | None:
@@ -212,28 +172,13 @@ def _read_capture_toml(path: Path) -> Capture:
 
 
 def _read_images(table: Section, capture: Capture) -> Capture:
-    folder = table.require("folder", table.file("folder"))
-    pattern = table.text("pattern")
-    times: Literal["name"] | Path | None = "name" if table.text("times") == "name" else table.file("times")
-    unit = table.choice("time_unit", TIME_UNITS_NS)
-    if times == "name" and unit is None:
-        table.fail("times", f'"name" needs time_unit, one of {", ".join(TIME_UNITS_NS)}')
-    if pattern is not None and (Path(pattern).is_absolute() or ".." in Path(pattern).parts):
-        table.fail("pattern", f"must stay inside folder, found {pattern!r}")
-    frames = ImageFolder(folder=folder, pattern=pattern, times=times, time_unit=unit, video=table.file("video"))
-    return replace(capture, frames=frames)
+    return replace(capture, frames=read_image_folder(table))
 
 
 def _read_video(table: Section, capture: Capture) -> Capture:
     if capture.frames is not None:
         table.fail(None, "a capture has [images] or [video], not both")
-    frames = Video(
-        file=table.require("file", table.file("file")),
-        frame_times=table.file("frame_times"),
-        time_unit=table.choice("time_unit", TIME_UNITS_NS),
-        frames_per_s=table.positive("frames_per_s"),
-    )
-    return replace(capture, frames=frames)
+    return replace(capture, frames=read_video(table, "file"))
 
 
 def _read_imu(table: Section, capture: Capture) -> Capture:
@@ -298,6 +243,17 @@ def _read_exposures(table: Section, capture: Capture) -> Capture:
     return replace(capture, exposures=read_exposures_table(table, capture.image_folder))
 
 
+def _read_rig(table: Section, capture: Capture) -> Capture:
+    if capture.frames is None:
+        table.fail(None, "belongs to [images] or [video], the main camera's, which is missing")
+    if capture.apertures is not None or capture.exposures is not None:
+        table.fail(None, "a capture has [rig], [apertures] or [exposures], not several of them")
+    rig = read_rig_table(table, body_from_cam=capture.body_from_cam)
+    if rig.reference is not None and capture.camera is not None:
+        table.fail("calibration", "gives the main camera, too; leave out [camera]")
+    return replace(capture, rig=rig.cameras, camera=rig.reference or capture.camera)
+
+
 def _read_calibration(table: Section, capture: Capture) -> Capture:
     calibrations = read_calibration_table(
         table,
@@ -339,7 +295,7 @@ class CaptureSection:
 
 #: In the order in which they are read.
 SECTIONS = (
-    CaptureSection(name="images", keys=("folder", "pattern", "times", "time_unit", "video"), read=_read_images),
+    CaptureSection(name="images", keys=IMAGES_KEYS, read=_read_images),
     CaptureSection(
         name="video", keys=("file", "frame_times", "time_unit", "frames_per_s"), read=_read_video, short="file"
     ),
@@ -353,6 +309,7 @@ SECTIONS = (
     CaptureSection(name="camera", keys=CAMERA_KEYS, read=_read_camera),
     CaptureSection(name="apertures", keys=None, read=_read_apertures),
     CaptureSection(name="exposures", keys=EXPOSURES_KEYS, read=_read_exposures),
+    CaptureSection(name="rig", keys=None, read=_read_rig),
     CaptureSection(name="calibration", keys=CALIBRATION_KEYS, read=_read_calibration, is_always_read=True),
     CaptureSection(name="target", keys=("spec",), read=_read_target),
 )

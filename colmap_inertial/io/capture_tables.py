@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from colmap_inertial.core.arrays import Array
-from colmap_inertial.core.geometry import colmap_px_from_opencv, quat_from_matrix
-from colmap_inertial.core.types import CameraModel, ImuNoise
+from colmap_inertial.core.geometry import quat_from_matrix
+from colmap_inertial.core.types import ImuNoise
 from colmap_inertial.io import sensor_yaml
 from colmap_inertial.io.calibration import (
     Calibrations,
@@ -19,8 +19,8 @@ from colmap_inertial.io.calibration import (
     holds_imu_alone,
     read_for_recording,
 )
+from colmap_inertial.io.camera_table import check_transform
 from colmap_inertial.io.imu_text import SensorTable
-from colmap_inertial.io.sensor_yaml import CAMERA_MODELS
 from colmap_inertial.io.toml_section import Section
 from colmap_inertial.io.units import SENSOR_UNITS, TIME_UNITS_NS, Axes, DeclaredUnits, Quantity
 
@@ -58,36 +58,6 @@ class ImuTables:
     gyro_axes: Axes | None = None
     accel_axes: Axes | None = None
     noise: ImuNoise | None = None
-
-
-CAMERA_KEYS = ("sensor_yaml", "model", "width", "height", "params", "pixel_origin")
-
-
-def read_camera_table(table: Section) -> tuple[CameraModel, Array | None]:
-    """The ``[camera]`` table: the model, and (4, 4) body_from_cam where a sensor.yaml gives it."""
-    sheet = table.file("sensor_yaml")
-    if sheet is not None:
-        if any(key in table for key in CAMERA_KEYS[1:]):
-            table.fail("sensor_yaml", "gives the intrinsics; leave out model, width, height, params and pixel_origin")
-        return sensor_yaml.read_camera(sheet), sensor_yaml.read_body_from_sensor(sheet)
-    model = table.require("model", table.choice("model", CAMERA_MODELS))
-    width, height = (table.require(key, table.integer(key)) for key in ("width", "height"))
-    params = table.require("params", table.numbers("params"))
-    count, centre = CAMERA_MODELS[model]
-    if len(params) != count:
-        table.fail("params", f"{model} has {count} parameters, found {len(params)}")
-    origin = table.choice("pixel_origin", ("corner", "center"))
-    if origin is None:
-        table.fail(
-            None,
-            'pixel_origin is missing: "corner" if params are COLMAP\'s, "center" if they are OpenCV\'s or Kalibr\'s',
-        )
-    values = np.array(params)
-    if origin == "center":
-        values[centre : centre + 2] = colmap_px_from_opencv(values[centre : centre + 2])
-    if (values[:centre] <= 0).any():
-        table.fail("params", "focal lengths must be above 0")
-    return CameraModel(model=model, width=width, height=height, params=tuple(values.tolist())), None
 
 
 IMU_KEYS = ("path", "format", "gyro", "accel", "noise")
@@ -173,7 +143,7 @@ def _read_pose(table: Section) -> tuple[ArrayLike | None, ArrayLike | None]:
         return xyzw, lever
     if xyzw is not None:
         table.fail("cam_from_imu_xyzw", "and cam_from_imu say the same; leave one out")
-    cam_from_imu = _check_transform(table, matrix)
+    cam_from_imu = check_transform(table, "cam_from_imu", matrix)
     if len(matrix) > 3 and lever is not None:
         table.fail("imu_in_cam_m", "and the last column of cam_from_imu say the same; leave one out")
     return quat_from_matrix(cam_from_imu[:3, :3]), cam_from_imu[:3, 3] if len(matrix) > 3 else lever
@@ -189,19 +159,6 @@ def body_from_imu(imu: ImuPath) -> Array:
     if sheet is None:
         return np.eye(4)
     return sensor_yaml.read_body_from_sensor(sheet)
-
-
-def _check_transform(table: Section, rows: list[list[float]]) -> Array:
-    shape = (len(rows), len(rows[0]) if rows else 0)
-    if shape not in ((3, 3), (4, 4)):
-        table.fail("cam_from_imu", f"must be a 3x3 or 4x4 matrix, found {shape[0]}x{shape[1]}")
-    matrix = np.eye(4)
-    matrix[: shape[0], : shape[1]] = rows
-    if not sensor_yaml.is_rotation(matrix[:3, :3]):
-        table.fail("cam_from_imu", "is not a rotation: rows must be perpendicular, of length 1, and right-handed")
-    if not np.allclose(matrix[3], [0, 0, 0, 1]):
-        table.fail("cam_from_imu", "must have 0, 0, 0, 1 as its last row")
-    return matrix
 
 
 def _read_noise(table: Section | None) -> ImuNoise | None:

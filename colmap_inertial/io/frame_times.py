@@ -24,7 +24,7 @@ from colmap_inertial.io.units import TIME_UNITS_NS, seconds, stamps_ns, unit_of
 _NAME_COLUMNS = {"name", "filename", "file", "image", "imagename", "frame"}
 _EXPOSURE_COLUMNS = {"exposure", "exposuretime"}
 #: Images of a rig are of one moment up to here: at 1 m/s and 1 rad/s, 1 mm and 1 mrad.
-_SAME_MOMENT_NS = 1_000_000
+SAME_MOMENT_NS = 1_000_000
 _HOW = (
     'give a CSV with the header "name,t_s" (or t_ms, t_us, t_ns) and one row for each frame, or put the times into the '
     'file names and set times = "name" with time_unit under [images] in capture.toml'
@@ -102,7 +102,7 @@ class FrameStamps:
                 places.setdefault(first_of[name], []).append(place)
         for own in places.values():
             apart_ns = int(self.t_ns[own[-1]] - self.t_ns[own[0]])
-            if apart_ns > _SAME_MOMENT_NS:
+            if apart_ns > SAME_MOMENT_NS:
                 raise TimingError(
                     f"{self.source}: {self.names[own[0]]} and {self.names[own[-1]]} are of one frame of a rig, but "
                     f"their times are {apart_ns / 1e6:.3g} ms apart. COLMAP's rig has one pose for both: give them one "

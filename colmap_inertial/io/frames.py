@@ -11,8 +11,9 @@ import numpy as np
 from colmap_inertial.core.arrays import IndexArray, Int64Array, UInt8Array, UInt16Array
 from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.core.types import Frame, FrameLog, FrameTiming
-from colmap_inertial.io.capture import Capture, ImageFolder, Video, load_capture
+from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.files import StrPath, path_in, reading
+from colmap_inertial.io.frame_sources import ImageFolder, Video, image_names
 from colmap_inertial.io.frame_times import NO_RIGS, FrameStamps, stamps_of_csv, stamps_of_log, stamps_of_names
 from colmap_inertial.io.images import SUFFIXES, grey_8bit, read_image
 from colmap_inertial.io.video import decode_reduced, decode_video, frame_name, reduced, video_stamps_ns
@@ -53,7 +54,7 @@ def read_frames(
             timing = _timing(capture, stamps)
         return timing, _decode_video(capture, capture.frames, timing, source_ns, _places(timing, only))
     timing = read_frame_timing(capture)
-    return timing, _decode_images(capture, timing, _places(timing, only))
+    return timing, decode_images(capture, timing, _places(timing, only))
 
 
 def read_reduced(capture: Capture, names: Collection[str], long_side_px: int) -> Iterator[tuple[str, UInt8Array]]:
@@ -117,13 +118,14 @@ def read_frame_times(path: StrPath, first_of: Mapping[str, str] = NO_RIGS) -> Fr
 
 
 def picture_folders(capture: Capture) -> tuple[Path, ...]:
-    """All folders that pictures of a capture are read from; empty where they come from a video."""
-    if not isinstance(capture.frames, ImageFolder):
-        return ()
-    more = [] if capture.apertures is None else [source.folder for source in capture.apertures.sources]
+    """All folders that pictures of a capture are read from; empty where they come from videos."""
+    folders = [capture.frames.folder] if isinstance(capture.frames, ImageFolder) else []
+    if capture.apertures is not None:
+        folders += [source.folder for source in capture.apertures.sources]
     if capture.exposures is not None:
-        more.append(capture.exposures.source.folder)
-    return tuple(dict.fromkeys([capture.frames.folder, *more]))
+        folders.append(capture.exposures.source.folder)
+    folders += [camera.frames.folder for camera in capture.rig if isinstance(camera.frames, ImageFolder)]
+    return tuple(dict.fromkeys(folders))
 
 
 def _timing(capture: Capture, stamps: FrameStamps) -> FrameTiming:
@@ -169,23 +171,10 @@ def _is_other_picture(source: ImageFolder, name: str) -> bool:
     return Path(name).suffix.lower() not in SUFFIXES and (source.folder / name).is_file()
 
 
-def image_names(source: ImageFolder) -> list[str]:
-    """Names relative to the folder, with forward slashes, as COLMAP has them."""
-    if not source.folder.is_dir():
-        raise FormatError(source.folder, "no such folder of pictures")
-    if source.pattern is not None and (Path(source.pattern).is_absolute() or ".." in Path(source.pattern).parts):
-        raise FormatError(source.folder, f"the pattern {source.pattern!r} leads out of it")
-    candidates = source.folder.iterdir() if source.pattern is None else source.folder.glob(source.pattern)
-    paths = [path for path in candidates if path.suffix.lower() in SUFFIXES and path.is_file()]
-    if not paths:
-        what = "holds no pictures" if source.pattern is None else f"holds no pictures that match {source.pattern!r}"
-        raise FormatError(source.folder, f"{what} (endings: {', '.join(SUFFIXES)})")
-    return sorted(path.relative_to(source.folder).as_posix() for path in paths)
-
-
-def _decode_images(capture: Capture, timing: FrameTiming, places: IndexArray) -> Iterator[Frame]:
+def decode_images(capture: Capture, timing: FrameTiming, places: IndexArray | None = None) -> Iterator[Frame]:
+    """Pictures of a capture's folder that a timing names, or those of them at some places; see :func:`read_frames`."""
     assert isinstance(capture.frames, ImageFolder)
-    for i in places.tolist():
+    for i in range(len(timing.names)) if places is None else places.tolist():
         path = path_in(capture.frames.folder, timing.names[i])
         yield _frame(capture, timing, i, path, read_image(path))
 

@@ -134,6 +134,10 @@ class ColmapSettings:
         files = [Path(text.partition("=")[2]) for text in chosen]
         return [*chosen, *(fingerprint(path) for path in files if path.is_absolute() and path.exists())]
 
+    def after(self, *settings: str) -> ColmapSettings:
+        """These after others, which count where the user set nothing."""
+        return ColmapSettings((*settings, *self.settings))
+
     def apply(self, options: Options) -> Options:
         """Set what belongs to an object of pycolmap's options; returns the object."""
         for text in self.settings:

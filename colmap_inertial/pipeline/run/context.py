@@ -10,8 +10,10 @@ from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.core.threads import worker_processes
 from colmap_inertial.core.types import CameraImuCalibration, FrameTiming, ImuRecording
 from colmap_inertial.io.calibration import CalibrationFiles, largest_offset_s, read_calibrations, read_for_recording
-from colmap_inertial.io.capture import Capture, Video
+from colmap_inertial.io.capture import Capture
+from colmap_inertial.io.capture_rig import rig_files
 from colmap_inertial.io.files import path_in
+from colmap_inertial.io.frame_sources import Video
 from colmap_inertial.pipeline.run.colmap_settings import NO_SETTINGS, ColmapSettings, read_settings
 from colmap_inertial.pipeline.run.executable import ColmapExecutable, Device, read_executable
 from colmap_inertial.pipeline.run.progress import Progress, silent
@@ -87,6 +89,7 @@ class Recording:
             paths += capture.apertures.files(self.timing.names)
         if capture.exposures is not None:
             paths += [*capture.exposures.files(self.timing.names), *filter(None, [capture.exposures.times])]
+        paths += rig_files(capture.rig)
         return [fingerprint(path) for path in paths]
 
 

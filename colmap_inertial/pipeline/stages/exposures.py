@@ -26,10 +26,10 @@ from colmap_inertial.imaging.exposure_pairs import (
     fuse_mertens,
 )
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
-from colmap_inertial.io.capture import Capture, ImageFolder
+from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.capture_images import LongExposures, LongTiming
 from colmap_inertial.io.files import path_in
-from colmap_inertial.io.frames import image_names
+from colmap_inertial.io.frame_sources import ImageFolder, image_names
 from colmap_inertial.io.images import read_image
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.pipeline.stages.imaging_plan import GyroView

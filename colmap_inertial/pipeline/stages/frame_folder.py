@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -87,12 +87,21 @@ class FramePaths:
     unsmoothed
         Written: the folder for frames as they are, of which COLMAP is to see smoothed ones. Without it, those are
         nowhere.
+    elsewhere
+        Original files that are not in ``source``, by frame; ``None`` where there is no file.
     """
 
     source: Path | None
     images: Path
     records: Path
     unsmoothed: Path | None = None
+    elsewhere: Mapping[str, Path | None] = field(default_factory=dict)
+
+    def original(self, name: str) -> Path | None:
+        """The original file of a frame; ``None`` where there is none."""
+        if name in self.elsewhere:
+            return self.elsewhere[name]
+        return None if self.source is None else path_in(self.source, name)
 
 
 class _Originals:
@@ -183,7 +192,7 @@ def write_frames(
 
 def _write(frame: Frame, original: AnyArray | None, paths: FramePaths) -> str:
     """Write the picture of a frame; returns what happened to it."""
-    source = None if paths.source is None else path_in(paths.source, frame.name)
+    source = paths.original(frame.name)
     target = path_in(paths.images, frame.name)
     target.parent.mkdir(parents=True, exist_ok=True)
     passed = original is not None and _same_memory(original, frame.image)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import EllipsisType
+from typing import get_args
 
 from colmap_inertial.checks.diagnose import Diagnosis
 from colmap_inertial.checks.report import require_plotly
@@ -19,7 +21,7 @@ from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.choices import check_kind
 from colmap_inertial.core.errors import FormatError, InertialError
 from colmap_inertial.core.gyro import gravity_in_cam
-from colmap_inertial.core.options import ReconstructOptions
+from colmap_inertial.core.options import BlurRemover, ReconstructOptions
 from colmap_inertial.core.types import Frame, PositionFixes
 from colmap_inertial.io.calibration import describe_files
 from colmap_inertial.io.capture import Capture, load_capture
@@ -27,6 +29,7 @@ from colmap_inertial.io.files import StrPath, reading_within
 from colmap_inertial.io.frames import picture_folders, read_frames
 from colmap_inertial.io.imu import read_raw_capture_imu
 from colmap_inertial.io.plausible import RawImu
+from colmap_inertial.io.rig_frames import RigFrames, pair_rig_frames
 from colmap_inertial.pipeline.run.context import Recording, RunContext, correct_imu, prior_calibration
 from colmap_inertial.pipeline.run.executable import Device
 from colmap_inertial.pipeline.run.progress import Progress, silent
@@ -62,6 +65,8 @@ from colmap_inertial.reconstruction.preparation.geolocation import positions_of
 from colmap_inertial.reconstruction.preparation.plan import add_stated_exposures, ask_for_plan, run_plan
 from colmap_inertial.reconstruction.preparation.preflight import check_imu, run_preflight
 from colmap_inertial.reconstruction.preparation.selection import part_of, run_selection
+
+log = logging.getLogger(__name__)
 
 #: A camera-IMU rotation less certain than this is no basis for gravity directions.
 _GRAVITY_ROTATION_RAD = 0.2
@@ -145,6 +150,8 @@ class _Given:
         By image name, where the options ask for it.
     fixes
         Positions of the frames, where the options ask for them.
+    rig
+        Images of the other cameras of a rig; ``None`` without one.
     """
 
     capture: Capture
@@ -155,6 +162,7 @@ class _Given:
     target: Target | None
     gravity: Mapping[str, Array]
     fixes: PositionFixes | None
+    rig: RigFrames | None
 
 
 def _read(path: Path, options: ReconstructOptions, stages: Stages) -> _Given:
@@ -176,7 +184,15 @@ def _read(path: Path, options: ReconstructOptions, stages: Stages) -> _Given:
     raw = check_imu(read_raw_capture_imu(capture), force=options.force)
     target = None if capture.target is None else parse_target(capture.target)
     given = None if options.database is None else read_given(options.database)
+    _refuse_with_rig(capture, options)
     timing, frames = read_frames(capture)
+    rig = None
+    if capture.rig:
+        rig = pair_rig_frames(capture, timing)
+        if rig.alone:
+            log.warning("%d frames are left out: a camera of the rig has no image of them", len(rig.alone))
+        timing = part_of(timing, rig.own_names[0].keys() - set(rig.alone))
+        _, frames = read_frames(capture, only=timing.names)
     if given is not None:
         timing = part_of(timing, given.names_in_time(timing.names))
         first = next(read_frames(capture, only=timing.names[:1])[1])
@@ -199,7 +215,25 @@ def _read(path: Path, options: ReconstructOptions, stages: Stages) -> _Given:
         target=target,
         gravity=gravity,
         fixes=positions_of(capture, timing.names) if options.georeference else None,
+        rig=rig,
     )
+
+
+def _refuse_with_rig(capture: Capture, options: ReconstructOptions) -> None:
+    """Raise ``InertialError`` for what is asked for by name and not done with a rig."""
+    if not capture.rig:
+        return
+    asked = {
+        "--database": options.database is not None,
+        "--colmap-executable": options.colmap_executable is not None,
+        f"--deblur {options.deblur}": options.deblur in get_args(BlurRemover),
+        "--rolling-shutter rectify": options.rolling_shutter == "rectify",
+        "--refine inertial": options.refine == "inertial",
+        "--mapping.mapper global": options.mapping.mapper == "global",
+    }
+    refused = [name for name, is_asked in asked.items() if is_asked]
+    if refused:
+        raise InertialError(f"{refused[0]}: not done for cameras of a rig; leave it out, or take [rig] out")
 
 
 def _reconstruct(
@@ -256,7 +290,7 @@ def _run(session: Session, given: _Given, options: ReconstructOptions, stages: S
     of_frames = insert_defaults(stages.frame, default_frame_stages(inputs))
     of_keypoints = insert_defaults(stages.keypoint, default_keypoint_stages(inputs))
     _require_known_images(options, of_keypoints)
-    records = run_frames(session, recording, frames, of_frames, workspace.colmap_images, inputs.plan)
+    records = run_frames(session, recording, frames, of_frames, workspace.colmap_images, inputs.plan, given.rig)
     used_timing = part_of(recording.timing, [record.name for record in records if record.used])
     # pairs are chosen by what the capture itself holds: a calibration that is given later maps nothing again
     plain_imu = correct_imu(capture, given.raw.imu, None)

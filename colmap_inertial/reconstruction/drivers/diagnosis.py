@@ -11,6 +11,7 @@ from colmap_inertial.io.files import write_json
 from colmap_inertial.io.frames import read_frame_timing
 from colmap_inertial.io.imu import is_capture, read_raw_capture_imu, read_raw_imu
 from colmap_inertial.io.imu_formats import find_recording
+from colmap_inertial.io.rig_frames import pair_rig_frames
 from colmap_inertial.pipeline.run.context import prior_calibration
 from colmap_inertial.pipeline.run.progress import Progress
 from colmap_inertial.reconstruction.drivers.paths import check_output
@@ -87,6 +88,9 @@ def _read_capture(capture: Capture, calibration: CalibrationFiles) -> CheckInput
     timing = None
     if capture.frames is not None:
         timing = reader.attempt(lambda: add_stated_exposures(capture, read_frame_timing(capture)))
+    if timing is not None:
+        known = timing
+        reader.attempt(lambda: pair_rig_frames(capture, known))
     raw = None if capture.imu is None else reader.attempt(lambda: read_raw_capture_imu(capture))
     return CheckInputs(
         raw=raw,

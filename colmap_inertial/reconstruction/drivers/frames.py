@@ -17,6 +17,7 @@ from colmap_inertial.imaging.psf import blur_field
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import path_in, write_json
 from colmap_inertial.io.images import read_image
+from colmap_inertial.io.rig_frames import RigFrames
 from colmap_inertial.model import colmap_camera, read_model
 from colmap_inertial.pipeline.run.context import Recording
 from colmap_inertial.pipeline.run.session import Session
@@ -214,15 +215,24 @@ def run_frames(
     stages: Sequence[FrameStage],
     images: Path,
     plan: ImagingPlan | None = None,
+    rig: RigFrames | None = None,
 ) -> tuple[FrameRecord, ...]:
-    """The frames through the stages into the folder ``images``; with a plan, parts of some are kept for the report."""
-    source, workspace = recording.capture.image_folder, session.workspace
+    """The frames through the stages into the folder ``images``; with a plan, parts of some are kept for the report.
+
+    ``rig``: images of other cameras, which go with the frames.
+    """
+    source, workspace, timing = recording.capture.image_folder, session.workspace, recording.timing
+    names, elsewhere = list(timing.names), {}
+    if rig is not None:
+        names, elsewhere = names + rig.names(timing.names), rig.originals(timing.names)
     kept = None if plan is None else CropKeeper.of(plan)
 
     def work(partial: Sequence[Path]) -> None:
-        paths = FramePaths(source=source, images=partial[0], records=partial[1], unsmoothed=partial[2])
+        images, records, unsmoothed = partial[:3]
+        paths = FramePaths(source=source, images=images, records=records, unsmoothed=unsmoothed, elsewhere=elsewhere)
         through = stages if kept is None else (kept.before, *stages, kept.after)
-        write_frames(frames, recording.timing.names, through, paths, session.progress)
+        every = frames if rig is None else rig.add_images(frames, timing)
+        write_frames(every, names, through, paths, session.progress)
         if kept is not None:
             kept.write(partial[3])
 

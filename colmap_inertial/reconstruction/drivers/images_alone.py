@@ -21,9 +21,10 @@ from colmap_inertial.core.options import (
 from colmap_inertial.core.types import Frame, FrameTiming
 from colmap_inertial.imaging.multi_aperture import refocus, require_colours
 from colmap_inertial.io.calibration import CalibrationFiles, list_paths
-from colmap_inertial.io.capture import Capture, ImageFolder, load_capture
+from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.files import StrPath, path_in, read_json, structured, write_json
-from colmap_inertial.io.frames import image_names, picture_folders, read_frame_timing, read_frames
+from colmap_inertial.io.frame_sources import ImageFolder, image_names
+from colmap_inertial.io.frames import picture_folders, read_frame_timing, read_frames
 from colmap_inertial.io.images import read_image
 from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.pipeline.run.context import Recording, RunContext, correct_imu, prior_calibration
@@ -100,6 +101,16 @@ def _run_fusion(
     return read_frame_records(workspace.frames)
 
 
+def _load_frames(path: Path) -> Capture:
+    """A capture whose frames can be deblurred: of short and long exposures, the short ones alone."""
+    loaded = replace(load_capture(path), exposures=None)
+    if loaded.frames is None:
+        raise FormatError(path, "has no frames: add [images] or [video]")
+    if loaded.rig:
+        raise FormatError(path, "frames of a rig's cameras are not deblurred: take [rig] out")
+    return loaded
+
+
 def deblur_capture(
     capture: StrPath,
     out: StrPath,
@@ -143,10 +154,7 @@ def deblur_capture(
         For what cannot be read or written.
     """
     require_method(method)
-    # of short and long exposures, the short ones alone
-    loaded = replace(load_capture(Path(capture)), exposures=None)
-    if loaded.frames is None:
-        raise FormatError(loaded.path, "has no frames: add [images] or [video]")
+    loaded = _load_frames(Path(capture))
     if sheet is not None:
         _require_free_sheet(sheet, Path(out))
     imu = read_capture_imu(loaded)

@@ -25,9 +25,10 @@ from colmap_inertial.core.types import (
     ReadoutDirection,
 )
 from colmap_inertial.io.calibration import calibration_prior, describe_files
-from colmap_inertial.io.capture import Capture, Video, load_capture
+from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.exif import read_exposures_s, stamps_of_exif
 from colmap_inertial.io.files import StrPath, path_in, read_record, reading_within, write_record
+from colmap_inertial.io.frame_sources import Video
 from colmap_inertial.io.frame_times import FrameStamps, stamps_of_pattern
 from colmap_inertial.io.frames import read_frame_times, read_frame_timing
 from colmap_inertial.io.imu import is_capture, read_raw_capture_imu, read_raw_imu

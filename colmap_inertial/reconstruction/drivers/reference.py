@@ -27,9 +27,10 @@ from colmap_inertial.core.errors import FormatError, InertialError, NotObservabl
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, ReferenceOptions, ValidateOptions
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.io.calibration import calibration_prior
-from colmap_inertial.io.capture import Capture, ImageFolder, Video, load_capture
+from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.files import StrPath, path_in, read_json, write_json
-from colmap_inertial.io.frames import image_names, read_frames
+from colmap_inertial.io.frame_sources import ImageFolder, Video, image_names
+from colmap_inertial.io.frames import read_frames
 from colmap_inertial.io.imu import is_capture
 from colmap_inertial.io.mp4 import is_mp4
 from colmap_inertial.model import find_models, read_model
@@ -382,6 +383,8 @@ def _pictures(path: Path) -> Capture:
         raise FormatError(path, "has no pictures: add [images] or [video]")
     if capture.apertures is not None or capture.exposures is not None:
         raise FormatError(path, "--scale-from target or distance takes plain pictures: fuse them first")
+    if capture.rig:
+        raise FormatError(path, "--scale-from target or distance takes one camera: take [rig] out")
     if isinstance(capture.frames, Video) and capture.frames.frames_per_s is None:
         capture = dataclasses.replace(capture, frames=dataclasses.replace(capture.frames, frames_per_s=_FRAMES_PER_S))
     return capture

@@ -11,8 +11,9 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, NotObservableError
 from colmap_inertial.core.types import CameraTrajectory, PositionFixes
 from colmap_inertial.inertial.georeference import Georeference, georeference, georeference_of_json
-from colmap_inertial.io.capture import Capture, ImageFolder, Video
+from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import read_json
+from colmap_inertial.io.frame_sources import ImageFolder, Video
 from colmap_inertial.io.positions import positions_in_pictures, positions_in_video
 from colmap_inertial.pipeline.run.workspace import a_record_of_ours
 

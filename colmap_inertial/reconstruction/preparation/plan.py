@@ -170,7 +170,7 @@ def plan_imaging(recording: Recording, context: RunContext, asked: Treatments) -
             "to the last"
         )
     why_not = _no_deblurring(recording, asked, context.progress)
-    no_rectifying = _no_rectifying(timing, asked)
+    no_rectifying = _no_rectifying(recording, asked)
     plan = ImagingPlan(
         method="wiener" if asked.deblur is None or asked.deblur == "off" else asked.deblur,
         rectify=not no_rectifying,
@@ -213,12 +213,15 @@ def plan_imaging(recording: Recording, context: RunContext, asked: Treatments) -
     return _deblurring(plan, calibration.view, capture, models, sliding, context.progress)
 
 
-def _no_rectifying(timing: FrameTiming, asked: Treatments) -> str:
+def _no_rectifying(recording: Recording, asked: Treatments) -> str:
     """Why keypoints are not rectified; empty where they are."""
+    timing = recording.timing
     if asked.keypoints_by_others:
         return "left to the keypoint stages that were given"
     if asked.rolling_shutter == "off":
         return "not asked for"
+    if recording.capture.rig:
+        return "keypoints of a rig's cameras are not rectified"
     if timing.readout_s is None:
         return (
             "the readout is unknown: give readout_s under [timing] in capture.toml (docs/devices says where to find it)"
@@ -243,6 +246,8 @@ def _no_deblurring(recording: Recording, asked: Treatments, progress: Progress) 
         return "left to the frame stages that were given"
     if asked.deblur == "off" or asked.pairs:
         return "not asked for"
+    if recording.capture.rig:
+        return "frames stay as they were filmed: those of a rig's cameras are not deblurred"
     if timing.exposure_s is None:
         return (
             "frames stay as they were filmed: the exposure time is unknown; give exposure_s under [timing] in "

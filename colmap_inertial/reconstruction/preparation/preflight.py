@@ -13,8 +13,9 @@ from colmap_inertial.checks.diagnose import Diagnosis, FramesInVideo, Recorded, 
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError, TimingError
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, FrameTiming
-from colmap_inertial.io.capture import Capture, ImageFolder
+from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import write_json
+from colmap_inertial.io.frame_sources import ImageFolder
 from colmap_inertial.io.plausible import RawImu
 from colmap_inertial.io.pose_convention import COLMAP, PoseConvention
 from colmap_inertial.io.video import decode_grey, video_stamps_ns

@@ -13,8 +13,9 @@ from colmap_inertial.core.types import (
     Frame,
     FrameTiming,
 )
-from colmap_inertial.io.capture import Capture, ImageFolder
+from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import path_in
+from colmap_inertial.io.frame_sources import ImageFolder
 from colmap_inertial.io.frames import read_frames
 from colmap_inertial.io.images import read_image
 from colmap_inertial.model import colmap_camera

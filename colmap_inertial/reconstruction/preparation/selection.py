@@ -24,8 +24,9 @@ from colmap_inertial.core.types import CameraModel, FrameTiming
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.imaging.psf import predict_blur_px
 from colmap_inertial.imaging.selection import Chosen, Ranked, Ranking, WindowLimits, choose_frames
-from colmap_inertial.io.capture import Capture, Video
+from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import read_json, write_json
+from colmap_inertial.io.frame_sources import Video
 from colmap_inertial.io.frames import read_reduced
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.motion.align import AlignOptions, align_clocks

@@ -81,9 +81,10 @@ def write_aperture_capture(
     for i, role in enumerate(roles):
         lines += ["", f"[apertures.{role}]", f'role = "{role}"']
         lines += [] if i == 0 else [f'folder = "frames_{role}"']
+    described = toml.read_text(encoding="utf-8").partition("\n[rig.")[0]
     # in place of the [camera] table, where there is one: the calibration has it
     place = re.compile(r"(\[camera\]\n.*?\n)?(?=\[imu\.)", re.DOTALL)
-    write_text(toml, place.sub(lambda _: "\n".join(lines) + "\n\n", toml.read_text(encoding="utf-8"), count=1))
+    write_text(toml, place.sub(lambda _: "\n".join(lines) + "\n\n", described, count=1))
     return toml
 
 

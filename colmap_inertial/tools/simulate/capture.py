@@ -19,6 +19,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array, UInt8Array
 from colmap_inertial.core.errors import OutputExistsError
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_multiply, quat_normalize
+from colmap_inertial.core.types import CameraModel
 from colmap_inertial.io.files import write_json, write_text
 from colmap_inertial.io.video import frame_name
 from colmap_inertial.model.copying import new_folder
@@ -303,12 +304,28 @@ def _capture_toml(recipe: SceneRecipe) -> str:
     lines += ["", "[timing]", f"exposure_s = {camera.exposure_s!r}", f"readout_s = {camera.readout_s!r}"]
     lines += [f'readout_direction = "{camera.readout_direction}"']
     if recipe.camera_known:
-        model = camera.model
-        lines += ["", "[camera]", f'model = "{model.model}"', f"width = {model.width}", f"height = {model.height}"]
-        lines += [f"params = {list(model.params)!r}", 'pixel_origin = "corner"']
+        lines += _camera_lines("camera", camera.model)
     for sensor, unit in (("gyro", "rad/s"), ("accel", "m/s2")):
         lines += ["", f"[imu.{sensor}]", f'file = "{sensor}.csv"', 'time = "t"', 'time_unit = "s"']
         lines += ['columns = ["x", "y", "z"]', f'unit = "{unit}"']
     lines += ["", "[imu.noise]", *(f"{name} = {value!r}" for name, value in asdict(recipe.imu.noise()).items())]
     lines += ["", "[target]", f'spec = "{recipe.board.spec()}"']
+    for name, other in recipe.rig.items():
+        if other.delay_s == camera.delay_s:  # others are not synchronised
+            source = f'video = "clip_{name}.mp4"' if recipe.format == "h264" else f'folder = "frames_{name}"'
+            pose = np.linalg.inv(_body_from_cam(other)) @ _body_from_cam(camera)
+            lines += ["", f"[rig.{name}]", source, f"cam_from_reference = {pose.tolist()!r}"]
+            lines += _camera_lines(f"rig.{name}.camera", other.model) if recipe.camera_known else []
     return "\n".join(["# A simulated recording; recipe.toml made it, truth.json is its truth.", *lines]) + "\n"
+
+
+def _camera_lines(table: str, model: CameraModel) -> list[str]:
+    lines = ["", f"[{table}]", f'model = "{model.model}"', f"width = {model.width}", f"height = {model.height}"]
+    return [*lines, f"params = {list(model.params)!r}", 'pixel_origin = "corner"']
+
+
+def _body_from_cam(camera: ShutterCamera) -> Array:
+    """(4, 4), metres."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = matrix_from_quat(np.array(camera.body_from_cam_xyzw)), camera.cam_in_body_m
+    return pose

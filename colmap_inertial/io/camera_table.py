@@ -1,0 +1,55 @@
+"""Tables of a ``capture.toml`` with intrinsics and poses of cameras."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.geometry import colmap_px_from_opencv
+from colmap_inertial.core.types import CameraModel
+from colmap_inertial.io import sensor_yaml
+from colmap_inertial.io.sensor_yaml import CAMERA_MODELS
+from colmap_inertial.io.toml_section import Section
+
+CAMERA_KEYS = ("sensor_yaml", "model", "width", "height", "params", "pixel_origin")
+
+
+def read_camera_table(table: Section) -> tuple[CameraModel, Array | None]:
+    """The ``[camera]`` table: the model, and (4, 4) body_from_cam where a sensor.yaml gives it."""
+    sheet = table.file("sensor_yaml")
+    if sheet is not None:
+        if any(key in table for key in CAMERA_KEYS[1:]):
+            table.fail("sensor_yaml", "gives the intrinsics; leave out model, width, height, params and pixel_origin")
+        return sensor_yaml.read_camera(sheet), sensor_yaml.read_body_from_sensor(sheet)
+    model = table.require("model", table.choice("model", CAMERA_MODELS))
+    width, height = (table.require(key, table.integer(key)) for key in ("width", "height"))
+    params = table.require("params", table.numbers("params"))
+    count, centre = CAMERA_MODELS[model]
+    if len(params) != count:
+        table.fail("params", f"{model} has {count} parameters, found {len(params)}")
+    origin = table.choice("pixel_origin", ("corner", "center"))
+    if origin is None:
+        table.fail(
+            None,
+            'pixel_origin is missing: "corner" if params are COLMAP\'s, "center" if they are OpenCV\'s or Kalibr\'s',
+        )
+    values = np.array(params)
+    if origin == "center":
+        values[centre : centre + 2] = colmap_px_from_opencv(values[centre : centre + 2])
+    if (values[:centre] <= 0).any():
+        table.fail("params", "focal lengths must be above 0")
+    return CameraModel(model=model, width=width, height=height, params=tuple(values.tolist())), None
+
+
+def check_transform(table: Section, key: str, rows: list[list[float]]) -> Array:
+    """(4, 4) rotation and translation of a 3x3 or 4x4 matrix under a key."""
+    shape = (len(rows), len(rows[0]) if rows else 0)
+    if shape not in ((3, 3), (4, 4)):
+        table.fail(key, f"must be a 3x3 or 4x4 matrix, found {shape[0]}x{shape[1]}")
+    matrix = np.eye(4)
+    matrix[: shape[0], : shape[1]] = rows
+    if not sensor_yaml.is_rotation(matrix[:3, :3]):
+        table.fail(key, "is not a rotation: rows must be perpendicular, of length 1, and right-handed")
+    if not np.allclose(matrix[3], [0, 0, 0, 1]):
+        table.fail(key, "must have 0, 0, 0, 1 as its last row")
+    return matrix
