@@ -1,6 +1,6 @@
 """Damaged output folders: the next run against one in a folder that nobody touched.
 
-    python scripts/study_heal.py [--trials 200] [--seed 0] [--commands NAME ...]
+    python scripts/study_heal.py [--trials 200] [--first 1] [--seed 0] [--commands NAME ...]
 
 Needs the checkout and the extra ``dev``. Finished and half-finished folders of reconstruct (of a capture, of a project,
 and of pictures with ``--scale-from``), deblur and batch, finished ones in which a run with other options was stopped,
@@ -191,7 +191,7 @@ def draw_path(folder: Path, chance: random.Random) -> Path:
     """A file or folder inside, each branch as likely as the other."""
     path = folder
     while True:
-        inside = sorted(path.iterdir()) if path.is_dir() else []
+        inside = sorted(path.iterdir()) if path.is_dir() and not path.is_symlink() else []
         if not inside or (path != folder and chance.random() < 0.3):
             return path
         path = chance.choice(inside)
@@ -215,9 +215,9 @@ def damage(out: Path, outside: Path, chance: random.Random, kinds: tuple[str, ..
         if not path.parent.is_dir():
             return "nothing"
         path.symlink_to(target)
-    elif kind == "delete" or path.is_dir() or not path.stat().st_size:
+    elif kind == "delete" or path.is_symlink() or path.is_dir() or not path.stat().st_size:
         kind = "delete"
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
+        shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
     else:
         data = path.read_bytes()
         at = chance.randrange(len(data))
@@ -298,6 +298,7 @@ def main(argv: list[str] | None = None) -> int:
     """Run the study; the exit code."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--trials", type=int, default=200)
+    parser.add_argument("--first", type=int, default=1, help="number of the first trial: to go on, or see one again")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--commands", nargs="*", metavar="NAME")
     args = parser.parse_args(argv)
@@ -322,7 +323,7 @@ def main(argv: list[str] | None = None) -> int:
                 made(root / "exported" if name == "export" else whole, whole, root / "exported"),
             )
             print(f"{name}: {len(expected[name])} files", flush=True)
-        for number in range(args.trials):
+        for number in range(args.first - 1, args.first - 1 + args.trials):
             name, place = names[number % len(names)], root / "place"
             chance = random.Random(1000 * args.seed + number)
             told, wrong = one_trial(name, known[name], wholes[name], expected[name], chance, place)

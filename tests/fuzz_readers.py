@@ -235,6 +235,13 @@ def _read_tomls(folder: Path) -> None:
     )
 
 
+def _frame_logs(folder: Path) -> list[Path]:
+    rows = "\n".join(map(str, FRAME_NS))
+    (folder / "bare.txt").write_text(rows)
+    (folder / "named.csv").write_text(f"timestamp_ns\n{rows}")
+    return _listed(folder)
+
+
 def _rigs(folder: Path) -> list[Path]:
     (folder / "camchain.yaml").write_text(kalibr_text())
     numbers = ", ".join(map(str, np.eye(3).ravel()))
@@ -314,8 +321,10 @@ READERS: dict[str, Reader] = {
     "capture with tables": Reader(_desk, _read_desk),
     "poses and sensors": Reader(_inertial_scale, read_inertial_scale),
     "frame log": Reader(
-        lambda folder: [folder / "log.txt"] if (folder / "log.txt").write_text("\n".join(map(str, FRAME_NS))) else [],
-        lambda folder: stamps_of_log(folder / "log.txt"),
+        _frame_logs,
+        lambda folder: each(
+            lambda: stamps_of_log(folder / "named.csv"), lambda: stamps_of_log(folder / "bare.txt", "ns")
+        ),
     ),
     "exif": Reader(
         _exif,

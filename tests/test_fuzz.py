@@ -25,6 +25,12 @@ def test_only_errors_of_our_own_come_out(tmp_path, name):
         assert found in ("read", "refused", "gated"), told
 
 
+@loop_over("name", [name for name, reader in READERS.items() if reader.cost < 10 and name != "dji"])
+def test_what_is_damaged_is_read_whole(tmp_path, name):
+    READERS[name].build(tmp_path)
+    READERS[name].read(tmp_path)
+
+
 def _fails(error: BaseException):
     def read(folder: Path) -> None:
         if (folder / "a").read_bytes() != b"whole":
