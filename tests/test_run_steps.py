@@ -19,6 +19,7 @@ from test_pipeline import contents
 from test_pipeline_parts import frames_of, recording_of, session_in
 
 from colmap_inertial.checks.diagnose import Recorded, diagnose
+from colmap_inertial.cli import main
 from colmap_inertial.colmap import steps
 from colmap_inertial.colmap.mapping import MapRecord, map_images
 from colmap_inertial.colmap.sparse import (
@@ -338,6 +339,28 @@ def test_a_folder_with_a_link_in_it_is_not_gone_on_with(workspace, tmp_path, nam
     os.mkfifo(workspace.root / "pipe")
     with pytest.raises(FormatError, match=r"a device, a pipe or a socket"):
         refuse_links(workspace.root)
+
+
+@pytest.mark.parametrize("name", ["sparse", "sparse/0/images.bin", "log.txt"])
+def test_commands_that_read_a_model_in_such_a_folder_refuse_it(workspace, tmp_path, capsys, name):
+    outside = tmp_path / "outside"
+    outside.write_text("")
+    for folder in ("sparse/0", "images", ".stages"):
+        (workspace.root / folder).mkdir(parents=True, exist_ok=True)
+    if name == "sparse":
+        (workspace.root / "sparse").rename(outside := tmp_path / "model")
+    (workspace.root / name).symlink_to(outside)
+    model, images = (str(workspace.root / folder) for folder in ("sparse/0", "images"))
+    for line in (
+        ("validate", model, "--images", images, "--target", "checkerboard:8x6:0.04"),
+        ("validate", str(tmp_path), "--images", images, "--target", "checkerboard:8x6:0.04"),
+        ("scale", model, "--imu", images, "--frame-times", images),
+        ("align", model, "--imu", images, "--frame-times", images, "--out", str(tmp_path / "calibration.json")),
+    ):
+        with pytest.raises(SystemExit, match="2"):
+            main([*line])
+        said = " ".join(capsys.readouterr().err.split())
+        assert "is a link to" in said and "links in an output folder are not followed" in said, line
 
 
 def test_links_of_a_project_may_stay_and_the_folder_itself_may_be_one(workspace, tmp_path):

@@ -230,6 +230,14 @@ def refuse_links(root: Path) -> None:
                 refuse_link(path)
 
 
+def refuse_links_around(*paths: Path) -> None:
+    """:func:`refuse_links` in the output folders that paths, such as those of a model and its images, lie in."""
+    for path in paths:
+        out = next((folder for folder in (path, *path.absolute().parents) if Workspace(folder).stamps.is_dir()), None)
+        if out is not None:
+            refuse_links(out)
+
+
 def _places_of_links(workspace: Workspace) -> list[Path]:
     """Possible places of links of an existing project: its copy, and the copy that a killed run prepared."""
     names: Sequence[object] = ()

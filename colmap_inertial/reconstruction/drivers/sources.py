@@ -39,6 +39,7 @@ from colmap_inertial.motion.align import AlignOptions
 from colmap_inertial.motion.align.consensus import align_by_consensus
 from colmap_inertial.motion.align.conventions import likely_convention
 from colmap_inertial.pipeline.run.progress import silent
+from colmap_inertial.pipeline.run.workspace import refuse_links_around
 from colmap_inertial.reconstruction.drivers.paths import check_output, only_model
 from colmap_inertial.reconstruction.preparation.preflight import CheckInputs, TolerantReader, measure_recording
 
@@ -96,6 +97,7 @@ def brings_imu(source: ScaleSource) -> bool:
     path = source.source
     if not path.exists():
         raise FormatError(path, "no such file or folder")
+    refuse_links_around(path)
     return path.is_dir() and is_inertial_scale(path)
 
 

@@ -22,6 +22,7 @@ from colmap_inertial.core.options import ValidateOptions
 from colmap_inertial.core.types import Similarity
 from colmap_inertial.io.files import write_json
 from colmap_inertial.model import apply_similarity
+from colmap_inertial.pipeline.run.workspace import refuse_links_around
 from colmap_inertial.reconstruction.drivers.paths import check_output, only_model
 
 
@@ -121,6 +122,7 @@ def validate_source(
         When ``apply`` is asked for and cannot be done; see also :func:`validate_model`.
     """
     parsed = parse_target(target)
+    refuse_links_around(model, images)
     outputs.check(model, unscaled=options.unscaled)
     folder = only_model(model)
     second = known.second_target(parsed)
