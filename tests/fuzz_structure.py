@@ -143,7 +143,7 @@ def _json(data: bytes, rng: Rng) -> bytes:
     return _with_raw(json.dumps(tree, ensure_ascii=bool(rng.random() < 0.5)))
 
 
-def _brackets(data: bytes, rng: Rng) -> bytes:
+def _brackets(data: bytes, rng: Rng) -> bytes | None:
     """JSON's list, or a table of TOML."""
     try:
         return _json(data, rng)
@@ -155,7 +155,9 @@ def _brackets(data: bytes, rng: Rng) -> bytes:
 TOML_VALUES = tuple(value for value in VALUES if value is not None and value != [None] * 40 and value != "\udcff")
 
 
-def _toml(data: bytes, rng: Rng) -> bytes:
+def _toml(data: bytes, rng: Rng) -> bytes | None:
+    if b"a.a.a" in data:  # from an earlier change; a parser without limits takes memory by the square of its parts
+        return None
     if rng.random() < 0.03:
         key = ".".join(["a"] * int(_any(rng, (20, 6000, 150_000))))
         return data + _any(rng, ("\n[{}]\n", "\n{} = 1\n", "\nx = {{ {} = 1 }}\n")).format(key).encode()
