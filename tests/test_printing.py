@@ -40,7 +40,17 @@ def test_signs_stay_and_all_else_is_named(text, shown):
     assert line.endswith(f"INFO {shown}")
 
 
-@loop_over(("text", "written"), [("=1+1|A1.jpg", "'=1+1|A1.jpg"), ("@a", "'@a"), ("a=1", "a=1"), ("-1.jpg", "'-1.jpg")])
+@loop_over(
+    ("text", "written"),
+    [
+        ("=1+1|A1.jpg", "'=1+1|A1.jpg"),
+        ("@a", "'@a"),
+        ("a=1", "a=1"),
+        ("-1.jpg", "'-1.jpg"),
+        ("\t=1", "'\t=1"),
+        ("\uff1d1", "'\uff1d1"),
+    ],
+)
 def test_a_cell_is_no_formula(text, written):
     assert cell(text) == written
 

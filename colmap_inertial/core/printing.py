@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from rich.segment import Segment
 
 #: What spreadsheets take for the beginning of a formula.
-_FORMULA = ("=", "+", "-", "@")
+_FORMULA = ("=", "+", "-", "@", "\t", "\uff1d", "\uff0b", "\uff0d", "\uff20")  # the last four are full-width
 
 
 def printable(text: str) -> str:
