@@ -282,6 +282,7 @@ def places_of(root: Path) -> Places:
 
 
 _MAKE_ROOM = "make room and start again, it continues"
+_RAISE_LIMIT = "raise the limit (ulimit -f) and start again, it continues"
 
 
 @contextlib.contextmanager
@@ -292,6 +293,8 @@ def full_disk_is_an_error(root: Path, advice: str = _MAKE_ROOM) -> Iterator[None
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
             raise
+        if error.errno == errno.EFBIG:
+            raise OutputError(f"{root}: a file in it would be larger than files may be; {_RAISE_LIMIT}") from error
         raise OutputError(f"the disk of {root} is full ({error.strerror}); {advice}") from error
 
 
@@ -327,7 +330,7 @@ def require_room(file: Path, num_bytes: int) -> None:
     if largest < size + num_bytes:
         raise OutputError(
             f"{file}: COLMAP cannot write it here: a file may have {largest / 1e6:.2g} MB, and this one may need "
-            f"{(size + num_bytes) / 1e6:.0f} MB; raise the limit (ulimit -f) and start again, it continues"
+            f"{max(1.0, (size + num_bytes) / 1e6):.0f} MB; {_RAISE_LIMIT}"
         )
 
 
