@@ -17,6 +17,7 @@ from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.io.ply import transform_ply
 from colmap_inertial.model.database import transform_database
+from colmap_inertial.model.nerf import transform_transforms
 from colmap_inertial.model.similarities import plain_factor
 from colmap_inertial.pipeline.run.config import read_config
 from colmap_inertial.tools.batch import read_manifest
@@ -141,3 +142,11 @@ def test_a_database_that_cannot_grow(tmp_path, limit):
     done = subprocess.run([sys.executable, "-c", LIMITED, str(tmp_path), limit], capture_output=True, text=True)
     assert done.stderr.splitlines()[-1].startswith(f"{tmp_path / 'x.db'}: COLMAP cannot write")
     assert done.returncode == 1
+
+
+@pytest.mark.parametrize("scale", ['"a"', "{}"])
+def test_the_scale_of_a_transforms_file_that_is_no_number(tmp_path, scale):
+    path = tmp_path / "transforms.json"
+    path.write_text(f'{{"frames": [], "scale": {scale}, "offset": [0, 0, 0]}}')
+    with pytest.raises(FormatError, match="no number"):
+        transform_transforms(path, tmp_path / "out.json", plain_factor(2.0))

@@ -16,7 +16,7 @@ from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import DOWN_IN_WORLD, UNDOES, Similarity
-from colmap_inertial.io.files import read_json
+from colmap_inertial.io.files import read_json, reading
 from colmap_inertial.model.database import PlacedModel
 
 _MATRICES = ("transform_matrix", "transform_matrix_start", "transform_matrix_end")
@@ -100,7 +100,9 @@ def transform_transforms(source: Path, target: Path, similarity: Similarity) -> 
         values["up"] = (rotation @ _vector(source, values["up"])).tolist()
         changed.append("up")
     if "scale" in values and "offset" in values:
-        scale, offset = float(values["scale"]), _vector(source, values["offset"])
+        with reading(source, "has a scale that is no number"):
+            scale = float(values["scale"])
+        offset = _vector(source, values["offset"])
         middle = moving[:3, :3] @ ((0.5 - offset) / scale) + moving[:3, 3]
         values["scale"] = scale / similarity.scale
         values["offset"] = (0.5 - values["scale"] * middle).tolist()
