@@ -147,6 +147,7 @@ def test_a_database_that_cannot_grow(tmp_path, limit):
 @pytest.mark.parametrize("scale", ['"a"', "{}"])
 def test_the_scale_of_a_transforms_file_that_is_no_number(tmp_path, scale):
     path = tmp_path / "transforms.json"
-    path.write_text(f'{{"frames": [], "scale": {scale}, "offset": [0, 0, 0]}}')
+    frames = [{"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}]
+    path.write_text(f'{{"frames": {json.dumps(frames)}, "scale": {scale}, "offset": [0, 0, 0]}}')
     with pytest.raises(FormatError, match="no number"):
         transform_transforms(path, tmp_path / "out.json", plain_factor(2.0))
