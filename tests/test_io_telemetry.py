@@ -9,6 +9,7 @@ from test_io_imu import handheld
 
 from colmap_inertial.core.errors import FormatError, MissingExtraError
 from colmap_inertial.core.types import ImuRecording
+from colmap_inertial.io import telemetry
 from colmap_inertial.io.imu import read_frame_log, read_imu
 from colmap_inertial.io.imu_formats import find_imu_format
 
@@ -64,6 +65,21 @@ def test_damage_is_an_error_of_ours(tmp_path, imu):
     cut.write_bytes(cut.read_bytes()[-300:])
     with pytest.raises(FormatError, match="telemetry-parser cannot read it"):
         read_imu(cut)
+
+
+def test_a_parser_that_aborts_ends_in_a_sentence(tmp_path, imu, monkeypatch):
+    pytest.importorskip("telemetry_parser")
+    monkeypatch.setattr(telemetry, "_PARSE", "import os; os.abort()")
+    with pytest.raises(FormatError, match="telemetry-parser cannot read it: it ended with signal 6"):
+        read_imu(write_runcam(tmp_path, imu, "Mobius Maxi 4K"))
+
+
+def test_a_parser_takes_no_more_than_its_memory(tmp_path, imu, monkeypatch):
+    pytest.importorskip("telemetry_parser")
+    path = write_runcam(tmp_path, imu, "Mobius Maxi 4K")
+    monkeypatch.setattr(telemetry, "_LEAST_MEMORY", 1 << 20)
+    with pytest.raises(FormatError, match="telemetry-parser cannot read it"):
+        read_imu(path)
 
 
 def test_without_the_package_it_says_what_to_install(tmp_path, imu, monkeypatch):

@@ -9,7 +9,11 @@ together, the checks of every recording say so.
 
 from __future__ import annotations
 
+import json
 import re
+import subprocess
+import sys
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +35,16 @@ _MOBIUS = "time,rx,ry,rz,ax,ay,az,temp"
 _INSTA360 = b"8db42d694ccc418790edff439fe026bf"
 #: Its units in our spelling.
 _UNITS = {"deg/s": "deg/s", "rad/s": "rad/s", "g": "g", "m/s²": "m/s2"}
+#: The parser's own process, and the memory that it may take: readings become objects of ten times their text.
+_PARSE = """
+import json, resource, sys
+import telemetry_parser
+resource.setrlimit(resource.RLIMIT_AS, 2 * (int(sys.argv[2]),))
+parser = telemetry_parser.Parser(sys.argv[1])
+names = [str(name or "") for name in (parser.camera, parser.model)]
+json.dump([*names, parser.telemetry()], sys.stdout, default=str)
+"""
+_LEAST_MEMORY, _MEMORY_PER_BYTE = 1 << 30, 20
 #: A readout that is longer, is none.
 _LONGEST_READOUT_S = 0.5
 
@@ -77,24 +91,24 @@ def read_telemetry_frames(path: Path) -> FrameLog | None:
 
 
 def _parsed(path: Path) -> tuple[str, dict[str, dict[str, Any]]]:
-    """The camera's name, and what telemetry-parser found, by group and tag."""
-    try:
-        import telemetry_parser
-    except ImportError:
-        raise MissingExtraError("devices", f"{path} is read by telemetry-parser") from None
-    try:
-        parser = telemetry_parser.Parser(str(path))
-        parts = parser.telemetry()
-    except BaseException as error:
-        # what panics in Rust is no Exception
-        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
-            raise
-        raise FormatError(path, f"telemetry-parser cannot read it: {str(error) or type(error).__name__}") from None
+    """The camera's name, and what telemetry-parser found, by group and tag.
+
+    It runs in a process of its own: on damaged files it may abort, which no exception tells of.
+    """
+    if find_spec("telemetry_parser") is None:
+        raise MissingExtraError("devices", f"{path} is read by telemetry-parser")
+    most_bytes = _LEAST_MEMORY + _MEMORY_PER_BYTE * path.stat().st_size
+    command = [sys.executable, "-c", _PARSE, str(path.absolute()), str(most_bytes)]
+    done = subprocess.run(command, capture_output=True, stdin=subprocess.DEVNULL)
+    if done.returncode:
+        lines = done.stderr.decode("utf-8", "replace").strip().splitlines()
+        ended = f"it ended with signal {-done.returncode}" if done.returncode < 0 else "without a word"
+        raise FormatError(path, f"telemetry-parser cannot read it: {lines[-1] if lines else ended}")
+    camera, model, parts = json.loads(done.stdout)
     groups: dict[str, dict[str, Any]] = {}
     for part in parts:
         for group, tags in part.items():
             groups.setdefault(group, {}).update(tags)
-    camera, model = (str(name or "") for name in (parser.camera, parser.model))
     return model if model.lower().startswith(camera.lower()) else f"{camera} {model}".strip(), groups
 
 
