@@ -77,7 +77,7 @@ def test_a_parser_that_aborts_ends_in_a_sentence(tmp_path, imu, monkeypatch):
 def test_a_parser_takes_no_more_than_its_memory(tmp_path, imu, monkeypatch):
     pytest.importorskip("telemetry_parser")
     path = write_runcam(tmp_path, imu, "Mobius Maxi 4K")
-    monkeypatch.setattr(telemetry, "_LEAST_MEMORY", 1 << 20)
+    monkeypatch.setattr(telemetry, "_LIMITS", telemetry.TelemetryLimits(memory_bytes=1 << 20))
     with pytest.raises(FormatError, match="telemetry-parser cannot read it"):
         read_imu(path)
 

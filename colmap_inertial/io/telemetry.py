@@ -13,6 +13,7 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -35,7 +36,7 @@ _MOBIUS = "time,rx,ry,rz,ax,ay,az,temp"
 _INSTA360 = b"8db42d694ccc418790edff439fe026bf"
 #: Its units in our spelling.
 _UNITS = {"deg/s": "deg/s", "rad/s": "rad/s", "g": "g", "m/s²": "m/s2"}
-#: The parser's own process, and the memory that it may take: readings become objects of ten times their text.
+#: The parser's own process.
 _PARSE = """
 import json, resource, sys
 import telemetry_parser
@@ -44,9 +45,20 @@ parser = telemetry_parser.Parser(sys.argv[1])
 names = [str(name or "") for name in (parser.camera, parser.model)]
 json.dump([*names, parser.telemetry()], sys.stdout, default=str)
 """
-_LEAST_MEMORY, _MEMORY_PER_BYTE = 1 << 30, 20
-#: A readout that is longer, is none.
-_LONGEST_READOUT_S = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class TelemetryLimits:
+    """Limits of the parser's process, and of what it reads."""
+
+    #: Memory that it may take, and more for each byte of the file: readings become objects of ten times their text.
+    memory_bytes: int = 1 << 30
+    memory_of_a_byte: int = 20
+    #: A readout that is longer, is none.
+    readout_s: float = 0.5
+
+
+_LIMITS = TelemetryLimits()
 
 
 def is_telemetry(path: Path) -> bool:
@@ -85,7 +97,7 @@ def read_telemetry_frames(path: Path) -> FrameLog | None:
     _, groups = _parsed(path)
     metadata = groups.get("Default", {}).get("Metadata")
     readout_s = 1e-3 * float(metadata.get("rolling_shutter_time") or 0.0) if isinstance(metadata, dict) else 0.0
-    if not 0 < readout_s < _LONGEST_READOUT_S:
+    if not 0 < readout_s < _LIMITS.readout_s:
         return None
     return FrameLog(t_s=np.zeros(0), readout_s=readout_s)
 
@@ -97,7 +109,7 @@ def _parsed(path: Path) -> tuple[str, dict[str, dict[str, Any]]]:
     """
     if find_spec("telemetry_parser") is None:
         raise MissingExtraError("devices", f"{path} is read by telemetry-parser")
-    most_bytes = _LEAST_MEMORY + _MEMORY_PER_BYTE * path.stat().st_size
+    most_bytes = _LIMITS.memory_bytes + _LIMITS.memory_of_a_byte * path.stat().st_size
     command = [sys.executable, "-c", _PARSE, str(path.absolute()), str(most_bytes)]
     done = subprocess.run(command, capture_output=True, stdin=subprocess.DEVNULL)
     if done.returncode:
