@@ -18,14 +18,15 @@ import numpy as np
 from refine_walk import tracks_of, walk
 from threadpoolctl import threadpool_info
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.inertial.refine._system import BandFactor
+from colmap_inertial.inertial.refine._panels import Layout, PanelFactor
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.model import Model, trajectory_from_model
 from colmap_inertial.pipeline.stages.metric import MetricStage, gravity_in_model, metric_trajectory, smooth_path
 from colmap_inertial.pipeline.stages.refine import RefineStage
 
-PLACES = ("scipy/linalg/_decomp_cholesky.py", "scipy/linalg/_basic.py", "core/arrow.py", "refine/_system.py")
+PLACES = ("scipy/linalg/_decomp_cholesky.py", "scipy/linalg/_basic.py", "core/arrow.py", "refine/_panels.py")
 SOLVES = ("cholesky_banded", "cho_solve_banded", "cho_factor", "cho_solve", "solve_triangular", "solve", "marginals")
+SOLVES += ("_factor", "_subtract", "_substitute")
 threads = {}
 
 def counted(frame, event, what):
@@ -56,7 +57,10 @@ ALONE = """
 assert "scipy.linalg" not in sys.modules
 sys.setprofile(counted)
 with one_blas_thread():
-    BandFactor.of(np.ones((30, 1)), 15).marginals(15)
+    layout = Layout.make(np.arange(2), 9, np.array([1]), np.array([0]))
+    values = np.zeros(layout.size_bytes // 8)
+    values[layout.entries[2]] = 1.0
+    PanelFactor.of(layout, values).marginals()
 """
 
 
@@ -64,8 +68,8 @@ with one_blas_thread():
 @pytest.mark.parametrize(
     ("work", "solves"),
     [
-        (RUN, "cho_factor cho_solve cho_solve_banded cholesky_banded marginals solve solve_triangular"),
-        (ALONE, "cholesky_banded marginals solve_triangular"),
+        (RUN, "_factor _substitute _subtract cho_factor cho_solve cho_solve_banded cholesky_banded marginals solve"),
+        (ALONE, "_factor _substitute _subtract marginals"),
     ],
     ids=["run", "alone"],
 )
