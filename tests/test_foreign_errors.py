@@ -144,7 +144,7 @@ def test_a_database_that_cannot_grow(tmp_path, limit):
     assert done.returncode == 1
 
 
-@pytest.mark.parametrize("scale", ['"a"', "{}"])
+@pytest.mark.parametrize("scale", ['"a"', "{}", "0", "-1", "true"])
 def test_the_scale_of_a_transforms_file_that_is_no_number(tmp_path, scale):
     path = tmp_path / "transforms.json"
     frames = [{"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}]

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
@@ -93,6 +94,19 @@ def test_a_damaged_recording_of_poses_is_a_finding_for_diagnose_and_bad_input_fo
     assert isinstance(recorded.trajectory, CameraTrajectory)
     assert [str(error) for error in recorded.refused] == [f.evidence for f in diagnose(recorded).stopping]
     with pytest.raises(InertialError, match=r"gyro\.csv"):
+        scale_source(source, ScaleOptions())
+
+
+def test_a_damaged_model_is_a_finding_for_diagnose_and_bad_input_for_scale(scene, tmp_path):
+    model = tmp_path / "model"
+    model.mkdir()
+    pycolmap.Reconstruction().write(str(model))
+    (model / "images.bin").write_bytes(b"\x09")
+    source = ScaleSource(source=model, imu=scene)
+    recorded = collect(source, lambda *_: None)
+    assert recorded.imu is not None and recorded.trajectory is None
+    assert any("images.bin" in finding.evidence for finding in diagnose(recorded).stopping)
+    with pytest.raises(FormatError, match=r"images\.bin"):
         scale_source(source, ScaleOptions())
 
 

@@ -15,7 +15,7 @@ from colmap_inertial.core.errors import FormatError, InertialError, MappingError
 from colmap_inertial.core.geometry import quat_exp, quat_multiply, so3_exp
 from colmap_inertial.core.options import MappingOptions, ReconstructOptions
 from colmap_inertial.io.capture import load_capture
-from colmap_inertial.io.capture_rig import RigCamera
+from colmap_inertial.io.capture_rig import RigCamera, rig_files
 from colmap_inertial.io.frame_sources import ImageFolder, Video
 from colmap_inertial.io.frames import picture_folders, read_frames
 from colmap_inertial.io.rig_frames import pair_rig_frames
@@ -217,6 +217,18 @@ def test_pairs_that_do_not_belong_together_are_refused(folders):
         pair('[rig.b]\nfolder = "other"\ntimes = "other.csv"\n')
     with pytest.raises(FormatError, match="no such folder"):
         pair('[rig.b]\nfolder = "nowhere"\n')
+    for folder, first in (("begun", 0), ("ended", 3)):
+        (folders / folder).mkdir()
+        for k in range(first, first + 3):
+            shutil.copy(folders / "same" / f"{k}.png", folders / folder)
+    with pytest.raises(TimingError, match=r"\[rig\]: 0 of the main camera's 6 frames have an image of every camera"):
+        pair('[rig.b]\nfolder = "begun"\n[rig.c]\nfolder = "ended"\n')
+
+
+def test_a_change_of_a_camera_s_times_changes_the_inputs(folders):
+    rig = '[rig.b]\nfolder = "other"\ntimes = "other.csv"\n'
+    files = rig_files(load_capture(describe(folders, rig)).rig)
+    assert folders / "other.csv" in files and folders / "other" / "b4.png" in files
 
 
 KALIBR = """
@@ -269,6 +281,8 @@ def test_a_calibration_of_all_cameras_gives_intrinsics_and_poses(folders):
         ('[rig."b c"]\nfolder = "same"\n', "becomes a folder"),
         ('[rig.b]\nfolder = "same"\ncam_from_reference = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n', "4x4"),
         ('[rig.b]\nfolder = "same"\ncamera = "cam1"\n', "must be a table"),
+        ('[rig.b]\nfolder = "left"\ntimes = "left.csv"\n', "has the images of another camera"),
+        ('[rig.b]\nfolder = "same"\n[rig.c]\nfolder = "same"\n', "has the images of another camera"),
         (
             f'[rig.b]\nfolder = "same"\ncam_from_reference = {POSE.tolist()}\n[rig.c]\nfolder = "same"\n',
             "of each camera, or of none",

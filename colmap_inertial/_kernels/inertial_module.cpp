@@ -202,9 +202,12 @@ bool reduce_points_of(Of<const int64_t, 1> first, Of<const int64_t, 1> place, Do
         most = std::max(most, first(i + 1) - first(i));
     }
     for (size_t i = 0; i < m; ++i) check(place(i) >= 0 && size_t(place(i)) < f, "place: not of a frame");
-    check(is(offset, f) && is(end, f) && wide >= FRAME && wide <= STATE && pitch >= wide, "panels: of another size");
+    check(is(offset, f) && is(end, f) && wide >= FRAME && wide <= STATE && pitch >= wide && pitch <= values.shape(0),
+          "panels: of another size");
+    // the panels' own columns alone have so many rows
+    const int64_t places = int64_t(values.shape(0) / (wide * pitch));
     for (size_t i = 0; i < f; ++i) {
-        check(end(i) > int64_t(i) && end(i) <= int64_t(1) << 32, "end: not after the place");
+        check(end(i) > int64_t(i) && end(i) <= places && (i == 0 || end(i) >= end(i - 1)), "end: not after the place");
         check(offset(i) + int64_t(wide * i * pitch) >= 0 &&
                   offset(i) + int64_t((wide * size_t(end(i)) - 1) * pitch + FRAME) <= int64_t(values.shape(0)),
               "offset: outside the panels");

@@ -4,7 +4,7 @@
 
 namespace {
 
-// Inverse of a symmetric positive definite matrix; its diagonal grows where it is singular. None of nothing.
+// Inverse of a symmetric positive definite matrix; its diagonal grows where it is singular. Zero for a zero matrix.
 void invert(double *v) {
     const double least = 1e-14 * (v[0] + v[4] + v[8]);
     if (!(least > 1e-60)) {

@@ -251,6 +251,10 @@ def _read_rig(table: Section, capture: Capture) -> Capture:
     rig = read_rig_table(table, body_from_cam=capture.body_from_cam)
     if rig.reference is not None and capture.camera is not None:
         table.fail("calibration", "gives the main camera, too; leave out [camera]")
+    sources = [capture.frames, *(camera.frames for camera in rig.cameras)]
+    for camera in rig.cameras:
+        if sources.count(camera.frames) > 1:
+            table.table(camera.name).fail(None, "has the images of another camera; give its own folder or video")
     return replace(capture, rig=rig.cameras, camera=rig.reference or capture.camera)
 
 

@@ -90,13 +90,14 @@ class RigTable:
 
 
 def rig_files(rig: Iterable[RigCamera]) -> list[Path]:
-    """Files of the images and videos of a rig's cameras."""
+    """Files of the images, videos and times of a rig's cameras."""
     files: list[Path] = []
     for source in (camera.frames for camera in rig):
         if isinstance(source, ImageFolder):
             files += [path_in(source.folder, name) for name in image_names(source)]
+            files += [source.times] if isinstance(source.times, Path) else []
         else:
-            files.append(source.file)
+            files += [source.file, *filter(None, [source.frame_times])]
     return files
 
 
@@ -134,6 +135,10 @@ def read_rig_table(table: Section, *, body_from_cam: Array | None) -> RigTable:
         table.fail("calibration", 'holds lengths without a unit; give unit = "m" or "mm"')
     main = known.camera(reference or next(iter(known.cameras)))
     cameras = tuple(_read_calibrated(table.table(name), name, main, known) for name in names)
+    models = [table.table(name).text("camera") or name for name in names]
+    for name, model in zip(names, models, strict=True):
+        if models.count(model) > 1:
+            table.table(name).fail("camera", f"{model!r} is that of another camera, too; each has its own")
     return RigTable(reference=_model(known, main, reference or "the first camera"), cameras=cameras)
 
 

@@ -101,6 +101,12 @@ def pair_rig_frames(capture: Capture, timing: FrameTiming) -> RigFrames:
         if taken is not None:
             raise TimingError(f"[rig.{camera.name}]: the main camera's image {taken} lies in a folder of that name")
     alone = tuple(name for name in timing.names if not all(name in own for own in own_names))
+    together = len(timing.names) - len(alone)
+    if together < _LIMITS.least_share * len(timing.names):
+        raise TimingError(
+            f"[rig]: {together} of the main camera's {len(timing.names)} frames have an image of every camera; "
+            "leave out a camera that ran at another time"
+        )
     return RigFrames(capture=capture, own_names=own_names, alone=alone)
 
 

@@ -38,12 +38,16 @@ _INSTA360 = b"8db42d694ccc418790edff439fe026bf"
 _UNITS = {"deg/s": "deg/s", "rad/s": "rad/s", "g": "g", "m/s²": "m/s2"}
 #: The parser's own process.
 _PARSE = """
-import json, resource, sys
+import json, os, resource, sys
 import telemetry_parser
-resource.setrlimit(resource.RLIMIT_AS, 2 * (int(sys.argv[2]),))
+out = os.fdopen(os.dup(1), "w")
+os.dup2(2, 1)  # what the parser prints is no result
+hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+most = int(sys.argv[2]) if hard == resource.RLIM_INFINITY else min(int(sys.argv[2]), hard)
+resource.setrlimit(resource.RLIMIT_AS, (most, hard))
 parser = telemetry_parser.Parser(sys.argv[1])
 names = [str(name or "") for name in (parser.camera, parser.model)]
-json.dump([*names, parser.telemetry()], sys.stdout, default=str)
+json.dump([*names, parser.telemetry()], out, default=str)
 """
 
 
@@ -54,7 +58,7 @@ class TelemetryLimits:
     #: Memory that it may take, and more for each byte of the file: readings become objects of ten times their text.
     memory_bytes: int = 1 << 30
     memory_of_a_byte: int = 20
-    #: A readout that is longer, is none.
+    #: Longer readouts are ignored.
     readout_s: float = 0.5
 
 
@@ -110,7 +114,7 @@ def _parsed(path: Path) -> tuple[str, dict[str, dict[str, Any]]]:
     if find_spec("telemetry_parser") is None:
         raise MissingExtraError("devices", f"{path} is read by telemetry-parser")
     most_bytes = _LIMITS.memory_bytes + _LIMITS.memory_of_a_byte * path.stat().st_size
-    command = [sys.executable, "-c", _PARSE, str(path.absolute()), str(most_bytes)]
+    command = [sys.executable, "-P", "-c", _PARSE, str(path.absolute()), str(most_bytes)]
     done = subprocess.run(command, capture_output=True, stdin=subprocess.DEVNULL)
     if done.returncode:
         lines = done.stderr.decode("utf-8", "replace").strip().splitlines()

@@ -16,7 +16,7 @@ from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import DOWN_IN_WORLD, UNDOES, Similarity
-from colmap_inertial.io.files import read_json, reading
+from colmap_inertial.io.files import read_json
 from colmap_inertial.model.database import PlacedModel
 
 _MATRICES = ("transform_matrix", "transform_matrix_start", "transform_matrix_end")
@@ -100,8 +100,9 @@ def transform_transforms(source: Path, target: Path, similarity: Similarity) -> 
         values["up"] = (rotation @ _vector(source, values["up"])).tolist()
         changed.append("up")
     if "scale" in values and "offset" in values:
-        with reading(source, "has a scale that is no number"):
-            scale = float(values["scale"])
+        scale = values["scale"]
+        if isinstance(scale, bool) or not isinstance(scale, (int, float)) or not 0 < scale < np.inf:
+            raise FormatError(source, "has a scale that is no number above 0; leave the file out with --keep")
         offset = _vector(source, values["offset"])
         middle = moving[:3, :3] @ ((0.5 - offset) / scale) + moving[:3, 3]
         values["scale"] = scale / similarity.scale

@@ -135,7 +135,7 @@ class ColmapSettings:
         return [*chosen, *(fingerprint(path) for path in files if path.is_absolute() and path.exists())]
 
     def after(self, *settings: str) -> ColmapSettings:
-        """These after others, which count where the user set nothing."""
+        """These settings, with defaults before them that count where the user set nothing."""
         return ColmapSettings((*settings, *self.settings))
 
     def apply(self, options: Options) -> Options:

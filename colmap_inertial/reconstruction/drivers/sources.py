@@ -23,6 +23,7 @@ from colmap_inertial.io.calibration import (
 )
 from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.files import write_json
+from colmap_inertial.io.frame_times import NO_RIGS
 from colmap_inertial.io.frames import read_frame_times
 from colmap_inertial.io.imu import is_capture, read_raw_imu
 from colmap_inertial.io.imu_text import is_inertial_scale
@@ -92,7 +93,7 @@ def brings_imu(source: ScaleSource) -> bool:
     Raises
     ------
     FormatError
-        Where there is no source.
+        Where there is no source, or it lies among links.
     """
     path = source.source
     if not path.exists():
@@ -147,12 +148,13 @@ def read_source(source: ScaleSource) -> tuple[CheckInputs, Sequence[str]]:
         folder, times = only_model(path), _find_times(source)
         if times is None:
             raise FormatError(path, "a COLMAP model has no frame times: give --frame-times, a CSV with name,t_s")
-        model = read_model(folder)
         capture = next(iter(_captures(source)), None)
-        timing = reader.attempt(lambda: read_frame_times(times, frames_of_rigs([model])))
-        if timing is not None:
-            known = timing
-            trajectory, notes = reader.attempt(lambda: trajectory_from_model(model, known)) or (None, ())
+        model = reader.attempt(lambda: read_model(folder))
+        rigs = NO_RIGS if model is None else frames_of_rigs([model])
+        timing = reader.attempt(lambda: read_frame_times(times, rigs))
+        if model is not None and timing is not None:
+            placed, known = model, timing
+            trajectory, notes = reader.attempt(lambda: trajectory_from_model(placed, known)) or (None, ())
         if is_metric(folder):
             notes = (*notes, "this model is metric already: a scale of 1 says that it is right")
     else:
