@@ -44,7 +44,8 @@ def scene(tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("code", FAULTS)
+# the others are found in the same poses below, and by the study of mistakes
+@pytest.mark.parametrize("code", ["none", "gyro-mirrored", "clock-offset"])
 def test_a_reconstruction_finds_what_diagnose_finds_and_stops_before_features(code, scene, tmp_path):
     FAULTS[code](scene, np.random.default_rng(0))
     alone = diagnose_source(ScaleSource(source=scene))
