@@ -118,7 +118,7 @@ def _parsed(path: Path) -> tuple[str, dict[str, dict[str, Any]]]:
     done = subprocess.run(command, capture_output=True, stdin=subprocess.DEVNULL)
     if done.returncode:
         lines = done.stderr.decode("utf-8", "replace").strip().splitlines()
-        ended = f"it ended with signal {-done.returncode}" if done.returncode < 0 else "without a word"
+        ended = f"it ended with {'signal' if done.returncode < 0 else 'exit code'} {abs(done.returncode)}"
         raise FormatError(path, f"telemetry-parser cannot read it: {lines[-1] if lines else ended}")
     camera, model, parts = json.loads(done.stdout)
     groups: dict[str, dict[str, Any]] = {}
