@@ -1,7 +1,7 @@
 """Bundle adjustment with the IMU and the rolling shutter in it."""
 
 import functools
-from dataclasses import replace
+from dataclasses import fields, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -47,7 +47,7 @@ def test_derivatives_of_observations_are_those_of_finite_differences(small):
     _, problem, start, _ = small
     x = nudged(start, np.random.default_rng(0))
     at = _residuals.project(problem, x, problem.observations)
-    by = _residuals.derivatives(problem, x, problem.observations, at)
+    by = _residuals.derivatives(problem, x, problem.observations, at, np.ones(len(at.seen)))
 
     def residual(y):
         return _residuals.project(problem, y, problem.observations).residual
@@ -171,7 +171,8 @@ def test_the_compiled_step_and_covariance_are_those_of_the_whole_system(folded, 
     prior = (problem.prior.info, -problem.prior.info @ at.offset)
     system = System.build(layout, problem.observations, by, residual, at.rows, prior, damping=0.0)
     solved = system.factored()
-    states, shared, points = solved.step(system, problem.observations, by)
+    step = solved.step(system, problem.observations, by)
+    states, shared, points = step.states, step.shared, step.points
     info, rhs = dense(problem, at, by, residual)
     unit = 1 / np.sqrt(np.diagonal(info))
     scaled = np.linalg.inv(info * unit[:, None] * unit)
@@ -314,7 +315,7 @@ def test_every_camera_model_of_colmap_is_differentiated(model):
     every = FreeCamera(model=problem.cameras[0].model, free=tuple(range(len(params))))
     problem, x = replace(problem, cameras=(every,)), replace(start, intrinsics=np.array(params))
     at = _residuals.project(problem, x, problem.observations)
-    by = _residuals.derivatives(problem, x, problem.observations, at)
+    by = _residuals.derivatives(problem, x, problem.observations, at, np.ones(len(at.seen)))
     for kind, values, columns in ((0, by.by_frame, range(6)), (1, by.by_shared, range(9, 9 + len(params)))):
         for column in columns:
             expected = slope(lambda y: _residuals.project(problem, y, problem.observations).residual, x, kind, column)
@@ -418,9 +419,10 @@ def test_what_a_small_step_promises_is_what_it_gives(small, share):
     by, residual = _weighted(problem, at)
     layout = Layout.of(problem.observations, len(start.velocity_m_s))
     system = solver._built(problem, layout, at, by, residual, 1e-4)
-    step = tuple(share * part for part in solver._step(system, problem.observations, by))
-    promised = solver._promised(problem, at, by, residual, step, problem.observations)
-    gained = at.cost - _evaluate(problem, at.estimate.moved(*step), problem.observations).cost
+    step = solver._step(system, problem.observations, by)
+    step = replace(step, **{field.name: share * getattr(step, field.name) for field in fields(step)})
+    promised = solver._promised(problem, at, residual, step)
+    gained = at.cost - _evaluate(problem, step.taken(at.estimate), problem.observations).cost
     assert np.sign(promised) == np.sign(share) and gained == pytest.approx(promised, rel=0.01)
 
 

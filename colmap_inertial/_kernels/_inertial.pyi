@@ -80,6 +80,50 @@ def whiten_tridiagonal(diagonal: Array, below: Array, sides: Array) -> float:
     The latter is nan where the matrix is not positive definite.
     """
 
+def place_points(
+    *,
+    pose: Int64Array,
+    point: Int64Array,
+    world_from_imu: Array,
+    imu_in_world: Array,
+    points: Array,
+    cam_from_imu: Array,
+    imu_in_cam: Array,
+    in_imu: Array,
+    in_cam: Array,
+) -> None:
+    """Write M points of (P, 3) in the body frames of their poses, of N, and in the camera's (M, 3)."""
+
+def apply_chain_rule(
+    *,
+    pose: Int64Array,
+    since_s: Array,
+    force: Array,
+    rate: Array,
+    reading: Array,
+    vector: Array,
+    turn: Array,
+    world_from_imu: Array,
+    velocity: Array,
+    cam_from_imu: Array,
+    imu_in_cam: Array,
+    in_imu: Array,
+    in_cam: Array,
+    by_cam: Array,
+    by_intrinsics: Array,
+    line: Array,
+    since_middle_s: Array,
+    weight: Array,
+    by_frame: Array,
+    by_shared: Array,
+    by_point: Array,
+) -> None:
+    """Write derivatives (M, 2, 9), (M, 2, q), (M, 2, 3) of observations, by the camera's: (M, 2, 3), (M, 2, k).
+
+    N poses as in `inertial/refine/_residuals.py`; M observations, each of a `pose`, with a weight. Where q is k + 18,
+    the last nine are by the gyroscope's gains.
+    """
+
 def reduce_points(
     *,
     first: Int64Array,

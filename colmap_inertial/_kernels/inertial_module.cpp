@@ -1,6 +1,7 @@
 #include "arrays.h"
 #include "arrow_simd.h"
 #include "dispatch.h"
+#include "observations.h"
 #include "points_simd.h"
 #include "preintegration.h"
 
@@ -184,10 +185,59 @@ double whiten_tridiagonal(Doubles<1> diagonal, Doubles<1> below, Results<2> side
     return logarithm;
 }
 
+// Numbers of places that point into an array.
+void check_places(const In<int64_t, 1> &places, size_t count, const char *message) {
+    for (size_t i = 0; i < places.shape(0); ++i) check(places(i) >= 0 && size_t(places(i)) < count, message);
+}
+
+// See the stub.
+void place_points_of(In<int64_t, 1> pose, In<int64_t, 1> point, Doubles<3> world_from_imu, Doubles<2> imu_in_world,
+                     Doubles<2> points, Doubles<2> cam_from_imu, Doubles<1> imu_in_cam, Results<2> in_imu,
+                     Results<2> in_cam) {
+    const size_t m = pose.shape(0), n = imu_in_world.shape(0), p = points.shape(0);
+    check(is(point, m) && is(in_imu, m, 3) && is(in_cam, m, 3) && is(world_from_imu, n, 3, 3) &&
+              is(imu_in_world, n, 3) && is(points, p, 3) && is(cam_from_imu, 3, 3) && is(imu_in_cam, 3),
+          "points: not of one size");
+    check_places(pose, n, "pose: not one of them");
+    check_places(point, p, "point: not one of them");
+    Poses poses{};
+    poses.world_from_imu = world_from_imu.data();
+    poses.position = imu_in_world.data();
+    nb::gil_scoped_release release;
+    place_points(poses, {cam_from_imu.data(), imu_in_cam.data()}, m, pose.data(), point.data(), points.data(),
+                 in_imu.data(), in_cam.data());
+}
+
+// See the stub.
+void apply_chain_rule_of(In<int64_t, 1> pose, Doubles<1> since_s, Doubles<2> force, Doubles<2> rate,
+                         Doubles<2> reading, Doubles<2> vector, Doubles<3> turn, Doubles<3> world_from_imu,
+                         Doubles<2> velocity, Doubles<2> cam_from_imu, Doubles<1> imu_in_cam, Doubles<2> in_imu,
+                         Doubles<2> in_cam, Doubles<3> by_cam, Doubles<3> by_intrinsics, Doubles<1> line,
+                         Doubles<1> since_middle_s, Doubles<1> weight, Results<3> by_frame, Results<3> by_shared,
+                         Results<3> by_point) {
+    const size_t m = pose.shape(0), n = since_s.shape(0), k = by_intrinsics.shape(2), q = by_shared.shape(2);
+    check(is(force, n, 3) && is(rate, n, 3) && is(reading, n, 3) && is(vector, n, 3) && is(turn, n, 3, 3) &&
+              is(world_from_imu, n, 3, 3) && is(velocity, n, 3) && is(cam_from_imu, 3, 3) && is(imu_in_cam, 3),
+          "poses: not of one size");
+    check(is(in_imu, m, 3) && is(in_cam, m, 3) && is(by_cam, m, 2, 3) && is(by_intrinsics, m, 2, k) && is(line, m) &&
+              is(since_middle_s, m) && is(weight, m) && is(by_frame, m, 2, FRAME) && is(by_shared, m, 2, q) &&
+              is(by_point, m, 2, 3) && (q == 9 + k || q == 18 + k),
+          "derivatives: not of one size");
+    check_places(pose, n, "pose: not one of them");
+    const Poses poses{since_s.data(), force.data(), rate.data(), reading.data(), vector.data(), turn.data(),
+                      world_from_imu.data(), nullptr, velocity.data()};
+    const SeenPoints seen{m, pose.data(), in_imu.data(), in_cam.data()};
+    const ByCamera by{k, by_cam.data(), by_intrinsics.data(), line.data(), since_middle_s.data(), weight.data(),
+                      q != 9 + k};
+    nb::gil_scoped_release release;
+    apply_chain_rule(poses, {cam_from_imu.data(), imu_in_cam.data()}, seen, by,
+                     {by_frame.data(), by_shared.data(), by_point.data()});
+}
+
 // Adds the normal equations of a bundle adjustment without its points; see the stub.
-bool reduce_points_of(Of<const int64_t, 1> first, Of<const int64_t, 1> place, Doubles<3> by_frame,
+bool reduce_points_of(In<int64_t, 1> first, In<int64_t, 1> place, Doubles<3> by_frame,
                       Doubles<3> by_shared, Doubles<3> by_point, Doubles<2> residual, double damping, size_t wide,
-                      size_t pitch, Of<const int64_t, 1> offset, Of<const int64_t, 1> end, Results<1> values,
+                      size_t pitch, In<int64_t, 1> offset, In<int64_t, 1> end, Results<1> values,
                       Results<2> border, Results<2> corner, Results<1> rhs, Results<1> rhs_shared, Results<3> inverse,
                       Results<2> pull, const std::string &instruction_set) {
     const size_t m = place.shape(0), n = rhs.shape(0), q = rhs_shared.shape(0), p = pull.shape(0), f = n / STATE;
@@ -201,7 +251,7 @@ bool reduce_points_of(Of<const int64_t, 1> first, Of<const int64_t, 1> place, Do
         check(first(i) <= first(i + 1), "first: must not fall");
         most = std::max(most, first(i + 1) - first(i));
     }
-    for (size_t i = 0; i < m; ++i) check(place(i) >= 0 && size_t(place(i)) < f, "place: not of a frame");
+    check_places(place, f, "place: not of a frame");
     check(is(offset, f) && is(end, f) && wide >= FRAME && wide <= STATE && pitch >= wide && pitch <= values.shape(0),
           "panels: of another size");
     // the panels' own columns alone have so many rows
@@ -247,6 +297,15 @@ NB_MODULE(_inertial, module) {
                nb::arg("rate").noconvert());
     module.def("whiten_tridiagonal", &whiten_tridiagonal, nb::arg("diagonal"), nb::arg("below"),
                nb::arg("sides").noconvert());
+    module.def("place_points", &place_points_of, nb::kw_only(), nb::arg("pose"), nb::arg("point"),
+               nb::arg("world_from_imu"), nb::arg("imu_in_world"), nb::arg("points"), nb::arg("cam_from_imu"),
+               nb::arg("imu_in_cam"), nb::arg("in_imu").noconvert(), nb::arg("in_cam").noconvert());
+    module.def("apply_chain_rule", &apply_chain_rule_of, nb::kw_only(), nb::arg("pose"), nb::arg("since_s"),
+               nb::arg("force"), nb::arg("rate"), nb::arg("reading"), nb::arg("vector"), nb::arg("turn"),
+               nb::arg("world_from_imu"), nb::arg("velocity"), nb::arg("cam_from_imu"), nb::arg("imu_in_cam"),
+               nb::arg("in_imu"), nb::arg("in_cam"), nb::arg("by_cam"), nb::arg("by_intrinsics"), nb::arg("line"),
+               nb::arg("since_middle_s"), nb::arg("weight"), nb::arg("by_frame").noconvert(),
+               nb::arg("by_shared").noconvert(), nb::arg("by_point").noconvert());
     module.def("reduce_points", &reduce_points_of, nb::kw_only(), nb::arg("first"), nb::arg("place"),
                nb::arg("by_frame"), nb::arg("by_shared"), nb::arg("by_point"), nb::arg("residual"), nb::arg("damping"),
                nb::arg("wide"), nb::arg("pitch"), nb::arg("offset"), nb::arg("end"), nb::arg("values").noconvert(),

@@ -5,10 +5,11 @@ Also the camera's position and velocity at a solution, and how they depend on wh
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from colmap_inertial._kernels import _inertial
 from colmap_inertial.core.arrays import Array, BoolArray, IndexArray, Int64Array
 from colmap_inertial.core.geometry import cross, skew, so3_exp, so3_log
 from colmap_inertial.core.gyro import GyroPath
@@ -19,14 +20,12 @@ from colmap_inertial.inertial.core.preintegration import SensorErrors, SensorStr
 from colmap_inertial.inertial.refine.values import (
     ACCEL_BIAS,
     CLOCK_RATE,
-    FIRST_INTRINSIC,
     GYRO_BIAS,
     LEVER,
     N_SEEN,
     N_STATE,
     OFFSET,
     POSITION,
-    READOUT,
     ROTATION,
     THETA,
     VELOCITY,
@@ -60,21 +59,17 @@ def turning_around(nodes_s: Array, streams: SensorStreams, half_span_s: float) -
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Poses:
-    """Pose of the IMU at the exposure of each of M lines."""
+    """Poses of the IMU at the exposure of each of N lines."""
 
-    since_s: Array  # (M,) after the frame's node
-    reading: Array  # (M, 3) rotation vector since then, by the readings
-    vector: Array  # (M, 3) the same less their errors
-    turn: Array  # (M, 3, 3) and as a matrix
-    rate: Array  # (M, 3) at that instant, body frame
-    world_from_imu: Array  # (M, 3, 3)
-    imu_in_world_m: Array  # (M, 3)
-    velocity_m_s: Array  # (M, 3)
-    force: Array  # (M, 3) body frame at the node
-
-    def of(self, index: Int64Array) -> Poses:
-        """Those of other observations, by number."""
-        return Poses(**{field.name: getattr(self, field.name)[index] for field in fields(self)})
+    since_s: Array  # (N,) after the frame's node
+    reading: Array  # (N, 3) rotation vector since then, by the readings
+    vector: Array  # (N, 3) the same less their errors
+    turn: Array  # (N, 3, 3) and as a matrix
+    rate: Array  # (N, 3) at that instant, body frame
+    world_from_imu: Array  # (N, 3, 3)
+    imu_in_world_m: Array  # (N, 3)
+    velocity_m_s: Array  # (N, 3)
+    force: Array  # (N, 3) body frame at the node
 
 
 def poses_at(problem: Problem, x: Estimate, frame: Int64Array, line: Array) -> Poses:
@@ -162,6 +157,10 @@ class Projected:
         (M, 2) predicted less measured; zero where a point cannot be seen.
     seen
         (M,) whether it can be.
+    in_imu, in_cam
+        (M, 3) the points.
+    poses, pose
+        Of the IMU: of all frames, or of each observation's line; (M,) which one it is.
     """
 
     residual: Array
@@ -169,24 +168,35 @@ class Projected:
     in_imu: Array
     in_cam: Array
     poses: Poses
+    pose: Int64Array
 
 
 def project(problem: Problem, x: Estimate, observations: Observations) -> Projected:
     """Predicted image positions of the points."""
+    count = len(observations.frame)
     if np.any(observations.line != 0):
-        poses = poses_at(problem, x, observations.frame, observations.line)
+        poses, pose = poses_at(problem, x, observations.frame, observations.line), np.arange(count)
     else:
         frames = np.arange(len(x.velocity_m_s))
-        poses = poses_at(problem, x, frames, np.zeros(len(frames))).of(observations.frame)
-    away = x.points_m[observations.point] - poses.imu_in_world_m
-    in_imu = np.einsum("nji,nj->ni", poses.world_from_imu, away)
-    in_cam = in_imu @ x.cam_from_imu.T + x.imu_in_cam_m
-    predicted = np.empty((len(away), 2))
+        poses, pose = poses_at(problem, x, frames, np.zeros(len(frames))), observations.frame
+    in_imu, in_cam = np.empty((count, 3)), np.empty((count, 3))
+    _inertial.place_points(
+        pose=pose,
+        point=observations.point,
+        world_from_imu=poses.world_from_imu,
+        imu_in_world=poses.imu_in_world_m,
+        points=x.points_m,
+        cam_from_imu=x.cam_from_imu,
+        imu_in_cam=x.imu_in_cam_m,
+        in_imu=in_imu,
+        in_cam=in_cam,
+    )
+    predicted = np.empty((count, 2))
     for model, mine in zip(cameras_of(problem, x), _group_by_camera(problem, observations), strict=True):
         predicted[mine] = colmap_camera(model).img_from_cam(in_cam[mine])
     seen: BoolArray = np.all(np.isfinite(predicted), axis=1)
     residual = np.where(seen[:, None], predicted - observations.xy_px, 0.0)
-    return Projected(residual=residual, seen=seen, in_imu=in_imu, in_cam=in_cam, poses=poses)
+    return Projected(residual=residual, seen=seen, in_imu=in_imu, in_cam=in_cam, poses=poses, pose=pose)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -198,8 +208,8 @@ class Derivatives:
     by_point: Array
 
 
-def derivatives(problem: Problem, x: Estimate, observations: Observations, at: Projected) -> Derivatives:
-    """Derivatives of :func:`project`, px.
+def derivatives(problem: Problem, x: Estimate, observations: Observations, at: Projected, weight: Array) -> Derivatives:
+    """Derivatives of :func:`project`, px, times (M,) weights.
 
     What biases and the accelerometer's gains do within a readout is left out: a thousandth of a pixel.
     """
@@ -217,33 +227,35 @@ def derivatives(problem: Problem, x: Estimate, observations: Observations, at: P
     # beside the camera, a step of the difference may see nothing
     lost = ~at.seen | ~np.isfinite(by_cam).all(axis=(1, 2)) | ~np.isfinite(by_intrinsics).all(axis=(1, 2))
     by_cam[lost], by_intrinsics[lost] = 0.0, 0.0
-    by_imu = by_cam @ x.cam_from_imu
-    by_point = np.einsum("nri,nji->nrj", by_imu, poses.world_from_imu)
-    t = poses.since_s[:, None, None]
-    by_frame = np.empty((count, 2, N_SEEN))
-    # X_imu = turn' Exp(-theta) R' (X - p): by theta turn' [R' (X - p)]x, and what turns the force
-    before = np.einsum("nij,nj->ni", poses.turn, at.in_imu) + 0.5 * poses.since_s[:, None] ** 2 * poses.force
-    by_frame[:, :, THETA] = np.einsum("nri,nji->nrj", by_imu, poses.turn) @ skew(before)
-    by_frame[:, :, POSITION] = -by_point
-    by_frame[:, :, VELOCITY] = -t * by_point
-    moving = -cross(poses.rate, at.in_imu) - np.einsum("nji,nj->ni", poses.world_from_imu, poses.velocity_m_s)
-    by_time = np.einsum("nri,ni->nr", by_imu, moving)
     rolling = bool(np.any(observations.line != 0))
-    by_shared = np.zeros((count, 2, x.columns.gyro_gain.stop if rolling else x.columns.seen.stop))
-    by_shared[:, :, ROTATION] = -by_cam @ skew(at.in_cam - x.imu_in_cam_m)
-    by_shared[:, :, LEVER] = by_cam
-    by_shared[:, :, OFFSET] = -by_time
-    by_shared[:, :, CLOCK_RATE] = -time_since_middle_s(problem, observations.frame)[:, None] * by_time
-    by_shared[:, :, READOUT] = observations.line[:, None] * by_time
-    by_shared[:, :, FIRST_INTRINSIC : x.columns.seen.stop] = by_intrinsics
-    if rolling:
-        # Jr, to the second order of an angle of a few degrees
-        turned = skew(poses.vector)
-        right = np.eye(3) - 0.5 * turned + turned @ turned / 6
-        by_vector = by_imu @ (skew(at.in_imu) @ right)
-        by_gain = by_vector[:, :, :, None] * poses.reading[:, None, None, :]
-        by_shared[:, :, x.columns.gyro_gain] = by_gain.reshape(count, 2, 9)
-    return Derivatives(by_frame=by_frame, by_shared=by_shared, by_point=by_point)
+    seen = x.columns.gyro_gain.stop if rolling else x.columns.seen.stop
+    by = Derivatives(
+        by_frame=np.empty((count, 2, N_SEEN)), by_shared=np.empty((count, 2, seen)), by_point=np.empty((count, 2, 3))
+    )
+    _inertial.apply_chain_rule(
+        pose=at.pose,
+        since_s=poses.since_s,
+        force=poses.force,
+        rate=poses.rate,
+        reading=poses.reading,
+        vector=poses.vector,
+        turn=poses.turn,
+        world_from_imu=poses.world_from_imu,
+        velocity=poses.velocity_m_s,
+        cam_from_imu=x.cam_from_imu,
+        imu_in_cam=x.imu_in_cam_m,
+        in_imu=at.in_imu,
+        in_cam=at.in_cam,
+        by_cam=by_cam,
+        by_intrinsics=by_intrinsics,
+        line=observations.line,
+        since_middle_s=time_since_middle_s(problem, observations.frame),
+        weight=weight,
+        by_frame=by.by_frame,
+        by_shared=by.by_shared,
+        by_point=by.by_point,
+    )
+    return by
 
 
 def _differentiate_by_direction(model: CameraModel, in_cam: Array) -> Array:

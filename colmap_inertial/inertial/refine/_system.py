@@ -11,7 +11,7 @@ from colmap_inertial._kernels import _inertial
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.inertial.refine._panels import Layout, PanelFactor
 from colmap_inertial.inertial.refine._residuals import Derivatives, Moving, Rows
-from colmap_inertial.inertial.refine.values import N_SEEN, N_STATE, Observations
+from colmap_inertial.inertial.refine.values import N_SEEN, N_STATE, Estimate, Observations
 
 
 @dataclass(eq=False, kw_only=True)
@@ -145,6 +145,28 @@ class System:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class Step:
+    """A step of the unknowns.
+
+    Attributes
+    ----------
+    states, shared, points
+        (F, 15), (Q,), (P, 3).
+    change
+        (M, 2) by which the weighted residuals of observations change, if they were linear.
+    """
+
+    states: Array
+    shared: Array
+    points: Array
+    change: Array
+
+    def taken(self, x: Estimate, length: float = 1.0) -> Estimate:
+        """The estimate after so many times the step."""
+        return x.moved(length * self.states, length * self.shared, length * self.points)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Factored:
     """A system that was factored; its matrix was used up.
 
@@ -169,18 +191,20 @@ class Factored:
         shared = np.asarray(cho_solve(self.corner, rhs_shared - self.solved.T @ rhs, check_finite=False))
         return self.states.solve(rhs) - self.solved @ shared, shared
 
-    def step(self, system: System, observations: Observations, by: Derivatives) -> tuple[Array, Array, Array]:
-        """The step of the states (F, 15), of what is shared (Q,), and of the points (P, 3)."""
+    def step(self, system: System, observations: Observations, by: Derivatives) -> Step:
+        """The step of all unknowns."""
         from scipy.linalg import cho_solve
 
         shared = np.asarray(
             cho_solve(self.corner, system.rhs_shared - system.border.T @ self.pulled, check_finite=False)
         )
-        moved = (self.pulled - self.solved @ shared).reshape(-1, N_STATE)[self.layout.place]
-        along = np.einsum("nri,ni->nr", by.by_frame, moved[observations.frame, :N_SEEN])
-        along += by.by_shared @ shared[: by.by_shared.shape[2]]
-        pulled = np.add.reduceat(np.einsum("nri,nr->ni", by.by_point, along), observations.first[:-1], axis=0)
-        return moved, shared, np.einsum("pij,pj->pi", system.inverse, system.pull - pulled)
+        states = (self.pulled - self.solved @ shared).reshape(-1, N_STATE)[self.layout.place]
+        change = np.einsum("nri,ni->nr", by.by_frame, states[observations.frame, :N_SEEN])
+        change += by.by_shared @ shared[: by.by_shared.shape[2]]
+        pulled = np.add.reduceat(np.einsum("nri,nr->ni", by.by_point, change), observations.first[:-1], axis=0)
+        points = np.einsum("pij,pj->pi", system.inverse, system.pull - pulled)
+        change += np.einsum("nri,ni->nr", by.by_point, points[observations.point])
+        return Step(states=states, shared=shared, points=points, change=change)
 
     def cov_of(self, by_state: Array, by_shared: Array) -> tuple[Array, Array, Array]:
         """Covariance of k numbers with derivatives (k, F, 15) by the states and (k, Q) by what is shared.

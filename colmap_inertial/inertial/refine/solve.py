@@ -18,7 +18,7 @@ from colmap_inertial.inertial.refine._residuals import (
     prior_offset,
     project,
 )
-from colmap_inertial.inertial.refine._system import Factored, System
+from colmap_inertial.inertial.refine._system import Factored, Step, System
 from colmap_inertial.inertial.refine.values import N_STATE, Estimate, Observations, Problem
 
 _MAX_STEPS = 40
@@ -29,6 +29,9 @@ _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e8
 _LARGEST_CHANGE = 0.5
 #: With more damping, every step promises little: what seems to rest then is pushed once more with less.
 _REST_DAMPING = 1e-3
+#: The robust weights overstate the curvature of the loss, and steps are too short: they are stretched by up to so much.
+#: (With the loss's own second derivatives, as Triggs corrects for them, 6 and 8 steps became 11 to 19.)
+_LONGEST_STRETCH = 2.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -84,23 +87,15 @@ def _evaluate(problem: Problem, x: Estimate, observations: Observations) -> _Poi
     return _Point(estimate=x, projected=projected, rows=rows, offset=offset, cost=cost)
 
 
-def _weighted(problem: Problem, at: _Point) -> tuple[Derivatives, Array]:
-    """Derivatives and residuals over their standard deviations, times the roots of their robust weights."""
+def _weighted(problem: Problem, at: _Point, informs: float = 1.0) -> tuple[Derivatives, Array]:
+    """Derivatives and residuals over their standard deviations, times the roots of their robust weights.
+
+    With ``informs``, derivatives tell as much more; what residuals pull with stays.
+    """
     squares = np.sum(at.projected.residual**2, axis=1)
     root = 1 / (problem.sigma_px * np.sqrt(1 + squares / problem.robust_px**2))
-    by = derivatives(problem, at.estimate, problem.observations, at.projected)
-    for values in (by.by_frame, by.by_shared, by.by_point):
-        values *= root[:, None, None]
-    return by, at.projected.residual * root[:, None]
-
-
-def _informing(problem: Problem, at: _Point) -> tuple[Derivatives, Array]:
-    """The same as much as observations tell; what they pull with stays."""
-    by, residual = _weighted(problem, at)
-    root = problem.informs**0.5
-    for values in (by.by_frame, by.by_shared, by.by_point):
-        values *= root
-    return by, residual / root
+    by = derivatives(problem, at.estimate, problem.observations, at.projected, root * informs**0.5)
+    return by, at.projected.residual * (root / informs**0.5)[:, None]
 
 
 def _built(problem: Problem, layout: Layout, at: _Point, by: Derivatives, residual: Array, damping: float) -> System:
@@ -113,7 +108,7 @@ def solve(problem: Problem, start: Estimate) -> Solution:
     observations = problem.observations
     layout = Layout.of(observations, len(start.velocity_m_s))
     at, damping, growth = _evaluate(problem, start, observations), _FIRST_DAMPING, 2.0
-    converged, steps = False, 0
+    converged, steps, stretch = False, 0, 1.0
     for steps in range(1, _MAX_STEPS + 1):
         by, residual = _weighted(problem, at)
         gained = pushed = False
@@ -123,23 +118,29 @@ def solve(problem: Problem, start: Estimate) -> Solution:
             if step is None:
                 damping, growth = damping * growth, 2 * growth
                 continue
-            moved = at.estimate.moved(*step)
-            if not _plausible(start, moved):
+            if not _plausible(start, step.taken(at.estimate, stretch)):
                 damping, growth = damping * growth, 2 * growth
                 continue
-            promised = _promised(problem, at, by, residual, step, observations)
+            promised = _promised(problem, at, residual, step)
             if promised < _SETTLED:
                 if damping <= _REST_DAMPING or pushed:
                     return _solution(at, steps, converged=damping <= _REST_DAMPING)
                 damping, growth, pushed = _REST_DAMPING, 2.0, True
                 continue
-            tried = _evaluate(problem, moved, observations)
-            ratio = (at.cost - tried.cost) / promised
-            gained = ratio > 1e-4
+            for length in (stretch, 1.0) if stretch > 1 else (1.0,):
+                tried = _evaluate(problem, step.taken(at.estimate, length), observations)
+                ratio = (at.cost - tried.cost) / promised
+                gained = ratio > 1e-4
+                if gained:
+                    break
+            stretch = 1.0
             if gained:
                 at = tried
                 damping = max(damping * max(0.1, 1 - (2 * ratio - 1) ** 3), _LEAST_DAMPING)
                 growth = 2.0
+                # of the curvature by the weights, the share that this step met
+                share = (2 * length - ratio) / length**2
+                stretch = 1 / min(max(share, 1 / _LONGEST_STRETCH), 1.0)
             else:
                 damping, growth = damping * growth, 2 * growth
         if not gained:
@@ -147,13 +148,13 @@ def solve(problem: Problem, start: Estimate) -> Solution:
     return _solution(at, steps, converged=converged)
 
 
-def _step(system: System, observations: Observations, by: Derivatives) -> tuple[Array, Array, Array] | None:
+def _step(system: System, observations: Observations, by: Derivatives) -> Step | None:
     """Step of the system; ``None`` where it needs more damping to be solved."""
     try:
         step = system.factored().step(system, observations, by)
     except np.linalg.LinAlgError:
         return None
-    return step if all(np.isfinite(part).all() for part in step) else None
+    return step if all(np.isfinite(part).all() for part in (step.states, step.shared, step.points)) else None
 
 
 def _plausible(start: Estimate, moved: Estimate) -> bool:
@@ -162,30 +163,19 @@ def _plausible(start: Estimate, moved: Estimate) -> bool:
     return bool(np.all(away <= _LARGEST_CHANGE * np.maximum(np.abs(start.intrinsics), 1.0)))
 
 
-def _promised(
-    problem: Problem,
-    at: _Point,
-    by: Derivatives,
-    residual: Array,
-    step: tuple[Array, Array, Array],
-    observations: Observations,
-) -> float:
+def _promised(problem: Problem, at: _Point, residual: Array, step: Step) -> float:
     """Decrease of the cost by a step, if all were linear."""
-    states, shared, points = step
-    change = np.einsum("nri,ni->nr", by.by_frame, states[observations.frame, : by.by_frame.shape[2]])
-    change += by.by_shared @ shared[: by.by_shared.shape[2]]
-    change += np.einsum("nri,ni->nr", by.by_point, points[observations.point])
-    total = -float(np.sum(change * residual)) - 0.5 * float(np.sum(change**2))
+    total = -float(np.sum(step.change * residual)) - 0.5 * float(np.sum(step.change**2))
     for block in at.rows.values():
         count = len(block.residual)
-        moved = np.einsum("nri,ni->nr", block.here, states[:count])
+        moved = np.einsum("nri,ni->nr", block.here, step.states[:count])
         if block.after is not None:
-            moved += np.einsum("nri,ni->nr", block.after, states[1:])
+            moved += np.einsum("nri,ni->nr", block.after, step.states[1:])
         if block.by_shared is not None:
-            moved += block.by_shared @ shared
+            moved += block.by_shared @ step.shared
         total -= float(np.sum(moved * block.residual)) + 0.5 * float(np.sum(moved**2))
     info = problem.prior.info
-    return total - float(shared @ info @ (at.offset + 0.5 * shared))
+    return total - float(step.shared @ info @ (at.offset + 0.5 * step.shared))
 
 
 def _solution(at: _Point, steps: int, *, converged: bool) -> Solution:
@@ -197,7 +187,7 @@ def factored(problem: Problem, x: Estimate) -> Factored:
     """The information at an estimate, for covariances."""
     layout = Layout.of(problem.observations, len(x.velocity_m_s))
     at = _evaluate(problem, x, problem.observations)
-    return _built(problem, layout, at, *_informing(problem, at), 0.0).factored()
+    return _built(problem, layout, at, *_weighted(problem, at, problem.informs), 0.0).factored()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -222,14 +212,14 @@ class Linearised:
         )
         system = _built(problem, self.layout, at, self.by, self.residual, 0.0)
         solved = system.factored()
-        states, shared, _ = solved.step(system, observations, self.by)
-        return solved, states, shared
+        step = solved.step(system, observations, self.by)
+        return solved, step.states, step.shared
 
 
 def linearised(problem: Problem, x: Estimate) -> Linearised:
     """The observations at an estimate."""
     at = _evaluate(problem, x, problem.observations)
-    by, residual = _informing(problem, at)
+    by, residual = _weighted(problem, at, problem.informs)
     layout = Layout.of(problem.observations, len(x.velocity_m_s))
     return Linearised(layout=layout, projected=at.projected, by=by, residual=residual, estimate=x)
 
