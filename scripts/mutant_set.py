@@ -1818,8 +1818,8 @@ MUTANTS = (
     ),
     Mutant(
         "inertial/refine/_residuals.py",
-        "by_shared[:, :, OFFSET] = -by_time\n    by_shared[:, :, CLOCK_RATE] = -time_since_middle_s(problem",
-        "by_shared[:, :, OFFSET] = by_time\n    by_shared[:, :, CLOCK_RATE] = -time_since_middle_s(problem",
+        "by_shared[:, :, OFFSET] = -by_time\n        by_shared[:, :, CLOCK_RATE] = -time_since_middle_s(problem",
+        "by_shared[:, :, OFFSET] = by_time\n        by_shared[:, :, CLOCK_RATE] = -time_since_middle_s(problem",
         "sign of the time offset in the camera's motion",
         ("refine::test_derivatives_of_the_camera_s_motion_are_those_of_finite_differences",),
     ),

@@ -197,7 +197,7 @@ def measure_rotation(
     for frame in frames:
         height, width = frame.image.shape[:2]
         shutter = FrameShutter.of(timing, index[frame.name], width=width, height=height)
-        now = (reduced(frame.image, options), shutter)
+        now = (reduced(frame.image, options.long_side_px), shutter)
         if before is not None:
             pairs.append(_estimate_pair_rotation(before, now, camera, options))
         names.append(frame.name)
@@ -347,9 +347,9 @@ def _measure_quick_rotation(rate: Array, width: int) -> float:
     return float(np.sqrt(np.mean(np.sort(quick**2)[: max(1, int(0.98 * len(quick)))])))
 
 
-def reduced(image: UInt8Array | UInt16Array, options: FlowOptions) -> UInt8Array:
+def reduced(image: UInt8Array | UInt16Array, long_side_px: int) -> UInt8Array:
     """The picture in which corners are tracked: (H, W), 8 bit."""
-    grey = reduce_image(convert_to_grey(image), options.long_side_px)
+    grey = reduce_image(convert_to_grey(image), long_side_px)
     return np.asarray(grey if grey.dtype == np.uint8 else grey >> 8, dtype=np.uint8)
 
 

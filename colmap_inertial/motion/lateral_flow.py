@@ -76,7 +76,7 @@ def follow_pairs(
     for frame in frames:
         height, width = frame.image.shape[:2]
         shutter = FrameShutter.of(timing, index[frame.name], width=width, height=height)
-        now = reduced(frame.image, options)
+        now = reduced(frame.image, options.long_side_px)
         if before is not None and before[0] in firsts and index[frame.name] == index[before[0]] + 1:
             followed = next(follow_points(before[1], now, shutter, options), None)
             if followed is not None:

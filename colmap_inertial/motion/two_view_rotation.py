@@ -17,13 +17,16 @@ from colmap_inertial.core.arrays import Array, Float32Array
 from colmap_inertial.core.geometry import so3_log
 from colmap_inertial.core.types import Frame, FrameTiming, Projector
 from colmap_inertial.imaging.rolling_shutter import append_unit_depth
-from colmap_inertial.motion.flow import FlowOptions, VisualRotation, reduced
+from colmap_inertial.motion.flow import VisualRotation, reduced
 
 
 @dataclass(frozen=True, kw_only=True)
 class TwoViewLimits:
     """Limits for the rotation between two views."""
 
+    #: Pictures are reduced to this long side (the 45 of the desk: 6.2 CPU-s, 10.8 at 640 px; rotations differ by .07
+    #: degrees).
+    long_side_px: int = 400
     #: Features of a picture.
     features: int = 1000
     #: Matches of two pictures that must agree.
@@ -53,7 +56,11 @@ class _Features:
 
 
 def measure_two_view_rotations(
-    frames: Iterable[Frame], camera: Projector, timing: FrameTiming, options: FlowOptions | None = None
+    frames: Iterable[Frame],
+    camera: Projector,
+    timing: FrameTiming,
+    *,
+    long_side_px: int = _LIMITS.long_side_px,
 ) -> VisualRotation:
     """Rotations of the camera between pictures that follow each other.
 
@@ -65,21 +72,20 @@ def measure_two_view_rotations(
         Intrinsics with distortion; a guess of the focal length serves to tell whether a gyroscope belongs to them.
     timing
         Holds every frame.
-    options
+    long_side_px
         Size to which pictures are reduced.
 
     Returns
     -------
     As of ``flow.measure_rotation``, NaN where no triangle of pictures closes.
     """
-    options = options or FlowOptions()
     index = {name: i for i, name in enumerate(timing.names)}
     names: list[str] = []
     seen: list[_Features] = []
     next_one: list[tuple[Array, int] | None] = []
     after_next: list[tuple[Array, int] | None] = []
     for frame in frames:
-        seen.append(_detect_features(frame, camera, options))
+        seen.append(_detect_features(frame, camera, long_side_px))
         names.append(frame.name)
         if len(seen) > 1:
             next_one.append(_estimate_rotation(seen[-2], seen[-1]))
@@ -107,10 +113,10 @@ def measure_two_view_rotations(
     )
 
 
-def _detect_features(frame: Frame, camera: Projector, options: FlowOptions) -> _Features:
+def _detect_features(frame: Frame, camera: Projector, long_side_px: int) -> _Features:
     import cv2
 
-    grey = reduced(frame.image, options)
+    grey = reduced(frame.image, long_side_px)
     points, descriptors = cv2.SIFT.create(_LIMITS.features).detectAndCompute(grey, None)
     to_full = np.array([frame.image.shape[1] / grey.shape[1], frame.image.shape[0] / grey.shape[0]])
     centre = np.array([[frame.image.shape[1] / 2, frame.image.shape[0] / 2]])
