@@ -43,7 +43,7 @@ from real_world import World, film, worlds
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import CameraTrajectory, FrameTiming
-from colmap_inertial.inertial.refine.judge import LIMITS
+from colmap_inertial.inertial.refine.shutter import SHUTTER_LIMITS
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.files import read_json
 from colmap_inertial.io.trajectories import read_inertial_scale
@@ -175,7 +175,7 @@ def filmed_window(asked: argparse.Namespace, world: World) -> dict[str, Any]:
 def _readout(values: dict[str, Any], true_s: float, *, declared: bool) -> dict[str, Any]:
     """Whether a readout was found, its error over its standard deviation, and whether the interval has the true one."""
     found_s = float(values.get("readout_s", 0.0))
-    changed = abs(found_s) >= LIMITS.least_readout_s
+    changed = abs(found_s) >= SHUTTER_LIMITS.least_s
     if not changed:
         return {"changed": False, "z": None, "inside": true_s == 0 and not declared}
     z = (found_s - true_s) / float(values["readout_sigma_s"])

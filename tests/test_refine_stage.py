@@ -14,7 +14,7 @@ from refine_walk import problem_of, tracks_of, walk
 
 from colmap_inertial import read_model, reconstruct_project
 from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, so3_log
-from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
+from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, ScaleOptions
 from colmap_inertial.core.types import CameraMotion, Similarity
 from colmap_inertial.inertial.core.priors import PRIORS, model_scale_sigma
 from colmap_inertial.inertial.refine import judge, motion
@@ -38,6 +38,7 @@ from colmap_inertial.pipeline.stages.refine import RefineStage, axes_by
 from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage
 from colmap_inertial.reconstruction.drivers import frames
 from colmap_inertial.reconstruction.drivers.frames import stages_of_refined
+from colmap_inertial.reconstruction.drivers.sources import ScaleSource, scale_source
 from colmap_inertial.tools.simulate.tracks import TrackOptions
 
 UNKNOWN = calibration_prior()
@@ -303,8 +304,15 @@ def test_a_readout_is_refined_with_where_images_keep_their_rolling_shutter(rolle
     start = Model(reconstruction=adjusted(tracks.reconstruction()), colmap_index=0, timing=timing)
     calibration = known if declared else UNKNOWN
     model = MetricStage(imu=tracks.imu, calibration=calibration)(start)
+    # without the refinement, nothing rests on a model that is bent
+    doubt = model.treatments[-1]
+    assert (doubt.stage, doubt.values["direction"]) == ("shutter", "down")
+    assert abs(doubt.values["readout_s"] - 0.025) < 3 * doubt.values["sigma_s"] < 0.006
+    assert model.scale.verdict == "weak" and doubt.reason in model.scale.reasons
+    assert model.similarity.cov[0, 0] == pytest.approx(sum(part**2 for part in model.scale.parts.values()))
     made, said = refined_by(tracks.imu, model, calibration=calibration)
-    assert said.action == "refined"
+    assert said.action == "refined" and doubt.reason not in made.scale.reasons
+    assert "rolling_shutter" not in made.scale.parts
     assert said.values["readout_s"] == pytest.approx(0.025, rel=0.03)
     assert "images and keypoints keep their rolling shutter of 2" in said.reason
     assert made.motion.readout_s == said.values["readout_s"]
@@ -316,6 +324,27 @@ def test_a_readout_is_refined_with_where_images_keep_their_rolling_shutter(rolle
             for one in (start.reconstruction, made.reconstruction)
         )
         assert np.array_equal(before, after)
+
+
+def test_lines_that_run_otherwise_than_assumed_stay_a_doubt(rolled):
+    """The refinement takes them to run as declared, and finds no such readout."""
+    tracks, _, _, _ = rolled
+    timing = replace(tracks.timing, readout_s=None, readout_direction="right")
+    start = Model(reconstruction=adjusted(tracks.reconstruction()), colmap_index=0, timing=timing)
+    model = MetricStage(imu=tracks.imu, calibration=UNKNOWN)(start)
+    made, _ = refined_by(tracks.imu, model)
+    assert model.treatments[-1].values["direction"] == "down"
+    assert made.scale.verdict == "weak" and model.treatments[-1].reason in made.scale.reasons
+
+
+def test_a_global_shutter_that_nobody_declared_costs_no_trust(walked):
+    tracks, model = walked
+    assert tracks.timing.readout_s is None and model.scale.verdict == "trusted" and model.treatments == ()
+    assert 0 < model.scale.parts["rolling_shutter"] < 1e-3
+    # a declared one is not looked for
+    start = Model(reconstruction=model.reconstruction, colmap_index=0, timing=replace(tracks.timing, readout_s=0.0))
+    judged = MetricStage(imu=tracks.imu, calibration=UNKNOWN).judge_shutter(start, model.scale)
+    assert judged.scale is model.scale
 
 
 def test_auto_refines_where_drift_exceeds_what_is_left(walked, monkeypatch):
@@ -646,6 +675,8 @@ def test_an_existing_project_is_refined(walked, tmp_path):
         stamps = np.rint((t_s + 1000) * 1e9).astype(np.int64)
         lines = [f"{t} {x:.8f} {y:.8f} {z:.8f}" for t, (x, y, z) in zip(stamps.tolist(), values, strict=True)]
         (imu / name).write_text("\n".join(lines) + "\n")
+    alone = scale_source(ScaleSource(source=project / "sparse" / "0", imu=imu, frame_times=times), ScaleOptions())
+    assert alone.verdict == "trusted" and 0 < alone.parts["rolling_shutter"] < 1e-3
     source = ProjectOptions(imu=imu, frame_times=times)
     result = reconstruct_project(project, tmp_path / "out", source, ReconstructOptions(refine="inertial"))
     said = json.loads((tmp_path / "out" / "result.json").read_text())["models"][0]["treatments"][-1]

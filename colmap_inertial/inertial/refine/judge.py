@@ -15,6 +15,7 @@ from colmap_inertial.inertial.refine._system import Factored
 from colmap_inertial.inertial.refine.motion import find_motion_covs
 from colmap_inertial.inertial.refine.pictures import apply_noise, measure_picture_noise, pictures_alone
 from colmap_inertial.inertial.refine.setup import NO_READOUT_S, move_to_middle_lines
+from colmap_inertial.inertial.refine.shutter import SHUTTER_LIMITS
 from colmap_inertial.inertial.refine.solve import Solution, apply_measured_noise, evaluate_held_out, factored, solve
 from colmap_inertial.inertial.refine.values import READOUT, Estimate, Observations, Problem
 from colmap_inertial.inertial.refine.world import (
@@ -33,14 +34,8 @@ class RefineLimits:
     #: Every so many observations of points with at least so many is held out.
     every: int = 10
     fewest: int = 4
-    #: A readout that was not declared is one where it is longer, so many standard deviations long, and predicts
-    #: observations that were held out better by so many.
-    least_readout_s: float = 1e-3
-    sure_sigma: float = 3.0
+    #: A readout that was not declared predicts observations that were held out better by so many standard deviations.
     better_sigma: float = 2.0
-    #: COLMAP leaves out observations that its global shutter misses by 4 px, and keeps those whose noise brings them
-    #: nearer: found readouts are 2 to 10 % short, 5 % rms, and right with all observations (``study_refine_real.py``).
-    cut_share: float = 0.05
     #: Frames whose covariance is told.
     most_covs: int = 400
     #: Length of a part of the path whose drift is told.
@@ -218,7 +213,7 @@ def _solve_all(judged: Judged, problem: Problem, x: Estimate, t_s: Array) -> Jud
     assert problem.inertial is not None
     final, cov = whole.estimate, solved.shared_cov()
     if judged.readout is not None:
-        cov[READOUT, READOUT] += (LIMITS.cut_share * final.readout_s) ** 2
+        cov[READOUT, READOUT] += (SHUTTER_LIMITS.cut_share * final.readout_s) ** 2
     by = moving(problem, final)
     # where the IMU says nothing, the covariance of a velocity is a prior's
     moved = problem.inertial.touched
@@ -287,14 +282,14 @@ def _test_readout(
     )
     without = solve(_part(still, kept), replace(seen.estimate, readout_s=0.0))
     readout = _readout(_part(problem, kept), seen.estimate)
-    if readout is None or abs(readout[0]) < max(LIMITS.least_readout_s, LIMITS.sure_sigma * readout[1]):
+    if readout is None or abs(readout[0]) < max(SHUTTER_LIMITS.least_s, SHUTTER_LIMITS.sure_sigma * readout[1]):
         return None, still, without
     better = evaluate_held_out(still, without.estimate, still.observations.select(~kept)) - evaluate_held_out(
         problem, seen.estimate, observations.select(~kept)
     )
     if len(better) < 2 or better.mean() < LIMITS.better_sigma * better.std(ddof=1) / len(better) ** 0.5:
         return None, still, without
-    return (readout[0], float(np.hypot(readout[1], LIMITS.cut_share * readout[0]))), problem, seen
+    return (readout[0], float(np.hypot(readout[1], SHUTTER_LIMITS.cut_share * readout[0]))), problem, seen
 
 
 def _doubt(alone: Solution, seen: Solution, chi2: float, change: float, spread: float) -> str:

@@ -177,8 +177,10 @@ class Worth:
         return f"expected to err by {1e3 * self.alone_m:.2g} mm by images alone, and by {1e3 * self.refined_m:.2g} mm"
 
 
-def expect_worth(seen: Seen, problem: Problem, start: Estimate) -> Worth:
+def expect_worth(seen: Seen, problem: Problem, start: Estimate, *, bent: bool = False) -> Worth:
     """Whether a refinement is expected to bring a path closer to the truth, surely enough and in little time.
+
+    A model that is ``bent`` by more than its noise, as by a rolling shutter that it ignores, is worth any risk.
 
     Times are predicted from counts, so that the same model always has the same answer, also where nobody knows how long
     its mapping took. The error of the refined path is part of that of pictures alone; what it removes is independent.
@@ -201,14 +203,14 @@ def expect_worth(seen: Seen, problem: Problem, start: Estimate) -> Worth:
     pictures = apply_noise(pictures, measure_picture_noise(pictures, x))
     alone, size_m = _shape_cov(seen, factored(pictures, x), moving(pictures, x))
     worth = Worth(alone_m=_sigma(alone), share=share)
-    if worth.alone_m < _LIMITS.least_drift * size_m:
+    if worth.alone_m < _LIMITS.least_drift * size_m and not bent:
         held = f"{1e3 * worth.alone_m:.2g} mm, {100 * worth.alone_m / size_m:.2g} % of its size"
         return replace(worth, reason=f"images hold its shape by themselves: it is expected to err by {held}")
     noise = measure_picture_noise(pictures_alone(problem, seen.observations.xy_px), start)
     problem = apply_noise(problem, noise)
     refined, _ = _shape_cov(seen, factored(problem, start), moving(problem, start))
     worth = replace(worth, refined_m=_sigma(refined), risk=_risk(alone, refined))
-    if worth.risk <= _LIMITS.most_risk:
+    if worth.risk <= _LIMITS.most_risk or bent:
         return worth
     why = f"it is {worth.describe()} with the IMU, but {100 * worth.risk:.0f} % of such paths come out farther off"
     return replace(worth, reason=why)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.arrays import Array, BoolArray
 from colmap_inertial.inertial.refine._residuals import project
 from colmap_inertial.inertial.refine.setup import Seen, free_cameras, intrinsics_of
 from colmap_inertial.inertial.refine.values import FIRST_INTRINSIC, Estimate, Prior, Problem
@@ -72,7 +72,12 @@ def remove_extremes(seen: Seen) -> Seen:
     depth = np.einsum("ni,ni->n", seen.cam_from_world[observed.frame, 2], away)
     extent = float(np.linalg.norm(np.ptp(seen.cam_in_world, axis=0)))
     wrong = (depth < extent / _EXTREME) | (depth > extent * _EXTREME)
-    kept = np.bincount(observed.point, wrong, minlength=len(seen.points)) == 0
+    return select_points(seen, np.bincount(observed.point, wrong, minlength=len(seen.points)) == 0)
+
+
+def select_points(seen: Seen, kept: BoolArray) -> Seen:
+    """A model of some of its points."""
+    observed = seen.observations
     mine = kept[observed.point]
     observations = replace(observed.select(mine), point=np.cumsum(kept)[observed.point[mine]] - 1)
     return replace(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -86,11 +86,13 @@ class Seen:
     camera_of: Int64Array
 
 
-def read_seen(reconstruction: pycolmap.Reconstruction, timing: FrameTiming) -> Seen:
-    """Read a model into arrays; its observations are at the middle line."""
+def read_seen(
+    reconstruction: pycolmap.Reconstruction, timing: FrameTiming, image_ids: Collection[int] | None = None
+) -> Seen:
+    """Read a model, or some of its images, into arrays; its observations are at the middle line."""
     t_of = dict(zip(timing.names, timing.pose_t_s().tolist(), strict=True))
-    images = [reconstruction.image(i) for i in reconstruction.reg_image_ids()]
-    images.sort(key=lambda image: (t_of.get(image.name, np.inf), image.name))
+    image_ids = reconstruction.reg_image_ids() if image_ids is None else image_ids
+    images = sorted(map(reconstruction.image, image_ids), key=lambda image: (t_of.get(image.name, np.inf), image.name))
     number = {image.image_id: i for i, image in enumerate(images)}
     keypoints = [np.array([p.xy for p in image.points2D]).reshape(-1, 2) for image in images]
     tracks = _read_tracks(reconstruction, number)

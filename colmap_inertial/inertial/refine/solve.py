@@ -103,13 +103,13 @@ def _built(problem: Problem, layout: Layout, at: _Point, by: Derivatives, residu
     return System.build(layout, problem.observations, by, residual, at.rows, (info, -info @ at.offset), damping=damping)
 
 
-def solve(problem: Problem, start: Estimate) -> Solution:
+def solve(problem: Problem, start: Estimate, *, most_steps: int = _MAX_STEPS) -> Solution:
     """Refine an estimate."""
     observations = problem.observations
     layout = Layout.of(observations, len(start.velocity_m_s))
     at, damping, growth = _evaluate(problem, start, observations), _FIRST_DAMPING, 2.0
     converged, steps, stretch = False, 0, 1.0
-    for steps in range(1, _MAX_STEPS + 1):
+    for steps in range(1, most_steps + 1):
         by, residual = _weighted(problem, at)
         gained = pushed = False
         while not gained and damping < _MOST_DAMPING:
@@ -183,11 +183,11 @@ def _solution(at: _Point, steps: int, *, converged: bool) -> Solution:
     return Solution(estimate=at.estimate, cost=at.cost, squares=squares, steps=steps, converged=converged)
 
 
-def factored(problem: Problem, x: Estimate) -> Factored:
+def factored(problem: Problem, x: Estimate, *, damping: float = 0.0) -> Factored:
     """The information at an estimate, for covariances."""
     layout = Layout.of(problem.observations, len(x.velocity_m_s))
     at = _evaluate(problem, x, problem.observations)
-    return _built(problem, layout, at, *_weighted(problem, at, problem.informs), 0.0).factored()
+    return _built(problem, layout, at, *_weighted(problem, at, problem.informs), damping).factored()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

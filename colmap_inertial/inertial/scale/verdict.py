@@ -173,6 +173,10 @@ CAUSES: dict[str, Cause] = {
     "model_shape": Cause(
         words="what was undone of the model's wrong shape", advice="close loops, and film what overlaps more"
     ),
+    "rolling_shutter": Cause(
+        words="a rolling shutter that the model ignores",
+        advice="declare readout_s before mapping, or refine it (--refine inertial)",
+    ),
     "noise_levels": Cause(words="how little the clip says of its own noise", advice="record longer"),
 }
 

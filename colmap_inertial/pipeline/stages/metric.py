@@ -13,8 +13,10 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.camera_clock import CameraTimedImu
+from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import quat_rotate, so3_log
 from colmap_inertial.core.options import ScaleOptions, WorldAxes
+from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import (
     CAL,
     CameraImuCalibration,
@@ -29,9 +31,10 @@ from colmap_inertial.core.types import (
 )
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.inertial.refine.motion import PictureDrift, find_drift
-from colmap_inertial.inertial.refine.setup import Seen, read_seen
-from colmap_inertial.inertial.scale import estimate_scale
-from colmap_inertial.io.calibration import SIGMAS
+from colmap_inertial.inertial.refine.setup import Known, Seen, read_seen
+from colmap_inertial.inertial.refine.shutter import SHUTTER_LIMITS, SeenReadout, find_readout
+from colmap_inertial.inertial.scale import estimate_scale, strength_of_gravity
+from colmap_inertial.io.calibration import SIGMAS, calibration_prior
 from colmap_inertial.io.files import write_record
 from colmap_inertial.io.trajectories import write_tum
 from colmap_inertial.model import Model, downgraded, trajectory_from_model
@@ -111,6 +114,23 @@ class InertialStage:
         if model.rectified and self.calibration is not None:
             return calibration_of_rectified(self.calibration)
         return self.calibration
+
+    def known_of(self, model: Model, *, refine_intrinsics: bool) -> Known:
+        """What a refinement of a metric model starts from."""
+        estimate, gravity = model.scale, gravity_in_model(model)
+        assert estimate is not None and estimate.calibration is not None and estimate.noise is not None
+        assert estimate.accel_bias_m_s2 is not None and gravity is not None
+        strength, sigma = strength_of_gravity(self.options)
+        return Known(
+            calibration=estimate.calibration,
+            prior=calibration_prior() if self.calibration is None else self.calibration,
+            noise=estimate.noise,
+            accel_bias_m_s2=estimate.accel_bias_m_s2,
+            down=gravity / np.linalg.norm(gravity),
+            gravity_m_s2=strength,
+            gravity_sigma_m_s2=sigma,
+            refine_intrinsics=refine_intrinsics,
+        )
 
     def estimate_scale(self, model: Model) -> tuple[Model, ScaleEstimate, CameraTrajectory]:
         """The model without cameras that contradict the gyroscope, its scale, and the poses that this rests on.
@@ -198,8 +218,56 @@ class MetricStage(InertialStage):
         estimate = downgraded(estimate, model.doubts)
         if estimate.verdict == "refused":
             return model.scaled(estimate, None)
+        return self.judge_shutter(model, estimate)
+
+    def judge_shutter(self, model: Model, estimate: ScaleEstimate) -> Model:
+        """A model in metres; where its images show a rolling shutter that it ignores, its scale says so.
+
+        Not looked for where a global shutter was declared, or the keypoints were rectified.
+        """
+        metric = self._apply(model, estimate)
+        if model.timing.readout_s == 0 or model.rectified or estimate.noise is None:
+            return metric
+        try:
+            readout = self._find_readout(metric)
+        except (NotObservableError, np.linalg.LinAlgError) as error:
+            log.info("model %d: nothing says whether its shutter rolls: %s", model.colmap_index, error)
+            return metric
+        if readout is None:
+            return metric
+        metric = self._apply(model, readout.widen(estimate))
+        if not readout.is_found:
+            return metric
+        values = {name: getattr(readout, name) for name in ("readout_s", "sigma_s", "direction")}
+        done = Treatment(stage="shutter", reason=readout.sentence(), action="", values=values)
+        log.info("model %d: %s", model.colmap_index, done.reason)
+        return replace(metric, treatments=(*metric.treatments, done))
+
+    def _apply(self, model: Model, estimate: ScaleEstimate) -> Model:
         similarity = Similarity.from_scale(estimate, world=self.world, provenance=provenance(estimate))
         return model.scaled(estimate, similarity)
+
+    def _find_readout(self, model: Model) -> SeenReadout | None:
+        """The readout of a metric model's images, of those in the middle of a long one."""
+        reconstruction, timing = model.reconstruction, model.timing
+        t_of = dict(zip(timing.names, timing.pose_t_s().tolist(), strict=True))
+        images = [reconstruction.image(i) for i in reconstruction.reg_image_ids()]
+        # cameras of a rig have readouts of their own; the scale is that of the reference
+        images = [image for image in images if image.name in t_of and image.is_ref_in_frame()]
+        images.sort(key=lambda image: t_of[image.name])
+        first = max(0, (len(images) - SHUTTER_LIMITS.most_images) // 2)
+        chosen = [image.image_id for image in images[first : first + SHUTTER_LIMITS.most_images]]
+        if not chosen:
+            return None
+        known = self.known_of(model, refine_intrinsics=True)
+        cov = known.prior.cov.copy()
+        # what was declared may be of another recording mode: images tell
+        cov[CAL.READOUT, :] = cov[:, CAL.READOUT] = 0.0
+        cov[CAL.READOUT, CAL.READOUT] = SIGMAS.unknown_readout_s**2
+        known = replace(known, prior=replace(known.prior, cov=cov))
+        seen = read_seen(reconstruction, timing, chosen)
+        with one_blas_thread():
+            return find_readout(seen, timing, self.imu, known, direction_known=timing.readout_s is not None)
 
 
 def provenance(estimate: ScaleEstimate) -> str:

@@ -21,7 +21,6 @@ from colmap_inertial.inertial.refine.judge import Judged, refine
 from colmap_inertial.inertial.refine.motion import add_scale, expect_worth
 from colmap_inertial.inertial.refine.pictures import remove_extremes
 from colmap_inertial.inertial.refine.setup import (
-    Known,
     Seen,
     Written,
     keypoints_of,
@@ -32,8 +31,6 @@ from colmap_inertial.inertial.refine.setup import (
 )
 from colmap_inertial.inertial.refine.values import FIRST_INTRINSIC, LEVER, OFFSET, READOUT, ROTATION, Estimate, Problem
 from colmap_inertial.inertial.refine.world import size_of, state_scale
-from colmap_inertial.inertial.scale import strength_of_gravity
-from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.model import Model
 from colmap_inertial.model.rigs import has_rigs
 from colmap_inertial.model.similarities import compose
@@ -140,11 +137,12 @@ class RefineStage(InertialStage):
 
     def _refined(self, model: Model) -> Model:
         seen = remove_extremes(read_seen(model.reconstruction, model.timing))
-        problem, start = make_problem(seen, model.timing, self.imu, self._known(model), self._exposed_px(model, seen))
+        known = self.known_of(model, refine_intrinsics=self.refine_intrinsics)
+        problem, start = make_problem(seen, model.timing, self.imu, known, self._exposed_px(model, seen))
         promised: dict[str, Any] = {}
         chosen = ""
         if self.auto:
-            worth = expect_worth(seen, problem, start)
+            worth = expect_worth(seen, problem, start, bent=bool(ignored_shutter(model)))
             promised = {"expected": {name: value for name, value in asdict(worth).items() if name != "reason"}}
             if worth.reason:
                 return _said(model, f"not refined: {worth.reason}", **promised)
@@ -165,9 +163,11 @@ class RefineStage(InertialStage):
         written = move_to_middle_lines(problem, x)
         move = _move_of(seen, written)
         calibrated = is_calibrated(self.imu)
-        own, similarity = state_scale(
-            model.scale, model.similarity, move, problem, x, judged.world, calibrated=calibrated
-        )
+        before = model.scale
+        if model.timing.readout_s or judged.readout:
+            now_known = [reason for reason in before.reasons if reason not in ignored_shutter(model)]
+            before = replace(before, reasons=tuple(now_known))
+        own, similarity = state_scale(before, model.similarity, move, problem, x, judged.world, calibrated=calibrated)
         if own.verdict == "refused":
             return _said(model, f"left as it is: refined, {'; '.join(own.reasons)} ({heard})", **figures)
         figures["size_before"] = 1 / move.scale
@@ -198,21 +198,10 @@ class RefineStage(InertialStage):
             keypoints[name] = self.shutter.as_exposed(name, xy_px)
         return keypoints_of(seen, keypoints)
 
-    def _known(self, model: Model) -> Known:
-        estimate, gravity = model.scale, gravity_in_model(model)
-        assert estimate is not None and estimate.calibration is not None and estimate.noise is not None
-        assert estimate.accel_bias_m_s2 is not None and gravity is not None
-        strength, sigma = strength_of_gravity(self.options)
-        return Known(
-            calibration=estimate.calibration,
-            prior=calibration_prior() if self.calibration is None else self.calibration,
-            noise=estimate.noise,
-            accel_bias_m_s2=estimate.accel_bias_m_s2,
-            down=gravity / np.linalg.norm(gravity),
-            gravity_m_s2=strength,
-            gravity_sigma_m_s2=sigma,
-            refine_intrinsics=self.refine_intrinsics,
-        )
+
+def ignored_shutter(model: Model) -> list[str]:
+    """What was said of a rolling shutter that a model ignores."""
+    return [treatment.reason for treatment in model.treatments if treatment.stage == "shutter"]
 
 
 def _alternate(model: Model) -> bool:

@@ -30,6 +30,7 @@ from colmap_inertial.io.imu_text import is_inertial_scale
 from colmap_inertial.io.pose_convention import COLMAP, INERTIAL_SCALE, TUM
 from colmap_inertial.io.trajectories import read_inertial_scale_poses, read_tum
 from colmap_inertial.model import (
+    Model,
     downgraded,
     is_metric,
     read_model,
@@ -41,6 +42,7 @@ from colmap_inertial.motion.align.consensus import align_by_consensus
 from colmap_inertial.motion.align.conventions import likely_convention
 from colmap_inertial.pipeline.run.progress import silent
 from colmap_inertial.pipeline.run.workspace import refuse_links_around
+from colmap_inertial.pipeline.stages.metric import MetricStage
 from colmap_inertial.reconstruction.drivers.paths import check_output, only_model
 from colmap_inertial.reconstruction.preparation.preflight import CheckInputs, TolerantReader, measure_recording
 
@@ -301,12 +303,28 @@ def scale_source(
             options=options,
             read_as=recording.checked.read_as,
         )
-        estimate = downgraded(estimate, doubts)
+        estimate = downgraded(_judge_shutter(source.source, recording, options, estimate), doubts)
     notes = (*estimate.notes, *recording.imu.repairs, *recording.notes)
     estimate = dataclasses.replace(estimate, notes=notes)
     if json is not None:
         write_json(json, scale_as_json(estimate, source.calibration))
     return estimate
+
+
+def _judge_shutter(
+    folder: Path, recording: TimedPoses, options: ScaleOptions, estimate: ScaleEstimate
+) -> ScaleEstimate:
+    """The scale of a model; where its images show a rolling shutter that it ignores, it says so."""
+    timing, capture = recording.checked.timing, recording.checked.capture
+    if recording.checked.read_as != COLMAP or timing is None or estimate.verdict == "refused":
+        return estimate
+    if timing.readout_s is None and capture is not None:
+        timing = dataclasses.replace(timing, readout_s=capture.readout_s, readout_direction=capture.readout_direction)
+    model = Model(reconstruction=read_model(only_model(folder)), colmap_index=0, timing=timing)
+    stage = MetricStage(imu=recording.imu, calibration=recording.calibration, options=options)
+    judged = stage.judge_shutter(model, estimate).scale
+    assert judged is not None
+    return judged
 
 
 def scale_as_json(estimate: ScaleEstimate, calibration: CalibrationFiles = None) -> dict[str, object]:

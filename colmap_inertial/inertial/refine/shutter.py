@@ -1,0 +1,171 @@
+"""Whether a model that was mapped with a global shutter has images of a rolling one, by its own observations.
+
+A readout that is not modelled bends a model: each image is stretched by how fast it moves, and scale follows. A few
+steps of the refinement with the readout as an unknown tell it, each line at its own instant by the IMU.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from colmap_inertial.core.types import FrameTiming, ImuRecording, ReadoutDirection, ScaleEstimate
+from colmap_inertial.inertial.refine._residuals import derivatives, project
+from colmap_inertial.inertial.refine.pictures import (
+    apply_noise,
+    measure_picture_noise,
+    pictures_alone,
+    remove_extremes,
+    select_points,
+)
+from colmap_inertial.inertial.refine.setup import Known, Seen, make_problem
+from colmap_inertial.inertial.refine.solve import factored, solve
+from colmap_inertial.inertial.refine.values import READOUT
+from colmap_inertial.inertial.scale.verdict import verdict_of
+from colmap_inertial.model import colmap_camera
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShutterLimits:
+    """Limits for finding a readout that was not declared."""
+
+    #: It is one where it is longer, and so many standard deviations long.
+    least_s: float = 1e-3
+    sure_sigma: float = 3.0
+    #: COLMAP leaves out observations that its global shutter misses by 4 px, and keeps those whose noise brings them
+    #: nearer: found readouts are 2 to 10 % short, 5 % rms, and right with all observations (``study_refine_real.py``).
+    cut_share: float = 0.05
+    #: Images in a row that are looked at: a readout is the camera's, not the recording's.
+    most_images: int = 300
+    #: Observations, at least, and about how many are looked at: more take longer and tell it no better than the model.
+    fewest: int = 500
+    most: int = 15_000
+    #: Steps of the refinement: from a global shutter, three come within 2 to 12 % of 20 ms (``study_refine_real.py``).
+    steps: int = 3
+    #: Share by which the information is raised: points far away hardly have any along their rays.
+    damping: float = 1e-6
+
+
+SHUTTER_LIMITS = ShutterLimits()
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeenReadout:
+    """Readout by the observations of a model.
+
+    Attributes
+    ----------
+    readout_s, sigma_s
+        From the first line to one past the last, and its standard deviation.
+    direction
+        Where the exposed line moves in the stored image.
+    rate_hz
+        How fast images move, in focal lengths, root mean square of their medians: times the readout, what they are
+        stretched by.
+    """
+
+    readout_s: float
+    sigma_s: float
+    direction: ReadoutDirection
+    rate_hz: float
+
+    @property
+    def is_found(self) -> bool:
+        """Whether lines were exposed one after the other, as surely as the refinement asks for."""
+        return self.readout_s >= max(SHUTTER_LIMITS.least_s, SHUTTER_LIMITS.sure_sigma * self.sigma_s)
+
+    def sentence(self) -> str:
+        """What is wrong with the model's scale then."""
+        return (
+            f"the images were exposed line by line within {1e3 * self.readout_s:.1f} +- {1e3 * self.sigma_s:.1f} ms "
+            f"({self.direction}), which the model ignores: declare readout_s and readout_direction before mapping, or "
+            "refine it (--refine inertial)"
+        )
+
+    def widen(self, estimate: ScaleEstimate) -> ScaleEstimate:
+        """A scale as uncertain as such a shutter makes it; weak at most where it was found."""
+        assert estimate.parts is not None and estimate.cov is not None
+        accepted = estimate.accepted
+        sigma = float(np.hypot(self.readout_s, self.sigma_s)) * self.rate_hz
+        widths = verdict_of(accepted.metres_per_unit, accepted.sigma_log)[2]
+        checks = [reason for reason in estimate.reasons if reason not in widths]
+        if self.is_found:
+            checks.append(self.sentence())
+        sigma_log = float(np.hypot(accepted.sigma_log, sigma))
+        verdict, ci95, reasons = verdict_of(accepted.metres_per_unit, sigma_log, checks)
+        if verdict == "refused":
+            # what the shutter leaves open is for the refinement to find
+            verdict, reasons = "weak", tuple(checks)
+        cov = estimate.cov.copy()
+        cov[0, 0] = sigma_log**2
+        return replace(
+            estimate,
+            sigma_log=sigma_log,
+            ci95=ci95,
+            verdict=verdict,
+            reasons=reasons,
+            cov=cov,
+            parts={**estimate.parts, "rolling_shutter": sigma},
+        )
+
+
+def find_readout(
+    seen: Seen, timing: FrameTiming, imu: ImuRecording, known: Known, *, direction_known: bool
+) -> SeenReadout | None:
+    """The readout of a metric model's images, whatever is declared; ``None`` where too little is seen.
+
+    Parameters
+    ----------
+    seen
+        The model, or a part of it.
+    timing, imu, known
+        As the refinement has them.
+    direction_known
+        Whether lines run as ``timing`` says; otherwise they may run down or across.
+
+    Raises
+    ------
+    NotObservableError
+        Where the IMU recorded hardly any of the frames.
+    numpy.linalg.LinAlgError
+        Where nothing determines it.
+    """
+    seen = remove_extremes(seen)
+    count = len(seen.observations.frame)
+    if count < SHUTTER_LIMITS.fewest:
+        return None
+    seen = select_points(seen, np.arange(len(seen.points)) % -(-count // SHUTTER_LIMITS.most) == 0)
+    directions: tuple[ReadoutDirection, ...] = (timing.readout_direction,) if direction_known else ("down", "right")
+    found = [
+        _measure(seen, replace(timing, readout_s=None, readout_direction=direction), imu, known)
+        for direction in directions
+    ]
+    return max(found, key=lambda one: one.readout_s / one.sigma_s)
+
+
+_OPPOSITE: dict[ReadoutDirection, ReadoutDirection] = {"down": "up", "up": "down", "right": "left", "left": "right"}
+
+
+def _measure(seen: Seen, timing: FrameTiming, imu: ImuRecording, known: Known) -> SeenReadout:
+    """The readout with lines that run as the timing says, or the other way."""
+    at_once_px = seen.observations.xy_px
+    problem, start = make_problem(seen, timing, imu, known, at_once_px)
+    problem = apply_noise(problem, measure_picture_noise(pictures_alone(problem, at_once_px), start))
+    x = solve(problem, start, most_steps=SHUTTER_LIMITS.steps).estimate
+    variance = float(factored(problem, x, damping=SHUTTER_LIMITS.damping).shared_cov()[READOUT, READOUT])
+    observations = problem.observations
+    alike = np.ones(len(observations.frame))
+    by = derivatives(problem, x, observations, project(problem, x, observations), alike).by_shared[:, :, READOUT]
+    # an observation moves by its line's share of the readout
+    away = np.flatnonzero(observations.line)
+    speed_px_s = np.linalg.norm(by[away], axis=1) / np.abs(observations.line[away])
+    frame = observations.frame[away]
+    of_images = [float(np.median(speed_px_s[frame == i])) for i in np.unique(frame)]
+    focal_px = float(np.mean([colmap_camera(camera).mean_focal_length() for camera in seen.cameras]))
+    return SeenReadout(
+        readout_s=abs(x.readout_s),
+        sigma_s=float(np.hypot(variance**0.5, SHUTTER_LIMITS.cut_share * x.readout_s)),
+        direction=timing.readout_direction if x.readout_s >= 0 else _OPPOSITE[timing.readout_direction],
+        rate_hz=float(np.sqrt(np.mean(np.square(of_images)))) / focal_px,
+    )
