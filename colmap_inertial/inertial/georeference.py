@@ -305,7 +305,7 @@ def georeference(
         delay_sigma_s=None if path_at is None else fit.delay_sigma_s,
         source=fixes.source,
         alike_assumed=fit.alike_assumed,
-        notes=tuple(_notes(fit, fixes.height_above if counted.any() else "ellipsoid")),
+        notes=tuple(_notes(fit, fixes.sigma_m[good], fixes.height_above if counted.any() else "ellipsoid")),
     )
 
 
@@ -349,12 +349,18 @@ def _require_same_path(fit: _Fit) -> None:
         )
 
 
-def _notes(fit: _Fit, height_above: HeightDatum | None) -> Iterator[str]:
-    """Sentences for the user on lengths that differ and on what heights count from."""
+def _notes(fit: _Fit, stated_m: Array, height_above: HeightDatum | None) -> Iterator[str]:
+    """Sentences for the user on lengths that differ, on sizes of errors that are assumed, and on heights' zero."""
     if fit.ratio_error > _LIMITS.least_ratio:
         yield (
             f"the positions are {fit.ratio:.3f} times as far apart as the model says (+-{Z95 * fit.ratio_sigma:.3f}): "
             "one of them is wrong; the model's scale was left as it is"
+        )
+    if not _states_accuracy(stated_m).any():
+        size_m, factor = _LIMITS.unstated_slow
+        yield (
+            f"the receiver states no accuracy: slow errors of {size_m:g} m, within a factor of {factor:g}, were assumed; "
+            "the interval of the place rests on that"
         )
     if height_above != "ellipsoid":
         zero = "the sea" if height_above == "sea" else "what the receiver took for zero"
@@ -432,10 +438,11 @@ def _fit_delay(
 
 def _fit(paths: ComplexArray, delays_s: Array, target: ComplexArray, t_s: Array, stated_m: Array) -> _Fit:
     """The mean over all sizes of errors and the delays given; plane points as complex numbers."""
-    stated = stated_m[np.isfinite(stated_m) & (stated_m > 0)]
+    is_stated = _states_accuracy(stated_m)
+    stated = stated_m[is_stated]
     usual_m, factor = (float(np.median(stated)), _LIMITS.slow_factor) if len(stated) else _LIMITS.unstated_slow
     # a receiver that is less sure of some positions than of others is right about that
-    relative = np.where(np.isfinite(stated_m) & (stated_m > 0), stated_m / usual_m, 1.0)
+    relative = np.where(is_stated, stated_m / usual_m, 1.0)
     apart_s = np.abs(t_s[:, None] - t_s[None, :])
     middle = complex(paths.mean())
     about, logs_of_delay = paths - middle, -0.5 * ((delays_s - _LIMITS.usual_delay_s) / _LIMITS.delay_sigma_s) ** 2
@@ -488,6 +495,11 @@ def _fit(paths: ComplexArray, delays_s: Array, target: ComplexArray, t_s: Array,
         delay_s=delay_s,
         delay_sigma_s=math.sqrt(float(of_delay @ (delays_s - delay_s) ** 2)),
     )
+
+
+def _states_accuracy(stated_m: Array) -> BoolArray:
+    """(N,) which positions have an accuracy."""
+    return np.isfinite(stated_m) & (stated_m > 0)
 
 
 def _judge_correlation(probability: Array) -> tuple[float, bool]:

@@ -126,7 +126,9 @@ def _scale_bar(low: Array, high: Array, step: float, unit: str) -> list[Figure]:
     start = np.array([low[0] + margin, low[1] + margin, low[2] + 0.2 * margin])
     end = start + np.array([step, 0.0, 0.0])
     bar = _lines(np.stack([start, end])[None], f"scale bar, {_length(step, unit)}", GOOD, 8)
-    return [bar, _label(0.5 * (start + end), _length(step, unit))]
+    # so far above it that no turn of the view brings the bar through the words
+    raised = np.array([0.0, 0.0, 1.5 * margin])
+    return [bar, _label(0.5 * (start + end) + raised, _length(step, unit))]
 
 
 def _label(at: Array, text: str, **more: Any) -> Figure:
