@@ -14,12 +14,14 @@ from colmap_inertial import (
     ProjectOptions,
     ReconstructOptions,
     ScaleOptions,
+    load_capture,
     reconstruct,
     reconstruct_project,
     run_batch,
 )
 from colmap_inertial.core.types import AcceptedScale, Gap, Similarity
 from colmap_inertial.imaging.wiener import DeblurOptions
+from colmap_inertial.model.project import Applied
 from colmap_inertial.model.similarities import ModelScale
 from colmap_inertial.motion.align import AlignOptions
 from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
@@ -80,12 +82,15 @@ def test_results_print_on_a_screen_and_in_a_notebook():
         Gap(first=0, second=1, seconds=2.5, reason="<b>", joined=False),
         Fragment(colmap_index=3, registered_images=2, sparse=Path("sparse/3")),
         FrameRecord(name="a.jpg", action="passed"),
-        AcceptedScale(metres_per_unit=0.5, sigma_log=0.01, ci95=(0.49, 0.51)),
+        AcceptedScale(metres_per_unit=0.5, sigma_log=np.float64(0.01), ci95=(0.49, 0.51)),
         ModelScale(similarity=None, verdict="refused", reasons=("hardly moves",)),
+        Applied(out=Path("metric"), models={0: ("sparse/0", None)}, changes=(), unchanged={"copied": 3}, notes=()),
+        load_capture(Path(__file__).parents[1] / "example_scenes" / "desk"),
     ]
     for value in shown:
         assert str(value).splitlines()[0] == type(value).__name__ and len(str(value).splitlines()) <= 20
         assert value._repr_html_().startswith("<table>")
+    assert "sigma_log        0.01" in str(shown[4])
     assert "array 7 x 7" in str(shown[0]) and "&lt;b&gt;" in shown[1]._repr_html_()
 
 

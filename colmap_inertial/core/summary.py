@@ -55,12 +55,12 @@ def _format_table(self: Any) -> str:
 
 def shorten(value: Any) -> str:
     """A value in one line."""
-    if hasattr(value, "shape"):
+    if isinstance(value, float):  # numpy's, too
+        return f"{value:.6g}"
+    if getattr(value, "shape", ()):
         if value.size <= _LIMITS.items and value.ndim == 1:
             return "[" + ", ".join(f"{number:.6g}" for number in value.tolist()) + "]"
         return f"array {' x '.join(map(str, value.shape))}"
-    if isinstance(value, float):
-        return f"{value:.6g}"
     if isinstance(value, Mapping):
         return f"{len(value)} by name: {_cut(', '.join(map(str, value)), _LIMITS.width // 2)}" if value else "()"
     if isinstance(value, tuple | list | frozenset):

@@ -7,9 +7,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from colmap_inertial.core.arrays import AnyArray, Array, Float32Array
+from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.imaging._bilinear import bilinear
 
 
+@prints_in_lines
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BlurField:
     """The line segment that each pixel smears along while it is exposed, centred on the pixel.

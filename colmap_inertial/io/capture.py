@@ -16,6 +16,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.geometry import quat_from_matrix
+from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.types import CameraImuCalibration, CameraModel, FrameLog, ImuCalibration, ReadoutDirection
 from colmap_inertial.io import sensor_yaml
 from colmap_inertial.io.calibration import Declared, calibration_prior
@@ -46,6 +47,7 @@ from colmap_inertial.io.toml_section import Section, read_toml
 from colmap_inertial.io.video import readout_of_video
 
 
+@prints_in_lines
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Capture:
     """One recording: where its parts lie and what is known about them. Nothing is opened but sheets of numbers.

@@ -16,6 +16,7 @@ from typing import Any
 
 from colmap_inertial import __version__
 from colmap_inertial.core.errors import AlreadyMetricError, FormatError, InertialError, NotObservableError, OutputError
+from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.threads import one_blas_thread, usable_processors
 from colmap_inertial.core.types import Similarity
 from colmap_inertial.io.files import StrPath, read_json, write_json
@@ -48,6 +49,7 @@ class Change:
     model: int | None
 
 
+@prints_in_lines
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Applied:
     """Result of :func:`apply_to_project` or :func:`undo_project`.
