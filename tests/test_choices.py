@@ -34,11 +34,11 @@ from colmap_inertial.tools.batch.manifest import BatchCapture
     [
         (lambda: ReconstructOptions(world="zup"), r"world: 'zup' is not one of .*; did you mean 'z-up'"),
         (lambda: ReconstructOptions(deblur="weiner"), "did you mean 'wiener'"),
-        (lambda: ReconstructOptions(dense="yes"), "dense: 'yes' is not a bool"),
+        (lambda: ReconstructOptions(dense="yes"), "dense: 'yes' is not true or false"),
         (lambda: ReconstructOptions(scale=MappingOptions()), "scale: a MappingOptions is not a ScaleOptions"),
-        (lambda: MappingOptions(overlap=2.5), "overlap: 2.5 is not a int"),
-        (lambda: MappingOptions(gravity_priors=1), "gravity_priors: 1 is not a bool"),
-        (lambda: ScaleOptions(max_offset_s="1"), "max_offset_s: '1' is not a float"),
+        (lambda: MappingOptions(overlap=2.5), "overlap: 2.5 is not a whole number"),
+        (lambda: MappingOptions(gravity_priors=1), "gravity_priors: 1 is not true or false"),
+        (lambda: ScaleOptions(max_offset_s="1"), "max_offset_s: '1' is not a number"),
         (lambda: ScaleOptions(latitude_deg=100), "from -90 to 90"),
     ],
 )
@@ -63,8 +63,8 @@ def test_a_field_that_there_is_not_is_refused_with_the_nearest_one(make, message
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: AlignOptions(max_offset_s="1"), "max_offset_s: '1' is not a float"),
-        (lambda: DeblurOptions(threads=1.5), "threads: 1.5 is not a int"),
+        (lambda: AlignOptions(max_offset_s="1"), "max_offset_s: '1' is not a number"),
+        (lambda: DeblurOptions(threads=1.5), "threads: 1.5 is not a whole number"),
         (lambda: BatchCapture(name="a", path="b", options=ScaleOptions()), "is not a ReconstructOptions"),
     ],
 )

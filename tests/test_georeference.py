@@ -243,7 +243,7 @@ def test_the_scale_is_never_touched_and_a_wrong_one_is_named():
     assert "times as far apart" in found.notes[0] and "left as it is" in found.notes[0]
     sound = walk(3, white_m=0.5)
     (note,) = sound.fitted().notes
-    assert "states no accuracy" in note
+    assert "no accuracy is stated" in note
     stated = replace(sound, fixes=replace(sound.fixes, sigma_m=np.ones(len(sound.t_s))))
     assert stated.fitted().notes == ()
 

@@ -594,7 +594,7 @@ def test_a_frame_is_placed_by_points_that_another_one_knew(tmp_path):
 def test_batches_of_pairs_grow_and_hold_every_pair_once():
     pairs = [f"{i} {i + 1}" for i in range(5000)]
     found = sparse.growing_batches(pairs)
-    assert [len(batch) for batch in found] == [100, 200, 400, 800, 1600, 1600, 300]
+    assert [len(batch) for batch in found] == [40, 80, 160, 320, 640, 1280, 1600, 880]
     assert [pair for batch in found for pair in batch] == pairs and sparse.growing_batches([]) == []
     assert [len(batch) for batch in sparse.growing_batches(pairs, first=1600)] == [1600, 1600, 1600, 200]
 
@@ -604,10 +604,10 @@ def test_once_some_are_matched_batches_are_large(database, tmp_path, monkeypatch
     monkeypatch.setattr(pycolmap, "match_image_pairs", lambda *_, **__: None)
     context = RunContext(scratch=tmp_path, progress=lambda _, done, total: told.append((done, total)))
     pairs = [("a", "b")] * 700
-    # a batch costs its pairs, and to index its two images as much as two more
+    # a batch costs its pairs, and to index its two images as much as four more
     done = sparse.match_pairs(database, pairs, context, total=0)
-    assert sparse.match_pairs(database, pairs, context, done=done) == 706 + sparse.matching_work(pairs) == 1408
-    assert told == [(0, 0), (102, 0), (304, 0), (706, 0), (706, 1408), (1408, 1408)]
+    assert sparse.match_pairs(database, pairs, context, done=done) == 720 + sparse.matching_work(pairs) == 1424
+    assert told == [(0, 0), (44, 0), (128, 0), (292, 0), (616, 0), (720, 0), (720, 1424), (1424, 1424)]
     assert [len(b) for b in sparse.growing_batches(range(45), first=4, most=16)] == [4, 8, 16, 16, 1]
 
 

@@ -129,7 +129,7 @@ def test_the_resolved_configuration_reads_back_as_it_was(tmp_path):
     [
         ("sede = 3", "unknown option sede; did you mean seed"),
         ("[mapping]\noverlapp = 3", "unknown option mapping.overlapp; did you mean mapping.overlap"),
-        ("[mapping]\noverlap = 'three'", "mapping.overlap: 'three' is not a int"),
+        ("[mapping]\noverlap = 'three'", "mapping.overlap: 'three' is not a whole number"),
         ("world = 'x-up'", "world: 'x-up' is not one of 'z-up', 'y-down'"),
         ("mapping = 3", "mapping is a table"),
         ("seed = ", "not valid TOML"),

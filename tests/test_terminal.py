@@ -107,7 +107,7 @@ def test_a_pipe_has_a_line_for_each_stage_and_few_of_how_far_it_is():
         now[0] += 1
     screen("metric", 0, 1)
     lines = file.getvalue().splitlines()
-    assert lines[:3] == ["kept from the earlier run: frames, matches", "Mapping ...", "Mapping 10/100, 3:10 left"]
+    assert lines[:3] == ["kept from the earlier run: frames, matches", "Mapping ...", "Mapping 10/100, 3:27 left"]
     assert lines[-2:] == ["Mapping 100/100, took 1:40", "Metric scale ..."] and len(lines) == 13
     assert not screen.unchanged
 
@@ -131,10 +131,10 @@ def test_no_time_is_said_where_a_step_takes_longer_than_all_was_to():
 
 @pytest.mark.parametrize("share", [0.1, 0.2, 0.5, 0.8])
 def test_a_stage_whose_steps_grow_dearer_ends_when_it_says(share):
-    """An image costs as much as 0.3 of those before it, as a mapper's does: to the power of 1.3 in all."""
+    """As a mapper's: to the power of 1.3, and an adjustment of all at the end, 8 % of the time."""
     stage, total = Stage(0.0, 0, 500, name="mapping"), 500.0
     done = round(500 * share)
-    now_s = total * (done / 500) ** 1.3
+    now_s = 0.92 * total * (done / 500) ** 1.3
     stage.moved(now_s, done, 500)
     assert stage.left_s(now_s) == pytest.approx(total - now_s, rel=0.02)
     if share < 0.3:

@@ -317,8 +317,12 @@ def _next_steps(model: dict[str, Any], pct: float) -> list[str]:
         steps = ["Measure the board's squares, compare them with [target], and see below which images hold it."]
     steps.append("Turn it, and measure in it: `colmap-inertial view .`, in this folder.")
     if model["verdict"] == "trusted":
-        steps.append("Take it to other programs in metres: `colmap-inertial export . ../export` (`--for PROGRAM`).")
-        if not model.get("dense"):
+        steps.append("Take it to other programs in metres: `colmap-inertial export . ../export`; `--for` names one.")
+        dense = model.get("dense")
+        if dense:
+            made = " and ".join(f"`{dense[kind]}`" for kind in ("fused", "mesh") if dense.get(kind))
+            steps += [f"Open in CloudCompare or MeshLab, in metres: {made}."] if made else []
+        else:
             steps.append("For depth maps, a dense cloud and a mesh, run `reconstruct` again with `--dense`.")
     return steps
 

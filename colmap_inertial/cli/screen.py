@@ -61,12 +61,15 @@ class StageCost:
     """
 
     power: float = 1.0
+    #: Share of its time that comes after its last step.
+    end: float = 0.0
     work: bool = False
 
 
-#: An image costs more, the more are in the model. Where a stage is not here, its steps are alike.
+#: An image costs more, the more are in the model, and all are adjusted once more at the end. Where a stage is not here,
+#: its steps are alike.
 _COSTS = {
-    "mapping": StageCost(power=1.3),
+    "mapping": StageCost(power=1.3, end=0.08),
     "matches": StageCost(work=True),
     "dense": StageCost(work=True),
 }
@@ -105,7 +108,8 @@ class Stage:
         """
         if self.done <= self._from or self.done > self.total:
             return None
-        begun, done = ((steps / self.total) ** self._cost.power for steps in (self._from, self.done))
+        cost = self._cost
+        begun, done = ((1 - cost.end) * (steps / self.total) ** cost.power for steps in (self._from, self.done))
         left_s = (1 - done) * (self._moved_s - self._begun_s) / (done - begun) - (now_s - self._moved_s)
         return left_s if left_s >= 0 else None
 

@@ -33,9 +33,9 @@ _EXHAUSTIVE_UP_TO = 150
 #: Images whose features are found in one go; the first ones are few, so that one sees soon how quickly it goes.
 _FIRST_EXTRACTION_BATCH, _EXTRACTION_BATCH = 4, 16
 _ALIKED_FILES = ("AlikedExtraction.n16rot_model_path", "AlikedMatching.lightglue_model_path")
-#: Each batch indexes its images' features anew, an image as dear as a pair; the first are small, so that one sees soon
-#: how quickly it goes.
-_FIRST_MATCHING_BATCH, _MATCHING_BATCH = 100, 1600
+#: Each batch indexes its images' features anew, an image as dear as two pairs; the first are small, so that one sees
+#: soon how quickly it goes.
+_FIRST_MATCHING_BATCH, _MATCHING_BATCH, _PAIRS_OF_AN_INDEX = 40, 1600, 2
 #: What a feature takes in the database at most, several orientations and SQLite's log included; likewise a pair.
 _FEATURE_BYTES = 500
 _PAIR_BYTES = 100_000
@@ -381,16 +381,16 @@ def match_pairs(
 
 
 def matching_work(pairs: Sequence[tuple[str, str]]) -> int:
-    """Cost of matching pairs after others, in pairs: to index an image's features for a batch costs as much as one.
+    """Cost of matching pairs after others, in pairs: to index an image's features for a batch costs as much as two.
 
-    With that, batches of 28 to 1600 pairs of the example scene and of EuRoC take the same time a unit within a third
+    With that, batches of 20 to 570 pairs of the example scene take the same time a unit within 10 %
     (``scripts/study_progress.py``).
     """
     return sum(map(_batch_work, growing_batches(pairs, first=_MATCHING_BATCH)))
 
 
 def _batch_work(batch: Sequence[tuple[str, str]]) -> int:
-    return len(batch) + len({name for pair in batch for name in pair})
+    return len(batch) + _PAIRS_OF_AN_INDEX * len({name for pair in batch for name in pair})
 
 
 def write_gravity_priors(database: Path, gravity_in_cam: Mapping[str, Array]) -> None:

@@ -108,6 +108,9 @@ def _shorten(value: object) -> str:
     return text if len(text) <= 80 else f"a {type(value).__name__}"
 
 
+_KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
+
+
 def _describe(kinds: tuple[Any, ...]) -> str:
     words = []
     for kind in kinds:
@@ -117,7 +120,7 @@ def _describe(kinds: tuple[Any, ...]) -> str:
             arguments = typing.get_args(kind)
             words.append("a list of texts" if arguments[-1] is ... else f"{len(arguments)} of {arguments[0].__name__}")
         elif kind is not type(None):
-            words.append(f"a {getattr(kind, '__name__', kind)}")
+            words.append(_KINDS.get(kind, f"a {getattr(kind, '__name__', kind)}"))
     return " or ".join(words)
 
 

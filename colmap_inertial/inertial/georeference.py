@@ -7,9 +7,8 @@ likelihood (H. D. Patterson and R. Thompson, "Recovery of inter-block informatio
 Biometrika 1971) times a prior, and the result is the mean over all of them. So a short path does not pass for sure
 because its errors all point one way.
 
-A receiver's positions are those of a moment before. By how much they lag is one more number that the mean is taken
-over, with a prior: where the path turns or changes its pace it is found; on a straight walk its prior is part of the
-place's uncertainty.
+A receiver's positions lag. By how much is one more number that the mean is taken over, with a prior: where the path
+turns or changes its pace it is found; on a straight walk its prior is part of the place's uncertainty.
 """
 
 from __future__ import annotations
@@ -284,6 +283,7 @@ def georeference(
     enu_from_world = turned @ level_from_world
     residual = target[good] - np.exp(1j * fit.turn) * (flat - fit.middle) - fit.at
     height_above = fixes.height_above if counted.any() else None
+    stated = bool((fixes.sigma_m[good] > 0).any())
     return Georeference(
         latitude_deg=float(origin[0]),
         longitude_deg=float(origin[1]),
@@ -305,7 +305,7 @@ def georeference(
         delay_sigma_s=None if path_at is None else fit.delay_sigma_s,
         source=fixes.source,
         alike_assumed=fit.alike_assumed,
-        notes=tuple(_notes(fit, fixes.sigma_m[good], fixes.height_above if counted.any() else "ellipsoid")),
+        notes=tuple(_notes(fit, stated, fixes.height_above if counted.any() else "ellipsoid")),
     )
 
 
@@ -349,19 +349,16 @@ def _require_same_path(fit: _Fit) -> None:
         )
 
 
-def _notes(fit: _Fit, stated_m: Array, height_above: HeightDatum | None) -> Iterator[str]:
+def _notes(fit: _Fit, stated: bool, height_above: HeightDatum | None) -> Iterator[str]:
     """Sentences for the user on lengths that differ, on sizes of errors that are assumed, and on heights' zero."""
     if fit.ratio_error > _LIMITS.least_ratio:
         yield (
             f"the positions are {fit.ratio:.3f} times as far apart as the model says (+-{Z95 * fit.ratio_sigma:.3f}): "
             "one of them is wrong; the model's scale was left as it is"
         )
-    if not _states_accuracy(stated_m).any():
+    if not stated:
         size_m, factor = _LIMITS.unstated_slow
-        yield (
-            f"the receiver states no accuracy: slow errors of {size_m:g} m, within a factor of {factor:g}, were assumed; "
-            "the interval of the place rests on that"
-        )
+        yield f"no accuracy is stated: slow errors of {size_m:g} m, within a factor of {factor:g}, were assumed"
     if height_above != "ellipsoid":
         zero = "the sea" if height_above == "sea" else "what the receiver took for zero"
         yield f"heights count from {zero}, not from the ellipsoid; the two differ by up to 100 m"
@@ -438,11 +435,10 @@ def _fit_delay(
 
 def _fit(paths: ComplexArray, delays_s: Array, target: ComplexArray, t_s: Array, stated_m: Array) -> _Fit:
     """The mean over all sizes of errors and the delays given; plane points as complex numbers."""
-    is_stated = _states_accuracy(stated_m)
-    stated = stated_m[is_stated]
+    stated = stated_m[np.isfinite(stated_m) & (stated_m > 0)]
     usual_m, factor = (float(np.median(stated)), _LIMITS.slow_factor) if len(stated) else _LIMITS.unstated_slow
     # a receiver that is less sure of some positions than of others is right about that
-    relative = np.where(is_stated, stated_m / usual_m, 1.0)
+    relative = np.where(np.isfinite(stated_m) & (stated_m > 0), stated_m / usual_m, 1.0)
     apart_s = np.abs(t_s[:, None] - t_s[None, :])
     middle = complex(paths.mean())
     about, logs_of_delay = paths - middle, -0.5 * ((delays_s - _LIMITS.usual_delay_s) / _LIMITS.delay_sigma_s) ** 2
@@ -497,15 +493,8 @@ def _fit(paths: ComplexArray, delays_s: Array, target: ComplexArray, t_s: Array,
     )
 
 
-def _states_accuracy(stated_m: Array) -> BoolArray:
-    """(N,) which positions have an accuracy."""
-    return np.isfinite(stated_m) & (stated_m > 0)
-
-
 def _judge_correlation(probability: Array) -> tuple[float, bool]:
-    """The mean time over which errors are alike, by its probability (K,) on the grid; whether the positions leave it
-    open.
-    """
+    """The mean time over which errors are alike, by its probability (K,); whether the positions leave it open."""
     log_alike = np.log(_LIMITS.alike_s)
     near = np.abs(log_alike - log_alike[int(np.argmax(probability))]) < math.log(_LIMITS.shown_within)
     return float(np.exp(np.sum(probability * log_alike))), bool(np.sum(probability[near]) < _LIMITS.shown)

@@ -52,12 +52,10 @@ class Change:
 @prints_in_lines
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Applied:
-    """Result of :func:`apply_to_project` or :func:`undo_project`.
+    """Result of :func:`apply_to_project` or :func:`undo_project`, in the folder ``out``.
 
     Attributes
     ----------
-    out
-        The new project.
     models
         Each sub-model's folder and what was applied to it, by number.
     changes

@@ -10,6 +10,7 @@ from typing import Any
 from colmap_inertial.core.choices import CheckedOptions
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, StageNames
+from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.io.files import StrPath, check_names, reader
 from colmap_inertial.io.toml_section import Section, read_toml
 from colmap_inertial.pipeline.run.config import override_options, read_values
@@ -18,6 +19,7 @@ from colmap_inertial.pipeline.run.config import override_options, read_values
 _RESERVED = ("status", "summary.csv", "summary.json")
 
 
+@prints_in_lines
 @dataclass(frozen=True, kw_only=True)
 class BatchCapture(CheckedOptions):
     """One capture of a batch.
