@@ -24,7 +24,7 @@ from colmap_inertial.io.toml_section import parse_toml
 
 VERSION = 1
 #: Of a model in ``result.json``, what the page shows otherwise or not.
-_NOT_SHOWN = ("drift", "validation", "cov", "dense", "findings")
+_NOT_SHOWN = ("drift", "validation", "cov", "findings")
 
 Content = dict[str, Any]
 

@@ -34,6 +34,8 @@ _WRITTEN = {
     "sparse": "COLMAP's own model",
     "sparse_metric": "the model in metres",
     "trajectory": "the camera's path in metres, smoothed by the IMU or refined",
+    "fused": "the dense point cloud in metres",
+    "mesh": "the mesh in metres",
     "project_metric": "the whole project in metres",
 }
 #: What COLMAP calls the parameters of its cameras; the others are distortion.
@@ -182,6 +184,7 @@ def readout_rows(models: Sequence[Content]) -> Rows:
 def list_outputs(content: Content) -> Rows:
     """Each path of the result, and what lies there."""
     paths = [(key, model[key]) for model in content["models"] for key in ("sparse", "sparse_metric", "trajectory")]
+    paths += [(key, (model.get("dense") or {}).get(key)) for model in content["models"] for key in ("fused", "mesh")]
     paths.append(("project_metric", content["project_metric"]))
     return [("this folder" if path == "." else path, _WRITTEN[key]) for key, path in paths if path is not None]
 
