@@ -12,7 +12,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from colmap_inertial.cli.screen import SEVERITY_COLOUR, Screen
+from colmap_inertial.cli.screen import SEVERITY_COLOUR, Screen, clock
 from colmap_inertial.core.errors import InertialError
 from colmap_inertial.core.printing import open_console, say
 
@@ -317,7 +317,8 @@ def _model_lines(model: ModelResult, result: ReconstructResult) -> Iterator[Line
     yield from _label_first("written", filter(None, (*paths, result.workspace.result, result.report)))
     if result.report is None:
         yield "report", f"failed, see {result.workspace.log}"
-    yield "time", ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in result.seconds.items())
+    took = {step.replace("_", " "): clock(seconds) for step, seconds in result.seconds.items()}
+    yield "time", ", ".join(f"{step} {text}" for step, text in took.items() if text != clock(0.0))
 
 
 def _describe_layout(result: ReconstructResult) -> str:

@@ -110,7 +110,7 @@ class RefineStage(InertialStage):
         except (NotObservableError, np.linalg.LinAlgError) as error:
             hint = error.hint if isinstance(error, NotObservableError) else "camera and IMU do not determine its shape"
             return _said(model, f"not refined: {hint}")
-        log.info("model %d: refined in %.1f s", model.colmap_index, time.perf_counter() - begin_s)
+        log.info("model %d: the refinement took %.1f s", model.colmap_index, time.perf_counter() - begin_s)
         return refined
 
     def _why_not(self, model: Model) -> str:
