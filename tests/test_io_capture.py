@@ -383,3 +383,8 @@ def test_equidistant_sheet_is_colmaps_fisheye(shared_data: Path, tmp_path: Path)
     (tmp_path / "sensor.yaml").write_text(sheet)
     camera = load_capture(write(tmp_path, IMU + '[camera]\nsensor_yaml = "sensor.yaml"\n')).camera
     assert camera is not None and camera.model == "OPENCV_FISHEYE"
+
+
+def test_a_folder_with_a_recipe_names_the_command_that_renders_it():
+    with pytest.raises(FormatError, match="simulate recipe.toml"):
+        load_capture(Path(__file__).parents[1] / "example_scenes" / "hopeless")

@@ -334,6 +334,8 @@ def _recognise_folder(path: Path) -> Capture:
     recording = find_recording(path)
     if recording is not None:
         return _describe_recording(path, recording)
+    if (path / "recipe.toml").is_file():
+        raise FormatError(path, "holds a recipe, which `colmap-inertial simulate recipe.toml OUT` renders to a capture")
     raise FormatError(
         path,
         "is no capture by itself: it holds no capture.toml, and is neither an ASL/EuRoC dataset (cam0/data.csv, "
