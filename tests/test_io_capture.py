@@ -386,5 +386,5 @@ def test_equidistant_sheet_is_colmaps_fisheye(shared_data: Path, tmp_path: Path)
 
 
 def test_a_folder_with_a_recipe_names_the_command_that_renders_it():
-    with pytest.raises(FormatError, match="simulate recipe.toml"):
+    with pytest.raises(FormatError, match=r"simulate recipe\.toml"):
         load_capture(Path(__file__).parents[1] / "example_scenes" / "hopeless")
