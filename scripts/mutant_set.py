@@ -2094,8 +2094,8 @@ MUTANTS = (
     ),
     Mutant(
         "cli/screen.py",
-        "(self._moved_s - self._begun_s) / (done - begun)",
-        "(self._moved_s - self._begun_s) / done",
+        "(self._moves[-1][1] - half_s) / (done - begun)",
+        "(self._moves[-1][1] - half_s) / done",
         "the time left counts what an earlier run did",
         ("terminal::test_the_time_left_is_by_what_this_run_did_and_runs_down",),
     ),
