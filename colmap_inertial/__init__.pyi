@@ -28,7 +28,6 @@ from .core.options import (
     StageNames as StageNames,
     ValidateOptions as ValidateOptions,
 )
-from .core.threads import using_workers as using_workers
 from .core.types import (
     AcceptedScale as AcceptedScale,
     CameraImuCalibration as CameraImuCalibration,
@@ -81,6 +80,7 @@ from .motion.align.conventions import LikelyConvention as LikelyConvention, like
 from .motion.smooth import smooth_trajectory as smooth_trajectory
 from .pipeline.run.config import read_config as read_config
 from .pipeline.run.progress import Progress as Progress
+from .pipeline.run.workers import using_workers as using_workers
 from .pipeline.stages.apertures import ApertureStage as ApertureStage
 from .pipeline.stages.deblur import DeblurStage as DeblurStage
 from .pipeline.stages.exposures import ExposureStage as ExposureStage

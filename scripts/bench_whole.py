@@ -65,6 +65,7 @@ from colmap_inertial.io.files import read_json
 from colmap_inertial.io.frames import read_frames
 from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.model import find_models, read_model
+from colmap_inertial.pipeline.run.chunks import Processes
 from colmap_inertial.pipeline.run.context import Recording, RunContext
 from colmap_inertial.pipeline.run.session import keep_colmap_quiet
 
@@ -418,7 +419,7 @@ def map_by(mapper: str, folder: Path, workers: int) -> Figures:
             folder / "frames",
             models,
             MappingOptions(mapper="global" if mapper == "global" else "incremental", refine_intrinsics=False),
-            context=RunContext(scratch=folder, num_threads=1, workers=workers),
+            context=RunContext(scratch=folder, num_threads=1, executor=Processes(number=workers)),
             in_time=[] if mapper == "one" else list(truth),
         )
         told |= {"parts": record.parts, "ends_joined": sum(met.joined for met in record.ends)}

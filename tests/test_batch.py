@@ -7,6 +7,7 @@ import errno
 import json
 import os
 import signal
+import sqlite3
 import subprocess
 import sys
 import threading
@@ -15,6 +16,7 @@ from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
 
+import psutil
 import pycolmap
 import pytest
 from batch_captures import TINY, model_bytes, tiny_capture
@@ -22,9 +24,17 @@ from cases import loop_over
 from json_schemas import find_violations
 
 from colmap_inertial.cli import main, parse
+from colmap_inertial.colmap import feature_chunks, submaps
+from colmap_inertial.colmap.feature_chunks import ChunkSizes
+from colmap_inertial.colmap.mapping import map_images
+from colmap_inertial.colmap.sparse import extract_features, image_pairs, match_pairs
 from colmap_inertial.core.errors import FormatError, InertialError, MissingExtraError, OutputExistsError
-from colmap_inertial.core.options import BatchOptions, ReconstructOptions
+from colmap_inertial.core.options import BatchOptions, MappingOptions, ReconstructOptions
+from colmap_inertial.io.capture import load_capture
 from colmap_inertial.pipeline.run.config import config_as_toml
+from colmap_inertial.pipeline.run.context import RunContext
+from colmap_inertial.pipeline.run.progress import silent
+from colmap_inertial.pipeline.run.workers import Cluster, using_workers
 from colmap_inertial.reconstruction.drivers.capture import reconstruct
 from colmap_inertial.tools import batch
 from colmap_inertial.tools.batch import BatchCapture, needs_gpu, read_manifest, run_batch
@@ -302,6 +312,12 @@ def dask(*args: object) -> subprocess.Popen[bytes]:
     return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
 
 
+def start_worker(address: str, scratch: Path) -> subprocess.Popen[bytes]:
+    """A worker of one thread, with a scratch folder of its own."""
+    flags = ("--nthreads", 1, "--no-nanny", "--no-dashboard", "--name", scratch.name, "--local-directory", scratch)
+    return dask("worker", address, *flags)
+
+
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory):
     """A Dask scheduler and two workers of one thread each: (address, worker processes). The last test kills one."""
@@ -311,13 +327,78 @@ def cluster(tmp_path_factory):
     running = [dask("scheduler", "--host", "127.0.0.1", "--port", 0, "--no-dashboard", "--scheduler-file", described)]
     eventually(lambda: described.is_file() and described.read_text().endswith("}"))
     address = json.loads(described.read_text())["address"]
-    for name in ("one", "two"):
-        flags = ("--nthreads", 1, "--no-nanny", "--no-dashboard", "--name", name, "--local-directory", root / name)
-        running.append(dask("worker", address, *flags))
+    running += [start_worker(address, root / name) for name in ("one", "two")]
     yield address, running[1:]
     for process in running:
         process.kill()
         process.wait()
+
+
+def tables_of(database: Path) -> dict[str, list[tuple[object, ...]]]:
+    with contextlib.closing(sqlite3.connect(f"file:{database}?immutable=1", uri=True)) as opened:
+        names = [row[0] for row in opened.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
+        return {name: opened.execute(f"SELECT * FROM {name}").fetchall() for name in names if "sqlite" not in name}
+
+
+def test_one_capture_on_a_cluster_is_that_of_one_machine(capture, cluster, tmp_path, monkeypatch):
+    """A worker is killed at its work, and the run that they work for is stopped and begun again."""
+    images, (address, _) = capture[0] / "frames", cluster
+    names = sorted(path.name for path in images.iterdir())[:12]
+    options = MappingOptions(
+        max_num_features=400, first_octave=0, overlap=3, pairing="sequential", refine_intrinsics=False
+    )
+    monkeypatch.setattr(feature_chunks, "SIZES", ChunkSizes(pairs=15, least_pairs=1))
+    monkeypatch.setattr(
+        submaps, "SIZES", dataclasses.replace(submaps.SIZES, least=2, shortest=8, longest=8, shared=0.5)
+    )
+    asked, run = [], Cluster.run
+
+    def ask(self, chunks, told):
+        asked.append(len(chunks))
+        return run(self, chunks, told)
+
+    monkeypatch.setattr(Cluster, "run", ask)
+
+    def reconstruct_in(folder: Path, told=silent):
+        folder.mkdir(exist_ok=True)
+        for path in folder.glob("*.db"):
+            path.unlink()
+        context, database = RunContext(scratch=folder, num_threads=1, progress=told), folder / "database.db"
+        camera = load_capture(capture[0]).camera
+        extract_features(images, dict.fromkeys(names, camera), database, options, context=context)
+        match_pairs(database, image_pairs(names, options), context)
+        record = map_images(database, images, folder / "sparse", options, context, in_time=names)
+        models = {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*.bin")}
+        return record.parts, tables_of(database), models
+
+    def stop(stage, done, total):
+        if stage == "matches" and 0 < done < total:
+            raise KeyboardInterrupt
+
+    parts, tables, models = reconstruct_in(tmp_path / "alone")
+    assert parts >= 2 and len(tables) >= 10 and models and asked == []
+    third = start_worker(address, tmp_path / "three")
+
+    def kill_at_work():
+        eventually(psutil.Process(third.pid).children)
+        third.kill()
+
+    killer = threading.Thread(target=kill_at_work)
+    try:
+        with using_workers(scheduler=address):
+            RunContext().executor.client.wait_for_workers(3)
+            killer.start()
+            with pytest.raises(KeyboardInterrupt):
+                reconstruct_in(tmp_path / "shared", stop)
+            *_, features, pairs = asked
+            found = reconstruct_in(tmp_path / "shared")
+    finally:
+        killer.join()
+        third.kill()
+    assert third.wait() == -signal.SIGKILL
+    assert found == (parts, tables, models)
+    assert features >= 2 and asked[2] == 0 and 0 < asked[3] < pairs and asked[4] == parts
+    assert {path.name for path in (tmp_path / "shared").iterdir()} == {"database.db", "sparse"}
 
 
 def test_a_cluster_stops_when_the_batch_does(capture, cluster, tmp_path):

@@ -15,10 +15,12 @@ from test_closing import NAMES, make
 
 from colmap_inertial.cli import main
 from colmap_inertial.cli.captures import Reconstruct
-from colmap_inertial.colmap.parts import PartJob, map_parts, start_part, write_part_database
+from colmap_inertial.colmap.parts import map_parts, prepare_part, write_part_database
 from colmap_inertial.core.errors import MappingError
-from colmap_inertial.core.threads import usable_processors, using_workers
+from colmap_inertial.core.threads import usable_processors
+from colmap_inertial.pipeline.run.chunks import Processes, start_process
 from colmap_inertial.pipeline.run.context import RunContext
+from colmap_inertial.pipeline.run.workers import using_workers
 
 PARTS = [(0, 18), (12, 30), (24, 42)]
 
@@ -38,9 +40,9 @@ def options_of(ring, begin, end):
     return options
 
 
-def jobs_in(folder: Path, ring):
+def parts_in(folder: Path, ring):
     return [
-        PartJob.prepare(ring.database, options_of(ring, begin, end), folder / str(number))
+        prepare_part(ring.database, folder, options_of(ring, begin, end), folder / str(number), number)
         for number, (begin, end) in enumerate(PARTS)
     ]
 
@@ -84,20 +86,20 @@ def test_models_are_those_of_the_whole_database_in_this_process_for_any_number_o
         expected.append(files(out))
     assert all(expected)
     for workers in (1, 2):
-        jobs, told = jobs_in(tmp_path / f"workers{workers}", ring), []
-        models = list(map_parts(jobs, tmp_path, workers=workers, registered=lambda told=told: told.append(1)))
-        assert [files(job.models) for job in jobs] == expected
+        parts, told = parts_in(tmp_path / f"workers{workers}", ring), []
+        models = list(map_parts(parts, Processes(number=workers), told.append))
+        assert [files(part.made) for part in parts] == expected
         assert [{k: model.num_reg_images() for k, model in found.items()} for found in models] == [
             {0: end - begin} for begin, end in PARTS
         ]
-        assert len(told) >= sum(end - begin - 2 for begin, end in PARTS)  # the first pair comes together
+        assert sum(told) >= sum(end - begin - 2 for begin, end in PARTS)  # the first pair comes together
 
 
 def test_a_part_that_fails_or_is_killed_is_an_error_in_a_sentence(ring, tmp_path, monkeypatch):
-    broken = jobs_in(tmp_path / "broken", ring)
+    broken = parts_in(tmp_path / "broken", ring)
     (broken[1].folder / "part.db").write_bytes(b"no database")
-    with pytest.raises(MappingError, match="part 2 cannot be mapped"):
-        list(map_parts(broken, tmp_path, workers=2, registered=lambda: None))
+    with pytest.raises(MappingError, match="mapping part 2 failed: "):
+        list(map_parts(broken, Processes(number=2), registered=lambda _: None))
     started, popen = [], subprocess.Popen
 
     def start(*args, **more):
@@ -106,12 +108,12 @@ def test_a_part_that_fails_or_is_killed_is_an_error_in_a_sentence(ring, tmp_path
 
     monkeypatch.setattr(subprocess, "Popen", start)
 
-    def kill_the_second():
+    def kill_the_second(_):
         if len(started) > 1:
             started[1].kill()
 
-    with pytest.raises(MappingError, match=r"part 2 was killed \(signal 9\); .* --workers"):
-        list(map_parts(jobs_in(tmp_path / "killed", ring), tmp_path, workers=2, registered=kill_the_second))
+    with pytest.raises(MappingError, match=r"part 2: the process was killed \(signal 9\); .* --workers"):
+        list(map_parts(parts_in(tmp_path / "killed", ring), Processes(number=2), registered=kill_the_second))
     assert all(process.poll() is not None for process in started)
 
 
@@ -121,9 +123,9 @@ def test_a_part_is_kept_unless_what_it_reads_changed_or_it_is_damaged(ring, tmp_
     def prepare(number: int, database=ring.database, seed: int = 3, names=NAMES[0:18]):
         options = options_of(ring, 0, 18)
         options.image_names, options.random_seed = names, seed
-        return PartJob.prepare(database, options, tmp_path / str(number))
+        return prepare_part(database, tmp_path, options, tmp_path / str(number), number)
 
-    (made,) = map_parts([prepare(0)], tmp_path, workers=1, registered=lambda: None)
+    (made,) = map_parts([prepare(0)], Processes(number=1), registered=lambda _: None)
     assert made[0].num_reg_images() == 18
     again, told = prepare(1), []
     assert again.is_made() and not prepare(2, seed=4).is_made() and not prepare(3, names=NAMES[1:18]).is_made()
@@ -133,12 +135,12 @@ def test_a_part_is_kept_unless_what_it_reads_changed_or_it_is_damaged(ring, tmp_
         with pycolmap.Database.open(str(path)) as opened:
             opened.delete_two_view_geometry(*pair)
     assert prepare(4, outside).is_made() and not prepare(5, inside).is_made()
-    monkeypatch.setattr("colmap_inertial.colmap.parts.start_part", None)  # nothing is started
-    (kept,) = map_parts([again], tmp_path, workers=1, registered=lambda: told.append(1))
-    assert len(told) == 18 and kept[0].num_reg_images() == 18 and not again.folder.exists()
-    points = again.models / "0" / "points3D.bin"
+    monkeypatch.setattr("colmap_inertial.pipeline.run.chunks.start_process", None)  # nothing is started
+    (kept,) = map_parts([again], Processes(number=1), told.append)
+    assert told == [18] and kept[0].num_reg_images() == 18 and not again.folder.exists()
+    points = again.made / "0" / "points3D.bin"
     points.write_bytes(points.read_bytes()[:-9])
-    assert not again.is_made() and not again.models.exists()
+    assert not again.is_made() and not again.made.exists()
 
 
 #: Maps the ring in short parts, one after the other; prints how many there are, and how many were started.
@@ -146,17 +148,18 @@ _MAP = """
 import sys
 from dataclasses import replace
 from pathlib import Path
-from colmap_inertial.colmap import mapping, parts, submaps
+from colmap_inertial.colmap import mapping, submaps
 from colmap_inertial.core.options import MappingOptions
+from colmap_inertial.pipeline.run import chunks
 from colmap_inertial.pipeline.run.context import RunContext
 
 submaps.SIZES = replace(submaps.SIZES, least=2, shortest=12, longest=12, shared=1 / 3)
-started, start = [], parts.start_part
-parts.start_part = lambda *args: (started.append(1), start(*args))[1]
+started, start = [], chunks.start_process
+chunks.start_process = lambda *args: (started.append(1), start(*args))[1]
 database, folder = Path(sys.argv[1]), Path(sys.argv[2])
 names = [f"{k:03d}.jpg" for k in range(48)]
 options = MappingOptions(overlap=3, pairing="sequential", refine_intrinsics=False)
-context = RunContext(scratch=folder, num_threads=1, workers=1)
+context = RunContext(scratch=folder, num_threads=1, executor=chunks.Processes(number=1))
 record = mapping.map_images(database, folder, folder / "sparse", options, context, in_time=names)
 print(record.parts, len(started))
 """
@@ -164,7 +167,7 @@ print(record.parts, len(started))
 
 def test_a_run_that_was_killed_makes_only_the_missing_parts_again(ring, tmp_path):
     def finished(folder):
-        return [path for path in folder.glob("mapped_parts/*") if len(path.name) == 32]
+        return [path for path in folder.glob("chunks/*") if len(path.name) == 32]
 
     def start(folder):
         folder.mkdir(exist_ok=True)
@@ -173,7 +176,7 @@ def test_a_run_that_was_killed_makes_only_the_missing_parts_again(ring, tmp_path
 
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     parts, started = map(int, start(whole).communicate()[0].split())
-    assert started == parts >= 5 and not (whole / "mapped_parts").exists()
+    assert started == parts >= 5 and not (whole / "chunks").exists()
     process = start(killed)
     while len(finished(killed)) < 2 and process.poll() is None:
         time.sleep(0.02)
@@ -189,24 +192,24 @@ def test_a_run_that_was_killed_makes_only_the_missing_parts_again(ring, tmp_path
 @pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="no SIGSTOP here")
 def test_a_process_ends_with_the_one_that_started_it(ring, tmp_path):
     """Its standard input ends then, as the kernel closes it."""
-    job = jobs_in(tmp_path, ring)[0]
-    process = start_part(job, tmp_path)
+    part = parts_in(tmp_path, ring)[0]
+    process = start_process(part)
     with process.stdout:
         assert process.stdout.read(1) == b"."  # at work
         process.send_signal(signal.SIGSTOP)
         process.stdin.close()
         process.send_signal(signal.SIGCONT)
         assert process.wait(timeout=60) == 1
-    assert not (job.folder / "models" / "0").exists() and not job.models.exists()
+    assert not (part.folder / "made" / "0").exists() and not part.made.exists()
 
 
 def test_the_number_of_workers_is_that_of_the_command_and_no_option_of_the_result(monkeypatch):
     given = []
-    monkeypatch.setattr(Reconstruct, "_by_imu", lambda self: given.append(RunContext().workers) or 0)
+    monkeypatch.setattr(Reconstruct, "_by_imu", lambda self: given.append(RunContext().executor.number) or 0)
     for argv in (["--workers", "3"], []):
         with pytest.raises(SystemExit, match="0"):
             main(["reconstruct", "capture", "out", *argv])
-    assert given == [3, usable_processors()] and RunContext().identity().keys().isdisjoint({"workers"})
+    assert given == [3, usable_processors()] and RunContext().identity().keys().isdisjoint({"executor"})
     with pytest.raises(ValueError, match="at least 1"), using_workers(0):
         pass
     with pytest.raises(SystemExit, match="2"):

@@ -25,6 +25,7 @@ from colmap_inertial.model.submodels.graph import (
     minimised,
 )
 from colmap_inertial.model.submodels.matches import Submodel, constrain_by_points, find_common_features
+from colmap_inertial.pipeline.run.chunks import Processes
 from colmap_inertial.pipeline.run.context import RunContext
 
 #: Runs of the ring's images.
@@ -374,7 +375,7 @@ def test_what_is_long_is_mapped_in_parts(tmp_path, monkeypatch, least, pairing, 
     def write_part(database, names, part):
         asked.append(list(names))
         # what a kill leaves is found by the next run
-        assert part.parents[1] == tmp_path / "mapped_parts"
+        assert part.parents[1] == tmp_path / "chunks"
         write_part_database(database, names, part)
 
     def in_one_go(*args, options, **more):
@@ -435,7 +436,7 @@ def test_parts_may_have_cameras_that_others_lack(tmp_path):
     assert rig_of == {2: 1, 1: 2}
     parts = [(0, 20), (14, 34), (28, 48)]
     capture = replace(ring.capture(), database=path)
-    made = submaps.map_runs(capture, tmp_path, tmp_path, parts, workers=2, registered=lambda: None)
+    made = submaps.map_runs(capture, tmp_path, tmp_path, parts, executor=Processes(number=2), registered=lambda _: None)
     (whole,), _ = join_runs(capture, made, near=4, loops=True)
     assert whole.num_reg_images() == FRAMES and error_m(ring, whole) < 0.008
     assert {whole.image(k).camera_id for k in range(1, FRAMES // 2 + 1)} == {1}

@@ -26,7 +26,6 @@ from colmap_inertial.core.options import (
     ReferenceOptions,
 )
 from colmap_inertial.core.printing import say
-from colmap_inertial.core.threads import using_workers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,15 +55,22 @@ class Reconstruct(DeviceCommand, ConfiguredCommand):
     workers: int | None = None
     """Processes that map the parts of a long capture; by default one for each processor. Their number does not change
     the result."""
+    scheduler: str | None = None
+    """Address of a Dask scheduler (tcp://host:8786), whose workers find features, match pairs and map parts (needs the
+    extra `cluster`, and OUT under the same path everywhere). They do not change the result."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.workers is not None and self.workers < 1:
             raise ValueError(f"workers must be at least 1, not {self.workers}")
+        if self.workers is not None and self.scheduler is not None:
+            raise ValueError("--workers are those of this machine; with --scheduler, the cluster has its own")
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        with using_workers(self.workers):
+        from colmap_inertial.pipeline.run.workers import using_workers
+
+        with using_workers(self.workers, scheduler=self.scheduler):
             return self._by_reference() if self.reference.scale_from != "imu" else self._by_imu()
 
     def _by_imu(self) -> int:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,8 +17,9 @@ from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.io.sqlite import open_foreign
 from colmap_inertial.model import find_models
 from colmap_inertial.model.soundness import check_binary_model
+from colmap_inertial.pipeline.run.chunks import CHUNKS_FOLDER
 from colmap_inertial.pipeline.run.context import RunContext
-from colmap_inertial.pipeline.run.progress import Progress
+from colmap_inertial.pipeline.run.progress import counting
 from colmap_inertial.pipeline.run.runner import remove
 from colmap_inertial.pipeline.run.workspace import require_room
 
@@ -31,8 +31,6 @@ log = logging.getLogger(__name__)
 #: Where cameras are known, the whole model is adjusted each time it has grown so much, as COLMAP's own settings for
 #: videos have it, and at the end; unknown cameras bend a model that is adjusted so seldom.
 _GLOBAL_RATIO = 1.4
-#: Parts of a long capture are kept there until its models are made.
-_PARTS = "mapped_parts"
 #: Images within so many times the overlap are neighbours in time.
 _NEIGHBOURS = 2
 
@@ -117,7 +115,7 @@ def map_images(
             record = _map_in_parts(capture, images, sparse, context, parts, near=near, loops=judged)
         else:
             nearest = None if judged and not every_pair else near
-            counted = _counter(context.progress, num_images)
+            counted = counting(context.progress, "mapping", num_images)
             if context.executable is None:
                 models = pycolmap.incremental_mapping(
                     str(database), str(images), str(sparse), options=pipeline, next_image_callback=counted
@@ -141,7 +139,7 @@ def map_images(
             "COLMAP found no model: too few matches between the frames. Film with more overlap, more texture or less "
             "blur, or try --mapping.pairing exhaustive"
         )
-    remove(context.scratch / _PARTS)
+    remove(context.scratch / CHUNKS_FOLDER)
     log.info("mapping: %s", record)
     return record
 
@@ -170,24 +168,16 @@ def _map_in_parts(
     loops: bool,
 ) -> MapRecord:
     # neighbouring parts have some images both
-    counted = _counter(context.progress, len(capture.names), of=sum(end - begin for begin, end in parts))
-    made = map_runs(capture, images, context.scratch / _PARTS, parts, workers=context.workers, registered=counted)
+    several = sum(end - begin for begin, end in parts)
+    counted = counting(context.progress, "mapping", len(capture.names), of=several)
+    scratch = context.scratch / CHUNKS_FOLDER
+    made = map_runs(capture, images, scratch, parts, executor=context.executor, registered=counted)
     models, seams = join_runs(capture, made, near=near, loops=loops) if made else ([], [])
     for number, model in enumerate(models):
         model.extract_colors_for_all_images(str(images))
         (sparse / str(number)).mkdir()
         model.write_binary(str(sparse / str(number)))
     return MapRecord(mapper="incremental", models=len(models), parts=len(parts), seams=tuple(seams))
-
-
-def _counter(progress: Progress, total: int, *, of: int | None = None) -> Callable[[], None]:
-    """Counts up to ``total``; where some images come several times, ``of`` so many calls."""
-    count = itertools.count(1)
-
-    def registered() -> None:
-        progress("mapping", min(next(count) * total // (of or total), total), total)
-
-    return registered
 
 
 def incremental_options(refine: bool, context: RunContext) -> pycolmap.IncrementalPipelineOptions:

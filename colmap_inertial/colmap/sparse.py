@@ -7,19 +7,29 @@ import itertools
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeVar
 
 import numpy as np
 
+from colmap_inertial.colmap.feature_chunks import (
+    FindFeatures,
+    MatchPairs,
+    find_elsewhere,
+    is_worth_chunks,
+    match_elsewhere,
+    state_reader,
+)
 from colmap_inertial.colmap.installed import InstalledColmap
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, InertialError, MappingError, OutputError
 from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.core.types import CameraModel, Keypoints, Treatment
 from colmap_inertial.model import colmap_camera
+from colmap_inertial.pipeline.run.chunks import CHUNKS_FOLDER
 from colmap_inertial.pipeline.run.context import RunContext
+from colmap_inertial.pipeline.run.progress import counting
 from colmap_inertial.pipeline.run.workspace import require_room
 from colmap_inertial.pipeline.stages.protocols import KeypointStage
 
@@ -151,21 +161,25 @@ def extract_features(
     -------
     What the stages did to the keypoints of each image.
     """
-    import pycolmap
-
-    pycolmap.set_random_seed(context.seed)
+    works = []
     for batch, reader in register_images(images, cameras, database, context, rig):
         require_room_for_features(database, len(batch), options)
+        work = FindFeatures(
+            names=tuple(batch),
+            reader=state_reader(reader),
+            extraction=extraction_options(options, context).todict(),
+            device=context.device,
+            seed=context.seed,
+        )
+        if context.executor.remote:
+            works.append(work)
+        else:
+            with writing_database(database):
+                work.find(database, images)
+    if works:
+        count = counting(context.progress, "features", len(cameras))
         with writing_database(database):
-            pycolmap.extract_features(
-                str(database),
-                str(images),
-                image_names=batch,
-                camera_mode=pycolmap.CameraMode.SINGLE,
-                reader_options=reader,
-                extraction_options=extraction_options(options, context),
-                device=pycolmap.Device(context.device),
-            )
+            find_elsewhere(works, database, images, context.scratch / CHUNKS_FOLDER, context.executor, count)
     return apply_keypoint_stages(database, keypoint_stages)
 
 
@@ -349,14 +363,26 @@ def match_pairs(
     -------
     The work that is done.
     """
-    import pycolmap
-
     # how quickly it goes is seen already where some are matched
     batches = growing_batches(pairs, first=_MATCHING_BATCH if done else _FIRST_MATCHING_BATCH)
-    total = done + sum(map(_batch_work, batches)) if total is None else total
-    pycolmap.set_random_seed(context.seed)
+    own = sum(map(_batch_work, batches))
+    total = done + own if total is None else total
+    work = MatchPairs(
+        pairs=tuple(pairs),
+        matching=matching_options(context).todict(),
+        verification=verification_options(context).todict(),
+        device=context.device,
+        seed=context.seed,
+        database=database,
+    )
+    if is_worth_chunks(pairs, context.executor):
+        require_room(database, len(pairs) * _PAIR_BYTES)
+        matched = counting(context.progress, "matches", total, begin=done, steps=own, of=len(pairs))
+        with writing_database(database):
+            match_elsewhere(work, context.scratch / CHUNKS_FOLDER, context.executor, matched)
+        batches, done = [], done + own
     with tempfile.TemporaryDirectory(dir=context.scratch) as folder:
-        listed, theirs = Path(folder) / "pairs.txt", Path(folder) / "installed.db"
+        theirs = Path(folder) / "installed.db"
         installed = None
         if context.executable is not None and pairs:
             installed = InstalledColmap(executable=context.executable, scratch=context.scratch)
@@ -364,17 +390,10 @@ def match_pairs(
         for batch in batches:
             context.progress("matches", done, total)
             require_room(database, len(batch) * _PAIR_BYTES)
-            listed.write_text("".join(f"{a} {b}\n" for a, b in batch))
             if installed is not None:
                 installed.match(database, theirs, batch)
             with writing_database(database):
-                pycolmap.match_image_pairs(
-                    str(database),
-                    matching_options=matching_options(context),
-                    pairing_options=pycolmap.ImportedPairingOptions(match_list_path=str(listed)),
-                    verification_options=verification_options(context),
-                    device=pycolmap.Device(context.device),
-                )
+                replace(work, pairs=tuple(batch)).match(database, Path(folder))
             done += _batch_work(batch)
     context.progress("matches", done, total)
     return done

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from colmap_inertial.colmap.loop_closure import LONGEST, LoopClosure, MappedCapture, SubmapOverlap, merge_overlaps
-from colmap_inertial.colmap.parts import PartJob, map_parts
+from colmap_inertial.colmap.parts import map_parts, prepare_part
 from colmap_inertial.model.submodels.graph import (
     Convergence,
     Equations,
@@ -36,6 +36,7 @@ from colmap_inertial.model.submodels.graph import (
 )
 from colmap_inertial.model.submodels.matches import Submodel, constrain_by_points, find_common_features, matches_between
 from colmap_inertial.model.submodels.merging import merge_models
+from colmap_inertial.pipeline.run.chunks import Executor
 from colmap_inertial.pipeline.run.runner import remove
 
 if TYPE_CHECKING:
@@ -116,8 +117,8 @@ def map_runs(
     scratch: Path,
     parts: Sequence[tuple[int, int]],
     *,
-    workers: int,
-    registered: Callable[[], None],
+    executor: Executor,
+    registered: Callable[[int], None],
 ) -> list[MappedRun]:
     """Run COLMAP's incremental mapper on runs of the images.
 
@@ -127,19 +128,19 @@ def map_runs(
         Models of the runs are kept there; those that an earlier call has left are not made again.
     parts
         Begins and ends, as :func:`runs` has them.
-    workers
-        Parts that are mapped at a time, each by a process with one thread.
+    executor
+        Who maps the parts, each in one thread.
     registered
-        Is called for each image that a part places.
+        Is called with numbers of images that parts place.
     """
-    jobs = []
+    chunks = []
     for number, (begin, end) in enumerate(parts):
         own = copy.copy(capture.pipeline)
         own.extract_colors, own.num_threads = False, 1
         own.image_names = list(capture.names[begin:end])
         remove(scratch / str(number))  # of a run that was killed
-        jobs.append(PartJob.prepare(capture.database, own, scratch / str(number)))
-    mapped = map_parts(jobs, images, workers=workers, registered=registered)
+        chunks.append(prepare_part(capture.database, images, own, scratch / str(number), number))
+    mapped = map_parts(chunks, executor, registered)
     return [
         MappedRun(model=model, begin=begin, end=end)
         for (begin, end), models in zip(parts, mapped, strict=True)

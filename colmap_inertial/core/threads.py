@@ -6,7 +6,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from contextvars import ContextVar, copy_context
+from contextvars import copy_context
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
@@ -40,29 +40,6 @@ def usable_processors() -> int:
 def usable_cores() -> list[int]:
     """Their numbers, counted from 0 where the system does not say."""
     return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(usable_processors()))
-
-
-_WORKERS: ContextVar[int | None] = ContextVar("workers", default=None)
-
-
-@contextmanager
-def using_workers(workers: int | None) -> Iterator[None]:
-    """Map parts of long captures by so many processes within it; ``None``: by one for each processor.
-
-    Their number does not change a result.
-    """
-    if workers is not None and workers < 1:
-        raise ValueError(f"workers must be at least 1, not {workers}")
-    token = _WORKERS.set(workers)
-    try:
-        yield
-    finally:
-        _WORKERS.reset(token)
-
-
-def worker_processes() -> int:
-    """Number of processes of :func:`using_workers`."""
-    return _WORKERS.get() or usable_processors()
 
 
 def threads_beside(workers: int) -> int:

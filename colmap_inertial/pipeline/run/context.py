@@ -6,18 +6,20 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
+from colmap_inertial.core.errors import InertialError
 from colmap_inertial.core.options import ReconstructOptions
-from colmap_inertial.core.threads import worker_processes
 from colmap_inertial.core.types import CameraImuCalibration, FrameTiming, ImuRecording
 from colmap_inertial.io.calibration import CalibrationFiles, largest_offset_s, read_calibrations, read_for_recording
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.capture_rig import rig_files
 from colmap_inertial.io.files import path_in
 from colmap_inertial.io.frame_sources import Video
+from colmap_inertial.pipeline.run.chunks import Executor
 from colmap_inertial.pipeline.run.colmap_settings import NO_SETTINGS, ColmapSettings, read_settings
 from colmap_inertial.pipeline.run.executable import ColmapExecutable, Device, read_executable
 from colmap_inertial.pipeline.run.progress import Progress, silent
 from colmap_inertial.pipeline.run.runner import fingerprint
+from colmap_inertial.pipeline.run.workers import chosen_executor
 
 Features = Literal["sift", "aliked"]
 
@@ -126,8 +128,8 @@ class RunContext:
         What the user set of COLMAP's own options.
     executable
         An installed COLMAP that finds and matches features and maps; ``None`` where pycolmap does.
-    workers
-        Processes that map parts of a long capture at a time.
+    executor
+        Who maps parts of a long capture.
     progress
         Hears how far it is.
     """
@@ -139,7 +141,7 @@ class RunContext:
     features: Features = "sift"
     colmap: ColmapSettings = NO_SETTINGS
     executable: ColmapExecutable | None = None
-    workers: int = field(default_factory=worker_processes)
+    executor: Executor = field(default_factory=chosen_executor)
     progress: Progress = silent
 
     @classmethod
@@ -149,6 +151,10 @@ class RunContext:
         settings = read_settings(options.colmap, options.colmap_project)
         executable = None
         if options.colmap_executable is not None:
+            if chosen_executor().remote:
+                raise InertialError(
+                    "--colmap-executable: an installed COLMAP works on this machine alone; leave out --scheduler"
+                )
             executable = read_executable(
                 options.colmap_executable, options.mapping, settings, deterministic=options.deterministic
             )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Protocol, TypeVar, runtime_checkable
 
@@ -49,3 +49,20 @@ def counted(items: Iterable[Item], total: int, stage: str, progress: Progress) -
         progress(stage, done, total)
         yield item
     progress(stage, total, total)
+
+
+def counting(
+    progress: Progress, stage: str, total: int, *, begin: int = 0, steps: int | None = None, of: int | None = None
+) -> Callable[..., None]:
+    """A function that counts items, one at a time or several, from ``begin`` on; ``of`` items are so many ``steps``.
+
+    By default ``total`` items are as many steps.
+    """
+    count = 0
+
+    def told(items: int = 1) -> None:
+        nonlocal count
+        count += items
+        progress(stage, min(begin + count * (steps or total) // (of or total), total), total)
+
+    return told

@@ -256,6 +256,7 @@ def _reconstruct(
         open_session(out, capture.path, options, context, pictures=pictures, decides=decides) as session,
         reporting_stops(session.workspace, capture),
     ):
+        session.context.executor.require(session.context.scratch)
         write_recording(session, given.recording)  # a run that stops reports it, too
         doubts = run_preflight(session, given.recording, given.raw, findings, force=options.force)
         given = replace(given, recording=replace(given.recording, doubts=doubts))

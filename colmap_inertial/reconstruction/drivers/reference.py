@@ -414,6 +414,7 @@ def _map(
     require_features(context)
     for _ in counted(_written(capture, names, images), len(names), "frames", progress):
         pass
+    context.executor.require(project)
     database = project / "database.db"
     extract_features(images, dict.fromkeys(names, capture.camera), database, mapping, context=context)
     match_pairs(database, image_pairs(names, mapping), context)

@@ -35,6 +35,7 @@ from colmap_inertial.motion.align import AlignOptions, align_clocks
 from colmap_inertial.motion.align.consensus import align_by_consensus
 from colmap_inertial.motion.flow import VisualRotation, check_motion, find_stabilisation
 from colmap_inertial.motion.sign import check_sign
+from colmap_inertial.pipeline.run.chunks import Processes
 from colmap_inertial.pipeline.run.context import Recording, RunContext
 from colmap_inertial.pipeline.run.progress import Progress
 from colmap_inertial.pipeline.stages.frame_folder import encode_image, smooth_for_colmap
@@ -326,6 +327,8 @@ def _small_models(
     cameras = {name: capture.camera for name in names}
     stages = [] if view is None else [RollingShutterStage(view=view)]
     pairs = image_pairs(names, _SMALL)
+    # what is small, and of images that others may not see, is done here
+    context = replace(context, executor=Processes(number=1))
     # COLMAP's matcher and mapper differ from run to run with several threads, and the rest of a run would follow them
     alone = replace(context, num_threads=1, executable=None)
     if matched is None:

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from colmap_inertial.core.errors import InertialError, MissingExtraError
 from colmap_inertial.core.threads import usable_cores
+from colmap_inertial.pipeline.run.workers import connect
 from colmap_inertial.tools.batch.task import CaptureStatus, CaptureTask, run_capture
 
 log = logging.getLogger(__name__)
@@ -115,21 +115,9 @@ def local_pool(shares: list[list[int]]) -> Iterator[Submit]:
 def dask_pool(address: str) -> Iterator[Submit]:
     """The workers of a Dask cluster. A capture whose worker is lost goes to another one.
 
-    Raises
-    ------
-    MissingExtraError
-        Where Dask is not installed.
-    InertialError
-        Where no scheduler answers.
+    Errors are those of :func:`~colmap_inertial.pipeline.run.workers.connect`.
     """
-    try:
-        from distributed import Client
-    except ImportError:
-        raise MissingExtraError("cluster", "--scheduler hands captures to a Dask cluster") from None
-    try:
-        client = Client(address, timeout=10, set_as_default=False)
-    except (OSError, ValueError) as error:
-        raise InertialError(f"no Dask scheduler answers at {address}: {error}") from error
+    client = connect(address, "--scheduler hands captures to a Dask cluster")
     submitted: list[Any] = []
     warn_without_gpu = functools.cache(lambda: _warn_without_gpu(client))
 

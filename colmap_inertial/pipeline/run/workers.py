@@ -1,0 +1,208 @@
+"""Who does the chunks of a run: processes of this machine, or the workers of a Dask cluster."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import shutil
+import subprocess
+import tempfile
+import uuid
+from collections.abc import Callable, Iterator, Sequence
+from contextvars import ContextVar
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+from colmap_inertial import __version__
+from colmap_inertial.core.errors import InertialError, MappingError, MissingExtraError
+from colmap_inertial.core.threads import usable_processors
+from colmap_inertial.io.files import write_text
+from colmap_inertial.pipeline.run.chunks import (
+    Chunk,
+    Executor,
+    Processes,
+    end_process,
+    require_success,
+    start_process,
+)
+from colmap_inertial.pipeline.run.runner import remove
+
+_EXECUTOR: ContextVar[Executor | None] = ContextVar("executor", default=None)
+#: How often a worker looks whether its chunk is still wanted, in seconds.
+_WANTED_S = 0.25
+
+
+@contextlib.contextmanager
+def using_workers(workers: int | None = None, *, scheduler: str | None = None) -> Iterator[None]:
+    """Let reconstructions within it be helped by so many processes, or by the workers of a Dask scheduler.
+
+    Parts of long captures are mapped by as many processes at a time, by default one for each processor. Workers of a
+    scheduler (``tcp://host:8786``) also find and match features; they need the same versions of this package and of
+    pycolmap, and must see the output under the same path. Neither changes a result.
+
+    Raises
+    ------
+    MissingExtraError
+        For a scheduler without Dask.
+    InertialError
+        Where no scheduler answers.
+    """
+    if workers is not None and workers < 1:
+        raise ValueError(f"workers must be at least 1, not {workers}")
+    if workers is not None and scheduler is not None:
+        raise ValueError("--workers are those of this machine; with --scheduler, the cluster has its own")
+    with contextlib.ExitStack() as stack:
+        executor: Executor = Processes(number=workers or usable_processors())
+        if scheduler is not None:
+            client = stack.enter_context(connect(scheduler, "--scheduler hands work to a Dask cluster"))
+            executor = Cluster(address=scheduler, client=client)
+        token = _EXECUTOR.set(executor)
+        try:
+            yield
+        finally:
+            _EXECUTOR.reset(token)
+
+
+def chosen_executor() -> Executor:
+    """That of :func:`using_workers`."""
+    return _EXECUTOR.get() or Processes(number=usable_processors())
+
+
+def connect(address: str, what: str) -> Any:
+    """A Dask client; closes where its context ends.
+
+    Raises
+    ------
+    MissingExtraError
+        Where Dask is not installed, which ``what`` needs.
+    InertialError
+        Where no scheduler answers.
+    """
+    try:
+        from distributed import Client
+    except ImportError:
+        raise MissingExtraError("cluster", what) from None
+    try:
+        return Client(address, timeout=10, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise InertialError(f"no Dask scheduler answers at {address}: {error}") from error
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Cluster:
+    """The workers of a Dask cluster. A chunk whose worker is lost goes to another one.
+
+    Attributes
+    ----------
+    address
+        Of the scheduler.
+    client
+        Dask's.
+    """
+
+    remote: ClassVar[bool] = True
+    address: str
+    client: Any
+
+    def run(self, chunks: Sequence[Chunk], told: Callable[[int], None]) -> Iterator[int]:
+        """As of :class:`~colmap_inertial.pipeline.run.chunks.Executor`."""
+        from distributed import as_completed
+
+        wanted: dict[Any, int] = {}
+        for number, chunk in enumerate(chunks):
+            key = f"colmap-inertial-{uuid.uuid4().hex}"
+            wanted[self.client.submit(do_for_another, chunk, describe_versions(), key=key, pure=False)] = number
+        try:
+            for future in as_completed(list(wanted), loop=self.client.loop):
+                chunk = chunks[wanted[future]]
+                for name, content in _result(future, chunk).items():
+                    path = chunk.folder / "made" / name
+                    path.parent.mkdir(parents=True, exist_ok=True)
+                    path.write_bytes(content)
+                chunk.keep()
+                future.release()
+                told(chunk.size)
+                yield wanted.pop(future)
+        finally:
+            with contextlib.suppress(Exception):  # the scheduler may be gone
+                self.client.cancel(list(wanted))
+            for number in wanted.values():
+                remove(chunks[number].folder)  # a worker that is at it stops
+
+    def require(self, folder: Path) -> None:
+        """Raise ``InertialError`` where there is no worker, or one has other versions or does not see a folder."""
+        probe, token = folder.absolute() / "seen_by_workers", uuid.uuid4().hex
+        write_text(probe, token)
+        try:
+            answers = self.client.run(describe_worker, probe, on_error="return")
+        finally:
+            remove(probe)
+        if not answers:
+            raise InertialError(f"{self.address} has no worker: start one (dask worker {self.address})")
+        for worker, answer in answers.items():
+            if isinstance(answer, BaseException):
+                raise InertialError(
+                    f"worker {worker} cannot use colmap-inertial {__version__}: {answer}; install it there"
+                )
+            versions, seen = answer
+            _require_versions(worker, versions, describe_versions())
+            if seen != token:
+                raise InertialError(
+                    f"worker {worker} does not see {folder}: the output must lie on a path that all machines share"
+                )
+
+
+def _result(future: Any, chunk: Chunk) -> dict[str, bytes]:
+    try:
+        files: dict[str, bytes] = future.result()
+    except MappingError:
+        raise
+    except (Exception, asyncio.CancelledError) as error:  # its workers were lost too often, or the scheduler is
+        text = f"{type(error).__name__}: {error}".partition("\n")[0]
+        raise MappingError(f"{chunk.name}: no worker could finish it: {text}; started again, it continues") from error
+    return files
+
+
+def describe_versions() -> str:
+    """What must be the same everywhere."""
+    import pycolmap
+
+    return f"colmap-inertial {__version__}, pycolmap {pycolmap.__version__}{' with CUDA' if pycolmap.has_cuda else ''}"
+
+
+def describe_worker(probe: Path) -> tuple[str, str]:
+    """The versions of this worker, and what it sees in a file; empty where it sees none."""
+    try:
+        return describe_versions(), probe.read_text(encoding="utf-8")
+    except OSError:
+        return describe_versions(), ""
+
+
+def _require_versions(worker: str, versions: str, wanted: str) -> None:
+    if versions != wanted:
+        raise MappingError(f"worker {worker} has {versions}; here is {wanted}: install the same there")
+
+
+def do_for_another(chunk: Chunk, versions: str) -> dict[str, bytes]:
+    """Do another machine's chunk in this worker's scratch folder; returns the files that were made, by name."""
+    from distributed import get_worker
+
+    worker = get_worker()
+    _require_versions(worker.address, describe_versions(), versions)
+    with tempfile.TemporaryDirectory(dir=worker.local_directory) as scratch:
+        own = replace(chunk, folder=Path(scratch) / "chunk")
+        shutil.copytree(chunk.folder, own.folder)
+        process = start_process(own, heard=False)
+        try:
+            while process.poll() is None:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(timeout=_WANTED_S)
+                if not chunk.folder.exists():
+                    raise MappingError(f"{chunk.name}: not wanted any more")
+            require_success(process, own)
+        finally:
+            process.kill()
+            end_process(process)
+        made = own.folder / "made"
+        return {str(path.relative_to(made)): path.read_bytes() for path in made.rglob("*") if path.is_file()}
