@@ -15,6 +15,7 @@ import time
 from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import psutil
 import pycolmap
@@ -34,7 +35,7 @@ from colmap_inertial.io.capture import load_capture
 from colmap_inertial.pipeline.run.config import config_as_toml
 from colmap_inertial.pipeline.run.context import RunContext
 from colmap_inertial.pipeline.run.progress import silent
-from colmap_inertial.pipeline.run.workers import Cluster, using_workers
+from colmap_inertial.pipeline.run.workers import Cluster, describe_versions, using_workers
 from colmap_inertial.reconstruction.drivers.capture import reconstruct
 from colmap_inertial.tools import batch
 from colmap_inertial.tools.batch import BatchCapture, needs_gpu, read_manifest, run_batch
@@ -343,11 +344,11 @@ def tables_of(database: Path) -> dict[str, list[tuple[object, ...]]]:
 def test_one_capture_on_a_cluster_is_that_of_one_machine(capture, cluster, tmp_path, monkeypatch):
     """A worker is killed at its work, and the run that they work for is stopped and begun again."""
     images, (address, _) = capture[0] / "frames", cluster
-    names = sorted(path.name for path in images.iterdir())[:12]
+    names = sorted(path.name for path in images.iterdir())[:10]
     options = MappingOptions(
         max_num_features=400, first_octave=0, overlap=3, pairing="sequential", refine_intrinsics=False
     )
-    monkeypatch.setattr(feature_chunks, "SIZES", ChunkSizes(pairs=15, least_pairs=1))
+    monkeypatch.setattr(feature_chunks, "SIZES", ChunkSizes(pairs=16, least_pairs=1))
     monkeypatch.setattr(
         submaps, "SIZES", dataclasses.replace(submaps.SIZES, least=2, shortest=8, longest=8, shared=0.5)
     )
@@ -386,7 +387,9 @@ def test_one_capture_on_a_cluster_is_that_of_one_machine(capture, cluster, tmp_p
     killer = threading.Thread(target=kill_at_work)
     try:
         with using_workers(scheduler=address):
-            RunContext().executor.client.wait_for_workers(3)
+            client = RunContext().executor.client
+            client.wait_for_workers(3)
+            monkeypatch.setattr(client, "submit", partial(client.submit, workers="three", allow_other_workers=True))
             killer.start()
             with pytest.raises(KeyboardInterrupt):
                 reconstruct_in(tmp_path / "shared", stop)
@@ -397,8 +400,40 @@ def test_one_capture_on_a_cluster_is_that_of_one_machine(capture, cluster, tmp_p
         third.kill()
     assert third.wait() == -signal.SIGKILL
     assert found == (parts, tables, models)
-    assert features >= 2 and asked[2] == 0 and 0 < asked[3] < pairs and asked[4] == parts
+    assert features >= 2 and asked[2:] == [0, pairs - 1, parts]
     assert {path.name for path in (tmp_path / "shared").iterdir()} == {"database.db", "sparse"}
+
+
+def test_what_keeps_a_cluster_from_helping_is_said_before_the_work(cluster, tmp_path, monkeypatch, capsys):
+    here = describe_versions()
+
+    def require(answers):
+        Cluster(address="tcp://a:1", client=SimpleNamespace(run=lambda *_, **__: answers)).require(tmp_path)
+
+    with pytest.raises(InertialError, match=r"tcp://a:1 has no worker: start one \(dask worker tcp://a:1\)"):
+        require({})
+    with pytest.raises(InertialError, match=r"worker w cannot use colmap-inertial .* No module named"):
+        require({"w": ModuleNotFoundError("No module named 'colmap_inertial'")})
+    with pytest.raises(InertialError, match=r"worker w does not see .* path that all machines share"):
+        require({"w": (here, "")})
+    with using_workers(scheduler=cluster[0]):
+        executor = RunContext().executor
+        executor.require(tmp_path)
+        monkeypatch.setattr("colmap_inertial.pipeline.run.workers.describe_versions", lambda: "pycolmap 9")
+        with pytest.raises(
+            InertialError, match=rf"worker tcp://.* has {here}; here is pycolmap 9: install the same there"
+        ):
+            executor.require(tmp_path)
+        with pytest.raises(InertialError, match="works on this machine alone"):
+            RunContext.of(ReconstructOptions(colmap_executable=Path("colmap")))
+    assert list(tmp_path.iterdir()) == []
+    for flags, said in (
+        (["--workers", "2"], "with --scheduler, the cluster has its own"),
+        ([], "no Dask scheduler answers"),
+    ):
+        with pytest.raises(SystemExit, match="2"):
+            main(["reconstruct", "capture", str(tmp_path / "out"), "--scheduler", "nonsense://a:1", *flags])
+        assert said in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_cluster_stops_when_the_batch_does(capture, cluster, tmp_path):

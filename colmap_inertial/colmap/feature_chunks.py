@@ -196,10 +196,10 @@ def find_elsewhere(
             pycolmap.Database.open(str(chunk.made / _MADE)) as source,
             pycolmap.Database.open(str(database)) as target,
         ):
+            own = {image.name: image.image_id for image in target.read_all_images()}
             for image in source.read_all_images():
-                number = target.read_image_with_name(image.name).image_id
-                target.write_keypoints(number, source.read_keypoints(image.image_id))
-                target.write_descriptors(number, source.read_descriptors(image.image_id))
+                target.write_keypoints(own[image.name], source.read_keypoints(image.image_id))
+                target.write_descriptors(own[image.name], source.read_descriptors(image.image_id))
 
 
 def is_worth_chunks(pairs: Sequence[tuple[str, str]], executor: Executor) -> bool:

@@ -18,7 +18,7 @@ import subprocess
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Protocol
@@ -103,10 +103,12 @@ class Chunk:
 class Executor(Protocol):
     """Who does chunks."""
 
-    #: Whether they are done on other machines, so that features and matches are worth chunks, too.
-    remote: bool
+    @property
+    def remote(self) -> bool:
+        """Whether they are done on other machines, so that features and matches are worth chunks, too."""
+        ...
 
-    def run(self, chunks: Sequence[Chunk], told: Callable[[int], None]) -> Iterator[int]:
+    def run(self, chunks: Sequence[Chunk], told: Callable[[int], None]) -> Generator[int, None, None]:
         """Do chunks, some at a time; yields the number of each that is kept.
 
         ``told`` is called in this thread with numbers of items that are done.
@@ -138,13 +140,11 @@ def do_chunks(chunks: Sequence[Chunk], executor: Executor, told: Callable[[int],
         told(chunks[number].size)
     missing = [number for number in range(len(chunks)) if number not in made]
     done = executor.run([chunks[number] for number in missing], told)
-    try:
+    with contextlib.closing(done):
         for number, chunk in enumerate(chunks):
             while number not in made:
                 made.add(missing[next(done)])
             yield chunk
-    finally:
-        done.close()  # type: ignore[attr-defined]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,7 +154,7 @@ class Processes:
     remote: ClassVar[bool] = False
     number: int
 
-    def run(self, chunks: Sequence[Chunk], told: Callable[[int], None]) -> Iterator[int]:
+    def run(self, chunks: Sequence[Chunk], told: Callable[[int], None]) -> Generator[int, None, None]:
         """As of :class:`Executor`."""
         events: queue.SimpleQueue[int | None] = queue.SimpleQueue()
         running: dict[int, subprocess.Popen[bytes]] = {}
@@ -242,7 +242,8 @@ def main() -> None:
     threading.Thread(target=_end_with_the_parent, daemon=True).start()
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     try:
-        work(*map(Path, sys.argv[1:]), told=_tell)
+        folder, images, made = map(Path, sys.argv[1:])
+        work(folder, images, made, _tell)
     except InertialError as error:
         sys.exit(str(error))
 

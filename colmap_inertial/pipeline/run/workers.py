@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import tempfile
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -66,7 +66,8 @@ def using_workers(workers: int | None = None, *, scheduler: str | None = None) -
 
 def chosen_executor() -> Executor:
     """That of :func:`using_workers`."""
-    return _EXECUTOR.get() or Processes(number=usable_processors())
+    executor = _EXECUTOR.get()
+    return Processes(number=usable_processors()) if executor is None else executor
 
 
 def connect(address: str, what: str) -> Any:
@@ -105,7 +106,7 @@ class Cluster:
     address: str
     client: Any
 
-    def run(self, chunks: Sequence[Chunk], told: Callable[[int], None]) -> Iterator[int]:
+    def run(self, chunks: Sequence[Chunk], told: Callable[[int], None]) -> Generator[int, None, None]:
         """As of :class:`~colmap_inertial.pipeline.run.chunks.Executor`."""
         from distributed import as_completed
 
@@ -156,7 +157,7 @@ class Cluster:
 def _result(future: Any, chunk: Chunk) -> dict[str, bytes]:
     try:
         files: dict[str, bytes] = future.result()
-    except MappingError:
+    except InertialError:
         raise
     except (Exception, asyncio.CancelledError) as error:  # its workers were lost too often, or the scheduler is
         text = f"{type(error).__name__}: {error}".partition("\n")[0]
@@ -181,7 +182,7 @@ def describe_worker(probe: Path) -> tuple[str, str]:
 
 def _require_versions(worker: str, versions: str, wanted: str) -> None:
     if versions != wanted:
-        raise MappingError(f"worker {worker} has {versions}; here is {wanted}: install the same there")
+        raise InertialError(f"worker {worker} has {versions}; here is {wanted}: install the same there")
 
 
 def do_for_another(chunk: Chunk, versions: str) -> dict[str, bytes]:
