@@ -1,7 +1,7 @@
 """Whole runs against plain COLMAP: processor time, registered images, camera error, loops.
 
-    python scripts/bench_whole.py FOLDER [--euroc DATASET] [--walk FRAMES] [--loop FRAMES] [--repeated SCENES]
-        [--drawn] [--long FRAMES ...] [--density D] [--seeds SEED ...] [--workers N] [--json FILE]
+    python scripts/bench_whole.py FOLDER [--euroc DATASET] [--walk FRAMES] [--loop FRAMES] [--laps LAPS] [--back]
+        [--repeated SCENES] [--drawn] [--long FRAMES ...] [--density D] [--seeds SEED ...] [--workers N] [--json FILE]
         [--mappers {incremental,one,global,bare} ...]
 
 FOLDER takes captures and reconstructions. ``--euroc``: the 100 keyframes of V1_01_easy (DATASET has ``keyframes/``,
@@ -16,7 +16,8 @@ errors, as large between one frame and the next (neighbours' error) and beyond w
 
 ``--loop``: the loop's error of a walk around a room, with its loops closed, and of the same features matched
 sequentially with a linear overlap (``quadratic_overlap`` off, no loops), both mapped alike; features are synthesised
-(``walk_features.py``).
+(``walk_features.py``). ``--laps``: of the walk; ``--back``: who walks turns round halfway, so that loops' ends see the
+same from other sides, 40 degrees apart. Of the loops, how many are false, as below.
 
 ``--repeated``: walks of 160 frames past posters that hang many times (``SCENES`` below, a seed each). A pair that
 closes a loop is false where less than half of its matches join what is the same place in truth (within 15 cm). A frame
@@ -215,6 +216,12 @@ def true_centres(folder: Path) -> dict[str, Array]:
     return dict(zip(truth["names"], np.array(truth["cam_in_world_m"]), strict=True))
 
 
+def true_poses(folder: Path) -> tuple[Array, Array]:
+    """(N, 3) centres of the frames' cameras, (N, 3, 3) rotations from them to the world."""
+    truth = read_json(folder / "truth.json")
+    return np.array(truth["cam_in_world_m"]), matrix_from_quat(np.array(truth["world_from_cam_xyzw"]))
+
+
 def recorded(folder: Path) -> Recording:
     """A capture, read."""
     capture = load_capture(folder)
@@ -239,8 +246,7 @@ def false_loops(walk: Walk, folder: Path) -> Figures:
     begun_s = time.process_time()
     record = match_capture(features, database, recording, camera, options, context)
     processor_s = time.process_time() - begun_s
-    truth = read_json(folder / "truth.json")
-    centre, turned = np.array(truth["cam_in_world_m"]), matrix_from_quat(np.array(truth["world_from_cam_xyzw"]))
+    centre, turned = true_poses(folder)
     right = {pair: share >= 0.5 for pair, share in true_shares(walk, names, centre, turned, database).items()}
     loops = {pair: true for pair, true in right.items() if pair[1] - pair[0] > 2 * OVERLAP}
     apart_m = np.linalg.norm(centre[:, None] - centre, axis=2)
@@ -330,6 +336,8 @@ def loop_errors(walk: Walk, folder: Path) -> dict[str, Figures]:
         else:
             record = match_capture(features, database, recording, camera, options, context)
             told = {"loops_closed": record.loops_closed, "verified": record.verified}
+            shares = true_shares(walk, names, *true_poses(folder), database)
+            told["false"] = sum(share < 0.5 for (i, j), share in shares.items() if j - i > 2 * LOOP_OVERLAP)
         matched_s = time.process_time()
         map_images(
             database,
@@ -453,6 +461,8 @@ def main() -> None:
     parser.add_argument("--euroc", type=Path, help="folder of the data set")
     parser.add_argument("--walk", type=int, default=0, help="frames")
     parser.add_argument("--loop", type=int, default=0, help="frames")
+    parser.add_argument("--laps", type=float, default=1.08, help="of --loop")
+    parser.add_argument("--back", action="store_true", help="turn round halfway in --loop")
     parser.add_argument("--repeated", type=int, default=0, help="scenes")
     parser.add_argument("--first", type=int, default=0, help="seed of the first scene")
     parser.add_argument("--drawn", action="store_true", help="find the scenes' features in drawn pictures")
@@ -486,8 +496,12 @@ def main() -> None:
         found["walk"] = both(capture, folder, true_centres(folder), sequential=True)
         print(json.dumps({"walk": found["walk"]}, indent=1), flush=True)
     if args.loop:
-        walk = Walk(seed=100, frames=args.loop, frame_rate_hz=args.loop / 40, drawn=False)
-        found["loop"] = loop_errors(walk, args.folder / f"loop{args.loop}")
+        seconds = 40 * args.laps / 1.08
+        walk = Walk(
+            seed=100, frames=args.loop, frame_rate_hz=args.loop / seconds, laps=args.laps, drawn=False, back=args.back
+        )
+        name = f"loop{args.loop}_laps{args.laps:g}{'_back' if args.back else ''}"
+        found["loop"] = loop_errors(walk, args.folder / name)
         print(json.dumps({"loop": found["loop"]}, indent=1), flush=True)
     for seed in range(args.first, args.first + args.repeated):
         folder = args.folder / f"{'drawn' if args.drawn else 'repeated'}{seed}"

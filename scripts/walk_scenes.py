@@ -43,6 +43,8 @@ LENGTH_M, AWAY_M, SPEED_M_S = 40.0, 2.2, 0.6
 CORNER_M = 1.2
 #: From one copy to the next.
 PERIOD_M = 1.25
+#: Who walks back looks so much to where they go, both ways: the same is seen from directions twice as far apart.
+AHEAD_DEG = 20.0
 #: Knots of the path.
 RATE_HZ = 60.0
 
@@ -61,6 +63,8 @@ class Walk:
     size, on all walls; ``copies``: nothing but one poster at equal distances, on plaster; ``tiled``: the plaster is the
     same from each poster to the next, too; likewise a ``corridor`` with one wall, and nobody turns round.
 
+    ``back``: halfway, who walks around a room turns round, and what they saw comes again from the other side.
+
     ``pace_m_s``: the room is as large as the walk, at this pace, is long. Without one, it is of the usual size; who
     walks is slow in corners, and quick in the middle of walls.
     """
@@ -72,6 +76,7 @@ class Walk:
     scene: Scene = "room"
     width: int = 480
     drawn: bool = True
+    back: bool = False
     pace_m_s: float | None = None
 
     def half_m(self) -> Array:
@@ -187,15 +192,22 @@ def motion_of(walk: Walk) -> Motion:
     duration_s = walk.frames / walk.frame_rate_hz
     count = int((duration_s + 2 * MARGIN_S) * RATE_HZ) + 33
     t_s = -MARGIN_S - 16 / RATE_HZ + np.arange(count) / RATE_HZ
-    phase, path_m = 2 * np.pi * walk.laps * t_s / duration_s, walk.path_m()
+    laps, path_m = walk.laps * t_s / duration_s, walk.path_m()
+    if walk.back:
+        laps = np.minimum(laps, walk.laps - laps)
+    phase = 2 * np.pi * laps
     # a superellipse; the camera looks along its normal
     cosine, sine = np.cos(phase), np.sin(phase)
     across = np.stack([np.sign(c) * np.abs(c) ** 0.5 for c in (cosine, sine)], axis=1) * path_m
     out = np.stack([cosine / path_m[0], sine / path_m[1]], axis=1)
     if walk.pace_m_s is not None:
-        across, out = _at_one_pace(path_m, walk.laps * t_s / duration_s)
+        across, out = _at_one_pace(path_m, laps)
         out = _smooth(out)
     across = _smooth(across)
+    if walk.back:
+        ahead = np.radians(AHEAD_DEG) * _smooth(np.where(t_s < duration_s / 2, 1.0, -1.0)[:, None])
+        out /= np.linalg.norm(out, axis=1, keepdims=True)
+        out = np.cos(ahead) * out + np.sin(ahead) * np.stack([-out[:, 1], out[:, 0]], axis=1)
     sway = [sum(a * np.sin(2 * np.pi * f * t_s + p) for a, f, p in _tones(rng)) for _ in range(6)]
     out = np.column_stack([out, 0 * phase])
     if "corridor" in walk.scene:
