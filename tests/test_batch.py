@@ -344,13 +344,13 @@ def tables_of(database: Path) -> dict[str, list[tuple[object, ...]]]:
 def test_one_capture_on_a_cluster_is_that_of_one_machine(capture, cluster, tmp_path, monkeypatch):
     """A worker is killed at its work, and the run that they work for is stopped and begun again."""
     images, (address, _) = capture[0] / "frames", cluster
-    names = sorted(path.name for path in images.iterdir())[:10]
+    names = sorted(path.name for path in images.iterdir())[:8]
     options = MappingOptions(
-        max_num_features=400, first_octave=0, overlap=3, pairing="sequential", refine_intrinsics=False
+        max_num_features=300, first_octave=0, overlap=3, pairing="sequential", refine_intrinsics=False
     )
-    monkeypatch.setattr(feature_chunks, "SIZES", ChunkSizes(pairs=16, least_pairs=1))
+    monkeypatch.setattr(feature_chunks, "SIZES", ChunkSizes(pairs=11, least_pairs=1))
     monkeypatch.setattr(
-        submaps, "SIZES", dataclasses.replace(submaps.SIZES, least=2, shortest=8, longest=8, shared=0.5)
+        submaps, "SIZES", dataclasses.replace(submaps.SIZES, least=2, shortest=6, longest=6, shared=0.5)
     )
     asked, run = [], Cluster.run
 
