@@ -241,7 +241,7 @@ def test_what_only_damping_holds_is_not_at_rest(small, monkeypatch):
     _, problem, start, _ = small
     off = nudged(start, np.random.default_rng(3), 2e-3)
     free = solve(problem, off)
-    monkeypatch.setattr(solver, "_FIRST_DAMPING", 1e7)
+    monkeypatch.setattr(solver, "SOLVE", replace(solver.SOLVE, first_damping=1e7))
     held = solve(problem, off)
     assert held.converged
     assert held.cost == pytest.approx(free.cost, abs=0.2)

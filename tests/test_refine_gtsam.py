@@ -1,5 +1,7 @@
 """GTSAM as the oracle: the same factors, put together and solved by somebody else."""
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from refine_walk import PINHOLE, nudged, problem_of, tracks_of, walk
 
 from colmap_inertial.core.geometry import so3_exp, so3_log
 from colmap_inertial.inertial.core.preintegration import SensorErrors, preintegrate
+from colmap_inertial.inertial.refine import solve as solver
 from colmap_inertial.inertial.refine._residuals import imu_rows
 from colmap_inertial.inertial.refine.solve import factored, solve
 from colmap_inertial.inertial.refine.values import N_STATE
@@ -18,15 +21,13 @@ STEP_S = 0.001
 
 @pytest.fixture(scope="module")
 def solved():
-    from dataclasses import replace
-
     options = walk(5.0, points_per_m=40.0, camera=PINHOLE)
     problem, start, _ = problem_of(tracks_of(options), options, refine_intrinsics=False)
     # what GTSAM's factors do not estimate is known
     count = start.columns.count
     problem = replace(problem, prior=replace(problem.prior, mean=start, info=1e14 * np.eye(count)))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("colmap_inertial.inertial.refine.solve._SETTLED", 1e-6)
+        patch.setattr(solver, "SOLVE", replace(solver.SOLVE, settled=1e-6))
         solution = solve(problem, nudged_states(start))
     return problem, solution.estimate
 

@@ -21,17 +21,27 @@ from colmap_inertial.inertial.refine._residuals import (
 from colmap_inertial.inertial.refine._system import Factored, Step, System
 from colmap_inertial.inertial.refine.values import N_STATE, Estimate, Observations, Problem
 
-_MAX_STEPS = 40
-#: Where a step promises less of the squares' sum (in variances), it is at rest.
-_SETTLED = 0.1
-_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e8
-#: A step to cameras whose numbers differ by more than this share (or as much of 1) is not tried.
-_LARGEST_CHANGE = 0.5
-#: With more damping, every step promises little: what seems to rest then is pushed once more with less.
-_REST_DAMPING = 1e-3
-#: The robust weights overstate the curvature of the loss, and steps are too short: they are stretched by up to so much.
-#: (With the loss's own second derivatives, as Triggs corrects for them, 6 and 8 steps became 11 to 19.)
-_LONGEST_STRETCH = 2.0
+
+@dataclass(frozen=True, kw_only=True)
+class SolveLimits:
+    """Limits of the steps by Levenberg and Marquardt."""
+
+    steps: int = 40
+    #: Where a step promises less of the squares' sum (in variances), it is at rest.
+    settled: float = 0.1
+    first_damping: float = 1e-4
+    least_damping: float = 1e-9
+    most_damping: float = 1e8
+    #: A step to cameras whose numbers differ by more than this share (or as much of 1) is not tried.
+    largest_change: float = 0.5
+    #: With more damping, every step promises little: what seems to rest then is pushed once more with less.
+    rest_damping: float = 1e-3
+    #: The robust weights overstate the curvature of the loss, and steps are too short: they are stretched by up to so
+    #: much. (With the loss's own second derivatives, as Triggs corrects for them, 6 and 8 steps became 11 to 19.)
+    longest_stretch: float = 2.0
+
+
+SOLVE = SolveLimits()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -103,16 +113,16 @@ def _built(problem: Problem, layout: Layout, at: _Point, by: Derivatives, residu
     return System.build(layout, problem.observations, by, residual, at.rows, (info, -info @ at.offset), damping=damping)
 
 
-def solve(problem: Problem, start: Estimate, *, most_steps: int = _MAX_STEPS) -> Solution:
+def solve(problem: Problem, start: Estimate, *, most_steps: int = SOLVE.steps) -> Solution:
     """Refine an estimate."""
     observations = problem.observations
     layout = Layout.of(observations, len(start.velocity_m_s))
-    at, damping, growth = _evaluate(problem, start, observations), _FIRST_DAMPING, 2.0
+    at, damping, growth = _evaluate(problem, start, observations), SOLVE.first_damping, 2.0
     converged, steps, stretch = False, 0, 1.0
     for steps in range(1, most_steps + 1):
         by, residual = _weighted(problem, at)
         gained = pushed = False
-        while not gained and damping < _MOST_DAMPING:
+        while not gained and damping < SOLVE.most_damping:
             system = _built(problem, layout, at, by, residual, damping)
             step = _step(system, observations, by)
             if step is None:
@@ -122,10 +132,10 @@ def solve(problem: Problem, start: Estimate, *, most_steps: int = _MAX_STEPS) ->
                 damping, growth = damping * growth, 2 * growth
                 continue
             promised = _promised(problem, at, residual, step)
-            if promised < _SETTLED:
-                if damping <= _REST_DAMPING or pushed:
-                    return _solution(at, steps, converged=damping <= _REST_DAMPING)
-                damping, growth, pushed = _REST_DAMPING, 2.0, True
+            if promised < SOLVE.settled:
+                if damping <= SOLVE.rest_damping or pushed:
+                    return _solution(at, steps, converged=damping <= SOLVE.rest_damping)
+                damping, growth, pushed = SOLVE.rest_damping, 2.0, True
                 continue
             for length in (stretch, 1.0) if stretch > 1 else (1.0,):
                 tried = _evaluate(problem, step.taken(at.estimate, length), observations)
@@ -136,11 +146,11 @@ def solve(problem: Problem, start: Estimate, *, most_steps: int = _MAX_STEPS) ->
             stretch = 1.0
             if gained:
                 at = tried
-                damping = max(damping * max(0.1, 1 - (2 * ratio - 1) ** 3), _LEAST_DAMPING)
+                damping = max(damping * max(0.1, 1 - (2 * ratio - 1) ** 3), SOLVE.least_damping)
                 growth = 2.0
                 # of the curvature by the weights, the share that this step met
                 share = (2 * length - ratio) / length**2
-                stretch = 1 / min(max(share, 1 / _LONGEST_STRETCH), 1.0)
+                stretch = 1 / min(max(share, 1 / SOLVE.longest_stretch), 1.0)
             else:
                 damping, growth = damping * growth, 2 * growth
         if not gained:
@@ -160,7 +170,7 @@ def _step(system: System, observations: Observations, by: Derivatives) -> Step |
 def _plausible(start: Estimate, moved: Estimate) -> bool:
     """Whether a step leaves a camera that can be one: a focal length keeps its sign and size."""
     away = np.abs(moved.intrinsics - start.intrinsics)
-    return bool(np.all(away <= _LARGEST_CHANGE * np.maximum(np.abs(start.intrinsics), 1.0)))
+    return bool(np.all(away <= SOLVE.largest_change * np.maximum(np.abs(start.intrinsics), 1.0)))
 
 
 def _promised(problem: Problem, at: _Point, residual: Array, step: Step) -> float:
