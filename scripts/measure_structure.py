@@ -25,7 +25,7 @@ from count_code import PACKAGE, ROOT, Function, code_lines, complexity, lines_wi
 
 #: Names of several words that begin with a participle or a preposition.
 PHRASE = re.compile(
-    "_*(?!(?:feed|need|speed)_)([a-z]+ed|begun|built|chosen|done|drawn|felt|found|given|held|kept|known|left|lost|made|met|said"
+    "_*(?!(?:embed|feed|need|speed)_)([a-z]+ed|begun|built|chosen|done|drawn|felt|found|given|held|kept|known|left|lost|made|met|said"
     "|seen|shown|shrunk|taken|told|torn|written|about|above|across|after|against|along|among|around|as|at|before|behind"
     "|below|beside|between|beyond|by|down|during|for|from|in|inside|into|like|near|of|off|on|onto|out|outside|over|past"
     "|per|since|than|through|throughout|to|towards|under|until|up|upon|with|within|without)_"

@@ -66,6 +66,7 @@ LIMITS = {
     "wide": 4,  # public signatures; goal: 2
     "numbers": 347,
     "offset": 8,
+    "phrases": 0,
 }
 
 

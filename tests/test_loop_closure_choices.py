@@ -87,7 +87,7 @@ def test_links_are_counted_as_by_a_search_in_breadth(monkeypatch):
                 break
             reached, rounds = reached | more, rounds + 1
         expected.append(rounds)
-    within = loop_closure._within_links(names, linked, names)
+    within = loop_closure._find_linked_images(names, linked, names)
     assert [b in within[a] for a, b in asked] == [rounds <= 3 for rounds in expected]
     assert {rounds <= 3 for rounds in expected if np.isfinite(rounds)} == {True, False}
 

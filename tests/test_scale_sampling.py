@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from colmap_inertial.inertial.scale import estimate_scale
-from colmap_inertial.inertial.scale._sampling import describe_sampling, repeated_share, scatter_s
+from colmap_inertial.inertial.scale._sampling import describe_sampling, measure_repeated_share, scatter_s
 from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, simulate_recording
 
 
@@ -42,6 +42,6 @@ def test_stamps_that_scatter_are_named(recording):
 def test_readings_that_were_held_are_named(recording):
     imu = recording.imu
     held = imu.accel_m_s2[np.arange(len(imu.accel_m_s2)) // 2 * 2]
-    assert repeated_share(held) == pytest.approx(0.5, abs=0.01)
+    assert measure_repeated_share(held) == pytest.approx(0.5, abs=0.01)
     estimate = estimate_scale(recording.trajectory, replace(imu, accel_m_s2=held))
     assert any("50 % of the accelerometer's readings repeat" in s for s in (*estimate.reasons, *estimate.notes))

@@ -343,11 +343,11 @@ def _find_torn_pairs(
             limit = nearest.get(_seam(part_of, first, second), -1)
             if limit is None or abs(place[first] - place[second]) <= limit:
                 suspects.append(_TornPair(first=first, second=second, features=matches[both], points=points[both]))
-    within = _within_links(sorted(timed), linked, {pair.first for pair in suspects})
+    within = _find_linked_images(sorted(timed), linked, {pair.first for pair in suspects})
     return [pair for pair in suspects if pair.second not in within[pair.first]]
 
 
-def _within_links(
+def _find_linked_images(
     names: Sequence[str], linked: Sequence[tuple[str, str]], begins: Collection[str]
 ) -> dict[str, set[str]]:
     """Images that are linked to some over no more others than neighbours are."""

@@ -56,7 +56,7 @@ def split_colours(image: AnyArray, threads: int) -> tuple[Float32Array, Float32A
     def convert(rows: slice) -> None:
         cv2.transform(linearise(image[rows]), to_luma, dst=luma[rows])
 
-    _in_bands(convert, height, threads)
+    _process_bands(convert, height, threads)
     even = _pad_to_even(image)
     small = cv2.resize(even, (even.shape[1] // 2, even.shape[0] // 2), interpolation=cv2.INTER_AREA)
     return luma, np.asarray(cv2.transform(linearise(small), to_chroma), dtype=np.float32)
@@ -87,7 +87,7 @@ def join_colours(luma: Float32Array, chroma: Float32Array, threads: int) -> Floa
             planes.append(factor * planes[0] + added)
         cv2.transform(cv2.merge(planes), to_rgb, dst=result[rows])
 
-    _in_bands(combine, height, threads)
+    _process_bands(combine, height, threads)
     return result
 
 
@@ -114,7 +114,7 @@ def _pad_to_even(values: AnyArray) -> AnyArray:
     return np.asarray(padded)
 
 
-def _in_bands(work: Callable[[slice], None], height: int, threads: int) -> None:
+def _process_bands(work: Callable[[slice], None], height: int, threads: int) -> None:
     """Call work on bands of rows, which begin at even rows."""
     bands = [slice(i, min(i + CHROMA_MODEL.band_rows, height)) for i in range(0, height, CHROMA_MODEL.band_rows)]
     if threads == 1:

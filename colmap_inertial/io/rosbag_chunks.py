@@ -81,7 +81,7 @@ def _check_file(path: Path, mode: str) -> None:
             if mode == "message":
                 raise FormatError(path, "its messages are packed one by one; convert it with rosbags-convert")
             known: dict[_Packed, int] = {}
-            for chunks in (_indexed_chunks(file, size), _chunks_in_order(file, size)):
+            for chunks in (_read_indexed_chunks(file, size), _read_chunks_in_order(file, size)):
                 _check_chunks(path, file, size, chunks, known)
         elif head.startswith(b"#ROSBAG V2"):
             _check_chunks(path, file, size, _ros1_chunks(file), {})
@@ -203,7 +203,7 @@ def _mcap_ends(file: IO[bytes], size: int) -> tuple[int, int]:
     return summary or size - 37, size - 37
 
 
-def _indexed_chunks(file: IO[bytes], size: int) -> Iterator[_Packed]:
+def _read_indexed_chunks(file: IO[bytes], size: int) -> Iterator[_Packed]:
     for kind, begin, length in _mcap_records(file, *_mcap_ends(file, size)):
         if kind in (_FOOTER, _SUMMARY_OFFSET):
             return
@@ -217,7 +217,7 @@ def _indexed_chunks(file: IO[bytes], size: int) -> Iterator[_Packed]:
             yield _Packed(begin=chunk + 49 + len(name), size=packed, compression=name.decode())
 
 
-def _chunks_in_order(file: IO[bytes], size: int) -> Iterator[_Packed]:
+def _read_chunks_in_order(file: IO[bytes], size: int) -> Iterator[_Packed]:
     """Read where the index is not enough."""
     for kind, begin, _ in _mcap_records(file, len(_MCAP), _mcap_ends(file, size)[0]):
         if kind == _CHUNK:

@@ -111,7 +111,7 @@ def is_database(path: Path) -> bool:
 
 
 @contextlib.contextmanager
-def opened_read_only(database: Path) -> Iterator[sqlite3.Connection]:
+def open_read_only(database: Path) -> Iterator[sqlite3.Connection]:
     """Open a database and leave no trace beside it, as SQLite does where the last writer kept a log ahead of writing.
 
     One whose log still holds something is read from a copy.
@@ -137,7 +137,7 @@ def find_database(project: Path, files: Sequence[Path]) -> Path | None:
 
 def _has_pairs(path: Path) -> bool:
     try:
-        with opened_read_only(path) as opened:
+        with open_read_only(path) as opened:
             return opened.execute("SELECT 1 FROM two_view_geometries LIMIT 1").fetchone() is not None
     except FormatError:
         return False  # no database, or one of another program
@@ -151,7 +151,7 @@ def check_records(database: Path) -> None:
     FormatError
         That names the table; also as of :func:`~colmap_inertial.io.sqlite.open_foreign`.
     """
-    with reading(database, UNREADABLE), opened_read_only(database) as opened:
+    with reading(database, UNREADABLE), open_read_only(database) as opened:
         columns = {row[1] for row in opened.execute("PRAGMA table_info(two_view_geometries)")}
         for table, holds in _RECORDS.items():
             if table == "two_view_geometries" and {"camera1", "camera2"} <= columns:

@@ -37,7 +37,7 @@ def scatter_s(t_s: Array) -> float:
     return float(np.median(off)) / 0.6745 * (2 / 3) ** 0.5
 
 
-def repeated_share(values: Array) -> float:
+def measure_repeated_share(values: Array) -> float:
     """Share of readings (N, 3) that are the same as the one before."""
     return float(np.mean(np.all(np.diff(values, axis=0) == 0, axis=1))) if len(values) > 1 else 0.0
 
@@ -54,7 +54,7 @@ def describe_sampling(trajectory: CameraTrajectory, imu: ImuRecording) -> tuple[
                 "samples, not of when they arrived"
             )
     for name, values in (("gyroscope", imu.gyro_rad_s), ("accelerometer", imu.accel_m_s2)):
-        if (share := repeated_share(values)) > _LIMITS.repeated:
+        if (share := measure_repeated_share(values)) > _LIMITS.repeated:
             out.append(
                 f"{100 * share:.0f} % of the {name}'s readings repeat the one before: they were held, or read more "
                 "often than the sensor samples; record at the sensor's own rate"

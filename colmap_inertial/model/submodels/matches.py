@@ -20,7 +20,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.io.files import reading
 from colmap_inertial.model import points_of_features
-from colmap_inertial.model.database import UNREADABLE, opened_read_only
+from colmap_inertial.model.database import UNREADABLE, open_read_only
 from colmap_inertial.model.submodels.graph import Pair, SimilarityConstraint
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ def read_matches(database: Path, wanted: Callable[[str, str], bool]) -> Iterator
     """
     import pycolmap
 
-    with reading(database, UNREADABLE), opened_read_only(database) as opened:
+    with reading(database, UNREADABLE), open_read_only(database) as opened:
         name = dict(opened.execute("SELECT image_id, name FROM images"))
         enough = "SELECT pair_id FROM two_view_geometries WHERE rows >= ? ORDER BY pair_id"
         for (pair,) in opened.execute(enough, (LIMITS.matches,)).fetchall():

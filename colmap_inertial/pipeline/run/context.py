@@ -19,7 +19,7 @@ from colmap_inertial.pipeline.run.colmap_settings import NO_SETTINGS, ColmapSett
 from colmap_inertial.pipeline.run.executable import ColmapExecutable, Device, read_executable
 from colmap_inertial.pipeline.run.progress import Progress, silent
 from colmap_inertial.pipeline.run.runner import fingerprint
-from colmap_inertial.pipeline.run.workers import chosen_executor
+from colmap_inertial.pipeline.run.workers import get_executor
 
 Features = Literal["sift", "aliked"]
 
@@ -141,7 +141,7 @@ class RunContext:
     features: Features = "sift"
     colmap: ColmapSettings = NO_SETTINGS
     executable: ColmapExecutable | None = None
-    executor: Executor = field(default_factory=chosen_executor)
+    executor: Executor = field(default_factory=get_executor)
     progress: Progress = silent
 
     @classmethod
@@ -151,7 +151,7 @@ class RunContext:
         settings = read_settings(options.colmap, options.colmap_project)
         executable = None
         if options.colmap_executable is not None:
-            if chosen_executor().remote:
+            if get_executor().remote:
                 raise InertialError(
                     "--colmap-executable: an installed COLMAP works on this machine alone; leave out --scheduler"
                 )

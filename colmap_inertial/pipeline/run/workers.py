@@ -64,7 +64,7 @@ def using_workers(workers: int | None = None, *, scheduler: str | None = None) -
             _EXECUTOR.reset(token)
 
 
-def chosen_executor() -> Executor:
+def get_executor() -> Executor:
     """That of :func:`using_workers`."""
     executor = _EXECUTOR.get()
     return Processes(number=usable_processors()) if executor is None else executor

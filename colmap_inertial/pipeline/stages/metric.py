@@ -372,7 +372,7 @@ def _add_drift(model: Model, smoothed: SmoothedTrajectory, gravity: Array) -> tu
         log.info("several cameras took the images: the path's covariance is that of its smoothing, without drift")
     drift, similarity_cov = None, model.similarity.cov.copy()
     if model.parts:
-        drift = _joined_drift(seen, model.joined_covs)
+        drift = _join_drift(seen, model.joined_covs)
     elif not several:
         drift = find_path_drift(seen, gravity)
     if drift is None or int(timed.sum()) != len(smoothed.t_s):
@@ -398,7 +398,7 @@ def find_path_drift(seen: Seen, gravity: Array) -> PictureDrift | None:
         return None
 
 
-def _joined_drift(seen: Seen, covs: Mapping[str, Array]) -> PictureDrift | None:
+def _join_drift(seen: Seen, covs: Mapping[str, Array]) -> PictureDrift | None:
     """Covariance of a joined path; ``None`` where that of an image is unknown."""
     if not all(name in covs for name in seen.names):
         return None

@@ -142,14 +142,14 @@ class RefineStage(InertialStage):
         promised: dict[str, Any] = {}
         chosen = ""
         if self.auto:
-            worth = expect_worth(seen, problem, start, bent=bool(ignored_shutter(model)))
+            worth = expect_worth(seen, problem, start, bent=bool(list_ignored_shutter(model)))
             promised = {"expected": {name: value for name, value in asdict(worth).items() if name != "reason"}}
             if worth.reason:
                 return _said(model, f"not refined: {worth.reason}", **promised)
             chosen = f"{worth.describe()} with the IMU; "
         declared = model.timing.readout_s is not None
         judged = refine(problem, start, seen.observations.xy_px, seen.t_s, readout_declared=declared)
-        figures = _judged_figures(judged) | promised
+        figures = _state_figures(judged) | promised
         heard = (
             f"{chosen}{judged.held_out} observations that were held out: {judged.before_px:.4f} -> "
             f"{judged.after_px:.4f} px; the IMU costs {judged.chi2:.2f} of what its noise explains"
@@ -165,7 +165,7 @@ class RefineStage(InertialStage):
         calibrated = is_calibrated(self.imu)
         before = model.scale
         if model.timing.readout_s or judged.readout:
-            now_known = [reason for reason in before.reasons if reason not in ignored_shutter(model)]
+            now_known = [reason for reason in before.reasons if reason not in list_ignored_shutter(model)]
             before = replace(before, reasons=tuple(now_known))
         own, similarity = state_scale(before, model.similarity, move, problem, x, judged.world, calibrated=calibrated)
         if own.verdict == "refused":
@@ -199,7 +199,7 @@ class RefineStage(InertialStage):
         return keypoints_of(seen, keypoints)
 
 
-def ignored_shutter(model: Model) -> list[str]:
+def list_ignored_shutter(model: Model) -> list[str]:
     """What was said of a rolling shutter that a model ignores."""
     return [treatment.reason for treatment in model.treatments if treatment.stage == "shutter"]
 
@@ -291,7 +291,7 @@ def _moved(similarity: Similarity, move: Similarity) -> Similarity:
     return replace(compose(move, similarity), cov=similarity.cov)
 
 
-def _judged_figures(judged: Judged) -> dict[str, Any]:
+def _state_figures(judged: Judged) -> dict[str, Any]:
     """What a refinement is judged by."""
     names = ("accepted", "held_out", "before_px", "after_px", "change", "change_sigma", "chi2", "sigma_px")
     out = {name: getattr(judged, name) for name in (*names, "accel_noise_m_s2_rthz")}
