@@ -18,6 +18,7 @@ from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, Sca
 from colmap_inertial.core.types import CameraMotion, Similarity
 from colmap_inertial.inertial.core.priors import PRIORS, model_scale_sigma
 from colmap_inertial.inertial.refine import judge, motion
+from colmap_inertial.inertial.refine.shutter import SeenReadout
 from colmap_inertial.inertial.refine.solve import evaluate_held_out, solve
 from colmap_inertial.inertial.refine.values import ROTATION
 from colmap_inertial.io.calibration import Declared, calibration_prior
@@ -326,10 +327,11 @@ def test_a_readout_is_refined_with_where_images_keep_their_rolling_shutter(rolle
         assert np.array_equal(before, after)
 
 
-def test_lines_that_run_otherwise_than_assumed_stay_a_doubt(rolled):
+@pytest.mark.parametrize("readout_s", [None, 0.025])
+def test_lines_that_run_otherwise_than_assumed_stay_a_doubt(rolled, readout_s):
     """The refinement takes them to run as declared, and finds no such readout."""
     tracks, _, _, _ = rolled
-    timing = replace(tracks.timing, readout_s=None, readout_direction="right")
+    timing = replace(tracks.timing, readout_s=readout_s, readout_direction="right")
     start = Model(reconstruction=adjusted(tracks.reconstruction()), colmap_index=0, timing=timing)
     model = MetricStage(imu=tracks.imu, calibration=UNKNOWN)(start)
     made, _ = refined_by(tracks.imu, model)
@@ -345,6 +347,22 @@ def test_a_global_shutter_that_nobody_declared_costs_no_trust(walked):
     start = Model(reconstruction=model.reconstruction, colmap_index=0, timing=replace(tracks.timing, readout_s=0.0))
     judged = MetricStage(imu=tracks.imu, calibration=UNKNOWN).judge_shutter(start, model.scale)
     assert judged.scale is model.scale
+
+
+def test_a_shutter_that_may_roll_is_in_the_interval(walked):
+    _, model = walked
+    known = SeenReadout(readout_s=0.0, sigma_s=0.01, direction="down", rate_hz=5.0).widen(model.scale)
+    assert known.sigma_log == pytest.approx(np.hypot(model.scale.sigma_log, 0.05)) and known.verdict == "weak"
+    assert known.parts["rolling_shutter"] == pytest.approx(0.05)
+    # beyond 30 % nothing is known
+    unknown = SeenReadout(readout_s=0.0, sigma_s=0.02, direction="down", rate_hz=8.0).widen(model.scale)
+    assert unknown.verdict == "refused" and unknown.metres_per_unit is None
+    assert "of up to 40 ms" in unknown.reasons[0] and "declare readout_s" in unknown.reasons[0]
+    # one that was found is for the refinement to take in
+    found = SeenReadout(readout_s=0.03, sigma_s=0.001, direction="down", rate_hz=8.0).widen(model.scale)
+    assert found.verdict == "weak" and found.reasons == (
+        SeenReadout(readout_s=0.03, sigma_s=0.001, direction="down", rate_hz=8.0).sentence(),
+    )
 
 
 def test_auto_refines_where_drift_exceeds_what_is_left(walked, monkeypatch):

@@ -22,7 +22,7 @@ from colmap_inertial.inertial.refine.pictures import (
 from colmap_inertial.inertial.refine.setup import Known, Seen, make_problem
 from colmap_inertial.inertial.refine.solve import factored, solve
 from colmap_inertial.inertial.refine.values import READOUT
-from colmap_inertial.inertial.scale.verdict import verdict_of
+from colmap_inertial.inertial.scale.verdict import half_width, verdict_of
 from colmap_inertial.model import colmap_camera
 
 
@@ -83,8 +83,16 @@ class SeenReadout:
             "refine it (--refine inertial)"
         )
 
+    def _unknown(self, sigma_log: float) -> str:
+        """Why a scale is refused that a shutter leaves open."""
+        return (
+            f"a rolling shutter of up to {1e3 * (self.readout_s + 2 * self.sigma_s):.0f} ms, which the points of the "
+            f"model do not rule out, leaves the scale open by {100 * half_width(sigma_log):.0f} %: declare readout_s, "
+            "0 for a global shutter"
+        )
+
     def widen(self, estimate: ScaleEstimate) -> ScaleEstimate:
-        """A scale as uncertain as such a shutter makes it; weak at most where it was found."""
+        """A scale as uncertain as such a shutter makes it; weak where it was found, as the refinement takes it in."""
         assert estimate.parts is not None and estimate.cov is not None
         accepted = estimate.accepted
         sigma = float(np.hypot(self.readout_s, self.sigma_s)) * self.rate_hz
@@ -95,7 +103,8 @@ class SeenReadout:
         sigma_log = float(np.hypot(accepted.sigma_log, sigma))
         verdict, ci95, reasons = verdict_of(accepted.metres_per_unit, sigma_log, checks)
         if verdict == "refused":
-            # what the shutter leaves open is for the refinement to find
+            if not self.is_found:
+                return ScaleEstimate.refused(estimate.method, self._unknown(sigma), calibration=estimate.calibration)
             verdict, reasons = "weak", tuple(checks)
         cov = estimate.cov.copy()
         cov[0, 0] = sigma_log**2
@@ -110,10 +119,8 @@ class SeenReadout:
         )
 
 
-def find_readout(
-    seen: Seen, timing: FrameTiming, imu: ImuRecording, known: Known, *, direction_known: bool
-) -> SeenReadout | None:
-    """The readout of a metric model's images, whatever is declared; ``None`` where too little is seen.
+def find_readout(seen: Seen, timing: FrameTiming, imu: ImuRecording, known: Known) -> SeenReadout | None:
+    """The readout of a metric model's images, down or across, whatever is declared; ``None`` where too little is seen.
 
     Parameters
     ----------
@@ -121,8 +128,6 @@ def find_readout(
         The model, or a part of it.
     timing, imu, known
         As the refinement has them.
-    direction_known
-        Whether lines run as ``timing`` says; otherwise they may run down or across.
 
     Raises
     ------
@@ -136,7 +141,7 @@ def find_readout(
     if count < SHUTTER_LIMITS.fewest:
         return None
     seen = select_points(seen, np.arange(len(seen.points)) % -(-count // SHUTTER_LIMITS.most) == 0)
-    directions: tuple[ReadoutDirection, ...] = (timing.readout_direction,) if direction_known else ("down", "right")
+    directions: tuple[ReadoutDirection, ...] = ("down", "right")
     found = [
         _measure(seen, replace(timing, readout_s=None, readout_direction=direction), imu, known)
         for direction in directions

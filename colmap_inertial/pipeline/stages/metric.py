@@ -231,11 +231,14 @@ class MetricStage(InertialStage):
         try:
             readout = self._find_readout(metric)
         except (NotObservableError, np.linalg.LinAlgError) as error:
-            log.info("model %d: nothing says whether its shutter rolls: %s", model.colmap_index, error)
-            return metric
+            log.info("model %d: its shutter cannot be looked at: %s", model.colmap_index, error)
+            readout = None
         if readout is None:
-            return metric
-        metric = self._apply(model, readout.widen(estimate))
+            return self._apply(model, replace(estimate, notes=(*estimate.notes, _SHUTTER_UNKNOWN)))
+        estimate = readout.widen(estimate)
+        if estimate.verdict == "refused":
+            return model.scaled(estimate, None)
+        metric = self._apply(model, estimate)
         if not readout.is_found:
             return metric
         values = {name: getattr(readout, name) for name in ("readout_s", "sigma_s", "direction")}
@@ -267,7 +270,13 @@ class MetricStage(InertialStage):
         known = replace(known, prior=replace(known.prior, cov=cov))
         seen = read_seen(reconstruction, timing, chosen)
         with one_blas_thread():
-            return find_readout(seen, timing, self.imu, known, direction_known=timing.readout_s is not None)
+            return find_readout(seen, timing, self.imu, known)
+
+
+_SHUTTER_UNKNOWN = (
+    "too little is seen to tell whether the images have a rolling shutter that the model ignores: declare readout_s, 0 "
+    "for a global shutter"
+)
 
 
 def provenance(estimate: ScaleEstimate) -> str:
