@@ -29,6 +29,7 @@ class SolveLimits:
     steps: int = 40
     #: Where a step promises less of the squares' sum (in variances), it is at rest.
     settled: float = 0.1
+    #: Damping of the first step, of the diagonal, and its range.
     first_damping: float = 1e-4
     least_damping: float = 1e-9
     most_damping: float = 1e8
