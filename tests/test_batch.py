@@ -6,6 +6,7 @@ import dataclasses
 import errno
 import json
 import os
+import shutil
 import signal
 import sqlite3
 import subprocess
@@ -28,14 +29,16 @@ from colmap_inertial.cli import main, parse
 from colmap_inertial.colmap import feature_chunks, submaps
 from colmap_inertial.colmap.feature_chunks import ChunkSizes
 from colmap_inertial.colmap.mapping import map_images
+from colmap_inertial.colmap.parts import MapPart
 from colmap_inertial.colmap.sparse import extract_features, image_pairs, match_pairs
-from colmap_inertial.core.errors import FormatError, InertialError, MissingExtraError, OutputExistsError
+from colmap_inertial.core.errors import FormatError, InertialError, MappingError, MissingExtraError, OutputExistsError
 from colmap_inertial.core.options import BatchOptions, MappingOptions, ReconstructOptions
 from colmap_inertial.io.capture import load_capture
+from colmap_inertial.pipeline.run.chunks import Chunk
 from colmap_inertial.pipeline.run.config import config_as_toml
 from colmap_inertial.pipeline.run.context import RunContext
 from colmap_inertial.pipeline.run.progress import silent
-from colmap_inertial.pipeline.run.workers import Cluster, describe_versions, using_workers
+from colmap_inertial.pipeline.run.workers import Cluster, describe_versions, do_for_another, using_workers
 from colmap_inertial.reconstruction.drivers.capture import reconstruct
 from colmap_inertial.tools import batch
 from colmap_inertial.tools.batch import BatchCapture, needs_gpu, read_manifest, run_batch
@@ -402,6 +405,34 @@ def test_one_capture_on_a_cluster_is_that_of_one_machine(capture, cluster, tmp_p
     assert found == (parts, tables, models)
     assert features >= 2 and asked[2:] == [0, pairs - 1, parts]
     assert {path.name for path in (tmp_path / "shared").iterdir()} == {"database.db", "sparse"}
+
+
+def a_part_without_matches(folder: Path) -> Chunk:
+    folder.mkdir()
+    pycolmap.Database.open(str(folder / "part.db")).close()
+    return Chunk.of(MapPart(options={"random_seed": 0}), name="a part", folder=folder, images=folder, size=1, reads=0)
+
+
+def test_a_chunk_of_which_nothing_comes_is_done(cluster, tmp_path):
+    part, told = a_part_without_matches(tmp_path / "0"), []
+    with using_workers(scheduler=cluster[0]):
+        assert list(RunContext().executor.run([part], told.append)) == [0]
+    assert told == [1] and list(tmp_path.iterdir()) == [part.made] and list(part.made.iterdir()) == []
+
+
+def test_a_chunk_that_a_run_has_begun_anew_is_given_up(tmp_path, monkeypatch):
+    distributed = pytest.importorskip("distributed", reason="dask[distributed] is not installed")
+    worker = SimpleNamespace(address="tcp://a:1", local_directory=str(tmp_path))
+    monkeypatch.setattr(distributed, "get_worker", lambda: worker)
+    part = a_part_without_matches(tmp_path / "0")
+    (part.folder / "wanted").write_text("by the run that goes on")
+    with pytest.raises(MappingError, match="not wanted any more"):
+        do_for_another(part, describe_versions(), "by the run that was killed")
+    assert do_for_another(part, describe_versions(), "by the run that goes on") == {}
+    shutil.rmtree(part.folder)
+    with pytest.raises(InertialError, match=r"worker tcp://a:1 does not see .*0: .* that all machines share"):
+        do_for_another(part, describe_versions(), "by the run that goes on")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_what_keeps_a_cluster_from_helping_is_said_before_the_work(cluster, tmp_path, monkeypatch, capsys):

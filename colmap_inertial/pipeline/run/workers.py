@@ -31,6 +31,8 @@ from colmap_inertial.pipeline.run.runner import remove
 _EXECUTOR: ContextVar[Executor | None] = ContextVar("executor", default=None)
 #: How often a worker looks whether its chunk is still wanted, in seconds.
 _WANTED_S = 0.25
+#: In the folder of a chunk: who wants it. A run that goes on has the same folder anew.
+_WANTED = "wanted"
 
 
 @contextlib.contextmanager
@@ -113,12 +115,16 @@ class Cluster:
         wanted: dict[Any, int] = {}
         for number, chunk in enumerate(chunks):
             key = f"colmap-inertial-{uuid.uuid4().hex}"
-            wanted[self.client.submit(do_for_another, chunk, describe_versions(), key=key, pure=False)] = number
+            write_text(chunk.folder / _WANTED, key)
+            future = self.client.submit(do_for_another, chunk, describe_versions(), key, key=key, pure=False)
+            wanted[future] = number
         try:
             for future in as_completed(list(wanted), loop=self.client.loop):
                 chunk = chunks[wanted[future]]
-                for name, content in _result(future, chunk).items():
-                    path = chunk.folder / "made" / name
+                files, made = _result(future, chunk), chunk.folder / "made"
+                made.mkdir()  # also for no file
+                for name, content in files.items():
+                    path = made / name
                     path.parent.mkdir(parents=True, exist_ok=True)
                     path.write_bytes(content)
                 chunk.keep()
@@ -149,9 +155,7 @@ class Cluster:
             versions, seen = answer
             _require_versions(worker, versions, describe_versions())
             if seen != token:
-                raise InertialError(
-                    f"worker {worker} does not see {folder}: the output must lie on a path that all machines share"
-                )
+                raise _unseen(worker, folder)
 
 
 def _result(future: Any, chunk: Chunk) -> dict[str, bytes]:
@@ -185,12 +189,30 @@ def _require_versions(worker: str, versions: str, wanted: str) -> None:
         raise InertialError(f"worker {worker} has {versions}; here is {wanted}: install the same there")
 
 
-def do_for_another(chunk: Chunk, versions: str) -> dict[str, bytes]:
-    """Do another machine's chunk in this worker's scratch folder; returns the files that were made, by name."""
+def _unseen(worker: str, folder: Path) -> InertialError:
+    return InertialError(
+        f"worker {worker} does not see {folder}: the output must lie on a path that all machines share"
+    )
+
+
+def _is_wanted(chunk: Chunk, by: str) -> bool:
+    try:
+        return (chunk.folder / _WANTED).read_text(encoding="utf-8") == by
+    except OSError:
+        return False
+
+
+def do_for_another(chunk: Chunk, versions: str, by: str) -> dict[str, bytes]:
+    """Do another machine's chunk in this worker's scratch folder; returns the files that were made, by name.
+
+    ``by`` is who wants it: what the chunk's folder says as long as that is so.
+    """
     from distributed import get_worker
 
     worker = get_worker()
     _require_versions(worker.address, describe_versions(), versions)
+    if not chunk.folder.is_dir():
+        raise _unseen(worker.address, chunk.folder)
     with tempfile.TemporaryDirectory(dir=worker.local_directory) as scratch:
         own = replace(chunk, folder=Path(scratch) / "chunk")
         shutil.copytree(chunk.folder, own.folder)
@@ -199,7 +221,7 @@ def do_for_another(chunk: Chunk, versions: str) -> dict[str, bytes]:
             while process.poll() is None:
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     process.wait(timeout=_WANTED_S)
-                if not chunk.folder.exists():
+                if not _is_wanted(chunk, by):
                     raise MappingError(f"{chunk.name}: not wanted any more")
             require_success(process, own)
         finally:
