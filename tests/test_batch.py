@@ -17,7 +17,10 @@ from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
+from typing import ClassVar
 
+import cv2
+import numpy as np
 import psutil
 import pycolmap
 import pytest
@@ -31,10 +34,18 @@ from colmap_inertial.colmap.feature_chunks import ChunkSizes
 from colmap_inertial.colmap.mapping import map_images
 from colmap_inertial.colmap.parts import MapPart
 from colmap_inertial.colmap.sparse import extract_features, image_pairs, match_pairs
-from colmap_inertial.core.errors import FormatError, InertialError, MappingError, MissingExtraError, OutputExistsError
+from colmap_inertial.core.errors import (
+    FormatError,
+    InertialError,
+    MappingError,
+    MissingExtraError,
+    OutputError,
+    OutputExistsError,
+)
 from colmap_inertial.core.options import BatchOptions, MappingOptions, ReconstructOptions
 from colmap_inertial.io.capture import load_capture
-from colmap_inertial.pipeline.run.chunks import Chunk
+from colmap_inertial.pipeline.run.chunks import Chunk, Processes
+from colmap_inertial.pipeline.run.colmap_settings import ColmapSettings
 from colmap_inertial.pipeline.run.config import config_as_toml
 from colmap_inertial.pipeline.run.context import RunContext
 from colmap_inertial.pipeline.run.progress import silent
@@ -365,18 +376,20 @@ def test_one_capture_on_a_cluster_is_that_of_one_machine(capture, cluster, tmp_p
 
     def reconstruct_in(folder: Path, told=silent):
         folder.mkdir(exist_ok=True)
-        for path in folder.glob("*.db"):
-            path.unlink()
         context, database = RunContext(scratch=folder, num_threads=1, progress=told), folder / "database.db"
-        camera = load_capture(capture[0]).camera
-        extract_features(images, dict.fromkeys(names, camera), database, options, context=context)
+        database.unlink(missing_ok=True)
+        if not (folder / "features.db").exists():
+            cameras = dict.fromkeys(names, load_capture(capture[0]).camera)
+            extract_features(images, cameras, database, options, context=context)
+            database.rename(folder / "features.db")
+        shutil.copyfile(folder / "features.db", database)
         match_pairs(database, image_pairs(names, options), context)
         record = map_images(database, images, folder / "sparse", options, context, in_time=names)
         models = {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*.bin")}
         return record.parts, tables_of(database), models
 
-    def stop(stage, done, total):
-        if stage == "matches" and 0 < done < total:
+    def stop(at, stage, done, total):
+        if stage == at and 0 < done < total:
             raise KeyboardInterrupt
 
     parts, tables, models = reconstruct_in(tmp_path / "alone")
@@ -394,17 +407,70 @@ def test_one_capture_on_a_cluster_is_that_of_one_machine(capture, cluster, tmp_p
             client.wait_for_workers(3)
             monkeypatch.setattr(client, "submit", partial(client.submit, workers="three", allow_other_workers=True))
             killer.start()
-            with pytest.raises(KeyboardInterrupt):
-                reconstruct_in(tmp_path / "shared", stop)
-            *_, features, pairs = asked
+            for at in ("features", "matches"):
+                with pytest.raises(KeyboardInterrupt):
+                    reconstruct_in(tmp_path / "shared", partial(stop, at))
+            features, rest, pairs = asked
             found = reconstruct_in(tmp_path / "shared")
     finally:
         killer.join()
         third.kill()
     assert third.wait() == -signal.SIGKILL
     assert found == (parts, tables, models)
-    assert features >= 2 and asked[2:] == [0, pairs - 1, parts]
-    assert {path.name for path in (tmp_path / "shared").iterdir()} == {"database.db", "sparse"}
+    # finished chunks are kept as long as the step of all is not
+    assert features >= 2 and rest == features - 1 and asked[3:] == [pairs - 1, parts]
+    assert {path.name for path in (tmp_path / "shared").iterdir()} == {"database.db", "features.db", "sparse"}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Elsewhere(Processes):
+    """Processes that stand for other machines."""
+
+    remote: ClassVar[bool] = True
+
+
+def test_features_that_others_find_are_those_that_are_found_here(tmp_path, monkeypatch):
+    """With an image that cannot be read, one of another size, and a mask that has changed since a run was killed."""
+    images, masks, noise = tmp_path / "images", tmp_path / "masks", np.random.default_rng(0)
+    images.mkdir()
+    masks.mkdir()
+    for number in range(5):
+        picture = cv2.GaussianBlur(noise.integers(0, 255, (96, 128 if number != 3 else 100), np.uint8), (0, 0), 1.5)
+        cv2.imwrite(str(images / f"{number}.png"), picture)
+        cv2.imwrite(str(masks / f"{number}.png.png"), np.full_like(picture, 255))
+    (images / "1.png").write_bytes(b"no picture")
+    options = MappingOptions(max_num_features=100, first_octave=0)
+    here = RunContext(scratch=tmp_path, num_threads=1, colmap=ColmapSettings((f"ImageReader.mask_path={masks}",)))
+    heard = []
+    there = dataclasses.replace(here, executor=Elsewhere(number=1), progress=lambda *told: heard.append(told))
+
+    def extract(context, stages=()):
+        database = tmp_path / "features.db"
+        database.unlink(missing_ok=True)
+        cameras = {path.name: None for path in images.iterdir()}
+        extract_features(images, cameras, database, options, context=context, keypoint_stages=stages)
+        return tables_of(database)
+
+    def be_killed(keypoints):
+        raise KeyboardInterrupt
+
+    found = extract(here)
+    assert [row[1] for row in found["images"]] == ["0.png", "2.png", "4.png"]
+    with pytest.raises(KeyboardInterrupt):
+        extract(there, [be_killed])
+    assert heard[0] == ("features", 0, 5) and heard[-1] == ("features", 5, 5)
+    assert heard == sorted(heard) and tables_of(tmp_path / "features.db") == found
+    cv2.imwrite(str(masks / "2.png.png"), np.zeros((96, 128), np.uint8))
+    fewer = extract(there)
+    assert fewer == extract(here) != found
+    assert not (tmp_path / "chunks").exists()
+    room = 5 * 100 * 500  # as much as the database takes at most
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=1.5e6 + room))
+    extract(here)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=1.9 * room))
+    with pytest.raises(OutputError, match=rf"may need {2 * room / 1e6:.0f} MB"):
+        extract(there)
+    assert not (tmp_path / "features.db").exists()
 
 
 def a_part_without_matches(folder: Path) -> Chunk:

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 from colmap_inertial.colmap.parts import write_part_database
 from colmap_inertial.core.errors import FormatError, MappingError
 from colmap_inertial.io.sqlite import open_foreign
-from colmap_inertial.pipeline.run.chunks import Chunk, Executor, do_chunks
+from colmap_inertial.pipeline.run.chunks import CHUNKS_FOLDER, Chunk, Executor, do_chunks
+from colmap_inertial.pipeline.run.context import RunContext
 from colmap_inertial.pipeline.run.runner import fingerprint, remove
 
 if TYPE_CHECKING:
@@ -176,27 +177,25 @@ class MatchPairs(_MakesDatabase):
 
 
 def find_elsewhere(
-    works: Sequence[FindFeatures],
-    database: Path,
-    images: Path,
-    folder: Path,
-    executor: Executor,
-    told: Callable[[int], None],
+    works: Sequence[FindFeatures], database: Path, images: Path, context: RunContext, told: Callable[[int], None]
 ) -> None:
-    """Let others find features, and write them to a database that holds the images."""
+    """Let others find features, and write them to a database that holds the images; of no other image."""
     import pycolmap
 
+    with pycolmap.Database.open(str(database)) as opened:
+        own = {image.name: image.image_id for image in opened.read_all_images()}
     chunks = []
     for number, work in enumerate(works):
-        prints = [fingerprint(images / name) for name in work.names]
-        name = f"finding features of {work.names[0]} to {work.names[-1]}"
-        chunks.append(_begin(work, name, folder / str(number), images, len(work.names), prints))
-    for chunk in do_chunks(chunks, executor, told):
+        names = tuple(name for name in work.names if name in own)
+        reads = [*(fingerprint(images / name) for name in names), *context.colmap.identity("features")]
+        name = f"finding features of {names[0]} to {names[-1]}"
+        folder = context.scratch / CHUNKS_FOLDER / str(number)
+        chunks.append(_begin(replace(work, names=names), name, folder, images, len(names), reads))
+    for chunk in do_chunks(chunks, context.executor, told):
         with (
             pycolmap.Database.open(str(chunk.made / _MADE)) as source,
             pycolmap.Database.open(str(database)) as target,
         ):
-            own = {image.name: image.image_id for image in target.read_all_images()}
             for image in source.read_all_images():
                 target.write_keypoints(own[image.name], source.read_keypoints(image.image_id))
                 target.write_descriptors(own[image.name], source.read_descriptors(image.image_id))
@@ -207,19 +206,20 @@ def is_worth_chunks(pairs: Sequence[tuple[str, str]], executor: Executor) -> boo
     return executor.remote and len(pairs) >= SIZES.least_pairs
 
 
-def match_elsewhere(work: MatchPairs, folder: Path, executor: Executor, told: Callable[[int], None]) -> None:
+def match_elsewhere(work: MatchPairs, context: RunContext, told: Callable[[int], None]) -> None:
     """Let others match pairs by the features of a database, and write what they found to it."""
     import pycolmap
 
     with open(work.database, "rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    chunks = []
+    chunks, folder = [], context.scratch / CHUNKS_FOLDER
+    reads = [digest, *context.colmap.identity("matches")]
     for number, begin in enumerate(range(0, len(work.pairs), SIZES.pairs)):
         own = replace(work, pairs=work.pairs[begin : begin + SIZES.pairs], database=work.database.absolute())
         name = f"matching pairs {begin + 1} to {begin + len(own.pairs)}"
-        chunks.append(_begin(own, name, folder / str(number), folder, len(own.pairs), digest))
+        chunks.append(_begin(own, name, folder / str(number), folder, len(own.pairs), reads))
     # others read the database until all are done
-    made = [chunk.made for chunk in do_chunks(chunks, executor, told)]
+    made = [chunk.made for chunk in do_chunks(chunks, context.executor, told)]
     with pycolmap.Database.open(str(work.database)) as target:
         pairs = work.numbered(target)
         for path in made:

@@ -29,7 +29,8 @@ from colmap_inertial.core.types import CameraModel, Keypoints, Treatment
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.pipeline.run.chunks import CHUNKS_FOLDER
 from colmap_inertial.pipeline.run.context import RunContext
-from colmap_inertial.pipeline.run.progress import counting
+from colmap_inertial.pipeline.run.progress import counting, silent
+from colmap_inertial.pipeline.run.runner import remove
 from colmap_inertial.pipeline.run.workspace import require_room
 from colmap_inertial.pipeline.stages.protocols import KeypointStage
 
@@ -161,9 +162,15 @@ def extract_features(
     -------
     What the stages did to the keypoints of each image.
     """
-    works = []
-    for batch, reader in register_images(images, cameras, database, context, rig):
-        require_room_for_features(database, len(batch), options)
+    works, remote, count = [], context.executor.remote, len(cameras)
+    if remote:
+        # what others find is there twice until all of it is
+        require_room_for_features(database, count, options, copies=2)
+    # only what is found here is heard while images are entered
+    entering = context.reporting(silent) if remote else context
+    for batch, reader in register_images(images, cameras, database, entering, rig):
+        if not remote:
+            require_room_for_features(database, len(batch), options)
         work = FindFeatures(
             names=tuple(batch),
             reader=state_reader(reader),
@@ -171,21 +178,25 @@ def extract_features(
             device=context.device,
             seed=context.seed,
         )
-        if context.executor.remote:
+        if remote:
             works.append(work)
         else:
             with writing_database(database):
                 work.find(database, images)
     if works:
-        count = counting(context.progress, "features", len(cameras))
+        context.progress("features", 0, count)
         with writing_database(database):
-            find_elsewhere(works, database, images, context.scratch / CHUNKS_FOLDER, context.executor, count)
-    return apply_keypoint_stages(database, keypoint_stages)
+            find_elsewhere(works, database, images, context, counting(context.progress, "features", count))
+        context.progress("features", count, count)
+    records = apply_keypoint_stages(database, keypoint_stages)
+    if works:
+        remove(context.scratch / CHUNKS_FOLDER)
+    return records
 
 
-def require_room_for_features(database: Path, images: int, options: MappingOptions) -> None:
-    """Raise ``OutputError`` where the features of so many images may find no room in a database."""
-    require_room(database, images * options.max_num_features * _FEATURE_BYTES)
+def require_room_for_features(database: Path, images: int, options: MappingOptions, *, copies: int = 1) -> None:
+    """Raise ``OutputError`` where the features of so many images may find no room in a database, or in copies."""
+    require_room(database, images * options.max_num_features * _FEATURE_BYTES, copies=copies)
 
 
 def register_images(
@@ -376,10 +387,10 @@ def match_pairs(
         database=database,
     )
     if is_worth_chunks(pairs, context.executor):
-        require_room(database, len(pairs) * _PAIR_BYTES)
+        require_room(database, len(pairs) * _PAIR_BYTES, copies=2)
         matched = counting(context.progress, "matches", total, begin=done, steps=own, of=len(pairs))
         with writing_database(database):
-            match_elsewhere(work, context.scratch / CHUNKS_FOLDER, context.executor, matched)
+            match_elsewhere(work, context, matched)
         batches, done = [], done + own
     with tempfile.TemporaryDirectory(dir=context.scratch) as folder:
         theirs = Path(folder) / "installed.db"

@@ -27,6 +27,7 @@ from colmap_inertial.core.types import CameraModel
 from colmap_inertial.io.capture_rig import RigCamera
 from colmap_inertial.io.files import read_record, write_record
 from colmap_inertial.model import find_models, read_model
+from colmap_inertial.pipeline.run.chunks import CHUNKS_FOLDER
 from colmap_inertial.pipeline.run.context import Recording, RunContext
 from colmap_inertial.pipeline.run.executable import ColmapExecutable
 from colmap_inertial.pipeline.run.runner import fingerprint, remove
@@ -100,6 +101,7 @@ def run_colmap(
             matched = match_rig_images(partial[0], matched, recording.timing.names, rig, context)
             _add_rig(partial[0], workspace.colmap_images, mapping, rig, context)
         write_record(partial[2], matched)
+        remove(context.scratch / CHUNKS_FOLDER)
 
     def models(partial: Sequence[Path]) -> None:
         database, images, own = workspace.colmap_database, workspace.colmap_images, _keep_poses(context, rig)

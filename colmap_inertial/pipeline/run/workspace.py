@@ -315,16 +315,17 @@ def require_apart(out: Path, pictures: Sequence[Path]) -> None:
             )
 
 
-def require_room(file: Path, num_bytes: int) -> None:
+def require_room(file: Path, num_bytes: int, *, copies: int = 1) -> None:
     """Raise :class:`OutputError` where a file cannot grow by ``num_bytes``: its disk is full, or it is not allowed to.
 
+    The disk is to hold ``copies`` of them, the file one.
     For what COLMAP writes: its threads end the process when a database cannot grow, and its models end early.
     """
     free = shutil.disk_usage(file.parent).free
-    if free < num_bytes:
+    if free < copies * num_bytes:
         raise OutputError(
             f"the disk of {file.parent} is nearly full: {free / 1e6:.0f} MB are left, COLMAP's next step may need "
-            f"{num_bytes / 1e6:.0f} MB; {_MAKE_ROOM}"
+            f"{copies * num_bytes / 1e6:.0f} MB; {_MAKE_ROOM}"
         )
     largest, size = _largest_file_bytes(), file.stat().st_size if file.is_file() else 0
     if largest < size + num_bytes:

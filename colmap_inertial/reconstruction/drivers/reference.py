@@ -412,9 +412,10 @@ def _map(
     device = mapping_device(mapping, deterministic=options.deterministic)
     context = dataclasses.replace(RunContext.of(options, device=device, progress=progress), scratch=project)
     require_features(context)
+    project.mkdir()
+    context.executor.require(project)
     for _ in counted(_written(capture, names, images), len(names), "frames", progress):
         pass
-    context.executor.require(project)
     database = project / "database.db"
     extract_features(images, dict.fromkeys(names, capture.camera), database, mapping, context=context)
     match_pairs(database, image_pairs(names, mapping), context)
