@@ -30,7 +30,7 @@ from json_schemas import find_violations
 
 from colmap_inertial.cli import main, parse
 from colmap_inertial.colmap import feature_chunks, submaps
-from colmap_inertial.colmap.feature_chunks import ChunkSizes
+from colmap_inertial.colmap.feature_chunks import ChunkSizes, FindFeatures, find_elsewhere
 from colmap_inertial.colmap.mapping import map_images
 from colmap_inertial.colmap.parts import MapPart
 from colmap_inertial.colmap.sparse import extract_features, image_pairs, match_pairs
@@ -44,12 +44,13 @@ from colmap_inertial.core.errors import (
 )
 from colmap_inertial.core.options import BatchOptions, MappingOptions, ReconstructOptions
 from colmap_inertial.io.capture import load_capture
+from colmap_inertial.pipeline.run import workers
 from colmap_inertial.pipeline.run.chunks import Chunk, Processes
 from colmap_inertial.pipeline.run.colmap_settings import ColmapSettings
 from colmap_inertial.pipeline.run.config import config_as_toml
 from colmap_inertial.pipeline.run.context import RunContext
 from colmap_inertial.pipeline.run.progress import silent
-from colmap_inertial.pipeline.run.workers import Cluster, describe_versions, do_for_another, using_workers
+from colmap_inertial.pipeline.run.workers import Cluster, connect, describe_versions, do_for_another, using_workers
 from colmap_inertial.reconstruction.drivers.capture import reconstruct
 from colmap_inertial.tools import batch
 from colmap_inertial.tools.batch import BatchCapture, needs_gpu, read_manifest, run_batch
@@ -481,6 +482,7 @@ def a_part_without_matches(folder: Path) -> Chunk:
 
 def test_a_chunk_of_which_nothing_comes_is_done(cluster, tmp_path):
     part, told = a_part_without_matches(tmp_path / "0"), []
+    assert not part.gpu
     with using_workers(scheduler=cluster[0]):
         assert list(RunContext().executor.run([part], told.append)) == [0]
     assert told == [1] and list(tmp_path.iterdir()) == [part.made] and list(part.made.iterdir()) == []
@@ -495,10 +497,42 @@ def test_a_chunk_that_a_run_has_begun_anew_is_given_up(tmp_path, monkeypatch):
     with pytest.raises(MappingError, match="not wanted any more"):
         do_for_another(part, describe_versions(), "by the run that was killed")
     assert do_for_another(part, describe_versions(), "by the run that goes on") == {}
+    killed = [sys.executable, "-c", "import os; os.kill(os.getpid(), 9)"]
+    with monkeypatch.context() as patch:
+        patch.setattr(workers, "start_process", lambda *_, **__: subprocess.Popen(killed, stdin=subprocess.PIPE))
+        with pytest.raises(MappingError, match=r"signal 9\); where memory is short, give workers more of it"):
+            do_for_another(part, describe_versions(), "by the run that goes on")
     shutil.rmtree(part.folder)
     with pytest.raises(InertialError, match=r"worker tcp://a:1 does not see .*0: .* that all machines share"):
         do_for_another(part, describe_versions(), "by the run that goes on")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+def test_chunks_on_cuda_ask_for_a_gpu(tmp_path, monkeypatch, caplog, device):
+    distributed = pytest.importorskip("distributed", reason="dask[distributed] is not installed")
+    asked = []
+
+    def wait(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(distributed, "as_completed", wait)
+    client = SimpleNamespace(
+        loop=None,
+        cancel=lambda _: None,
+        scheduler_info=lambda **_: {"workers": {"w": {"resources": {}}}},
+        submit=lambda *_, resources, **__: asked.append(resources),
+    )
+    executor = Cluster(address="tcp://a:1", client=client)
+    database, image = tmp_path / "features.db", tmp_path / "0.png"
+    cv2.imwrite(str(image), np.zeros((8, 8), np.uint8))
+    pycolmap.Database.open(str(database)).close()
+    pycolmap.import_images(str(database), str(tmp_path))
+    work = FindFeatures(names=("0.png",), reader={}, extraction={}, device=device, seed=0)
+    with pytest.raises(KeyboardInterrupt):
+        find_elsewhere([work], database, tmp_path, tmp_path / "chunks", executor, asked.append)
+    assert asked == [{"GPU": 1} if device == "cuda" else None]
+    assert ("features and matches wait for one" in caplog.text) == (device == "cuda")
 
 
 def test_what_keeps_a_cluster_from_helping_is_said_before_the_work(cluster, tmp_path, monkeypatch, capsys):
@@ -523,6 +557,8 @@ def test_what_keeps_a_cluster_from_helping_is_said_before_the_work(cluster, tmp_
             executor.require(tmp_path)
         with pytest.raises(InertialError, match="works on this machine alone"):
             RunContext.of(ReconstructOptions(colmap_executable=Path("colmap")))
+    with pytest.raises(InertialError, match=r"tls://127.0.0.1:1 needs certificates: .*distributed\.comm\.tls"):
+        connect("tls://127.0.0.1:1", "")
     assert list(tmp_path.iterdir()) == []
     for flags, said in (
         (["--workers", "2"], "with --scheduler, the cluster has its own"),

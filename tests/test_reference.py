@@ -17,6 +17,7 @@ from colmap_inertial.checks.validate.result import LengthCheck
 from colmap_inertial.cli.terminal import show_reference
 from colmap_inertial.core.errors import InertialError, NotObservableError, TargetNotFoundError
 from colmap_inertial.core.options import ReferenceOptions
+from colmap_inertial.pipeline.run.chunks import Processes
 from colmap_inertial.reconstruction.drivers import reference as rooms
 from colmap_inertial.reconstruction.drivers.reference import Reference, scale_project_by
 
@@ -126,6 +127,15 @@ def test_pictures_alone_are_mapped_and_scaled(pictures, tmp_path, monkeypatch, c
     folder, mapped = pictures
     out = tmp_path / "out"
     args = ["reconstruct", folder, out, "--scale-from", "target", "--target", "aruco:DICT_4X4_50:0.1"]
+
+    def cannot(self, folder):
+        assert list(folder.iterdir()) == []  # no picture is copied before
+        raise InertialError("no worker sees it")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Processes, "require", cannot)
+        code, _, err = run(capsys, *args)
+        assert code and "no worker sees it" in err and not out.exists()
 
     def nothing_found(*_, **__):
         raise TargetNotFoundError("no marker was found")

@@ -57,7 +57,7 @@ class Reconstruct(DeviceCommand, ConfiguredCommand):
     the result."""
     scheduler: str | None = None
     """Address of a Dask scheduler (tcp://host:8786), whose workers find features, match pairs and map parts (needs the
-    extra `cluster`, and OUT under the same path everywhere). They do not change the result."""
+    extra `cluster`, and OUT under the same path everywhere). With --deterministic they do not change the result."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 from colmap_inertial.colmap.parts import write_part_database
 from colmap_inertial.core.errors import FormatError, MappingError
 from colmap_inertial.io.sqlite import open_foreign
-from colmap_inertial.pipeline.run.chunks import CHUNKS_FOLDER, Chunk, Executor, do_chunks
-from colmap_inertial.pipeline.run.context import RunContext
+from colmap_inertial.pipeline.run.chunks import Chunk, Executor, do_chunks
 from colmap_inertial.pipeline.run.runner import fingerprint, remove
 
 if TYPE_CHECKING:
@@ -61,6 +60,8 @@ class FindFeatures(_MakesDatabase):
         What it is done on.
     seed
         Of COLMAP.
+    settings
+        Identity of what the user set, with the files that it names.
     """
 
     names: tuple[str, ...]
@@ -68,6 +69,7 @@ class FindFeatures(_MakesDatabase):
     extraction: dict[str, Any]
     device: str
     seed: int
+    settings: Sequence[object] = ()
 
     def find(self, database: Path, images: Path) -> None:
         """Find them in a database that may hold the images."""
@@ -128,6 +130,8 @@ class MatchPairs(_MakesDatabase):
         What it is done on.
     seed
         Of COLMAP.
+    settings
+        Identity of what the user set, with the files that it names.
     database
         Of the features, for a chunk; it does not change meanwhile.
     """
@@ -137,6 +141,7 @@ class MatchPairs(_MakesDatabase):
     verification: dict[str, Any]
     device: str
     seed: int
+    settings: Sequence[object] = ()
     database: Path = field(default=Path(), repr=False)
 
     def numbered(self, database: pycolmap.Database) -> list[tuple[int, int]]:
@@ -177,7 +182,12 @@ class MatchPairs(_MakesDatabase):
 
 
 def find_elsewhere(
-    works: Sequence[FindFeatures], database: Path, images: Path, context: RunContext, told: Callable[[int], None]
+    works: Sequence[FindFeatures],
+    database: Path,
+    images: Path,
+    folder: Path,
+    executor: Executor,
+    told: Callable[[int], None],
 ) -> None:
     """Let others find features, and write them to a database that holds the images; of no other image."""
     import pycolmap
@@ -187,11 +197,10 @@ def find_elsewhere(
     chunks = []
     for number, work in enumerate(works):
         names = tuple(name for name in work.names if name in own)
-        reads = [*(fingerprint(images / name) for name in names), *context.colmap.identity("features")]
+        prints = [fingerprint(images / name) for name in names]
         name = f"finding features of {names[0]} to {names[-1]}"
-        folder = context.scratch / CHUNKS_FOLDER / str(number)
-        chunks.append(_begin(replace(work, names=names), name, folder, images, len(names), reads))
-    for chunk in do_chunks(chunks, context.executor, told):
+        chunks.append(_begin(replace(work, names=names), name, folder / str(number), images, len(names), prints))
+    for chunk in do_chunks(chunks, executor, told):
         with (
             pycolmap.Database.open(str(chunk.made / _MADE)) as source,
             pycolmap.Database.open(str(database)) as target,
@@ -206,20 +215,19 @@ def is_worth_chunks(pairs: Sequence[tuple[str, str]], executor: Executor) -> boo
     return executor.remote and len(pairs) >= SIZES.least_pairs
 
 
-def match_elsewhere(work: MatchPairs, context: RunContext, told: Callable[[int], None]) -> None:
+def match_elsewhere(work: MatchPairs, folder: Path, executor: Executor, told: Callable[[int], None]) -> None:
     """Let others match pairs by the features of a database, and write what they found to it."""
     import pycolmap
 
     with open(work.database, "rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    chunks, folder = [], context.scratch / CHUNKS_FOLDER
-    reads = [digest, *context.colmap.identity("matches")]
+    chunks = []
     for number, begin in enumerate(range(0, len(work.pairs), SIZES.pairs)):
         own = replace(work, pairs=work.pairs[begin : begin + SIZES.pairs], database=work.database.absolute())
         name = f"matching pairs {begin + 1} to {begin + len(own.pairs)}"
-        chunks.append(_begin(own, name, folder / str(number), folder, len(own.pairs), reads))
+        chunks.append(_begin(own, name, folder / str(number), folder, len(own.pairs), digest))
     # others read the database until all are done
-    made = [chunk.made for chunk in do_chunks(chunks, context.executor, told)]
+    made = [chunk.made for chunk in do_chunks(chunks, executor, told)]
     with pycolmap.Database.open(str(work.database)) as target:
         pairs = work.numbered(target)
         for path in made:
@@ -230,7 +238,7 @@ def match_elsewhere(work: MatchPairs, context: RunContext, told: Callable[[int],
 def _begin(work: FindFeatures | MatchPairs, name: str, folder: Path, images: Path, size: int, reads: object) -> Chunk:
     remove(folder)  # of a run that was killed
     folder.mkdir(parents=True)
-    return Chunk.of(work, name=name, folder=folder, images=images, size=size, reads=reads)
+    return Chunk.of(work, name=name, folder=folder, images=images, size=size, reads=reads, gpu=work.device == "cuda")
 
 
 def _copy_pairs(source: pycolmap.Database, target: pycolmap.Database, pairs: Iterable[tuple[int, int]]) -> None:

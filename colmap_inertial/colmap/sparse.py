@@ -166,6 +166,7 @@ def extract_features(
     if remote:
         # what others find is there twice until all of it is
         require_room_for_features(database, count, options, copies=2)
+    settings = context.colmap.identity("features") if remote else []
     # only what is found here is heard while images are entered
     entering = context.reporting(silent) if remote else context
     for batch, reader in register_images(images, cameras, database, entering, rig):
@@ -177,6 +178,7 @@ def extract_features(
             extraction=extraction_options(options, context).todict(),
             device=context.device,
             seed=context.seed,
+            settings=settings,
         )
         if remote:
             works.append(work)
@@ -186,7 +188,8 @@ def extract_features(
     if works:
         context.progress("features", 0, count)
         with writing_database(database):
-            find_elsewhere(works, database, images, context, counting(context.progress, "features", count))
+            told = counting(context.progress, "features", count)
+            find_elsewhere(works, database, images, context.scratch / CHUNKS_FOLDER, context.executor, told)
         context.progress("features", count, count)
     records = apply_keypoint_stages(database, keypoint_stages)
     if works:
@@ -384,13 +387,14 @@ def match_pairs(
         verification=verification_options(context).todict(),
         device=context.device,
         seed=context.seed,
+        settings=context.colmap.identity("matches"),
         database=database,
     )
     if is_worth_chunks(pairs, context.executor):
         require_room(database, len(pairs) * _PAIR_BYTES, copies=2)
         matched = counting(context.progress, "matches", total, begin=done, steps=own, of=len(pairs))
         with writing_database(database):
-            match_elsewhere(work, context, matched)
+            match_elsewhere(work, context.scratch / CHUNKS_FOLDER, context.executor, matched)
         batches, done = [], done + own
     with tempfile.TemporaryDirectory(dir=context.scratch) as folder:
         theirs = Path(folder) / "installed.db"

@@ -62,6 +62,8 @@ class Chunk:
         Folder that takes what the work makes. It is there as a whole, or not yet.
     size
         Number of items, for progress.
+    gpu
+        Whether it is done on a GPU.
     """
 
     name: str
@@ -70,17 +72,19 @@ class Chunk:
     images: Path
     made: Path
     size: int
+    gpu: bool = False
 
     @classmethod
-    def of(cls, work: Work, *, name: str, folder: Path, images: Path, size: int, reads: object) -> Chunk:
+    def of(
+        cls, work: Work, *, name: str, folder: Path, images: Path, size: int, reads: object, gpu: bool = False
+    ) -> Chunk:
         """A chunk whose result goes beside its ``folder``; ``reads`` is the identity of the files that it reads."""
         import pycolmap
 
         key = hashlib.sha256(f"{pycolmap.__version__} {reads!r} {work!r}".encode()).hexdigest()
-        folder = folder.absolute()
-        return cls(
-            name=name, work=work, folder=folder, images=images.absolute(), made=folder.with_name(key[:32]), size=size
-        )
+        folder, images = folder.absolute(), images.absolute()
+        made = folder.with_name(key[:32])
+        return cls(name=name, work=work, folder=folder, images=images, made=made, size=size, gpu=gpu)
 
     def is_made(self) -> bool:
         """Whether an earlier run made the result; remove one that is damaged."""
@@ -212,13 +216,14 @@ def _watch(process: subprocess.Popen[bytes], number: int, events: queue.SimpleQu
     events.put(number)
 
 
-def require_success(process: subprocess.Popen[bytes], chunk: Chunk) -> None:
-    """Wait for the end of a chunk's process; a ``MappingError`` where it failed or was killed."""
+def require_success(process: subprocess.Popen[bytes], chunk: Chunk, *, if_short: str = "give fewer --workers") -> None:
+    """Wait for the end of a chunk's process; a ``MappingError`` where it failed or was killed.
+
+    ``if_short`` says what to do where memory is short.
+    """
     code = end_process(process)
     if code < 0:
-        raise MappingError(
-            f"{chunk.name}: the process was killed (signal {-code}); where memory is short, give fewer --workers"
-        )
+        raise MappingError(f"{chunk.name}: the process was killed (signal {-code}); where memory is short, {if_short}")
     if code:
         lines = (chunk.folder / "log.txt").read_text(encoding="utf-8", errors="replace").strip().splitlines()
         raise MappingError(f"{chunk.name} failed: {lines[-1] if lines else f'exit code {code}'}")

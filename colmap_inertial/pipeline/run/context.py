@@ -129,7 +129,7 @@ class RunContext:
     executable
         An installed COLMAP that finds and matches features and maps; ``None`` where pycolmap does.
     executor
-        Who maps parts of a long capture.
+        Who maps parts of a long capture; on a cluster, who finds features and matches pairs, too.
     progress
         Hears how far it is.
     """

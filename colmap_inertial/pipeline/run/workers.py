@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import shutil
 import subprocess
 import tempfile
@@ -28,6 +29,8 @@ from colmap_inertial.pipeline.run.chunks import (
 )
 from colmap_inertial.pipeline.run.runner import remove
 
+log = logging.getLogger(__name__)
+
 _EXECUTOR: ContextVar[Executor | None] = ContextVar("executor", default=None)
 #: How often a worker looks whether its chunk is still wanted, in seconds.
 _WANTED_S = 0.25
@@ -41,7 +44,8 @@ def using_workers(workers: int | None = None, *, scheduler: str | None = None) -
 
     Parts of long captures are mapped by as many processes at a time, by default one for each processor. Workers of a
     scheduler (``tcp://host:8786``) also find and match features; they need the same versions of this package and of
-    pycolmap, and must see the output under the same path. Neither changes a result.
+    pycolmap, and must see the output under the same path. The number of processes does not change a result, nor do a
+    scheduler's workers where it is ``deterministic``.
 
     Raises
     ------
@@ -80,16 +84,30 @@ def connect(address: str, what: str) -> Any:
     MissingExtraError
         Where Dask is not installed, which ``what`` needs.
     InertialError
-        Where no scheduler answers.
+        Where no scheduler answers, or TLS has no certificates.
     """
     try:
-        from distributed import Client
+        from distributed import Client, Security
     except ImportError:
         raise MissingExtraError("cluster", what) from None
     try:
+        if address.startswith("tls:") and Security().get_connection_args("client")["ssl_context"] is None:
+            raise InertialError(
+                f"{address} needs certificates: name them in Dask's own configuration (distributed.comm.tls)"
+            )
         return Client(address, timeout=10, set_as_default=False)
     except (OSError, ValueError) as error:
         raise InertialError(f"no Dask scheduler answers at {address}: {error}") from error
+
+
+def warn_without_gpu(client: Any, what: str) -> None:
+    """Say where no worker of a Dask client offers a GPU, for which ``what`` waits."""
+    try:
+        workers = client.scheduler_info(n_workers=-1)["workers"]
+    except TypeError:  # before 2025.2 it lists all workers without being asked
+        workers = client.scheduler_info()["workers"]
+    if not any("GPU" in worker.get("resources", {}) for worker in workers.values()):
+        log.warning("no worker offers a GPU yet (dask worker --resources GPU=1): %s wait for one", what)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -112,11 +130,14 @@ class Cluster:
         """As of :class:`~colmap_inertial.pipeline.run.chunks.Executor`."""
         from distributed import as_completed
 
+        if any(chunk.gpu for chunk in chunks):
+            warn_without_gpu(self.client, "features and matches")
         wanted: dict[Any, int] = {}
         for number, chunk in enumerate(chunks):
             key = f"colmap-inertial-{uuid.uuid4().hex}"
             write_text(chunk.folder / _WANTED, key)
-            future = self.client.submit(do_for_another, chunk, describe_versions(), key, key=key, pure=False)
+            resources, versions = {"GPU": 1} if chunk.gpu else None, describe_versions()
+            future = self.client.submit(do_for_another, chunk, versions, key, key=key, pure=False, resources=resources)
             wanted[future] = number
         try:
             for future in as_completed(list(wanted), loop=self.client.loop):
@@ -223,7 +244,7 @@ def do_for_another(chunk: Chunk, versions: str, by: str) -> dict[str, bytes]:
                     process.wait(timeout=_WANTED_S)
                 if not _is_wanted(chunk, by):
                     raise MappingError(f"{chunk.name}: not wanted any more")
-            require_success(process, own)
+            require_success(process, own, if_short="give workers more of it, or one thread each (--nthreads 1)")
         finally:
             process.kill()
             end_process(process)

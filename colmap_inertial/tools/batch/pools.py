@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import logging
 import queue
 import re
 import threading
@@ -16,10 +15,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from colmap_inertial.core.threads import usable_cores
-from colmap_inertial.pipeline.run.workers import connect
+from colmap_inertial.pipeline.run.workers import connect, warn_without_gpu
 from colmap_inertial.tools.batch.task import CaptureStatus, CaptureTask, run_capture
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,11 +116,11 @@ def dask_pool(address: str) -> Iterator[Submit]:
     """
     client = connect(address, "--scheduler hands captures to a Dask cluster")
     submitted: list[Any] = []
-    warn_without_gpu = functools.cache(lambda: _warn_without_gpu(client))
+    warn_once = functools.cache(lambda: warn_without_gpu(client, "dense captures"))
 
     def submit(task: CaptureTask) -> Pending:
         if task.gpu:
-            warn_without_gpu()
+            warn_once()
         key, resources = f"colmap-inertial-{task.name}-{uuid.uuid4().hex}", {"GPU": 1} if task.gpu else None
         future: Pending = client.submit(run_capture, task, key=key, pure=False, resources=resources)
         submitted.append(future)
@@ -135,12 +132,3 @@ def dask_pool(address: str) -> Iterator[Submit]:
         finally:
             with contextlib.suppress(Exception):  # the scheduler may be gone
                 client.cancel([future for future in submitted if not future.done()])
-
-
-def _warn_without_gpu(client: Any) -> None:
-    try:
-        workers = client.scheduler_info(n_workers=-1)["workers"]
-    except TypeError:  # before 2025.2 it lists all workers without being asked
-        workers = client.scheduler_info()["workers"]
-    if not any("GPU" in worker.get("resources", {}) for worker in workers.values()):
-        log.warning("no worker offers a GPU yet (dask worker --resources GPU=1): dense captures wait for one")
