@@ -119,10 +119,13 @@ def test_of_a_project_ini_counts_what_differs_and_a_setting_goes_before_it(tmp_p
         read_settings((), ini)
 
 
-def test_a_step_is_made_again_by_its_own_settings_and_by_files_that_they_name(tmp_path):
+@pytest.mark.parametrize("absolute", [True, False])
+def test_a_step_is_made_again_by_its_own_settings_and_by_files_that_they_name(tmp_path, monkeypatch, absolute):
+    monkeypatch.chdir(tmp_path)
     mask = tmp_path / "mask.png"
     mask.write_bytes(b"1")
-    settings = ColmapSettings((f"ImageReader.camera_mask_path={mask}", "Mapper.init_num_trials=60"))
+    named = mask if absolute else mask.name
+    settings = ColmapSettings((f"ImageReader.camera_mask_path={named}", "Mapper.init_num_trials=60"))
     assert settings.of("mapping") == ("Mapper.init_num_trials=60",)
     before = settings.identity("features"), settings.identity("mapping")
     mask.write_bytes(b"22")

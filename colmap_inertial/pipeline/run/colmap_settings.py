@@ -132,7 +132,7 @@ class ColmapSettings:
         """Values that decide these steps, with the content of files that settings name."""
         chosen = self.of(*steps)
         files = [Path(text.partition("=")[2]) for text in chosen]
-        return [*chosen, *(fingerprint(path) for path in files if path.is_absolute() and path.exists())]
+        return [*chosen, *(fingerprint(path) for path in files if path != Path() and path.exists())]
 
     def after(self, *settings: str) -> ColmapSettings:
         """These settings, with defaults before them that count where the user set nothing."""
