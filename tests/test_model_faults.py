@@ -12,7 +12,7 @@ import pytest
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.options import ScaleOptions
 from colmap_inertial.core.quantiles import Z95
-from colmap_inertial.inertial.scale._shape import ShapeFault
+from colmap_inertial.inertial.scale._shape import Scores, ShapeFault, find_faults
 from colmap_inertial.inertial.scale.posterior import FittedPath
 
 SCRIPTS = Path(__file__).parents[1] / "scripts"
@@ -111,3 +111,12 @@ def test_what_is_undone_is_what_was_done():
     assert np.trace(strain.strain) == pytest.approx(0, abs=1e-12)
     bent = path @ np.linalg.inv(np.eye(3) + strain.strain)
     assert np.allclose(strain.undo(t_s, bent), path)
+
+
+def test_vibration_makes_a_break_less_sure_and_no_larger():
+    """Of an information and the score of a break by 5 %."""
+    of = Scores(information=np.array([[1e4]]), score=np.array([1e4 * 0.05]), by_scale=np.zeros(1))
+    calm, shaken = (find_faults([("break", 20.0)], of, shaken=vibrates)[0] for vibrates in (False, True))
+    assert calm.value == pytest.approx(0.05) and shaken.value == pytest.approx(0.05)
+    assert calm.cov == pytest.approx(1e-4) and shaken.cov > 2 * calm.cov
+    assert shaken.chi2(1.0) < 0.5 * calm.chi2(1.0)
