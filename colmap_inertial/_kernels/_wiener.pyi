@@ -5,7 +5,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.core.arrays import BoolArray, Float32Array, Int32Array
+from colmap_inertial.core.arrays import BoolArray, Float32Array, Int32Array, UInt8Array
 
 Code = TypeVar("Code", np.uint8, np.uint16, np.float32)
 
@@ -46,6 +46,9 @@ def blend(
     instruction_set: str = "",
 ) -> None:
     """Write the codes of `light`, which another filter made of the (H, W, C) image, into `result`."""
+
+def encode(light: Float32Array, result: UInt8Array, *, encode: Float32Array, instruction_set: str = "") -> None:
+    """Write the nearest codes of (N,) linear light into `result`."""
 
 def peak_multiply_adds(instruction_set: str = "", seconds: float = 0.2) -> float:
     """Fused multiply-adds a second that one core reaches in registers, each lane counted."""

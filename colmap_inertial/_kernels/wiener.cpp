@@ -16,42 +16,49 @@ namespace {
 
 constexpr int NODE = 4;  // px between the points at which the influence of lost light is worked out
 constexpr int PER_CELL = CELL / NODE;
+constexpr int SCANNED = 16;  // nodes of a row whose brightest pixel is looked for at once
 constexpr float ZERO_TO = 2.0f, ONE_FROM = 2.5f;  // share of the result, by distance from lost light in blur lengths
 constexpr float STEEPEST =
     2.0f;  // of a scene that fits the sensor's range, times full scale over the length of the blur
 
-// Codes of linear light, a whole cell at a time.
+// Codes of linear light, at most MOST at a time.
 template <class Code>
 class Encoder {
   public:
-    explicit Encoder(const Codec &codec) : table_(codec.encode), steps_(float(codec.encode_steps)) {
+    static constexpr int MOST = CELL * CELL;
+
+    Encoder(const Codec &codec, const Simd &simd) : table_(codec.encode), steps_(float(codec.encode_steps)), simd_(simd) {
         if constexpr (std::is_same_v<Code, uint8_t>) {
             nearest_.resize(size_t(codec.encode_steps) + 2);
             for (size_t i = 0; i < nearest_.size(); ++i) nearest_[i] = uint8_t(table_[i] + 0.5f);
         }
     }
 
-    // Indices into the table for a tile, and where between its entries.
-    void find(const float *tile, const Simd &simd, float *position, int32_t *index) const {
-        // the nearest entry, or the one below
-        if constexpr (!std::is_same_v<Code, float>)
-            simd.index(tile, steps_, std::is_same_v<Code, uint8_t> ? 0.5f : 0.0f, position, index);
-    }
-
-    Code code(float light, float position, int32_t index) const {
+    void encode(const float *light, int count, Code *out) const {
         if constexpr (std::is_same_v<Code, float>) {
-            return light;
-        } else if constexpr (std::is_same_v<Code, uint8_t>) {
-            return nearest_[size_t(index)];
-        } else {
-            const float low = table_[index], high = table_[index + 1];
-            return Code(low + (high - low) * (position - float(index)) + 0.5f);
+            std::copy_n(light, count, out);
+            return;
+        }
+        float position[MOST];
+        int32_t index[MOST];
+        // the nearest entry, or the one below
+        constexpr bool nearest = std::is_same_v<Code, uint8_t>;
+        simd_.index(light, count, steps_, nearest ? 0.5f : 0.0f, position, index);
+        const uint8_t *const codes = nearest_.data();
+        for (int i = 0; i < count; ++i) {
+            if constexpr (nearest) {
+                out[i] = codes[index[i]];
+            } else {
+                const float low = table_[index[i]], high = table_[index[i] + 1];
+                out[i] = Code(low + (high - low) * (position[i] - float(index[i])) + 0.5f);
+            }
         }
     }
 
   private:
     const float *table_;
     float steps_;
+    const Simd &simd_;
     std::vector<uint8_t> nearest_;
 };
 
@@ -73,15 +80,18 @@ class LostLight {
         in_parallel(blocks_y, threads, [&](int i) {
             for (int y = i * NODE; y < std::min((i + 1) * NODE, size_.height); ++y) {
                 const Code *row = image + ptrdiff_t(y) * line;
-                Code top = 0;
-                for (int x = 0; x < line; ++x) top = std::max(top, row[x]);
-                if (top < threshold) continue;
-                for (int x = 0; x < line; ++x) {
-                    unsigned char &lost = blocks[size_t(i) * blocks_x + x / block];
-                    if (row[x] < threshold || lost || !steep(image, codec, y, x / size_.channels, x % size_.channels))
-                        continue;
-                    lost = 1;
-                    any = true;
+                for (int begin = 0; begin < line; begin += SCANNED * block) {
+                    const int end = std::min(begin + SCANNED * block, line);
+                    Code top = 0;
+                    for (int x = begin; x < end; ++x) top = std::max(top, row[x]);
+                    if (top < threshold) continue;
+                    for (int x = begin; x < end; ++x) {
+                        if (row[x] < threshold) continue;
+                        unsigned char &lost = blocks[size_t(i) * blocks_x + x / block];
+                        if (lost || !steep(image, codec, y, x / size_.channels, x % size_.channels)) continue;
+                        lost = 1;
+                        any = true;
+                    }
                 }
             }
         });
@@ -185,7 +195,7 @@ class Deblur {
           codec_(codec),
           simd_(simd),
           threads_(threads),
-          encoder_(codec),
+          encoder_(codec, simd),
           lost_light_(size, field) {}
 
     Seconds run() {
@@ -198,10 +208,13 @@ class Deblur {
         return {double(middle - start) / CLOCKS_PER_SEC, double(end - middle) / CLOCKS_PER_SEC};
     }
 
-    // The result of another filter, as linear light, in place of its own.
+    // The result of another filter, as linear light, in place of its own. Channels lie side by side all the way.
     void blend(const float *light) {
         lost_light_.find(image_, codec_, threads_);
+        const int pixel = size_.channels, together = Encoder<Code>::MOST;
+        const size_t line = size_t(size_.width) * size_t(pixel);
         in_parallel(field_.ny, threads_, [&](int cy) {
+            std::vector<float> mixed(size_t(CELL) * size_t(pixel));
             for (int cx = 0; cx < field_.nx; ++cx) {
                 if (faded(cy, cx)) {
                     copy(cy, cx);
@@ -210,15 +223,21 @@ class Deblur {
                 float share[CELL][CELL];
                 const bool blended = shares(cy, cx, share);
                 const int rows = std::min(CELL, size_.height - cy * CELL),
-                          columns = std::min(CELL, size_.width - cx * CELL);
-                for (int channel = 0; channel < size_.channels; ++channel) {
-                    alignas(64) float tile[CELL * CELL] = {};
-                    for (int y = 0; y < rows; ++y)
-                        for (int x = 0; x < columns; ++x)
-                            tile[y * CELL + x] = light[(size_t(cy * CELL + y) * size_t(size_.width) +
-                                                        size_t(cx * CELL + x)) * size_t(size_.channels) +
-                                                       size_t(channel)];
-                    write(cy, cx, channel, tile, false, blended ? share : nullptr);
+                          count = std::min(CELL, size_.width - cx * CELL) * pixel;
+                for (int y = 0; y < rows; ++y) {
+                    const size_t at = size_t(cy * CELL + y) * line + size_t(cx * CELL) * size_t(pixel);
+                    const float *row = light + at;
+                    if (blended) {
+                        for (int i = 0; i < count; ++i) {
+                            const float before = light_of(image_[at + size_t(i)], codec_);
+                            mixed[size_t(i)] = before + share[y][i / pixel] * (row[i] - before);
+                        }
+                        row = mixed.data();
+                    }
+                    for (int i = 0; i < count; i += together)
+                        encoder_.encode(row + i, std::min(together, count - i), result_ + at + i);
+                    for (int i = 0; blended && i < count; ++i)
+                        if (share[y][i / pixel] == 0) result_[at + size_t(i)] = image_[at + size_t(i)];
                 }
             }
         });
@@ -346,14 +365,12 @@ class Deblur {
                     float &light = tile[transposed ? x * CELL + y : y * CELL + x];
                     light = before + share[y][x] * (light - before);
                 }
-        float position[CELL * CELL];
-        int32_t index[CELL * CELL];
-        encoder_.find(tile, simd_, position, index);
+        Code codes[CELL * CELL];
+        encoder_.encode(tile, CELL * CELL, codes);
         for (int y = 0; y < rows; ++y)
             for (int x = 0; x < columns; ++x) {
                 const int i = transposed ? x * CELL + y : y * CELL + x;
-                out[y * line + x * pixel] = share && share[y][x] == 0 ? in[y * line + x * pixel]
-                                                                      : encoder_.code(tile[i], position[i], index[i]);
+                out[y * line + x * pixel] = share && share[y][x] == 0 ? in[y * line + x * pixel] : codes[i];
             }
     }
 
@@ -392,6 +409,13 @@ void blend(const Code *image, const float *light, Code *result, Image size, cons
            const Simd &simd, int threads) {
     const Table none{};
     Deblur<Code>(image, result, size, field, none, codec, simd, threads).blend(light);
+}
+
+void encode(const float *light, size_t count, uint8_t *result, const Codec &codec, const Simd &simd) {
+    const Encoder<uint8_t> encoder(codec, simd);
+    const size_t together = Encoder<uint8_t>::MOST;
+    for (size_t i = 0; i < count; i += together)
+        encoder.encode(light + i, int(std::min(together, count - i)), result + i);
 }
 
 template void blend(const uint8_t *, const float *, uint8_t *, Image, const Field &, const Codec &, const Simd &, int);

@@ -49,3 +49,6 @@ Seconds deblur(const Code *image, Code *result, Image size, const Field &field, 
 template <class Code>
 void blend(const Code *image, const float *light, Code *result, Image size, const Field &field, const Codec &codec,
            const Simd &simd, int threads);
+
+// The nearest codes of linear light.
+void encode(const float *light, size_t count, uint8_t *result, const Codec &codec, const Simd &simd);

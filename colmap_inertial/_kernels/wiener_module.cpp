@@ -71,6 +71,15 @@ void blend_image(In<Code, 3> image, In<float, 3> light, Of<Code, 3> result, In<f
           count);
 }
 
+void encode_light(In<float, 1> light, Of<uint8_t, 1> result, In<float, 1> encode, const std::string &instruction_set) {
+    check(is(result, light.shape(0)), "result: not the shape of light");
+    check(encode.shape(0) >= 3, "encode: too short");
+    const Codec codec{nullptr, encode.data(), int(encode.shape(0)) - 2, 0};
+    const Simd &simd = SIMD_TABLES.require(instruction_set);
+    nb::gil_scoped_release release;
+    ::encode(light.data(), light.shape(0), result.data(), codec, simd);
+}
+
 // Multiply-adds a second, lanes counted singly, that one core does on numbers in registers: the best of several runs.
 double peak_multiply_adds(const std::string &instruction_set, double seconds) {
     const Simd &simd = SIMD_TABLES.require(instruction_set);
@@ -117,6 +126,8 @@ NB_MODULE(_wiener, module) {
     define_blend<uint16_t>(module);
     define<uint16_t>(module);
     define<float>(module);
+    module.def("encode", &encode_light, nb::arg("light").noconvert(), nb::arg("result").noconvert(), nb::kw_only(),
+               nb::arg("encode").noconvert(), nb::arg("instruction_set") = "");
     module.def("peak_multiply_adds", &peak_multiply_adds, nb::arg("instruction_set") = "", nb::arg("seconds") = 0.2);
     module.def("instruction_sets", [] { return SIMD_TABLES.names(); });
 }

@@ -97,10 +97,10 @@ void combine(const float *const *sources, const float *weights, int radius, floa
     }
 }
 
-void index(const float *__restrict tile, float scale, float offset, float *__restrict position,
+void index(const float *__restrict values, int count, float scale, float offset, float *__restrict position,
            int32_t *__restrict index) {
-    for (int i = 0; i < CELL * CELL; ++i) {
-        const float clipped = tile[i] < 0.0f ? 0.0f : tile[i];
+    for (int i = 0; i < count; ++i) {
+        const float clipped = values[i] < 0.0f ? 0.0f : values[i];
         position[i] = (clipped > 1.0f ? 1.0f : clipped) * scale + offset;
         index[i] = int32_t(position[i]);
     }

@@ -25,8 +25,8 @@ struct Simd {
     void (*filter)(const float *source, ptrdiff_t stride, const Taps &taps, float *tile);
     // target[x] = weights[0] sources[0][x] + sum over 1 <= k <= radius of weights[k] (sources[2k-1][x] + sources[2k][x]).
     void (*combine)(const float *const *sources, const float *weights, int radius, float *target, int width);
-    // Clips a tile to 0..1, scales it, and rounds down.
-    void (*index)(const float *tile, float scale, float offset, float *position, int32_t *index);
+    // Clips values to 0..1, scales them, and rounds down.
+    void (*index)(const float *values, int count, float scale, float offset, float *position, int32_t *index);
     // Runs `rounds` of independent multiply-adds in registers; returns how many (lanes counted singly) it did.
     double (*multiply_adds)(int64_t rounds, float *sink);
 };

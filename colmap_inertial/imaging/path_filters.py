@@ -9,19 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.core.arrays import Array, Float32Array, UInt8Array
+from colmap_inertial.core.arrays import Array, Float32Array
 from colmap_inertial.core.threads import usable_processors
 from colmap_inertial.imaging._cells import Cells
 from colmap_inertial.imaging._chroma import join_colours, split_colours
 from colmap_inertial.imaging._tiles import TILING, TiledPaths, Tiling
 from colmap_inertial.imaging.blur_path import BlurPath
-from colmap_inertial.imaging.transfer import ENCODE_STEPS, decode_table, encode_table, linearise, srgb_from_linear
+from colmap_inertial.imaging.transfer import decode_table, encode_table, linearise, srgb_from_linear
 from colmap_inertial.imaging.wiener import DeblurOptions, lowest_saturated_code, require_planes
 
 Code = TypeVar("Code", np.uint8, np.uint16)
@@ -106,20 +105,15 @@ def smoothed(image: NDArray[Code], sigma_px: float) -> NDArray[Code]:
     """An image smoothed by a Gaussian in linear light, as feature extraction likes it after a filter."""
     import cv2
 
+    from colmap_inertial._kernels import _wiener
+
     light = np.asarray(cv2.GaussianBlur(linearise(image), (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT_101))
     if image.dtype == np.uint8:  # the table is fine enough for 256 codes
-        steps = cv2.multiply(light, float(ENCODE_STEPS), dtype=cv2.CV_16U)  # rounded as np.rint does
-        return np.asarray(_nearest_codes().take(steps), dtype=image.dtype)
+        result = np.empty_like(image, order="C")
+        _wiener.encode(light.reshape(-1), result.reshape(-1), encode=encode_table(image.dtype))
+        return result
     codes = np.iinfo(image.dtype).max * srgb_from_linear(light.astype(np.float64)).astype(np.float32)
     return np.rint(codes).astype(image.dtype)
-
-
-@lru_cache(maxsize=1)
-def _nearest_codes() -> UInt8Array:
-    """Codes of 8 bit of evenly spaced linear light."""
-    table = np.rint(encode_table(np.dtype(np.uint8))).astype(np.uint8)
-    table.setflags(write=False)
-    return table
 
 
 @dataclass(frozen=True)
