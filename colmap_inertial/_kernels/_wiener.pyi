@@ -47,6 +47,18 @@ def blend(
 ) -> None:
     """Write the codes of `light`, which another filter made of the (H, W, C) image, into `result`."""
 
+def join(
+    luma: Float32Array,
+    lines: Float32Array,
+    result: Float32Array,
+    *,
+    red: float,
+    blue: float,
+    threads: int = 0,
+    instruction_set: str = "",
+) -> None:
+    """Write (H, W, 3) RGB into `result`; lines are (4, ceil(H / 2), ceil(W / 2)) slopes and offsets over luma."""
+
 def encode(light: Float32Array, result: UInt8Array, *, encode: Float32Array, instruction_set: str = "") -> None:
     """Write the nearest codes of (N,) linear light into `result`."""
 

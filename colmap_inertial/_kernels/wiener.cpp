@@ -411,6 +411,24 @@ void blend(const Code *image, const float *light, Code *result, Image size, cons
     Deblur<Code>(image, result, size, field, none, codec, simd, threads).blend(light);
 }
 
+void join(const float *luma, const float *lines, Image size, float red, float blue, float *result, const Simd &simd,
+          int threads) {
+    const int half = (size.width + 1) / 2, half_rows = (size.height + 1) / 2;
+    in_parallel((size.height + BAND - 1) / BAND, threads, [&](int band) {
+        std::vector<float> room(size_t(10 * half + 4));
+        for (int y = band * BAND; y < std::min((band + 1) * BAND, size.height); ++y) {
+            const int row = y / 2, beyond = std::min(std::max(row + (y % 2 ? 1 : -1), 0), half_rows - 1);
+            const float *near[4], *far[4];
+            for (int plane = 0; plane < 4; ++plane) {
+                near[plane] = lines + (size_t(plane) * half_rows + row) * half;
+                far[plane] = lines + (size_t(plane) * half_rows + beyond) * half;
+            }
+            const size_t at = size_t(y) * size.width;
+            simd.join(luma + at, near, far, half, size.width, red, blue, room.data(), result + 3 * at);
+        }
+    });
+}
+
 void encode(const float *light, size_t count, uint8_t *result, const Codec &codec, const Simd &simd) {
     const Encoder<uint8_t> encoder(codec, simd);
     const size_t together = Encoder<uint8_t>::MOST;

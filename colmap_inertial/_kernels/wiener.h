@@ -50,5 +50,10 @@ template <class Code>
 void blend(const Code *image, const float *light, Code *result, Image size, const Field &field, const Codec &codec,
            const Simd &simd, int threads);
 
+// result (height, width, 3) = linear light of (height, width) luma, whose shares of R - G and B - G are red and blue;
+// lines: slopes and offsets of both over luma, each of half the size, rounded up.
+void join(const float *luma, const float *lines, Image size, float red, float blue, float *result, const Simd &simd,
+          int threads);
+
 // The nearest codes of linear light.
 void encode(const float *light, size_t count, uint8_t *result, const Codec &codec, const Simd &simd);

@@ -71,6 +71,18 @@ void blend_image(In<Code, 3> image, In<float, 3> light, Of<Code, 3> result, In<f
           count);
 }
 
+void join_colours(In<float, 2> luma, In<float, 3> lines, Of<float, 3> result, float red, float blue, int threads,
+                  const std::string &instruction_set) {
+    const size_t height = luma.shape(0), width = luma.shape(1);
+    check(height > 0 && width > 0, "luma: empty");
+    check(is(lines, 4, (height + 1) / 2, (width + 1) / 2), "lines: not four planes of half the size");
+    check(is(result, height, width, 3), "result: not three channels of luma's shape");
+    const Simd &simd = SIMD_TABLES.require(instruction_set);
+    const int count = threads_or_all(threads);
+    nb::gil_scoped_release release;
+    ::join(luma.data(), lines.data(), Image{int(height), int(width), 3}, red, blue, result.data(), simd, count);
+}
+
 void encode_light(In<float, 1> light, Of<uint8_t, 1> result, In<float, 1> encode, const std::string &instruction_set) {
     check(is(result, light.shape(0)), "result: not the shape of light");
     check(encode.shape(0) >= 3, "encode: too short");
@@ -126,6 +138,9 @@ NB_MODULE(_wiener, module) {
     define_blend<uint16_t>(module);
     define<uint16_t>(module);
     define<float>(module);
+    module.def("join", &join_colours, nb::arg("luma").noconvert(), nb::arg("lines").noconvert(),
+               nb::arg("result").noconvert(), nb::kw_only(), nb::arg("red"), nb::arg("blue"), nb::arg("threads") = 0,
+               nb::arg("instruction_set") = "");
     module.def("encode", &encode_light, nb::arg("light").noconvert(), nb::arg("result").noconvert(), nb::kw_only(),
                nb::arg("encode").noconvert(), nb::arg("instruction_set") = "");
     module.def("peak_multiply_adds", &peak_multiply_adds, nb::arg("instruction_set") = "", nb::arg("seconds") = 0.2);

@@ -106,6 +106,30 @@ void index(const float *__restrict values, int count, float scale, float offset,
     }
 }
 
+void join(const float *__restrict luma, const float *const *near, const float *const *far, int half, int width,
+          float red, float blue, float *__restrict room, float *__restrict rgb) {
+    float *__restrict between = room + 8 * ptrdiff_t(half);
+    for (int plane = 0; plane < 4; ++plane) {
+        const float *__restrict one = near[plane], *__restrict other = far[plane];
+        float *__restrict full = room + 2 * ptrdiff_t(half) * plane;
+        for (int i = 0; i < half; ++i) between[i + 1] = 0.75f * one[i] + 0.25f * other[i];
+        between[0] = between[1];
+        between[half + 1] = between[half];
+        for (int i = 0; i < half; ++i) {
+            full[2 * i] = 0.75f * between[i + 1] + 0.25f * between[i];
+            full[2 * i + 1] = 0.75f * between[i + 1] + 0.25f * between[i + 2];
+        }
+    }
+    for (int x = 0; x < width; ++x) {
+        const float *line = room + x;
+        const float r = line[0] * luma[x] + line[2 * half], b = line[4 * half] * luma[x] + line[6 * half];
+        const float green = luma[x] - red * r - blue * b;
+        rgb[3 * x] = green + r;
+        rgb[3 * x + 1] = green;
+        rgb[3 * x + 2] = green + b;
+    }
+}
+
 double multiply_adds(int64_t rounds, float *sink) {
     Vector sum[CHAINS], factor = Vector{} + 0.999f, term = Vector{} + 0.001f;
 #pragma GCC unroll 24
@@ -123,4 +147,4 @@ double multiply_adds(int64_t rounds, float *sink) {
 
 }  // namespace
 
-extern const Simd JOIN(simd_, SIMD) = {TEXT(SIMD), LANES, place, filter, combine, index, multiply_adds};
+extern const Simd JOIN(simd_, SIMD) = {TEXT(SIMD), LANES, place, filter, combine, index, join, multiply_adds};

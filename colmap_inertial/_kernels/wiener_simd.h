@@ -27,6 +27,10 @@ struct Simd {
     void (*combine)(const float *const *sources, const float *weights, int radius, float *target, int width);
     // Clips values to 0..1, scales them, and rounds down.
     void (*index)(const float *values, int count, float scale, float offset, float *position, int32_t *index);
+    // A row of colours from luma; R - G and B - G are lines over it. near and far: slopes and offsets of both, one after
+    // the other, in the next row of half the size and the one beyond, of `half` pixels. room: 10 half + 4 floats.
+    void (*join)(const float *luma, const float *const *near, const float *const *far, int half, int width, float red,
+                 float blue, float *room, float *rgb);
     // Runs `rounds` of independent multiply-adds in registers; returns how many (lanes counted singly) it did.
     double (*multiply_adds)(int64_t rounds, float *sink);
 };

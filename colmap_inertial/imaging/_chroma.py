@@ -64,35 +64,16 @@ def split_colours(image: AnyArray, threads: int) -> tuple[Float32Array, Float32A
 
 def join_colours(luma: Float32Array, chroma: Float32Array, threads: int) -> Float32Array:
     """(H, W, 3) RGB from luma and chroma as :func:`split_colours` gives them; detail of chroma follows that of luma."""
-    import cv2
+    from colmap_inertial._kernels import _wiener
 
-    height, width = luma.shape
-    slopes, offsets = _fit_lines(luma, chroma)
+    result = np.empty((*luma.shape, 3), dtype=np.float32)
     red, blue = CHROMA_MODEL.red, CHROMA_MODEL.blue
-    to_rgb = np.array([[1, 1 - red, -blue], [1, -red, -blue], [1, -red, 1 - blue]], dtype=np.float32)
-    result = np.empty((height, width, 3), dtype=np.float32)
-
-    def combine(rows: slice) -> None:
-        # with a row more on either side, of which each makes two
-        first, last = max(rows.start // 2 - 1, 0), min(-(-rows.stop // 2) + 1, len(chroma))
-        begin = rows.start - 2 * first
-        planes = [luma[rows]]
-        for slope, offset in zip(slopes, offsets, strict=True):
-            factor, added = (
-                cv2.resize(plane[first:last], (2 * plane.shape[1], 2 * (last - first)), interpolation=cv2.INTER_LINEAR)[
-                    begin : begin + len(planes[0]), :width
-                ]
-                for plane in (slope, offset)
-            )
-            planes.append(factor * planes[0] + added)
-        cv2.transform(cv2.merge(planes), to_rgb, dst=result[rows])
-
-    _process_bands(combine, height, threads)
+    _wiener.join(luma, _fit_lines(luma, chroma), result, red=red, blue=blue, threads=threads)
     return result
 
 
-def _fit_lines(luma: Float32Array, chroma: Float32Array) -> tuple[list[Float32Array], list[Float32Array]]:
-    """Slope and offset of each chroma over luma around each pixel of the half size."""
+def _fit_lines(luma: Float32Array, chroma: Float32Array) -> Float32Array:
+    """(4, h, w) slope and offset of each chroma over luma around each pixel of the half size."""
     import cv2
 
     def mean(values: AnyArray) -> Float32Array:
@@ -101,8 +82,12 @@ def _fit_lines(luma: Float32Array, chroma: Float32Array) -> tuple[list[Float32Ar
     small = np.asarray(cv2.resize(_pad_to_even(luma), chroma.shape[1::-1], interpolation=cv2.INTER_AREA))
     luma_mean = mean(small)
     spread = mean(small * small) - luma_mean * luma_mean + np.float32(CHROMA_MODEL.flat_variance)
-    slopes = [mean((mean(plane * small) - mean(plane) * luma_mean) / spread) for plane in cv2.split(chroma)]
-    return slopes, [plane - slope * small for plane, slope in zip(cv2.split(chroma), slopes, strict=True)]
+    lines = np.empty((4, *small.shape), dtype=np.float32)
+    for i, plane in enumerate(cv2.split(chroma)):
+        slope, offset = lines[2 * i : 2 * i + 2]
+        slope[:] = mean((mean(plane * small) - mean(plane) * luma_mean) / spread)
+        np.subtract(plane, slope * small, out=offset)
+    return lines
 
 
 def _pad_to_even(values: AnyArray) -> AnyArray:

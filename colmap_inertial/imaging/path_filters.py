@@ -109,11 +109,11 @@ def smoothed(image: NDArray[Code], sigma_px: float) -> NDArray[Code]:
 
     light = np.asarray(cv2.GaussianBlur(linearise(image), (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT_101))
     if image.dtype == np.uint8:  # the table is fine enough for 256 codes
-        result = np.empty_like(image, order="C")
-        _wiener.encode(light.reshape(-1), result.reshape(-1), encode=encode_table(image.dtype))
-        return result
-    codes = np.iinfo(image.dtype).max * srgb_from_linear(light.astype(np.float64)).astype(np.float32)
-    return np.rint(codes).astype(image.dtype)
+        codes = np.empty(light.size, dtype=np.uint8)
+        _wiener.encode(light.reshape(-1), codes, encode=encode_table(image.dtype))
+        return np.asarray(codes.reshape(image.shape), dtype=image.dtype)
+    exact = np.iinfo(image.dtype).max * srgb_from_linear(light.astype(np.float64)).astype(np.float32)
+    return np.rint(exact).astype(image.dtype)
 
 
 @dataclass(frozen=True)
