@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array, Float32Array, IndexArray, UInt8Array, UInt16Array
+from colmap_inertial.core.arrays import AnyArray, Array, Float32Array, IndexArray, UInt8Array, UInt16Array
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath, middles
 from colmap_inertial.imaging.tracking import convert_to_grey
@@ -293,14 +293,12 @@ def _compute_spectra(
     extent = np.hypot(vectors[:, 0], vectors[:, 1])
     usable = (extent >= _LIMITS.shortest_px) & (extent * FACTORS[-1] < 0.5 * tile)
     usable &= (windows > 0.97).mean(axis=(1, 2)) < _LIMITS.most_clipped
-    spread = windows.std(axis=(1, 2))
-    usable &= spread > _LIMITS.least_contrast
+    tiles = windows - windows.mean(axis=(1, 2), keepdims=True)
+    usable &= np.einsum("nij,nij->n", tiles, tiles) > (_LIMITS.least_contrast * tile) ** 2
     if usable.sum() < _LIMITS.fewest_tiles:
         return None
-    tiles = windows[usable]
     window = np.hanning(tile).astype(np.float32)
-    tiles = (tiles - tiles.mean(axis=(1, 2), keepdims=True)) * (window[:, None] * window)
-    power = np.abs(rfft2(tiles)) ** 2
+    power = _measure_power(rfft2(tiles[usable] * (window[:, None] * window)))
     paths = path.at(*middles).reshape(len(vectors), -1, 2)[usable] / reduced
     return np.asarray(np.log(power + _LIMITS.floor * tile**2)), vectors[usable], paths
 
@@ -352,9 +350,9 @@ def _measure_falls(logarithm: Float32Array, vectors: Array, path_px: Array) -> t
     ]
     power = logarithm[:, np.arange(2 - reach, reach - 1) % tile, : reach - 1][:, band].astype(np.float64)
     every = np.hypot(np.fft.rfftfreq(tile), np.fft.fftfreq(tile)[:, None])
-    noise = np.exp(
-        logarithm[:, (every > _LIMITS.noise_band_per_px[0]) & (every < _LIMITS.noise_band_per_px[1])].astype(np.float64)
-    ).mean(1)[:, None]
+    noise = np.exp(logarithm[:, (every > _LIMITS.noise_band_per_px[0]) & (every < _LIMITS.noise_band_per_px[1])]).mean(
+        axis=1, dtype=np.float64
+    )[:, None]
     turn = np.stack([np.broadcast_to(along, radius.shape)[band] for along in (x, y)]) / radius[band]
     across = np.abs(vectors @ turn) < np.sin(np.pi / 6) * np.hypot(vectors[:, 0], vectors[:, 1])[:, None]
     # the same at all frequencies of one distance from the origin
@@ -379,15 +377,21 @@ def _measure_falls(logarithm: Float32Array, vectors: Array, path_px: Array) -> t
     )
 
 
-def _compute_transfer(path_px: Array, x: Array, y: Array) -> Array:
+def _compute_transfer(path_px: Array, x: Array, y: Array) -> Float32Array:
     """(N, Y, X) power that (N, S, 2) paths leave at frequencies, cycles per pixel."""
-    wave_x, wave_y = (
-        np.exp(2j * np.pi * (path_px[:, :, i, None] * f)).astype(np.complex64) for i, f in enumerate((x, y))
-    )
-    return np.asarray(np.abs(np.swapaxes(wave_y, 1, 2) @ wave_x / path_px.shape[1]) ** 2, dtype=np.float64)
+    waves = []
+    for i, frequencies in enumerate((x, y)):
+        phase = (2 * np.pi * path_px[:, :, i, None] * frequencies).astype(np.float32)
+        waves.append(np.cos(phase) + np.complex64(1j) * np.sin(phase))
+    return _measure_power(np.swapaxes(waves[1], 1, 2) @ waves[0] / np.float32(path_px.shape[1]))
 
 
-def _leak_window(power: Array) -> Array:
+def _measure_power(spectrum: AnyArray) -> Float32Array:
+    """Square of the absolute value."""
+    return np.asarray(spectrum.real**2 + spectrum.imag**2)
+
+
+def _leak_window(power: Float32Array) -> Float32Array:
     """Leakage of a tile under Hann's window: each frequency takes a sixth of either neighbour; without the
     outermost.
     """

@@ -428,8 +428,10 @@ def keep_sharp(image: NDArray[Code], deblurred: NDArray[Code], blur: BlurField) 
     weight = cv2.resize(keep.astype(np.float32), whole, interpolation=cv2.INTER_LINEAR)[:height, :width]
     out = deblurred.copy()
     for top in range(0, height, _SHARP.block_px):
-        band = slice(top, top + _SHARP.block_px)
-        if weight[band].any():
-            part = weight[band] if image.ndim == 2 else weight[band, :, None]
+        rows_px = slice(top, top + _SHARP.block_px)
+        kept = np.flatnonzero(weight[rows_px].any(axis=0))
+        if len(kept):
+            band = rows_px, slice(kept[0], kept[-1] + 1)
+            part = weight[band] if image.ndim == 2 else weight[band][..., None]
             out[band] = np.rint(deblurred[band] + part * (image[band].astype(np.float32) - deblurred[band]))
     return out, share

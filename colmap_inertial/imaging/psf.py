@@ -293,7 +293,10 @@ class _Grid:
 
     def turned(self, turn: Array) -> Array:
         """(F, Y, X, 3) the rays after (F, L, 3, 3) rotations of their lines."""
-        return np.asarray(np.einsum("fxij,yxj->fyxi" if self.by_column else "fyij,yxj->fyxi", turn, self.directions))
+        # a product of matrices for each line
+        lines = np.swapaxes(self.directions, 0, 1) if self.by_column else self.directions
+        turned = lines @ np.swapaxes(turn, -1, -2)
+        return np.swapaxes(turned, 1, 2) if self.by_column else turned
 
 
 def _project(camera: Projector, points: Array) -> Array:
@@ -353,8 +356,10 @@ def _compute_vector_cov(motion: GyroCamera, camera: Projector, shutter: FrameShu
         turned = grid.directions + _LIMITS.small_turn_rad * np.cross(np.eye(3)[axis], grid.directions)
         lever[..., axis] = (_project(camera, turned) - grid.nodes_px) / _LIMITS.small_turn_rad
     turn = motion.turn_cov_rad2(shutter.middle_s(grid.lines_px), shutter.exposure_s or 0.0)
-    cov = lever @ (turn[None] if grid.by_column else turn[:, None]) @ np.swapaxes(lever, -1, -2)
-    return np.stack([cov[..., 0, 0], cov[..., 0, 1], cov[..., 1, 1]], axis=-1)
+    weighed = np.einsum("xij,yxkj->yxki" if grid.by_column else "yij,yxkj->yxki", turn, lever)
+    return np.stack(
+        [(lever[..., i, :] * weighed[..., j, :]).sum(axis=-1) for i, j in ((0, 0), (0, 1), (1, 1))], axis=-1
+    )
 
 
 def _fill_nodes(vectors: Array) -> Array:
