@@ -210,7 +210,7 @@ def test_colours_come_back_from_luma_and_half_chroma(size):
     coarse = cv2.resize(rng.random((13, 20, 3), dtype=np.float32), (width, height), interpolation=cv2.INTER_CUBIC)
     image = np.clip(30 + 190 * coarse, 0, 255).astype(np.uint8)
     luma, chroma = split_colours(image, 1)
-    assert luma.shape == (height, width) and chroma.shape == (-(-height // 2), -(-width // 2), 2)
+    assert luma.shape == (height, width) and chroma.shape == (2, -(-height // 2), -(-width // 2))
     light = decode_table(image.dtype)[image]
     np.testing.assert_allclose(luma, light @ [0.2126, 0.7152, 0.0722], atol=1e-5)
     one, many = (join_colours(luma, chroma, threads) for threads in (1, 3))

@@ -219,6 +219,7 @@ class Filter {
         const int first_y = row * tiles_.hop - tiles_.before, first_x = column * tiles_.hop - tiles_.before;
         const bool inside = light_.channels == 1 && first_x >= 0 && first_x + side <= light_.width;
         const int *columns = columns_of_.data() + column * tiles_.hop;
+        const int begin = std::min(std::max(-first_x, 0), side), end = std::max(std::min(light_.width - first_x, side), begin);
         float *sums = room.scratch.get(), *line = sums + side;
         std::fill_n(sums, side, 0.0f);
         for (int y = 0; y < side; ++y) {
@@ -227,7 +228,9 @@ class Filter {
             if (inside)
                 from += first_x;
             else {
-                for (int x = 0; x < side; ++x) line[x] = from[columns[x] + channel];
+                for (int x = 0; x < begin; ++x) line[x] = from[columns[x] + channel];
+                for (int x = begin; x < end; ++x) line[x] = from[(first_x + x) * light_.channels + channel];
+                for (int x = end; x < side; ++x) line[x] = from[columns[x] + channel];
                 from = line;
             }
             simd_.take(side, from, room.tile.get() + size_t(y) * pitch, sums);

@@ -43,14 +43,13 @@ def split_colours(image: AnyArray, threads: int) -> tuple[Float32Array, Float32A
     luma
         (H, W).
     chroma
-        (ceil(H / 2), ceil(W / 2), 2) R - G and B - G, each the mean over two by two pixels.
+        (2, ceil(H / 2), ceil(W / 2)) R - G and B - G, each the mean over two by two pixels.
     """
     import cv2
 
     height, width = image.shape[:2]
     red, blue = CHROMA_MODEL.red, CHROMA_MODEL.blue
     to_luma = np.array([[red, 1 - red - blue, blue]], dtype=np.float32)
-    to_chroma = np.array([[1, -1, 0], [0, -1, 1]], dtype=np.float32)
     luma = np.empty((height, width), dtype=np.float32)
 
     def convert(rows: slice) -> None:
@@ -59,7 +58,8 @@ def split_colours(image: AnyArray, threads: int) -> tuple[Float32Array, Float32A
     _process_bands(convert, height, threads)
     even = _pad_to_even(image)
     small = cv2.resize(even, (even.shape[1] // 2, even.shape[0] // 2), interpolation=cv2.INTER_AREA)
-    return luma, np.asarray(cv2.transform(linearise(small), to_chroma), dtype=np.float32)
+    of_red, of_green, of_blue = cv2.split(linearise(small))
+    return luma, np.stack([of_red - of_green, of_blue - of_green])
 
 
 def join_colours(luma: Float32Array, chroma: Float32Array, threads: int) -> Float32Array:
@@ -79,11 +79,11 @@ def _fit_lines(luma: Float32Array, chroma: Float32Array) -> Float32Array:
     def mean(values: AnyArray) -> Float32Array:
         return np.asarray(cv2.blur(values, (CHROMA_MODEL.window_px, CHROMA_MODEL.window_px)))
 
-    small = np.asarray(cv2.resize(_pad_to_even(luma), chroma.shape[1::-1], interpolation=cv2.INTER_AREA))
+    small = np.asarray(cv2.resize(_pad_to_even(luma), chroma.shape[:0:-1], interpolation=cv2.INTER_AREA))
     luma_mean = mean(small)
     spread = mean(small * small) - luma_mean * luma_mean + np.float32(CHROMA_MODEL.flat_variance)
     lines = np.empty((4, *small.shape), dtype=np.float32)
-    for i, plane in enumerate(cv2.split(chroma)):
+    for i, plane in enumerate(chroma):
         slope, offset = lines[2 * i : 2 * i + 2]
         slope[:] = mean((mean(plane * small) - mean(plane) * luma_mean) / spread)
         np.subtract(plane, slope * small, out=offset)

@@ -391,7 +391,7 @@ def _measure_power(spectrum: AnyArray) -> Float32Array:
     return np.asarray(spectrum.real**2 + spectrum.imag**2)
 
 
-def _leak_window(power: Float32Array) -> Float32Array:
+def _leak_window(power: AnyArray) -> AnyArray:
     """Leakage of a tile under Hann's window: each frequency takes a sixth of either neighbour; without the
     outermost.
     """

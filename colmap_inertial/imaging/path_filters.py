@@ -240,8 +240,9 @@ def _filter_image(
     if planes.shape[2] == 3:
         luma, chroma = split_colours(planes, threads)
         sharp_luma = _filter_light(luma[..., None], path, options, splitting, threads)
-        sharp_chroma = _filter_light(chroma, path.halved(), options, (), threads, chroma=True)
-        sharp = join_colours(sharp_luma[..., 0], sharp_chroma, threads)
+        halved = path.halved()
+        sharp_chroma = [_filter_light(c[..., None], halved, options, (), threads, chroma=True)[..., 0] for c in chroma]
+        sharp = join_colours(sharp_luma[..., 0], np.stack(sharp_chroma), threads)
     else:
         light = linearise(planes).reshape(planes.shape)
         sharp = _filter_light(light, path, options, splitting, threads)
