@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from references.path_filters import filter_reference, noise_reference, shares_of, sources_of
 
-from colmap_inertial._kernels import _path
+from colmap_inertial._kernels import _path, _wiener
 from colmap_inertial.imaging import path_filters
 from colmap_inertial.imaging._chroma import join_colours, split_colours
 from colmap_inertial.imaging._tiles import TiledPaths, Tiling
@@ -215,6 +215,14 @@ def test_colours_come_back_from_luma_and_half_chroma(size):
     np.testing.assert_allclose(luma, light @ [0.2126, 0.7152, 0.0722], atol=1e-5)
     one, many = (join_colours(luma, chroma, threads) for threads in (1, 3))
     np.testing.assert_array_equal(one, many)
+    # between pixels of half the size, lines are interpolated as OpenCV does
+    lines = rng.random((4, *chroma.shape[1:]), dtype=np.float32)
+    planes = [cv2.resize(p, (2 * p.shape[1], 2 * p.shape[0]))[:height, :width] for p in lines]
+    r, b = (planes[i] * luma + planes[i + 1] for i in (0, 2))
+    for name in _wiener.instruction_sets():
+        _wiener.join(luma, lines, joined := np.empty_like(one), red=0.3, blue=0.2, instruction_set=name)
+        green = luma - 0.3 * r - 0.2 * b
+        np.testing.assert_allclose(joined, np.stack([green + r, green, green + b], axis=-1), atol=1e-5)
     # what is coarser than the window comes back, and a place stays where it was
     assert np.abs(one - light).mean() < 2e-3
     shifted = np.roll(one, 1, axis=1)
