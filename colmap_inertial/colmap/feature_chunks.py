@@ -197,6 +197,8 @@ def find_elsewhere(
     chunks = []
     for number, work in enumerate(works):
         names = tuple(name for name in work.names if name in own)
+        if not names:
+            continue
         prints = [fingerprint(images / name) for name in names]
         name = f"finding features of {names[0]} to {names[-1]}"
         chunks.append(_begin(replace(work, names=names), name, folder / str(number), images, len(names), prints))
