@@ -62,8 +62,7 @@ def finished(tmp_path_factory):
     assert stages == ["check", "frames", "features", "matches", "mapping", "images", "metric", "validation"]
     # how much there is to match is said from the start, and hardly changes
     totals = [total for stage, _, total in steps if stage == "matches"]
-    assert max(totals) / totals[-1] < 1.5
-    assert min(totals) == totals[-1]
+    assert max(totals) / totals[-1] < 1.5 and totals[-1] / min(totals) < 1.5
     return capture, root / "out", result
 
 
