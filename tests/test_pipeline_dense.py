@@ -236,8 +236,8 @@ def test_with_cuda_it_goes_through_in_one_run(box, tmp_path, monkeypatch):
     assert (dense.depth_maps, dense.images, dense.mesh, dense.waiting) == (100, 120, None, "")
     assert dense.points > 2000
     assert max(camera.width for camera in read_model(dense.folder / "sparse").cameras.values()) == 96
-    # 1 for undistortion, 40 and 3 for depth maps, 7 for fusion: times on two recordings
-    assert [done for stage, done, _ in seen if stage == "dense"] == [120, 44 * 120, 51 * 120, 51 * 120]
+    # 1 for undistortion, 46 for depth maps, 11 for fusion: times on two recordings
+    assert [done for stage, done, _ in seen if stage == "dense"] == [120, 47 * 120, 58 * 120, 58 * 120]
     assert not [stage for stage, *_ in seen if stage == "mesh"]
     assert "no depth map of" in (out / "log.txt").read_text()
 

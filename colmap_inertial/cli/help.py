@@ -235,7 +235,8 @@ _TITLES = {
 #: The same for options without a group, by field.
 _TOPICS = {
     **dict.fromkeys(
-        ("workers", "colmap", "colmap_project", "colmap_executable", "database", "database_images"), _TITLES["mapping"]
+        ("workers", "scheduler", "colmap", "colmap_project", "colmap_executable", "database", "database_images"),
+        _TITLES["mapping"],
     ),
     **dict.fromkeys(("join", "fragments", "refine", "georeference"), _TITLES["join-options"]),
     **dict.fromkeys(("device", "remembered"), "Calibrations kept of a device"),
