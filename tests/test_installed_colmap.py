@@ -9,6 +9,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -316,7 +317,9 @@ def test_it_ends_with_the_run_which_then_continues(capture, names, tmp_path, by)
     text = NEWER.replace("import pycolmap\n", wait)
     path = program(tmp_path / "colmap", text)
     words = ["reconstruct", capture, tmp_path / "out", "--colmap-executable", path, *SMALL]
-    with subprocess.Popen([sys.executable, "-m", "colmap_inertial", *words], stderr=subprocess.PIPE) as process:
+    heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # a shell's background jobs ignore it
+    command = [sys.executable, "-m", "colmap_inertial", *words]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, preexec_fn=heed) as process:
         end_s = time.monotonic() + 120
         while not (tmp_path / "pid").exists() or not (tmp_path / "pid").read_text():
             assert process.poll() is None and time.monotonic() < end_s
