@@ -12,8 +12,10 @@ import pytest
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.options import ScaleOptions
 from colmap_inertial.core.quantiles import Z95
+from colmap_inertial.inertial.scale import estimate_scale
 from colmap_inertial.inertial.scale._shape import Scores, ShapeFault, find_faults
 from colmap_inertial.inertial.scale.posterior import FittedPath
+from colmap_inertial.io.trajectories import read_inertial_scale
 
 SCRIPTS = Path(__file__).parents[1] / "scripts"
 
@@ -120,3 +122,16 @@ def test_vibration_makes_a_break_less_sure_and_no_larger():
     assert calm.value == pytest.approx(0.05) and shaken.value == pytest.approx(0.05)
     assert calm.cov == pytest.approx(1e-4) and shaken.cov > 2 * calm.cov
     assert shaken.chi2(1.0) < 0.5 * calm.chi2(1.0)
+
+
+@pytest.mark.parametrize("name, begin_s", [("D1", 50.0), ("D5", 0.0), ("D9", 50.0)])
+def test_short_clips_are_not_taken_for_bent(shared_data, name, begin_s):
+    """Ten seconds of sound recordings; a search for breaks and bends accuses these of 48."""
+    folder = shared_data / "inertial_scale" / name
+    trajectory, imu = read_inertial_scale(folder)
+    since_s = trajectory.t_s - trajectory.t_s[0]
+    clip = trajectory.select((since_s >= begin_s) & (since_s < begin_s + 10))
+    estimate = estimate_scale(clip, imu, options=ScaleOptions(method="joint"))
+    low, high = estimate.ci95
+    assert low < float((folder / "groundtruth.txt").read_text()) < high
+    assert not any("longer along" in reason or "not the same" in reason for reason in estimate.reasons)

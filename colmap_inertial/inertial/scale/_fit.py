@@ -198,7 +198,6 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
     drift = scale_drift(data, noise, at, inflation)
     weights = [groups[name].weight for name in ("rotation", "centre")]
     weight = np.min([each for each in weights if each is not None], axis=0)
-    kinds, columns = shape.shape_columns(data.t_s, shape.camera_path(x))
     return Fit(
         estimate=x,
         noise=noise,
@@ -218,7 +217,7 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         gain_surprise=_gain_surprise(at.prior, x, cov),
         variance_parts=variance_parts,
         suspicions=suspicions,
-        shape=shape.find_faults(kinds, at.score(columns, data, noise), shaken=levels.vibrates(data)),
+        shape=_find_shape_faults(data, noise, at),
         system=at.system,
         rate_rad_s=at.pre.rate_rad_s,
         prior_info=at.prior.info,
@@ -298,6 +297,14 @@ _CAUSE_OF_GLOBALS = {
         slice(par.ACCEL_DELAY, par.ACCEL_DELAY + 1),
     ],
 }
+
+
+def _find_shape_faults(data: Data, noise: Noise, at: _Optimum) -> list[shape.ShapeFault]:
+    """What may be wrong with the model's shape; nothing where the clip is too short to tell."""
+    if data.t_s[-1] - data.t_s[0] < shape.LIMITS.shortest_s:
+        return []
+    kinds, columns = shape.shape_columns(data.t_s, shape.camera_path(at.estimate))
+    return shape.find_faults(kinds, at.score(columns, data, noise), shaken=levels.vibrates(data))
 
 
 def _gain_surprise(prior: Prior, x: Estimate, cov: Array) -> float:
