@@ -150,6 +150,7 @@ def filmed_window(asked: argparse.Namespace, world: World) -> dict[str, Any]:
     out["recording_pct"] = 100 * filmed.recording_log
     if model.similarity is None:
         return out | {"said": "; ".join(model.scale.reasons)}
+    out["shutter_ms"] = [1e3 * done.values["readout_s"] for done in model.treatments if done.stage == "shutter"]
     filmed = select_registered(model, filmed)
     out["before"] = scores(model, filmed) | covered(model, filmed)
     begin_s, processor_s = time.perf_counter(), time.process_time()
@@ -228,6 +229,9 @@ def summarise(results: list[dict[str, Any]], readout_s: float) -> None:
     """What all windows come to."""
     judged = [one for one in results if "before" in one]
     good = [one for one in judged if one["accepted"]]
+    found_ms = [found_ms for one in judged for found_ms in one["shutter_ms"]]
+    seen = f": {min(found_ms):.1f} to {max(found_ms):.1f} ms" if found_ms else ""
+    print(f"rolling shutter seen before the refinement in {len(found_ms)} of {len(judged)}{seen}")
     ratio = np.array([one["before"]["path_mm"] / one["after"]["path_mm"] for one in good])
     if len(good):
         print(

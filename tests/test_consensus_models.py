@@ -10,7 +10,7 @@ import pytest
 from box_project import shared_box
 
 from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply
-from colmap_inertial.core.options import ProjectOptions, ScaleOptions
+from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, ScaleOptions
 from colmap_inertial.core.types import CAL
 from colmap_inertial.model import read_model
 from colmap_inertial.model.deregistration import deregister_images
@@ -53,7 +53,8 @@ def altered(box, folder, names, deg, **how):
 
 def reconstructed(box, project, out):
     """The only model of ``result.json``, checked for the truth."""
-    reconstruct_project(project, out, ProjectOptions(imu=box.imu, frame_times=box.frame_times))
+    source = ProjectOptions(imu=box.imu, frame_times=box.frame_times)
+    reconstruct_project(project, out, source, ReconstructOptions(refine="off"))
     (model,) = json.loads((out / "result.json").read_text())["models"]
     low, high = model["ci95"]
     assert low < box.recording.truth.metres_per_unit < high

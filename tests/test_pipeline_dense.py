@@ -27,8 +27,9 @@ from colmap_inertial.pipeline.run.colmap_settings import ColmapSettings
 from colmap_inertial.pipeline.run.context import RunContext
 from colmap_inertial.reconstruction.drivers.project import reconstruct_project
 
-QUICK = ReconstructOptions(dense=True, dense_options=DenseOptions(max_image_size=96), deterministic=True)
-FLAGS = ["--dense", "--dense-options.max-image-size", "96", "--deterministic"]
+QUICK = ReconstructOptions(dense=True, dense_options=DenseOptions(max_image_size=96), refine="off", deterministic=True)
+SPARSE = ["--deterministic", "--refine", "off"]
+FLAGS = ["--dense", "--dense-options.max-image-size", "96", *SPARSE]
 
 
 @pytest.fixture(scope="module")
@@ -168,7 +169,7 @@ def test_a_finished_project_is_gone_on_with_by_the_sweep(tmp_path, capsys):
     box = build(tmp_path / "box", every=12)
     count = len(box.names)
     out, flags = tmp_path / "out", ["--imu", box.imu, "--frame-times", box.frame_times]
-    code, _, err = run(capsys, "reconstruct", box.root, out, *flags, "--deterministic")
+    code, _, err = run(capsys, "reconstruct", box.root, out, *flags, *SPARSE)
     assert code == 0, err
     before = contents(out / "sparse")
     log = (out / "log.txt").read_text()

@@ -28,6 +28,10 @@ from colmap_inertial.model.similarities import read_similarity
 from colmap_inertial.reconstruction.drivers.project import is_project, reconstruct_project
 from colmap_inertial.tools.view import load_scene
 
+#: Most of these are about what goes in and comes out: the refinement, a third of a run, is left to those that are not.
+NOT_REFINED = ReconstructOptions(refine="off")
+UNREFINED = ("--refine", "off")
+
 
 @pytest.fixture(scope="module")
 def box(tmp_path_factory):
@@ -109,7 +113,7 @@ def test_a_project_with_a_csv_becomes_metric_whole(box, tmp_path, capsys):
 
 def test_a_project_is_checked_beforehand_and_force_goes_on(box, tmp_path, capsys):
     out = tmp_path / "out"
-    flags = ["--imu", box.imu, "--frame-times", box.frame_times]
+    flags = ["--imu", box.imu, "--frame-times", box.frame_times, *UNREFINED]
     code, _, err = run(capsys, "reconstruct", box.root, out, *flags)
     assert code == 0, err
     assert "poses" in json.loads((out / "diagnosis.json").read_text())["checked"]
@@ -135,7 +139,7 @@ def test_a_model_folder_alone_and_times_in_its_names(box, tmp_path, capsys):
     names = [f"cam/cam0_{t}_left.png" for t in box.t_ns()]
     project = poses_only(box, tmp_path / "project", names)
     out = tmp_path / "out"
-    flags = ["--imu", box.imu, "--name-times"]
+    flags = ["--imu", box.imu, *UNREFINED, "--name-times"]
     code, _, err = run(capsys, "reconstruct", project / "sparse" / "0", out, *flags, "cam0_{ns}_*", "--world", "y-down")
     assert code == 0, err
     assert_metric(box, out)
@@ -184,7 +188,7 @@ def test_exif_with_fractions_times_the_images_and_without_is_refused(box, tmp_pa
     assert digits == 3
     off_ns = stamps.t_ns - np.array(box.t_ns()) - (1_700_000_000 - 3600) * 10**9
     assert np.abs(off_ns).max() < 1_000_000
-    flags = ["--imu", box.imu, "--exif-times", "--images"]
+    flags = ["--imu", box.imu, *UNREFINED, "--exif-times", "--images"]
     code, _, err = run(capsys, "reconstruct", box.root, tmp_path / "out", *flags, images)
     assert code == 0, err
     assert_metric(box, tmp_path / "out")
@@ -208,7 +212,7 @@ def test_exif_with_fractions_times_the_images_and_without_is_refused(box, tmp_pa
 
 def test_images_are_found_in_their_video_by_content(box, video, tmp_path, capsys):
     out = tmp_path / "out"
-    code, _, err = run(capsys, "reconstruct", box.root, out, "--imu", box.imu, "--video", video)
+    code, _, err = run(capsys, "reconstruct", box.root, out, "--imu", box.imu, "--video", video, *UNREFINED)
     assert code == 0, err
     model = assert_metric(box, out)
     times = json.loads((out / "frames.json").read_text())["timing"]
@@ -334,7 +338,7 @@ def test_a_target_without_images_to_measure_it_in_is_said(box, tmp_path):
         '[target]\nspec = "aruco:DICT_4X4_50:0.1"\n'
     )
     project = poses_only(box, tmp_path / "project", box.names)
-    result = reconstruct_project(project, tmp_path / "out", ProjectOptions(imu=described))
+    result = reconstruct_project(project, tmp_path / "out", ProjectOptions(imu=described), NOT_REFINED)
     assert any("the target was not measured" in note for note in result.models[0].scale.notes)
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert "not at hand" in report["models"][0]["validation"]["missing"]
@@ -346,7 +350,7 @@ def test_a_capture_toml_gives_imu_times_and_what_is_known_of_the_camera(box, tmp
         f'[images]\nfolder = "{box.root / "images"}"\ntimes = "{box.frame_times}"\n[timing]\nreadout_s = 0.0\n'
         f'exposure_s = 0.004\n[imu]\npath = "{box.imu}"\n[target]\nspec = "aruco:DICT_4X4_50:0.1"\n'
     )
-    result = reconstruct_project(box.root, tmp_path / "out", ProjectOptions(imu=described))
+    result = reconstruct_project(box.root, tmp_path / "out", ProjectOptions(imu=described), NOT_REFINED)
     assert_metric(box, tmp_path / "out")
     assert result.exit_code() == 5  # the target is not in the pictures
     times = json.loads((tmp_path / "out" / "frames.json").read_text())["timing"]
@@ -399,7 +403,8 @@ def test_each_sub_model_has_its_own_scale(box, tmp_path):
     (project / "sparse" / "1").mkdir()
     other.write_binary(str(project / "sparse" / "1"))
     out = tmp_path / "out"
-    result = reconstruct_project(project, out, ProjectOptions(imu=box.imu, frame_times=box.frame_times))
+    source = ProjectOptions(imu=box.imu, frame_times=box.frame_times)
+    result = reconstruct_project(project, out, source, NOT_REFINED)
     scales = [model.scale.metres_per_unit for model in result.models]
     assert scales[0] / scales[1] == pytest.approx(2, rel=1e-3)
     models = [read_model(out / "sparse" / str(i)) for i in (0, 1)]

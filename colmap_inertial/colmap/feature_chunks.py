@@ -33,8 +33,23 @@ class ChunkSizes:
 SIZES = ChunkSizes()
 
 
-class _MakesDatabase:
-    """Work that makes a database."""
+@dataclass(frozen=True, kw_only=True)
+class _DatabaseWork:
+    """Work by COLMAP that makes a database.
+
+    Attributes
+    ----------
+    device
+        What it is done on.
+    seed
+        Of COLMAP.
+    settings
+        Identity of what the user set, with the files that it names.
+    """
+
+    device: str
+    seed: int
+    settings: Sequence[object] = ()
 
     def check(self, made: Path) -> None:
         """As of :class:`~colmap_inertial.pipeline.run.chunks.Work`."""
@@ -45,7 +60,7 @@ class _MakesDatabase:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FindFeatures(_MakesDatabase):
+class FindFeatures(_DatabaseWork):
     """Finds features of some images.
 
     Attributes
@@ -56,20 +71,11 @@ class FindFeatures(_MakesDatabase):
         COLMAP's options, as of :func:`state_reader`.
     extraction
         COLMAP's options, as a dictionary.
-    device
-        What it is done on.
-    seed
-        Of COLMAP.
-    settings
-        Identity of what the user set, with the files that it names.
     """
 
     names: tuple[str, ...]
     reader: dict[str, Any]
     extraction: dict[str, Any]
-    device: str
-    seed: int
-    settings: Sequence[object] = ()
 
     def find(self, database: Path, images: Path) -> None:
         """Find them in a database that may hold the images."""
@@ -117,7 +123,7 @@ def state_reader(options: pycolmap.ImageReaderOptions) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MatchPairs(_MakesDatabase):
+class MatchPairs(_DatabaseWork):
     """Matches and verifies pairs of images.
 
     Attributes
@@ -126,12 +132,6 @@ class MatchPairs(_MakesDatabase):
         Names.
     matching, verification
         COLMAP's options, as dictionaries.
-    device
-        What it is done on.
-    seed
-        Of COLMAP.
-    settings
-        Identity of what the user set, with the files that it names.
     database
         Of the features, for a chunk; it does not change meanwhile.
     """
@@ -139,9 +139,6 @@ class MatchPairs(_MakesDatabase):
     pairs: tuple[tuple[str, str], ...]
     matching: dict[str, Any]
     verification: dict[str, Any]
-    device: str
-    seed: int
-    settings: Sequence[object] = ()
     database: Path = field(default=Path(), repr=False)
 
     def numbered(self, database: pycolmap.Database) -> list[tuple[int, int]]:
