@@ -187,9 +187,9 @@ def test_photographic_things_are_hit_where_they_are():
 
 @pytest.mark.skipif(not photo_world.PHOTOS.is_dir(), reason="needs ../shared/data/sharp_photos")
 def test_a_photographic_world_is_measured(tmp_path):
-    world = photo_world.PhotoWorld.of(1, 160, images=7)
+    world = photo_world.PhotoWorld.of(1, 160, images=5)
     figures = bench.measure_photo(world, tmp_path / "world")
     assert figures["depth"]["has"] > 0.3
     assert figures["depth"]["of_kept"][2] > 0.75
-    truth = bench.photo_truth(world, {f"{i:03d}.jpg": world.render(i)[1] for i in range(7)})
+    truth = bench.photo_truth(world, {f"{i:03d}.jpg": world.render(i)[1] for i in range(5)})
     assert bench.surface_figures(truth.surface_m, truth).f == pytest.approx((1, 1), abs=1e-3)

@@ -72,8 +72,7 @@ def test_a_fault_of_the_accelerometer_is_named_and_undone(recording, alter, said
     assert estimate.ci95[0] < recording.truth.metres_per_unit < estimate.ci95[1]
 
 
-@pytest.mark.parametrize("width_s", [0.05, 0.12])
-@pytest.mark.parametrize("kind", ["roam", "walk"])
+@pytest.mark.parametrize(("kind", "width_s"), [("roam", 0.05), ("walk", 0.12)])
 def test_a_path_that_was_smoothed_gives_no_scale(kind, width_s):
     recording = simulate_recording(RecordingOptions(motion=MotionOptions(kind=kind, duration_s=40.0)), seed=5)
     trajectory = recording.trajectory
