@@ -34,7 +34,7 @@ from colmap_inertial.tools.simulate.render import colmap_camera
 
 HANDHELD = [f"D{i}" for i in (1, 3, 5, 7, 9, 11, 13, 15)]
 #: Those whose camera is altered, and how much of them.
-ALTERED, SECONDS = ("D3", "D11", "D15"), 30.0
+ALTERED, SECONDS = ("D3", "D15"), 30.0
 Recording = tuple[CameraTrajectory, ImuRecording]
 
 
