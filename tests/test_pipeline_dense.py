@@ -411,6 +411,6 @@ def test_images_that_are_not_the_model_s_are_named(box, tmp_path, capsys):
     image = cv2.imread(str(some / box.names[0]))
     cv2.imwrite(str(some / box.names[0]), image[::2, ::2])
     shutil.copy(some / box.names[3], some / box.names[4])
-    code, _, err = run(capsys, "reconstruct", box.root, tmp_path / "out2", *flags, some)
+    code, _, err = run(capsys, "reconstruct", box.root, tmp_path / "out", *flags, some)
     assert code == 2
     assert "80x60" in err
