@@ -229,9 +229,9 @@ def summarise(results: list[dict[str, Any]], readout_s: float) -> None:
     """What all windows come to."""
     judged = [one for one in results if "before" in one]
     good = [one for one in judged if one["accepted"]]
-    found_ms = [found_ms for one in judged for found_ms in one["shutter_ms"]]
-    seen = f": {min(found_ms):.1f} to {max(found_ms):.1f} ms" if found_ms else ""
-    print(f"rolling shutter seen before the refinement in {len(found_ms)} of {len(judged)}{seen}")
+    shutters_ms = [shutter_ms for one in judged for shutter_ms in one["shutter_ms"]]
+    span = f": {min(shutters_ms):.1f} to {max(shutters_ms):.1f} ms" if shutters_ms else ""
+    print(f"rolling shutter found before the refinement in {len(shutters_ms)} of {len(judged)}{span}")
     ratio = np.array([one["before"]["path_mm"] / one["after"]["path_mm"] for one in good])
     if len(good):
         print(

@@ -12,5 +12,5 @@ import study_heal
 
 @pytest.mark.slow
 def test_a_damaged_folder_heals_or_says_what_to_do(capsys):
-    arguments = ["--trials", "10", "--seed", "7", "--commands", "reconstruct", "project", "deblur", "export"]
+    arguments = ["--trials", "16", "--seed", "7", "--commands", "reconstruct", "project", "deblur", "export"]
     assert study_heal.main(arguments) == 0, capsys.readouterr().out

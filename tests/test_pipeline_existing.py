@@ -28,7 +28,7 @@ from colmap_inertial.model.similarities import read_similarity
 from colmap_inertial.reconstruction.drivers.project import is_project, reconstruct_project
 from colmap_inertial.tools.view import load_scene
 
-#: Most of these are about what goes in and comes out: the refinement, a third of a run, is left to those that are not.
+#: For tests of what goes in and comes out: the refinement takes a third of a run.
 NOT_REFINED = ReconstructOptions(refine="off")
 UNREFINED = ("--refine", "off")
 

@@ -41,7 +41,7 @@ class ShutterLimits:
     #: Observations, at least, and about how many are looked at: more take longer and tell it no better than the model.
     fewest: int = 500
     most: int = 15_000
-    #: Steps of the refinement: from a global shutter, three come within 2 to 12 % of 20 ms (``study_refine_real.py``).
+    #: Steps of the refinement: from a global shutter, three come within 3 to 11 % of 20 ms (``study_refine_real.py``).
     steps: int = 3
     #: Share by which the information is raised: points far away hardly have any along their rays.
     damping: float = 1e-6
