@@ -13,7 +13,8 @@ of which FOLDER may hold some only.
 
 Printed per method and window: the errors in % of the recordings, mean, median and largest absolute error of those that
 were not refused, how many 95 % intervals hold the truth (a refusal counts as a miss), their median half-width, the
-refusals, and the median processor time of alignment and estimate together, on one thread.
+refusals, and the median processor time of alignment and estimate together, on one thread. Last, what ``joint`` states
+where the true sizes of the other recordings of the same window are known, as those of targets.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from __future__ import annotations
 import argparse
 import functools
 import itertools
+import math
 import multiprocessing
 import os
 import time
@@ -38,7 +40,9 @@ from rich.progress import track
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.options import ScaleOptions
+from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import CameraTrajectory, ImuRecording
+from colmap_inertial.inertial.core.target_comparison import TargetComparison, calibrate_by_targets
 from colmap_inertial.inertial.scale import estimate_scale
 from colmap_inertial.io.trajectories import read_inertial_scale
 from colmap_inertial.motion.align import align_camera_imu
@@ -96,6 +100,19 @@ class Outcome:
     inside: bool
     verdict: str
     cpu_s: float
+    accel_sigma_log: float | None = None
+    sigma_log: float | None = None
+
+    def compared(self) -> TargetComparison:
+        """The estimate beside its true size."""
+        assert self.error is not None and self.accel_sigma_log is not None and self.sigma_log is not None
+        return TargetComparison(
+            error_log=math.log1p(0.01 * self.error),
+            accel_sigma_log=self.accel_sigma_log,
+            sigma_log=math.sqrt(self.sigma_log**2 - self.accel_sigma_log**2),
+            target=self.recording,
+            target_sigma_log=0.0,
+        )
 
 
 @functools.lru_cache
@@ -155,6 +172,8 @@ def run(task: tuple[Window, str]) -> Outcome:
     start = time.process_time()
     scale: float | None = None
     interval, verdict = None, "-"
+    sigma_log: float | None = None
+    accel: float | None = None
     if method == "linear":
         try:
             scale = estimate_linear(trajectory, imu, align_camera_imu(trajectory, imu)).metres_per_unit
@@ -163,6 +182,7 @@ def run(task: tuple[Window, str]) -> Outcome:
     else:
         estimate = estimate_scale(trajectory, imu, options=ScaleOptions(method=method))
         scale, interval, verdict = estimate.metres_per_unit, estimate.ci95, estimate.verdict
+        sigma_log, accel = estimate.sigma_log, (estimate.parts or {}).get("accel_gain")
     cpu_s = time.process_time() - start
     low, high = interval or (np.nan, np.nan)
     return Outcome(
@@ -176,6 +196,8 @@ def run(task: tuple[Window, str]) -> Outcome:
         inside=bool(low <= truth <= high),
         verdict=verdict,
         cpu_s=cpu_s,
+        accel_sigma_log=accel,
+        sigma_log=sigma_log,
     )
 
 
@@ -259,6 +281,26 @@ def print_parts(outcomes: Sequence[Outcome]) -> None:
         print(_figures(f"{'pooled':<20}{method:<11}", rows, "") + note)
 
 
+def print_compared(outcomes: Sequence[Outcome]) -> None:
+    """Intervals of each recording where the sizes of the others are known."""
+    print(f"{'compared':<12}{'recordings':>11}{'factor':>8}{'inside':>9}{'+-%':>7}")
+    for (group, method), rows in grouped(outcomes).items():
+        usable = [row for row in rows if method == "joint" and row.error is not None]
+        factors, widths, inside = [], [], 0
+        for row in usable if len(usable) > 1 else ():
+            factor = calibrate_by_targets(
+                [other.compared() for other in usable if other is not row], gravity_m_s2=9.81
+            ).accel_factor
+            mine = row.compared()
+            half_width = Z95 * math.hypot(mine.sigma_log, (factor or 1.0) * mine.accel_sigma_log)
+            factors.append(factor)
+            widths.append(100 * math.sinh(half_width))
+            inside += abs(mine.error_log) <= half_width
+        if factors:
+            figures = f"{np.median(factors):8.2f}{f'{inside}/{len(factors)}':>9}{np.median(widths):7.1f}"
+            print(f"{group:<12}{len(factors):>11}{figures}")
+
+
 def draw(outcomes: Sequence[Outcome], path: Path) -> None:
     """Mean absolute error against the length of the window, first so many seconds, and the joint half-width."""
     import matplotlib
@@ -330,6 +372,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         of_first, of_parts = outcomes[: len(first) * len(args.methods)], outcomes[len(first) * len(args.methods) :]
         if of_first:
             print_first(of_first, [folder.name for folder in folders])
+            print()
+            print_compared(of_first)
         if of_parts:
             print()
             print_parts(of_parts)

@@ -47,7 +47,7 @@ class BoundPriors:
     time_offset_s: float = 1.0
     accel_delay_s: float = 0.02
     clock_rate: float = PRIORS.clock_rate
-    model_scale: float = model_scale_sigma(calibrated=False)
+    model_scale: float = model_scale_sigma()
 
 
 # Columns of the errors. World frame, but for the biases (IMU frame) and the correlated error of rotations (camera).

@@ -186,7 +186,7 @@ def stabilised(trajectory: CameraTrajectory, options: RecordingOptions, seed: in
 def run(seed: int) -> Run:
     """Simulate, estimate, compare."""
     recording, options, kind, device = recorded(seed)
-    lens = model_scale_sigma(calibrated=False) * float(np.random.default_rng([seed, 2]).standard_normal())
+    lens = model_scale_sigma() * float(np.random.default_rng([seed, 2]).standard_normal())
     begin_s = time.perf_counter()
     estimate = estimate_scale(recording.trajectory, recording.imu)
     seconds = time.perf_counter() - begin_s

@@ -10,8 +10,8 @@ from refine_walk import PINHOLE, known_of, nudged, problem_of, tracks_of, walk
 
 from colmap_inertial._kernels import _inertial
 from colmap_inertial.core.errors import NotObservableError
-from colmap_inertial.core.geometry import so3_log
-from colmap_inertial.inertial.refine import _residuals, _system, judge, pictures, setup, solve as solver
+from colmap_inertial.core.geometry import so3_exp, so3_log
+from colmap_inertial.inertial.refine import _residuals, _system, judge, judging_points, pictures, setup, solve as solver
 from colmap_inertial.inertial.refine._panels import Layout
 from colmap_inertial.inertial.refine._residuals import moving
 from colmap_inertial.inertial.refine._system import System
@@ -387,6 +387,54 @@ def test_what_is_held_out_leaves_each_point_enough(small):
     assert 0.05 < chosen.mean() < 0.12
     left = problem.observations.select(~chosen)
     assert np.diff(left.first).min() >= 2
+
+
+def test_of_many_observations_a_share_judges_and_all_refine(monkeypatch):
+    options = walk(6.0, readout_s=0.025, points_per_m=400.0)
+    problem, start, seen = problem_of(tracks_of(options), options)
+    nearly = nudged(start, np.random.default_rng(1))
+    at_once_px = problem.observations.xy_px
+    whole = judge.refine(problem, nearly, at_once_px, seen.t_s)
+    assert judging_points.draw_points(problem.observations, len(seen.t_s)) is None
+    monkeypatch.setattr(judging_points, "JUDGING", judging_points.JudgingLimits(observations=200, each=30))
+    points = judging_points.draw_points(problem.observations, len(seen.t_s))
+    counts, left = (
+        np.bincount(observations.frame, minlength=len(seen.t_s))
+        for observations in (problem.observations, problem.observations.select_points(points))
+    )
+    assert np.all(left >= np.minimum(counts, 30)) and left.sum() < 0.8 * counts.sum()
+    shared = judge.refine(problem, nearly, at_once_px, seen.t_s)
+    assert shared.accepted and whole.accepted, (shared.reason, whole.reason)
+    assert shared.held_out < 0.8 * whole.held_out
+    sigma_m = np.sqrt([np.trace(cov[:3, :3]) for cov in whole.motion_covs.values()]).max()
+    assert shared.estimate.imu_in_world_m == pytest.approx(whole.estimate.imu_in_world_m, abs=0.3 * sigma_m)
+    assert shared.estimate.points_m == pytest.approx(whole.estimate.points_m, abs=0.05)
+
+
+def test_points_are_carried_along_by_a_frame_that_sees_them(small):
+    """By a motion of the whole world, and by frames that move one by one."""
+    _, problem, start, _ = small
+    observations = problem.observations
+    few = np.arange(len(start.points_m)) % 3 == 0
+    turn, shift = so3_exp(np.array([0.1, -0.2, 0.3])), np.array([1.0, -2.0, 0.5])
+    moved = replace(
+        start,
+        world_from_imu=turn @ start.world_from_imu,
+        imu_in_world_m=start.imu_in_world_m @ turn.T + shift,
+        points_m=start.points_m[few],
+    )
+    assert judging_points.carry_points(observations, start, moved).points_m == pytest.approx(
+        start.points_m @ turn.T + shift, abs=1e-9
+    )
+    away = 0.1 * np.arange(len(start.velocity_m_s))[:, None] * np.array([0.0, 0.0, 1.0])
+    carried = judging_points.carry_points(
+        observations, start, replace(start, imu_in_world_m=start.imu_in_world_m + away)
+    )
+    up = carried.points_m - start.points_m
+    by = np.round(up[:, 2] / 0.1).astype(int)
+    assert up == pytest.approx(away[by], abs=1e-9)
+    for point in range(0, len(up), 17):
+        assert by[point] in observations.frame[observations.point == point]
 
 
 def test_the_model_that_is_written_is_the_one_that_was_found(small):

@@ -713,7 +713,7 @@ def test_an_existing_project_is_refined(walked, tmp_path):
     assert sigma_m[0] < 1e-3 < 10 * sigma_m[-1] and sigma_m[-1] > 2 * sigma_m[10]
     last = said["values"]["drift"][-1]["end_sigma_m"]
     # with what a lens and an accelerometer that nobody calibrated leave of any scale
-    along = model_scale_sigma(False) * (path.cam_in_world[-1] - path.cam_in_world[0])
+    along = model_scale_sigma() * (path.cam_in_world[-1] - path.cam_in_world[0])
     assert np.diagonal(stored["cov"][-1])[:3] == pytest.approx(np.array(last) ** 2 + along**2, rel=1e-6)
     assert stored["rotation_cov"].shape == (len(tracks.timing.names), 3, 3)
     assert str(stored["relative_to"]) == "first image"

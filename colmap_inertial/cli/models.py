@@ -13,6 +13,7 @@ from colmap_inertial.cli.speech import DeviceCommand, Reader
 from colmap_inertial.cli.terminal import (
     show_applied,
     show_calibration,
+    show_compared,
     show_diagnosis,
     show_exported,
     show_imu_calibration,
@@ -227,26 +228,44 @@ class CalibrateImu(Reader):
     interval then no longer has to allow for an unknown gain of the accelerometer. A page with the residuals of each
     rest is written beside it. Calibrate again after a year, or where the device is much warmer or colder.
 
+    Without such a recording, results that contain a target do as well: give their output folders, each of another
+    recording of the device. The less their scales and the target differ, the narrower are later intervals.
+
     Example: colmap-inertial calibrate-imu rests.csv --latitude-deg 47.4 --height-m 400 --out phone_imu.json
     """
 
-    recording: Positional[Path]
-    """IMU recording: a file or folder of a known format, or a capture.toml; no pictures are needed."""
+    recording: Positional[tuple[Path, ...]]
+    """IMU recording: a file or folder of a known format, or a capture.toml; no pictures are needed. Or output folders
+    of `reconstruct`, of captures with a [target] whose size is stated with its standard deviation (+-)."""
     out: Path
-    """Where to write the calibration (JSON); a page of the same name, ending in .html, is put beside it."""
+    """Where to write the calibration (JSON); of a recording, a page of the same name, ending in .html, is put beside
+    it."""
     gravity: Annotated[GravityOptions, arg(name="")] = dataclasses.field(default_factory=GravityOptions)
     remember: str | None = None
     """Keep the calibration under this name of the device: `reconstruct` and `scale` then use it by themselves."""
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.reconstruction.drivers.device_store import calibrate_source, remember
+        from colmap_inertial.reconstruction.drivers.device_store import (
+            calibrate_from_results,
+            calibrate_source,
+            remember,
+        )
 
-        self.check_json(self.recording, self.out)
-        calibration = calibrate_source(self.recording, self.out, self.gravity, device=self.remember)
+        self.check_json(*self.recording, self.out)
+        first, *others = self.recording
+        compared = bool(others) or (first / "result.json").is_file()
+        if compared:
+            by_targets = calibrate_from_results(self.recording, self.out, device=self.remember or "")
+        else:
+            by_rests = calibrate_source(first, self.out, self.gravity, device=self.remember)
         kept = None if self.remember is None else remember(self.remember, self.out)
-        more = {"out": self.out, "kept": kept, "verdict": calibration.verdict}
-        self.tell(lambda: show_imu_calibration(calibration, self.recording, self.out, kept), self.out, more)
+        more: dict[str, Any] = {"out": self.out, "kept": kept}
+        if compared:
+            self.tell(lambda: show_compared(by_targets, self.out, kept), self.out, more)
+        else:
+            more |= {"verdict": by_rests.verdict}
+            self.tell(lambda: show_imu_calibration(by_rests, first, self.out, kept), self.out, more)
         return 0
 
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from colmap_inertial.checks.diagnose import Diagnosis
     from colmap_inertial.checks.validate import Validation
-    from colmap_inertial.core.types import CameraImuCalibration, ScaleEstimate
+    from colmap_inertial.core.types import CameraImuCalibration, ImuCalibration, ScaleEstimate
     from colmap_inertial.inertial.static_calibration import RestCalibration
     from colmap_inertial.model.project import Applied
     from colmap_inertial.pipeline.run.workspace import Workspace
@@ -137,6 +137,14 @@ def show_applied(applied: Applied) -> None:
 
 def _describe_remembered(kept: Path | None) -> list[Line]:
     return [] if kept is None else [("remembered", f"{kept}; reconstruct and scale take it by the device's name")]
+
+
+def show_compared(calibration: ImuCalibration, out: Path, kept: Path | None) -> None:
+    """Print what results with targets say of a device."""
+    from colmap_inertial.checks.report.imu_calibration import comparison_effect
+
+    lines: list[Line] = [("scale", comparison_effect(calibration)), ("written", str(out))]
+    _print_panel(f"{calibration.compared} results with targets", [*lines, *_describe_remembered(kept)])
 
 
 def show_imu_calibration(calibration: RestCalibration, source: Path, out: Path, kept: Path | None) -> None:

@@ -69,6 +69,8 @@ SIGMAS = CalibrationSigmas()
 CAMERA_IMU = "camera-imu"
 #: Fields that a file may lack, as those of clocks that keep step do.
 _CLOCK = frozenset({"clock_rate", "clock_middle_s"})
+#: Fields of an IMU's calibration that one by rests may lack.
+_COMPARED = frozenset({"compared", "accel_factor"})
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -287,7 +289,8 @@ class Calibrations:
 
 def write_imu_calibration(path: StrPath, calibration: ImuCalibration) -> None:
     """Write an IMU's calibration as JSON: its kind, the fields of :class:`ImuCalibration`, and the order of ``cov``."""
-    _write_fields(Path(path), IMU, calibration, IMU_CALIBRATION_PARAMETERS)
+    left_out = _COMPARED if calibration.accel_factor is None else frozenset[str]()
+    _write_fields(Path(path), IMU, calibration, IMU_CALIBRATION_PARAMETERS, left_out)
 
 
 @reader("a calibration of an IMU")
@@ -303,7 +306,7 @@ def read_imu_calibration(path: StrPath) -> ImuCalibration:
     values = read_json(path)
     if values.pop("kind", None) != IMU:
         raise FormatError(path, "holds no calibration of an IMU (colmap-inertial calibrate-imu writes one)")
-    return _read_fields(path, values, ImuCalibration, IMU_CALIBRATION_PARAMETERS)
+    return _read_fields(path, values, ImuCalibration, IMU_CALIBRATION_PARAMETERS, _COMPARED)
 
 
 def calibration_kind(path: StrPath) -> str:

@@ -200,7 +200,11 @@ class ImuCalibration:
     device
         What was calibrated; empty where unknown.
     attitudes
-        In how many it lay still.
+        In how many it lay still; 0 where targets were compared instead.
+    compared
+        How many results were compared with targets.
+    accel_factor
+        On the accelerometer's part of a scale's interval, by such results; ``None`` without.
     """
 
     accel_gain: Array
@@ -212,6 +216,8 @@ class ImuCalibration:
     temperature_c: float | None = None
     device: str = ""
     attitudes: int
+    compared: int = 0
+    accel_factor: float | None = None
 
     def __post_init__(self) -> None:
         gains, biases = {"accel_gain": (3, 3), "gyro_gain": (3, 3)}, {"accel_bias_m_s2": (3,), "gyro_bias_rad_s": (3,)}
@@ -225,6 +231,8 @@ class ImuCalibration:
             raise ValueError("temperature_c must be finite")
         if self.attitudes < 0:
             raise ValueError("attitudes must not be negative")
+        if self.accel_factor is not None and not (0 < self.accel_factor < math.inf and self.compared > 0):
+            raise ValueError("accel_factor must be positive, and be that of compared results")
 
     def sigma(self, parameter: str) -> float:
         """Standard deviation of one of ``IMU_CALIBRATION_PARAMETERS``."""
@@ -259,6 +267,8 @@ class ImuCalibration:
             "gain_sigma": self.gain_sigma,
             "gravity_m_s2": self.gravity_m_s2,
             "temperature_c": self.temperature_c,
+            "compared": self.compared,
+            "accel_factor": self.accel_factor,
         }
 
     def corrected(self, imu: ImuRecording) -> ImuRecording:
@@ -272,12 +282,18 @@ class ImuCalibration:
         if imu.calibration is not None:
             raise ValueError("the recording was corrected by a calibration before")
         attitudes = f" in {self.attitudes} attitudes" if self.attitudes else ""
+        repair = f"the IMU's readings were corrected by its calibration{attitudes}"
+        if self.accel_factor is not None:
+            repair = (
+                f"the accelerometer's part of the scale's interval is {self.accel_factor:.2f} of that of unknown "
+                f"devices, by {self.compared} results of this one that were compared with targets"
+            )
         return replace(
             imu,
             gyro_rad_s=imu.gyro_rad_s @ (np.eye(3) + self.gyro_gain).T - self.gyro_bias_rad_s,
             accel_m_s2=imu.accel_m_s2 @ (np.eye(3) + self.accel_gain).T - self.accel_bias_m_s2,
             calibration=self,
-            repairs=(*imu.repairs, f"the IMU's readings were corrected by its calibration{attitudes}"),
+            repairs=(*imu.repairs, repair),
         )
 
     def uncorrected(self, gyro_rad_s: Array, accel_m_s2: Array) -> tuple[Array, Array]:

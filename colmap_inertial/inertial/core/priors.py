@@ -26,6 +26,8 @@ class JointPriors:
     """The same of the accelerometer: after the factory's calibration, half of what data sheets allow."""
     accel_bias_m_s2: float = 0.4
     """Each axis: data sheets give 20-90 mg over temperature and soldering."""
+    gyro_bias_rad_s: float = 0.1
+    """Each axis, of a gyroscope that nothing was said about."""
     clock_rate: float = 1e-4
     """Quartzes of camera and IMU against each other."""
     coupling_m: float = 5.0
@@ -53,9 +55,36 @@ PRIORS = JointPriors()
 KNOWN_GAIN = 0.0025
 
 
-def model_scale_sigma(calibrated: bool) -> float:
-    """The least standard deviation of a scale's logarithm, by whether the IMU is calibrated."""
-    return PRIORS.lens if calibrated else math.hypot(PRIORS.lens, PRIORS.accel_model)
+@dataclass(frozen=True, kw_only=True)
+class AccelPart:
+    """The accelerometer's part of a scale's interval.
+
+    Attributes
+    ----------
+    model_sigma
+        Standard deviation of the scale's logarithm beside the gains that a fit estimates; 0 of a calibrated IMU.
+    factor
+        On the standard deviation of the whole part, by results of the device that were compared with targets.
+    """
+
+    model_sigma: float = PRIORS.accel_model
+    factor: float = 1.0
+
+
+UNCALIBRATED = AccelPart()
+
+
+def accel_part(imu: ImuRecording) -> AccelPart:
+    """What the accelerometer of a recording adds to a scale's interval, by its calibration."""
+    if is_calibrated(imu):
+        return AccelPart(model_sigma=0.0)
+    compared = None if imu.calibration is None else imu.calibration.accel_factor
+    return UNCALIBRATED if compared is None else AccelPart(factor=compared)
+
+
+def model_scale_sigma(accel: AccelPart = UNCALIBRATED) -> float:
+    """The least standard deviation of a scale's logarithm."""
+    return math.hypot(PRIORS.lens, accel.model_sigma * accel.factor)
 
 
 def clock_scale_sigma(clock_rate: float) -> float:
@@ -87,7 +116,8 @@ def gains_cov(imu: ImuRecording) -> Array:
     if imu.calibration is None:
         raise ValueError("the recording was not corrected by a calibration")
     entries = np.r_[IMU_CAL.ACCEL_GAIN, IMU_CAL.GYRO_GAIN]
-    moved = math.hypot(PRIORS.calibrated_gain, _sigma_of_warming(imu))
+    by_rests = imu.calibration.accel_factor is None
+    moved = math.hypot(PRIORS.calibrated_gain, _sigma_of_warming(imu)) if by_rests else 0.0
     return np.asarray(imu.calibration.cov[np.ix_(entries, entries)] + moved**2 * np.eye(len(entries)))
 
 

@@ -12,6 +12,7 @@ from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.inertial.refine._panels import Layout
 from colmap_inertial.inertial.refine._residuals import Moving, moving
 from colmap_inertial.inertial.refine._system import Factored
+from colmap_inertial.inertial.refine.judging_points import carry_points, draw_points, restore_points, select_points
 from colmap_inertial.inertial.refine.motion import find_motion_covs
 from colmap_inertial.inertial.refine.pictures import apply_noise, measure_picture_noise, pictures_alone
 from colmap_inertial.inertial.refine.setup import NO_READOUT_S, move_to_middle_lines
@@ -159,6 +160,10 @@ def refine(
     alone = pictures_alone(problem, at_once_px)
     noise = measure_picture_noise(alone, start)
     problem, alone = (apply_noise(each, noise) for each in (problem, alone))
+    whole, whole_start = problem, start
+    if (points := draw_points(problem.observations, len(t_s))) is not None:
+        problem, alone = (select_points(each, points) for each in (problem, alone))
+        start = replace(start, points_m=start.points_m[points])
     kept = ~_chosen(problem.observations)
     seen_alone, seen = solve(_part(alone, kept), start), solve(_part(problem, kept), start)
     # pictures alone may fit worse than with a rolling shutter: the IMU's own squares are the least that it costs
@@ -182,7 +187,7 @@ def refine(
     reason = _doubt(seen_alone, seen, chi2, mean, spread) or _too_late(problem, seen.estimate)
     assert problem.inertial is not None
     judged = Judged(
-        estimate=start,
+        estimate=whole_start,
         accepted=False,
         reason=reason,
         held_out=count,
@@ -197,7 +202,12 @@ def refine(
         readout=readout,
         steps=steps,
     )
-    return judged if reason else _solve_all(judged, problem, seen.estimate, t_s)
+    if reason:
+        return judged
+    x = seen.estimate
+    if points is not None:
+        problem, x = restore_points(whole, problem), carry_points(whole.observations, whole_start, x)
+    return _solve_all(judged, problem, x, t_s)
 
 
 def _solve_all(judged: Judged, problem: Problem, x: Estimate, t_s: Array) -> Judged:

@@ -11,6 +11,7 @@ from colmap_inertial.core.geometry import skew
 from colmap_inertial.inertial.refine._panels import Layout
 from colmap_inertial.inertial.refine._residuals import CENTRE, N_MOVING, SPEED, TURN, Moving, moving
 from colmap_inertial.inertial.refine._system import Factored
+from colmap_inertial.inertial.refine.judging_points import JUDGING
 from colmap_inertial.inertial.refine.pictures import apply_noise, make_pictures, measure_picture_noise, pictures_alone
 from colmap_inertial.inertial.refine.setup import Seen
 from colmap_inertial.inertial.refine.solve import factored
@@ -29,11 +30,13 @@ class DriftLimits:
 
     #: Normal equations of pictures alone, for a covariance: more take longer than a scale is worth.
     most_bytes: int = 300_000_000
-    #: Processor seconds: of a step of the refinement for each observation, and for each product of its factor; its
-    #: steps; of features, matching and mapping for each image and each observation (a desk computer's core).
+    #: Processor seconds: of a step of the refinement for each observation, and for each product of its factor; steps of
+    #: those that judge, and of all; of features, matching and mapping for each image and each observation (a desk
+    #: computer's core).
     step_observation_s: float = 2.5e-6
     step_product_s: float = 3.2e-11
-    steps: int = 55
+    judging_steps: int = 45
+    steps: int = 10
     mapped_image_s: float = 0.4
     mapped_observation_s: float = 2e-4
     #: Of that time what a refinement may take.
@@ -192,8 +195,10 @@ def expect_worth(seen: Seen, problem: Problem, start: Estimate, *, bent: bool = 
     """
     frames, observations = len(seen.names), len(problem.observations.frame)
     layout = Layout.of(problem.observations, frames)
-    products = layout.products
-    needed_s = _LIMITS.steps * (_LIMITS.step_observation_s * observations + _LIMITS.step_product_s * products)
+    judging = min(observations, frames * JUDGING.of_frame(frames))
+    steps, judging_steps = _LIMITS.steps, _LIMITS.judging_steps
+    needed_s = _LIMITS.step_observation_s * (judging_steps * judging + steps * observations)
+    needed_s += _LIMITS.step_product_s * (judging_steps + steps) * layout.products
     share = needed_s / (_LIMITS.mapped_image_s * frames + _LIMITS.mapped_observation_s * observations)
     if share > _LIMITS.share or layout.size_bytes > _LIMITS.most_bytes:
         return Worth(

@@ -79,12 +79,11 @@ def select_points(seen: Seen, kept: BoolArray) -> Seen:
     """A model of some of its points."""
     observed = seen.observations
     mine = kept[observed.point]
-    observations = replace(observed.select(mine), point=np.cumsum(kept)[observed.point[mine]] - 1)
     return replace(
         seen,
         point_ids=tuple(np.array(seen.point_ids)[kept].tolist()),
         points=seen.points[kept],
-        observations=observations,
+        observations=observed.select_points(kept),
         place=seen.place[mine],
     )
 

@@ -88,6 +88,11 @@ class Observations:
             self, frame=self.frame[keep], point=self.point[keep], xy_px=self.xy_px[keep], line=self.line[keep]
         )
 
+    def select_points(self, kept: BoolArray) -> Observations:
+        """Those of a mask of points, which are numbered anew."""
+        mine = kept[self.point]
+        return replace(self.select(mine), point=np.cumsum(kept)[self.point[mine]] - 1)
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Turning:

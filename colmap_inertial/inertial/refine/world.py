@@ -11,7 +11,7 @@ from colmap_inertial.core.geometry import matrix_from_quat, skew
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import AcceptedScale, ScaleEstimate, Similarity
 from colmap_inertial.inertial.core.parameters import LARGEST_GAIN_CHI2
-from colmap_inertial.inertial.core.priors import PRIORS
+from colmap_inertial.inertial.core.priors import PRIORS, AccelPart
 from colmap_inertial.inertial.refine._residuals import TURN as MOVING_TURN, Moving, Rows, all_rows
 from colmap_inertial.inertial.refine._system import Factored
 from colmap_inertial.inertial.refine.values import (
@@ -79,7 +79,7 @@ def state_scale(
     x: Estimate,
     world: FoundWorld,
     *,
-    calibrated: bool,
+    accel: AccelPart,
 ) -> tuple[ScaleEstimate, Similarity]:
     """A refinement's own scale, up and bias, and the similarity that they give.
 
@@ -92,8 +92,8 @@ def state_scale(
         From the model before to the refined one.
     problem, x, world
         The refinement, its solution, and how sure that is of its world.
-    calibrated
-        Whether the accelerometer is.
+    accel
+        What the accelerometer adds to a scale's interval.
     """
     inertial = problem.inertial
     assert inertial is not None
@@ -101,8 +101,7 @@ def state_scale(
     metres_per_unit = first.metres_per_unit * move.scale
     # what the refinement does not see: the lens, and which of two clocks is wrong
     variances = world.parts | {"lens": PRIORS.lens**2, "clocks": (before.parts or {}).get("clocks", 0.0) ** 2}
-    if not calibrated:
-        variances["accel_gain"] += PRIORS.accel_model**2
+    variances["accel_gain"] = (variances["accel_gain"] + accel.model_sigma**2) * accel.factor**2
     sigma_log = sum(variances.values()) ** 0.5
     # what decided before but for the interval's width
     widths = verdict_of(first.metres_per_unit, first.sigma_log)[2]

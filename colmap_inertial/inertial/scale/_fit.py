@@ -48,7 +48,7 @@ def scale_drift(data: Data, noise: Noise, optimum: _Optimum, inflation: float) -
         By how much variances are larger than the noise levels say.
     """
     # standard deviation of the parts' scales that is no drift to speak of
-    tolerated_log = model_scale_sigma(calibrated=False)
+    tolerated_log = model_scale_sigma()
     span_s = float(data.t_s[-1] - data.t_s[0])
     parts = int(np.clip(round(span_s / _PART_S), 2, _MOST_PARTS))
     edges_s = np.linspace(data.t_s[0], data.t_s[-1], parts + 1)

@@ -33,7 +33,7 @@ from colmap_inertial.core.types import (
 )
 from colmap_inertial.inertial.core import parameters as par
 from colmap_inertial.inertial.core.parameters import Prior
-from colmap_inertial.inertial.core.priors import PRIORS, clock_scale_sigma, is_calibrated
+from colmap_inertial.inertial.core.priors import PRIORS, AccelPart, accel_part, clock_scale_sigma
 from colmap_inertial.inertial.scale._fit import Fit, fit_jointly
 from colmap_inertial.inertial.scale._gain import WrongGain, judge_gain
 from colmap_inertial.inertial.scale._setup import Data, prepare
@@ -123,13 +123,11 @@ def estimate_joint(
     reason.
     """
     options = options or JointOptions()
-    calibrated = is_calibrated(timed.imu)
+    accel = accel_part(timed.imu)
     try:
         data, prior = _prepared(trajectory, timed, options)
         fit, faults = _fit_soundly(data, prior, timed.imu.noise)
-        fit, shape = _fit_shapely(
-            fit, faults.undone(data), faults.loosened(prior), timed.imu.noise, calibrated=calibrated
-        )
+        fit, shape = _fit_shapely(fit, faults.undone(data), faults.loosened(prior), timed.imu.noise, accel=accel)
     except NotObservableError as error:
         return ScaleEstimate.refused("joint", error.hint)
     except np.linalg.LinAlgError:
@@ -138,7 +136,7 @@ def estimate_joint(
     fit = replace(fit, variance_parts={**fit.variance_parts, "accel_faults": left_open})
     wrong = [*faults.sentences(), *_cut_off(data)]
     # what was taken from a path nobody can put back: its scale is too large by more than any interval says
-    estimate = _judged(fit, data.t_s, timed.calibration, calibrated, wrong, shape, worthless=faults.path_is_smoothed)
+    estimate = _judged(fit, data.t_s, timed.calibration, accel, wrong, shape, worthless=faults.path_is_smoothed)
     return replace(estimate, jumped=_name_jumped(fit, data, trajectory))
 
 
@@ -178,10 +176,10 @@ def fit_path(
     """
     data, prior = _prepared(trajectory, timed, options)
     fit, faults = _fit_soundly(data, prior, timed.imu.noise)
-    calibrated = is_calibrated(timed.imu)
+    accel = accel_part(timed.imu)
     sound = faults.undone(data), faults.loosened(prior)
-    _, shape = _fit_shapely(fit, *sound, timed.imu.noise, calibrated=calibrated)
-    widened = scale_of(fit, data.t_s, calibrated).widened
+    _, shape = _fit_shapely(fit, *sound, timed.imu.noise, accel=accel)
+    widened = scale_of(fit, data.t_s, accel).widened
     return data, fit, (*faults.sentences(), *(fault.sentence(data.t_s, widened) for fault in shape))
 
 
@@ -207,7 +205,7 @@ def _fit_soundly(data: Data, prior: Prior, sheet: ImuNoise | None) -> tuple[Fit,
 
 
 def _fit_shapely(
-    fit: Fit, data: Data, prior: Prior, sheet: ImuNoise | None, *, calibrated: bool
+    fit: Fit, data: Data, prior: Prior, sheet: ImuNoise | None, *, accel: AccelPart
 ) -> tuple[Fit, list[ShapeFault]]:
     """The fit of a model without what shows to be wrong with its shape, and what that was."""
     found: list[ShapeFault] = []
@@ -215,13 +213,13 @@ def _fit_shapely(
     # wrong gains look like a stretch
     sound = fit.gain_chi2 <= par.LARGEST_GAIN_CHI2 and not _refusals(fit, data.t_s)
     while sound and len(found) < SHAPE_LIMITS.most:
-        suspected = suspect(fit.shape, scale_of(fit, data.t_s, calibrated).widened)
+        suspected = suspect(fit.shape, scale_of(fit, data.t_s, accel).widened)
         if suspected is None:
             break
         mended = replace(data.groups, centre=suspected.undo(data.t_s, data.groups.centre))
         trial_data = replace(data, groups=mended)
         trial = fit_jointly(trial_data, prior, sheet)
-        fault = confirmed(suspected, trial.shape, scale_of(trial, data.t_s, calibrated).widened)
+        fault = confirmed(suspected, trial.shape, scale_of(trial, data.t_s, accel).widened)
         if fault is None:
             break
         data, fit = trial_data, trial
@@ -246,7 +244,7 @@ def _judged(
     fit: Fit,
     t_s: Array,
     calibration: CameraImuCalibration,
-    calibrated: bool,
+    accel: AccelPart,
     wrong: Sequence[str],
     shape: Sequence[ShapeFault],
     *,
@@ -256,7 +254,7 @@ def _judged(
     squares = sum(s for s, _ in fit.sums.values())
     expected = sum(e for _, e in fit.sums.values())
     clock_rate = calibration.clock_rate + x.clock_rate
-    scale = scale_of(fit, t_s, calibrated, clock_rate)
+    scale = scale_of(fit, t_s, accel, clock_rate)
     metres_per_unit, sigma_log = scale.metres_per_unit, scale.sigma_log
     refusals = [*_refusals(fit, t_s), *(wrong if worthless else ())]
     verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, refusals=refusals)
@@ -322,7 +320,7 @@ class FoundScale:
     wrong_gain: WrongGain | None
 
 
-def scale_of(fit: Fit, t_s: Array, calibrated: bool, clock_rate: float = 0.0) -> FoundScale:
+def scale_of(fit: Fit, t_s: Array, accel: AccelPart, clock_rate: float = 0.0) -> FoundScale:
     """The scale and the standard deviation of its logarithm, with what the fit takes for granted put right.
 
     The scale makes residuals orthogonal to the fitted path. That path follows the visual noise with as many degrees of
@@ -344,9 +342,10 @@ def scale_of(fit: Fit, t_s: Array, calibrated: bool, clock_rate: float = 0.0) ->
     variances = {name: widened * variance for name, variance in fit.variance_parts.items()}
     variances["accel_gain"] *= fit.gain_surprise
     variances["noise_levels"] = (student * _UNIFORM * share) ** 2 + fit.level_variance
-    variances["accel_gain"] += 0.0 if calibrated else PRIORS.accel_model**2
-    wrong_gain = None if calibrated else judge_gain(fit.estimate, fit.cov, fit.prior_info, widened)
+    variances["accel_gain"] += accel.model_sigma**2
+    wrong_gain = None if accel.model_sigma == 0 else judge_gain(fit.estimate, fit.cov, fit.prior_info, widened)
     variances["accel_gain"] += 0.0 if wrong_gain is None else wrong_gain.variance
+    variances["accel_gain"] *= accel.factor**2
     variances["lens"] = PRIORS.lens**2
     variances["clocks"] = clock_scale_sigma(clock_rate) ** 2
     return FoundScale(

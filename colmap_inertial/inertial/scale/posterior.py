@@ -19,7 +19,7 @@ from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording
 from colmap_inertial.inertial.core import parameters as par
 from colmap_inertial.inertial.core.parameters import Noise
-from colmap_inertial.inertial.core.priors import clock_scale_sigma, is_calibrated, model_scale_sigma
+from colmap_inertial.inertial.core.priors import accel_part, clock_scale_sigma, model_scale_sigma
 from colmap_inertial.inertial.scale._fit import Fit
 from colmap_inertial.inertial.scale._inputs import align_recording, strength_of_gravity
 from colmap_inertial.inertial.scale._setup import Data
@@ -136,11 +136,11 @@ class FittedPath:
         if wrong:
             raise NotObservableError("place", f"what is wrong counts from end to end of a gap: {'; '.join(wrong)}")
         clock_rate = timed.calibration.clock_rate + fit.estimate.clock_rate
-        scale = scale_of(fit, data.t_s, is_calibrated(imu), clock_rate)
+        scale = scale_of(fit, data.t_s, accel_part(imu), clock_rate)
         ends = (0, -1)
         return cls(
             origin=data.origin,
-            floor_log=math.hypot(model_scale_sigma(is_calibrated(imu)), clock_scale_sigma(clock_rate)),
+            floor_log=math.hypot(model_scale_sigma(accel_part(imu)), clock_scale_sigma(clock_rate)),
             _data=data,
             _fit=fit,
             _aligned=timed.calibration,

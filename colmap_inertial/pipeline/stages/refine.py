@@ -16,7 +16,7 @@ from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import quat_from_matrix
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import CAL, CameraImuCalibration, Similarity, SolvedMotion, Treatment
-from colmap_inertial.inertial.core.priors import is_calibrated, model_scale_sigma
+from colmap_inertial.inertial.core.priors import AccelPart, accel_part, model_scale_sigma
 from colmap_inertial.inertial.refine.judge import Judged, refine
 from colmap_inertial.inertial.refine.motion import add_scale, expect_worth
 from colmap_inertial.inertial.refine.pictures import remove_extremes
@@ -162,12 +162,12 @@ class RefineStage(InertialStage):
         assert model.similarity is not None and judged.world is not None
         written = move_to_middle_lines(problem, x)
         move = _move_of(seen, written)
-        calibrated = is_calibrated(self.imu)
+        accel = accel_part(self.imu)
         before = model.scale
         if model.timing.readout_s or judged.readout:
             now_known = [reason for reason in before.reasons if reason not in list_ignored_shutter(model)]
             before = replace(before, reasons=tuple(now_known))
-        own, similarity = state_scale(before, model.similarity, move, problem, x, judged.world, calibrated=calibrated)
+        own, similarity = state_scale(before, model.similarity, move, problem, x, judged.world, accel=accel)
         if own.verdict == "refused":
             return _said(model, f"left as it is: refined, {'; '.join(own.reasons)} ({heard})", **figures)
         figures["size_before"] = 1 / move.scale
@@ -182,7 +182,7 @@ class RefineStage(InertialStage):
             similarity=similarity,
             parts=tuple(replace(part, similarity=_moved(part.similarity, move)) for part in model.parts),
             observed_px={},
-            motion=_motion(seen, written.cam_in_world, judged, calibrated=calibrated, readout_s=readout_s),
+            motion=_motion(seen, written.cam_in_world, judged, accel=accel, readout_s=readout_s),
         )
         return _said(done, f"refined by the IMU ({heard}){_rolling(x, rolling)}", action="refined", **figures)
 
@@ -256,12 +256,12 @@ def _rolling(x: Estimate, rolling: bool) -> str:
     )
 
 
-def _motion(seen: Seen, centres: Array, judged: Judged, *, calibrated: bool, readout_s: float | None) -> SolvedMotion:
+def _motion(seen: Seen, centres: Array, judged: Judged, *, accel: AccelPart, readout_s: float | None) -> SolvedMotion:
     """The camera's motion in the model that is written; with what lens and accelerometer leave of its scale."""
     velocity, with_cov = judged.velocity_m_s, np.array(list(judged.motion_covs), dtype=np.int64)
     covs = add_scale(
         np.array(list(judged.motion_covs.values())).reshape(-1, 9, 9),
-        model_scale_sigma(calibrated) ** 2,
+        model_scale_sigma(accel) ** 2,
         centres[with_cov] - centres[0],
         velocity[with_cov],
     )

@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import re
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from colmap_inertial.checks.report import require_plotly
 from colmap_inertial.checks.report.imu_calibration import calibration_page
+from colmap_inertial.checks.validate import parse_target
 from colmap_inertial.core.errors import FormatError, InertialError, OutputError, OutputExistsError
 from colmap_inertial.core.options import GravityOptions
+from colmap_inertial.core.quantiles import Z95
+from colmap_inertial.core.types import ImuCalibration
+from colmap_inertial.inertial.core.target_comparison import TargetComparison, calibrate_by_targets
 from colmap_inertial.inertial.scale import check_units, strength_of_gravity
 from colmap_inertial.inertial.static_calibration import RestCalibration, calibrate_imu
 from colmap_inertial.io.calibration import CAMERA_IMU, IMU, calibration_kind, write_imu_calibration
 from colmap_inertial.io.capture import Capture, load_capture
-from colmap_inertial.io.files import read_text, write_text
+from colmap_inertial.io.files import read_json, read_text, reading, write_text
 from colmap_inertial.io.imu import read_raw_capture_imu, read_raw_imu
 from colmap_inertial.io.plausible import check_alive
 from colmap_inertial.reconstruction.drivers.paths import check_output
@@ -113,6 +120,74 @@ def read_remembered(source: Path, given: tuple[Path, ...], *, device: str | None
         return Remembered()
     files = ((_folder(device) / f"{kind}.json", kind) for kind in (CAMERA_IMU, IMU) if kind not in kinds)
     return Remembered(device=device, files=tuple((path, kind) for path, kind in files if path.is_file()))
+
+
+def calibrate_from_results(folders: Sequence[Path], out: Path, *, device: str = "") -> ImuCalibration:
+    """Estimate what a device's accelerometer adds to a scale, from results of it that have a target; write it.
+
+    Parameters
+    ----------
+    folders
+        Output folders of ``reconstruct``, each of another recording.
+    out
+        The calibration's JSON file.
+    device
+        Name of the device.
+
+    Raises
+    ------
+    FormatError
+        For a folder without a result, without a measured target, with a target whose size nobody knows how well, or
+        with a scale that an earlier calibration of the IMU went into; for two of one recording.
+    """
+    check_output(out, folders)
+    gravity_m_s2, _ = strength_of_gravity(GravityOptions())
+    comparisons: dict[str, TargetComparison] = {}
+    for folder in folders:
+        path = folder / "result.json"
+        with reading(path, "is no result of `colmap-inertial reconstruct`"):
+            content = read_json(path)
+            capture, comparison = str(content["capture"]), _read_comparison(path, content["models"])
+        if capture in comparisons:
+            raise FormatError(path, f"is of {capture}, as another of these results; give one result of each recording")
+        comparisons[capture] = comparison
+    calibration = calibrate_by_targets(list(comparisons.values()), gravity_m_s2=gravity_m_s2, device=device)
+    write_imu_calibration(out, calibration)
+    return calibration
+
+
+def _read_comparison(path: Path, models: Sequence[Mapping[str, Any]]) -> TargetComparison:
+    """The largest model of a result beside its target."""
+    checks = {model["index"]: model.get("validation") or {} for model in models}
+    measured = [
+        m for m in models if checks[m["index"]].get("scale_error_pct") is not None and m["verdict"] != "refused"
+    ]
+    if not measured:
+        raise FormatError(path, "has no scale with a measured target; name the target under [target] of the capture")
+    model = max(measured, key=lambda one: int(one["registered_images"]))
+    check = model["validation"]
+    if model["imu_calibration"] is not None:
+        raise FormatError(path, "a calibration of the IMU went into its scale; run it without one (--no-remembered)")
+    if not check["within_tolerance"]:
+        raise FormatError(path, f"its target does not agree with it: {'; '.join(check['reasons'])}")
+    target = parse_target(check["target"])
+    if target.sigma_m is None:
+        raise FormatError(
+            path, f"how well the size of {target.spec} is known is not stated; measure it, and add +- to the target"
+        )
+    low, high = (math.log1p(0.01 * float(pct)) for pct in check["ci95_pct"])
+    target_sigma = target.sigma_m / target.length_m
+    of_check = max(0.0, ((high - low) / (2 * Z95)) ** 2 - target_sigma**2)
+    if "accel_gain" not in (model["parts"] or {}):
+        raise FormatError(path, "its scale is not that of the joint method")
+    accel = float(model["parts"]["accel_gain"])
+    return TargetComparison(
+        error_log=math.log1p(0.01 * float(check["scale_error_pct"])),
+        accel_sigma_log=accel,
+        sigma_log=math.sqrt(of_check + max(0.0, float(model["sigma_log"]) ** 2 - accel**2)),
+        target=target.spec,
+        target_sigma_log=target_sigma,
+    )
 
 
 def _capture_of(source: Path) -> Capture | None:
