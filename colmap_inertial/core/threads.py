@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from contextvars import copy_context
+from contextvars import ContextVar, copy_context
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
+
+#: Number of modules that were loaded when BLAS was limited; 0 where it is not.
+_LIMITED: ContextVar[int] = ContextVar("limited", default=0)
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -96,5 +100,14 @@ def one_blas_thread() -> Iterator[None]:
     import scipy.linalg  # noqa: F401
     from threadpoolctl import threadpool_limits
 
-    with threadpool_limits(limits=1, user_api="blas"):
+    # to look for them takes 10 ms: inside such a context, only where something was loaded since
+    if _LIMITED.get() == len(sys.modules):
         yield
+        return
+    with threadpool_limits(limits=1, user_api="blas"):
+        outside = _LIMITED.get()
+        _LIMITED.set(len(sys.modules))
+        try:
+            yield
+        finally:
+            _LIMITED.set(outside)

@@ -144,6 +144,7 @@ def _draw_points(cloud: Figure, project: _Projection, view: StillView) -> str:
     for i in np.argsort(near, kind="stable").tolist():
         centre = round(view.density * float(at[i, 0])), round(view.density * float(at[i, 1]))
         cv2.circle(canvas, centre, radius, (*rgb[i], 255), -1)
-    data = cv2.imencode(".png", canvas, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes()
+    # 9 takes eight times as long, and is no smaller
+    data = cv2.imencode(".png", canvas, [cv2.IMWRITE_PNG_COMPRESSION, 6])[1].tobytes()
     place = f'width="{view.width}" height="{view.height}"'
     return f'<image {place} href="data:image/png;base64,{base64.b64encode(data).decode("ascii")}"/>'

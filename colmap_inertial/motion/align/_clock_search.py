@@ -428,12 +428,13 @@ def _closest(
     intervals: Intervals, path: GyroPath, offset_s: Array, effective: float, rotation: Array | None, share: float
 ) -> ClockFit:
     """The best of a few neighbouring offsets, with its rotation and bias."""
-    inertial, inside = [], []
-    for offset in offset_s:
-        inertial.append(path.turn_rad(intervals.begin_s - offset, intervals.end_s - offset))
-        inside.append(path.covers(intervals.begin_s - offset, intervals.end_s - offset))
-    mask = np.stack(inside)
-    energy, left, (cross, rate_v, rate_g) = _fit(intervals, np.stack(inertial), mask, rotation, share)
+    # an interval begins where the one before ends
+    instants_s, place = np.unique(np.concatenate([intervals.begin_s, intervals.end_s]), return_inverse=True)
+    attitude = path.at((instants_s - offset_s[:, None]).ravel())[0].reshape(len(offset_s), -1, 4)
+    first, last = attitude[:, place[: len(intervals)]], attitude[:, place[len(intervals) :]]
+    inertial = quat_log(quat_multiply(quat_conjugate(first), last))
+    mask = np.stack([path.covers(intervals.begin_s - offset, intervals.end_s - offset) for offset in offset_s])
+    energy, left, (cross, rate_v, rate_g) = _fit(intervals, inertial, mask, rotation, share)
     covered = np.sum(mask * intervals.dt_s, axis=1) / intervals.dt_s.sum()
     gain = _gain(energy, left, effective * share * covered)
     best = int(np.argmax(gain))
