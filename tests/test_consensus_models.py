@@ -8,16 +8,22 @@ import numpy as np
 import pycolmap
 import pytest
 from box_project import shared_box
+from test_pipeline_parts import recording_of, session_in
 
 from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply
-from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, ScaleOptions
+from colmap_inertial.core.options import JoinOptions, ProjectOptions, ReconstructOptions, ScaleOptions
 from colmap_inertial.core.types import CAL
-from colmap_inertial.model import read_model
+from colmap_inertial.io.frames import read_frame_times
+from colmap_inertial.model import num_registered, read_model
 from colmap_inertial.model.deregistration import deregister_images
 from colmap_inertial.model.project import apply_to_project
 from colmap_inertial.model.similarities import read_scales
 from colmap_inertial.model.submodels.registration import register_again
+from colmap_inertial.pipeline.run.workspace import Workspace
+from colmap_inertial.pipeline.stages.join import JoinStage
+from colmap_inertial.pipeline.stages.metric import MetricStage
 from colmap_inertial.reconstruction.drivers.diagnosis import diagnose_source
+from colmap_inertial.reconstruction.drivers.models import Submodels, run_models
 from colmap_inertial.reconstruction.drivers.project import reconstruct_project
 from colmap_inertial.reconstruction.drivers.sources import ScaleSource, align_source, scale_source
 
@@ -42,6 +48,11 @@ def turned(model, names, deg, *, about=None):
             pose = pose * world
         model.frame(image.frame_id).set_cam_from_world(image.camera_id, pose)
     return model
+
+
+def make_folder(path):
+    path.mkdir(parents=True)
+    return path
 
 
 def altered(box, folder, names, deg, **how):
@@ -166,6 +177,56 @@ def test_of_a_torn_model_the_largest_part_is_kept(box, tmp_path):
     model = reconstructed(box, project, tmp_path / "out")
     assert [seam["name"] for seam in model["rotations"]["seams"]] == [box.names[30], box.names[60]]
     assert model["rotations"]["left_out"] == names
+
+
+@pytest.mark.parametrize("first, last", [(30, 60), (0, 45)], ids=["a block", "the beginning"])
+def test_parts_of_a_torn_model_are_joined_by_the_imu(box, tmp_path, first, last):
+    """A capture's model: what a project has no place for goes on as a model of its own."""
+    names = set(box.names[first:last])
+    sound = read_model(box.root / "sparse" / "0")
+    workspace = Workspace(tmp_path / "out")
+    workspace.open(tmp_path / "capture.toml")
+    turned(pycolmap.Reconstruction(sound), names, 25, about=np.zeros(3)).write_binary(
+        str(make_folder(workspace.colmap_sparse / "0"))
+    )
+    imu, timing = box.recording.imu, read_frame_times(box.frame_times)
+    stages = [MetricStage(imu=imu, calibration=None), JoinStage(imu=imu, calibration=None)]
+    (model,), _, gaps = run_models(session_in(workspace), recording_of(imu, timing), stages, Submodels(after=()))
+    assert all(gap.joined for gap in gaps) and gaps
+    assert sorted(part.images for part in model.parts) == sorted((len(names), len(box.names) - len(names)))
+    assert {one.name for one in model.scale.rotations.seams} <= {box.names[first], box.names[last]}
+    assert set(model.scale.rotations.joined) == names and model.scale.rotations.left_out == ()
+    assert any("joined" in note and "torn" not in note for note in model.scale.notes)
+    assert not any("left out" in note for note in model.scale.notes)
+    joined = read_model(model.sparse_metric)
+    centres, truth = (
+        np.array([one.find_image_with_name(name).projection_center() for name in box.names]) for one in (joined, sound)
+    )
+    fitted = pycolmap.estimate_sim3d(truth, centres)
+    away_m = np.linalg.norm(fitted * truth - centres, axis=1)
+    assert np.sqrt(np.mean(away_m**2)) < 0.02
+    assert np.linalg.norm(away_m[first:last]) / (last - first) ** 0.5 < 0.03
+
+
+def test_of_a_torn_model_what_the_imu_cannot_join_stays_apart(box, tmp_path):
+    """Where positions must be known to a tenth of a millimetre."""
+    names = set(box.names[:45])
+    workspace = Workspace(tmp_path / "out")
+    workspace.open(tmp_path / "capture.toml")
+    torn = turned(read_model(box.root / "sparse" / "0"), names, 25, about=np.zeros(3))
+    torn.write_binary(str(make_folder(workspace.colmap_sparse / "0")))
+    imu, timing = box.recording.imu, read_frame_times(box.frame_times)
+    stages = [
+        MetricStage(imu=imu, calibration=None),
+        JoinStage(imu=imu, calibration=None, limits=JoinOptions(sigma_m=1e-4)),
+    ]
+    (first, second), _, gaps = run_models(session_in(workspace), recording_of(imu, timing), stages, Submodels(after=()))
+    assert [gap.joined for gap in gaps] == [False] and "known to" in gaps[0].reason
+    assert [num_registered(one.sparse_metric) for one in (first, second)] == [len(box.names) - 45, 45]
+    assert set(first.scale.rotations.left_out) == names
+    assert second.sparse_metric is not None and second.colmap_index == 1
+    low, high = second.scale.ci95
+    assert low < box.recording.truth.metres_per_unit < high
 
 
 def test_diagnose_names_the_wrong_cameras(box, tmp_path):

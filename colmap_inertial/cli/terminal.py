@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import shlex
 import shutil
 import sys
@@ -325,8 +326,11 @@ def _model_lines(model: ModelResult, result: ReconstructResult) -> Iterator[Line
     yield from _label_first("written", filter(None, (*paths, result.workspace.result, result.report)))
     if result.report is None:
         yield "report", f"failed, see {result.workspace.log}"
-    took = {step.replace("_", " "): clock(seconds) for step, seconds in result.seconds.items()}
-    yield "time", ", ".join(f"{step} {text}" for step, text in took.items() if text != clock(0.0))
+    took: dict[str, float] = {}
+    for step, seconds in result.seconds.items():
+        name = re.sub(r"_\d+$", "", step).replace("_", " ")
+        took[name] = took.get(name, 0.0) + seconds  # of all models together
+    yield "time", ", ".join(f"{step} {clock(s)}" for step, s in took.items() if clock(s) != clock(0.0))
 
 
 def _describe_layout(result: ReconstructResult) -> str:

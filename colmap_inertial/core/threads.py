@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, TypeVar
 if TYPE_CHECKING:
     from concurrent.futures import Future
 
-#: Number of modules that were loaded when BLAS was limited; 0 where it is not.
-_LIMITED: ContextVar[int] = ContextVar("limited", default=0)
+#: Number of modules that were loaded when BLAS was limited; none where it is not.
+_LIMITED: ContextVar[int | None] = ContextVar("limited", default=None)
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

@@ -64,6 +64,8 @@ class Model:
         What was found wrong with the recording beforehand; with any of them, no scale is trusted.
     rotations
         Which cameras of COLMAP's model agree with the gyroscope, where others were taken from it.
+    torn_off
+        Of a model that is torn, the smaller parts: models of their own for a stage that joins models.
     scale
         What the inertial estimate said; ``None`` before it.
     similarity
@@ -86,6 +88,7 @@ class Model:
     rectified: bool = False
     doubts: tuple[str, ...] = ()
     rotations: RotationConsensus | None = None
+    torn_off: tuple[pycolmap.Reconstruction, ...] = ()
     scale: ScaleEstimate | None = None
     similarity: Similarity | None = None
     treatments: tuple[Treatment, ...] = ()

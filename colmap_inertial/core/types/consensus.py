@@ -65,6 +65,8 @@ class RotationConsensus:
         Cameras whose rotations agree and whose positions the accelerometer contradicts.
     registered_again
         Cameras that were wrong, and are kept where matches place them: they agree.
+    joined
+        Cameras of smaller parts that the IMU joined to the largest one.
     """
 
     names: tuple[str, ...]
@@ -75,6 +77,7 @@ class RotationConsensus:
     ref_from_part_xyzw: Array
     moved: tuple[str, ...] = ()
     registered_again: tuple[str, ...] = ()
+    joined: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_fields(self, t_s=("F",), deviation_deg=("F",), ref_from_part_xyzw=("P", 4))
@@ -89,8 +92,9 @@ class RotationConsensus:
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """Images of all other cameras."""
-        return tuple(name for name, kept in zip(self.names, self.kept, strict=True) if not kept)
+        """Images of all other cameras that were not joined."""
+        joined = set(self.joined)
+        return tuple(name for name, kept in zip(self.names, self.kept, strict=True) if not kept and name not in joined)
 
     @property
     def deviations_deg(self) -> dict[str, float]:
@@ -117,6 +121,11 @@ class RotationConsensus:
                 turn_deg = 2 * np.degrees(np.arccos(min(1.0, abs(float(a @ b)))))
                 out.append(Seam(before=self.names[i], name=self.names[j], turn_deg=float(turn_deg)))
         return tuple(out)
+
+    def list_part(self, number: int) -> tuple[str, ...]:
+        """Images of a part that were not moved."""
+        mine = (self.part == number) & ~np.isin(self.names, self.moved)
+        return tuple(self.names[i] for i in np.flatnonzero(mine))
 
     def updated(self, later: RotationConsensus) -> RotationConsensus:
         """The consensus after some cameras were registered again; the others stay wrong."""
@@ -147,5 +156,6 @@ class RotationConsensus:
             "moved": list(self.moved),
             "left_out": list(self.left_out),
             "registered_again": list(self.registered_again),
+            "joined": list(self.joined),
             "deviations_deg": self.deviations_deg,
         }

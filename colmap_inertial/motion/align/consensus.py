@@ -153,7 +153,13 @@ def describe_consensus(consensus: RotationConsensus) -> tuple[str, ...]:
     ]
     if consensus.seams:
         kept = int(consensus.kept.sum())
-        out.append(f"the scale rests on the largest part, {kept} of {count} cameras; the other parts were left out")
+        if consensus.joined:
+            out.append(
+                f"the IMU joined {len(consensus.joined)} cameras of other parts to the largest, {kept} of {count}"
+            )
+        if any(consensus.part[consensus.names.index(name)] > 0 for name in consensus.left_out):
+            rests = f"the scale rests on the largest part, {kept} of {count} cameras; "
+            out.append(f"{'' if consensus.joined else rests}the other parts were left out")
     return tuple(out)
 
 

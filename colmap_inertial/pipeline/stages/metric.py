@@ -191,9 +191,12 @@ def _select_agreeing_images(
         action="left out" if consensus.left_out else "registered again",
         values={"left_out": consensus.left_out, "registered_again": consensus.registered_again},
     )
+    others = (consensus.list_part(number) for number in range(1, len(consensus.ref_from_part_xyzw)))
+    torn_off = [deregister_images(reconstruction, set(consensus.names) - set(names)) for names in others if names]
     return replace(
         model,
         reconstruction=deregister_images(reconstruction, consensus.left_out),
+        torn_off=tuple(torn_off),
         rotations=consensus,
         treatments=(*model.treatments, done),
     )

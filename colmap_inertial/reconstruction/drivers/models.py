@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -29,6 +30,7 @@ from colmap_inertial.model import (
 )
 from colmap_inertial.model.rigs import rig_sensors
 from colmap_inertial.model.similarities import undoing
+from colmap_inertial.motion.align.consensus import describe_consensus
 from colmap_inertial.pipeline.run.context import Recording
 from colmap_inertial.pipeline.run.runner import fingerprint, remove
 from colmap_inertial.pipeline.run.session import Session
@@ -203,8 +205,8 @@ def _run_stages(
     TimingError
         Where no model has two timed images.
     """
-    several = len(place_of) > 1
-    at, joining = next(((i, s) for i, s in enumerate(stages) if several and joins_models(s)), (len(stages), None))
+    at, joining = next(((i, s) for i, s in enumerate(stages) if joins_models(s)), (len(stages), None))
+    numbers = itertools.count(max(folders) + 1)
     untimed: list[TimingError] = []
 
     def begun() -> Iterator[_Begun]:
@@ -220,7 +222,11 @@ def _run_stages(
             )
             reason = _too_few_timed(model)
             if reason is None:
-                yield scaled, _after(stages[:at], model)
+                model = _after(stages[:at], model)
+                yield scaled, model
+                # an existing project has no place for models that it did not have
+                if joining is not None and not numbered:
+                    yield from _begin_torn_off(scaled, model, stages[:at], numbers)
             else:
                 untimed.append(reason)
                 yield replace(scaled, scale=_refused(str(reason))), None
@@ -232,7 +238,8 @@ def _run_stages(
         going = list(going)
         if numbered:
             staged = {model.colmap_index: model for _, model in going if model is not None}
-        going, gaps = _joined(joining, going, numbered=numbered)
+        if len(going) > 1:
+            going, gaps = _joined(joining, going, numbered=numbered)
     made: list[ScaledModel] = []
     for scaled, model in going:
         if model is None:
@@ -248,6 +255,35 @@ def _run_stages(
     return made, gaps
 
 
+def _begin_torn_off(
+    scaled: ScaledModel, model: Model, stages: Sequence[ModelStage], numbers: Iterator[int]
+) -> Iterator[_Begun]:
+    """Parts of a torn model through the stages, as models of their own; those without a scale stay left out."""
+    for part in model.torn_off:
+        own = Model(
+            reconstruction=part,
+            colmap_index=next(numbers),
+            timing=model.timing,
+            rectified=model.rectified,
+            doubts=model.doubts,
+        )
+        if _too_few_timed(own) is None and (made := _after(stages, own)).similarity is not None:
+            log.info("a part of model %d goes on as model %d", model.colmap_index, own.colmap_index)
+            yield replace(scaled, colmap_index=own.colmap_index, summary=summarize(part)), made
+
+
+def _note_joined(model: Model) -> Model:
+    """A joined model that says which cameras of other parts came back to it."""
+    before, scale = model.rotations, model.scale
+    if before is None or scale is None or not before.seams:
+        return model
+    has = {model.reconstruction.image(number).name for number in model.reconstruction.reg_image_ids()}
+    now = replace(before, joined=tuple(name for name in before.left_out if name in has))
+    old = describe_consensus(before)
+    notes = (*(note for note in scale.notes if note not in old), *describe_consensus(now))
+    return replace(model, rotations=now, scale=replace(scale, rotations=now, notes=notes))
+
+
 def _joined(joining: JoiningStage, begun: Sequence[_Begun], *, numbered: bool) -> tuple[list[_Begun], tuple[Gap, ...]]:
     """Run a stage on all models at once, the largest first; numbers of models that were joined become free."""
     of_number = {scaled.colmap_index: scaled for scaled, _ in begun}
@@ -255,7 +291,10 @@ def _joined(joining: JoiningStage, begun: Sequence[_Begun], *, numbered: bool) -
     left: list[_Begun] = [(scaled, None) for scaled, model in begun if model is None]
     for model in models:
         scaled = of_number[model.colmap_index]
-        left.append((replace(scaled, summary=summarize(model.reconstruction)) if model.parts else scaled, model))
+        if model.parts:
+            model = _note_joined(model)
+            scaled = replace(scaled, summary=summarize(model.reconstruction))
+        left.append((scaled, model))
     left.sort(key=lambda each: (-each[0].summary["registered_images"], each[0].colmap_index))
     return [(scaled if numbered else replace(scaled, index=i), model) for i, (scaled, model) in enumerate(left)], gaps
 
