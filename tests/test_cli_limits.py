@@ -1,6 +1,7 @@
 """Too little memory or too few files: a sentence before the work, or where they run out on the way."""
 
 import errno
+import os
 import subprocess
 import sys
 
@@ -18,6 +19,17 @@ from colmap_inertial.cli import main
 main(sys.argv[3:])
 """
 ARGUMENTS = ("apply", "project", "out", "--factor", "2")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such limits")
+def test_bytecode_is_not_cut_off_at_the_largest_file(tmp_path):
+    (tmp_path / "project").mkdir()
+    command = [sys.executable, "-c", LIMITED, "RLIMIT_FSIZE", "2000", *ARGUMENTS]
+    environment = {**os.environ, "PYTHONPYCACHEPREFIX": str(tmp_path / "cache"), "PYTHONDONTWRITEBYTECODE": ""}
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=environment)
+    assert done.stderr.startswith("error: ")
+    of_ours = [path for path in (tmp_path / "cache").rglob("*.pyc") if "colmap_inertial/model" in path.as_posix()]
+    assert of_ours == []  # what ``main`` imports
 
 
 @pytest.mark.parametrize(

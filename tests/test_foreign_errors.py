@@ -127,6 +127,7 @@ from colmap_inertial.core.errors import OutputError
 from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.pipeline.run.context import RunContext
 folder = Path(sys.argv[1])
+sys.dont_write_bytecode = True  # it would be cut off, for good
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), resource.RLIM_INFINITY))
 context = RunContext(scratch=folder, num_threads=1)
 try:

@@ -104,6 +104,9 @@ def require_limits(*, to_load: bool = False) -> None:
         import resource
     except ImportError:  # Windows has none
         return
+    # before 3.12.8, Python cuts the bytecode that it keeps off at the largest file, and can never load it again
+    if resource.getrlimit(resource.RLIMIT_FSIZE)[0] != resource.RLIM_INFINITY:
+        sys.dont_write_bytecode = True
     from colmap_inertial.core.threads import usable_processors
 
     least = LEAST_BYTES + THREAD_BYTES * usable_processors()

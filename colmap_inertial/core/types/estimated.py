@@ -385,7 +385,7 @@ class JoinedPart:
     Attributes
     ----------
     colmap_index
-        COLMAP's number.
+        COLMAP's number; the next free one of a part that was torn off a model.
     images
         How many it has.
     begin_s, end_s
