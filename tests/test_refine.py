@@ -411,6 +411,19 @@ def test_of_many_observations_a_share_judges_and_all_refine(monkeypatch):
     assert shared.estimate.points_m == pytest.approx(whole.estimate.points_m, abs=0.05)
 
 
+def test_all_observations_come_back_with_what_a_share_of_them_found(small):
+    _, problem, _, _ = small
+    points = np.arange(problem.observations.point[-1] + 1) % 2 == 0
+    judging = judging_points.select_points(problem, points)
+    assert judging_points.restore_points(problem, judging).observations == problem.observations
+    still = replace(judging.observations, line=np.zeros_like(judging.observations.line))
+    noise = replace(problem.inertial.noise, accel_density_m_s2_rthz=0.5)
+    found = replace(judging, observations=still, inertial=replace(problem.inertial, noise=noise))
+    back = judging_points.restore_points(problem, found)
+    assert not back.observations.line.any() and back.inertial.noise == noise
+    assert np.array_equal(back.observations.xy_px, problem.observations.xy_px)
+
+
 def test_points_are_carried_along_by_a_frame_that_sees_them(small):
     """By a motion of the whole world, and by frames that move one by one."""
     _, problem, start, _ = small

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from colmap_inertial.cli import main
-from colmap_inertial.core.errors import FormatError, NotObservableError
+from colmap_inertial.core.errors import FormatError, NotObservableError, OutputError
 from colmap_inertial.inertial.core.target_comparison import TargetComparison, calibrate_by_targets
 from colmap_inertial.inertial.scale import estimate_scale
-from colmap_inertial.io.calibration import read_imu_calibration
-from colmap_inertial.reconstruction.drivers.device_store import calibrate_from_results
+from colmap_inertial.io.calibration import read_imu_calibration, write_imu_calibration
+from colmap_inertial.reconstruction.drivers.device_store import calibrate_from_results, remember
 from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, simulate_recording
 
 by_targets = partial(calibrate_by_targets, gravity_m_s2=9.81)
@@ -56,7 +56,7 @@ def test_the_next_recording_errs_as_the_factor_says():
 def test_agreement_narrows_scatter_does_not_and_a_bad_device_is_wider():
     assert factor(*[0.001] * 8) < 0.5 < factor(*[0.001] * 2) < 0.85
     assert 0.8 < factor(0.006, -0.005, 0.0055, -0.006) < 1.1
-    assert factor(0.03, 0.031, 0.029) > 3
+    assert factor(0.03, 0.031, 0.029) > 3 and factor(0.03, -0.002) > 1.5
     # errors of one board do not average out
     of_one, of_many = (
         by_targets([replace(compared(0.0, target=name)[0], target_sigma_log=0.004) for name in names])
@@ -89,6 +89,7 @@ def result(error_pct: float = 0.1, *, capture: str = "a", **changes) -> dict:
     validation = {
         "target": "checkerboard:8x6:0.04+-0.00004",
         "within_tolerance": True,
+        "doubts": [],
         "scale_error_pct": error_pct,
         "ci95_pct": [error_pct - 0.3, error_pct + 0.3],
         "reasons": ["two images only"],
@@ -103,6 +104,13 @@ def result(error_pct: float = 0.1, *, capture: str = "a", **changes) -> dict:
         "validation": validation | changes.pop("validation", {}),
     }
     return {"capture": f"/home/user/{capture}/capture.toml", "models": [model | changes]}
+
+
+def earlier() -> dict:
+    """A result of a version that did not tell doubts from other reasons."""
+    content = result(validation={"within_tolerance": False})
+    del content["models"][0]["validation"]["doubts"]
+    return content
 
 
 def run(words: list[str]) -> int:
@@ -144,6 +152,10 @@ def test_the_command_writes_and_remembers_what_results_show(tmp_path, monkeypatc
     assert found.accel_factor == pytest.approx(by_targets(expected).accel_factor, rel=1e-6)
     assert (found.device, found.compared, found.attitudes) == ("My phone", 2, 0)
     assert f"{found.accel_factor:.2f}" in shown
+    # far beyond any tolerance, and still what the target says
+    write_result(tmp_path / "a", result(3.0, capture="a"))
+    assert run(words) == 0 and read_imu_calibration(out).accel_factor > 1.5
+    capsys.readouterr()
     assert run([*words[:2], "--out", str(out), "--json", "-"]) == 0  # one result will do
     assert json.loads(capsys.readouterr().out)["compared"] == 1
 
@@ -154,7 +166,8 @@ def test_the_command_writes_and_remembers_what_results_show(tmp_path, monkeypatc
         (result(validation={"scale_error_pct": None}), "no scale with a measured target"),
         (result(verdict="refused"), "no scale with a measured target"),
         (result(imu_calibration={"attitudes": 12}), "calibration of the IMU went into its scale"),
-        (result(validation={"within_tolerance": False}), "does not agree with it: two images only"),
+        (result(validation={"doubts": ["too few"]}), "its target may not be the stated one: too few"),
+        (earlier(), "its target may not be the stated one: two images only"),
         (result(validation={"target": "checkerboard:8x6:0.04"}), r"is not stated; measure it, and add \+-"),
         (result(parts=None), "not that of the joint method"),
         ({"capture": "x"}, "is no result"),
@@ -167,3 +180,21 @@ def test_a_result_that_shows_nothing_is_refused_by_name(tmp_path, content, said)
         calibrate_from_results([sound, write_result(tmp_path / "other", content)], tmp_path / "out.json")
     assert str(tmp_path / "other" / "result.json") in str(caught.value)
     assert not (tmp_path / "out.json").exists()
+
+
+def test_a_calibration_by_rests_is_not_replaced_by_targets_and_a_place_is_for_rests(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    monkeypatch.setenv("APPDATA", str(tmp_path / "config"))
+    monkeypatch.setattr(Path, "home", lambda: tmp_path / "home")
+    by_target = by_targets(compared(0.001))
+    for name, calibration in (("rests", replace(by_target, attitudes=12, accel_factor=None)), ("targets", by_target)):
+        write_imu_calibration(tmp_path / f"{name}.json", calibration)
+    kept = remember("My phone", tmp_path / "targets.json")
+    assert remember("My phone", tmp_path / "rests.json") == kept
+    with pytest.raises(OutputError, match="by rests, which says more than targets: remove it first"):
+        remember("My phone", tmp_path / "targets.json")
+    assert read_imu_calibration(kept).attitudes == 12
+    out = ["--out", str(tmp_path / "out.json")]
+    for words, said in ((["a", "b", "--latitude-deg", "47"], "leave out the place"), ([], "name the recording")):
+        assert run(["calibrate-imu", *words, *out]) == 2
+        assert said in capsys.readouterr().err

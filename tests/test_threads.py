@@ -79,3 +79,44 @@ def test_every_solve_of_a_fresh_process_has_one_thread(work, solves):
     done = subprocess.run(command, capture_output=True, text=True, env=environment)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout) == dict.fromkeys(solves.split(), 1)
+
+
+def test_blas_stays_limited_until_the_last_thread_leaves():
+    """In a process of its own: here, an outer context holds throughout."""
+    code = """
+import threading
+import scipy.linalg
+from threadpoolctl import ThreadpoolController
+from colmap_inertial.core.threads import one_blas_thread
+
+def counts():
+    blas = ThreadpoolController().select(user_api="blas")
+    return {library["num_threads"] for library in blas.info()}
+
+before, seen = counts(), []
+first_is_in, first_is_out = threading.Event(), threading.Event()
+
+def first():
+    with one_blas_thread():
+        first_is_in.set()
+        second_is_in.wait()
+    first_is_out.set()
+
+second_is_in = threading.Event()
+thread = threading.Thread(target=first)
+thread.start()
+first_is_in.wait()
+with one_blas_thread():
+    second_is_in.set()
+    first_is_out.wait()
+    seen.append(counts())
+    with one_blas_thread():
+        seen.append(counts())
+    seen.append(counts())
+thread.join()
+print(before, seen, counts())
+"""
+    environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    environment["OPENBLAS_NUM_THREADS"] = "2"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True)
+    assert done.stdout.strip() == "{2} [{1}, {1}, {1}] {2}"

@@ -244,6 +244,13 @@ class CalibrateImu(Reader):
     remember: str | None = None
     """Keep the calibration under this name of the device: `reconstruct` and `scale` then use it by themselves."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.recording:
+            raise ValueError("name the recording, or results that have a target")
+        if len(self.recording) > 1 and self.gravity != GravityOptions():
+            raise ValueError("results know their gravity: leave out the place")
+
     def run(self) -> int:
         """Run the command; returns the exit code."""
         from colmap_inertial.reconstruction.drivers.device_store import (

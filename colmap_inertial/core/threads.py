@@ -7,15 +7,13 @@ import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from contextvars import ContextVar, copy_context
+from contextvars import copy_context
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from threading import Lock
+from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
-
-#: Number of modules that were loaded when BLAS was limited; none where it is not.
-_LIMITED: ContextVar[int | None] = ContextVar("limited", default=None)
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -96,18 +94,37 @@ def one_blas_thread() -> Iterator[None]:
     The estimators multiply many small matrices: there, threads within one product cost more than they save (three
     times the time on two cores).
     """
-    # SciPy brings a BLAS of its own, and only libraries that are loaded can be limited
-    import scipy.linalg  # noqa: F401
-    from threadpoolctl import threadpool_limits
-
-    # to look for them takes 10 ms: inside such a context, only where something was loaded since
-    if _LIMITED.get() == len(sys.modules):
+    _BLAS.enter()
+    try:
         yield
-        return
-    with threadpool_limits(limits=1, user_api="blas"):
-        outside = _LIMITED.get()
-        _LIMITED.set(len(sys.modules))
-        try:
-            yield
-        finally:
-            _LIMITED.set(outside)
+    finally:
+        _BLAS.leave()
+
+
+class _LimitedBlas:
+    """BLAS, which the whole process shares: limited as long as any thread is inside."""
+
+    def __init__(self) -> None:
+        self._lock, self._inside, self._modules = Lock(), 0, 0
+        self._limits: list[Any] = []
+
+    def enter(self) -> None:
+        # SciPy brings a BLAS of its own, and only libraries that are loaded can be limited
+        import scipy.linalg  # noqa: F401
+        from threadpoolctl import threadpool_limits
+
+        with self._lock:
+            # to look for libraries takes milliseconds: only where something was loaded since
+            if not self._inside or self._modules != len(sys.modules):
+                self._limits.append(threadpool_limits(limits=1, user_api="blas"))
+                self._modules = len(sys.modules)
+            self._inside += 1
+
+    def leave(self) -> None:
+        with self._lock:
+            self._inside -= 1
+            while self._limits and not self._inside:
+                self._limits.pop().restore_original_limits()
+
+
+_BLAS = _LimitedBlas()

@@ -65,7 +65,7 @@ class Model:
     rotations
         Which cameras of COLMAP's model agree with the gyroscope, where others were taken from it.
     torn_off
-        Of a model that is torn, the smaller parts: models of their own for a stage that joins models.
+        Of a model that is torn, the images of its smaller parts: models of their own for a stage that joins models.
     scale
         What the inertial estimate said; ``None`` before it.
     similarity
@@ -88,7 +88,7 @@ class Model:
     rectified: bool = False
     doubts: tuple[str, ...] = ()
     rotations: RotationConsensus | None = None
-    torn_off: tuple[pycolmap.Reconstruction, ...] = ()
+    torn_off: tuple[tuple[str, ...], ...] = ()
     scale: ScaleEstimate | None = None
     similarity: Similarity | None = None
     treatments: tuple[Treatment, ...] = ()

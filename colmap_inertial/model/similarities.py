@@ -256,11 +256,14 @@ def _model_scale(path: Path, fields: Any, world: WorldAxes) -> ModelScale:
 
 
 def _read_left_out(path: Path, rotations: Any) -> tuple[str, ...]:
-    """Images that an estimate left out, or registered again; none where it was made before cameras were compared."""
+    """Images that an estimate left out, registered again, or joined: in COLMAP's model, they are in the wrong place.
+
+    None where it was made before cameras were compared.
+    """
     if rotations is None:
         return ()
     fields = rotations if isinstance(rotations, dict) else {}
-    names = [fields.get("left_out"), fields.get("registered_again", [])]
+    names = [fields.get("left_out"), fields.get("registered_again", []), fields.get("joined", [])]
     if not all(isinstance(some, list) and all(isinstance(name, str) for name in some) for some in names):
-        raise FormatError(path, "rotations: left_out and registered_again must be lists of image names")
+        raise FormatError(path, "rotations: left_out, registered_again and joined must be lists of image names")
     return tuple(name for some in names for name in some)

@@ -422,6 +422,7 @@ class Validation:
                 values["within_tolerance"] = self.within_tolerance
         values["target"] = self.target.spec
         values["reasons"] = (*self.doubts, *self.reasons)
+        values["doubts"] = self.doubts
         values["views"] = [{"name": v.name, "corners": len(v.corner), "rms_px": v.rms_px} for v in self.views]
         json: dict[str, Any] = convert_to_plain(values)
         return json

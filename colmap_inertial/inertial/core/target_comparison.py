@@ -45,7 +45,7 @@ def calibrate_by_targets(
     The accelerometer's part of a scale's error, over its standard deviation, has a variance of 1 over all devices. A
     share of it is the device's, and the same in all its recordings; the rest differs from one to the next. The share is
     unknown and integrated over, each value weighed by the likelihood of the comparisons. ``accel_factor`` is the root
-    mean square of what the next recording has.
+    mean square of what the next recording has, larger where the errors are beyond chance.
 
     Parameters
     ----------
@@ -72,14 +72,18 @@ def calibrate_by_targets(
     of_target = np.array([[one.target == other.target for other in comparisons] for one in comparisons])
     target_sigma = np.array([one.target_sigma_log for one in comparisons])
     known = np.diag([one.sigma_log**2 for one in comparisons]) + of_target * np.outer(target_sigma, target_sigma)
-    squares, log_likelihoods = [], []
+    squares, chi2, log_likelihoods = [], [], []
     for share in np.linspace(0.0, 1.0, 41):  # none is likelier
         cov = known + (1 - share) * np.diag(accel**2) + share * np.outer(accel, accel)
         solved = np.linalg.solve(cov, np.stack([error, share * accel], axis=1))
         mean, left = share * float(accel @ solved[:, 0]), share - share * float(accel @ solved[:, 1])
         squares.append(mean**2 + left + 1 - share)
-        log_likelihoods.append(-0.5 * (np.linalg.slogdet(cov)[1] + float(error @ solved[:, 0])))
+        chi2.append(float(error @ solved[:, 0]))
+        log_likelihoods.append(-0.5 * (np.linalg.slogdet(cov)[1] + chi2[-1]))
     weight = np.exp(np.array(log_likelihoods) - max(log_likelihoods))
+    # beyond two standard deviations of what chance makes of them, errors are larger than those of unknown devices
+    unlikely = len(error) + 2 * (2 * len(error)) ** 0.5
+    surprise = max(1.0, float(np.average(chi2, weights=weight)) / unlikely)
     sigma = np.empty(IMU_CAL.COUNT)
     sigma[IMU_CAL.ACCEL_GAIN], sigma[IMU_CAL.GYRO_GAIN] = PRIORS.accel_gain, PRIORS.gyro_gain
     sigma[IMU_CAL.ACCEL_BIAS], sigma[IMU_CAL.GYRO_BIAS] = PRIORS.accel_bias_m_s2, PRIORS.gyro_bias_rad_s
@@ -93,5 +97,5 @@ def calibrate_by_targets(
         device=device,
         attitudes=0,
         compared=len(comparisons),
-        accel_factor=float(np.average(squares, weights=weight)) ** 0.5,
+        accel_factor=(surprise * float(np.average(squares, weights=weight))) ** 0.5,
     )

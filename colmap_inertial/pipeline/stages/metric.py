@@ -192,11 +192,10 @@ def _select_agreeing_images(
         values={"left_out": consensus.left_out, "registered_again": consensus.registered_again},
     )
     others = (consensus.list_part(number) for number in range(1, len(consensus.ref_from_part_xyzw)))
-    torn_off = [deregister_images(reconstruction, set(consensus.names) - set(names)) for names in others if names]
     return replace(
         model,
         reconstruction=deregister_images(reconstruction, consensus.left_out),
-        torn_off=tuple(torn_off),
+        torn_off=tuple(names for names in others if names),
         rotations=consensus,
         treatments=(*model.treatments, done),
     )

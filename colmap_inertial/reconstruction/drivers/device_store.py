@@ -22,7 +22,13 @@ from colmap_inertial.core.types import ImuCalibration
 from colmap_inertial.inertial.core.target_comparison import TargetComparison, calibrate_by_targets
 from colmap_inertial.inertial.scale import check_units, strength_of_gravity
 from colmap_inertial.inertial.static_calibration import RestCalibration, calibrate_imu
-from colmap_inertial.io.calibration import CAMERA_IMU, IMU, calibration_kind, write_imu_calibration
+from colmap_inertial.io.calibration import (
+    CAMERA_IMU,
+    IMU,
+    calibration_kind,
+    read_imu_calibration,
+    write_imu_calibration,
+)
 from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.files import read_json, read_text, reading, write_text
 from colmap_inertial.io.imu import read_raw_capture_imu, read_raw_imu
@@ -85,7 +91,11 @@ def remember(device: str, calibration: Path) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{folder} cannot be created: {error.strerror or error}") from error
-    target = folder / f"{calibration_kind(calibration)}.json"
+    kind = calibration_kind(calibration)
+    target = folder / f"{kind}.json"
+    by_targets = kind == IMU and read_imu_calibration(calibration).attitudes == 0
+    if by_targets and target.is_file() and read_imu_calibration(target).attitudes > 0:
+        raise OutputError(f"{target} is a calibration by rests, which says more than targets: remove it first")
     write_text(target, read_text(calibration))
     return target
 
@@ -168,8 +178,8 @@ def _read_comparison(path: Path, models: Sequence[Mapping[str, Any]]) -> TargetC
     check = model["validation"]
     if model["imu_calibration"] is not None:
         raise FormatError(path, "a calibration of the IMU went into its scale; run it without one (--no-remembered)")
-    if not check["within_tolerance"]:
-        raise FormatError(path, f"its target does not agree with it: {'; '.join(check['reasons'])}")
+    if doubts := check.get("doubts", () if check["within_tolerance"] else check["reasons"]):  # earlier versions
+        raise FormatError(path, f"its target may not be the stated one: {'; '.join(doubts)}")
     target = parse_target(check["target"])
     if target.sigma_m is None:
         raise FormatError(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -30,7 +29,6 @@ from colmap_inertial.model import (
 )
 from colmap_inertial.model.rigs import rig_sensors
 from colmap_inertial.model.similarities import undoing
-from colmap_inertial.motion.align.consensus import describe_consensus
 from colmap_inertial.pipeline.run.context import Recording
 from colmap_inertial.pipeline.run.runner import fingerprint, remove
 from colmap_inertial.pipeline.run.session import Session
@@ -39,6 +37,7 @@ from colmap_inertial.pipeline.stages.protocols import JoiningStage, ModelStage, 
 from colmap_inertial.reconstruction.drivers.project_output import remove_stale_dense
 from colmap_inertial.reconstruction.drivers.reporting import write_model_record
 from colmap_inertial.reconstruction.drivers.result import Fragment, ModelResult, ScaledModel
+from colmap_inertial.reconstruction.drivers.torn_parts import TornParts
 
 if TYPE_CHECKING:
     import pycolmap
@@ -206,7 +205,7 @@ def _run_stages(
         Where no model has two timed images.
     """
     at, joining = next(((i, s) for i, s in enumerate(stages) if joins_models(s)), (len(stages), None))
-    numbers = itertools.count(max(folders) + 1)
+    torn = TornParts(max(folders) + 1)
     untimed: list[TimingError] = []
 
     def begun() -> Iterator[_Begun]:
@@ -220,13 +219,13 @@ def _run_stages(
                 summary=summarize(model.reconstruction),
                 sparse=_within(session.workspace.root, folders[model.colmap_index]),
             )
-            reason = _too_few_timed(model)
-            if reason is None:
-                model = _after(stages[:at], model)
-                yield scaled, model
+            if (reason := _too_few_timed(model)) is None:
+                made = _after(stages[:at], model)
+                yield scaled, made
                 # an existing project has no place for models that it did not have
-                if joining is not None and not numbered:
-                    yield from _begin_torn_off(scaled, model, stages[:at], numbers)
+                for part in torn.split(model, made) if joining is not None and not numbered else ():
+                    if _too_few_timed(part) is None:
+                        yield replace(scaled, colmap_index=part.colmap_index), _after(stages[:at], part)
             else:
                 untimed.append(reason)
                 yield replace(scaled, scale=_refused(str(reason))), None
@@ -239,7 +238,9 @@ def _run_stages(
         if numbered:
             staged = {model.colmap_index: model for _, model in going if model is not None}
         if len(going) > 1:
-            going, gaps = _joined(joining, going, numbered=numbered)
+            going, gaps = _joined(joining, going, torn, numbered=numbered)
+        else:
+            going = [(scaled, None if model is None else joining(model)) for scaled, model in going]
     made: list[ScaledModel] = []
     for scaled, model in going:
         if model is None:
@@ -255,44 +256,19 @@ def _run_stages(
     return made, gaps
 
 
-def _begin_torn_off(
-    scaled: ScaledModel, model: Model, stages: Sequence[ModelStage], numbers: Iterator[int]
-) -> Iterator[_Begun]:
-    """Parts of a torn model through the stages, as models of their own; those without a scale stay left out."""
-    for part in model.torn_off:
-        own = Model(
-            reconstruction=part,
-            colmap_index=next(numbers),
-            timing=model.timing,
-            rectified=model.rectified,
-            doubts=model.doubts,
-        )
-        if _too_few_timed(own) is None and (made := _after(stages, own)).similarity is not None:
-            log.info("a part of model %d goes on as model %d", model.colmap_index, own.colmap_index)
-            yield replace(scaled, colmap_index=own.colmap_index, summary=summarize(part)), made
-
-
-def _note_joined(model: Model) -> Model:
-    """A joined model that says which cameras of other parts came back to it."""
-    before, scale = model.rotations, model.scale
-    if before is None or scale is None or not before.seams:
-        return model
-    has = {model.reconstruction.image(number).name for number in model.reconstruction.reg_image_ids()}
-    now = replace(before, joined=tuple(name for name in before.left_out if name in has))
-    old = describe_consensus(before)
-    notes = (*(note for note in scale.notes if note not in old), *describe_consensus(now))
-    return replace(model, rotations=now, scale=replace(scale, rotations=now, notes=notes))
-
-
-def _joined(joining: JoiningStage, begun: Sequence[_Begun], *, numbered: bool) -> tuple[list[_Begun], tuple[Gap, ...]]:
+def _joined(
+    joining: JoiningStage, begun: Sequence[_Begun], torn: TornParts, *, numbered: bool
+) -> tuple[list[_Begun], tuple[Gap, ...]]:
     """Run a stage on all models at once, the largest first; numbers of models that were joined become free."""
     of_number = {scaled.colmap_index: scaled for scaled, _ in begun}
-    models, gaps = joining.join_models([model for _, model in begun if model is not None])
+    going = [model for _, model in begun if model is not None]
+    if torn:
+        going.sort(key=lambda model: -int(model.reconstruction.num_reg_images()))
+    models, gaps = joining.join_models(going)
     left: list[_Begun] = [(scaled, None) for scaled, model in begun if model is None]
-    for model in models:
+    for model in torn.describe_joined(models):
         scaled = of_number[model.colmap_index]
         if model.parts:
-            model = _note_joined(model)
             scaled = replace(scaled, summary=summarize(model.reconstruction))
         left.append((scaled, model))
     left.sort(key=lambda each: (-each[0].summary["registered_images"], each[0].colmap_index))
