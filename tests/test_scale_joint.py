@@ -14,7 +14,7 @@ from colmap_inertial.core.types import CAL, CameraTrajectory, ImuNoise, ImuRecor
 from colmap_inertial.inertial.core import factors as fac, parameters as par
 from colmap_inertial.inertial.core.arrow import ArrowSystem
 from colmap_inertial.inertial.core.preintegration import SensorErrors, SensorStream, SensorStreams, preintegrate
-from colmap_inertial.inertial.core.priors import PRIORS
+from colmap_inertial.inertial.core.priors import PRIORS, UNCALIBRATED
 from colmap_inertial.inertial.scale import _residuals as res, _setup, estimate_scale, first_seconds
 from colmap_inertial.inertial.scale._noise import LEVELS, TYPICAL, Expected
 from colmap_inertial.inertial.scale._setup import first_of_groups, group_frames, prepare, roughness
@@ -617,7 +617,7 @@ def test_errors_of_a_shaken_accelerometer_that_stay_for_a_while_are_told_from_wh
         data, fit, _ = fit_path(recording.trajectory, timed(recording.trajectory, imu, calibration), JointOptions())
         assert fit.noise.accel_slow_m_s2_rts == pytest.approx(0.06, rel=0.35)
         assert fit.noise.accel_density_m_s2_rthz < 0.015
-        found = scale_of(fit, data.t_s, False)
+        found = scale_of(fit, data.t_s, UNCALIBRATED)
         error = np.log(found.metres_per_unit / recording.truth.metres_per_unit)
         assert abs(error) < 1.96 * found.sigma_log
 

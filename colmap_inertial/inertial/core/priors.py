@@ -26,8 +26,6 @@ class JointPriors:
     """The same of the accelerometer: after the factory's calibration, half of what data sheets allow."""
     accel_bias_m_s2: float = 0.4
     """Each axis: data sheets give 20-90 mg over temperature and soldering."""
-    gyro_bias_rad_s: float = 0.1
-    """Each axis, of a gyroscope that nothing was said about."""
     clock_rate: float = 1e-4
     """Quartzes of camera and IMU against each other."""
     coupling_m: float = 5.0
@@ -61,14 +59,19 @@ class AccelPart:
 
     Attributes
     ----------
-    model_sigma
-        Standard deviation of the scale's logarithm beside the gains that a fit estimates; 0 of a calibrated IMU.
+    calibrated
+        Whether the IMU is.
     factor
         On the standard deviation of the whole part, by results of the device that were compared with targets.
     """
 
-    model_sigma: float = PRIORS.accel_model
+    calibrated: bool = False
     factor: float = 1.0
+
+    @property
+    def model_sigma(self) -> float:
+        """Standard deviation of the scale's logarithm beside the gains that a fit estimates."""
+        return 0.0 if self.calibrated else PRIORS.accel_model
 
 
 UNCALIBRATED = AccelPart()
@@ -77,7 +80,7 @@ UNCALIBRATED = AccelPart()
 def accel_part(imu: ImuRecording) -> AccelPart:
     """What the accelerometer of a recording adds to a scale's interval, by its calibration."""
     if is_calibrated(imu):
-        return AccelPart(model_sigma=0.0)
+        return AccelPart(calibrated=True)
     compared = None if imu.calibration is None else imu.calibration.accel_factor
     return UNCALIBRATED if compared is None else AccelPart(factor=compared)
 

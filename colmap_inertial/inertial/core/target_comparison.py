@@ -86,7 +86,8 @@ def calibrate_by_targets(
     surprise = max(1.0, float(np.average(chi2, weights=weight)) / unlikely)
     sigma = np.empty(IMU_CAL.COUNT)
     sigma[IMU_CAL.ACCEL_GAIN], sigma[IMU_CAL.GYRO_GAIN] = PRIORS.accel_gain, PRIORS.gyro_gain
-    sigma[IMU_CAL.ACCEL_BIAS], sigma[IMU_CAL.GYRO_BIAS] = PRIORS.accel_bias_m_s2, PRIORS.gyro_bias_rad_s
+    # what nobody knows of a gyroscope: each recording's alignment finds its bias
+    sigma[IMU_CAL.ACCEL_BIAS], sigma[IMU_CAL.GYRO_BIAS] = PRIORS.accel_bias_m_s2, 0.1
     return ImuCalibration(
         accel_gain=np.zeros((3, 3)),
         accel_bias_m_s2=np.zeros(3),

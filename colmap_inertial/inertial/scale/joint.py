@@ -343,7 +343,7 @@ def scale_of(fit: Fit, t_s: Array, accel: AccelPart, clock_rate: float = 0.0) ->
     variances["accel_gain"] *= fit.gain_surprise
     variances["noise_levels"] = (student * _UNIFORM * share) ** 2 + fit.level_variance
     variances["accel_gain"] += accel.model_sigma**2
-    wrong_gain = None if accel.model_sigma == 0 else judge_gain(fit.estimate, fit.cov, fit.prior_info, widened)
+    wrong_gain = None if accel.calibrated else judge_gain(fit.estimate, fit.cov, fit.prior_info, widened)
     variances["accel_gain"] += 0.0 if wrong_gain is None else wrong_gain.variance
     variances["accel_gain"] *= accel.factor**2
     variances["lens"] = PRIORS.lens**2
