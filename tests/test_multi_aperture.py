@@ -507,6 +507,23 @@ def test_refocusing_leaves_what_is_in_focus_and_blurs_the_rest():
     assert np.abs(both.astype(int) - picture).max() <= 1
 
 
+def test_a_point_out_of_focus_is_a_disc_as_wide_as_its_disparity_and_no_wider_than_the_limit():
+    picture = np.zeros((201, 201, 3), dtype=np.uint8)
+    picture[100, 100] = 255
+    for disparity, wide in ((10.0, 10), (30.0, 30), (90.0, 60)):
+        lit = refocus(picture, np.full((201, 201), disparity, dtype=np.float32), 0.0)[..., 0] > 0
+        across = np.flatnonzero(lit.any(axis=0))
+        if lit.any():  # a bright point spread over 60 px is darker than a grey level
+            assert across[-1] - across[0] + 1 == pytest.approx(wide, abs=2), disparity
+        flat = refocus(
+            np.where(np.arange(201)[None, :, None] < 100, 0, picture | 255).astype(np.uint8),
+            np.full((201, 201), disparity, dtype=np.float32),
+            0.0,
+        )[100, :, 0].astype(float)
+        edge = np.flatnonzero((flat > 2) & (flat < 253))
+        assert edge[-1] - edge[0] + 1 == pytest.approx(wide, abs=6), disparity
+
+
 def test_planes_of_colour_pictures():
     picture = np.zeros((2, 2, 3), dtype=np.uint16)
     picture[..., 0], picture[..., 1], picture[..., 2] = 1000, 2000, 3000

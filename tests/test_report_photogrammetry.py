@@ -48,6 +48,17 @@ def test_residuals_are_those_of_the_noise(synthetic, record):
     assert np.sqrt((weights * squares).sum() / weights.sum()) == pytest.approx(0.5 * np.sqrt(2), rel=0.1)
 
 
+def test_the_field_of_view_is_that_of_a_pinhole_with_the_focal_length(synthetic, record):
+    (camera,) = record["cameras"]
+    width, height = camera["width"], camera["height"]
+    expected = [2 * np.degrees(np.arctan2(side / 2, 1280.0)) for side in (width, height)]
+    assert camera["field_of_view_deg"] == pytest.approx(expected, abs=0.5)
+    # a radial term of 0.1: points lie farther out than a pinhole has them, by 0.1 times the third power
+    at, shift = np.array(camera["distortion"]["at_px"]), np.array(camera["distortion"]["shift_px"])
+    away = (at - shift - [512.0, 384.0]) / 1280.0
+    assert shift == pytest.approx(1280.0 * 0.1 * np.sum(away**2, axis=1, keepdims=True) * away, abs=0.01)
+
+
 def test_tracks_and_overlap_count_images(synthetic, record):
     tracks = record["tracks"]
     assert sum(tracks["counts"]) == synthetic.num_points3D()

@@ -611,6 +611,26 @@ def test_noise_of_the_accelerometer_does_not_look_like_a_smaller_gain():
     assert abs(np.mean(gains)) < 0.006
 
 
+def test_increments_are_integrated_again_where_the_device_is_another(recording, calibration):
+    """To first order they hold for small changes: of the delays, the gyroscope's bias and its gains."""
+    data, fit, _ = fit_path(
+        recording.trajectory, timed(recording.trajectory, recording.imu, calibration), JointOptions()
+    )
+    x, span_s = fit.estimate, float(np.ptp(data.t_s))
+    assert fac.still_near(x, x, data.t_s)
+    for name, limit in (
+        ("delay_s", 3e-4),
+        ("clock_rate", 2 * 3e-4 / span_s),
+        ("accel_delay_s", 1e-3),
+        ("gyro_bias_rad_s", 1e-3),
+        ("gyro_gain", 2e-3),
+    ):
+        for sign in (1, -1):
+            near, far = (replace(x, **{name: getattr(x, name) + sign * share * limit}) for share in (0.9, 1.1))
+            assert fac.still_near(x, near, data.t_s) and not fac.still_near(x, far, data.t_s), name
+            assert fac.still_near(x, far, data.t_s, tolerance=1.3), name
+
+
 def test_errors_of_a_shaken_accelerometer_that_stay_for_a_while_are_told_from_white_noise():
     for seed in range(2):
         recording, imu, calibration = shaken(seed, 0.0, 0.06)
