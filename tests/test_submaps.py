@@ -123,6 +123,17 @@ def test_a_constraint_has_the_squares_of_its_points():
         assert tie.squares + tie.misfit(state) == pytest.approx(expected, rel=3 * size)
 
 
+def test_a_constraint_that_counts_less_counts_less_in_all_it_says():
+    rng = np.random.default_rng(5)
+    world = [random_similarity(rng), random_similarity(rng)]
+    tie, *_ = constraint(rng, world, 0, 1, noise=0.02)
+    state = placements(world).moved(1e-2 * rng.standard_normal(14))
+    quarter = tie.weighted(0.25)
+    assert quarter.squares == pytest.approx(0.25 * tie.squares) and quarter.squares > 0
+    assert quarter.misfit(state) == pytest.approx(0.25 * tie.misfit(state))
+    assert quarter.equations == pytest.approx(0.25 * tie.equations)
+
+
 def test_the_derivatives_of_a_constraint_are_those_of_its_residual():
     rng = np.random.default_rng(6)
     world = [random_similarity(rng), random_similarity(rng)]
