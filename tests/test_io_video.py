@@ -17,6 +17,7 @@ from conftest import write_anew
 
 from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.core.types import FrameLog
+from colmap_inertial.io import video
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frames import read_frame_timing, read_frames, read_reduced, thin
 from colmap_inertial.io.video import decode_grey, decode_reduced, decode_video, video_stamps_ns
@@ -499,3 +500,21 @@ def test_the_filmed_stream_is_found_among_others(tmp_path: Path, first: bool) ->
     same = write_pattern(tmp_path / "same.mp4", 20, size=(64, 48))
     with pytest.raises(FormatError, match=r"2 video streams of 64x48; .*-map"):
         video_stamps_ns(add_stream(video, same, first=first))
+
+
+@pytest.mark.parametrize(
+    ("sizes", "lacking", "cut_off"),
+    [
+        ([92], 0, False),
+        ([100], 0, False),  # the head of 8 bytes counted, too
+        ([101], 0, True),
+        ([92, 92], 0, False),
+        ([92, 92], 20, True),
+        ([92, 92], 100, False),  # a whole list is gone, which nothing shows
+        ([93], 0, False),
+    ],
+)
+def test_an_avi_ends_inside_its_last_list_or_not(tmp_path, sizes, lacking, cut_off):
+    lists = [b"RIFF" + struct.pack("<I", size) + b"AVI " + bytes(88 + (size == 93) * 2) for size in sizes]
+    (tmp_path / "a.avi").write_bytes(b"".join(lists)[: sum(map(len, lists)) - lacking])
+    assert video._ends_inside_riff(tmp_path / "a.avi") == cut_off
