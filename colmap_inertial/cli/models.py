@@ -235,8 +235,8 @@ class CalibrateImu(Reader):
     """
 
     recording: Positional[tuple[Path, ...]]
-    """IMU recording: a file or folder of a known format, or a capture.toml; no pictures are needed. Or output folders
-    of `reconstruct`, of captures with a [target] whose size is stated with its standard deviation (+-)."""
+    """IMU recording (a file or folder of a known format, or a capture.toml), or output folders of `reconstruct`. These
+    must be of captures with a [target] whose size is stated with its standard deviation (+-)."""
     out: Path
     """Where to write the calibration (JSON); of a recording, a page of the same name, ending in .html, is put beside
     it."""

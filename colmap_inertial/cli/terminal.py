@@ -145,7 +145,8 @@ def show_compared(calibration: ImuCalibration, out: Path, kept: Path | None) -> 
     from colmap_inertial.checks.report.imu_calibration import comparison_effect
 
     lines: list[Line] = [("scale", comparison_effect(calibration)), ("written", str(out))]
-    _print_panel(f"{calibration.compared} results with targets", [*lines, *_describe_remembered(kept)])
+    results = f"{calibration.compared} result{'s' * (calibration.compared > 1)}"
+    _print_panel(f"{results} with targets", [*lines, *_describe_remembered(kept)])
 
 
 def show_imu_calibration(calibration: RestCalibration, source: Path, out: Path, kept: Path | None) -> None:

@@ -286,7 +286,7 @@ class ImuCalibration:
         if self.accel_factor is not None:
             repair = (
                 f"the accelerometer's part of the scale's interval is {self.accel_factor:.2f} of that of unknown "
-                f"devices, by {self.compared} results of this one that were compared with targets"
+                f"devices, by targets (results of this device: {self.compared})"
             )
         return replace(
             imu,
