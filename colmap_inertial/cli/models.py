@@ -21,6 +21,7 @@ from colmap_inertial.cli.terminal import (
     show_validation,
     show_view,
 )
+from colmap_inertial.core.errors import InertialError
 from colmap_inertial.core.options import (
     ExportImages,
     ExportProgram,
@@ -248,8 +249,6 @@ class CalibrateImu(Reader):
         super().__post_init__()
         if not self.recording:
             raise ValueError("name the recording, or results that have a target")
-        if len(self.recording) > 1 and self.gravity != GravityOptions():
-            raise ValueError("results know their gravity: leave out the place")
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
@@ -262,6 +261,8 @@ class CalibrateImu(Reader):
         self.check_json(*self.recording, self.out)
         first, *others = self.recording
         compared = bool(others) or (first / "result.json").is_file()
+        if compared and self.gravity != GravityOptions():
+            raise InertialError("gravity is for recordings of rests; with results, leave out the place")
         if compared:
             by_targets = calibrate_from_results(self.recording, self.out, device=self.remember or "")
         else:

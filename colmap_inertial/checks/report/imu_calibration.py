@@ -10,8 +10,8 @@ from colmap_inertial.checks.report.page import render_page
 from colmap_inertial.checks.words import Fact
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.quantiles import Z95
-from colmap_inertial.core.types import IMU_CAL, ImuCalibration
-from colmap_inertial.inertial.core.priors import KNOWN_GAIN, PRIORS, model_scale_sigma
+from colmap_inertial.core.types import IMU_CAL
+from colmap_inertial.inertial.core.priors import KNOWN_GAIN, UNCALIBRATED, AccelPart, model_scale_sigma
 from colmap_inertial.inertial.static_calibration import RestCalibration
 
 
@@ -53,14 +53,8 @@ def gain_effect(rests: RestCalibration) -> str:
     )
     if rests.calibration.gain_sigma > KNOWN_GAIN:
         return f"{evidence}; that is too little to lower the floor of a scale's interval"
-    before, after = (100 * Z95 * sigma for sigma in (model_scale_sigma(), PRIORS.lens))
+    before, after = (100 * Z95 * model_scale_sigma(accel) for accel in (UNCALIBRATED, AccelPart(calibrated=True)))
     return f"{evidence}; the floor of a scale's interval falls from +-{before:.1g} % to +-{after:.1g} %"
-
-
-def comparison_effect(calibration: ImuCalibration) -> str:
-    """A sentence on how results that were compared with targets change the interval of a scale."""
-    assert calibration.accel_factor is not None
-    return f"the accelerometer's part of its interval is {calibration.accel_factor:.2f} of that of unknown devices"
 
 
 def calibration_facts(rests: RestCalibration) -> list[Fact]:

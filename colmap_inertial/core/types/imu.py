@@ -284,16 +284,20 @@ class ImuCalibration:
         attitudes = f" in {self.attitudes} attitudes" if self.attitudes else ""
         repair = f"the IMU's readings were corrected by its calibration{attitudes}"
         if self.accel_factor is not None:
-            repair = (
-                f"the accelerometer's part of the scale's interval is {self.accel_factor:.2f} of that of unknown "
-                f"devices, by targets (results of this device: {self.compared})"
-            )
+            repair = self.describe_comparison()
         return replace(
             imu,
             gyro_rad_s=imu.gyro_rad_s @ (np.eye(3) + self.gyro_gain).T - self.gyro_bias_rad_s,
             accel_m_s2=imu.accel_m_s2 @ (np.eye(3) + self.accel_gain).T - self.accel_bias_m_s2,
             calibration=self,
             repairs=(*imu.repairs, repair),
+        )
+
+    def describe_comparison(self) -> str:
+        """What results that were compared with targets say, in words."""
+        return (
+            f"the accelerometer's part of the scale's interval is {self.accel_factor:.2f} of that of unknown devices, "
+            f"by targets (results of this device: {self.compared})"
         )
 
     def uncorrected(self, gyro_rad_s: Array, accel_m_s2: Array) -> tuple[Array, Array]:

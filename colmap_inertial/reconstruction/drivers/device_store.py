@@ -168,9 +168,10 @@ def calibrate_from_results(folders: Sequence[Path], out: Path, *, device: str = 
 
 def _read_comparison(path: Path, models: Sequence[Mapping[str, Any]]) -> TargetComparison:
     """The largest model of a result beside its target."""
-    checks = {model["index"]: model.get("validation") or {} for model in models}
     measured = [
-        m for m in models if checks[m["index"]].get("scale_error_pct") is not None and m["verdict"] != "refused"
+        model
+        for model in models
+        if (model.get("validation") or {}).get("scale_error_pct") is not None and model["verdict"] != "refused"
     ]
     if not measured:
         raise FormatError(path, "has no scale with a measured target; name the target under [target] of the capture")
