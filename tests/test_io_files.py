@@ -1,5 +1,6 @@
 """Atomic files and JSON."""
 
+import importlib
 import json
 import os
 import subprocess
@@ -12,7 +13,7 @@ import pytest
 from cases import loop_over
 
 from colmap_inertial.core.errors import FormatError, OutputError, OutputExistsError
-from colmap_inertial.io.files import locked, read_json, write_json, write_text
+from colmap_inertial.io.files import locked, read_json, reading, write_json, write_text
 
 
 @dataclass(frozen=True)
@@ -93,6 +94,13 @@ def test_what_is_no_json_object_is_a_format_error(tmp_path: Path, text: str, sai
     (tmp_path / "a.json").write_text(text)
     with pytest.raises(FormatError, match=said):
         read_json(tmp_path / "a.json")
+
+
+def test_a_package_that_is_missing_is_not_a_damaged_file(tmp_path: Path) -> None:
+    with pytest.raises(ImportError, match="no_such"), reading(tmp_path):
+        importlib.import_module("no_such_package")
+    with pytest.raises(FormatError, match=r"is damaged \(KeyError: 'no'\)"), reading(tmp_path):
+        {}["no"]
 
 
 def test_a_missing_file_is_a_format_error(tmp_path: Path) -> None:

@@ -216,8 +216,10 @@ def test_a_finished_project_is_gone_on_with_by_the_sweep(tmp_path, capsys):
 def test_with_cuda_it_goes_through_in_one_run(box, tmp_path, monkeypatch):
     out, calls = tmp_path / "out", []
 
-    def patch_match(workspace, max_image_size, settings):
+    def patch_match(workspace, max_image_size, settings, count):
         calls.append(max_image_size)
+        for there in (30, 150, 60, 300):  # of 240; those of an earlier attempt may have gone
+            count(there)
         # the result file is not there yet, but the scale is in the model
         estimate = json.loads((out / "sparse" / "0" / "transform.json").read_text())["scale"]
         (out / "result.json").write_text(json.dumps({"models": [{"metres_per_unit": estimate}]}))
@@ -238,7 +240,8 @@ def test_with_cuda_it_goes_through_in_one_run(box, tmp_path, monkeypatch):
     assert dense.points > 2000
     assert max(camera.width for camera in read_model(dense.folder / "sparse").cameras.values()) == 96
     # 1 for undistortion, 46 for depth maps, 11 for fusion: times on two recordings
-    assert [done for stage, done, _ in seen if stage == "dense"] == [120, 47 * 120, 58 * 120, 58 * 120]
+    depth = [120 + 46 * 120 * there // 240 for there in (30, 150, 240, 240)]
+    assert [done for stage, done, _ in seen if stage == "dense"] == [120, *depth, 58 * 120, 58 * 120]
     assert not [stage for stage, *_ in seen if stage == "mesh"]
     assert "no depth map of" in (out / "log.txt").read_text()
 
@@ -247,14 +250,15 @@ def test_half_written_depth_maps_are_made_again(unfinished, box, monkeypatch):
     name = f"dense/0/stereo/depth_maps/{box.names[0]}.geometric.bin"
     (unfinished / name).write_bytes(b"96&72&1&" + bytes(100))
 
-    def run_colmap(command, **_):
+    def run_colmap(code, *arguments, watch):
         beside = unfinished / ".stages" / "next"  # as no mesh was asked for before
         assert beside.is_dir() and not (beside / name).exists()
         cast_depth_maps(box, beside)
-        return subprocess.CompletedProcess(command, 0, "", "")
+        watch()
+        return subprocess.CompletedProcess(code, 0, "", "")
 
     monkeypatch.setattr(pycolmap, "has_cuda", True)
-    monkeypatch.setattr(depth_maps.subprocess, "run", run_colmap)
+    monkeypatch.setattr(depth_maps, "_run_apart", run_colmap)
     no_mesh = dataclasses.replace(QUICK, dense_options=DenseOptions(max_image_size=96, mesh="none"))
     assert reconstruct_project(box.root, unfinished, source(box), no_mesh).exit_code() == 0
 
@@ -278,8 +282,8 @@ def test_a_mesh_of_points_is_made_apart_by_threads_that_sleep_while_they_wait(tm
     header += [f"property uchar {colour}" for colour in ("red", "green", "blue")]
     points, mesh = tmp_path / "points.ply", tmp_path / "mesh.ply"
     points.write_bytes("\n".join([*header, "end_header\n"]).encode() + rows.tobytes())
-    ran, begun = subprocess.run, []
-    monkeypatch.setattr(depth_maps.subprocess, "run", lambda *a, **k: begun.append(k) or ran(*a, **k))
+    ran, begun = subprocess.Popen, []
+    monkeypatch.setattr(depth_maps.subprocess, "Popen", lambda *a, **k: begun.append(k) or ran(*a, **k))
     depth_maps.mesh_points(points, mesh, depth=6, trim=0, context=RunContext(num_threads=1))
     assert begun[0]["env"]["OMP_WAIT_POLICY"] == "passive"
     found = vertices(mesh)

@@ -142,11 +142,7 @@ def _densify(
     if maker == "plane sweep":
         _sweep(session, index, prepared, count)
     elif pycolmap.has_cuda:
-        size = prepared.made_from.max_image_size
-        decided = {"maps": maker, "settings": prepared.made_from.settings}
-        step, maps_of, colmap = f"dense_{index}_depth", partial(_map_folders, folder), context.colmap
-        runner.run(step, decided, [], lambda _: patch_match(folder, size, colmap), after=before, beside=maps_of)
-        count(len(names) * (_WORK.matched + _WORK.confirmed))
+        _patch_match(session, index, prepared, count)
     kind, mapped = find_maps(folder, names)
     result = DenseResult(folder=folder, images=len(names), depth_maps=len(mapped), maps=maker)
     if not mapped:
@@ -220,6 +216,27 @@ def _sweep(session: Session, index: int, prepared: _Prepared, count: Callable[[i
     depends = {"maps": prepared.made_from.maps}
     after, step = [f"dense_{index}_undistorted"], f"dense_{index}_depth"
     session.runner.run(step, depends, [record], work, after=after, beside=partial(_map_folders, folder))
+
+
+def _patch_match(session: Session, index: int, prepared: _Prepared, count: Callable[[int], None]) -> None:
+    """Depth maps by COLMAP's patch-match, of each image a photometric one and a geometric one."""
+    folder, made_from = session.workspace.dense / str(index), prepared.made_from
+    whole, counted = len(prepared.names) * (_WORK.matched + _WORK.confirmed), 0
+
+    def count_maps(there: int) -> None:
+        nonlocal counted
+        now = min(whole, whole * there // (2 * len(prepared.names)))
+        if now > counted:
+            count(now - counted)
+            counted = now
+
+    def work(_: Sequence[Path]) -> None:
+        patch_match(folder, made_from.max_image_size, session.context.colmap, count_maps)
+
+    decided = {"maps": made_from.maps, "settings": made_from.settings}
+    after, step = [f"dense_{index}_undistorted"], f"dense_{index}_depth"
+    session.runner.run(step, decided, [], work, after=after, beside=partial(_map_folders, folder))
+    count(whole - counted)
 
 
 def _map_folders(folder: Path) -> list[Path]:

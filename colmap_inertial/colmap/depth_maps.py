@@ -6,7 +6,7 @@ import hashlib
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -202,8 +202,12 @@ def map_file(folder: Path, what: str, name: str, kind: str = "geometric") -> Pat
     return path_in(folder / "stereo" / f"{what}_maps", f"{name}.{kind}.bin")
 
 
-def patch_match(folder: Path, max_image_size: int | None, settings: ColmapSettings) -> None:
+def patch_match(
+    folder: Path, max_image_size: int | None, settings: ColmapSettings, count: Callable[[int], None]
+) -> None:
     """COLMAP's patch-match on a dense workspace, in a process of its own: where CUDA fails it ends the process.
+
+    ``count`` is called each second with the number of depth maps there are, photometric and geometric ones.
 
     Raises
     ------
@@ -216,7 +220,11 @@ def patch_match(folder: Path, max_image_size: int | None, settings: ColmapSettin
             check_map(path, 1 if "depth_maps" in path.parts else 3)
         except FormatError:
             remove(path)
-    done = _run_apart(_PATCH_MATCH, folder, max_image_size or -1, *settings.of("stereo"))
+
+    def watch() -> None:
+        count(sum(1 for _ in (folder / "stereo" / "depth_maps").glob("**/*.bin")))
+
+    done = _run_apart(_PATCH_MATCH, folder, max_image_size or -1, *settings.of("stereo"), watch=watch)
     if done.returncode:
         message = _last_line(done)
         raise InertialError(
@@ -254,11 +262,22 @@ def mesh_points(fused: Path, target: Path, *, depth: int, trim: float, context: 
         raise OutputError(f"{fused.parent}: COLMAP wrote no mesh ({_last_line(done)}); are disk or memory full?")
 
 
-def _run_apart(code: str, *arguments: object) -> subprocess.CompletedProcess[str]:
-    """Run COLMAP in a process of its own, which ends with this one."""
+def _run_apart(
+    code: str, *arguments: object, watch: Callable[[], None] = lambda: None
+) -> subprocess.CompletedProcess[str]:
+    """Run COLMAP in a process of its own, which ends with this one; calls ``watch`` each second."""
     command = [sys.executable, "-c", _BEGIN + code, *map(str, arguments)]
-    waiting = os.environ | {"OMP_WAIT_POLICY": "passive"}
-    return subprocess.run(command, env=waiting, capture_output=True, text=True, errors="replace")
+    waiting, pipe = os.environ | {"OMP_WAIT_POLICY": "passive"}, subprocess.PIPE
+    with subprocess.Popen(command, env=waiting, stdout=pipe, stderr=pipe, text=True, errors="replace") as process:
+        try:
+            while True:
+                try:
+                    out, said = process.communicate(timeout=1)
+                    return subprocess.CompletedProcess(command, process.returncode, out, said)
+                except subprocess.TimeoutExpired:
+                    watch()
+        finally:
+            process.kill()
 
 
 def _last_line(done: subprocess.CompletedProcess[str]) -> str:

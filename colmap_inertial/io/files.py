@@ -81,11 +81,12 @@ def reading(path: StrPath, fault: str = "is damaged") -> Iterator[None]:
     Raises
     ------
     FormatError
-        With the code :data:`DAMAGED`, for any other exception than our own and those of used up memory or files.
+        With the code :data:`DAMAGED`, for any other exception than our own, those of used up memory or files, and of a
+        package that is missing or broken.
     """
     try:
         yield
-    except InertialError:
+    except (InertialError, ImportError):
         raise
     except Exception as error:
         if exhausted(error) is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
@@ -28,6 +29,8 @@ _SPECTRAL = 0.05
 #: strong they are around, so that faint texture counts as strong edges do. Below the least (per px), there is none.
 _FEATURES, _FEATURE_SIGMA_PX, _AROUND_PX, _LEAST_GRADIENT = 0.04, 1.2, 17, 4e-3
 _KEEP_EVERY, _TELL_EVERY = 500, 100
+#: Threads that read batches ahead.
+_READERS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,13 +175,12 @@ def _batches(pool: Pool, options: TrainOptions, first: int) -> Iterator[tuple[in
         samples = pool.batch(order[options.batch * place : options.batch * (place + 1)])
         return turned(samples, np.random.default_rng([options.seed, turn, place]))
 
-    with ThreadPoolExecutor(1) as reader:
-        ahead = reader.submit(read, first) if first < options.steps else None
+    with ThreadPoolExecutor(_READERS) as readers:
+        ahead = deque(readers.submit(read, step) for step in range(first, min(first + _READERS, options.steps)))
         for step in range(first, options.steps):
-            assert ahead is not None
-            samples = ahead.result()
-            if step + 1 < options.steps:
-                ahead = reader.submit(read, step + 1)
+            samples = ahead.popleft().result()
+            if step + _READERS < options.steps:
+                ahead.append(readers.submit(read, step + _READERS))
             yield step, samples
 
 
@@ -198,10 +200,10 @@ def turned(samples: Samples, rng: np.random.Generator) -> Samples:
     if transpose:
         blur[..., 3:] = blur[..., :2:-1]
     return Samples(
-        picture=moved(samples.picture)[..., colours],
-        aid=moved(samples.aid)[..., colours],
-        truth=moved(samples.truth)[..., colours],
-        blur=blur,
+        picture=np.ascontiguousarray(moved(samples.picture)[..., colours]),
+        aid=np.ascontiguousarray(moved(samples.aid)[..., colours]),
+        truth=np.ascontiguousarray(moved(samples.truth)[..., colours]),
+        blur=np.ascontiguousarray(blur),
     )
 
 
@@ -209,7 +211,7 @@ def _tensors(samples: Samples, device: str) -> tuple[Tensor, Tensor, Tensor, Ten
     """(B, 3, H, W) float32, codes 0 to 1."""
 
     def tensor(array: Any, scale: float) -> Tensor:
-        there = torch.from_numpy(np.ascontiguousarray(array)).to(device)
+        there = torch.from_numpy(array).to(device)
         return (there.permute(0, 3, 1, 2).float() * scale).contiguous(memory_format=torch.channels_last)
 
     code = 1 / 255
