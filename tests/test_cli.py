@@ -1,6 +1,7 @@
 """The command as a user calls it: exit codes, messages, files."""
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -383,3 +384,26 @@ def test_validate_does_not_write_into_a_folder_of_pictures(capsys, project, tmp_
         "--tolerance", -3,
     )  # fmt: skip
     assert (code, "tolerance must be" in err) == (2, True)
+
+
+@loop_over(
+    "library, mend",
+    [("libSM.so.6", "on Debian: apt install libsm6"), ("libcudart.so.12", "pip install --force-reinstall pycolmap")],
+)
+def test_a_pycolmap_that_lacks_a_library_is_one_sentence(tmp_path, library, mend):
+    """What pycolmap-cuda12 4.2.1 raises on a machine without the libraries of X or of CUDA."""
+    broken = tmp_path / "pycolmap" / "__init__.py"
+    broken.parent.mkdir(exist_ok=True)
+    broken.write_text(
+        "why = ImportError('" + library + ": cannot open shared object file: No such file or directory',\n"
+        "    name='_core', path=__file__)\n"
+        "raise RuntimeError('Cannot import the C++ backend') from why\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-m", "colmap_inertial", "diagnose", tmp_path],
+        env=os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"},
+        capture_output=True,
+        text=True,
+    )
+    said = f"error: pycolmap cannot be loaded ({library}: cannot open shared object file: No such file or directory); "
+    assert (done.returncode, done.stderr.splitlines()) == (2, [said + mend])

@@ -18,7 +18,7 @@ import numpy as np
 
 from colmap_inertial.colmap.depth_maps import Maker, map_file
 from colmap_inertial.core.arrays import Array, Float32Array
-from colmap_inertial.core.errors import InertialError, MissingExtraError, OutputError
+from colmap_inertial.core.errors import InertialError, MissingExtraError, OutputError, advise_library
 from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.io.files import path_in
 from colmap_inertial.io.images import read_image
@@ -27,17 +27,6 @@ from colmap_inertial.model.artefacts import read_map
 
 if TYPE_CHECKING:
     import pycolmap
-
-
-#: Libraries that open3d takes from the system, and their packages on Debian.
-_SYSTEM_LIBRARIES = {
-    "libusb-1.0": "libusb-1.0-0",
-    "libGL.so": "libgl1",
-    "libEGL.so": "libegl1",
-    "libgomp.so": "libgomp1",
-    "libX11.so": "libx11-6",
-    "libudev.so": "libudev1",
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,9 +81,7 @@ def _missing_error() -> MissingExtraError:
 
 
 def _unloadable_error(why: str) -> InertialError:
-    package = next((package for library, package in _SYSTEM_LIBRARIES.items() if library in why), None)
-    # its wheel brings all others
-    mend = "pip install --force-reinstall open3d" if package is None else f"on Debian: apt install {package}"
+    mend = advise_library(why, "open3d")
     return InertialError(f"open3d cannot be loaded ({why}); {mend}, or take --dense-options.mesh poisson")
 
 

@@ -10,6 +10,19 @@ import errno
 from pathlib import Path
 from typing import ClassVar
 
+#: Libraries that open3d and pycolmap-cuda12 take from the system, and their packages on Debian.
+_SYSTEM_LIBRARIES = {
+    "libusb-1.0": "libusb-1.0-0",
+    "libGL.so": "libgl1",
+    "libEGL.so": "libegl1",
+    "libgomp.so": "libgomp1",
+    "libX11.so": "libx11-6",
+    "libudev.so": "libudev1",
+    "libSM.so": "libsm6",
+    "libICE.so": "libice6",
+    "libXext.so": "libxext6",
+}
+
 
 class InertialError(Exception):
     """Base class of all errors that the command line shows as one line."""
@@ -140,5 +153,25 @@ def exhausted(error: BaseException | None) -> str | None:
             return "the memory is used up: close other programs, or allow smaller pictures or fewer processes"
         if number in (errno.EMFILE, errno.ENFILE):
             return "too many files are open at a time: raise the limit (ulimit -n) and start again"
+        error = error.__cause__ or error.__context__
+    return None
+
+
+def advise_library(why: str, distribution: str) -> str:
+    """How to mend that a package (by its name for pip) cannot be loaded, by what the loader said of a library."""
+    package = next((package for library, package in _SYSTEM_LIBRARIES.items() if library in why), None)
+    # other libraries come with the package, or with those that it needs
+    return f"pip install --force-reinstall {distribution}" if package is None else f"on Debian: apt install {package}"
+
+
+def describe_unloadable(error: BaseException | None) -> str | None:
+    """A sentence for an exception that a library that cannot be loaded has led to; ``None`` for any other."""
+    from importlib.metadata import packages_distributions
+
+    while error is not None:
+        if isinstance(error, ImportError) and error.path and "cannot open shared object file" in str(error):
+            module = Path(error.path).parent.name
+            distribution = packages_distributions().get(module, [module])[0]
+            return f"{module} cannot be loaded ({error}); {advise_library(str(error), distribution)}"
         error = error.__cause__ or error.__context__
     return None
