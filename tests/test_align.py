@@ -139,7 +139,7 @@ def test_gyro_path_knows_how_a_bias_turns_an_interval():
         return quat_multiply(quat_conjugate(q[0]), q[1])
 
     actual = quat_log(quat_multiply(quat_conjugate(turn(base)), turn(moved)))
-    lever = base.bias_lever(ends)
+    lever = base.at_with_levers(ends)[2]
     predicted = -matrix_from_quat(quat_conjugate(base.at(ends)[0][1])) @ (lever[1] - lever[0]) @ change
     assert np.allclose(actual, predicted, rtol=1e-3, atol=1e-10)
 

@@ -79,12 +79,16 @@ def test_every_instruction_set_eliminates_and_substitutes_alike(instruction_set,
     border = (system.border * unit[:, :, None]).reshape(k * m, n)
     scaled = (rhs * unit[:, :, None]).reshape(k * m, q)
 
-    products = np.empty((n, n + q))
-    factor = _inertial.eliminate(
-        system.diagonal, system.below, system.border, rhs, unit, products, instruction_set=instruction_set
-    )
+    products, forward = np.empty((n, n + q)), np.empty((k, m, -(-(n + q) // 8) * 8))
+    parts = system.diagonal, system.below, system.border, rhs, unit, products
+    factor = _inertial.eliminate(*parts, forward=forward, instruction_set=instruction_set)
     assert factor is not None
-    assert close(products, border.T @ np.linalg.solve(dense, np.hstack([border, scaled])))
+    solved = np.linalg.solve(dense, np.hstack([border, scaled]))
+    assert close(products, border.T @ solved)
+    factor.substitute(forward, half_done=True)
+    assert close(forward.reshape(k * m, -1)[:, : n + q], solved)
+    with pytest.raises(ValueError, match="padded"):
+        _inertial.eliminate(*parts, forward=np.empty((k, m, n)))
     sides = rhs * unit[:, :, None]
     factor.substitute(sides)
     assert close(sides.reshape(k * m, q), np.linalg.solve(dense, scaled))

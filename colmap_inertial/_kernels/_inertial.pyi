@@ -5,8 +5,11 @@ from colmap_inertial.core.arrays import Array, Int64Array
 class ArrowFactor:
     """Cholesky factor of a chain of states, its rows and columns scaled by `unit`."""
 
-    def substitute(self, sides: Array) -> None:
-        """Solve for `sides` (K, m, q) in place; the matrix is the one with its rows and columns scaled by `unit`."""
+    def substitute(self, sides: Array, *, half_done: bool = False) -> None:
+        """Solve for `sides` (K, m, q) in place; the matrix is the one with its rows and columns scaled by `unit`.
+
+        `half_done`: they are what `eliminate` left in `forward`. Where q is a multiple of 8, nothing is copied.
+        """
 
     def selected_inverse(self, diagonal: Array, right: Array) -> None:
         """The inverse's blocks on the diagonal (K, m, m) and to the right of it (K - 1, m, m), scaled likewise."""
@@ -19,11 +22,13 @@ def eliminate(
     unit: Array,
     products: Array,
     *,
+    forward: Array | None = None,
     instruction_set: str = "",
 ) -> ArrowFactor | None:
     """Factor H = L L' of a chain with `unit`'s scaling; None where it is not positive definite.
 
-    `products` (n, n + q) becomes the product of L^-1 border (transposed) with L^-1 [border, rhs].
+    `products` (n, n + q) becomes the product of L^-1 border (transposed) with L^-1 [border, rhs], and `forward`
+    (K, m, n + q; the last rounded up to a multiple of 8) the latter.
     """
 
 def add_information(

@@ -152,7 +152,7 @@ void fill_panel(const Chain &chain, ptrdiff_t k, double *panel) {
     }
 }
 
-bool eliminate(const Chain &chain, const Factor &factor, double *products, double *panels) {
+bool eliminate(const Chain &chain, const Factor &factor, double *products, double *forward, double *panels) {
     const ptrdiff_t m = chain.size, n = chain.globals, pitch = padded(m), row = panel_row(chain);
     const ptrdiff_t width = padded(n + chain.sides), panel_size = m * row;
     ptrdiff_t waiting = 0;  // panels 1.. whose products are not added yet; panel 0 is of the state before them
@@ -173,6 +173,8 @@ bool eliminate(const Chain &chain, const Factor &factor, double *products, doubl
         solve_forward(upper, pitch, panel, row, m, row);
         for (ptrdiff_t i = 0; i < m; ++i)
             memcpy(factor.right + (k * m + i) * pitch, panel + i * row + width, size_t(pitch) * sizeof(double));
+        for (ptrdiff_t i = 0; forward && i < m; ++i)
+            memcpy(forward + (k * m + i) * width, panel + i * row, size_t(width) * sizeof(double));
         if (++waiting == STATES_AT_ONCE || k + 1 == chain.states) {
             const double *first = panels + panel_size;
             for (ptrdiff_t i = 0; i < n; i += ROWS) {
@@ -187,9 +189,9 @@ bool eliminate(const Chain &chain, const Factor &factor, double *products, doubl
     return true;
 }
 
-void substitute(const Chain &chain, const Factor &factor, double *x) {
+void substitute(const Chain &chain, const Factor &factor, double *x, bool half_done) {
     const ptrdiff_t m = chain.size, pitch = padded(m), columns = padded(chain.sides), block = m * pitch;
-    for (ptrdiff_t k = 0; k < chain.states; ++k) {
+    for (ptrdiff_t k = 0; k < chain.states && !half_done; ++k) {
         double *here = x + k * m * columns;
         if (k > 0)
             subtract_product(here, columns, Matrix{factor.right + (k - 1) * block, 1, pitch}, here - m * columns,

@@ -43,10 +43,10 @@ struct ArrowSimd {
     size_t (*work)(const Chain &chain);
     // Factors the chain and subtracts the products of U'^-1 border with U'^-1 [border, rhs] from `products`
     // (n, padded(n + q)), of whose first n columns only the upper triangle is right. False where a pivot is not
-    // positive.
-    bool (*eliminate)(const Chain &chain, const Factor &factor, double *products, double *work);
-    // Solves U' U x = b in place: (K, m, padded(q)).
-    void (*substitute)(const Chain &chain, const Factor &factor, double *x);
+    // positive. Writes U'^-1 [border, rhs] (K, m, padded(n + q)) to `forward` where that is not null.
+    bool (*eliminate)(const Chain &chain, const Factor &factor, double *products, double *forward, double *work);
+    // Solves U' U x = b in place: (K, m, padded(q)), on any boundary; U x = b where it is half done.
+    void (*substitute)(const Chain &chain, const Factor &factor, double *x, bool half_done);
     // Doubles of memory, aligned to 64 bytes, that selected_inverse needs.
     size_t (*inverse_work)(const Chain &chain);
     // The blocks of the inverse of U' U where the chain has blocks: on the diagonal (K, m, m), to the right of it

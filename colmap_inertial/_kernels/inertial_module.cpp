@@ -48,17 +48,18 @@ class ArrowFactor {
 
     Factor factor() const { return {diagonal_.get(), right_.get()}; }
 
-    void substitute(Results<3> sides) const {
+    void substitute(Results<3> sides, bool half_done) const {
         check(is(sides, chain_.states, chain_.size, sides.shape(2)), "sides: not one row for each number of a state");
         Chain chain = chain_;
         chain.sides = ptrdiff_t(sides.shape(2));
         const ptrdiff_t rows = chain.states * chain.size, q = chain.sides, pitch = padded(q);
         double *values = sides.data();
         nb::gil_scoped_release release;
+        if (pitch == q) return simd_.substitute(chain, factor(), values, half_done);
         const Memory x = memory_for(size_t(rows * pitch));
         for (ptrdiff_t i = 0; i < rows; ++i)
             for (ptrdiff_t j = 0; j < pitch; ++j) x.get()[i * pitch + j] = j < q ? values[i * q + j] : 0;
-        simd_.substitute(chain, factor(), x.get());
+        simd_.substitute(chain, factor(), x.get(), half_done);
         for (ptrdiff_t i = 0; i < rows; ++i)
             for (ptrdiff_t j = 0; j < q; ++j) values[i * q + j] = x.get()[i * pitch + j];
     }
@@ -79,12 +80,12 @@ class ArrowFactor {
 };
 
 // Null where the chain is not positive definite.
-std::unique_ptr<ArrowFactor> eliminate(const Chain &chain, const ArrowSimd &simd, double *products) {
+std::unique_ptr<ArrowFactor> eliminate(const Chain &chain, const ArrowSimd &simd, double *products, double *forward) {
     auto result = std::make_unique<ArrowFactor>(chain, simd);
     const ptrdiff_t n = chain.globals, columns = n + chain.sides, pitch = padded(columns);
     const Memory work = memory_for(simd.work(chain));
     std::vector<double> negative(size_t(n * pitch), 0.0);
-    if (!simd.eliminate(chain, result->factor(), negative.data(), work.get())) return nullptr;
+    if (!simd.eliminate(chain, result->factor(), negative.data(), forward, work.get())) return nullptr;
     for (ptrdiff_t i = 0; i < n; ++i)
         for (ptrdiff_t j = 0; j < columns; ++j)
             products[i * columns + j] = -negative[size_t(j < i ? j * pitch + i : i * pitch + j)];
@@ -92,18 +93,20 @@ std::unique_ptr<ArrowFactor> eliminate(const Chain &chain, const ArrowSimd &simd
 }
 
 ArrowFactor *eliminate_chain(Doubles<3> diagonal, Doubles<3> below, Doubles<3> border, Doubles<3> rhs, Doubles<2> unit,
-                             Results<2> products, const std::string &instruction_set) {
+                             Results<2> products, std::optional<Results<3>> forward,
+                             const std::string &instruction_set) {
     const size_t k = border.shape(0), m = border.shape(1), n = border.shape(2), q = rhs.shape(2);
     check(k > 0 && m > 0, "border: empty");
     check(is(diagonal, k, m, m) && is(below, k - 1, m, m) && is(rhs, k, m, q) && is(unit, k, m),
           "diagonal, below, rhs, unit: not of the size of border");
     check(is(products, n, n + q), "products: not (n, n + q)");
+    check(!forward || is(*forward, k, m, padded(n + q)), "forward: not (K, m, n + q), padded");
     const ArrowSimd &simd = SIMD_TABLES.require(instruction_set);
     const Chain chain{ptrdiff_t(k), ptrdiff_t(m), ptrdiff_t(n), ptrdiff_t(q), diagonal.data(), below.data(),
                       border.data(), rhs.data(), unit.data()};
-    double *values = products.data();
+    double *values = products.data(), *solved = forward ? forward->data() : nullptr;
     nb::gil_scoped_release release;
-    return eliminate(chain, simd, values).release();
+    return eliminate(chain, simd, values, solved).release();
 }
 
 void add_information(Doubles<3> here, std::optional<Doubles<3>> after, std::optional<Doubles<3>> by_globals,
@@ -276,12 +279,13 @@ bool reduce_points_of(In<int64_t, 1> first, In<int64_t, 1> place, Doubles<3> by_
 
 NB_MODULE(_inertial, module) {
     nb::class_<ArrowFactor>(module, "ArrowFactor")
-        .def("substitute", &ArrowFactor::substitute, nb::arg("sides").noconvert())
+        .def("substitute", &ArrowFactor::substitute, nb::arg("sides").noconvert(), nb::kw_only(),
+             nb::arg("half_done") = false)
         .def("selected_inverse", &ArrowFactor::selected_inverse, nb::arg("diagonal").noconvert(),
              nb::arg("right").noconvert());
     module.def("eliminate", &eliminate_chain, nb::rv_policy::take_ownership, nb::arg("diagonal"), nb::arg("below"),
                nb::arg("border"), nb::arg("rhs"), nb::arg("unit"), nb::arg("products").noconvert(), nb::kw_only(),
-               nb::arg("instruction_set") = "");
+               nb::arg("forward").noconvert().none() = nb::none(), nb::arg("instruction_set") = "");
     module.def("add_information", &add_information, nb::arg("here"), nb::arg("after").none(),
                nb::arg("by_globals").none(), nb::kw_only(), nb::arg("first"), nb::arg("column"),
                nb::arg("diagonal").noconvert(), nb::arg("below").noconvert(), nb::arg("border").noconvert(),

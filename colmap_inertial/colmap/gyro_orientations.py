@@ -121,12 +121,13 @@ class GyroOrientations:
         gaps = np.concatenate([[0], np.cumsum(is_gap(path.t_s))])
         place = np.clip(np.searchsorted(path.t_s, on_gyro_s, side="right") - 1, 0, len(path.t_s) - 2)
         in_gap = gaps[place] != gaps[place + 1]
+        _, _, bias_lever_s, gain_lever_rad = path.at_with_levers(on_gyro_s)
         return cls(
             t_s=t_s,
             start_from_cam=motion.start_from_cam(t_s),
             part=np.where(inside & ~in_gap, gaps[place], -1),
-            bias_lever_s=path.bias_lever(on_gyro_s),
-            gain_lever_rad=path.gain_lever(on_gyro_s),
+            bias_lever_s=bias_lever_s,
+            gain_lever_rad=gain_lever_rad,
             rate_rad_s=np.linalg.norm(motion.rate_in_cam_rad_s(t_s), axis=1),
             calibration=calibration,
             density_rad_s_rthz=(imu.noise or TYPICAL_NOISE).gyro_density_rad_s_rthz,
@@ -223,7 +224,7 @@ def estimate_gyro_orientations(
     motion = GyroCamera.from_timed(CameraTimedImu.from_recording(recording.imu, aligned, timing.epoch_ns))
     t_s = timing.pose_t_s()
     covered = motion.covers(t_s[pairs.first], t_s[pairs.second])
-    lever = motion.path.bias_lever(t_s - motion.offset_s)
+    lever = motion.path.at_with_levers(t_s - motion.offset_s)[2]
     change, covariance = estimate_bias_correction(pairs.only(covered), motion.start_from_cam(t_s), lever)
     cov = np.array(aligned.cov)
     cov[CAL.GYRO_BIAS] = cov[:, CAL.GYRO_BIAS] = 0
@@ -272,7 +273,7 @@ def estimate_bias_correction(pairs: RayPairs, start_from_cam: Array, bias_lever_
     pairs
         Of images close in time.
     start_from_cam, bias_lever_s
-        (N, 3, 3) orientations, and what a change of the bias turns them by (``GyroPath.bias_lever``).
+        (N, 3, 3) orientations, and what a change of the bias turns them by (``GyroPath.at_with_levers``).
 
     Raises
     ------

@@ -30,11 +30,20 @@ def skew(v: Array) -> Array:
     return out
 
 
+def _norm(v: Array) -> Array:
+    """Lengths along the last axis, which stays with length one: ``np.linalg.norm`` is slow along a short axis."""
+    squares = v * v
+    total = squares[..., :1]
+    for i in range(1, v.shape[-1]):
+        total = total + squares[..., i : i + 1]
+    return np.asarray(np.sqrt(total))
+
+
 def quat_normalize(q: Array) -> Array:
     """Unit quaternions with non-negative scalar part, xyzw. Shape (..., 4)."""
     q = np.asarray(q, dtype=np.float64)
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    return np.where(q[..., 3:] < 0, -q, q)
+    norm = _norm(q)
+    return np.asarray(q / np.where(q[..., 3:] < 0, -norm, norm))
 
 
 def quat_multiply(a: Array, b: Array) -> Array:
@@ -97,7 +106,7 @@ def quat_from_matrix(rotation: Array) -> Array:
 def quat_exp(rotation_vector: Array) -> Array:
     """Unit quaternions xyzw of rotation vectors (rad). Shape (..., 3) -> (..., 4)."""
     v = np.asarray(rotation_vector, dtype=np.float64)
-    angle = np.linalg.norm(v, axis=-1, keepdims=True)
+    angle = _norm(v)
     # np.sinc(x) = sin(pi x) / (pi x), finite at zero
     return np.concatenate([0.5 * np.sinc(angle / (2 * np.pi)) * v, np.cos(angle / 2)], axis=-1)
 
@@ -105,7 +114,7 @@ def quat_exp(rotation_vector: Array) -> Array:
 def quat_log(q: Array) -> Array:
     """Rotation vectors (rad, norm <= pi) of unit quaternions xyzw. Shape (..., 4) -> (..., 3)."""
     q = quat_normalize(q)
-    norm = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
+    norm = _norm(q[..., :3])
     angle = 2 * np.arctan2(norm, q[..., 3:])
     small = norm < 1e-9
     return np.where(small, 2.0, angle / np.where(small, 1.0, norm)) * q[..., :3]
@@ -160,8 +169,16 @@ def quat_cumulative(steps: Array) -> Array:
     padded[:, 3] = 1.0
     padded[:count] = out
     grid = padded.reshape(-1, block, 4)
+    factors = np.empty((block, 8, len(grid)))
+    factors[:, :4] = grid.transpose(1, 2, 0)
+    np.negative(factors[:, :4], out=factors[:, 4:])
+    # quat_multiply in few calls, with its very sums: the terms (rows) of each component (columns), a component of the
+    # left factor times one of the right or, from 4 on, of its negative; from -0.0, which keeps the sign of a zero
+    left = np.array([[3, 3, 3, 3], [0, 1, 2, 0], [1, 2, 0, 1], [2, 0, 1, 2]])
+    right = np.array([[0, 1, 2, 3], [3, 3, 3, 4], [2, 0, 1, 5], [5, 6, 4, 6]])
     for i in range(1, block):
-        grid[:, i] = quat_multiply(grid[:, i - 1], grid[:, i])
+        np.add.reduce(factors[i - 1, left] * factors[i, right], axis=0, out=factors[i, :4], initial=-0.0)
+    grid[:] = factors[:, :4].transpose(2, 0, 1)
     if len(grid) > 1:
         before = quat_cumulative(grid[:-1, -1])[1:]
         grid[1:] = quat_multiply(before[:, None], grid[1:])

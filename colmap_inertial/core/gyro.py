@@ -76,29 +76,30 @@ class GyroPath:
         of_each = float(np.median(own)) / (_NORMAL_MEDIAN * np.sqrt(math.comb(2 * _DIFFERENCES, _DIFFERENCES)))
         return float(of_each * np.sqrt(np.median(self._step_s)))
 
+    @cached_property
+    def fastest_rad_s(self) -> float:
+        """Angular speed that one reading in a thousand exceeds."""
+        return float(np.percentile(np.linalg.norm(self.rate_rad_s, axis=1), 99.9))
+
     def turn_rad(self, begin_s: Array, end_s: Array) -> Array:
         """(M, 3) rotation vectors ``begin_from_end`` of intervals, IMU frame."""
         return quat_log(quat_multiply(quat_conjugate(self.at(begin_s)[0]), self.at(end_s)[0]))
 
-    def bias_lever(self, query_s: Array) -> Array:
-        """(M, 3, 3) integrals of ``start_from_imu`` from the first sample to ``query_s``, in seconds.
+    def at_with_levers(self, query_s: Array) -> tuple[Array, Array, Array, Array]:
+        """What :meth:`at` returns, and what errors of the gyroscope turn: integrals from the first sample on.
 
-        A change ``db`` of the bias turns the interval from i to j, seen in the IMU frame at j, by
-        ``-R_j' (A_j - A_i) db`` with A these integrals.
-        """
-        i, since_s, _ = self._locate(query_s)
-        here = matrix_from_quat(self.at(query_s)[0])
-        return np.asarray(self._levers[i] + 0.5 * (self._rotation[i] + here) * since_s[:, None, None])
+        (M, 3, 3) of ``start_from_imu``, in seconds. A change ``db`` of the bias turns the interval from i to j, seen in
+        the IMU frame at j, by ``-R_j' (A_j - A_i) db`` with A these integrals.
 
-    def gain_lever(self, query_s: Array) -> Array:
-        """(M, 3, 6) integrals of ``start_from_imu S rate`` for symmetric ``S`` with a one in xx, yy, zz, yz, xz, xy.
-
-        A gain error S (the true rate is ``(I + S) rate``) turns the interval from i to j by ``R_j' (G_j - G_i) S``.
+        (M, 3, 6) of ``start_from_imu S rate`` for symmetric ``S`` with a one in xx, yy, zz, yz, xz, xy. A gain error S
+        (the true rate is ``(I + S) rate``) turns the interval by ``R_j' (G_j - G_i) S``.
         """
         i, since_s, rate = self._locate(query_s)
-        here = matrix_from_quat(self.at(query_s)[0]) @ _differentiate_symmetric(rate)
-        before = self._rotation[i] @ _differentiate_symmetric(self.rate_rad_s[i])
-        return np.asarray(self._gain_levers[i] + 0.5 * (before + here) * since_s[:, None, None])
+        attitude = quat_multiply(self.start_from_imu_xyzw[i], _turn(self.rate_rad_s[i], rate, since_s))
+        here, since_s = matrix_from_quat(attitude), since_s[:, None, None]
+        bias_lever = self._levers[i] + 0.5 * (self._rotation[i] + here) * since_s
+        by_gain = here @ _differentiate_symmetric(rate)
+        return attitude, rate, bias_lever, self._gain_levers[i] + 0.5 * (self._by_gain[i] + by_gain) * since_s
 
     @cached_property
     def _rotation(self) -> Array:
@@ -109,8 +110,12 @@ class GyroPath:
         return self._integral(self._rotation)
 
     @cached_property
+    def _by_gain(self) -> Array:
+        return np.asarray(self._rotation @ _differentiate_symmetric(self.rate_rad_s))
+
+    @cached_property
     def _gain_levers(self) -> Array:
-        return self._integral(self._rotation @ _differentiate_symmetric(self.rate_rad_s))
+        return self._integral(self._by_gain)
 
     def _integral(self, values: Array) -> Array:
         steps = 0.5 * (values[1:] + values[:-1]) * self._step_s[:, None, None]

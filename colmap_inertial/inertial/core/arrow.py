@@ -100,9 +100,9 @@ class ArrowSystem:
             When the matrix is not positive definite.
         """
         (k, m), n = self.diagonal.shape[:2], len(self.corner)
-        unit, _ = self.scaling(np.zeros((k, m, 0)))
-        products = np.empty((n, n))
-        factor = _inertial.eliminate(self.diagonal, self.below, self.border, np.zeros((k, m, 0)), unit, products)
+        no_sides, products, lines = np.zeros((k, m, 0)), np.empty((n, n)), np.empty((k, m, n + -n % 8))
+        unit, _ = self.scaling(no_sides)
+        factor = _inertial.eliminate(self.diagonal, self.below, self.border, no_sides, unit, products, forward=lines)
         if factor is None:
             raise np.linalg.LinAlgError("the normal equations are singular")
         root = self._root_of_globals(products)
@@ -110,7 +110,9 @@ class ArrowSystem:
         factor.selected_inverse(here, beside)
         here *= unit[:, :, None] * unit[:, None, :]
         beside *= unit[:-1, :, None] * unit[1:, None, :]
-        followed = _solve_chain(factor, unit, self.border)
+        factor.substitute(lines, half_done=True)  # in whole vectors, which it need not copy
+        followed = lines[:, :, :n]
+        followed *= unit[:, :, None]
         return Inverse(unit=unit, factor=factor, here=here, beside=beside, followed=followed, root=root)
 
     def scaling(self, rhs_states: Array) -> tuple[Array, Array]:

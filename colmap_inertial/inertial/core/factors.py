@@ -236,7 +236,7 @@ def imu_group(noise: ImuNoise, x: InertialStates, pre: Preintegrated, *, rotatio
     after[:, 3:6, par.VELOCITY] = body_from_world
     after[:, 6:9, par.POSITION] = body_from_world
 
-    z = np.zeros((k, 9, par.N_GLOBALS))
+    z = np.zeros((k, 9, par.IMU_GLOBALS.stop))
     z[:, 3:6, par.GRAVITY] = -body_from_world * dt[:, :, None]
     z[:, 6:9, par.GRAVITY] = -0.5 * body_from_world * dt[:, :, None] ** 2
     z[:, :, par.ACCEL_BIAS] = -pre.by_accel_bias

@@ -16,6 +16,7 @@ are integrals over ``G``, so that nothing has to be propagated step by step.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -113,6 +114,12 @@ class SensorStreams:
     def from_camera(cls, timed: CameraTimedImu) -> SensorStreams:
         """The streams of a recording over camera time."""
         return cls.from_recording(timed.imu, timed.gyro_t_s, timed.accel_t_s)
+
+    @cached_property
+    def step_s(self) -> float:
+        """Length of the steps of an integration, at most."""
+        spacing = min(float(np.median(np.diff(stream.t_s))) for stream in (self.gyro, self.accel))
+        return float(np.clip(spacing, _SHORTEST_STEP_S, _LONGEST_STEP_S))
 
     def gap_s(self, t_s: Array, accel_delay_s: float = 0.0) -> tuple[Array, Array]:
         """(K,) seconds of gaps of gyroscope and accelerometer between K + 1 times; the delay is the accelerometer's."""
@@ -231,9 +238,7 @@ def preintegrate(nodes_s: Array, streams: SensorStreams, errors: SensorErrors) -
 
 def integration_steps(nodes_s: Array, streams: SensorStreams) -> Int64Array:
     """Number of integration steps of each interval."""
-    spacing = min(float(np.median(np.diff(stream.t_s))) for stream in (streams.gyro, streams.accel))
-    step_s = float(np.clip(spacing, _SHORTEST_STEP_S, _LONGEST_STEP_S))
-    return np.maximum(np.ceil(np.diff(nodes_s) / step_s).astype(np.int64), 2)
+    return np.maximum(np.ceil(np.diff(nodes_s) / streams.step_s).astype(np.int64), 2)
 
 
 def accel_noise_cov(dt: Array) -> Array:

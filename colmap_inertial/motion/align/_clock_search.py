@@ -163,12 +163,12 @@ def search_offsets(
     dense = intervals.dt_s <= DENSE_S
     if share == 1 and dense.any() and intervals.dt_s[dense].sum() > 0.5 * intervals.dt_s.sum():
         intervals, step_s = intervals.select(dense), _GRID_S
-        offset_s, gain, per_second = _correlate(intervals, path, min_overlap, rotation)
+        offset_s, gain, per_second = _correlate(intervals, path, offsets_s, min_overlap, rotation)
     else:
         step_s = _SCAN_S
         offset_s, gain, per_second = _scan(intervals, path, offsets_s, min_overlap, rotation, share)
-    inside = (offset_s >= offsets_s[0] - step_s) & (offset_s <= offsets_s[1] + step_s) & np.isfinite(gain)
-    offset_s, gain = offset_s[inside], gain[inside]
+    known = np.isfinite(gain)
+    offset_s, gain = offset_s[known], gain[known]
     compared = intervals.select(_evenly(len(intervals), _COMPARED_INTERVALS))
     fits = []
     for peak in _peaks(offset_s, gain):
@@ -193,7 +193,7 @@ def _evenly(count: int, wanted: int) -> IndexArray:
 
 def _remove_jumps(intervals: Intervals, path: GyroPath) -> Intervals:
     """Rotations faster than the gyroscope ever turned are jumps of the poses: shorten them to what it did."""
-    fastest = 1.2 * np.percentile(np.linalg.norm(path.rate_rad_s, axis=1), 99.9)
+    fastest = 1.2 * path.fastest_rad_s
     angle = np.linalg.norm(intervals.turn_rad, axis=1)
     shrink = np.minimum(1.0, fastest * intervals.dt_s / np.maximum(angle, 1e-12))
     turn = intervals.turn_rad * shrink[:, None]
@@ -216,9 +216,13 @@ def _gain(energy: Array, left: Array, effective: Array) -> Array:
 
 
 def _correlate(
-    intervals: Intervals, path: GyroPath, min_overlap: float, rotation: Array | None
+    intervals: Intervals,
+    path: GyroPath,
+    offsets_s: tuple[float, float],
+    min_overlap: float,
+    rotation: Array | None,
 ) -> tuple[Array, Array, float]:
-    """Gain at all offsets on a grid, for dense frames, by FFT of the angular velocities with their gaps masked."""
+    """Gain at a range of offsets, for dense frames, by FFT of the angular velocities with their gaps masked."""
     swept = 0.5 * (path.rate_rad_s[1:] + path.rate_rad_s[:-1]) * np.diff(path.t_s)[:, None]
     visual, visual_ok, begin_s = _resample_on_grid(intervals.begin_s, intervals.end_s, intervals.turn_rad)
     inertial, inertial_ok, imu_begin_s = _resample_on_grid(path.t_s[:-1], path.t_s[1:], swept)
@@ -233,24 +237,26 @@ def _correlate(
     v, g = spectrum(visual), spectrum(inertial)
     v_ok, g_ok = spectrum(visual_ok.astype(float))[:, None], spectrum(inertial_ok.astype(float))[:, None]
     cells = np.maximum(np.round(correlate(v_ok, g_ok)), 0.0)
-    sum_v, sum_g = correlate(v, g_ok), correlate(v_ok, g)
-    energy_v = correlate(spectrum(np.sum(visual**2, axis=1))[:, None], g_ok)
-    energy_g = correlate(v_ok, spectrum(np.sum(inertial**2, axis=1))[:, None])
-    cross = np.stack([correlate(v[:, [i]], g) for i in range(3)], axis=1)
-    count = np.maximum(cells, 1.0)
-    energy_v = energy_v[:, 0] - np.sum(sum_v**2, axis=1) / count[:, 0]
-    energy_g = energy_g[:, 0] - np.sum(sum_g**2, axis=1) / count[:, 0]
-    cross -= sum_v[:, :, None] * sum_g[:, None, :] / count[:, :, None]
-    left = energy_v + energy_g - 2 * _agreement(cross, rotation)
-
-    per_second = 3 / (_GRID_S * _redundancy(visual[visual_ok], inertial[inertial_ok]))
-    gain = _gain(energy_v, left, per_second * _GRID_S * cells[:, 0])
-    gain[cells[:, 0] < max(1.0, min_overlap * min(visual_ok.sum(), inertial_ok.sum()))] = np.nan
     lag = np.arange(size)
     lag[lag >= len(inertial)] -= size
-    order = np.argsort(-lag)
     offset_s = np.asarray(begin_s - imu_begin_s - lag * _GRID_S, dtype=np.float64)
-    return offset_s[order], gain[order], per_second
+    enough = cells[:, 0] >= max(1.0, min_overlap * min(visual_ok.sum(), inertial_ok.sum()))
+    kept = np.argsort(-lag)
+    kept = kept[(enough & _allowed(offset_s, offsets_s, _GRID_S))[kept]]
+    count, sum_v, sum_g = cells[kept], correlate(v, g_ok)[kept], correlate(v_ok, g)[kept]
+    energy_v = correlate(spectrum(np.sum(visual**2, axis=1))[:, None], g_ok)[kept, 0]
+    energy_g = correlate(v_ok, spectrum(np.sum(inertial**2, axis=1))[:, None])[kept, 0]
+    cross = np.stack([correlate(v[:, [i]], g)[kept] for i in range(3)], axis=1)
+    energy_v -= np.sum(sum_v**2, axis=1) / count[:, 0]
+    energy_g -= np.sum(sum_g**2, axis=1) / count[:, 0]
+    cross -= sum_v[:, :, None] * sum_g[:, None, :] / count[:, :, None]
+    left = energy_v + energy_g - 2 * _agreement(cross, rotation)
+    per_second = 3 / (_GRID_S * _redundancy(visual[visual_ok], inertial[inertial_ok]))
+    return offset_s[kept], _gain(energy_v, left, per_second * _GRID_S * count[:, 0]), per_second
+
+
+def _allowed(offset_s: Array, offsets_s: tuple[float, float], step_s: float) -> BoolArray:
+    return (offset_s >= offsets_s[0] - step_s) & (offset_s <= offsets_s[1] + step_s)
 
 
 def _fft_length(at_least: int) -> int:
@@ -313,7 +319,7 @@ def _scan(
     offset_s = begin_s - grid[0] - lag * _SCAN_S
     needed_s = min_overlap * min(float(end_s - begin_s), float(path.t_s[-1] - path.t_s[0])) * some.dt_s.sum()
     needed_s /= float(end_s - begin_s)
-    allowed = (offset_s >= offsets_s[0] - _SCAN_S) & (offset_s <= offsets_s[1] + _SCAN_S)
+    allowed = _allowed(offset_s, offsets_s, _SCAN_S)
     offset_s, lag = offset_s[allowed], lag[allowed]
     effective = _effective_intervals(some)
     gain = np.full(len(lag), np.nan)
@@ -433,7 +439,7 @@ def _closest(
     attitude = path.at((instants_s - offset_s[:, None]).ravel())[0].reshape(len(offset_s), -1, 4)
     first, last = attitude[:, place[: len(intervals)]], attitude[:, place[len(intervals) :]]
     inertial = quat_log(quat_multiply(quat_conjugate(first), last))
-    mask = np.stack([path.covers(intervals.begin_s - offset, intervals.end_s - offset) for offset in offset_s])
+    mask = path.covers(intervals.begin_s - offset_s[:, None], intervals.end_s - offset_s[:, None])
     energy, left, (cross, rate_v, rate_g) = _fit(intervals, inertial, mask, rotation, share)
     covered = np.sum(mask * intervals.dt_s, axis=1) / intervals.dt_s.sum()
     gain = _gain(energy, left, effective * share * covered)

@@ -232,10 +232,10 @@ def _residuals(
     since_s = trajectory.t_s - middle_s
     t_s = trajectory.t_s - state.offset_s - state.nuisance[_RATE] * since_s
     covered = path.covers(t_s[:-1], t_s[1:])
-    attitude, rate = path.at(t_s)
+    attitude, rate, bias_lever, gain_lever = path.at_with_levers(t_s)
     to_end = matrix_from_quat(quat_conjugate(attitude[1:]))
-    by_bias = -to_end @ np.diff(path.bias_lever(t_s), axis=0)
-    by_gain = to_end @ np.diff(path.gain_lever(t_s), axis=0)
+    by_bias = -to_end @ np.diff(bias_lever, axis=0)
+    by_gain = to_end @ np.diff(gain_lever, axis=0)
     turn = quat_multiply(quat_conjugate(attitude[:-1]), attitude[1:])
     change = by_bias @ bias_change + by_gain @ state.nuisance[_GAIN]
     turn = quat_multiply(turn, quat_exp(change))
