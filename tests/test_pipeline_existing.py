@@ -86,6 +86,7 @@ def test_a_project_with_a_csv_becomes_metric_whole(box, tmp_path, capsys):
     assert "120" in shown
     assert model["sparse"] == str(box.root / "sparse" / "0")
     assert not (out / "colmap").exists()
+    assert "poses" in json.loads((out / "diagnosis.json").read_text())["checked"]
     # the metric model, the same as apply makes it, and what carries no length
     apply_to_project(box.root, tmp_path / "applied", read_similarity(out / "sparse" / "0" / "transform.json"))
     metric, whole = (read_model(folder / "sparse" / "0") for folder in (out, tmp_path / "applied"))
@@ -112,18 +113,13 @@ def test_a_project_with_a_csv_becomes_metric_whole(box, tmp_path, capsys):
 
 
 def test_a_project_is_checked_beforehand_and_force_goes_on(box, tmp_path, capsys):
-    out = tmp_path / "out"
-    flags = ["--imu", box.imu, "--frame-times", box.frame_times, *UNREFINED]
-    code, _, err = run(capsys, "reconstruct", box.root, out, *flags)
-    assert code == 0, err
-    assert "poses" in json.loads((out / "diagnosis.json").read_text())["checked"]
     # a gyroscope of which one axis was mirrored
     mirrored = tmp_path / "imu"
     shutil.copytree(box.imu, mirrored)
     table = mirrored / "gyroscope.txt"
     rows = [line.split() for line in table.read_text().splitlines()]
     table.write_text("".join(f"{t} {x} {y} {-float(z)}\n" for t, x, y, z in rows))
-    flags[1] = mirrored
+    flags = ["--imu", mirrored, "--frame-times", box.frame_times, *UNREFINED]
     code, _, err = run(capsys, "reconstruct", box.root, tmp_path / "stopped", *flags)
     assert code == 3 and "--force" in err
     assert not (tmp_path / "stopped" / "result.json").exists()
@@ -427,12 +423,12 @@ def test_an_interrupted_run_continues(box, tmp_path):
 
     out = tmp_path / "out"
     with pytest.raises(Stopped):
-        reconstruct_project(box.root, out, source, progress=stop)
+        reconstruct_project(box.root, out, source, NOT_REFINED, progress=stop)
     assert not (out / "result.json").exists()
     assert not (out / "transform.json").exists() and not (out / "images").exists()
-    first = reconstruct_project(box.root, out, source)
+    first = reconstruct_project(box.root, out, source, NOT_REFINED)
     assert "times: finished in an earlier run, kept" in (out / "log.txt").read_text()
-    whole = reconstruct_project(box.root, tmp_path / "whole", source)
+    whole = reconstruct_project(box.root, tmp_path / "whole", source, NOT_REFINED)
     assert first.models[0].scale.metres_per_unit == whole.models[0].scale.metres_per_unit
     assert contents(out / "sparse") == contents(tmp_path / "whole" / "sparse")
     assert not list(out.rglob("*partial*"))
