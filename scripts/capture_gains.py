@@ -7,6 +7,7 @@ in the gain (nine entries), the tilt of gravity and a bias for every ten seconds
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -56,6 +57,7 @@ def _equations(motion: Motion, rig: tuple[Array, Array]) -> tuple[Array, Array]:
     return np.concatenate(rows), np.concatenate(right)
 
 
+@cache
 def fitted_gain(folder: Path, name: str) -> Array:
     """(3, 3) errors of gain and alignment of a recording's accelerometer against its motion capture."""
     rows, right = _equations(read(folder, name, whole=True), RECORDINGS[name][0])
