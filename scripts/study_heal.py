@@ -27,7 +27,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from batch_captures import TINY, tiny_capture
+from batch_captures import FRAMES, TINY, tiny_capture
 
 from colmap_inertial.cli import main as command_line
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
@@ -125,12 +125,12 @@ def commands(root: Path) -> dict[str, Command]:
     from corner_scene import CALIBRATED, CornerScene
 
     (root / "options.toml").write_text(config_as_toml(TINY))
-    for name, frames in (("hall", 16), ("yard", 15)):
+    for name, frames in (("hall", FRAMES), ("yard", FRAMES - 1)):
         tiny_capture(root / name, frames=frames)
     (root / "batch.toml").write_text("".join(f'[[capture]]\npath = "{name}"\n' for name in ("hall", "yard")))
     CornerScene.make(exposure_s=0.03, readout_s=0.0, frames=8).write(root / "dim", extra=CALIBRATED)
-    reconstruct(root / "hall", root / "first", TINY)
-    shutil.move(root / "first" / "colmap", root / "project")
+    reconstruct(root / "hall", root / "whole" / "reconstruct", TINY)
+    shutil.copytree(root / "whole" / "reconstruct" / "colmap", root / "project")
     source, options = ProjectOptions(imu=root / "hall"), ReconstructOptions(deterministic=True)
     downward = replace(options, world="y-down")
     config = ("--config", str(root / "options.toml"))

@@ -4,9 +4,9 @@ from pathlib import Path
 
 from test_pipeline import DETERMINISTIC, copy_scene
 
-#: Three seconds a capture, and a scale that is trusted.
+#: Three seconds a capture.
 TINY = DETERMINISTIC
-FRAMES = 16
+FRAMES = 12
 
 
 def tiny_capture(folder: Path, *, frames: int = FRAMES) -> Path:

@@ -540,7 +540,7 @@ def test_a_stopped_run_and_one_with_every_section_fit_the_schema_of_the_report(t
 
     capture = tiny_capture(tmp_path / "capture")
     for path in (capture / "frames").iterdir():
-        cv2.imwrite(str(path), np.full((480, 640, 3), 120, np.uint8))
+        cv2.imwrite(str(path), np.full((240, 320, 3), 120, np.uint8))
     with pytest.raises(MappingError):
         reconstruct(capture, tmp_path / "out", TINY)
     for name in ("report", "diagnosis"):

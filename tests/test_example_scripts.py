@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from batch_captures import TINY, tiny_capture
+from test_pipeline import copy_scene
 
 from colmap_inertial.model import read_model
 from colmap_inertial.pipeline.run.config import config_as_toml
@@ -30,7 +31,7 @@ def run(script: str, *args: object, code: int = 0) -> str:
 
 
 def test_a_frame_hook_of_one_s_own(config, tmp_path):
-    capture = tiny_capture(tmp_path / "capture")
+    capture = copy_scene(tmp_path / "capture", first=16, half=False)  # a scale that is trusted
     said = run("example_frame_hook.py", capture, tmp_path / "out", "--below", 1000, "--config", config)
     assert "16 of 16 frames changed" in said
     assert "trusted" in said

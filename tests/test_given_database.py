@@ -27,8 +27,8 @@ from colmap_inertial.tools.simulate.truth import read_truth, true_metres_per_uni
 FIRST = 16
 FEATURES = 500
 #: The example scene's camera, as somebody else may know it.
-OPENCV = [520.0, 520.0, 320.0, 240.0, 0.08, -0.12, 0.0005, -0.0003]
-SIMPLE = [530.0, 320.0, 240.0, 0.0]
+OPENCV = [260.0, 260.0, 160.0, 120.0, 0.08, -0.12, 0.0005, -0.0003]
+SIMPLE = [265.0, 160.0, 120.0, 0.0]
 
 
 def features_of(kind, picture):
@@ -176,8 +176,8 @@ def test_what_cannot_be_gone_on_with_is_refused_in_words(capture, names, akaze, 
     small = tmp_path / "small"
     small.mkdir()
     for name in names:
-        cv2.imwrite(str(small / name), cv2.resize(cv2.imread(str(capture / "frames" / name)), (320, 240)))
-    refused(write_database(tmp_path / "small.db", small, "sift"), "is 320x240 there and 640x480 in the capture")
+        cv2.imwrite(str(small / name), cv2.resize(cv2.imread(str(capture / "frames" / name)), (160, 120)))
+    refused(write_database(tmp_path / "small.db", small, "sift"), "is 160x120 there and 320x240 in the capture")
     refused(
         write_database(tmp_path / "unmatched.db", capture / "frames", "akaze"),
         r"holds no matches, and descriptors that pycolmap cannot match",

@@ -6,7 +6,7 @@ import sys
 import tomllib
 from pathlib import Path
 
-from batch_captures import FRAMES, TINY
+from batch_captures import TINY
 from test_pipeline import SCENE, copy_scene
 
 from colmap_inertial.pipeline.run.config import config_as_toml
@@ -43,7 +43,7 @@ print(json.dumps([usable_processors(), codes]))
 
 
 def test_commands_run_without_what_only_linux_has(project, tmp_path: Path) -> None:
-    scene = copy_scene(tmp_path / "scene", first=FRAMES)
+    scene = copy_scene(tmp_path / "scene", first=16, half=False)
     (tmp_path / "tiny.toml").write_text(config_as_toml(TINY))
     out, metric = tmp_path / "out", tmp_path / "metric"
     spec = tomllib.loads((SCENE / "capture.toml").read_text())["target"]["spec"]

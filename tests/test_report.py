@@ -785,7 +785,7 @@ def test_reconstruct_writes_it_and_a_continued_run_does_too(tmp_path):
 def test_a_run_that_stops_says_why(tmp_path):
     capture = copy_scene(tmp_path / "capture", first=4)
     for path in (capture / "frames").iterdir():
-        cv2.imwrite(str(path), np.full((480, 640, 3), 120, np.uint8))
+        cv2.imwrite(str(path), np.full((240, 320, 3), 120, np.uint8))
     with pytest.raises(MappingError) as stopped:
         reconstruct(capture, tmp_path / "out", ReconstructOptions(deblur="off", rolling_shutter="off"))
     content, page = json.loads((tmp_path / "out" / "report.json").read_text()), Page(tmp_path / "out" / "report.html")
