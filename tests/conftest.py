@@ -4,6 +4,7 @@ import gc
 import hashlib
 import logging
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -70,25 +71,33 @@ def _one_blas_thread():
         yield
 
 
-@pytest.fixture(scope="session", autouse=True)
-def _pictures_are_compared_once():
-    """Many tests reconstruct the same capture: what the check beforehand measures in its pictures is kept."""
-    from colmap_inertial.reconstruction.preparation import preflight
+def _once(measure: Callable) -> Callable:
+    """``measure`` of frames, a camera, their timing and options, which keeps what it found."""
+    measured = {}
 
-    measure, measured = preflight.measure_two_view_rotations, {}
-
-    def measure_once(frames, camera, timing):
+    def measure_once(frames, camera, timing, *options):
         frames = list(frames)
-        known = (camera.model, camera.params.tolist(), timing.pose_t_s().tolist(), timing.epoch_ns)
+        exposure_s = None if timing.exposure_s is None else timing.exposure_s.tolist()
+        told = (timing.names, timing.t_s.tolist(), exposure_s, timing.readout_s, timing.readout_direction)
+        known = (camera.model, camera.params.tolist(), told, timing.epoch_ns, options)
         seen = hashlib.sha256(repr(known).encode())
         for frame in frames:
             seen.update(f"{frame.name} {frame.image.shape}".encode() + frame.image.tobytes())
         if seen.digest() not in measured:
-            measured[seen.digest()] = measure(frames, camera, timing)
+            measured[seen.digest()] = measure(frames, camera, timing, *options)
         return measured[seen.digest()]
 
+    return measure_once
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _pictures_are_compared_once():
+    """Many tests reconstruct the same capture: what is measured in its pictures beforehand is kept."""
+    from colmap_inertial.reconstruction.preparation import preflight, sampling
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(preflight, "measure_two_view_rotations", measure_once)
+        patch.setattr(preflight, "measure_two_view_rotations", _once(preflight.measure_two_view_rotations))
+        patch.setattr(sampling, "measure_rotation", _once(sampling.measure_rotation))
         yield
 
 

@@ -2,7 +2,7 @@
 
 import copy
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -29,7 +29,10 @@ IMU_CLOCK_S = 11.0
 def _posters(seed, side):
     """What hangs on the planes, which takes seconds to print, and the generator as it is then."""
     rng = np.random.default_rng(seed)
-    return np.stack([poster(rng, side, side) for _ in PLANES]), rng
+    textures = [poster(rng, side, side) for _ in PLANES]
+    # one above the other, each with its last row again: what is between two rows of one is not of two textures
+    atlas = np.concatenate([np.concatenate([texture, texture[-1:]]) for texture in textures])
+    return textures, atlas, rng
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -37,21 +40,22 @@ class CornerScene:
     """The corner, the hand's motion and the shutter."""
 
     motion: Motion
-    textures: np.ndarray
+    textures: list[np.ndarray]
+    atlas: np.ndarray
     frames: int
     exposure_s: float
     readout_s: float
 
     @classmethod
     def make(cls, *, exposure_s, readout_s, frames=24, seed=5, vigour=1.0, side=SIDE):
-        textures, rng = _posters(seed, side)
+        textures, atlas, rng = _posters(seed, side)
         options = MotionOptions(
             kind="orbit", duration_s=frames / 3, heading_deg=-90.0, vigour=vigour, radius_m=1.6, arc_deg=40,
             sweep_s=frames / 3,
         )  # fmt: skip
         return cls(
-            motion=make_motion(options, copy.deepcopy(rng)), textures=textures, frames=frames, exposure_s=exposure_s,
-            readout_s=readout_s,
+            motion=make_motion(options, copy.deepcopy(rng)), textures=textures, atlas=atlas, frames=frames,
+            exposure_s=exposure_s, readout_s=readout_s,
         )  # fmt: skip
 
     def shutter(self, i):
@@ -74,11 +78,6 @@ class CornerScene:
         light += noise * np.random.default_rng(i).standard_normal(light.shape)
         return np.round(255 * srgb(light)).astype(np.uint8)
 
-    @cached_property
-    def _atlas(self):
-        """All textures, one above the other, each with its last row again."""
-        return np.concatenate([np.concatenate([texture, texture[-1:]]) for texture in self.textures])
-
     def _seen(self, centre, direction):
         """Light along (H, W, 3) directions, from a place for each row; in single precision, which is quicker."""
         centre = centre.astype(np.float32)
@@ -94,10 +93,10 @@ class CornerScene:
         x, y, z = (400 * (centre[:, None, k] + nearest * direction[..., k]) for k in range(3))
         axis = np.array([of for of, _ in PLANES])
         u, v = np.where((axis == 0)[plane], y, x), np.where((axis == 2)[plane], y, z)
-        side = self.textures.shape[1]
+        side = len(self.textures[0])
         u, v = (at - side * np.floor(at / side) for at in (u, v))
         v += (side + 1) * plane.astype(np.float32)
-        out = cv2.remap(self._atlas, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        out = cv2.remap(self.atlas, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         out *= hit[..., None]
         return out
 

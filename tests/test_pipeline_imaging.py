@@ -36,7 +36,7 @@ from colmap_inertial.reconstruction.preparation.selection import part_of
 from colmap_inertial.reconstruction.preparation.translation import find_parallaxes
 from colmap_inertial.tools.simulate import MotionOptions, make_motion
 
-QUICK = ReconstructOptions(mapping=MappingOptions(max_num_features=1000, first_octave=0), deterministic=True)
+QUICK = ReconstructOptions(mapping=MappingOptions(max_num_features=700, first_octave=0), deterministic=True)
 OFF = replace(QUICK, deblur="off", rolling_shutter="off")
 
 
