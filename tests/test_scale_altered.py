@@ -204,7 +204,7 @@ def test_clocks_that_part_are_both_suspected(attempt, shared_data, faster):
     ],
 )
 def test_a_badly_calibrated_imu_is_not_trusted(attempt, alter):
-    _, _, estimate = attempt(alter, seconds=60.0)
+    _, _, estimate = attempt(alter, seconds=45.0)
     assert estimate["verdict"] != "trusted" and estimate["reasons"]
 
 
