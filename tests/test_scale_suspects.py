@@ -75,7 +75,7 @@ def test_a_fault_of_the_accelerometer_is_named_and_undone(recording, alter, said
 @pytest.mark.parametrize("width_s", [0.05, 0.12])
 @pytest.mark.parametrize("kind", ["roam", "walk"])
 def test_a_path_that_was_smoothed_gives_no_scale(kind, width_s):
-    recording = simulate_recording(RecordingOptions(motion=MotionOptions(kind=kind, duration_s=40.0)), seed=5)
+    recording = simulate_recording(RecordingOptions(motion=MotionOptions(kind=kind, duration_s=25.0)), seed=5)
     trajectory = recording.trajectory
     kernel = np.exp(-0.5 * (np.arange(-15, 16) * np.median(np.diff(trajectory.t_s)) / width_s) ** 2)
     padded = np.pad(trajectory.cam_in_world, ((15, 15), (0, 0)), mode="edge")

@@ -41,7 +41,7 @@ print(json.dumps(threads))
 """
 
 RUN = """
-tracks = tracks_of(walk(12.0))
+tracks = tracks_of(walk(7.0))
 stages = {"imu": tracks.imu, "calibration": calibration_prior()}
 model = Model(reconstruction=tracks.reconstruction(), colmap_index=0, timing=tracks.timing)
 metric, refine = MetricStage(**stages), RefineStage(**stages, refine_intrinsics=False)
