@@ -92,7 +92,7 @@ def commands(root: Path) -> dict[str, Command]:
     options = root / "options.toml"
     options.write_text(OPTIONS)
     for name, frames in (("hall", 16), ("yard", 17)):
-        tiny_capture(root / name, frames=frames)
+        tiny_capture(root / name, frames=frames, half=False)
     (root / "batch.toml").write_text("".join(f'[[capture]]\npath = "{name}"\n' for name in ("hall", "yard")))
     write_plane_capture(root / "apertures")
     write_pair_capture(root / "pairs")

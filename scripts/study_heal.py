@@ -126,7 +126,7 @@ def commands(root: Path) -> dict[str, Command]:
 
     (root / "options.toml").write_text(config_as_toml(TINY))
     for name, frames in (("hall", FRAMES), ("yard", FRAMES - 1)):
-        tiny_capture(root / name, frames=frames)
+        tiny_capture(root / name, frames=frames, half=False)  # the board is found in it
     (root / "batch.toml").write_text("".join(f'[[capture]]\npath = "{name}"\n' for name in ("hall", "yard")))
     CornerScene.make(exposure_s=0.03, readout_s=0.0, frames=8).write(root / "dim", extra=CALIBRATED)
     reconstruct(root / "hall", root / "whole" / "reconstruct", TINY)

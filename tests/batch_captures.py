@@ -9,9 +9,9 @@ TINY = DETERMINISTIC
 FRAMES = 12
 
 
-def tiny_capture(folder: Path, *, frames: int = FRAMES) -> Path:
+def tiny_capture(folder: Path, *, frames: int = FRAMES, half: bool = True) -> Path:
     """A capture of a few frames."""
-    return copy_scene(folder, first=frames)
+    return copy_scene(folder, first=frames, half=half)
 
 
 def model_bytes(out: Path) -> dict[str, bytes]:

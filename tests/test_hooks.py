@@ -25,7 +25,7 @@ from colmap_inertial.pipeline.stages.protocols import insert_defaults
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
     """The first frames of the desk, said to have a rolling shutter."""
-    folder = copy_scene(tmp_path_factory.mktemp("hooks") / "capture", first=16)
+    folder = copy_scene(tmp_path_factory.mktemp("hooks") / "capture", first=16, half=False)  # a target is found in it
     file = folder / "capture.toml"
     text = file.read_text()
     assert "readout_s = 0.0" in text
