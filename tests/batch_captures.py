@@ -4,7 +4,7 @@ from pathlib import Path
 
 from test_pipeline import DETERMINISTIC, copy_scene
 
-#: Three seconds a capture.
+#: A capture of them is reconstructed in about three seconds.
 TINY = DETERMINISTIC
 FRAMES = 12
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from cases import loop_over
 
-from colmap_inertial.core.errors import FormatError, OutputError, OutputExistsError
+from colmap_inertial.core.errors import FormatError, OutputError, OutputExistsError, describe_unloadable
 from colmap_inertial.io.files import locked, read_json, reading, write_json, write_text
 
 
@@ -94,6 +94,34 @@ def test_what_is_no_json_object_is_a_format_error(tmp_path: Path, text: str, sai
     (tmp_path / "a.json").write_text(text)
     with pytest.raises(FormatError, match=said):
         read_json(tmp_path / "a.json")
+
+
+@loop_over(
+    "error, said",
+    [
+        (
+            ImportError("libX11.so.6: cannot open shared object file", path="/a/site-packages/scipy/linalg/_f.so"),
+            "scipy cannot be loaded (libX11.so.6: cannot open shared object file); on Debian: apt install libx11-6",
+        ),
+        (
+            ImportError("undefined symbol: x", path="/a/site-packages/numpy/_core/_m.so"),
+            "numpy cannot be loaded (undefined symbol: x); pip install --force-reinstall numpy",
+        ),
+        (
+            ImportError("libm.so.9: cannot open it", path="/a/colmap_inertial/_kernels/_path.so"),
+            "libm.so.9: cannot open it: install that package, or colmap-inertial again with its dependencies",
+        ),
+        (
+            ModuleNotFoundError("No module named 'yaml'", name="yaml"),
+            "No module named 'yaml': install that package, or colmap-inertial again with its dependencies",
+        ),
+        (ValueError("no"), None),
+    ],
+)
+def test_what_cannot_be_loaded_is_one_sentence(error: Exception, said: str | None) -> None:
+    outer = RuntimeError("wrapped")
+    outer.__cause__ = error
+    assert describe_unloadable(outer) == said
 
 
 def test_a_package_that_is_missing_is_not_a_damaged_file(tmp_path: Path) -> None:

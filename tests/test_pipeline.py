@@ -43,8 +43,8 @@ def _half_size() -> dict[str, bytes]:
 def copy_scene(folder: Path, *, first: int | None = None, target: bool = False, half: bool = True) -> Path:
     """A copy of the example scene, or of its first frames.
 
-    With its target, a run measures that in seconds more. It is found in pictures of full size alone; COLMAP sees none
-    larger than half of that in these tests.
+    With its target, a run measures that in seconds more. It is found in pictures of full size alone; most options of
+    these tests let COLMAP see at most half of that.
     """
     half = half and not target
     shutil.copytree(SCENE, folder, ignore=lambda _, names: {"frames"} & {*names} if half else ())

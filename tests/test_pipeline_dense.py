@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+import time
 
 import cv2
 import numpy as np
@@ -261,6 +262,25 @@ def test_half_written_depth_maps_are_made_again(unfinished, box, monkeypatch):
     monkeypatch.setattr(depth_maps, "_run_apart", run_colmap)
     no_mesh = dataclasses.replace(QUICK, dense_options=DenseOptions(max_image_size=96, mesh="none"))
     assert reconstruct_project(box.root, unfinished, source(box), no_mesh).exit_code() == 0
+
+
+def test_colmap_apart_is_watched_and_ends_with_its_watcher(tmp_path):
+    number, watched = tmp_path / "number", []
+    code = "import os, time; open(sys.argv[1], 'w').write(str(os.getpid())); time.sleep(float(sys.argv[2]))"
+    done = depth_maps._run_apart(code, number, 1.5, watch=lambda: watched.append(1))
+    assert done.returncode == 0 and watched
+
+    def give_up():
+        if number.exists():
+            raise RuntimeError("enough")
+
+    number.unlink()
+    begin_s = time.monotonic()
+    with pytest.raises(RuntimeError, match="enough"):
+        depth_maps._run_apart(code, number, 60, watch=give_up)
+    assert time.monotonic() - begin_s < 45
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(number.read_text()), 0)
 
 
 def test_a_patch_match_that_fails_is_said(unfinished, box, monkeypatch):

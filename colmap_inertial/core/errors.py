@@ -158,20 +158,27 @@ def exhausted(error: BaseException | None) -> str | None:
 
 
 def advise_library(why: str, distribution: str) -> str:
-    """How to mend that a package (by its name for pip) cannot be loaded, by what the loader said of a library."""
+    """What to do where a library of a package (by its name for pip) is missing, by what the loader said."""
     package = next((package for library, package in _SYSTEM_LIBRARIES.items() if library in why), None)
     # other libraries come with the package, or with those that it needs
     return f"pip install --force-reinstall {distribution}" if package is None else f"on Debian: apt install {package}"
 
 
 def describe_unloadable(error: BaseException | None) -> str | None:
-    """A sentence for an exception that a library that cannot be loaded has led to; ``None`` for any other."""
+    """A sentence for an exception that means that a package is missing or cannot be loaded, or that one has led to.
+
+    ``None`` for any other. pycolmap says only that it cannot be imported, and how it is installed.
+    """
+    while error is not None and not isinstance(error, ImportError):
+        error = error.__cause__
+    if error is None:
+        return None
     from importlib.metadata import packages_distributions
 
-    while error is not None:
-        if isinstance(error, ImportError) and error.path and "cannot open shared object file" in str(error):
-            module = Path(error.path).parent.name
-            distribution = packages_distributions().get(module, [module])[0]
-            return f"{module} cannot be loaded ({error}); {advise_library(str(error), distribution)}"
-        error = error.__cause__ or error.__context__
-    return None
+    known = packages_distributions()
+    # of a compiled module, which may lie deep in its package
+    folders = Path(error.path or "").parents if str(error.path).endswith(".so") else ()
+    package = next((folder.name for folder in folders if folder.name in known), None)
+    if package is None or package == "colmap_inertial":
+        return f"{error}: install that package, or colmap-inertial again with its dependencies"
+    return f"{package} cannot be loaded ({error}); {advise_library(str(error), known[package][0])}"

@@ -86,7 +86,7 @@ class GyroPath:
         return quat_log(quat_multiply(quat_conjugate(self.at(begin_s)[0]), self.at(end_s)[0]))
 
     def at_with_levers(self, query_s: Array) -> tuple[Array, Array, Array, Array]:
-        """What :meth:`at` returns, and what errors of the gyroscope turn: integrals from the first sample on.
+        """What :meth:`at` returns, then two integrals from the first sample on: what errors of bias and gain turn.
 
         (M, 3, 3) of ``start_from_imu``, in seconds. A change ``db`` of the bias turns the interval from i to j, seen in
         the IMU frame at j, by ``-R_j' (A_j - A_i) db`` with A these integrals.

@@ -24,7 +24,14 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from colmap_inertial.core.errors import FormatError, InertialError, OutputError, OutputExistsError, exhausted
+from colmap_inertial.core.errors import (
+    FormatError,
+    InertialError,
+    OutputError,
+    OutputExistsError,
+    describe_unloadable,
+    exhausted,
+)
 from colmap_inertial.core.options import ReadLimits
 from colmap_inertial.core.printing import printable
 
@@ -81,15 +88,15 @@ def reading(path: StrPath, fault: str = "is damaged") -> Iterator[None]:
     Raises
     ------
     FormatError
-        With the code :data:`DAMAGED`, for any other exception than our own, those of used up memory or files, and of a
-        package that is missing or broken.
+        With the code :data:`DAMAGED`, for any other exception than our own, those of used up memory or files, and those
+        of a package that is missing or cannot be loaded.
     """
     try:
         yield
-    except (InertialError, ImportError):
+    except InertialError:
         raise
     except Exception as error:
-        if exhausted(error) is not None:
+        if exhausted(error) is not None or describe_unloadable(error) is not None:
             raise
         reason = f"{type(error).__name__}: {error}".splitlines()[0][:300]
         raise FormatError(Path(path), f"{fault} ({reason})", code=DAMAGED) from error

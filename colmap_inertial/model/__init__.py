@@ -210,6 +210,7 @@ def read_model(folder: StrPath, suffix: str | None = None) -> pycolmap.Reconstru
     suffix = suffix or require_format(folder)
     if suffix == ".bin":
         check_binary_model(folder)
+    load_pycolmap()
     try:
         reconstruction = _read_from(folder, suffix)
     except (ValueError, RuntimeError, IndexError, MemoryError) as error:
@@ -222,7 +223,6 @@ def read_model(folder: StrPath, suffix: str | None = None) -> pycolmap.Reconstru
 
 
 def _read_from(folder: Path, suffix: str) -> pycolmap.Reconstruction:
-    load_pycolmap()
     import pycolmap
 
     reconstruction = pycolmap.Reconstruction()
