@@ -115,6 +115,8 @@ def test_what_is_no_json_object_is_a_format_error(tmp_path: Path, text: str, sai
             ModuleNotFoundError("No module named 'yaml'", name="yaml"),
             "No module named 'yaml': install that package, or colmap-inertial again with its dependencies",
         ),
+        (ModuleNotFoundError("No module named 'colmap_inertial.x'", name="colmap_inertial.x"), None),
+        (ImportError("cannot import name 'x' from 'numpy'", name="numpy", path="/a/numpy/__init__.py"), None),
         (ValueError("no"), None),
     ],
 )

@@ -171,13 +171,17 @@ def describe_unloadable(error: BaseException | None) -> str | None:
     """
     while error is not None and not isinstance(error, ImportError):
         error = error.__cause__
-    if error is None:
+    is_compiled = error is not None and str(error.path).endswith(".so")
+    # a name that a module lacks, or a module of ours, is a programmer's mistake
+    if error is None or not (is_compiled or isinstance(error, ModuleNotFoundError)):
+        return None
+    if str(error.name).startswith("colmap_inertial") and not is_compiled:
         return None
     from importlib.metadata import packages_distributions
 
     known = packages_distributions()
-    # of a compiled module, which may lie deep in its package
-    folders = Path(error.path or "").parents if str(error.path).endswith(".so") else ()
+    # a compiled module may lie deep in its package
+    folders = Path(str(error.path)).parents if is_compiled else ()
     package = next((folder.name for folder in folders if folder.name in known), None)
     if package is None or package == "colmap_inertial":
         return f"{error}: install that package, or colmap-inertial again with its dependencies"
