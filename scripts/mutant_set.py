@@ -110,7 +110,7 @@ MUTANTS = (
         "imu.accel_m_s2, accel_cut)",
         "imu.accel_m_s2)",
         "readings of the accelerometer at the end of its range count as good ones",
-        ("scale_suspects::test_a_fault_of_the_accelerometer_is_named_and_undone",),
+        ("scale_suspects::test_the_accelerometer_s_cut_off_readings_are_a_gap_of_its_own",),
     ),
     Mutant(
         "inertial/scale/joint.py",

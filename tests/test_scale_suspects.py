@@ -267,6 +267,17 @@ def test_the_gyroscope_s_cut_off_readings_are_a_gap(recording):
     assert estimate.ci95[0] < recording.truth.metres_per_unit < estimate.ci95[1]
 
 
+def test_the_accelerometer_s_cut_off_readings_are_a_gap_of_its_own(recording):
+    imu = recording.imu
+    limit = np.quantile(np.abs(imu.accel_m_s2), 0.99)
+    altered = replace(imu, accel_m_s2=np.clip(imu.accel_m_s2, -limit, limit))
+    whole, cut = (SensorStreams.from_recording(of, of.gyro_t_s, of.accel_t_s) for of in (imu, altered))
+    lost_s = np.any(np.abs(imu.accel_m_s2) >= limit, axis=1).mean() * np.ptp(imu.accel_t_s)
+    assert whole.accel.paused_s[-1] == 0
+    assert cut.accel.paused_s[-1] == pytest.approx(lost_s, rel=0.5)
+    assert cut.gyro.paused_s[-1] == 0
+
+
 def test_lost_samples_are_a_gap_of_their_own_sensor_however_short():
     t_s = np.arange(0, 2, 0.01)
     values = np.random.default_rng(0).standard_normal((len(t_s), 3))
