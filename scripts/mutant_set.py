@@ -1964,7 +1964,7 @@ MUTANTS = (
         "np.where(length <= farthest, ",
         "np.where(length <= 0.05, ",
         "a pair between whose exposures the camera turned far is not found",
-        ("exposures_simulated::test_no_good_pair_is_refused_however_far_the_camera_turned",),
+        ("exposures_simulated::test_a_shift_is_found_up_to_the_farthest_and_not_beyond",),
     ),
     Mutant(
         "imaging/exposure_pairs/_registration.py",

@@ -16,6 +16,7 @@ from simulated_exposures import TEXTURES, pairs
 from turning_world import Turning
 
 from colmap_inertial.imaging.exposure_pairs import better_alone, bring_together, first_brightness
+from colmap_inertial.imaging.exposure_pairs._search import places
 from colmap_inertial.imaging.restoration import load_network, lsd2
 
 SEED, WIDTH = 3, 240
@@ -47,6 +48,17 @@ def test_no_good_pair_is_refused_however_far_the_camera_turned(good, together):
         error = np.linalg.norm(found.registered.shift_px[:rows, :columns] - pair.shift_px, axis=2)
         # what hands do unevenly during the long exposure moves its centre
         assert np.nanmedian(error) < 0.02 * WIDTH, pair.kind
+
+
+def test_a_shift_is_found_up_to_the_farthest_and_not_beyond():
+    scene = cv2.GaussianBlur(np.random.default_rng(0).standard_normal((220, 260)).astype(np.float32), (0, 0), 1.5)
+    scene -= scene.mean()
+    first, second = scene[40:168, 40:200], scene[60:188, 72:232]  # 38 px of 160 away
+    tells = np.ones_like(first)
+    near, far = (places(first, tells, second, tells, farthest=f, turns_deg=[0.0])[0] for f in (0.1, 0.3))
+    np.testing.assert_allclose(far.mapping[:2, 2], [-32, -20])
+    assert far.score > 0.5 and near.score < 0.2
+    assert np.hypot(*near.mapping[:2, 2]) <= 16
 
 
 def test_pictures_of_two_scenes_are_never_blended(turnings):
