@@ -1985,7 +1985,7 @@ MUTANTS = (
         "np.sort(dark.ravel())[inner], np.sort(bright.ravel())[inner]",
         "dark.ravel()[inner], bright.ravel()[inner]",
         "the first gain compares what lies in one place though nothing is aligned",
-        ("exposures_simulated::test_the_first_gain_needs_no_alignment",),
+        ("exposures_simulated::test_the_first_gain_is_found_where_bright_stripes_lie_on_dark_ones",),
     ),
     Mutant(
         "checks/validate/markers.py",
