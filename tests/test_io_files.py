@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from cases import loop_over
 
-from colmap_inertial.core.errors import FormatError, OutputError, OutputExistsError, describe_unloadable
+from colmap_inertial.core.errors import FormatError, OutputError, OutputExistsError, describe_environment_fault
 from colmap_inertial.io.files import locked, read_json, reading, write_json, write_text
 
 
@@ -123,7 +123,7 @@ def test_what_is_no_json_object_is_a_format_error(tmp_path: Path, text: str, sai
 def test_what_cannot_be_loaded_is_one_sentence(error: Exception, said: str | None) -> None:
     outer = RuntimeError("wrapped")
     outer.__cause__ = error
-    assert describe_unloadable(outer) == said
+    assert describe_environment_fault(outer) == said
 
 
 def test_a_package_that_is_missing_is_not_a_damaged_file(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from colmap_inertial.cli.help import options_of, print_help, print_overview
 from colmap_inertial.cli.models import Align, Apply, CalibrateImu, Diagnose, Export, Scale, Validate, View
 from colmap_inertial.cli.process import INTERRUPTED, TERMINATED, Terminated, answering_signals, require_limits
 from colmap_inertial.cli.speech import Speaker, log_on_terminal, print_json
-from colmap_inertial.core.errors import InertialError, describe_unloadable, exhausted
+from colmap_inertial.core.errors import InertialError, describe_environment_fault
 from colmap_inertial.core.options import ProjectOptions, ReadLimits, ReconstructOptions, ReferenceOptions
 from colmap_inertial.core.printing import say
 
@@ -264,7 +264,7 @@ def _main(args: Sequence[str] | None) -> None:
         say(f"interrupted{again}", error=True)
         code = TERMINATED if isinstance(stop, Terminated) else INTERRUPTED
     except (MemoryError, OSError, ImportError, RuntimeError) as error:
-        reason = exhausted(error) or describe_unloadable(error)
+        reason = describe_environment_fault(error)
         if reason is None:
             raise
         say(f"error: {reason}", error=True)

@@ -142,11 +142,15 @@ class TargetNotFoundError(InertialError):
     exit_code = 5
 
 
-def exhausted(error: BaseException | None) -> str | None:
-    """A sentence for an exception that means that memory or files have run out, or that one such has led to.
+def describe_environment_fault(error: BaseException) -> str | None:
+    """A sentence for an exception that memory, files or a package that cannot be loaded have led to.
 
     ``None`` for any other. pycolmap says only that it cannot be imported, and how it is installed.
     """
+    return _describe_exhausted(error) or _describe_unloadable(error)
+
+
+def _describe_exhausted(error: BaseException | None) -> str | None:
     while error is not None:
         number = error.errno if isinstance(error, OSError) else None
         if isinstance(error, MemoryError) or number == errno.ENOMEM or "failed to map segment" in str(error):
@@ -164,11 +168,7 @@ def advise_library(why: str, distribution: str) -> str:
     return f"pip install --force-reinstall {distribution}" if package is None else f"on Debian: apt install {package}"
 
 
-def describe_unloadable(error: BaseException | None) -> str | None:
-    """A sentence for an exception that means that a package is missing or cannot be loaded, or that one has led to.
-
-    ``None`` for any other. pycolmap says only that it cannot be imported, and how it is installed.
-    """
+def _describe_unloadable(error: BaseException | None) -> str | None:
     while error is not None and not isinstance(error, ImportError):
         error = error.__cause__
     is_compiled = error is not None and str(error.path).endswith(".so")

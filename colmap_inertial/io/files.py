@@ -29,8 +29,7 @@ from colmap_inertial.core.errors import (
     InertialError,
     OutputError,
     OutputExistsError,
-    describe_unloadable,
-    exhausted,
+    describe_environment_fault,
 )
 from colmap_inertial.core.options import ReadLimits
 from colmap_inertial.core.printing import printable
@@ -96,7 +95,7 @@ def reading(path: StrPath, fault: str = "is damaged") -> Iterator[None]:
     except InertialError:
         raise
     except Exception as error:
-        if exhausted(error) is not None or describe_unloadable(error) is not None:
+        if describe_environment_fault(error) is not None:
             raise
         reason = f"{type(error).__name__}: {error}".splitlines()[0][:300]
         raise FormatError(Path(path), f"{fault} ({reason})", code=DAMAGED) from error

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from colmap_inertial.core.choices import check_kind
-from colmap_inertial.core.errors import OutputError, OutputExistsError, describe_unloadable, exhausted
+from colmap_inertial.core.errors import OutputError, OutputExistsError, describe_environment_fault
 from colmap_inertial.core.options import BatchOptions, ReconstructOptions, StageNames
 from colmap_inertial.core.printing import cell
 from colmap_inertial.core.summary import prints_in_lines
@@ -259,8 +259,7 @@ class _Batch:
             self._set(pending.result())
         except Exception as error:  # the worker was lost too often, or cannot run it, or the scheduler is gone
             known = read_status(task.status) or self._known[name]
-            known_reason = exhausted(error) or describe_unloadable(error)
-            text = known_reason or f"{type(error).__name__}: {error}".partition("\n")[0]
+            text = describe_environment_fault(error) or f"{type(error).__name__}: {error}".partition("\n")[0]
             self._set(failed(known, f"no worker could finish it: {text}"))
             write_status(task.status, self._known[name])
 
