@@ -1,7 +1,8 @@
 """Whole runs against plain COLMAP: processor time, registered images, camera error, loops.
 
     python scripts/bench_whole.py FOLDER [--euroc DATASET] [--walk FRAMES] [--loop FRAMES] [--laps LAPS] [--back]
-        [--repeated SCENES] [--drawn] [--long FRAMES ...] [--density D] [--seeds SEED ...] [--workers N] [--json FILE]
+        [--repeated SCENES] [--drawn] [--long FRAMES ...] [--streets] [--density D] [--seeds SEED ...] [--workers N]
+        [--json FILE]
         [--mappers {incremental,one,global,bare} ...]
 
 FOLDER takes captures and reconstructions. ``--euroc``: the 100 keyframes of V1_01_easy (DATASET has ``keyframes/``,
@@ -29,7 +30,8 @@ time, memory beyond that of what is loaded, error. ``incremental`` is ours, in p
 in one go; ``global`` COLMAP's; ``bare`` COLMAP's incremental one with its own settings, in one go. Features are
 synthesised, 132 a frame for each 1 of ``--density``. Parts are mapped by ``--workers`` processes; the longest chain is
 this process's own time and that of as many parts, of equal length, as one worker maps: the time on as many idle
-processors. Memory is that of this process.
+processors. Memory is that of this process. ``--streets``: these walks go through a grid of streets, half of whose
+fronts are copies; of the loops, how many are false.
 """
 
 from __future__ import annotations
@@ -62,7 +64,7 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import matrix_from_quat, quat_rotate, slerp
 from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.io.capture import load_capture
-from colmap_inertial.io.files import read_json
+from colmap_inertial.io.files import read_json, write_json
 from colmap_inertial.io.frames import read_frames
 from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.model import find_models, read_model
@@ -269,9 +271,9 @@ def false_loops(walk: Walk, folder: Path) -> Figures:
 
 
 def true_shares(
-    walk: Walk, names: Sequence[str], centre: Array, turned: Array, database: Path
+    walk: Walk, names: Sequence[str], centre: Array, turned: Array, database: Path, apart: int = 0
 ) -> dict[tuple[int, int], float]:
-    """Of each verified pair of frames, the share of its matches that join what is the same place in truth."""
+    """Of verified pairs of frames so far apart, the share of matches that join what is the same place in truth."""
     import pycolmap
 
     world, place = world_of(walk), {name: i for i, name in enumerate(names)}
@@ -281,6 +283,8 @@ def true_shares(
         camera = opened.read_all_cameras()[0]
         for pair in verified_pairs(database):
             both = sorted(pair)
+            if place[both[1]] - place[both[0]] < apart:
+                continue
             matches = opened.read_two_view_geometry(*(images[name].image_id for name in both)).inlier_matches
             some = np.array(matches)[np.linspace(0, len(matches) - 1, min(60, len(matches))).astype(int)]
             met = []
@@ -361,6 +365,7 @@ def long_walk(walk: Walk, density: float, folder: Path, mappers: Sequence[str], 
     """What matching and each mapper take for a walk: processor time and memory."""
     keep_colmap_quiet()
     write_walk(walk, folder)
+    write_json(folder / "walk.json", dataclasses.asdict(walk))
     if not (folder / "features.db").is_file():
         write_features(walk, recorded(folder).timing.names, folder / "features.db", density=density)
     found: dict[str, Figures] = {}
@@ -397,7 +402,17 @@ def match_walk(folder: Path) -> Figures:
         "compared": record.loops_compared,
         "verified": record.verified,
         "loops_closed": record.loops_closed,
+        **judged_loops(folder, recording.timing.names),
     }
+
+
+def judged_loops(folder: Path, names: Sequence[str]) -> Figures:
+    """Of streets, how many pairs are of frames more than five seconds apart, and how many of these are false."""
+    walk = Walk(**read_json(folder / "walk.json"))
+    if walk.scene != "streets":
+        return {}
+    shares = true_shares(walk, names, *true_poses(folder), folder / "database.db", apart=5 * round(walk.frame_rate_hz))
+    return {"loops": len(shares), "false": sum(share < 0.5 for share in shares.values())}
 
 
 def peak_mib() -> float:
@@ -467,6 +482,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="seed of the first scene")
     parser.add_argument("--drawn", action="store_true", help="find the scenes' features in drawn pictures")
     parser.add_argument("--long", type=int, nargs="*", default=[], help="frames")
+    parser.add_argument("--streets", action="store_true", help="long walks go through streets")
     parser.add_argument("--density", type=float, default=LOOP_DENSITY, help="of long walks' features")
     parser.add_argument("--seeds", type=int, nargs="*", default=[100], help="of long walks")
     parser.add_argument("--json", type=Path)
@@ -510,8 +526,9 @@ def main() -> None:
         found[folder.name] = {"scene": scene, **false_loops(walk, folder)}
         print(json.dumps({folder.name: found[folder.name]}), flush=True)
     for frames, seed in itertools.product(args.long, args.seeds):
-        folder = args.folder / f"long{frames}_seed{seed}_density{args.density:g}"
-        walk = Walk(seed=seed, frames=frames, frame_rate_hz=8.0, drawn=False, pace_m_s=PACE_M_S)
+        scene: Scene = "streets" if args.streets else "room"
+        folder = args.folder / f"{'streets' if args.streets else 'long'}{frames}_seed{seed}_density{args.density:g}"
+        walk = Walk(seed=seed, frames=frames, frame_rate_hz=8.0, scene=scene, drawn=False, pace_m_s=PACE_M_S)
         found[folder.name] = long_walk(walk, args.density, folder, args.mappers, args.workers)
         print(json.dumps({folder.name: found[folder.name]}, indent=1), flush=True)
     write_report(args.json, found)

@@ -1,4 +1,4 @@
-"""Walks past walls on which the same posters may hang many times: around a room back to its start, or along a corridor.
+"""Walks past walls on which the same posters may hang: around a room back to its start, along a corridor or streets.
 
 What a pixel of a frame truly shows is told by `places_m`.
 """
@@ -43,6 +43,9 @@ LENGTH_M, AWAY_M, SPEED_M_S = 40.0, 2.2, 0.6
 CORNER_M = 1.2
 #: From one copy to the next.
 PERIOD_M = 1.25
+#: Blocks of houses in each direction, how long they are, how wide the streets between them; how many of the fronts
+#: look like others, of so many designs; who walks looks so much to the right.
+BLOCKS, BLOCK_M, STREET_M, ALIKE, DESIGNS, ASIDE_DEG = 3, 7.0, 4.0, 0.5, 3, 40.0
 #: Who walks back looks so much to where they go, both ways: the same is seen from directions twice as far apart.
 AHEAD_DEG = 20.0
 #: Knots of the path.
@@ -50,7 +53,7 @@ RATE_HZ = 60.0
 
 Kind = Callable[[np.random.Generator, int, int], Float32Array]
 Paint = Callable[[Kind, np.random.Generator, int, int], Float32Array]
-Scene = Literal["room", "mixed", "copies", "tiled", "corridor", "tiled corridor"]
+Scene = Literal["room", "mixed", "copies", "tiled", "corridor", "tiled corridor", "streets"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +64,8 @@ class Walk:
 
     ``scene``: a ``room`` in which everything is unlike; ``mixed``: in it, every other poster is one of two, of one
     size, on all walls; ``copies``: nothing but one poster at equal distances, on plaster; ``tiled``: the plaster is the
-    same from each poster to the next, too; likewise a ``corridor`` with one wall, and nobody turns round.
+    same from each poster to the next, too; likewise a ``corridor`` with one wall, and nobody turns round. ``streets``:
+    a grid of them, half of whose fronts are copies, whole, of one of three; who walks turns at crossings as it comes.
 
     ``back``: halfway, who walks around a room turns round, and what they saw comes again from the other side.
 
@@ -106,42 +110,88 @@ def world_of(walk: Walk) -> World:
     paint = _drawn if walk.drawn else _blank
     if walk.scene in ("copies", "tiled", "corridor", "tiled corridor"):
         return _copies(walk, rng, paint)
-    up = np.array([0.0, 0.0, 1.0])
+    if walk.scene == "streets":
+        return _streets(rng, paint)
     designs = [paint(textures.poster, rng, 240, 300) for _ in range(2)]
     quads = []
     corners = walk.half_m() * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]])
     for wall in range(4):
         start, end = (np.array([*corners[(wall + k) % 4], HEIGHT_M]) for k in (0, 1))
-        along = (end - start) / np.linalg.norm(end - start)
-        length = float(np.linalg.norm(end - start))
-        inwards = np.cross(along, up)
-        plaster = paint(textures.plaster, rng, 260, round(100 * length))
-        quads.append(Quad(corner_m=start, edge_u_m=end - start, edge_v_m=-HEIGHT_M * up, texture=plaster))
-        for place in range(round(length / 1.2)):
-            same = walk.scene == "mixed" and rng.random() < 0.5
-            size = np.array([0.9, 0.75]) if same else rng.uniform([0.5, 0.4], [1.1, 1.0])
-            left = (place + rng.uniform(0, 0.15)) * length / round(length / 1.2)
-            drawn = (round(300 * size[1]), round(300 * size[0]))
-            texture = designs[rng.integers(len(designs))] if same else paint(textures.poster, rng, *drawn)
-            corner = start + left * along + rng.uniform(0.02, 0.1) * inwards - rng.uniform(0.4, 0.9) * up
-            quads.append(Quad(corner_m=corner, edge_u_m=size[0] * along, edge_v_m=-size[1] * up, texture=texture))
-            # something that stands before the wall, here and nowhere else
-            width, depth, height = rng.uniform([0.3, 0.2, 0.4], [0.8, 0.6, 1.2])
-            front = start + (left + rng.uniform(0, 0.5)) * along + depth * inwards - (HEIGHT_M - height) * up
-            for corner, edge in (
-                (front, width * along),
-                (front - depth * inwards, depth * inwards),
-                (front + width * along, -depth * inwards),
-            ):
-                face = paint(
-                    textures.poster, rng, round(300 * height), max(8, round(300 * float(np.linalg.norm(edge))))
-                )
-                quads.append(Quad(corner_m=corner, edge_u_m=edge, edge_v_m=-height * up, texture=face))
-    half_m = walk.half_m()
+        quads += _wall(start, end, rng, paint, designs if walk.scene == "mixed" else [])
+    quads.append(_floor(walk.half_m(), rng, paint))
+    return World(quads=tuple(quads), board=Board(), board_corners_m=np.zeros((0, 3)))
+
+
+def _wall(start: Array, end: Array, rng: np.random.Generator, paint: Paint, designs: list[Float32Array]) -> list[Quad]:
+    """A wall with posters, and things before it; every other poster is one of the designs, if there are any."""
+    up, along = np.array([0.0, 0.0, 1.0]), (end - start) / np.linalg.norm(end - start)
+    length = float(np.linalg.norm(end - start))
+    inwards = np.cross(along, up)
+    plaster = paint(textures.plaster, rng, 260, round(100 * length))
+    quads = [Quad(corner_m=start, edge_u_m=end - start, edge_v_m=-HEIGHT_M * up, texture=plaster)]
+    for place in range(round(length / 1.2)):
+        same = bool(designs) and rng.random() < 0.5
+        size = np.array([0.9, 0.75]) if same else rng.uniform([0.5, 0.4], [1.1, 1.0])
+        left = (place + rng.uniform(0, 0.15)) * length / round(length / 1.2)
+        drawn = (round(300 * size[1]), round(300 * size[0]))
+        texture = designs[rng.integers(len(designs))] if same else paint(textures.poster, rng, *drawn)
+        corner = start + left * along + rng.uniform(0.02, 0.1) * inwards - rng.uniform(0.4, 0.9) * up
+        quads.append(Quad(corner_m=corner, edge_u_m=size[0] * along, edge_v_m=-size[1] * up, texture=texture))
+        # something that stands before the wall, here and nowhere else
+        width, depth, height = rng.uniform([0.3, 0.2, 0.4], [0.8, 0.6, 1.2])
+        front = start + (left + rng.uniform(0, 0.5)) * along + depth * inwards - (HEIGHT_M - height) * up
+        for corner, edge in (
+            (front, width * along),
+            (front - depth * inwards, depth * inwards),
+            (front + width * along, -depth * inwards),
+        ):
+            face = paint(textures.poster, rng, round(300 * height), max(8, round(300 * float(np.linalg.norm(edge)))))
+            quads.append(Quad(corner_m=corner, edge_u_m=edge, edge_v_m=-height * up, texture=face))
+    return quads
+
+
+def _floor(half_m: Array, rng: np.random.Generator, paint: Paint) -> Quad:
     x, y = np.array([2 * half_m[0], 0, 0]), np.array([0, 2 * half_m[1], 0])
     floor = paint(textures.carpet, rng, 800, 1000)
-    quads.append(Quad(corner_m=np.array([-half_m[0], half_m[1], 0]), edge_u_m=x, edge_v_m=-y, texture=floor))
+    return Quad(corner_m=np.array([-half_m[0], half_m[1], 0]), edge_u_m=x, edge_v_m=-y, texture=floor)
+
+
+def _streets(rng: np.random.Generator, paint: Paint) -> World:
+    """Blocks of houses in a grid of streets, around which there are houses, too; fronts face the streets."""
+    start, end = np.array([0.0, 0.0, HEIGHT_M]), np.array([BLOCK_M, 0.0, HEIGHT_M])
+    designs = [_wall(start, end, rng, paint, []) for _ in range(DESIGNS)]
+    period_m, half_m = BLOCK_M + STREET_M, (BLOCKS * (BLOCK_M + STREET_M) + STREET_M) / 2
+    places = [-half_m + STREET_M + period_m * block for block in range(BLOCKS)]
+    quarters = [np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))]
+    corners = np.array([[0.0, 0.0, 0.0], [BLOCK_M, 0.0, 0.0], [BLOCK_M, BLOCK_M, 0.0], [0.0, BLOCK_M, 0.0]])
+    fronts = [
+        (np.array([x, y, 0.0]) + corners[side], quarters[side]) for x in places for y in places for side in range(4)
+    ]
+    # houses beyond the last street; between two of them there is a gap, which a hedge of its own closes
+    quads = [_floor(np.array([half_m, half_m]), rng, paint)]
+    for turned in quarters:
+        fronts += [(turned @ np.array([place, half_m, 0.0]), turned) for place in places]
+        for gap in (-half_m, *(place + BLOCK_M for place in places)):
+            hedge = _wall(start, np.array([STREET_M, 0.0, HEIGHT_M]), rng, paint, [])
+            quads += _placed(hedge, turned @ np.array([gap, half_m, 0.0]), turned)
+    for at_m, turned in fronts:
+        alike = rng.random() < ALIKE
+        front = designs[rng.integers(DESIGNS)] if alike else _wall(start, end, rng, paint, [])
+        quads += _placed(front, at_m, turned)
     return World(quads=tuple(quads), board=Board(), board_corners_m=np.zeros((0, 3)))
+
+
+def _placed(quads: list[Quad], at_m: Array, turned: Array) -> list[Quad]:
+    """The same, turned and set elsewhere."""
+    return [
+        Quad(
+            corner_m=turned @ quad.corner_m + at_m,
+            edge_u_m=turned @ quad.edge_u_m,
+            edge_v_m=turned @ quad.edge_v_m,
+            texture=quad.texture,
+        )
+        for quad in quads
+    ]
 
 
 def _drawn(kind: Kind, rng: np.random.Generator, height: int, width: int) -> Float32Array:
@@ -210,6 +260,10 @@ def motion_of(walk: Walk) -> Motion:
         out = np.cos(ahead) * out + np.sin(ahead) * np.stack([-out[:, 1], out[:, 0]], axis=1)
     sway = [sum(a * np.sin(2 * np.pi * f * t_s + p) for a, f, p in _tones(rng)) for _ in range(6)]
     out = np.column_stack([out, 0 * phase])
+    if walk.scene == "streets":
+        across, heading = _route(walk, t_s)
+        aside = _smooth(heading[:, None])[:, 0] - np.radians(ASIDE_DEG)
+        out = np.column_stack([np.cos(aside), np.sin(aside), 0 * phase])
     if "corridor" in walk.scene:
         across = np.stack([SPEED_M_S * (t_s - duration_s / 2), 0 * t_s], axis=1)
         out = np.tile([0.3, 1.0, 0.0], (count, 1))
@@ -242,6 +296,40 @@ def _at_one_pace(half_m: Array, laps: Array) -> tuple[Array, Array]:
     angle = np.interp(at_m, way_m, np.pi / 2 * np.array([0, 0, 1, 1, 2, 2, 3, 3, 4, 4]))
     out = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return np.stack([np.interp(at_m, way_m, c) for c in middle.T], axis=1) + CORNER_M * out, out
+
+
+def _route(walk: Walk, t_s: Array) -> tuple[Array, Array]:
+    """(N, 2) places in the middle of streets at one pace, with round corners, and (N,) which way that is, rad."""
+    if walk.pace_m_s is None:
+        raise ValueError("who walks through streets has a pace")
+    rng, period_m = np.random.default_rng([walk.seed, 6]), BLOCK_M + STREET_M
+    corner_m, bend_m = STREET_M / 2, np.pi / 4 * STREET_M
+    at, ahead = np.array([1, 0]), np.array([0, 1])
+    # of the route's pieces, the length and how far it turns: a street between crossings, then a crossing
+    pieces: list[tuple[float, float]] = []
+    for _ in range(int(np.ptp(t_s) * walk.pace_m_s / (period_m - 2 * corner_m)) + 1):
+        pieces.append((period_m - 2 * corner_m, 0.0))
+        at = at + ahead
+        left = np.array([-ahead[1], ahead[0]])
+        possible = [
+            (direction, quarter)
+            for direction, quarter in ((ahead, 0), (left, 1), (-left, -1))
+            if ((at + direction >= 0) & (at + direction <= BLOCKS)).all()
+        ]
+        ahead, quarter = possible[rng.integers(len(possible))]
+        pieces.append((bend_m if quarter else 2 * corner_m, quarter * np.pi / 2))
+    lengths, turns = (np.array(column) for column in zip(*pieces, strict=True))
+    # integrated in steps of a millimetre, so that the route does not drift out of its streets
+    fine_m = np.arange(0, np.ptp(t_s) * walk.pace_m_s + 0.01, 1e-3)
+    ends, angles = np.cumsum([0, *lengths]), np.pi / 2 + np.cumsum([0, *turns])
+    heading = np.interp(fine_m + 5e-4, ends, angles)
+    steps = 1e-3 * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    half_m = (BLOCKS * period_m + STREET_M) / 2
+    start = np.array([period_m + corner_m, 2 * corner_m]) - half_m
+    places = start + np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)[:-1]])
+    at_m = (t_s - t_s[0]) * walk.pace_m_s
+    place = np.stack([np.interp(at_m, fine_m, column) for column in places.T], axis=1)
+    return place, np.interp(at_m, ends, angles)
 
 
 def _tones(rng: np.random.Generator) -> list[tuple[float, float, float]]:
