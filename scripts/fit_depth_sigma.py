@@ -3,8 +3,9 @@
     python scripts/fit_depth_sigma.py FOLDER [--fit 0 2] [--judge 1 3] [--widths 640]
 
 FOLDER takes the worlds (``photo_world.py``) and their sweeps; what is there already is used. Printed: the factors of
-``SigmaModel`` (``imaging/plane_sweep/confidence.py``), and for the worlds that judge the share of depths within twice
-their standard deviation, by decile of it.
+``SigmaModel`` (``imaging/plane_sweep/confidence.py``) and, by the standard deviations that the package has, those of
+``PlaneModel`` (``smoothing.py``); and for the worlds that judge the share of depths within twice their standard
+deviation, by decile of it.
 
 The factors are the 95 % quantile of the logarithm of errors, by iteratively reweighted least squares. Two standard
 deviations are meant to hold 95 % of the errors; errors are far from Gaussian.
@@ -23,7 +24,13 @@ from photo_world import PhotoWorld
 
 from colmap_inertial.colmap.sweep_stereo import SweptWorkspace
 from colmap_inertial.core.arrays import Array
-from colmap_inertial.imaging.plane_sweep import MEASURES, measure_pixels
+from colmap_inertial.imaging.plane_sweep import (
+    MEASURES,
+    PLANE_MEASURES,
+    estimate_sigma,
+    measure_pixels,
+    measure_planes,
+)
 
 QUANTILE, ROUNDS = 0.95, 60
 #: Added to errors before the logarithm: smaller ones are the poses'.
@@ -45,18 +52,26 @@ def swept_world(folder: Path, seed: int, width: int) -> tuple[SweptWorkspace, di
         return swept, {name: truth[name] for name in swept.names}
 
 
-def collect(folder: Path, seeds: Sequence[int], widths: Sequence[int]) -> tuple[Array, Array]:
-    """(N, 5) measures of pixels that have a depth, and (N,) errors in pixels of the partners."""
+def collect(folder: Path, seeds: Sequence[int], widths: Sequence[int], *, planes: bool) -> tuple[Array, Array]:
+    """(N, F) measures of pixels, and (N,) errors in pixels of the partners: of own depths where known, or of planes."""
     measures, errors = [], []
     for seed, width in itertools.product(seeds, widths):
         swept, truth = swept_world(folder, seed, width)
         for view, name in enumerate(swept.names):
-            agreement = swept.compare(view)
-            found, motion_px = measure_pixels(agreement, swept.sights.views[view], swept.partners(view))
-            known = np.flatnonzero((truth[name] < NEARER_M) & (agreement.depth > 0))[::EVERY]
-            measures.append(found.reshape(len(found), -1)[:, known].T.astype(np.float64))
-            away = np.abs(1 / agreement.depth.ravel()[known] - 1 / truth[name].ravel()[known])
-            errors.append(away * motion_px.ravel()[known])
+            agreement, camera, partners = swept.compare(view), swept.sights.views[view], swept.partners(view)
+            known = truth[name] < NEARER_M
+            if planes:
+                sigma = estimate_sigma(agreement, camera, partners)
+                found, inverse, motion_px = measure_planes(
+                    agreement.depth, sigma, swept.picture(view), camera, partners
+                )
+            else:
+                found, motion_px = measure_pixels(agreement, camera, partners)
+                known &= agreement.depth > 0
+                inverse = 1 / np.where(agreement.depth > 0, agreement.depth, np.inf)
+            some = np.flatnonzero(known)[::EVERY]
+            measures.append(found.reshape(len(found), -1)[:, some].T.astype(np.float64))
+            errors.append(np.abs(inverse.ravel()[some] - 1 / truth[name].ravel()[some]) * motion_px.ravel()[some])
     return np.concatenate(measures), np.concatenate(errors)
 
 
@@ -79,14 +94,15 @@ def main() -> None:
     parser.add_argument("--judge", nargs="+", type=int, default=[1, 3])
     parser.add_argument("--widths", nargs="+", type=int, default=[640])
     arguments = parser.parse_args()
-    measures, errors = collect(arguments.folder, arguments.fit, arguments.widths)
-    factors = fit_quantile(measures, np.log(errors + FLOOR_PX), QUANTILE)
-    for name, factor in zip(MEASURES, factors, strict=True):
-        print(f"    {name}: float = {factor:.3f}")
-    measures, errors = collect(arguments.folder, arguments.judge, arguments.widths)
-    twice_px = np.exp(measures @ factors)
-    for decile in np.array_split(np.argsort(twice_px), 10):
-        print(f"{twice_px[decile].mean():8.3f} px: {(errors[decile] <= twice_px[decile]).mean():.3f} within")
+    for names, planes in ((MEASURES, False), (PLANE_MEASURES, True)):
+        measures, errors = collect(arguments.folder, arguments.fit, arguments.widths, planes=planes)
+        factors = fit_quantile(measures, np.log(errors + FLOOR_PX), QUANTILE)
+        for name, factor in zip(names, factors, strict=True):
+            print(f"    {name}: float = {factor:.3f}")
+        measures, errors = collect(arguments.folder, arguments.judge, arguments.widths, planes=planes)
+        twice_px = np.exp(measures @ factors)
+        for decile in np.array_split(np.argsort(twice_px), 10):
+            print(f"{twice_px[decile].mean():8.3f} px: {(errors[decile] <= twice_px[decile]).mean():.3f} within")
 
 
 if __name__ == "__main__":

@@ -30,6 +30,7 @@ from colmap_inertial.imaging.plane_sweep import (
     estimate_sigma,
     keep_certain,
     score_partners,
+    smooth_depth,
     sweep_depth,
 )
 from colmap_inertial.io.files import convert_to_plain, path_in, read_json, write_json
@@ -131,10 +132,10 @@ class SweptWorkspace:
         files = [map_file(self.folder, what, self.names[view], kind) for what, kind in _MAPS]
         if not self._raw_file(view).is_file() or all(file.is_file() for file in files):
             return
-        agreement = self.compare(view)
-        sigma = estimate_sigma(agreement, self.sights.views[view], self.partners(view))
-        depth, sigma = keep_certain(agreement.depth, sigma)
-        for file, values in zip(files, (depth, sigma, estimate_normals(depth, self.sights.views[view])), strict=True):
+        agreement, camera, partners = self.compare(view), self.sights.views[view], self.partners(view)
+        own = agreement.depth, estimate_sigma(agreement, camera, partners)
+        depth, sigma = keep_certain(*smooth_depth(*own, self.picture(view), camera, partners))
+        for file, values in zip(files, (depth, sigma, estimate_normals(depth, camera)), strict=True):
             write_map(file, values)
 
     def partners(self, view: int) -> list[Pinhole]:
@@ -152,10 +153,13 @@ class SweptWorkspace:
     def _depth_view(self, view: int) -> DepthView:
         return DepthView(depth=read_map(self._raw_file(view)), camera=self.sights.views[view])
 
+    def picture(self, view: int) -> UInt8Array:
+        """(H, W) or (H, W, 3) codes."""
+        picture = read_image(path_in(self.folder / "images", self.names[view]))
+        return np.asarray(picture >> 8 if picture.dtype == np.uint16 else picture, dtype=np.uint8)
+
     def _grey(self, view: int) -> UInt8Array:
         import cv2
 
-        picture = read_image(path_in(self.folder / "images", self.names[view]))
-        if picture.dtype == np.uint16:
-            picture = (picture >> 8).astype(np.uint8)
+        picture = self.picture(view)
         return np.asarray(picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), dtype=np.uint8)

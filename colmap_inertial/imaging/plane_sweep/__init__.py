@@ -1,4 +1,4 @@
-"""Depth of posed pictures by a plane sweep: partners, candidates, matching, agreement, normals. Touches no file.
+"""Depth of posed pictures by a plane sweep: partners, matching, agreement, smoothing, normals. Touches no file.
 
 Views are pinhole cameras whose pixel centres are whole numbers. Depth is along the optical axis; 0 is unknown.
 """
@@ -23,3 +23,8 @@ from colmap_inertial.imaging.plane_sweep.partners import (
     score_partners as score_partners,
 )
 from colmap_inertial.imaging.plane_sweep.pinhole import Pinhole as Pinhole
+from colmap_inertial.imaging.plane_sweep.smoothing import (
+    PLANE_MEASURES as PLANE_MEASURES,
+    measure_planes as measure_planes,
+    smooth_depth as smooth_depth,
+)

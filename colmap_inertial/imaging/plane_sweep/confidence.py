@@ -50,7 +50,7 @@ class ConfidenceLimits:
     #: Depths with a larger standard deviation, as a share of the depth, are left out: on photographic worlds a tenth of
     #: them, of which half are more than 1 % wrong (``scripts/bench_dense.py FOLDER --world photo``; at 0.025 another
     #: hundredth goes).
-    most_share: float = 0.03
+    most_share: float = 0.045
 
 
 SIGMA, _LIMITS = SigmaModel(), ConfidenceLimits()
@@ -101,7 +101,7 @@ def measure_pixels(
     motion_px
         (H, W) by how many pixels a change of inverse depth moves a pixel in the partners, root mean square.
     """
-    motion_px = _measure_motion(camera, partners)
+    motion_px = measure_motion(camera, partners)
     known = agreement.depth > 0
     inverse = np.divide(1, agreement.depth, out=np.zeros_like(agreement.depth), where=known)
     weight, scatter, away = _measure_planes(inverse, np.where(known, agreement.agreeing, 0))
@@ -118,7 +118,7 @@ def measure_pixels(
     return measures, motion_px
 
 
-def _measure_motion(camera: Pinhole, partners: Sequence[Pinhole]) -> Float32Array:
+def measure_motion(camera: Pinhole, partners: Sequence[Pinhole]) -> Float32Array:
     """(H, W) motion of pixels in the partners for a change of inverse depth, root mean square."""
     (fx, fy), (cx, cy) = camera.focal_px, camera.centre_px
     squared = np.zeros((camera.height, camera.width))
