@@ -8,13 +8,17 @@ import pycolmap
 import pytest
 
 from colmap_inertial.checks.diagnose.frames import _readout
+from colmap_inertial.checks.diagnose.imu import acceleration_rms_m_s2
 from colmap_inertial.checks.validate.overlays import _ticks
 from colmap_inertial.checks.validate.views import load_views
 from colmap_inertial.colmap.loops import key_frames
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import FormatError, NotObservableError
-from colmap_inertial.core.geometry import quat_exp
+from colmap_inertial.core.geometry import quat_conjugate, quat_exp, quat_rotate
+from colmap_inertial.core.types import ImuRecording
 from colmap_inertial.imaging.gyro_camera import FrameShutter
+from colmap_inertial.inertial.core.factors import lasting_group, state_group, walk_group
+from colmap_inertial.inertial.core.parameters import DRIFT
 from colmap_inertial.io.gopro import _stabilisation
 from colmap_inertial.motion.align._fit import _noise_of
 from colmap_inertial.motion.align.conventions import quick_accelerations
@@ -116,3 +120,50 @@ def test_models_without_poses_and_folders_of_several_are_refused(tmp_path):
 def test_pictures_far_apart_tell_no_readout():
     with pytest.raises(NotObservableError, match="far apart"):
         _readout(SimpleNamespace(rotation=object(), aligned=None, imu=None, is_dense=False))
+
+
+@pytest.mark.parametrize(
+    ("amplitude_m_s2", "rms_m_s2"), [(0.0, 0.0), (0.4, 0.4 / np.sqrt(2))], ids=["turning in place", "shaken"]
+)
+def test_acceleration_is_what_turning_drift_bias_and_lever_arm_leave(amplitude_m_s2, rms_m_s2):
+    t_s = np.arange(0, 12, 1 / 400)
+    # turns to and fro about the upright, with a bias, and with the IMU half a metre beside that axis
+    angle, spin = 0.8 * np.cos(np.pi * t_s), -0.8 * np.pi**2 * np.cos(np.pi * t_s)
+    rate = -0.8 * np.pi * np.sin(np.pi * t_s)
+    zero, lever_m = np.zeros_like(t_s), np.array([0.5, 0.0, 0.1])
+    world_from_imu = quat_exp(np.stack([zero, zero, angle], axis=1))
+    # gravity changes ever faster, as through a gyroscope that drifts
+    world = np.stack([zero, amplitude_m_s2 * np.sin(3 * np.pi * t_s), 9.8 + 0.3 * t_s**2], axis=1)
+    off_axis = np.stack([-(rate**2) * lever_m[0], spin * lever_m[0], zero], axis=1)
+    accel = quat_rotate(quat_conjugate(world_from_imu), world) + off_axis + [0.1, -0.2, 0.3]
+    gyro = np.stack([zero, zero, rate], axis=1)
+    found = acceleration_rms_m_s2(ImuRecording(gyro_t_s=t_s, gyro_rad_s=gyro, accel_t_s=t_s, accel_m_s2=accel))
+    assert found == pytest.approx(rms_m_s2, rel=0.05, abs=0.01)
+
+
+@pytest.mark.parametrize("kind", ["lasting", "walk", "lasting, broken", "each by itself"])
+def test_errors_that_last_weigh_as_by_the_whole_covariance(kind):
+    rng, sigma, lasting_s = np.random.default_rng(11), 0.3, 0.6
+    t_s = np.cumsum([0.1, 0.05, 0.4, 2.0, 0.2, 0.9])
+    values, dt_s = rng.standard_normal((len(t_s), 3)), np.diff(t_s)
+    apart_s, first_s = np.abs(t_s[:, None] - t_s), np.minimum(t_s[:, None], t_s)
+    variance = 0.5 * lasting_s * sigma**2
+    whole = np.ones(len(dt_s), dtype=bool)
+    if kind == "lasting":
+        cov, group = (
+            variance * np.exp(-apart_s / lasting_s),
+            lasting_group(values, DRIFT, sigma, lasting_s, dt_s, ~whole),
+        )
+    elif kind == "each by itself":
+        cov, group = variance * np.eye(len(t_s)), state_group(values, DRIFT, variance**0.5)
+    elif kind == "walk":
+        cov, group = sigma**2 * first_s, walk_group(values, DRIFT, sigma, dt_s)
+    else:
+        whole[2] = False
+        cov, group = sigma**2 * first_s, lasting_group(values, DRIFT, sigma, lasting_s, dt_s, ~whole)
+        # either side of the break is a walk of its own
+        cov[:3, 3:] = cov[3:, :3] = 0.0
+    squares = np.sum(values * np.linalg.solve(cov, values))
+    starts = {"each by itself": [], "lasting, broken": [0, 3]}.get(kind, [0])
+    first = sum(np.sum(values[i] ** 2) / cov[i, i] for i in starts)
+    assert np.sum(group.residual**2) + first == pytest.approx(squares, rel=1e-4)
