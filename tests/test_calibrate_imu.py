@@ -4,6 +4,7 @@ import dataclasses
 import importlib.util
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ import pytest
 from colmap_inertial import calibrate_imu, estimate_scale, gravity_at_latitude_m_s2
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.types import IMU_CAL, IMU_CALIBRATION_PARAMETERS, ImuCalibration, ImuRecording
-from colmap_inertial.inertial.static_calibration._rests import candidate_rests
+from colmap_inertial.inertial.static_calibration import _residual
+from colmap_inertial.inertial.static_calibration._rests import _means, candidate_rests
 from colmap_inertial.tools.simulate import RecordingOptions, RestOptions, simulate_recording, simulate_rests
 from colmap_inertial.tools.simulate.sensors import IMU_PRESETS
 
@@ -286,3 +288,41 @@ def test_the_rests_of_an_xsens_are_found_and_gravity_is_as_long_in_all(study, sh
     assert found.calibration.device == "Xsens MTi"
     # its nominal factor of rates is 31 % off; the authors' own calibration has 4778 counts per rad/s
     np.testing.assert_allclose(np.diagonal(found.calibration.gyro_gain), 6258 / 4778 - 1, atol=0.006)
+
+
+def lying(rng, *, seconds=20.0, accel_m_s2=0.02, gyro_rad_s=1e-3) -> ImuRecording:
+    """Readings of a device that lies still, with noise of so much on all axes together."""
+    t_s = np.arange(0, seconds, 0.01)
+    accel, gyro = (size / 3**0.5 * rng.standard_normal((len(t_s), 3)) for size in (accel_m_s2, gyro_rad_s))
+    return ImuRecording(gyro_t_s=t_s, gyro_rad_s=gyro, accel_t_s=t_s, accel_m_s2=accel + np.array([0, 0, 9.81]))
+
+
+@pytest.mark.parametrize(("sensor", "most"), [("accel_m_s2", 0.5), ("gyro_rad_s", 0.03)])
+def test_what_shakes_as_a_hand_does_lies_nowhere(sensor, most):
+    rng = np.random.default_rng(5)
+    assert candidate_rests(lying(rng, **{sensor: 0.8 * most}))
+    assert not candidate_rests(lying(rng, **{sensor: 1.3 * most}))
+
+
+@pytest.mark.parametrize("step_s", [0.02, 0.8], ids=["quick", "slower than blocks"])
+def test_means_of_rests_scatter_as_they_say(step_s):
+    rng, rests, seconds = np.random.default_rng(6), 80, 9.6
+    t_s = np.arange(0, rests * seconds, step_s) + 1e-3
+    truth = rng.standard_normal((rests, 3))
+    values = truth[(t_s / seconds).astype(int)] + 0.3 * rng.standard_normal((len(t_s), 3))
+    begin_s = seconds * np.arange(rests)
+    means, sigma, deviation = _means(t_s, values, np.stack([begin_s, begin_s + seconds], axis=1))
+    expected = 0.3 / (seconds / step_s) ** 0.5
+    assert sigma == pytest.approx(expected, rel=0.1)
+    assert np.std(means - truth) == pytest.approx(expected, rel=0.15)
+    # of a few readings, the mean takes a part of the scatter along
+    assert deviation == pytest.approx(0.3 * (1 - step_s / seconds) ** 0.5, rel=0.05)
+
+
+def test_what_nine_parameters_leave_is_the_size_of_the_noise():
+    rng, found = np.random.default_rng(8), []
+    for _ in range(300):
+        by, noise = rng.standard_normal((14, 9)), 0.02 * rng.standard_normal(14)
+        left = noise - by @ np.linalg.lstsq(by, noise, rcond=None)[0]
+        found.append(_residual(SimpleNamespace(accel_residual_m_s2=left), range(14)))
+    assert np.mean(found) == pytest.approx(0.02**2, rel=0.1)
