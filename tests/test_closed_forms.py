@@ -15,10 +15,14 @@ from colmap_inertial.colmap.loops import key_frames
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import FormatError, NotObservableError
 from colmap_inertial.core.geometry import quat_conjugate, quat_exp, quat_rotate
-from colmap_inertial.core.types import ImuRecording
+from colmap_inertial.core.types import CameraTrajectory, ImuRecording
 from colmap_inertial.imaging.gyro_camera import FrameShutter
+from colmap_inertial.inertial import scale
 from colmap_inertial.inertial.core.factors import lasting_group, state_group, walk_group
-from colmap_inertial.inertial.core.parameters import DRIFT
+from colmap_inertial.inertial.core.parameters import ACCEL_GAIN, DRIFT, GYRO_GAIN, N_GLOBALS, SCALE, Estimate, Prior
+from colmap_inertial.inertial.core.priors import AccelPart
+from colmap_inertial.inertial.scale._fit import _gain_surprise
+from colmap_inertial.inertial.scale.joint import scale_of
 from colmap_inertial.io.gopro import _stabilisation
 from colmap_inertial.motion.align._fit import _noise_of
 from colmap_inertial.motion.align.conventions import quick_accelerations
@@ -167,3 +171,76 @@ def test_errors_that_last_weigh_as_by_the_whole_covariance(kind):
     starts = {"each by itself": [], "lasting, broken": [0, 3]}.get(kind, [0])
     first = sum(np.sum(values[i] ** 2) / cov[i, i] for i in starts)
     assert np.sum(group.residual**2) + first == pytest.approx(squares, rel=1e-4)
+
+
+def test_gains_surprise_where_they_are_farther_off_than_chance_has_it():
+    rng, sigma = np.random.default_rng(3), 0.005
+    start = Estimate.at_start(np.eye(3)[None], np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
+    info = np.zeros((N_GLOBALS, N_GLOBALS))
+    info[ACCEL_GAIN, ACCEL_GAIN] = info[GYRO_GAIN, GYRO_GAIN] = np.eye(9) / sigma**2
+    prior = Prior(mean=start, info=info, gravity_m_s2=9.8, gravity_sigma_m_s2=0.02)
+
+    def surprise(times, cov):
+        gains = times * sigma * rng.standard_normal((400, 3, 3))
+        return np.array([_gain_surprise(prior, replace(start, accel_gain=gain), cov) for gain in gains])
+
+    # all of the gains are known: nine squares are nine on average, and three standard deviations nine times as many
+    known = np.zeros((N_GLOBALS, N_GLOBALS))
+    usual = surprise(1.0, known)
+    assert usual.min() == 1.0 and 0.1 < np.mean(usual > 1) < 0.2
+    assert surprise(3.0, known).mean() == pytest.approx(81 / (9 + 18**0.5), rel=0.1)
+    # none is: a little says more
+    unknown = known.copy()
+    unknown[ACCEL_GAIN, ACCEL_GAIN] = sigma**2 * np.eye(9)
+    assert surprise(3.0, unknown).mean() > 3 * surprise(3.0, known).mean()
+
+
+@pytest.mark.parametrize(
+    ("fitted", "shift"),
+    [(1.0, 0.0), (0.5, 0.0), (2.0, 0.75 * 4e-3), (30.0, 4e-3)],
+    ids=["as expected", "quieter", "twice", "all of it"],
+)
+def test_a_fit_that_overstates_the_accelerometer_s_noise_is_corrected_by_its_share(fitted, shift):
+    cov = np.zeros((N_GLOBALS, N_GLOBALS))
+    cov[SCALE, SCALE] = 2e-5
+    fit = SimpleNamespace(
+        # 300 centres, of which the states take 200
+        sums={"centre_m": (90.0, 90.0), "drift_m_rts": (10.0, 10.0)}, cov=cov, freedom=1e6, gain_surprise=2.0,
+        expected_accel_m_s2_rthz=1e-3, noise=SimpleNamespace(accel_density_m_s2_rthz=fitted * 1e-3),
+        variance_parts={"accel_gain": 1e-6, "motion": 3e-6}, level_variance=0.0,
+        estimate=SimpleNamespace(metres_per_unit=0.5),
+    )  # fmt: skip
+    found = scale_of(fit, np.linspace(0, 1e4, 100), AccelPart(calibrated=True, factor=0.5), clock_rate=1e-3)
+    assert found.shift == pytest.approx(shift, rel=0.01, abs=1e-12)
+    assert found.metres_per_unit == pytest.approx(0.5 * np.exp(shift), rel=1e-4)
+    # the surprise doubles the variance of the gains, and results of the device halve their standard deviation
+    assert found.parts["accel_gain"] ** 2 == pytest.approx(0.5 * 1e-6, rel=0.02)
+    assert found.parts["motion"] ** 2 == pytest.approx(3e-6, rel=0.02)
+    assert found.parts["clocks"] == pytest.approx(2**0.5 * 1e-3)
+    assert found.sigma_log == pytest.approx(sum(part**2 for part in found.parts.values()) ** 0.5)
+
+
+@pytest.mark.parametrize(("sigma_without", "believed"), [(0.4, False), (0.2, True)])
+@pytest.mark.parametrize("end", [1, -1], ids=["begin", "end"])
+def test_an_end_is_left_out_where_the_scale_is_three_times_as_sure_without_it(
+    monkeypatch, sigma_without, believed, end
+):
+    count, wrong = 30, 7
+    names = tuple(f"{i:02}" for i in range(count))
+    path = CameraTrajectory(
+        names=names,
+        t_s=np.arange(30.0),
+        cam_from_world_xyzw=np.tile([0, 0, 0, 1.0], (count, 1)),
+        cam_in_world=np.zeros((count, 3)),
+    )
+    misplaced = set(names[:wrong] if end == 1 else names[-wrong:])
+
+    def estimate(trajectory, timed, options):
+        sigma = 1.0 if misplaced & set(trajectory.names) else sigma_without
+        return SimpleNamespace(cov=sigma**2 * np.eye(7), verdict="weak")
+
+    monkeypatch.setattr(scale, "_estimate", estimate)
+    whole = estimate(path, None, None)
+    best, left_out = scale._estimate_without_end(path, None, None, (whole, ()))
+    assert set(left_out) == (misplaced if believed else set())
+    assert best.cov[0, 0] == pytest.approx(sigma_without**2 if believed else 1.0)

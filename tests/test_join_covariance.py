@@ -10,6 +10,7 @@ from colmap_inertial.core.geometry import matrix_from_quat, quat_from_matrix, so
 from colmap_inertial.inertial.join import joined_model
 from colmap_inertial.inertial.join.placement import ImuLink, Placed
 from colmap_inertial.inertial.join.relative_poses import end_images, relative_cov, tie_cov, worst
+from colmap_inertial.inertial.scale.posterior import FittedPath
 from colmap_inertial.model.similarities import compose
 from colmap_inertial.model.submodels.graph import Placements
 
@@ -104,6 +105,30 @@ def test_the_poses_on_both_sides_of_a_gap_add_their_own_errors():
         by = slopes(moved, 6)
         cov += by @ roots[side] @ roots[side].T @ by.T
     assert tie_cov(submodels, placed, link) == pytest.approx(cov, rel=1e-6, abs=1e-12)
+
+
+def test_a_visual_pose_errs_by_its_rotation_and_by_what_that_carries_along():
+    rng = np.random.default_rng(4)
+    world_from_imu, cam_from_imu = so3_exp(rng.uniform(-1, 1, (2, 3)))
+    camera, coupling, learned = world_from_imu @ cam_from_imu.T, *rng.standard_normal((2, 3, 3))
+    # square roots of the information, of a standard deviation of one
+    shapes = np.linalg.inv(np.eye(3) + 0.3 * rng.standard_normal((2, 3, 3)))
+    noise = SimpleNamespace(rotation_rad=2e-3, rotation_excess=1.5, centre_m=5e-3, drift_m2=1e-6)
+    x = SimpleNamespace(
+        world_from_imu=world_from_imu[None], cam_from_imu=cam_from_imu, coupling_m=learned, metres_per_unit=0.4
+    )
+    data = SimpleNamespace(rotation_shape=shapes[:1], centre_shape=shapes[1:], coupling=coupling[None])
+    path = FittedPath(
+        origin=np.zeros(3), floor_log=0.0, _data=data, _fit=SimpleNamespace(estimate=x, noise=noise), _aligned=None,
+        _stamps_s=np.zeros((2, 2)), _widened=1.0, _shift_log=0.0,
+    )  # fmt: skip
+    # whitened errors: of the rotation in the camera, which turns the camera the other way, of the centre, and a drift
+    turned, moved = 2e-3 * np.linalg.inv(shapes[0]), 5e-3 * np.linalg.inv(shapes[1])
+    carried = camera @ (learned + 0.4 * coupling) @ turned
+    root = np.block([[-camera @ turned, np.zeros((3, 6))], [carried, moved, 1e-3 * np.eye(3)]])
+    assert path.seen_cov(0) == pytest.approx(root @ root.T, rel=1e-9, abs=1e-15)
+    # many of them, each as one of a chain that errs alike
+    assert path.seen_variances == pytest.approx((9e-6, 2.6e-5))
 
 
 def test_the_worst_direction_is_the_largest_of_many():
