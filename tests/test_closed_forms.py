@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pycolmap
 import pytest
+from scipy.spatial.transform import Rotation
 
 from colmap_inertial.checks.diagnose.frames import _readout
 from colmap_inertial.checks.diagnose.imu import acceleration_rms_m_s2
@@ -24,8 +25,11 @@ from colmap_inertial.inertial.core.priors import AccelPart
 from colmap_inertial.inertial.scale._fit import _gain_surprise
 from colmap_inertial.inertial.scale.joint import scale_of
 from colmap_inertial.io.gopro import _stabilisation
+from colmap_inertial.motion.align._clock_search import Intervals, _best_rotation, _fit
 from colmap_inertial.motion.align._fit import _noise_of
 from colmap_inertial.motion.align.conventions import quick_accelerations
+from colmap_inertial.motion.flow import FlowOptions, _measure_quick_rotation
+from colmap_inertial.motion.two_view_rotation import _fit_pure_rotation
 from colmap_inertial.reconstruction.drivers.paths import only_model
 from colmap_inertial.reconstruction.preparation.plan import _most_turned_rad
 from colmap_inertial.reconstruction.preparation.selection import _slots
@@ -244,3 +248,73 @@ def test_an_end_is_left_out_where_the_scale_is_three_times_as_sure_without_it(
     best, left_out = scale._estimate_without_end(path, None, None, (whole, ()))
     assert set(left_out) == (misplaced if believed else set())
     assert best.cov[0, 0] == pytest.approx(sigma_without**2 if believed else 1.0)
+
+
+def turned_intervals(rng, noise_rad, count=240):
+    """Intervals of a camera, what a gyroscope says at the right clock offset and at a wrong one, and its rotation."""
+    end_s = np.cumsum(rng.uniform(0.2, 0.6, count))
+    intervals = Intervals(begin_s=np.append(0, end_s[:-1]), end_s=end_s, turn_rad=np.zeros((count, 3)))
+    cam_from_imu = Rotation.random(random_state=5).as_matrix()
+    felt = 0.2 * rng.standard_normal((count, 3))
+    turn = felt @ cam_from_imu.T + intervals.dt_s[:, None] * [0.03, -0.02, 0.01]
+    turn += noise_rad * rng.standard_normal((count, 3))
+    return replace(intervals, turn_rad=turn), np.stack([felt, rng.permutation(felt)]), cam_from_imu
+
+
+def test_what_a_rotation_and_a_rate_leave_is_what_scipy_leaves():
+    intervals, inertial, cam_from_imu = turned_intervals(np.random.default_rng(9), 0.02)
+    inside = np.random.default_rng(10).random((2, len(intervals))) < 0.8
+    energy, left, _ = _fit(intervals, inertial, inside, None, 1.0)
+    held = _fit(intervals, inertial, inside, cam_from_imu, 1.0)[1]
+    for k in range(2):
+        dt_s, *turns = (x[inside[k]] for x in (intervals.dt_s, intervals.turn_rad, inertial[k]))
+        # weighed by one over the time, the rate that leaves least is the mean over all of it
+        visual, felt = (x - dt_s[:, None] * x.sum(axis=0) / dt_s.sum() for x in turns)
+        assert energy[k] == pytest.approx(np.sum(visual**2 / dt_s[:, None]))
+        _, root = Rotation.align_vectors(visual, felt, weights=1 / dt_s)
+        assert left[k] == pytest.approx(root**2, rel=1e-6)
+        assert held[k] == pytest.approx(np.sum((visual - felt @ cam_from_imu.T) ** 2 / dt_s[:, None]))
+
+
+def test_intervals_that_are_wrong_leave_nothing_where_a_share_is_believed():
+    rng, noise_rad = np.random.default_rng(12), 1e-3
+    intervals, inertial, cam_from_imu = turned_intervals(rng, noise_rad)
+    wrong = rng.random(len(intervals)) < 0.2
+    turn = np.where(wrong[:, None], 0.5 * rng.standard_normal((len(wrong), 3)), intervals.turn_rad)
+    intervals = replace(intervals, turn_rad=turn)
+    inside = np.ones((2, len(wrong)), dtype=bool)
+    for held in (None, cam_from_imu):
+        energy, left, (cross, *_) = _fit(intervals, inertial, inside, held, 0.7)
+        noise = noise_rad**2 * np.sum(3 / intervals.dt_s)
+        assert 0.2 * noise < left[0] < 0.8 * noise < 0.01 * energy[0] and left[1] > 0.3 * energy[1]
+        assert _best_rotation(cross)[0] == pytest.approx(cam_from_imu, abs=3e-3)
+
+
+def test_rays_that_do_not_turn_along_hardly_pull():
+    rng, reach = np.random.default_rng(13), 1e-3
+    b = rng.uniform(-0.5, 0.5, (300, 2))
+    rays = np.concatenate([b, np.ones((300, 1))], axis=1)
+    a_from_b = Rotation.from_rotvec([0.02, -0.03, 0.05])
+    # two fifths of them moved sideways, all alike
+    further = np.where(np.arange(300) < 120, 30 * reach, 0.0)[:, None] * [1.0, 0, 0]
+    turned = a_from_b.apply(rays) + further
+    found, share = _fit_pure_rotation(turned[:, :2] / turned[:, 2:], b, reach)
+    assert (Rotation.from_matrix(found).inv() * a_from_b).magnitude() < 0.02 * reach
+    assert share == pytest.approx(0.6)
+
+
+def test_quick_rotation_is_what_is_faster_than_the_running_mean():
+    t_s = np.arange(0, 20, 1 / 30)
+    slow, quick = 2.0 * np.sin(0.4 * t_s), 0.3 * np.sin(2 * np.pi * 5 * t_s + 0.2)
+    rate = np.stack([quick, slow, np.zeros_like(t_s)], axis=1)
+    # one that was measured wrongly
+    rate[300, 2] = 20.0
+    assert _measure_quick_rotation(rate, 6) == pytest.approx(0.3 / np.sqrt(2), rel=0.1)
+
+
+def test_options_of_the_flow_may_be_as_small_as_it_is_said():
+    smallest = {"long_side_px": 64, "min_support": 8, "corners": 8}
+    FlowOptions(**smallest)
+    for name in smallest:
+        with pytest.raises(ValueError, match="long_side_px must be 64 or more"):
+            FlowOptions(**{**smallest, name: smallest[name] - 1})
