@@ -543,3 +543,7 @@ def test_the_drift_map_names_what_was_stretched_and_how_sure_it_is(small, monkey
     assert found == pytest.approx(jacobian @ cov @ jacobian.T, rel=1e-5, abs=1e-12)
     assert np.array(parts[-1].end_sigma_m) == pytest.approx(np.sqrt(np.diagonal(found)[:3]), rel=1e-9)
     assert 0 < parts[0].sigma_percent < 50
+    # of a frame by itself nothing is said
+    alone_s = np.append(seen.t_s[:-1], seen.t_s[-1] + 3.0)
+    again = judge.drift_map(problem, start, replace(start, imu_in_world_m=longer), alone_s, solved, by)
+    assert len(again) == 4 and again[-1].end_s < alone_s[-1]

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from cases import loop_over
 
-from colmap_inertial.inertial.refine import judge, world
+from colmap_inertial.core.geometry import so3_exp
+from colmap_inertial.inertial.refine import _residuals, judge, world
 
 
 def test_the_size_of_a_path_and_its_derivative():
@@ -26,6 +27,27 @@ def test_the_size_of_a_path_and_its_derivative():
             assert by[i, axis] == pytest.approx((sizes[0] - sizes[1]) / (2 * step), abs=1e-8)
     assert not world.derive_log_size(centres, part[:1]).any()
     assert np.isfinite(world.derive_log_size(np.zeros((3, 3)), np.arange(3))).all()
+
+
+def test_pictures_alone_hold_a_path_s_farthest_frame_as_far_away_as_it_was():
+    path = np.array([[1.0, 2, 3], [4, 3, 3], [-8, -1, 2], [2, 2, 2]])
+    axes = np.tile(np.eye(3), (4, 1, 1))
+    mean = SimpleNamespace(imu_in_world_m=path, world_from_imu=axes)
+    problem = SimpleNamespace(inertial=None, prior=SimpleNamespace(mean=mean))
+
+    def squares(moved):
+        x = SimpleNamespace(imu_in_world_m=moved, velocity_m_s=np.zeros((4, 3)), world_from_imu=axes)
+        return float(np.sum(_residuals.state_rows(problem, x).residual ** 2))
+
+    assert squares(path) == 0
+    away = path - path[0]
+    # longer by a millimetre at the farthest frame, where a hundredth of one is held
+    longer = path[0] + (1 + 1e-3 / np.linalg.norm(away[2])) * away
+    assert squares(longer) == pytest.approx(1e4, rel=1e-3)
+    assert squares(path[0] + away @ so3_exp(np.array([0, 0, 1e-4])).T) < 0.01
+    others = path.copy()
+    others[[1, 3]] += 0.1
+    assert squares(others) < 0.01
 
 
 def test_errors_in_pixels_are_roots_of_mean_costs():

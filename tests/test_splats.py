@@ -161,6 +161,9 @@ def test_packed_splats_are_refused(tmp_path):
 FLIP = np.diag([1.0, -1, -1, 1])
 #: What nerfstudio does to COLMAP's world before it writes.
 SWAPPED = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+#: Two axes change places, and hands with them; all of it moves.
+MIRRORED = np.array([[1.0, 0, 0, 2], [0, 0, 1, 0], [0, 1, 0, -1], [0, 0, 0, 1]])
+WORLDS = {"ours": np.eye(4), "swapped": SWAPPED, "mirrored": MIRRORED}
 
 
 def cameras_of(model, applied):
@@ -180,7 +183,7 @@ def write_trained(root):
     model.write_binary(str(root / "sparse" / "0"))
     (root / "splat").mkdir()
     rows = write_splats(root / "splat" / "point_cloud.ply", 3, kind="f4")
-    for name, applied in (("ours", np.eye(4)), ("swapped", SWAPPED)):
+    for name, applied in WORLDS.items():
         frames = [
             {
                 "file_path": f"images/{n}",
@@ -215,10 +218,13 @@ def test_splats_and_cameras_of_a_project_move_and_come_back(tmp_path, how):
     else:
         write_json(tmp_path / "sim3.json", similarity_as_json(SIMILARITY))
         similarity = read_similarity(tmp_path / "sim3.json")
-    applied = apply_to_project(root, out, similarity)
+    steps: list[tuple[int, int]] = []
+    applied = apply_to_project(root, out, similarity, progress=lambda *step: steps.append(step))
     kinds = {change.path: change.changed for change in applied.changes}
     assert kinds["splat/point_cloud.ply"] == ("positions", "normals", "sizes", "rotations", "colours")
-    assert kinds["ours/transforms.json"] == kinds["swapped/transforms.json"] == ("cameras", "velocities", "up", "box")
+    for name in WORLDS:
+        assert kinds[f"{name}/transforms.json"] == ("cameras", "velocities", "up", "box")
+    assert steps == [(i + 1, len(steps)) for i in range(len(steps))]
     assert any("lost/transforms.json" in note for note in applied.notes)
     assert any(".splat" in note for note in applied.notes)
     assert (out / "transforms_of_mine.json").read_text() == "[1, 2"
@@ -226,7 +232,7 @@ def test_splats_and_cameras_of_a_project_move_and_come_back(tmp_path, how):
     assert_moved(rows, read_splats(out / "splat" / "point_cloud.ply", rows), similarity, atol=5e-6)
 
     moved = read_model(out / "sparse" / "0")
-    for name, world in (("ours", np.eye(4)), ("swapped", SWAPPED)):
+    for name, world in WORLDS.items():
         before = json.loads((root / name / "transforms.json").read_text())
         content = json.loads((out / name / "transforms.json").read_text())
         wanted = cameras_of(moved, world)
@@ -239,7 +245,8 @@ def test_splats_and_cameras_of_a_project_move_and_come_back(tmp_path, how):
         # the same things are in the middle of the box, as large as before
         middle = (0.5 - np.array(before["offset"])) / before["scale"]
         rotation = matrix_from_quat(similarity.rotation_xyzw)
-        there = world[:3, :3] @ (similarity.scale * rotation @ world[:3, :3].T @ middle + similarity.translation_m)
+        in_model = world[:3, :3].T @ (middle - world[:3, 3])
+        there = world[:3, :3] @ (similarity.scale * rotation @ in_model + similarity.translation_m) + world[:3, 3]
         np.testing.assert_allclose(content["scale"] * there + content["offset"], [0.5] * 3, atol=1e-9)
         assert content["scale"] == pytest.approx(0.5 / similarity.scale)
 
@@ -247,7 +254,7 @@ def test_splats_and_cameras_of_a_project_move_and_come_back(tmp_path, how):
     found = read_splats(back / "splat" / "point_cloud.ply", rows)
     for name in rows.dtype.names:
         np.testing.assert_allclose(found[name], rows[name], atol=2e-5)
-    for name in ("ours", "swapped"):
+    for name in WORLDS:
         content, before = (json.loads((r / name / "transforms.json").read_text()) for r in (back, root))
         for frame, old in zip(content["frames"], before["frames"], strict=True):
             np.testing.assert_allclose(frame["transform_matrix"], old["transform_matrix"], atol=1e-9)
