@@ -13,10 +13,12 @@ from colmap_inertial.checks.validate.fit import (
     estimate_ratio,
     fit_scale,
     normal_equations,
+    settle,
+    weigh_equations,
 )
 from colmap_inertial.checks.validate.measure import fit_without_outliers
 from colmap_inertial.checks.validate.observations import Placement, linearise, triangulate
-from colmap_inertial.checks.validate.place import observe
+from colmap_inertial.checks.validate.place import _place_by_pair, observe
 from colmap_inertial.checks.validate.views import View, sight
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import so3_exp
@@ -199,3 +201,68 @@ def test_corners_are_triangulated_from_the_cameras_alone():
     np.testing.assert_allclose(in_world, TARGET.corners_m[corner], atol=1e-7)
     once = obs.select(obs.view == 0)
     assert not triangulate(once, START)[2].any()
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("turn_rad", [-2.1, 2.1])
+def test_a_start_that_is_far_off_comes_to_rest_at_the_truth(axis, turn_rad):
+    obs = simulate(np.random.default_rng(14), 4, noise_px=0.0)
+    turned = Placement(
+        log_scale=0.1, rotation=so3_exp(turn_rad * np.eye(3)[axis])[None], centre=np.array([[0.05, -0.05, 0.02]])
+    )
+    found = settle(obs, turned)
+    assert abs(found.log_scale) < 1e-6
+    np.testing.assert_allclose(found.rotation[0], np.eye(3), atol=1e-6)
+
+
+def test_with_pose_errors_the_fit_rests_where_these_weigh_as_they_are():
+    obs = simulate(np.random.default_rng(15), 6, turn_rad=2e-3, shift_m=2e-3)
+    plain = settle(obs, START)
+    none = settle(obs, START, pose_ratio=np.zeros(5))
+    assert none.log_scale == pytest.approx(plain.log_scale, abs=1e-12)
+    ratio = (2e-3 / 0.3) ** 2 * np.ones(5)
+    weighed = settle(obs, START, pose_ratio=ratio)
+    _, s, rhs, _ = weigh_equations(normal_equations(obs, weighed)[0], ratio)
+    _, s_plain, rhs_plain, _ = weigh_equations(normal_equations(obs, plain)[0], ratio)
+    assert rhs @ np.linalg.solve(s, rhs) < 1e-3 * (rhs_plain @ np.linalg.solve(s_plain, rhs_plain))
+
+
+@pytest.mark.parametrize("unit", [0.01, 1.0, 100.0])
+def test_two_views_place_a_target_in_a_model_of_any_unit(unit):
+    rng, views, sightings = np.random.default_rng(16), [], []
+    for i, pose in enumerate(orbit(rng, 2)):
+        px = CAMERA.img_from_cam(TARGET.corners_m @ pose.rotation.T + pose.translation)
+        sightings.append(sight(i, CAMERA, Detection(part=0, corner=np.arange(len(px)), xy_px=px)))
+        views.append(
+            View(
+                name=str(i), path=None, camera=CAMERA, cam_from_world=pose.rotation,
+                cam_from_world_t=unit * np.asarray(pose.translation),
+            )
+        )  # fmt: skip
+    found = _place_by_pair(*sightings, 0, TARGET, views)
+    assert found is not None and found.log_scale == pytest.approx(np.log(unit), abs=1e-5)
+    # a camera that looks the other way saw nothing in front of it
+    about = np.diag([-1.0, 1, -1])
+    for i, view in enumerate(views):
+        turned = views.copy()
+        turned[i] = replace(
+            view, cam_from_world=about @ view.cam_from_world, cam_from_world_t=about @ view.cam_from_world_t
+        )
+        assert _place_by_pair(*sightings, 0, TARGET, turned) is None
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_corners_whose_ray_does_not_lead_back_are_left_out(axis):
+    class Bent:
+        """A camera that forgets a part of its distortion on one side, as a fit of it may do."""
+
+        cam_from_img = staticmethod(CAMERA.cam_from_img)
+
+        def img_from_cam(self, direction):
+            xy = CAMERA.img_from_cam(direction)
+            xy[:, axis] += 0.1 * (xy[:, axis] > 250)
+            return xy
+
+    xy = np.stack([np.linspace(100, 400, 20), np.linspace(120, 390, 20)], axis=1)
+    seen = sight(0, Bent(), Detection(part=0, corner=np.arange(20), xy_px=xy))
+    assert seen.corner.tolist() == np.flatnonzero(xy[:, axis] < 250).tolist()
