@@ -24,7 +24,7 @@ from colmap_inertial.checks.report.figure_3d import scene_figure
 from colmap_inertial.checks.report.photogrammetry import scene_record
 from colmap_inertial.checks.report.series import SIZES, nice_length, rounded, strided, thinned
 from colmap_inertial.checks.report.signals import signal_record
-from colmap_inertial.checks.report.still import draw_still
+from colmap_inertial.checks.report.still import STYLE, draw_still
 from colmap_inertial.checks.report.still_3d import StillView, draw_scene_still
 from colmap_inertial.checks.report.still_axes import choose_axis, equalise
 from colmap_inertial.checks.words import outcome_of_model
@@ -227,6 +227,74 @@ def test_logarithmic_equal_and_coloured_axes_of_stills():
     cells = {a["fill"]: a["d"] for tag, a in still.shapes if tag == "path" and "fill" in a}
     assert list(cells) == ["#050000", "#850000", "#fa0000"]  # the middles of 24 steps
     assert len({path.count("M") for path in cells.values()}) == 1 and "images" in still.words
+
+
+def texts_of(still):
+    return list(zip(still.words, (attrs for tag, attrs in still.shapes if tag == "text"), strict=True))
+
+
+def test_everything_that_a_still_says_lies_within_it_and_names_have_room():
+    lines = {"type": "scatter", "mode": "lines", "x": [0.0, 1.0], "line": {"color": "#123456", "width": 1}}
+    left, right = figures.axis("left", range=[0, 1]), {**figures.axis("right"), "overlaying": "y", "side": "right"}
+    spec = figures.layout(300, figures.axis("t", range=[0, 1]), left, yaxis2=right, showlegend=True)
+    for names, rows in ((["a", "b", "c"], 1), ([f"a name that is long, number {i}" for i in range(5)], 3)):
+        data = [{**lines, "y": [0.2, 0.4], "name": name} for name in names]
+        data[-1] |= {"y": [1000.0, 3000.0], "yaxis": "y2"}
+        texts = texts_of(Drawing(draw_still({"data": data, "layout": spec}, "x")))
+        ends = {}
+        for word, attrs in texts:
+            x, y, wide = float(attrs["x"]), float(attrs["y"]), STYLE.letter * len(word)
+            if "transform" in attrs:  # upwards: letters stand to the left of this line, tails to the right
+                assert STYLE.font <= x <= STYLE.width - STYLE.font / 4
+                continue
+            begin = x - wide * {"start": 0.0, "middle": 0.5, "end": 1.0}[attrs["text-anchor"]]
+            assert begin >= -1 and begin + wide <= STYLE.width + 1, word
+            if word in names:
+                assert begin >= ends.get(y, 0.0)
+                ends[y] = begin + wide
+        assert len(ends) == rows and set(names) <= {word for word, _ in texts}
+        assert max(ends) < min(float(attrs["y"]) for word, attrs in texts if word == "1.0")
+
+
+def test_bars_of_stills_are_as_high_as_their_numbers():
+    bars = {"type": "bar", "x": ["a", "b", "c"], "y": [1.0, 4.0, 2.0], "marker": {"color": "#654321"}, "name": "n"}
+    spec = figures.layout(300, figures.axis("x", type="category"), figures.axis("y", range=[0, 5]))
+    still = Drawing(draw_still({"data": [bars], "layout": spec}, "bars"))
+    boxes = [attrs for tag, attrs in still.shapes if tag == "rect" and attrs["fill"] == "#654321"]
+    left, top, width, height = np.array([[float(b[k]) for k in ("x", "y", "width", "height")] for b in boxes]).T
+    assert height / height[0] == pytest.approx([1, 4, 2], rel=0.02)
+    assert top + height == pytest.approx([top[0] + height[0]] * 3, abs=0.2)
+    assert width == pytest.approx(0.8 * np.diff(left).mean(), rel=0.01) and np.ptp(width) < 0.2
+    (labels,) = [[float(a["x"]) for word, a in texts_of(still) if word in "abc"]]
+    assert left + width / 2 == pytest.approx(labels, abs=0.2)
+
+
+@pytest.mark.parametrize("unit", ["m/s2", "units/s2"])
+def test_accelerations_and_spectra_have_axes_on_which_their_curves_lie(unit):
+    curves = {side: [{"t_s": [0.0, 1.0], "values": [a, -b]} for a, b in sizes] for side, sizes in (
+        ("accelerometer", ((1.0, 0.5), (9.0, 12.0), (0.1, 0.2))), ("camera", ((30.0, 20.0), (0.0, 0.0), (2.0, 5.0)))
+    )}  # fmt: skip
+    figure = figures.accelerations({"camera_unit": unit, **curves})
+    spec, metric = figure["layout"], unit == "m/s2"
+    domains = [spec[f"yaxis{key}"]["domain"] for key in ("", 2, 3)]
+    assert domains[0][1] == 1 and domains[2][0] == pytest.approx(0) and domains[1][0] - domains[2][1] > 0.01
+    assert [high - low for low, high in domains] == pytest.approx([0.3] * 3)
+    assert ("yaxis4" in spec) is not metric
+    if not metric:
+        for trace in figure["data"]:
+            low, high = spec[f"yaxis{trace['yaxis'][1:]}"]["range"]
+            # zero in the middle, and the curve next to it
+            assert low == -high < min(trace["y"]) and max(trace["y"]) < high
+            assert high < 2 * max(map(abs, trace["y"])) or high < 1.2 * max(1.0, SIZES.hand_m_s2)
+    spectrum = {"camera_unit": unit, "curves": {
+        "imu": {"hz": [1.0, 20.0], "density": [1e-3, 0.5]}, "camera": {"hz": [1.0, 8.0], "density": [2.0, 9.0]}
+    }}  # fmt: skip
+    spec = figures.spectra(spectrum, unit="mm/s²", factor=1000.0)["layout"]
+    # over more than two decades, at tens alone
+    assert spec["yaxis"]["dtick"] == 1 and spec["xaxis"]["dtick"] == "D2"
+    assert ("yaxis2" in spec) is not metric and spec.get("yaxis2", {"dtick": "D2"})["dtick"] == "D2"
+    imu, camera = figures.spectra(spectrum, unit="mm/s²", factor=1000.0)["data"]
+    assert imu["y"] == [1.0, 500.0] and camera["y"] == ([2000.0, 9000.0] if metric else [2.0, 9.0])
 
 
 def test_the_picture_of_a_model_shows_near_over_far_and_up_upwards(full):
