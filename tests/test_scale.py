@@ -49,8 +49,17 @@ def test_gravity_agrees_with_the_wgs84_table():
     assert gravity_at_latitude_m_s2(0) == pytest.approx(9.7803253359, abs=1e-9)
     assert gravity_at_latitude_m_s2(90) == pytest.approx(9.8321849378, abs=1e-7)
     assert gravity_at_latitude_m_s2(-45) == pytest.approx(9.80620, abs=2e-5)
-    with pytest.raises(ValueError, match="latitude"):
-        gravity_at_latitude_m_s2(91)
+    # the free-air gradient of textbooks
+    assert gravity_at_latitude_m_s2(45, 1000) - gravity_at_latitude_m_s2(45) == pytest.approx(-3.086e-3, rel=2e-3)
+    for latitude_deg, height_m in ((-90, -1000), (90, 10000)):
+        free_air = gravity_at_latitude_m_s2(latitude_deg) - 3.086e-6 * height_m
+        assert gravity_at_latitude_m_s2(latitude_deg, height_m) == pytest.approx(free_air, abs=1e-4)
+    for latitude_deg in (91, -91, float("nan")):
+        with pytest.raises(ValueError, match="latitude"):
+            gravity_at_latitude_m_s2(latitude_deg)
+    for height_m in (-1001, 10001, float("nan")):
+        with pytest.raises(ValueError, match="height"):
+            gravity_at_latitude_m_s2(0, height_m)
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ from colmap_inertial.core.types import (
     CAL,
     CALIBRATION_PARAMETERS,
     CameraImuCalibration,
+    CameraModel,
     CameraTrajectory,
     FrameTiming,
     ImuRecording,
@@ -40,6 +41,12 @@ def recording(**changes):
 def test_a_recording_that_makes_no_sense_cannot_be_built(changes, words):
     with pytest.raises(ValueError, match=words):
         recording(**changes)
+
+
+@loop_over("changes", [{"width": 0}, {"height": -1}, {"params": (100.0, np.nan, 32.0, 24.0)}])
+def test_a_camera_that_makes_no_sense_cannot_be_built(changes):
+    with pytest.raises(ValueError, match=r"must be (positive|finite)"):
+        CameraModel(**{"model": "PINHOLE", "width": 64, "height": 48, "params": (100.0, 100.0, 32.0, 24.0), **changes})
 
 
 def test_a_gyroscope_alone_is_a_recording():

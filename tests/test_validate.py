@@ -294,6 +294,10 @@ def test_missing_and_unreadable_images_are_listed(small, tmp_path):
     assert reasons.pop("001.png") == "no such file in the image folder"
     assert reasons.pop("004.png").startswith("cannot be decoded") and not reasons
     assert result.views_used == 3
+    for path in tmp_path.iterdir():
+        path.write_bytes(b"not a picture")
+    with pytest.raises(FormatError, match=r"000\.png.*cannot be decoded"):
+        validate_model(small.model(), tmp_path, TARGET)
 
 
 def test_the_search_stops_when_enough_views_are_found(small):
