@@ -12,7 +12,7 @@ from colmap_inertial.inertial.join.placement import ImuLink, Placed
 from colmap_inertial.inertial.join.relative_poses import end_images, relative_cov, tie_cov, worst
 from colmap_inertial.inertial.scale.posterior import FittedPath
 from colmap_inertial.model.similarities import compose
-from colmap_inertial.model.submodels.graph import Placements
+from colmap_inertial.model.submodels.graph import Placements, SimilarityConstraint
 
 PAIR = (2, 0)
 FLOORS = (3e-3, 1e-3, 2e-3)
@@ -105,6 +105,15 @@ def test_the_poses_on_both_sides_of_a_gap_add_their_own_errors():
         by = slopes(moved, 6)
         cov += by @ roots[side] @ roots[side].T @ by.T
     assert tie_cov(submodels, placed, link) == pytest.approx(cov, rel=1e-6, abs=1e-12)
+    # the same two images as the first that a constraint was measured by: the nodes are those next to them
+    images = np.array([end_images(submodels, link), (0, 0)])
+    shared = object.__new__(SimilarityConstraint)
+    for name, value in (("first", 2), ("second", 0), ("images", images)):
+        object.__setattr__(shared, name, value)
+    for k, node in ((2, link.from_node), (0, link.to_node)):
+        there = submodels[k].path.seen_cov(node)
+        submodels[k].path.seen_cov = {node: there, 1 - node: np.eye(6)}.get
+    assert tie_cov(submodels, placed, shared) == pytest.approx(cov, rel=1e-6, abs=1e-12)
 
 
 def test_a_visual_pose_errs_by_its_rotation_and_by_what_that_carries_along():

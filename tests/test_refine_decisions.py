@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from cases import loop_over
 
-from colmap_inertial.core.geometry import so3_exp
+from colmap_inertial.core.geometry import so3_exp, so3_log
 from colmap_inertial.inertial.refine import _residuals, judge, world
+from colmap_inertial.inertial.refine.motion import PictureDrift
 
 
 def test_the_size_of_a_path_and_its_derivative():
@@ -48,6 +49,29 @@ def test_pictures_alone_hold_a_path_s_farthest_frame_as_far_away_as_it_was():
     others = path.copy()
     others[[1, 3]] += 0.1
     assert squares(others) < 0.01
+
+
+def test_a_motion_errs_by_its_drift_and_by_what_a_wrong_scale_and_up_do_to_all_of_it():
+    rng, count, step = np.random.default_rng(2), 3, 1e-6
+    centres, velocities = rng.standard_normal((2, count, 3))
+    roots = 0.1 * rng.standard_normal((count, 6, 6))
+    similarity, local = 0.1 * rng.standard_normal((7, 7)), 0.1 * rng.standard_normal((count, 3, 3))
+    names = tuple(map(str, range(count)))
+    drift = PictureDrift(names=names, cam_in_world=centres, cov=roots @ roots.transpose(0, 2, 1))
+    found = drift.motion_covs(similarity @ similarity.T, velocities, local @ local.transpose(0, 2, 1))
+
+    def motion(k, error):
+        """Position against the first frame's, velocity and rotation, with errors of drift, scale and up."""
+        scale, up, turn = np.exp(error[6]), error[7:], error[3:6]
+        rotation = so3_exp(up) @ so3_exp(turn)
+        position = scale * so3_exp(up) @ (centres[k] - centres[0]) + error[:3]
+        return np.concatenate([position, scale * rotation @ velocities[k], so3_log(rotation)])
+
+    for k in range(count):
+        by = np.array([motion(k, e) - motion(k, -e) for e in step * np.eye(10)]).T / (2 * step)
+        cov = by[:, :6] @ drift.cov[k] @ by[:, :6].T + by[:, 6:] @ (similarity @ similarity.T)[:4, :4] @ by[:, 6:].T
+        cov[3:6, 3:6] += local[k] @ local[k].T
+        assert found[k] == pytest.approx(cov, rel=1e-6, abs=1e-9)
 
 
 def test_errors_in_pixels_are_roots_of_mean_costs():

@@ -20,7 +20,7 @@ from test_pipeline import DETERMINISTIC, SCENE, copy_scene
 
 from colmap_inertial.checks.report import figures, signals, write_report
 from colmap_inertial.checks.report.content import _describe_path
-from colmap_inertial.checks.report.figure_3d import scene_figure
+from colmap_inertial.checks.report.figure_3d import _grid, scene_figure
 from colmap_inertial.checks.report.photogrammetry import scene_record
 from colmap_inertial.checks.report.series import SIZES, nice_length, rounded, strided, thinned
 from colmap_inertial.checks.report.signals import signal_record
@@ -267,6 +267,86 @@ def test_bars_of_stills_are_as_high_as_their_numbers():
     assert width == pytest.approx(0.8 * np.diff(left).mean(), rel=0.01) and np.ptp(width) < 0.2
     (labels,) = [[float(a["x"]) for word, a in texts_of(still) if word in "abc"]]
     assert left + width / 2 == pytest.approx(labels, abs=0.2)
+
+
+def test_long_lines_of_stills_keep_their_peaks_and_closed_ones_all_their_corners():
+    count = 5000
+    x, y = np.linspace(0, 10, count), np.zeros(count)
+    y[1234], angle = 1.0, np.linspace(0, 2 * np.pi, count)
+    look = {"type": "scatter", "mode": "lines", "name": "n", "line": {"color": "#123456", "width": 1}}
+    spec = figures.layout(300, figures.axis("x"), figures.axis("y"))
+    over_time, ring = (
+        Drawing(draw_still({"data": [{**look, "x": list(a), "y": list(b)}], "layout": spec}, "x")).lines("#123456")
+        for a, b in ((x, y), (np.cos(angle), np.sin(angle)))
+    )
+    (line,) = over_time
+    assert len(line) <= STYLE.line_points and np.all(np.diff(line[:, 0]) >= 0)
+    assert line[np.argmin(line[:, 1]), 0] == pytest.approx(line[0, 0] + x[1234] / 10 * np.ptp(line[:, 0]), abs=1.0)
+    assert len(ring[0]) == count
+
+
+@pytest.mark.parametrize(
+    "places", [{"x": [1.0, 3.0, 5.0], "y": [10.0, 20.0]}, {"x0": 1.0, "dx": 2.0, "y0": 10.0, "dy": 10.0}], ids=str
+)
+def test_the_cells_of_a_table_fill_its_axes(places):
+    heat = {"type": "heatmap", **places, "z": [[0, 1, 2], [3, 4, 5]], "colorbar": {"title": {"text": "n"}}}
+    heat["colorscale"] = [[0, "#000000"], [1, "#ffffff"]]
+    spec = figures.layout(300, figures.axis("x"), figures.axis("y"))
+    still = Drawing(draw_still({"data": [heat], "layout": spec}, "heat"))
+    cells = [
+        re.findall(r"[\d.]+", a["d"]) for tag, a in still.shapes if tag == "path" and "fill" in a and "z" in a["d"]
+    ]
+    left, low, right, high = np.array(cells, dtype=float)[:, :4].T
+    beside = left.min() - STYLE.left, STYLE.width - STYLE.right_axis - right.max()
+    assert beside[0] == pytest.approx(beside[1], abs=0.1) and 0 <= beside[0] < 0.03 * STYLE.width
+    assert (right - left) == pytest.approx((right.max() - left.min()) / 3, abs=0.1) and len(cells) == 6
+    # columns are at their numbers
+    ticks = {word: float(attrs["x"]) for word, attrs in texts_of(still) if attrs["text-anchor"] == "middle"}
+    middles = sorted({round(v) for v in 0.5 * (left + right)})
+    known = [(ticks[word], at) for word, at in zip("135", middles, strict=True) if word in ticks]
+    assert known and all(abs(tick - at) < 1 for tick, at in known)
+    # the first row at the bottom
+    assert low - high == pytest.approx((low.max() - high.min()) / 2, abs=0.2) and np.argmax(low) < 3
+
+
+def test_a_drift_and_distances_are_drawn_as_they_were_measured():
+    parts = [
+        {
+            "begin_s": 105.0 + 10 * i,
+            "end_s": 115.0 + 10 * i,
+            "metres_per_unit": 2.0 * (1 + 0.01 * i),
+            "sigma_log": 0.004,
+        }
+        for i in range(3)
+    ]
+    model = {
+        "metres_per_unit": 2.0,
+        "half_width_pct": 0.8,
+        "drift": {"parts": parts},
+        "signals": {"first_frame_s": 100.0},
+    }
+    figure = figures.drift(model)
+    dots, spec = figure["data"][0], figure["layout"]
+    assert dots["y"] == pytest.approx([0, 1, 2]) and dots["x"] == [10, 20, 30] and dots["error_x"]["array"] == [5, 5, 5]
+    assert dots["error_y"]["array"] == pytest.approx([0.784] * 3, rel=0.01)
+    assert spec["xaxis"]["range"] == [0, 35] and spec["yaxis"]["range"][1] == -spec["yaxis"]["range"][0] > 2.784
+    assert (spec["shapes"][0]["y0"], spec["shapes"][0]["y1"]) == (-0.8, 0.8)
+    many = [
+        {"known_m": 0.1, "residual_m": 1e-4 * i, "pair": ("a", "b"), "set": "check"}
+        for i in range(2 * SIZES.target_distances - 1)
+    ]
+    (shown,) = figures.target_distances({"distances": many})["data"]
+    assert len(shown["x"]) == SIZES.target_distances and set(shown["x"]) == {100.0}
+    assert shown["y"][:3] == pytest.approx([0, 0.2, 0.4])
+
+
+def test_the_grid_under_a_scene_lies_at_whole_steps():
+    lines = _grid(np.array([-0.3, 0.2, 1.0]), np.array([1.1, 0.9, 2.0]), 0.5)
+    across = [line for line in lines if line[0, 0] == line[1, 0]]
+    assert [line[0, 0] for line in across] == pytest.approx([0, 0.5, 1])
+    assert all(line[:, 1].tolist() == [0.2, 0.9] for line in across)
+    (along,) = [line for line in lines if line[0, 1] == line[1, 1]]
+    assert along.tolist() == [[-0.3, 0.5, 1.0], [1.1, 0.5, 1.0]]
 
 
 @pytest.mark.parametrize("unit", ["m/s2", "units/s2"])

@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import norm, t
 
 from colmap_inertial.core.options import ScaleOptions
 from colmap_inertial.inertial.scale import check_units, estimate_scale, first_seconds, gravity_at_latitude_m_s2
-from colmap_inertial.inertial.scale.verdict import half_width, verdict_of
+from colmap_inertial.inertial.scale.verdict import half_width, student_factor, verdict_of
 from colmap_inertial.tools.simulate.recording import RecordingOptions, simulate_recording
 
 
@@ -28,6 +29,12 @@ def test_the_width_of_the_interval_decides_the_verdict(sigma, verdict):
     low, high = verdict_of(1.0, sigma)[1]
     if np.isfinite(sigma):
         assert half_width(sigma) == pytest.approx((high - low) / 2)
+
+
+def test_few_degrees_of_freedom_widen_as_student_has_it():
+    for freedom in (3, 4, 7, 20, 1000):
+        assert student_factor(freedom) == pytest.approx(t.ppf(0.975, freedom) / norm.ppf(0.975), rel=0.01)
+    assert student_factor(0.5) == student_factor(3.0)
 
 
 def test_failed_checks_lower_and_refusals_refuse():

@@ -2,15 +2,17 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from colmap_inertial.core.camera_clock import CameraTimedImu
+from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import quat_exp, quat_multiply, so3_exp
 from colmap_inertial.inertial.scale import spectral as spectral_module
 from colmap_inertial.inertial.scale._spectra import Signals
-from colmap_inertial.inertial.scale.spectral import SpectralOptions, estimate_spectral
+from colmap_inertial.inertial.scale.spectral import SpectralOptions, estimate_spectral, fit_spectra
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.trajectories import read_inertial_scale
 from colmap_inertial.motion.align import align_camera_imu
@@ -211,6 +213,9 @@ def test_what_cannot_be_differentiated_is_refused(handheld):
     assert spectral(handheld.trajectory, later, calibration).verdict == "refused"
     frozen = replace(handheld.trajectory, cam_in_world=np.zeros_like(handheld.trajectory.cam_in_world))
     assert "does not move" in spectral(frozen, handheld.imu, calibration).reasons[0]
+    # two frequencies of three axes tell less than nine numbers twice over
+    with pytest.raises(NotObservableError, match="at least five seconds"):
+        fit_spectra(SimpleNamespace(frequency_hz=np.array([0.5, 1.0])), calibration, 9.8)
 
 
 # --- real recordings

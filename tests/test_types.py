@@ -85,6 +85,9 @@ def test_a_refusal_has_no_number_and_a_number_is_no_refusal():
         )
     with pytest.raises(ValueError, match="no number"):
         ScaleEstimate(metres_per_unit=None, sigma_log=None, ci95=None, verdict="weak", method="joint")
+    for scale in (0.0, -1.0, float("nan")):
+        with pytest.raises(ValueError, match="must be positive"):
+            ScaleEstimate(metres_per_unit=scale, sigma_log=0.1, ci95=(0.8, 1.2), verdict="weak", method="joint")
     with pytest.raises(ValueError, match="needs a reason"):
         ScaleEstimate(metres_per_unit=None, sigma_log=None, ci95=None, verdict="refused", method="joint")
 

@@ -19,7 +19,7 @@ from validate_scenes import (
 from versions import version_of
 
 from colmap_inertial.checks.validate import parse_target
-from colmap_inertial.checks.validate.detect import detect, find_any_checkerboard
+from colmap_inertial.checks.validate.detect import _fit_homography, _project, _refine, detect, find_any_checkerboard
 
 CAMERA = default_camera()
 
@@ -162,3 +162,32 @@ def test_the_size_of_another_checkerboard_is_told():
     assert sorted(size) == [5, 7]
     right, *_ = detect(image, target)
     assert np.abs(np.sort(xy, axis=0) - np.sort(right.xy_px, axis=0)).max() < 0.5
+
+
+def test_a_homography_is_fitted_to_edges_of_which_some_were_seen_elsewhere():
+    rng = np.random.default_rng(21)
+    first = np.array([[20.0, 3, 200], [-2, 22, 150], [1e-3, 2e-3, 1]])
+    change = np.array([[0.1, 0.03, 1.2], [-0.05, 0.08, -0.7], [2e-4, -1e-4, 0]])
+    xy = rng.uniform(0, 8, (150, 2))
+    normal = np.stack([np.cos(angle := rng.uniform(0, 2 * np.pi, 150)), np.sin(angle)], axis=1)
+    # edges look brighter by a common shift, some are those of a shadow
+    seen = np.sum((_project(first + change, xy) - _project(first, xy)) * normal, axis=1) + 0.3
+    for side in (-4.0, 4.0):
+        offset = np.where(np.arange(150) % 40 == 0, seen + side, seen) + 0.01 * rng.standard_normal(150)
+        found = _fit_homography(first, xy, normal, offset, np.ones(150, dtype=bool))
+        # to first order
+        np.testing.assert_allclose(_project(first + found, xy), _project(first + change, xy), atol=0.1)
+
+
+@pytest.mark.parametrize("half", [3, 8, 11])
+def test_corners_near_any_border_are_left_out_alike(half):
+    size, (y, x) = np.array([80, 60]), np.indices((60, 80))
+    for near, kept in ((half + 0.5, False), (half + 1.5, True)):
+        for axis in (0, 1):
+            for place in (near, size[axis] - 1 - near):
+                corner = np.array([30.5, 30.5])
+                corner[axis] = place
+                image = np.where((x > corner[0]) == (y > corner[1]), 40, 200).astype(np.uint8)
+                xy, good = _refine(image, corner[None], np.array([float(half)]), allowed_px=3.0)
+                assert good.tolist() == [kept], (near, axis, place)
+                assert not kept or xy[0] == pytest.approx(corner, abs=0.05)

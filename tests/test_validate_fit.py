@@ -213,6 +213,8 @@ def test_a_start_that_is_far_off_comes_to_rest_at_the_truth(axis, turn_rad):
     found = settle(obs, turned)
     assert abs(found.log_scale) < 1e-6
     np.testing.assert_allclose(found.rotation[0], np.eye(3), atol=1e-6)
+    with pytest.raises(NotObservableError, match="does not settle"):
+        settle(obs, turned, most_iterations=1)
 
 
 def test_with_pose_errors_the_fit_rests_where_these_weigh_as_they_are():
