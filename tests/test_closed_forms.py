@@ -24,6 +24,7 @@ from colmap_inertial.inertial.core.factors import lasting_group, state_group, wa
 from colmap_inertial.inertial.core.parameters import ACCEL_GAIN, DRIFT, GYRO_GAIN, N_GLOBALS, SCALE, Estimate, Prior
 from colmap_inertial.inertial.core.priors import AccelPart
 from colmap_inertial.inertial.scale._fit import _gain_surprise
+from colmap_inertial.inertial.scale._shape import ShapeFault
 from colmap_inertial.inertial.scale.joint import scale_of
 from colmap_inertial.io.gopro import _stabilisation
 from colmap_inertial.motion.align._clock_search import Intervals, _best_rotation, _fit
@@ -327,3 +328,35 @@ def test_numbers_and_lengths_are_written_as_people_do():
     assert [fixed(v) for v in (2.0, 1234.0, 123456.0, 1e9)] == ["2.000", "1234", "123456", "1.000e+09"]
     assert [length(v) for v in (2.5, 0.9996, 0.5, 0.00999, 0.004)] == ["2.5 m", "1 m", "50 cm", "9.99 mm", "4 mm"]
     assert length_error(0.25) == "2.5 cm" and half_width_pct(2.0, (1.9, 2.1)) == pytest.approx(5.0)
+
+
+@pytest.mark.parametrize(
+    ("at_s", "words"), [(110.0, "+5.0 +- 2.0 % larger before 10 s"), (150.0, "-4.8 +- 2.0 % larger after 50 s")]
+)
+def test_a_scale_that_breaks_is_told_by_lengths_and_undone_in_the_smaller_part(at_s, words):
+    t_s = np.linspace(100.0, 160.0, 61)
+    truth = np.stack([3 * np.sin(0.1 * t_s), 0.05 * t_s, np.cos(0.2 * t_s)], axis=1)
+    # metres per unit are 5 % more behind the break, where lengths of the model are that much shorter
+    longer = np.where(t_s[1:] <= at_s, 1.0, 1 / 1.05)
+    model = np.concatenate([truth[:1], truth[0] + np.cumsum(np.diff(truth, axis=0) * longer[:, None], axis=0)])
+    value, cov = np.array([np.log(1.05)]), np.array([[(0.02 / 1.96) ** 2]])
+    fault = ShapeFault(kind="break", value=value, cov=cov, by_scale=np.zeros(1), at_s=at_s + 0.1)
+    assert words in fault.sentence(t_s, 1.0)
+    # either part is as large as in the larger one
+    steps = np.diff(fault.undo(t_s, model), axis=0) / np.diff(truth, axis=0)
+    assert steps == pytest.approx(np.full_like(steps, longer[-1] if at_s == 110.0 else 1.0), rel=1e-9)
+
+
+def test_a_drift_of_the_scale_is_undone_and_told_from_end_to_end():
+    t_s = np.linspace(0.0, 80.0, 81)
+    truth = np.stack([np.sin(0.1 * t_s), 0.05 * t_s, np.cos(0.2 * t_s)], axis=1)
+    middle_s = 0.5 * (t_s[1:] + t_s[:-1])
+    log_scale = 0.08 * (middle_s - 40.0) / 80.0
+    model = np.cumsum(np.concatenate([truth[:1], np.diff(truth, axis=0) / np.exp(log_scale)[:, None]]), axis=0)
+    cov = np.array([[1e-4]])
+    fault = ShapeFault(kind="drift", value=np.array([0.08]), cov=cov, by_scale=np.zeros(1))
+    assert fault.undo(t_s, model) == pytest.approx(truth, abs=1e-9)
+    # more metres per unit at the end: the model's lengths are smaller there
+    assert "lengths are -7.7 +- 2.8 % larger at the end" in fault.sentence(t_s, 2.0)
+    tolerated = 0.01
+    assert fault.chi2(2.0, tolerated) == pytest.approx(0.08**2 / (2e-4 + tolerated**2))

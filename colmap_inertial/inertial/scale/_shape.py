@@ -115,7 +115,8 @@ class ShapeFault:
 
     def sentence(self, t_s: Array, widened: float) -> str:
         """The error in words; ``t_s`` are the nodes' times."""
-        size, sigma = 100 * np.expm1(float(self.value[0])), 196 * (widened * float(self.cov[0, 0])) ** 0.5
+        # where metres per unit are more, lengths of the model are less
+        (more, less), sigma = 100 * np.expm1(self.value[0] * np.array([1, -1])), 196 * (widened * self.cov[0, 0]) ** 0.5
         advice = "close loops while recording, or scale its parts apart"
         if self.kind == "stretch":
             sizes, axes = np.linalg.eigh(self.strain)
@@ -127,12 +128,12 @@ class ShapeFault:
             )
         if self.kind == "drift":
             return (
-                f"the reconstruction's scale is not the same throughout: lengths are {-size:+.1f} +- {sigma:.1f} % "
+                f"the reconstruction's scale is not the same throughout: lengths are {less:+.1f} +- {sigma:.1f} % "
                 f"larger at the end than at the beginning: {advice}"
             )
         since_s, first = self.at_s - float(t_s[0]), 2 * self.at_s < t_s[0] + t_s[-1]
         return (
-            f"the reconstruction's scale is not the same throughout: lengths are {size if first else -size:+.1f} +- "
+            f"the reconstruction's scale is not the same throughout: lengths are {more if first else less:+.1f} +- "
             f"{sigma:.1f} % larger {'before' if first else 'after'} {since_s:.0f} s than in the longer part, whose "
             f"scale is used: {advice}"
         )
