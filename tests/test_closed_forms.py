@@ -23,10 +23,11 @@ from colmap_inertial.inertial import scale
 from colmap_inertial.inertial.core.factors import lasting_group, state_group, walk_group
 from colmap_inertial.inertial.core.parameters import ACCEL_GAIN, DRIFT, GYRO_GAIN, N_GLOBALS, SCALE, Estimate, Prior
 from colmap_inertial.inertial.core.priors import AccelPart
-from colmap_inertial.inertial.scale._fit import _gain_surprise
+from colmap_inertial.inertial.scale._fit import _excitation_m_s2, _gain_surprise
 from colmap_inertial.inertial.scale._shape import ShapeFault
 from colmap_inertial.inertial.scale.joint import scale_of
 from colmap_inertial.io.gopro import _stabilisation
+from colmap_inertial.model.readout import _noise_px
 from colmap_inertial.motion.align._clock_search import Intervals, _best_rotation, _fit
 from colmap_inertial.motion.align._fit import _noise_of
 from colmap_inertial.motion.align.conventions import quick_accelerations
@@ -360,3 +361,38 @@ def test_a_drift_of_the_scale_is_undone_and_told_from_end_to_end():
     assert "lengths are -7.7 +- 2.8 % larger at the end" in fault.sentence(t_s, 2.0)
     tolerated = 0.01
     assert fault.chi2(2.0, tolerated) == pytest.approx(0.08**2 / (2e-4 + tolerated**2))
+
+
+def test_the_excitation_is_the_acceleration_of_the_camera_and_not_of_its_imu():
+    t_s, hz = np.arange(0, 20, 0.05), 0.5
+    angle = 0.6 * np.sin(2 * np.pi * 0.8 * t_s)
+    world_from_imu = Rotation.from_rotvec(angle[:, None] * [0, 0, 1.0]).as_matrix()
+    camera = np.stack([0.3 * np.sin(2 * np.pi * hz * t_s), 2.0 * t_s, np.zeros_like(t_s)], axis=1)
+    # half a metre in front of the IMU
+    cam_from_imu, imu_in_cam = Rotation.from_rotvec([0.3, -0.2, 0.9]).as_matrix(), np.array([0.0, 0.0, -0.5])
+    path = SimpleNamespace(
+        imu_in_world_m=camera + world_from_imu @ cam_from_imu.T @ imu_in_cam,
+        world_from_imu=world_from_imu, cam_from_imu=cam_from_imu, imu_in_cam_m=imu_in_cam,
+    )  # fmt: skip
+    found = _excitation_m_s2(SimpleNamespace(t_s=t_s), path)
+    assert found == pytest.approx(0.3 * (2 * np.pi * hz) ** 2 / np.sqrt(2), rel=0.02)
+
+
+@pytest.mark.parametrize(("points", "known"), [(12, False), (400, True)])
+def test_noise_is_told_by_what_poses_and_points_do_not_adapt_to(points, known):
+    pycolmap.set_random_seed(4)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, 2 if points == 12 else 8
+    options.num_points3D = points
+    model = pycolmap.synthesize_dataset(options)
+    noise = pycolmap.SyntheticNoiseOptions()
+    noise.point2D_stddev = 0.4
+    pycolmap.synthesize_noise(noise, model)
+    adjusted = pycolmap.BundleAdjustmentOptions()
+    adjusted.print_summary = adjusted.refine_focal_length = adjusted.refine_extra_params = False
+    if known:
+        pycolmap.bundle_adjustment(model, adjusted)
+    model.update_point_3d_errors()
+    found = _noise_px(model)
+    # two images of twelve points have as many numbers as poses and points
+    assert found == (pytest.approx(0.4, rel=0.1) if known else None)
