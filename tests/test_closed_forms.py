@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from colmap_inertial.checks.diagnose.frames import _readout
-from colmap_inertial.checks.diagnose.imu import acceleration_rms_m_s2
+from colmap_inertial.checks.diagnose.imu import acceleration_rms_m_s2, scatter_of
 from colmap_inertial.checks.validate.overlays import _ticks
 from colmap_inertial.checks.validate.views import load_views
 from colmap_inertial.checks.words import digits, fixed, half_width_pct, length, length_error
@@ -396,3 +396,12 @@ def test_noise_is_told_by_what_poses_and_points_do_not_adapt_to(points, known):
     found = _noise_px(model)
     # two images of twelve points have as many numbers as poses and points
     assert found == (pytest.approx(0.4, rel=0.1) if known else None)
+
+
+def test_the_scatter_of_readings_is_that_of_their_white_noise():
+    t_s, rng = np.arange(0, 20, 0.01), np.random.default_rng(17)
+    sizes = np.array([0.5, 0.02, 0.001])
+    values = sizes * rng.standard_normal((len(t_s), 3)) + np.sin(2 * t_s)[:, None]
+    # of the axis in the middle, whatever a few readings say
+    values[::50] += 3.0
+    assert scatter_of(values) == pytest.approx(0.02, rel=0.15)

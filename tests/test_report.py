@@ -340,6 +340,51 @@ def test_a_drift_and_distances_are_drawn_as_they_were_measured():
     assert shown["y"][:3] == pytest.approx([0, 0.2, 0.4])
 
 
+@pytest.mark.parametrize(("size_px", "times"), [(0.5, 115), (400.0, 1)])
+def test_a_shutter_s_movements_are_drawn_in_their_picture(size_px, times):
+    at, way = np.array([[100.0, 50], [640, 360], [1200, 700]]), np.array([[0.2, 0.1], [0, 1], [-0.6, -0.8]])
+    worst = {"at_px": at.tolist(), "shift_px": (size_px * way).tolist(), "width": 1280, "height": 720, "name": "a.jpg"}
+    figure = figures.shutter_field(worst)
+    lines, ends = figure["data"]
+    # the largest movement about a twelfth as long as the picture is wide, or as long as it is
+    moved = at + (times * size_px if times == 1 else 0.09 * 1280) * way
+    assert np.stack([ends["x"], ends["y"]], axis=1) == pytest.approx(moved, abs=0.5)
+    assert lines["x"][::3] == at[:, 0].tolist() and lines["y"][1::3] == ends["y"] and lines["x"][2::3] == [None] * 3
+    assert ends["text"][1] == f"{size_px:.2f} px"
+    spec = figure["layout"]
+    (left, right), (bottom, top) = spec["xaxis"]["range"], spec["yaxis"]["range"]
+    # the picture with a margin, y downwards
+    assert -left == pytest.approx(right - 1280) and -top == pytest.approx(bottom - 720) and 0 < -left < 200
+
+
+def test_intervals_and_colours_of_stills_are_as_long_as_they_say():
+    dots = {"type": "scatter", "mode": "markers", "name": "n", "x": [2.0, 8.0], "y": [10.0, 40.0]}
+    dots |= {"marker": {"color": "#123456", "size": 5}}
+    dots |= {f"error_{k}": {"array": a, "color": c, "thickness": 1} for k, a, c in (
+        ("x", [1.0, 0.5], "#aa0000"), ("y", [4.0, 8.0], "#00aa00")
+    )}  # fmt: skip
+    spec = figures.layout(300, figures.axis("x", range=[0, 10]), figures.axis("y", range=[0, 50]))
+    still = Drawing(draw_still({"data": [dots], "layout": spec}, "x"))
+    across, upwards = (np.array(still.lines(colour)) for colour in ("#aa0000", "#00aa00"))
+    middles = across.mean(axis=1)
+    assert upwards.mean(axis=1) == pytest.approx(middles, abs=0.2)
+    unit = (middles[1] - middles[0]) / [6.0, 30.0]
+    assert np.ptp(across[:, :, 0], axis=1) == pytest.approx(2 * unit[0] * np.array([1.0, 0.5]), abs=0.5)
+    assert np.ptp(upwards[:, :, 1], axis=1) == pytest.approx(-2 * unit[1] * np.array([4.0, 8.0]), abs=0.5)
+    heat = {"type": "heatmap", "x0": 0.5, "dx": 1.0, "y0": 0.5, "dy": 1.0, "z": [[0, 6]]}
+    heat |= {"colorscale": [[0, "#000000"], [1, "#ff0000"]], "colorbar": {"title": {"text": "n"}}}
+    still = Drawing(
+        draw_still({"data": [heat], "layout": figures.layout(200, figures.axis("x"), figures.axis("y"))}, "x")
+    )
+    bar = [{k: float(a[k]) for k in ("x", "y", "width", "height")} for tag, a in still.shapes if tag == "rect"]
+    ticks = {word: attrs for word, attrs in texts_of(still) if attrs["text-anchor"] == "start"}
+    assert len(bar) == STYLE.colours and all(box["width"] == 12 for box in bar)
+    # dark below, at zero; numbers to the right of the colours, a quarter of a line lower
+    assert float(ticks["0"]["y"]) - 4 == pytest.approx(bar[0]["y"] + bar[0]["height"], abs=0.2)
+    assert float(ticks["6"]["y"]) - 4 == pytest.approx(bar[-1]["y"], abs=0.2)
+    assert all(float(tick["x"]) > bar[0]["x"] + 12 for tick in ticks.values())
+
+
 def test_the_grid_under_a_scene_lies_at_whole_steps():
     lines = _grid(np.array([-0.3, 0.2, 1.0]), np.array([1.1, 0.9, 2.0]), 0.5)
     across = [line for line in lines if line[0, 0] == line[1, 0]]
