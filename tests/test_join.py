@@ -382,6 +382,13 @@ def test_of_an_image_whose_poses_differ_only_the_first_one_s_observations_stay()
     image_id = first.find_image_with_name(wrong).image_id
     assert whole.image(image_id).num_points3D == first.image(image_id).num_points3D
     assert every.image(image_id).num_points3D > first.image(image_id).num_points3D
+    # keypoints that are elsewhere, along either side, are others
+    for axis in (0, 1):
+        _, moved = small_models()
+        for point in moved.image(image_id).points2D:
+            point.xy = point.xy + 5 * np.eye(2)[axis]
+        apart, _ = merge_models([first, moved], agreeing={(0, 1): both})
+        assert apart.image(image_id).num_points3D == first.image(image_id).num_points3D
     # a third model's owner is the one whose pose stayed
     other, _ = merge_models([first, second, second], agreeing={(0, 1): both, (1, 2): both})
     assert other.num_points3D() == every.num_points3D()

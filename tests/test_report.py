@@ -379,6 +379,7 @@ def test_intervals_and_colours_of_stills_are_as_long_as_they_say():
     bar = [{k: float(a[k]) for k in ("x", "y", "width", "height")} for tag, a in still.shapes if tag == "rect"]
     ticks = {word: attrs for word, attrs in texts_of(still) if attrs["text-anchor"] == "start"}
     assert len(bar) == STYLE.colours and all(box["width"] == 12 for box in bar)
+    assert bar[0]["x"] > STYLE.width - STYLE.right_axis + 5  # apart from the table
     # dark below, at zero; numbers to the right of the colours, a quarter of a line lower
     assert float(ticks["0"]["y"]) - 4 == pytest.approx(bar[0]["y"] + bar[0]["height"], abs=0.2)
     assert float(ticks["6"]["y"]) - 4 == pytest.approx(bar[-1]["y"], abs=0.2)
