@@ -488,6 +488,20 @@ def test_what_a_small_step_promises_is_what_it_gives(small, share):
     assert np.sign(promised) == np.sign(share) and gained == pytest.approx(promised, rel=0.01)
 
 
+def test_observations_that_tell_more_pull_as_much_and_hold_so_many_times_as_firmly(small):
+    _, problem, start, _ = small
+    at = _evaluate(problem, nudged(start, np.random.default_rng(12), 3e-4), problem.observations)
+    plain, firm = _weighted(problem, at), _weighted(problem, at, 4.0)
+
+    def sums(by, residual):
+        points = by.by_point
+        return np.einsum("nij,nik->jk", points, points), np.einsum("nij,ni->j", points, residual)
+
+    (held, pull), (firmly, pull_firm) = sums(*plain), sums(*firm)
+    np.testing.assert_allclose(firmly, 4.0 * held, rtol=1e-9)
+    np.testing.assert_allclose(pull_firm, pull, rtol=1e-9)
+
+
 @pytest.mark.parametrize("robust_px", [0.5, 3.0])
 def test_weights_are_the_slope_of_the_robust_cost(robust_px):
     residual = np.random.default_rng(1).normal(0, 2.0, (40, 2))
