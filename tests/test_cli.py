@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from cases import loop_over
 
-from colmap_inertial.cli import _COMMANDS, _options, main
+from colmap_inertial.cli import _COMMANDS, _move_lists_last, _options, main
+from colmap_inertial.core.errors import InertialError
 
 
 def run(capsys, *args):
@@ -43,6 +44,39 @@ def test_help_teaches(capsys, command):
     assert "usage: colmap-inertial" in out
     if command:
         assert "Example: colmap-inertial" in out
+
+
+def test_help_is_for_those_who_ask_for_it(capsys):
+    for args, code in (([], 2), (["--help"], 0), (["-h"], 0)):
+        found, out, _ = run(capsys, *args)
+        assert found == code and "usage: colmap-inertial" in out
+    # also behind a source, and not where something is missing
+    assert run(capsys, "scale", "x", "--help")[0] == run(capsys, "scale", "--imu", "y", "-h")[0] == 0
+    for args in (["scale"], ["apply", "x"]):
+        code, out, err = run(capsys, *args)
+        assert code == 2 and out == "" and "required" in err.lower()
+    code, _, err = run(capsys, "--json", "x", "scale")
+    assert code == 2 and "a command comes first, before --json" in err
+
+
+@loop_over(
+    ("given", "moved"),
+    [
+        (["--calibration", "a.json", "x", "y"], ["x", "y", "--calibration", "a.json"]),
+        (["--calibration", "a.json", "B.JSON", "x"], ["x", "--calibration", "a.json", "B.JSON"]),
+        (["--calibration=a", "x", "--calibration", "b.json"], ["x", "--calibration", "a", "b.json"]),
+        (["--colmap", "A.b=1", "C.d=2", "x", "--quiet"], ["x", "--quiet", "--colmap", "A.b=1", "C.d=2"]),
+        (["x", "--colmap=A.b=1", "--json", "y"], ["x", "--json", "y", "--colmap", "A.b=1"]),
+    ],
+)
+def test_what_takes_several_values_swallows_no_path(given, moved):
+    assert _move_lists_last(given) == moved
+
+
+@loop_over("args", [["--calibration"], ["--colmap"], ["--calibration", "--json"], ["x", "--colmap", "--quiet"]])
+def test_a_list_without_a_value_is_refused(args):
+    with pytest.raises(InertialError, match=r"--(calibration|colmap) takes"):
+        _move_lists_last(args)
 
 
 def test_a_wrong_flag_exits_2_and_names_it(capsys):

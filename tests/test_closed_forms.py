@@ -13,12 +13,23 @@ from colmap_inertial.checks.diagnose.imu import acceleration_rms_m_s2, scatter_o
 from colmap_inertial.checks.validate.overlays import _ticks
 from colmap_inertial.checks.validate.views import load_views
 from colmap_inertial.checks.words import digits, fixed, half_width_pct, length, length_error
+from colmap_inertial.colmap import dense
 from colmap_inertial.colmap.loops import key_frames
+from colmap_inertial.colmap.sparse import require_room_for_features
 from colmap_inertial.core.camera_clock import CameraTimedImu
-from colmap_inertial.core.errors import FormatError, NotObservableError
-from colmap_inertial.core.geometry import quat_conjugate, quat_exp, quat_rotate
-from colmap_inertial.core.types import CameraTrajectory, ImuRecording
+from colmap_inertial.core.errors import FormatError, NotObservableError, OutputError
+from colmap_inertial.core.geometry import (
+    matrix_from_quat,
+    quat_conjugate,
+    quat_exp,
+    quat_log,
+    quat_multiply,
+    quat_rotate,
+)
+from colmap_inertial.core.options import MappingOptions
+from colmap_inertial.core.types import CameraTrajectory, FrameTiming, ImuRecording
 from colmap_inertial.imaging.gyro_camera import FrameShutter
+from colmap_inertial.imaging.psf import _fill_nodes
 from colmap_inertial.inertial import scale
 from colmap_inertial.inertial.core.factors import lasting_group, state_group, walk_group
 from colmap_inertial.inertial.core.parameters import ACCEL_GAIN, DRIFT, GYRO_GAIN, N_GLOBALS, SCALE, Estimate, Prior
@@ -26,18 +37,25 @@ from colmap_inertial.inertial.core.priors import AccelPart
 from colmap_inertial.inertial.scale._fit import _excitation_m_s2, _gain_surprise
 from colmap_inertial.inertial.scale._shape import ShapeFault
 from colmap_inertial.inertial.scale.joint import scale_of
+from colmap_inertial.io import video
 from colmap_inertial.io.gopro import _stabilisation
+from colmap_inertial.io.phyphox import _column
+from colmap_inertial.io.rig_frames import _find_nearest
+from colmap_inertial.io.video_match import _Candidates, _distance, _normalise
 from colmap_inertial.model.readout import _noise_px
 from colmap_inertial.motion.align._clock_search import Intervals, _best_rotation, _fit
 from colmap_inertial.motion.align._fit import _noise_of
 from colmap_inertial.motion.align.conventions import quick_accelerations
 from colmap_inertial.motion.flow import FlowOptions, _measure_quick_rotation
 from colmap_inertial.motion.two_view_rotation import _fit_pure_rotation
+from colmap_inertial.pipeline.run import workspace
+from colmap_inertial.pipeline.run.workspace import require_room
 from colmap_inertial.reconstruction.drivers.paths import only_model
+from colmap_inertial.reconstruction.preparation import plan
 from colmap_inertial.reconstruction.preparation.plan import _most_turned_rad
 from colmap_inertial.reconstruction.preparation.selection import _slots
-from colmap_inertial.tools.simulate import RecordingOptions, simulate_recording
-from colmap_inertial.tools.simulate.rests import RestOptions, _Turn
+from colmap_inertial.tools.simulate import ImuOptions, RecordingOptions, simulate_recording
+from colmap_inertial.tools.simulate.rests import RestOptions, _triangular, _Turn, simulate_rests
 
 
 @pytest.fixture(scope="module")
@@ -92,6 +110,13 @@ def test_what_a_gyroscope_felt_just_before_an_uncertain_exposure_counts(recordin
         timing = SimpleNamespace(t_s=stamps_s[[at]] + after_s, readout_s=0.0, epoch_ns=epoch_ns)
         case = SimpleNamespace(timing=timing, prior=prior, imu=imu)
         assert _most_turned_rad(case, np.array([0.01])) == pytest.approx(felt)
+    # and after its last line was exposed, as late as the readout and the clocks let it be
+    for readout_s, longest_s in ((0.02, 0.02), (None, plan._LIMITS.longest_readout_s)):
+        end_s = longest_s + 0.01 + uncertain_s
+        for before_s, felt in ((end_s + 4 * step_s, 0.0), (end_s - 0.5 * step_s, 0.02)):
+            timing = SimpleNamespace(t_s=stamps_s[[at]] - before_s, readout_s=readout_s, epoch_ns=epoch_ns)
+            case = SimpleNamespace(timing=timing, prior=prior, imu=imu)
+            assert _most_turned_rad(case, np.array([0.01])) == pytest.approx(felt)
 
 
 def test_a_picture_that_turns_seldom_but_far_was_stabilised():
@@ -116,6 +141,70 @@ def test_a_hand_knocks_where_it_takes_and_leaves():
     middle = np.abs(since_s - turn.duration_s / 2) < 0.2 * turn.duration_s
     assert np.sqrt(np.mean(felt[middle] ** 2)) == pytest.approx(0.3 * np.sqrt(3), rel=0.1)
     assert felt[:20].mean() > 5 and felt[-20:].mean() > 5
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_turned_device_turns_as_its_gyroscope_says_from_one_rest_to_the_next(seed):
+    rng = np.random.default_rng(seed)
+    up, up_next = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
+    turn = _Turn.draw(up, up_next, RestOptions(tremor_rad=0.2), rng)
+    assert 1.5 <= turn.duration_s <= 3.0
+    ends = matrix_from_quat(turn.attitude(np.array([0.0, turn.duration_s])))
+    assert ends[0] == pytest.approx(np.eye(3), abs=1e-9) and ends[1] @ up_next == pytest.approx(up, abs=1e-9)
+    assert turn.rate_rad_s(np.array([0.0, turn.duration_s])) == pytest.approx(np.zeros((2, 3)), abs=1e-9)
+    at_s, step_s = np.linspace(0.05, 0.95, 40) * turn.duration_s, 1e-4
+    before, after = (turn.attitude(at_s + sign * step_s) for sign in (-1, 1))
+    rate = quat_log(quat_multiply(quat_conjugate(before), after)) / (2 * step_s)
+    assert np.abs(turn.rate_rad_s(at_s) - rate).max() < 1e-4 * np.abs(rate).max()
+
+
+def test_readings_at_rest_become_gravity_by_the_true_calibration():
+    quiet = {
+        name: 0.0
+        for name in (
+            *("gyro_density_rad_s_rthz", "accel_density_m_s2_rthz", "gyro_walk_rad_s2_rthz", "accel_walk_m_s3_rthz"),
+            *("gyro_resolution_rad_s", "accel_resolution_m_s2"),
+        )
+    }
+    device = ImuOptions(gyro_scale_sd=0.02, accel_scale_sd=0.03, accel_misalignment_sd=0.02, **quiet)
+    options = RestOptions(attitudes=5, rest_s=2.0, imu=device, gravity_m_s2=9.7)
+    made = simulate_rests(options, seed=7)
+    imu, begin_s = made.recording, 0.0
+    assert len(made.up_in_imu) == 5
+    accel = imu.accel_m_s2 @ (np.eye(3) + made.accel_gain).T - made.accel_bias_m_s2
+    gyro = imu.gyro_rad_s @ (np.eye(3) + made.gyro_gain).T - made.gyro_bias_rad_s
+    still = np.abs(gyro).max(axis=1) < 1e-9
+    # each rest is the longest stretch of its attitude
+    for k, up in enumerate(made.up_in_imu):
+        here = np.linalg.norm(accel - 9.7 * up, axis=1) < 1e-9
+        rest_s = imu.accel_t_s[here]
+        assert 1.98 <= np.ptp(rest_s) <= 2.02 and rest_s[0] >= begin_s
+        assert still[(imu.gyro_t_s > rest_s[0]) & (imu.gyro_t_s < rest_s[-1])].all()
+        assert k == 0 or 1.4 < rest_s[0] - begin_s < 3.1
+        begin_s = rest_s[-1]
+    assert imu.accel_t_s[-1] == pytest.approx(begin_s) and imu.gyro_t_s[-1] == pytest.approx(begin_s, abs=0.02)
+
+
+def test_a_hand_swings_and_shakes_by_its_acceleration():
+    rng = np.random.default_rng(5)
+    options = RestOptions(hand_m_s2=20.0, knock_m_s2=0.0, turn_s=(2.0, 2.0))
+    turn = _Turn.draw(np.array([0, 0, 1.0]), np.array([1.0, 0, 0]), options, rng)
+    since_s = np.linspace(0, 2.0, 4000, endpoint=False)
+    felt = turn.handled_m_s2(since_s, rng)
+    power = 2 * np.abs(np.fft.rfft(felt, axis=0) / 4000) ** 2
+    # once in the turn, and 25 times a second
+    assert power[1] == pytest.approx((20 * turn.hand_axes[0]) ** 2 / 2, rel=0.05, abs=0.05)
+    assert power[50] == pytest.approx((6 * turn.hand_axes[1]) ** 2 / 2, rel=0.05, abs=0.05)
+    rest = np.delete(power, [1, 50], axis=0)
+    assert rest.max() < 0.01 and np.sqrt(rest.sum(axis=0)) == pytest.approx([0.3] * 3, rel=0.1)
+
+
+def test_a_matrix_becomes_lower_triangular_by_a_rotation():
+    matrix = np.eye(3) + 0.1 * np.random.default_rng(2).standard_normal((3, 3))
+    turned, lower = _triangular(matrix)
+    assert turned @ matrix == pytest.approx(lower) and turned @ turned.T == pytest.approx(np.eye(3))
+    assert np.triu(lower, 1) == pytest.approx(np.zeros((3, 3)), abs=1e-12)
+    assert (np.diagonal(lower) > 0).all() and np.linalg.det(turned) == pytest.approx(1)
 
 
 def test_models_without_poses_and_folders_of_several_are_refused(tmp_path):
@@ -405,3 +494,142 @@ def test_the_scatter_of_readings_is_that_of_their_white_noise():
     # of the axis in the middle, whatever a few readings say
     values[::50] += 3.0
     assert scatter_of(values) == pytest.approx(0.02, rel=0.15)
+
+
+def test_a_file_may_fill_its_disk_and_its_limit_and_no_more(tmp_path, monkeypatch):
+    file, absent = tmp_path / "made", tmp_path / "absent"
+    file.write_bytes(bytes(100))
+    monkeypatch.setattr(workspace.shutil, "disk_usage", lambda _: SimpleNamespace(free=1000))
+    for copies, most in ((1, 1000), (2, 500)):
+        require_room(file, most, copies=copies)
+        with pytest.raises(OutputError, match="nearly full"):
+            require_room(file, most + 1, copies=copies)
+    monkeypatch.setattr(workspace, "_largest_file_bytes", lambda: 700)
+    for path, most in ((file, 600), (absent, 700)):
+        require_room(path, most)
+        with pytest.raises(OutputError, match="a file may have"):
+            require_room(path, most + 1)
+
+
+def test_a_feature_needs_room_for_its_place_and_its_descriptor(tmp_path, monkeypatch):
+    """Six numbers of four bytes and 128 of one, for as many as an image may have; four times that is plenty."""
+    options, free = MappingOptions(max_num_features=50), SimpleNamespace(free=0)
+    monkeypatch.setattr(workspace.shutil, "disk_usage", lambda _: free)
+    free.free = 7 * 50 * (6 * 4 + 128) - 1
+    with pytest.raises(OutputError, match="nearly full"):
+        require_room_for_features(tmp_path / "database.db", 7, options)
+    free.free = 4 * 7 * 50 * (6 * 4 + 128)
+    require_room_for_features(tmp_path / "database.db", 7, options)
+    with pytest.raises(OutputError, match="nearly full"):
+        require_room_for_features(tmp_path / "database.db", 7, options, copies=4)
+
+
+def test_a_picture_that_varies_by_less_than_a_grey_level_looks_like_nothing():
+    one_of_eight = (np.arange(256) % 8 == 0).reshape(16, 16)
+    # a step of three levels has a standard deviation of 0.99, one of four 1.32
+    assert not _normalise((100 + 3 * one_of_eight).astype(np.uint8)).any()
+    telling = _normalise((100 + 4 * one_of_eight).astype(np.uint8))
+    assert np.linalg.norm(telling) == pytest.approx(1) and telling.mean() == pytest.approx(0, abs=1e-6)
+
+
+def test_frames_beyond_the_file_are_those_of_the_video_that_was_listed(monkeypatch):
+    """Not those of sound with as many samples, nor of another picture in the file."""
+
+    def track(handler, listed, beyond):
+        return SimpleNamespace(handler=handler, size=np.zeros(listed), lost=beyond)
+
+    tracks = [track("soun", 90, 5), track("vide", 1, 1), track("vide", 90, 3)]
+    movie = SimpleNamespace(tracks=tracks, beyond=lambda one: np.zeros(one.lost))
+    monkeypatch.setattr(video, "read_movie", lambda _: movie)
+    assert video._count_lost("a.mp4", "mov,mp4,m4a", 90, 7) == 3
+    assert video._count_lost("a.mp4", "mov,mp4,m4a", 40, 7) == 0
+    assert video._count_lost("a.mkv", "matroska,webm", 90, 7) == 7
+    for whole, lost in ((True, 7), (False, 0)):
+        monkeypatch.setattr(video, "_ends_inside_riff", lambda _, whole=whole: whole)
+        assert video._count_lost("a.avi", "avi", 90, 7) == lost
+
+
+def test_images_of_another_camera_are_the_nearest_in_time():
+    rng = np.random.default_rng(8)
+    own_s, frames_s = np.sort(rng.uniform(0, 10, 60)), np.sort(rng.uniform(-1, 11, 80))
+    own = FrameTiming(names=tuple(f"o{k}" for k in range(60)), t_s=own_s - 3, epoch_ns=10**18 + 3 * 10**9)
+    timing = FrameTiming(names=tuple(f"f{k}" for k in range(80)), t_s=frames_s + 2, epoch_ns=10**18 - 2 * 10**9)
+    nearest, apart_ns = _find_nearest(own, timing)
+    away = np.abs(own_s - frames_s[:, None])
+    assert np.array_equal(nearest, away.argmin(axis=1))
+    assert apart_ns == pytest.approx(1e9 * away.min(axis=1), abs=3)
+
+
+@pytest.mark.parametrize(
+    ("away", "focal_px"), [(4.0, 500.0), (1.0, 500.0), (4.0, 2000.0), (0.01, 4000.0), (400.0, 10.0)]
+)
+def test_cells_of_a_surface_are_as_large_as_pixels_on_it(tmp_path, away, focal_px):
+    """The widest axis of the points and a tenth more, halved until a cell is no larger than a pixel spans there."""
+    places = np.random.default_rng(0).uniform(0, 1, (500, 3)) * [2, 8, 1] + [5, -3, 7]
+    places[:2] = [[6, -3, 7], [6, 5, 7]]
+    header = "ply\nformat binary_little_endian 1.0\nelement vertex 500\n"
+    fields = "".join(f"property float {axis}\n" for axis in "xyz")
+    path = tmp_path / "fused.ply"
+    path.write_bytes((header + fields + "end_header\n").encode() + places.astype("<f4").tobytes())
+    turn = matrix_from_quat(quat_exp(np.array([0.3, -0.5, 0.2])))
+    points, images = {}, {}
+    for k, depth in enumerate((0.5 * away, away, 3 * away)):
+        seen = []
+        for j in range(5):
+            # half of the points are nearer, half farther
+            in_cam = np.array([0.1 * j, -0.2, depth + 0.1 * depth * (j - 2)])
+            points[10 * k + j] = SimpleNamespace(xyz=turn.T @ (in_cam - [1, 2, 3]))
+            seen.append(SimpleNamespace(point3D_id=10 * k + j, has_point3D=lambda: True))
+        seen.append(SimpleNamespace(point3D_id=-1, has_point3D=lambda: False))
+        rotation = SimpleNamespace(matrix=lambda: turn)
+        pose = SimpleNamespace(rotation=rotation, translation=np.array([1.0, 2, 3]))
+        images[k] = SimpleNamespace(camera_id=1, points2D=seen, cam_from_world=lambda pose=pose: pose)
+    camera = SimpleNamespace(mean_focal_length=lambda: focal_px)
+    model = SimpleNamespace(
+        reg_image_ids=lambda: list(images), image=images.get, camera=lambda _: camera, points3D=points
+    )
+    depth, trim = dense._choose_octree(path, model)
+    cells = 1.1 * 8 / (away / focal_px)
+    expected = min(max(next(n for n in range(40) if 2**n >= cells), dense._LEAST_DEPTH), dense._MOST_DEPTH)
+    assert depth == expected and trim == depth - dense._TRIM_LEVELS
+    images.clear()
+    assert dense._choose_octree(path, model)[0] == dense._MOST_DEPTH
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.5])
+def test_a_picture_between_two_frames_lies_at_its_share_of_the_way(share):
+    frames = np.random.default_rng(4).integers(0, 255, (2, 16, 16)).astype(np.uint8)
+    between = _distance(*(_normalise(frame) for frame in frames))
+    candidates = object.__new__(_Candidates)
+    candidates._frames, candidates.distance = [frames], np.array([[share * between, (1 - share) * between]])
+    assert candidates.fraction_to_next(0) == pytest.approx(share)
+    # off the way between them by as much from both
+    candidates.distance = np.hypot(candidates.distance, 0.3)
+    assert candidates.fraction_to_next(0) == pytest.approx(share)
+    candidates.distance[0, 1] = np.inf
+    assert candidates.fraction_to_next(0) == 0
+    candidates._frames, candidates.distance = [frames[[0, 0]]], np.array([[0.1, 0.1]])
+    assert candidates.fraction_to_next(0) == 0.5
+
+
+def test_nodes_without_a_ray_take_the_vector_of_the_nearest_one():
+    rng = np.random.default_rng(9)
+    vectors = rng.standard_normal((7, 9, 2))
+    bad = rng.random((7, 9)) < 0.4
+    vectors[bad, 0] = np.nan
+    filled = _fill_nodes(vectors)
+    assert np.array_equal(filled[~bad], vectors[~bad]) and np.isfinite(filled).all()
+    known = np.argwhere(~bad)
+    for node in np.argwhere(bad):
+        away = np.hypot(*(known - node).T)
+        nearest = known[away < away.min() + 1e-9]
+        assert any(np.array_equal(filled[tuple(node)], vectors[tuple(one)]) for one in nearest)
+    with pytest.raises(ValueError, match="no pixel"):
+        _fill_nodes(np.full((2, 2, 2), np.nan))
+
+
+def test_a_column_of_phyphox_is_found_by_its_pattern():
+    table = SimpleNamespace(path="a.csv", header=("Time (s)", " Gyroscope x (rad/s)"), header_text="Time (s), ...")
+    assert _column(table, r"time.*") == 0 and _column(table, r"gyroscope x.*") == 1
+    with pytest.raises(FormatError, match="no column like 'accelerometer'"):
+        _column(table, "accelerometer")

@@ -1,6 +1,7 @@
 """Short and long exposures brought together, against pairs whose gain, geometry and blur are known."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -11,6 +12,7 @@ from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.exposure_pairs import (
     PairGyro,
+    _registration as registration,
     blur_seen_from_short,
     brightened,
     bring_together,
@@ -20,6 +22,7 @@ from colmap_inertial.imaging.exposure_pairs import (
     match_brightness,
     replace_departures,
 )
+from colmap_inertial.imaging.exposure_pairs.pair import _weigh_median_gain
 from colmap_inertial.imaging.psf import blur_field
 from colmap_inertial.imaging.transfer import linear_from_srgb, srgb_from_linear
 from colmap_inertial.model import colmap_camera
@@ -92,6 +95,17 @@ def test_lamps_and_darkness_do_not_sway_the_gain():
     found = match_brightness(codes(light / 15 + noise), codes(light))
     assert found.gain == pytest.approx(15, rel=0.02)
     assert found.colours == pytest.approx((1, 1, 1), rel=0.02)
+
+
+def test_squares_that_are_shifted_against_each_other_sway_no_gain():
+    """A shift makes as many squares too bright as too dark; whichever image counts more would prefer its own."""
+    light = np.exp(0.8 * np.random.default_rng(3).standard_normal(20_000))
+    shifted = np.roll(light, 1)
+    assert _weigh_median_gain(light, 8 * shifted) == pytest.approx(8, rel=0.05)
+    assert _weigh_median_gain(8 * shifted, light) == pytest.approx(1 / 8, rel=0.05)
+    # bright squares count more than dark ones
+    dark = np.array([0.01] * 600 + [1.0] * 300)
+    assert _weigh_median_gain(dark, dark * np.where(dark < 0.1, 3.0, 5.0)) == pytest.approx(5)
 
 
 def test_colours_differ_within_limits_only():
@@ -312,3 +326,70 @@ def test_a_fused_image_that_departs_from_the_short_one_gives_way_to_it():
     assert error(found, ghost) < 1.3 * error(short, ghost)
     np.testing.assert_array_equal(found[:, clean], fused[:, clean])
     np.testing.assert_array_equal(replace_departures(fused[..., 0], short[..., 0])[:, clean], fused[:, clean, 0])
+
+
+@pytest.mark.parametrize(("times", "share"), [(1.9, 0.0), (2.5, 0.5), (3.1, 1.0)])
+def test_without_noise_departures_are_measured_by_the_rounding_to_8_bits(times, share):
+    """Whose variance is a twelfth of a code's square: up to twice that stays, from three times on is replaced."""
+    short = np.full((60, 80, 3), 0.4, np.float32)
+    pattern = (-1.0) ** np.add.outer(np.arange(60), np.arange(80))
+    departed = short + (np.sqrt(times / 12) / 255 * pattern[..., None]).astype(np.float32)
+    found = replace_departures(departed, short)
+    inner = (slice(13, -13), slice(13, -13))
+    assert np.abs(found - departed - share * (short - departed))[inner].max() < 2e-5
+
+
+def registered_at(shift_px, *, by_gyro=False, agreement=0.5):
+    return registration.Registered(
+        shift_px=shift_px, by_gyro=by_gyro, by_pixels=False, agreement=agreement, untouched=0.0
+    )
+
+
+@pytest.mark.parametrize("by_gyro", [False, True])
+def test_a_mapping_moves_what_was_shifted_before(by_gyro):
+    step_px, rows, columns = 10, 13, 17
+    x, y = step_px * np.arange(columns), step_px * np.arange(rows)[:, None]
+    before = np.stack(np.broadcast_arrays(0.01 * x + 0.5, -0.02 * y), axis=-1)
+    start = registered_at(before, by_gyro=by_gyro)
+    turn, move = 0.01, np.array([3.0, -2.0])
+    mapping = np.array([[1, -turn, move[0]], [turn, 1, move[1]], [0, 0, 1.0]])
+    found = registration._apply_mapping(mapping, start, step_px)
+    x, y = np.broadcast_arrays(x, y)
+    to_x, to_y = x - turn * y + move[0], y + turn * x + move[1]
+    # beyond the grid, what was shifted at its edge
+    inside = (to_x >= 0) & (to_x <= 160) & (to_y >= 0) & (to_y <= 120)
+    expected = np.stack([to_x - x + 0.01 * to_x + 0.5, to_y - y - 0.02 * to_y], axis=-1)
+    assert np.abs(found - expected)[inside].max() < 1e-9 and inside.mean() > 0.7
+    assert registration._apply_mapping(np.array([[1, 0, 0], [0, 1, 0], [0.01, 0, -1.0]]), start, step_px) is None
+
+
+def test_a_mapping_that_leads_far_is_none_and_a_gyroscope_allows_less():
+    limits, side = registration._LIMITS, 170
+    free, held = (registered_at(np.zeros((13, 17, 2)), by_gyro=by_gyro) for by_gyro in (False, True))
+    for start, share in ((free, limits.farthest), (held, limits.farthest_from_gyro)):
+        for times, allowed in ((0.99, True), (1.01, False)):
+            mapping = np.eye(3)
+            mapping[1, 2] = -times * share * side
+            assert (registration._apply_mapping(mapping, start, 10) is not None) == allowed
+
+
+def test_a_more_general_mapping_must_be_worth_it(monkeypatch):
+    start = registered_at(np.zeros((2, 2, 2)), agreement=0.5)
+    worth = registration._LIMITS.worth
+    for agreements, best in (
+        ([0.5 + 0.9 * worth], 0),
+        ([0.5 + 1.1 * worth], 1),
+        ([0.5 + 1.1 * worth, 0.5 + 1.9 * worth], 1),
+        ([0.5 + 1.1 * worth, None, 0.5 + 2.2 * worth], 3),
+        ([0.4, 0.3], 0),
+    ):
+        monkeypatch.setattr(registration, "_generalise_mapping", lambda *_, said=agreements: iter(enumerate(said, 1)))
+        monkeypatch.setattr(
+            registration, "_apply_mapping", lambda mapping, *_: None if mapping[1] is None else np.array(mapping)
+        )
+        level = SimpleNamespace(step_px=10, agreement=lambda shift: float(shift[1]))
+        found = registration._refine(start, None, [level])
+        if best == 0:
+            assert found is start
+        else:
+            assert found.shift_px[0] == best and found.agreement == agreements[best - 1] and found.by_pixels

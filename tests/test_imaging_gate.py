@@ -393,6 +393,30 @@ def test_what_moved_with_the_camera_keeps_its_pixels():
     assert share < 0.02
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("vertical", [False, True])
+def test_blocks_of_a_sharp_edge_keep_their_pixels_and_fade_into_the_next(dtype, vertical):
+    """A step among ramps as long as the blur: weights are one in the step's blocks, and linear to the next middles."""
+    top = 60000 if dtype == np.uint16 else 240
+    ramp = top * (0.25 + 0.5 * np.clip((np.arange(320) - 140) / 40, 0, 1))
+    image = np.tile(ramp, (192, 1))
+    image[64:128] = np.where(np.arange(320) < 160, 0.25 * top, 0.75 * top)
+    image = np.rint(image).astype(dtype)
+    grey, length = (image.T, (0.0, 40.0)) if vertical else (image, (40.0, 0.0))
+    field = BlurField.uniform(*grey.shape[::-1], length)
+    out, share = keep_sharp(grey, np.zeros_like(grey), field)
+    weight = (out / grey).T if vertical else out / grey
+    rows = np.interp(np.arange(192), [47.5, 79.5, 111.5, 143.5], [0, 1, 1, 0])
+    columns = np.interp(np.arange(320), [111.5, 143.5, 175.5, 207.5], [0, 1, 1, 0])
+    assert np.abs(weight - rows[:, None] * columns).max() < 0.02
+    assert share == pytest.approx(4 / 60)
+    # three channels alike; without blur nothing is too sharp for it
+    colour = np.repeat(grey[..., None], 3, axis=2)
+    coloured, _ = keep_sharp(colour, np.zeros_like(colour), field)
+    assert np.abs(coloured.astype(float) - out[..., None]).max() <= 0.01 * top
+    assert keep_sharp(grey, np.zeros_like(grey), BlurField.uniform(*grey.shape[::-1], (0.0, 0.0)))[1] == 0
+
+
 def blur_of(px, reasons=None):
     names = tuple(f"{i}.jpg" for i in range(len(px)))
     return PredictedBlur(names=names, px=np.array(px, dtype=float), reasons=tuple(reasons or [""] * len(px)))
@@ -412,6 +436,22 @@ def test_every_frame_has_a_decision_with_a_reason():
     # what is 3 px of 1920 are too few to be undone there
     actions = [d.action for d in decide(blur_of([1.1, 1.9, 2.1]), np.arange(3) / 30, width=640, height=360)]
     assert actions == ["keep", "keep", "deblur"]
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"skip_below_own_px": -0.1}, "skip_below_own_px"),
+        ({"skip_below_px": -0.1}, "skip_below_px"),
+        ({"skip_below_px": 9.0, "drop_above_px": 9.0}, "drop_above_px"),
+        ({"bridge_s": 0.0}, "bridge_s"),
+        ({"bridge_deg": 0.0}, "bridge_deg"),
+    ],
+)
+def test_thresholds_that_make_no_sense_are_refused(values, said):
+    with pytest.raises(ValueError, match=said):
+        GateOptions(**values)
+    assert GateOptions(skip_below_own_px=0.0, skip_below_px=0.0, bridge_s=1e-3, bridge_deg=1e-3).skip_below_px == 0
 
 
 def test_frames_that_bridge_a_gap_stay_the_least_blurred_first():

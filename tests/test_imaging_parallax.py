@@ -1,19 +1,21 @@
 """Depths between a few points, and the blur that a translation adds."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 from test_imaging_psf import LENS, PINHOLE, STEPS, room, shutter_of, turning
 
-from colmap_inertial.core.geometry import matrix_from_quat
+from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, quat_rotate
 from colmap_inertial.core.gyro import GyroPath
-from colmap_inertial.core.types import FrameTiming
+from colmap_inertial.core.types import CameraTrajectory, FrameTiming
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.parallax import Parallax, parallax_from_points
 from colmap_inertial.imaging.psf import blur_field, predict_blur_px
+from colmap_inertial.reconstruction.preparation import translation
 from colmap_inertial.tools.simulate import MotionOptions, make_motion
 from colmap_inertial.tools.simulate.render import ShutterCamera, colmap_camera
 
@@ -132,3 +134,99 @@ def test_a_parallax_is_written_and_read_without_its_unit_of_length():
     for wrong in ({"velocity_in_cam": [0.0, np.nan, 1.0]}, {"inverse_depth": [[1.0]]}):
         with pytest.raises(ValueError, match=r"velocity_in_cam|inverse_depth"):
             Parallax.from_json({**parallax.as_json(), **wrong})
+
+
+# --- which frames a model tells about --------------------------------------------------------------------------------
+
+WORLD_FROM_CAM_XYZW = quat_exp(np.array([0.3, -0.2, 1.1]))
+ALONG_THE_WALL = quat_rotate(WORLD_FROM_CAM_XYZW, np.array([1.0, 0, 0]))
+
+
+def wall_model(names, trajectory, depth):
+    """As of COLMAP, of images at poses before a wall so many units away."""
+    rng = np.random.default_rng(5)
+    points, images = {}, {}
+    for name, centre in zip(names, trajectory.cam_in_world, strict=True):
+        px = np.column_stack([rng.uniform(-300, 940, 60), rng.uniform(-300, 780, 60)])
+        rays = np.column_stack([np.asarray(colmap_camera(PINHOLE).cam_from_img(px))[:, :2], np.ones(60)])
+        number = len(points)
+        for k, place in enumerate(centre + quat_rotate(WORLD_FROM_CAM_XYZW, depth * rays)):
+            points[number + k] = SimpleNamespace(xyz=place)
+        seen = [SimpleNamespace(point3D_id=number + k, has_point3D=lambda: True) for k in range(60)]
+        seen.append(SimpleNamespace(point3D_id=-1, has_point3D=lambda: False))
+        images[name] = SimpleNamespace(points2D=seen)
+    return SimpleNamespace(points3D=points, find_image_with_name=images.get, num_reg_images=lambda: len(names))
+
+
+def told_of(monkeypatch, speed_m_s, sigma_m_s, *, registered=slice(12, 29, 2)):
+    """Parallaxes of 45 frames 0.25 s apart by a model of some of them, at half a metre per unit, a metre from a wall.
+
+    Velocities are so quick and so uncertain.
+    """
+    names = [f"{k:03}" for k in range(45)]
+    t_s = 0.25 * np.arange(45)
+    trajectory = CameraTrajectory(
+        names=tuple(names[registered]),
+        t_s=t_s[registered],
+        cam_in_world=np.outer(t_s[registered], 0.1 * ALONG_THE_WALL),
+        cam_from_world_xyzw=np.tile(WORLD_FROM_CAM_XYZW * [-1, -1, -1, 1], (len(names[registered]), 1)),
+        length_unit="model",
+    )
+    model = wall_model(names[registered], trajectory, depth=2.0)
+
+    def smoothed(metric, imu, estimate, gravity, also_at_s):
+        assert np.array_equal(metric.cam_in_world, 0.5 * trajectory.cam_in_world) and metric.length_unit == "m"
+        count = len(also_at_s)
+        cov = np.zeros((count, 9, 9))
+        cov[:, 3:6, 3:6] = sigma_m_s**2 / 3 * np.eye(3)
+        return SimpleNamespace(
+            t_s=also_at_s,
+            cov=cov,
+            velocity_in_world=np.tile([0, float(speed_m_s), 0], (count, 1)),
+            cam_in_world=np.outer(also_at_s, 0.05 * ALONG_THE_WALL),
+            cam_from_world_xyzw=np.tile(WORLD_FROM_CAM_XYZW * [-1, -1, -1, 1], (count, 1)),
+        )
+
+    estimate = SimpleNamespace(metres_per_unit=0.5, gravity_in_world_m_s2=np.array([0, 0, -9.8]), rotations=None)
+    monkeypatch.setattr(translation, "trajectory_from_model", lambda *_: (trajectory, ()))
+    monkeypatch.setattr(translation, "estimate_scale", lambda *_, **__: estimate)
+    monkeypatch.setattr(translation, "smooth_path", smoothed)
+    view = SimpleNamespace(
+        calibration=None,
+        timing=FrameTiming(names=tuple(names), t_s=t_s, readout_s=0.0),
+        camera=PINHOLE,
+        timed=lambda: SimpleNamespace(imu=None),
+    )
+    return translation.find_parallaxes([model], view)
+
+
+def test_frames_within_two_seconds_of_a_model_s_have_its_depths_and_the_camera_s_velocity(monkeypatch):
+    found = told_of(monkeypatch, 1.0, 0.1)
+    # images from 3 to 7 s
+    assert sorted(found) == [f"{k:03}" for k in range(4, 37)]
+    velocity = quat_rotate(WORLD_FROM_CAM_XYZW * [-1, -1, -1, 1], np.array([0, 1.0, 0]))
+    for one in found.values():
+        assert one.velocity_in_cam == pytest.approx(velocity)
+        assert np.abs(one.inverse_depth - 1).max() < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("speed_m_s", "sigma_m_s", "known"),
+    [
+        (1.0, 0.29, True),
+        (1.0, 0.31, False),
+        (0.2, 0.059, True),
+        (0.2, 0.061, False),
+        (0, 0.029, True),
+        (0, 0.031, False),
+    ],
+)
+def test_velocities_count_where_they_are_known_to_three_tenths_of_what_is_not_slow(
+    monkeypatch, speed_m_s, sigma_m_s, known
+):
+    assert bool(told_of(monkeypatch, speed_m_s, sigma_m_s)) == known
+
+
+def test_a_model_of_few_images_tells_nothing(monkeypatch):
+    assert told_of(monkeypatch, 1.0, 0.1, registered=slice(12, 20))
+    assert not told_of(monkeypatch, 1.0, 0.1, registered=slice(12, 19))

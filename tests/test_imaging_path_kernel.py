@@ -131,6 +131,10 @@ def test_tiles_add_up_to_one_wherever_there_is_image(extent_px):
         for k in range(count):
             total[k * tiling.hop : k * tiling.hop + tiling.side] += shares_of(tiling, k, count)
         np.testing.assert_allclose(total[tiling.before : tiling.before + size], 1, atol=1e-6)
+    # no seam: what is near a tile's edge counts little there
+    for window in (tiling.window_in(), tiling.window_out()):
+        assert (np.diff(window[: tiling.side // 2]) >= 0).all() and np.array_equal(window, window[::-1])
+        assert window[0] < 0.01 and window[tiling.side // 2] == 1
     rows, columns = sources_of(tiling)
     np.testing.assert_array_equal(rows[tiling.before - 2 : tiling.before + 335], [2, 1, *range(333), 331, 330])
 
@@ -146,6 +150,32 @@ def test_a_tile_has_the_path_of_its_middle():
     np.testing.assert_allclose(
         paths[1, 2], path.at(np.array([tiling.hop + middle - 2 * tiling.hop]), np.array([middle]))[0, 0]
     )
+
+
+def test_how_uncertain_a_changing_path_is_follows_the_chord_s_slopes():
+    """A chord that is linear in x and in y: over a tile's middle it changes by slope times side, evenly spread."""
+    width, height, step_px = 1000, 700, 10
+    rows, columns = BlurField.nodes(width, height, step_px)
+    y, x = np.meshgrid(step_px * np.arange(rows), step_px * np.arange(columns), indexing="ij")
+    chord = np.stack([8 + 0.006 * x + 2e-5 * x * y, 3 - 0.004 * y + 1e-5 * x * y], axis=-1)
+    field = BlurField(width=width, height=height, step_px=step_px, vector_px=chord, cov_px2=(0.5, 0.1, 0.2))
+    path = BlurPath.straight(field)
+    tiling = Tiling.covering(width, height, 20.0)
+    across = tiling.side - 2 * tiling.margin
+    inside = 0
+    for row, down in zip(tiling.spreads(path), tiling._middles()[0].ravel(), strict=True):
+        for found, right in zip(row, tiling._middles()[1].ravel(), strict=True):
+            if not (across / 2 < down < height - 1 - across / 2 and across / 2 < right < width - 1 - across / 2):
+                continue
+            inside += 1
+            along_x, along_y = (
+                np.array([0.006 + 2e-5 * down, 1e-5 * down]),
+                np.array([2e-5 * right, -0.004 + 1e-5 * right]),
+            )
+            cov = np.array([[0.5, 0.1], [0.1, 0.2]])
+            cov = cov + across**2 / 12 * (np.outer(along_x, along_x) + np.outer(along_y, along_y))
+            assert found == pytest.approx(cov[[0, 0, 1], [0, 1, 1]], rel=1e-3)
+    assert inside > 4
 
 
 def test_a_path_that_changes_within_a_tile_is_as_uncertain_there():

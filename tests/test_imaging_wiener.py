@@ -18,7 +18,7 @@ from scipy.ndimage import gaussian_filter
 from colmap_inertial._kernels import _wiener
 from colmap_inertial.imaging import wiener
 from colmap_inertial.imaging._cells import Cells
-from colmap_inertial.imaging._taps import Prior, TapTable, optimal_taps
+from colmap_inertial.imaging._taps import Prior, TapTable, gaussian_weights, optimal_taps, smoothing_px
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.transfer import linear_from_srgb, srgb_from_linear
 from colmap_inertial.imaging.wiener import DeblurOptions, deblur, estimate_noise
@@ -375,6 +375,24 @@ def test_the_noise_is_looked_for_along_the_blur(vector_px):
     told, found = deblur(image, field, DeblurOptions(noise=0.004)), deblur(image, field)
     assert psnr(found, told.astype(np.float64)) > 45
     assert psnr(found, image.astype(np.float64)) < 33  # it is not left alone
+
+
+@pytest.mark.parametrize("sigma_px", [0.0, 0.5, 0.7, 1.5, 4.0])
+def test_a_gaussian_s_weights_have_its_mass_and_width(sigma_px):
+    weights = gaussian_weights(sigma_px)
+    both = np.concatenate([weights[:0:-1], weights])
+    at = np.arange(len(both)) - len(both) // 2
+    assert both.sum() == pytest.approx(1) and len(weights) == np.ceil(3 * sigma_px) + 1
+    if sigma_px:
+        assert weights[1] / weights[0] == pytest.approx(np.exp(-0.5 / sigma_px**2))
+    if sigma_px > 0.5:  # else pixels are too coarse for it
+        assert (both @ at**2) ** 0.5 == pytest.approx(sigma_px, rel=0.02)
+
+
+def test_smoothing_grows_with_the_roots_of_noise_and_blur_up_to_its_end():
+    assert smoothing_px(0.01, 10.0) == pytest.approx(0.7)
+    assert smoothing_px(0.04, 10.0) == smoothing_px(0.01, 40.0) == pytest.approx(1.4)
+    assert smoothing_px(0.0025, 10.0) == pytest.approx(0.35) and smoothing_px(0.1, 40.0) == 1.5
 
 
 def test_wrong_images_and_options_are_refused():

@@ -125,3 +125,54 @@ def test_the_next_recording_of_a_device_keeps_the_delay_and_opens_the_offset() -
     np.testing.assert_allclose(shared.cov[:3, :3], before.cov[:3, :3])
     np.testing.assert_allclose(shared.cov[8:, 8:], before.cov[8:, 8:])
     np.testing.assert_array_equal(prior.imu_in_cam_m, before.imu_in_cam_m)
+
+
+@pytest.mark.parametrize(
+    ("said", "offsets_s", "gyro_s", "accel_s", "delay_s"),
+    [
+        ({"gyro_time_offset_s": 3.0}, (3.0, 3.0), 0.002, np.hypot(0.002, 0.02), 0.02),
+        ({"accel_time_offset_s": 3.0}, (3.0, 3.0), np.hypot(0.002, 0.02), 0.002, 0.02),
+        ({"gyro_time_offset_s": 3.0, "accel_time_offset_s": 3.5}, (3.0, 3.5), 0.002, 0.002, 0.002 * 2**0.5),
+        ({"gyro_time_offset_s": 3.0, "time_offset_sigma_s": 0.1}, (3.0, 3.0), 0.1, np.hypot(0.1, 0.02), 0.02),
+    ],
+)
+def test_an_offset_of_one_sensor_carries_the_other_s(said, offsets_s, gyro_s, accel_s, delay_s) -> None:
+    prior = calibration_prior(Declared(**said))
+    assert (prior.gyro_time_offset_s, prior.accel_time_offset_s) == offsets_s
+    assert prior.sigma("gyro_time_offset_s") == pytest.approx(gyro_s)
+    assert prior.sigma("accel_time_offset_s") == pytest.approx(accel_s)
+    assert sd_of_delay(prior) == pytest.approx(delay_s)
+
+
+def test_what_is_stated_is_as_sure_as_it_is_said_to_be() -> None:
+    said = Declared(
+        cam_from_imu_xyzw=[0, 0, 0, 1], rotation_sigma_rad=0.02, imu_in_cam_m=[0.1, 0.2, 0.3],
+        imu_in_cam_sigma_m=0.03, gyro_bias_rad_s=[0.01, 0.02, 0.03], gyro_bias_sigma_rad_s=0.004,
+    )  # fmt: skip
+    prior = calibration_prior(said)
+    for axis, lever, bias in zip("xyz", (0.1, 0.2, 0.3), (0.01, 0.02, 0.03), strict=True):
+        assert prior.sigma(f"rotation_{axis}_rad") == pytest.approx(0.02)
+        assert prior.sigma(f"imu_in_cam_{axis}_m") == pytest.approx(0.03)
+        assert prior.sigma(f"gyro_bias_{axis}_rad_s") == pytest.approx(0.004)
+        assert prior.imu_in_cam_m["xyz".index(axis)] == lever and prior.gyro_bias_rad_s["xyz".index(axis)] == bias
+    # two per cent of a readout, and at least a tenth of a millisecond
+    for readout_s, sigma_s in ((0.03, 6e-4), (0.001, 1e-4), (0.0, 1e-4), (None, 0.02)):
+        prior = calibration_prior(Declared(readout_s=readout_s))
+        assert prior.sigma("readout_s") == pytest.approx(sigma_s) and prior.readout_s == (readout_s or 0.0)
+
+
+def test_in_the_next_recording_offsets_lie_where_the_delay_has_them() -> None:
+    """The scatter of accelerometers' offsets around gyroscopes' is that of before, whatever the gyroscopes' are."""
+    before = known()
+    root = np.random.default_rng(1).standard_normal((before.cov.shape[0],) * 2)
+    before = replace(before, cov=1e-4 * root @ root.T)
+    rng = np.random.default_rng(2)
+    drawn = rng.multivariate_normal(np.zeros(len(before.cov)), before.cov, 40_000)
+    delay = drawn[:, 4] - drawn[:, 3]
+    offset = rng.standard_normal(len(delay))  # of a shared clock: to a second
+    after = reset_for_recording(before, shared_clock=True)
+    expected = np.cov(np.stack([offset, offset + delay, *drawn[:, :3].T, *drawn[:, 8:].T]))
+    places = [3, 4, 0, 1, 2, *range(8, len(before.cov))]
+    sigma = np.sqrt(np.diagonal(expected))
+    assert np.abs((after.cov[np.ix_(places, places)] - expected) / np.outer(sigma, sigma)).max() < 0.03
+    assert not after.cov[5:8, [0, 1, 2, 3, 4, 8, 9, 10, 11]].any()

@@ -9,12 +9,14 @@ from cases import loop_over
 from test_io_imu import HEADER, handheld, rows, write_csv
 
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.geometry import matrix_from_quat, quat_exp
 from colmap_inertial.io.calibration import Declared, calibration_prior, write_calibration
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.capture_tables import ImuPath, ImuTables
 from colmap_inertial.io.frame_sources import ImageFolder, Video
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.io.sensor_yaml import CAMERA_MODELS
+from colmap_inertial.io.toml_section import parse_toml
 
 IMU = '[imu]\npath = "imu.csv"\n'
 
@@ -179,6 +181,46 @@ def test_a_mistake_names_file_line_table_and_key(tmp_path: Path, text: str, said
     with pytest.raises(FormatError, match=said) as caught:
         load_capture(write(tmp_path, text))
     assert str(tmp_path) in str(caught.value)
+
+
+def test_a_pose_is_a_matrix_with_or_without_a_place_or_a_quaternion(tmp_path: Path) -> None:
+    turned = quat_exp(np.array([0.3, -0.4, 1.2]))
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = matrix_from_quat(turned), [0.01, -0.02, 0.03]
+    lever = "imu_in_cam_m = [0.01, -0.02, 0.03]\n"
+    for said in (
+        f"cam_from_imu = {pose.tolist()}\n",
+        f"cam_from_imu = {pose[:3, :3].tolist()}\n{lever}",
+        f"cam_from_imu_xyzw = {turned.tolist()}\n{lever}",
+    ):
+        known = load_capture(write(tmp_path, IMU + "[calibration]\n" + said)).calibration
+        assert known is not None
+        assert np.abs(known.cam_from_imu_xyzw @ turned) == pytest.approx(1, abs=1e-12)
+        assert known.imu_in_cam_m == pytest.approx(np.array([0.01, -0.02, 0.03]))
+    for said, complaint in (
+        (f"cam_from_imu = {pose.tolist()}\n{lever}", "say the same; leave one out"),
+        (f"cam_from_imu = {pose[:3, :3].tolist()}\ncam_from_imu_xyzw = {turned.tolist()}\n", "leave one out"),
+        (f"cam_from_imu = {np.vstack([pose[:3], [0, 0, 0.1, 1]]).tolist()}\n", "last row"),
+        (f"cam_from_imu = {pose[:3].tolist()}\n", "found 3x4"),
+    ):
+        with pytest.raises(FormatError, match=complaint):
+            load_capture(write(tmp_path, IMU + "[calibration]\n" + said))
+
+
+def test_intrinsics_count_from_the_corner_or_the_centre_of_the_first_pixel(tmp_path: Path) -> None:
+    def camera(params: str, origin: str, model: str = "PINHOLE") -> tuple[float, ...]:
+        said = f'[camera]\nmodel = "{model}"\nwidth = 40\nheight = 30\nparams = {params}\npixel_origin = "{origin}"\n'
+        known = load_capture(write(tmp_path, IMU + said)).camera
+        assert known is not None and (known.model, known.width, known.height) == (model, 40, 30)
+        return known.params
+
+    assert camera("[50, 51, 20, 15]", "corner") == (50, 51, 20, 15)
+    assert camera("[50, 51, 20, 15]", "center") == (50, 51, 20.5, 15.5)
+    assert camera("[50, 20, 15]", "center", "SIMPLE_PINHOLE") == (50, 20.5, 15.5)
+    for params in ("[0, 51, 20, 15]", "[50, -1, 20, 15]"):
+        with pytest.raises(FormatError, match="focal lengths must be above 0"):
+            camera(params, "corner")
+    assert camera("[50, 51, 0, -2]", "corner") == (50, 51, 0, -2)
 
 
 @loop_over(
@@ -388,3 +430,16 @@ def test_equidistant_sheet_is_colmaps_fisheye(shared_data: Path, tmp_path: Path)
 def test_a_folder_with_a_recipe_names_the_command_that_renders_it():
     with pytest.raises(FormatError, match=r"simulate recipe\.toml"):
         load_capture(Path(__file__).parents[1] / "example_scenes" / "hopeless")
+
+
+def test_a_key_of_many_parts_is_refused_and_a_text_with_many_dots_is_none(tmp_path: Path) -> None:
+    deep = ".".join("a" * 32)
+    assert parse_toml(tmp_path, f"{deep} = 1")["a"]["a"]
+    for text in (f"{deep}.b = 1", f"[{deep}.b]", f'{deep}."b" = 1', f"x = {{ {deep} . b = 1 }}"):
+        with pytest.raises(FormatError, match="more than 32 parts"):
+            parse_toml(tmp_path, text)
+    dots = "." * 99
+    for text in (f'x = "{dots}"', f"x = '{dots}'", f'x = """\n{dots}"""', f"x = '''{dots}'''"):
+        assert parse_toml(tmp_path, f"{text} # {dots}") == {"x": dots}
+    with pytest.raises(FormatError, match=r"line 2: not valid TOML"):
+        parse_toml(tmp_path, "x = 1\ny = = 2")

@@ -284,6 +284,48 @@ def test_an_entry_beyond_its_payload_names_the_byte() -> None:
         list(entries(struct.pack(">4scBH", b"GYRO", b"s", 6, 100) + bytes(12)))
 
 
+@pytest.mark.parametrize(
+    ("kind", "packed", "values"),
+    [
+        ("b", "b", (-3, 100)),
+        ("B", "B", (3, 200)),
+        ("s", "h", (-300, 30000)),
+        ("S", "H", (300, 60000)),
+        ("l", "i", (-70000, 2**30)),
+        ("L", "I", (70000, 2**31)),
+        ("j", "q", (-(2**40), 5)),
+        ("J", "Q", (2**40, 5)),
+        ("f", "f", (-0.25, 1e6)),
+        ("d", "d", (-0.1, 1e300)),
+    ],
+)
+def test_numbers_are_read_by_their_type(kind, packed, values) -> None:
+    data = struct.pack(f">{2 * packed}", *values)
+    (alone,) = entries(struct.pack(">4scBH", b"DATA", kind.encode(), len(data) // 2, 2) + data + bytes(-len(data) % 4))
+    assert alone.numbers().tolist() == [[value] for value in values]
+    (both,) = entries(struct.pack(">4scBH", b"DATA", b"?", len(data), 1) + data + bytes(-len(data) % 4))
+    assert both.numbers(2 * kind).tolist() == [list(values)]
+
+
+def test_fixed_point_numbers_are_fractions_also_among_others() -> None:
+    """Sixteen bits behind the point, or thirty-two."""
+    for kind, packed, one in ((b"q", "i", 2**16), (b"Q", "q", 2**32)):
+        size = struct.calcsize(packed)
+        data = struct.pack(f">2{packed}", -3 * one // 4, 5 * one)
+        (alone,) = entries(struct.pack(">4scBH", b"DATA", kind, 2 * size, 1) + data)
+        assert alone.numbers().tolist() == [[-0.75, 5.0]]
+    data = struct.pack(">hiq", 7, 2**15, 2**33)
+    (mixed,) = entries(struct.pack(">4scBH", b"DATA", b"?", len(data), 1) + data + bytes(2))
+    assert mixed.numbers("sqQ").tolist() == [[7, 0.5, 2]]
+
+
+@pytest.mark.parametrize(("kind", "members"), [(b"x", ""), (b"s", ""), (b"?", "s"), (b"?", "sx"), (b"?", "")])
+def test_samples_of_no_known_type_or_another_size_are_refused(kind, members) -> None:
+    (entry,) = entries(struct.pack(">4scBH", b"DATA", kind, 3, 1) + bytes(4))
+    with pytest.raises(ValueError, match="DATA holds samples of 3 bytes"):
+        entry.numbers(members)
+
+
 # --- the container --------------------------------------------------------------------------------------------------
 
 

@@ -9,6 +9,7 @@ from cases import loop_over
 
 from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.io.imu import read_imu
+from colmap_inertial.io.units import stamps_ns as stamps_of_text
 
 HEADER = "#timestamp [ns],w_x [rad s^-1],w_y [rad s^-1],w_z [rad s^-1],a_x [m s^-2],a_y [m s^-2],a_z [m s^-2]"
 EPOCH_NS = 1403715273262142976
@@ -284,6 +285,33 @@ def test_no_path_and_no_known_layout_are_format_errors(tmp_path: Path) -> None:
         read_imu(tmp_path / "a.csv", format="eurok")
 
 
+@loop_over(
+    ("kind", "lacks"),
+    [
+        ("euroc", "mav0/imu0/data.csv"),
+        ("inertial-scale", "gyroscope.txt and accelerometer.txt"),
+        ("mars", "of MARS logger"),
+        ("opencamera", r"0 files \*gyro.csv of OpenCamera-Sensors \(none\)"),
+        ("sensor-logger", "Gyroscope.csv of Sensor Logger"),
+        ("gcsv", "Is a directory"),
+        ("gopro", "Is a directory"),
+        ("camm", "Is a directory"),
+        ("stray-scanner", "imu.csv: no such file"),
+        ("phyphox", "no gyroscope of phyphox"),
+        ("video-imu-capture", "video_meta.pb3: no such file"),
+        ("csv", "Is a directory"),
+    ],
+)
+def test_a_folder_that_is_not_of_the_kind_that_was_named_is_refused_by_what_it_lacks(
+    tmp_path: Path, kind: str, lacks: str
+) -> None:
+    folder = tmp_path / kind
+    folder.mkdir()
+    with pytest.raises(FormatError, match=lacks) as caught:
+        read_imu(folder, format=kind)
+    assert str(folder) in str(caught.value)
+
+
 def test_a_dataset_with_several_imus_asks_which(tmp_path: Path) -> None:
     for name in ("imu0", "imu1"):
         folder = tmp_path / "mav0" / name
@@ -321,3 +349,32 @@ def test_a_fault_of_one_sensor_names_its_own_file(
         read_imu(tmp_path)
     assert caught.value.path == tmp_path / guilty
     assert said in str(caught.value)
+
+
+@loop_over(
+    ("token", "unit", "nanoseconds"),
+    [
+        ("1.5", "s", 1_500_000_000),
+        ("1.5e3", "ms", 1_500_000_000),
+        ("-2.25", "us", -2250),
+        ("0.4", "ns", 0),
+        ("0.6", "ns", 1),
+        ("1" + "0" * 63 + "E-63", "s", None),
+        ("00000000000000000000012", "ns", 12),
+        ("4500000000", "s", None),
+        ("4400000000", "s", 4_400_000_000_000_000_000),
+    ],
+)
+def test_stamps_are_decimal_numbers_of_any_form(token: str, unit: str, nanoseconds: int | None) -> None:
+    if nanoseconds is None:
+        with pytest.raises((FormatError, TimingError), match=r"line 7|beyond 142 years"):
+            stamps_of_text(Path("a"), ["1", token], unit, [6, 7])
+    else:
+        assert stamps_of_text(Path("a"), [token, "3"], unit)[0] == nanoseconds
+
+
+@loop_over("token", ["", "x", "nan", "inf", "-Infinity", "1_000", "1" * 65, "0x10", "1,5"])
+def test_what_is_no_decimal_number_is_no_stamp(token: str) -> None:
+    with pytest.raises(FormatError, match=r"line 5.*is not a number") as caught:
+        stamps_of_text(Path("a"), ["1", token, "2"], "s", [4, 5, 6])
+    assert len(str(caught.value)) < 120

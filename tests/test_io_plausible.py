@@ -205,6 +205,17 @@ def test_axes_to_set_replace_those_that_were_set(recordings: dict[str, ImuRecord
     assert str(settings(str(caught.value))["accel"]) == "x,y,z"
 
 
+@pytest.mark.parametrize(("stated", "true"), [("-z,y,x", "y,-x,z"), ("y,z,x", "-z,y,x"), ("x,y,z", "y,z,x")])
+def test_axes_to_set_are_those_of_the_file_s_columns(recordings: dict[str, ImuRecording], stated, true) -> None:
+    imu = recordings["inertial_scale/D1"]
+    columns = imu.gyro_rad_s @ Axes.parse(true).matrix
+    np.testing.assert_array_equal(Axes.parse(true).apply(columns), imu.gyro_rad_s)
+    altered = replace(imu, gyro_rad_s=Axes.parse(stated).apply(columns))
+    with pytest.raises(FormatError) as caught:
+        RawImu(imu=altered, path=Path("x"), gyro_axes=Axes.parse(stated)).check()
+    assert str(settings(str(caught.value))["gyro"]) == true
+
+
 @pytest.mark.parametrize("name", HANDHELD)
 def test_a_wrong_unit_of_a_slow_gyroscope_is_noticed_by_gravity(recordings: dict[str, ImuRecording], name: str) -> None:
     imu = recordings[name]

@@ -247,3 +247,78 @@ def test_meshes_of_open3d_are_read_by_open3d_afterwards(tmp_path):
         )
         assert np.array_equal(np.asarray(after.triangles), np.asarray(before.triangles))
         assert np.array_equal(np.asarray(after.vertex_colors), np.asarray(before.vertex_colors))
+
+
+def small_ply(form, body, *, count="uchar", vertices=2, faces=1, end="end_header\n"):
+    header = f"ply\nformat {form} 1.0\nelement vertex {vertices}\n"
+    header += "".join(f"property float {axis}\n" for axis in "xyz") + "property uchar label\n"
+    header += f"element face {faces}\nproperty list {count} int vertex_indices\n" if faces else ""
+    return header.encode() + end.encode() + body
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ("0 0 0 1\n1 2 3 255\n3 0 1 1\n", None),
+        ("0 0 0 1\n1 2 3 2.0\n0\n\n", None),
+        ("0 0 0 1\n1 2 3 2\n3 0 1 1\nmore\n", "line 14: damaged: text follows the last element"),
+        ("0 0 0 1\n1 2 3 2 9\n3 0 1 1\n", "line 12: 5 values where element vertex has 4"),
+        ("0 0 0 1\n1 2 3\n3 0 1 1\n", "line 12: too few values for element vertex"),
+        ("0 0 0 1\n\n3 0 1 1\n", "line 12: truncated within element vertex"),
+        ("0 0 0 1\n1 2 3 2\n", "line 13: truncated within element face"),
+        ("0 0 0 1\n1 2 3 256\n3 0 1 1\n", "line 12: .*256 does not fit into 8 bits"),
+        ("0 0 0 1\n1 2 3 -1\n3 0 1 1\n", "line 12: .*-1 does not fit into 8 bits"),
+        ("0 0 0 1\n1 2 3 1.5\n3 0 1 1\n", "line 12: .*1.5 does not fit into 8 bits"),
+        ("0 0 0 1\n1 2 3 1_0\n3 0 1 1\n", "line 12: .*1_0 does not fit into 8 bits"),
+        ("0 0 0 1\n1 2_0 3 1\n3 0 1 1\n", "line 12: not a value of element vertex: .*2_0"),
+        ("0 0 0 1\n1 two 3 1\n3 0 1 1\n", "line 12: not a value of element vertex: .*two"),
+        ("0 0 0 1\n1 2 3 2\n3 0 1\n", "line 13: too few values for element face"),
+        ("0 0 0 1\n1 2 3 2\n3 0 1 2\n", "line 13: a face refers to none of the 2 vertices"),
+        ("0 0 0 1\n1 2 3 2\n3 0 1 -1\n", "line 13: a face refers to none of the 2 vertices"),
+        ("0 0 0 1\n1 2 3 2\n2 0 1 1\n", "line 13: 4 values where element face has 3"),
+    ],
+)
+def test_each_line_of_a_text_file_has_the_values_that_it_should(tmp_path, body, words):
+    path, out = tmp_path / "a.ply", tmp_path / "b.ply"
+    path.write_bytes(small_ply("ascii", body.encode()))
+    if words is None:
+        transform_ply(path, out, SIMILARITY)
+        assert out.read_bytes().endswith(body.partition("\n")[2].partition("\n")[2].encode())
+        return
+    with pytest.raises(FormatError, match=words):
+        transform_ply(path, out, SIMILARITY)
+
+
+def test_a_list_of_fewer_values_than_none_is_refused(tmp_path):
+    path, out = tmp_path / "a.ply", tmp_path / "b.ply"
+    path.write_bytes(small_ply("ascii", b"-1\n", count="char", vertices=0))
+    with pytest.raises(FormatError, match="too few values for element face"):
+        transform_ply(path, out, SIMILARITY)
+
+
+VERTICES = np.zeros(2, [("xyz", "<f4", 3), ("label", "u1")]).tobytes()
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (small_ply("binary_little_endian", VERTICES + bytes([1, 0, 0, 0, 0])), None),
+        (small_ply("binary_little_endian", VERTICES, faces=0, end=""), "does not end"),
+        (small_ply("binary_little_endian", VERTICES, faces=0, end="comment" + "x" * 100_000), "does not end"),
+        (small_ply("binary_little_endian", VERTICES, faces=0, vertices=3), "3 rows of vertex do not fit"),
+        (small_ply("binary_little_endian", VERTICES + bytes([1, 0, 0])), "truncated within element face"),
+        (small_ply("binary_little_endian", VERTICES + bytes([200, 0, 0, 0, 0])), "truncated within element face"),
+        (small_ply("binary_little_endian", VERTICES + bytes([255]), count="char"), "a list of -1 values in element"),
+        (small_ply("binary_little_endian", VERTICES + bytes([1, 2, 0, 0, 0])), "none of the 2 vertices"),
+        (small_ply("binary_little_endian", VERTICES + bytes([1, 0, 0, 0, 0, 7])), "1 bytes follow"),
+    ],
+)
+def test_a_binary_file_has_the_bytes_that_it_should(tmp_path, data, words):
+    path = tmp_path / "a.ply"
+    path.write_bytes(data)
+    if words is None:
+        transform_ply(path, tmp_path / "b.ply", SIMILARITY)
+        assert len((tmp_path / "b.ply").read_bytes()) == len(data)
+        return
+    with pytest.raises(FormatError, match=words):
+        transform_ply(path, tmp_path / "b.ply", SIMILARITY)

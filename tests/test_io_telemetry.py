@@ -55,6 +55,20 @@ def test_a_gyroscope_alone_is_for_imaging(tmp_path, imu):
     assert not read_imu(path).has_accel
 
 
+def test_an_insta360_is_known_by_the_end_of_its_file(tmp_path):
+    mark, path = b"8db42d694ccc418790edff439fe026bf", tmp_path / "VID.mp4"
+    for content, known in (
+        (mark, True),
+        (b"video" + mark, True),
+        (mark + b"0", False),
+        (mark[1:], False),
+        (b"", False),
+    ):
+        path.write_bytes(content)
+        assert telemetry.is_telemetry(path) == known
+    assert not telemetry.is_telemetry(tmp_path)
+
+
 def test_damage_is_an_error_of_ours(tmp_path, imu):
     pytest.importorskip("telemetry_parser")
     path = write_runcam(tmp_path, imu, "Thumb")

@@ -9,7 +9,7 @@ from cases import loop_over
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.options import ReadLimits
 from colmap_inertial.io.files import reading_within
-from colmap_inertial.io.tables import head_of, members_of, text_of
+from colmap_inertial.io.tables import _unpacking, head_of, members_of, text_of
 
 TABLES = {
     "plain.csv": "t,x\n1,2\n",
@@ -93,3 +93,18 @@ def test_a_table_is_packed_as_recorders_do(tmp_path, compression):
     assert members_of(path) == {"a.csv": "a.csv"} and head_of(path, "a.csv") == ""
     with pytest.raises(FormatError, match=r"its a\.csv is packed by method (12|14), not by deflate; unpack it"):
         text_of(path, "a.csv")
+
+
+@pytest.mark.parametrize("stated", [10, 10**9])
+def test_packed_bytes_are_those_stated_and_no_more_than_the_zip_has(both, monkeypatch, stated):
+    _, archive = both
+    true = zipfile.ZipFile.getinfo
+
+    def claimed(opened, member):
+        info = true(opened, member)
+        info.compress_size = stated
+        return info
+
+    monkeypatch.setattr(zipfile.ZipFile, "getinfo", claimed)
+    with _unpacking(archive, "export/plain.csv") as (_, packed):
+        assert packed == min(stated, archive.stat().st_size)

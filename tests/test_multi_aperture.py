@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -22,7 +23,7 @@ from colmap_inertial.imaging.multi_aperture import (
     rectify,
     refocus,
 )
-from colmap_inertial.imaging.multi_aperture._fill import fill_hidden
+from colmap_inertial.imaging.multi_aperture._fill import _fit_neighbours, fill_hidden
 from colmap_inertial.imaging.multi_aperture._geometry import transfer, trifocal_tensor
 from colmap_inertial.imaging.multi_aperture._information import cost_tables
 from colmap_inertial.imaging.multi_aperture._light import adds_up, light_cost
@@ -434,6 +435,30 @@ def test_hidden_colours_follow_the_reference_nearby():
     assert np.array_equal(blind, guide)
 
 
+def test_neighbours_weigh_by_distance_likeness_and_depth():
+    """Each by a closed form: two spacings away, a twentieth of full scale lighter, a pixel of disparity apart."""
+    shape, y, x = (21, 21), np.array([10]), np.array([10])
+    flat, one = np.full(shape, 0.5, np.float32), np.zeros(shape, np.float32)
+    one[10, 16] = 1
+    seen = np.ones(shape, dtype=bool)
+    steps = np.arange(-3, 4)
+    everything = np.exp(-(steps[:, None] ** 2 + steps**2) / 8).sum()
+    value, total = _fit_neighbours(one, seen, flat, flat, y, x, 3)
+    assert total[0] == pytest.approx(everything) and value[0] == pytest.approx(np.exp(-0.5) / everything)
+    for guide, disparity, less in (
+        (flat + 0.05 * one, flat, np.exp(-0.5)),
+        (flat, flat + one, np.exp(-1)),
+        (flat, flat - one, np.exp(-1)),
+    ):
+        _, total = _fit_neighbours(one, seen, guide, disparity, y, x, 3)
+        assert total[0] == pytest.approx(everything - np.exp(-0.5) * (1 - less), rel=1e-5)
+    _, total = _fit_neighbours(one, one == 0, flat, flat, y, x, 3)
+    assert total[0] == pytest.approx(everything - np.exp(-0.5), rel=1e-5)
+    # in the corner a quarter is there
+    _, total = _fit_neighbours(one, seen, flat, flat, y - 10, x - 10, 3)
+    assert total[0] == pytest.approx(np.exp(-(np.arange(4)[:, None] ** 2 + np.arange(4) ** 2) / 8).sum())
+
+
 def test_luminance_lends_its_lower_noise():
     colours = [texture(200, 160, seed=0)] * 3
     planes, _, rig = plane_views(160, 120, 4.0, (0.0, 0.0), colours=colours)
@@ -494,6 +519,25 @@ def test_noise_is_measured_and_clean_pictures_are_left_alone():
     assert smoothing(even, 5.0)[0] > 1
     assert smoothing(rich, 5.0) == (0.0, 5)
     assert measure_noise(np.zeros((4, 4), dtype=np.uint8)) == 0
+
+
+@pytest.mark.parametrize("noise", [4.0, 9.0])
+def test_smoothing_leaves_differences_that_noise_hardly_makes(noise):
+    rng = np.random.default_rng(12)
+    white = noise * rng.standard_normal((300, 400)).astype(np.float32)
+    width_px, tells = smoothing(np.clip(np.rint(128 + white), 0, 255).astype(np.uint8), noise)
+    assert width_px == pytest.approx(smoothing(np.full((300, 400), 128, np.uint8), 4 * noise)[0] / 2)
+    smoothed = cv2.GaussianBlur(white, (0, 0), width_px)
+    # a difference of two pixels, one and a half of its standard deviations
+    assert tells == pytest.approx(1.5 * np.sqrt(2) * smoothed.std(), abs=0.6)
+
+
+@pytest.mark.parametrize(("times", "smooths"), [(1.3, True), (1.75, False)])
+def test_nothing_is_smoothed_where_texture_stands_out_of_the_noise(times, smooths):
+    """By half again as much as the noise."""
+    rng, noise = np.random.default_rng(13), 8.0
+    codes = np.clip(np.rint(128 + noise * np.hypot(1, times) * rng.standard_normal((200, 300))), 0, 255)
+    assert (smoothing(codes.astype(np.uint8), noise)[0] > 0) == smooths
 
 
 def test_refocusing_leaves_what_is_in_focus_and_blurs_the_rest():

@@ -1,6 +1,7 @@
 """Calibrations of multi-aperture cameras, captures that hold them, and the frames made of them."""
 
 import json
+import struct
 from dataclasses import replace
 from pathlib import Path
 
@@ -173,6 +174,87 @@ def test_what_is_wrong_with_a_calibration_is_said(tmp_path, text, reason):
     path.write_text(text)
     with pytest.raises(FormatError, match=reason):
         read_rig_calibration(path)
+
+
+FIRST = {"image_prefix": "a/", "ref_sensor": True, "camera_model_name": "PINHOLE", "camera_params": [5, 5, 3, 2]}
+SECOND = FIRST | {
+    "image_prefix": "b/",
+    "ref_sensor": False,
+    "cam_from_rig_rotation": [1, 0, 0, 0],
+    "cam_from_rig_translation": [1, 2, 3],
+}
+
+
+@loop_over(
+    ("rigs", "reason"),
+    [
+        ([{"cameras": [FIRST, SECOND | {"cam_from_rig_rotation": [1, 0, 0, 0.1]}]}], "b: .*no unit quaternion"),
+        ([{"cameras": [FIRST, SECOND | {"cam_from_rig_rotation": [1, 0, 0]}]}], "must hold 4 numbers"),
+        ([{"cameras": [FIRST, SECOND | {"camera_model_name": "LENS"}]}], "camera model 'LENS' is unknown"),
+        ([{"cameras": [FIRST, SECOND | {"camera_params": [5, 3, 2]}]}], "must hold 4 numbers"),
+        ([{"cameras": [FIRST | {"camera_model_name": None}]}], "camera_model_name and camera_params are missing"),
+        ([{"cameras": [FIRST]}, {"cameras": [SECOND]}], "describes 2 rigs"),
+        ({"cameras": [FIRST]}, "not a rig_config.json"),
+        ([], "not a rig_config.json"),
+    ],
+)
+def test_what_is_wrong_with_a_rig_config_is_said(tmp_path, rigs, reason):
+    path = tmp_path / "rig_config.json"
+    path.write_text(json.dumps([{"cameras": [FIRST, SECOND]}]))
+    for unit, factor in ((None, 1), ("m", 1), ("mm", 1e-3)):
+        known = read_rig_calibration(path, unit=unit)
+        assert np.allclose(known.camera("b").cam_from_rig[:3, 3], factor * np.array([1, 2, 3]))
+        assert known.length_unit == ("model" if unit is None else "m")
+    path.write_text(json.dumps(rigs))
+    with pytest.raises(FormatError, match=reason):
+        read_rig_calibration(path)
+
+
+def sensor(kind, number, pose=None):
+    """A sensor of a rig, as COLMAP writes it, but for the first without a place."""
+    known = b"" if pose is None else struct.pack("<B7d", 1, *pose)
+    return struct.pack("<iI", kind, number) + known
+
+
+STRAIGHT = (1, 0, 0, 0, 1, 2, 3)
+CAMERAS = struct.pack("<Q", 2) + b"".join(struct.pack("<IiQQ4d", number, 1, 64, 48, 5, 5, 3, 2) for number in (1, 2))
+RIG = struct.pack("<QII", 1, 1, 2) + sensor(0, 1) + sensor(0, 2, STRAIGHT)
+
+
+@loop_over(
+    ("cameras", "rigs", "reason"),
+    [
+        (None, RIG, "cameras.bin: is missing"),
+        (CAMERAS, None, "rigs.bin: is missing"),
+        (CAMERAS[:8] + struct.pack("<Ii", 1, 99) + CAMERAS[16:], RIG, "camera model 99 is unknown"),
+        (CAMERAS, struct.pack("<QII", 1, 1, 2) + sensor(0, 1) + sensor(0, 2) + bytes(1), "camera 2 has no pose"),
+        (CAMERAS, struct.pack("<QII", 1, 1, 1) + sensor(0, 1), "holds 0 rigs of several cameras"),
+        (CAMERAS, struct.pack("<Q", 2) + 2 * RIG[8:], "holds 2 rigs of several cameras"),
+        (
+            CAMERAS,
+            struct.pack("<QII", 1, 1, 2) + sensor(0, 1) + sensor(0, 7, STRAIGHT),
+            "camera 7 of the rig is missing",
+        ),
+        (CAMERAS, RIG[:-1], "rigs.bin: truncated"),
+        (CAMERAS[:-1], RIG, "cameras.bin: truncated"),
+    ],
+)
+def test_what_is_wrong_with_a_model_s_rig_is_said(tmp_path, cameras, rigs, reason):
+    for name, content in (("cameras.bin", CAMERAS), ("rigs.bin", RIG)):
+        (tmp_path / name).write_bytes(content)
+    known = read_rig_calibration(tmp_path, unit="mm")
+    assert known.camera("2").params == (5, 5, 3, 2) and known.camera("2").size == (64, 48)
+    assert np.allclose(known.camera("2").cam_from_rig[:3, 3], [1e-3, 2e-3, 3e-3])
+    # an IMU is a sensor, too, and no camera
+    imu = struct.pack("<QII", 1, 1, 3) + sensor(0, 1) + sensor(1, 9, STRAIGHT) + sensor(0, 2, STRAIGHT)
+    (tmp_path / "rigs.bin").write_bytes(imu)
+    assert list(read_rig_calibration(tmp_path).cameras) == ["1", "2"]
+    for name, content in (("cameras.bin", cameras), ("rigs.bin", rigs)):
+        (tmp_path / name).unlink()
+        if content is not None:
+            (tmp_path / name).write_bytes(content)
+    with pytest.raises(FormatError, match=reason):
+        read_rig_calibration(tmp_path)
 
 
 def test_a_calibration_of_no_known_format_is_refused(tmp_path):

@@ -11,6 +11,7 @@ from colmap_inertial.colmap import loops, pairing, relative_track, sparse
 from colmap_inertial.colmap.gyro_orientations import (
     GyroOrientations,
     RayPairs,
+    _curvature,
     estimate_bias_correction,
     estimate_gyro_orientations,
 )
@@ -32,6 +33,7 @@ from colmap_inertial.colmap.two_views import (
     delete_matches,
     localise_frames,
     read_observations,
+    read_ray_pairs,
 )
 from colmap_inertial.core.errors import InertialError, NotObservableError
 from colmap_inertial.core.geometry import quat_from_matrix, so3_exp
@@ -96,6 +98,18 @@ def test_across_a_gap_of_the_gyroscope_nothing_is_known():
     assert apart.agree(*pair(0, 1), np.eye(3)[None])[0]
 
 
+def test_frames_outside_of_the_recording_and_in_its_gaps_belong_to_no_part():
+    fine_s = np.arange(0, 8, 0.01)
+    fine_s = fine_s[(fine_s < 3) | (fine_s > 4)]
+    t_s = np.array([-1.0, -0.5, 0.5, 2.0, 3.5, 5.0, 7.0, 9.0])
+    timing = FrameTiming(names=tuple(f"{i}" for i in range(8)), t_s=t_s, readout_s=0.0)
+    found = GyroOrientations.of(imu_of(fine_s, np.zeros((len(fine_s), 3))), calibration_of(), timing, CAMERA)
+    assert found.part.tolist() == [-1, -1, 0, 0, -1, 1, 1, -1]
+    i, j = np.triu_indices(8, 1)
+    together = {(a, b) for a, b, known in zip(i.tolist(), j.tolist(), found.known(i, j).tolist(), strict=True) if known}
+    assert together == {(2, 3), (5, 6)}
+
+
 def test_what_a_change_of_the_bias_does_to_headings_is_what_their_covariance_says():
     t_s = np.array([0.0, 20.0])
     change = np.array([2e-3, 0, 0])
@@ -104,6 +118,51 @@ def test_what_a_change_of_the_bias_does_to_headings_is_what_their_covariance_say
     moved = after.start_from_cam[0].T @ after.start_from_cam[1]
     expected = before.start_from_cam[0].T @ so3_exp(-(lever @ change)) @ before.start_from_cam[1]
     assert moved == pytest.approx(expected, abs=2e-4)
+
+
+def unsure_by(headings, *, cov=None, density=0.0, walk=0.0, **changes):
+    """Headings that are unsure by these errors alone, and by gains."""
+    calibration = replace(headings.calibration, cov=np.zeros((CAL.COUNT, CAL.COUNT)) if cov is None else cov)
+    return replace(
+        headings, calibration=calibration, density_rad_s_rthz=density, walk_rad_s_rts=walk, **changes
+    ).covariance(*pair(0, 1))[0]
+
+
+def test_noise_turns_headings_as_far_as_they_are_unsure():
+    """The scatter of 4000 recordings of a camera at rest."""
+    still = headings_of([0.0, 0.0], np.array([0.0, 20.0]))
+    rng, step_s = np.random.default_rng(0), 0.2
+    white = 3e-3 / np.sqrt(step_s) * rng.standard_normal((4000, 100))
+    walked = np.cumsum(2e-4 * np.sqrt(step_s) * rng.standard_normal((4000, 100)), axis=1)
+    for rate, values in ((white, {"density": 3e-3}), (walked, {"walk": 2e-4}), (white + walked, None)):
+        known = {"density": 3e-3, "walk": 2e-4} if values is None else values
+        variance = float(np.var(rate.sum(axis=1) * step_s))
+        assert unsure_by(still, **known) == pytest.approx(variance * np.eye(3), rel=0.1, abs=1e-9)
+
+
+def test_a_wrong_calibration_turns_headings_as_far_as_they_are_unsure():
+    still = headings_of([0.0, 0.0], np.array([0.0, 20.0]))
+    cov = np.zeros((3, CAL.COUNT, CAL.COUNT))
+    cov[0, CAL.GYRO_BIAS, CAL.GYRO_BIAS] = np.diag([1e-3, 2e-3, 3e-3]) ** 2
+    cov[1, CAL.GYRO_TIME_OFFSET, CAL.GYRO_TIME_OFFSET] = 0.01**2
+    cov[2, CAL.ROTATION, CAL.ROTATION] = 0.02**2 * np.eye(3)
+    assert unsure_by(still, cov=cov[0]) == pytest.approx(np.diag([0.02, 0.04, 0.06]) ** 2, abs=1e-9)
+    moving = replace(still, rate_rad_s=np.array([0.3, 0.4]))
+    assert unsure_by(moving, cov=cov[1]) == pytest.approx(0.005**2 * np.eye(3), abs=1e-9)
+    assert unsure_by(still, cov=cov[2]) == pytest.approx(0.04**2 * np.eye(3), rel=0.01)
+    # about y by 60 degrees: a hundredth too far, and by what is crossed between the axes towards x and z
+    turned, angle = headings_of([0.0, 60.0], np.array([0.0, 20.0])), np.radians(60)
+    sine, versine = np.sin(angle), 1 - np.cos(angle)
+    crossed = 0.005**2 / 2 * np.array([sine**2 + versine**2, 0, sine**2 + versine**2])
+    expected = np.diag(crossed + np.array([0, (0.01 * angle) ** 2, 0]))
+    assert unsure_by(turned) == pytest.approx(expected, abs=3e-7)
+
+
+def test_what_bends_a_sum_of_squares_is_its_matrix():
+    root = np.random.default_rng(3).standard_normal((3, 3))
+    at = np.array([0.01, -0.02, 0.03])
+    found = _curvature(lambda x: float(np.sum((root @ (x - at)) ** 2)) + 7.0, at + 1e-3 * np.array([2, 1, -1]))
+    assert found == pytest.approx(root.T @ root, rel=1e-6)
 
 
 def test_a_rotation_that_the_gyroscope_contradicts_is_told():
@@ -472,6 +531,36 @@ def test_without_a_gyroscope_a_long_capture_matches_neighbours_only(database, tm
     assert record.matched == len(matched) == record.pairs - record.far and record.loops_closed == 0
 
 
+def test_loops_are_sought_farther_apart_than_twice_the_overlap(database, tmp_path, monkeypatch):
+    matched, sought = [], []
+
+    class Search:
+        def __init__(self, database, names, orientations, track, covisibility, nearest):
+            sought.append(nearest)
+
+        def close_loops(self, match, *, doubtful, neighbours, given):
+            match(neighbours)
+            sought.append({j - i for i, j in doubtful})
+            return loops.Loops(compared=7, candidates=5, refused=3, closed=((0, 39),))
+
+    headings = headings_of(np.zeros(40), np.arange(40.0))
+    monkeypatch.setattr(pairing, "match_pairs", lambda db, pairs, context, **_: matched.extend(pairs) or 0)
+    monkeypatch.setattr(pairing, "_estimate_orientations", lambda *_: headings)
+    monkeypatch.setattr(pairing.Covisibility, "of", lambda *_: None)
+    monkeypatch.setattr(pairing, "_estimate_track", lambda *_: None)
+    monkeypatch.setattr(pairing, "LoopSearch", Search)
+    names = tuple(f"{i:03}" for i in range(40))
+    recording = type("Recording", (), {"timing": FrameTiming(names=names, t_s=np.arange(40.0))})()
+    options = MappingOptions(pairing="sequential", overlap=3)
+    record = match_capture(database, tmp_path / "out.db", recording, CAMERA, options, RunContext(scratch=tmp_path))
+    nearest, doubtful = sought
+    # within twice the overlap nothing is a loop; pairs up to four times the overlap apart may be one
+    assert {int(b) - int(a) for a, b in matched} == {1, 2, 3, 4} and nearest == 2 * 3 + 1
+    assert doubtful == {8} and record.matched == len(matched) == len(set(matched))
+    assert (record.loops_compared, record.loop_candidates, record.loops_refused, record.loops_closed) == (7, 5, 3, 1)
+    assert record.apart == record.unlike == 0 and record.gyroscope == "the frames turn as the gyroscope does"
+
+
 def test_matches_are_verified_counted_and_forgotten(database, tmp_path):
     context = RunContext(scratch=tmp_path, num_threads=1)
     sparse.match_pairs(database, [("a", "b"), ("a", "c")], context)
@@ -557,6 +646,22 @@ def test_points_are_those_that_three_frames_saw_and_rays_are_turned(tmp_path):
     assert (of_a + of_c == 39).all()
     there = np.column_stack([(xy["c"][found.feature[80:]] - [240, 180]) / 400, np.ones(40)]) @ turned[2].T
     assert found.rays[80:] == pytest.approx(there / np.linalg.norm(there, axis=1)[:, None], abs=1e-6)
+
+
+def test_rays_of_pairs_are_those_of_their_matches_and_of_none_that_cannot_be_seen(tmp_path):
+    rng = np.random.default_rng(6)
+    xy = {name: rng.uniform(10, 350, (80, 2)) for name in "abcd"}
+    xy["d"][::3] = np.nan
+    matched = {(0, 1): rng.permutation(80), (1, 2): np.arange(5), (0, 3): np.arange(80)}
+    path = written(tmp_path / "database.db", xy, matched)
+    found = read_ray_pairs(path, list("abcd"), [(0, 1), (1, 2), (0, 3)])
+    # few matches, and features that no ray meets
+    assert found.first.tolist() == [0] and found.second.tolist() == [1] and found.pixel_rad == pytest.approx(1 / 400)
+    rays = [np.column_stack([(xy[name] - [240, 180]) / 400, np.ones(80)]) for name in "ab"]
+    first, second = (one / np.linalg.norm(one, axis=1)[:, None] for one in rays)
+    for ray, other in zip(found.rays_first[0], found.rays_second[0], strict=True):
+        k = np.argmax(first @ ray)
+        assert ray == pytest.approx(first[k], abs=1e-6) and other == pytest.approx(second[matched[0, 1][k]], abs=1e-6)
 
 
 def test_a_frame_is_placed_by_points_that_another_one_knew(tmp_path):

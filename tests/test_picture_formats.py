@@ -1,14 +1,16 @@
 """Pictures come out as they went in: coding, colours, alpha and metadata, as Pillow reads them."""
 
 import io
+import struct
 
 import cv2
 import numpy as np
 import pytest
 from PIL import Image, ImageCms, JpegImagePlugin, TiffImagePlugin
 
-from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.io.capture import load_capture
+from colmap_inertial.io.exif import exposure_of, position_of, stamps_of_exif
 from colmap_inertial.io.frames import read_frame_timing
 from colmap_inertial.io.jpeg_coding import read_jpeg_coding
 from colmap_inertial.pipeline.stages.frame_folder import encode_image
@@ -107,3 +109,133 @@ def test_a_webp_that_has_a_time_is_named(tmp_path):
     (tmp_path / "capture.toml").write_text('[images]\nfolder = "frames"\ntimes = "frames.csv"\n')
     with pytest.raises(FormatError, match=r"b\.webp.*convert them"):
         read_frame_timing(load_capture(tmp_path / "capture.toml"))
+
+
+# --- EXIF, byte by byte ----------------------------------------------------------------------------------------------
+
+ASCII, SHORT, LONG, RATIONAL = 2, 3, 4, 5
+
+
+def tiff_with(order, pointer, entries):
+    """A TIFF structure of two directories: one that points to the other, and that of entries: tag, type, values."""
+    marks = {"<": b"II*\0", ">": b"MM\0*"}
+    head = marks[order] + struct.pack(order + "I", 8)
+    first = struct.pack(order + "HHHII", 1, pointer, LONG, 1, 26) + bytes(4)
+    at, rows, data = 26 + 2 + 12 * len(entries) + 4, b"", b""
+    for tag, kind, values in entries:
+        raw = values if kind == ASCII else struct.pack(f"{order}{len(values)}{'H' if kind == SHORT else 'I'}", *values)
+        count = len(values) // 2 if kind == RATIONAL else len(values)
+        if len(raw) > 4:
+            raw, data = struct.pack(order + "I", at + len(data)), data + raw
+        rows += struct.pack(order + "HHI4s", tag, kind, count, raw.ljust(4, b"\0"))
+    return head + first + struct.pack(order + "H", len(entries)) + rows + bytes(4) + data
+
+
+def place_of(order="<", **changed):
+    """The position by EXIF that says 48 degrees, 7.5 minutes and 36 seconds north, 11 and a half east, 520.25 m."""
+    said = {
+        "north": (1, ASCII, b"N\0"),
+        "latitude": (2, RATIONAL, (48, 1, 75, 10, 3600, 100)),
+        "east": (3, ASCII, b"E\0"),
+        "longitude": (4, RATIONAL, (23, 2, 0, 1, 0, 7)),
+        "side": (5, ASCII, b"\0"),
+        "height": (6, RATIONAL, (2081, 4)),
+        "error": (31, RATIONAL, (35, 10)),
+    }
+    said |= {name: None if value is None else (*said[name][:2], value) for name, value in changed.items()}
+    return position_of(tiff_with(order, 0x8825, [entry for entry in said.values() if entry is not None]))
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_a_place_is_what_its_fractions_say(order):
+    assert place_of(order) == (pytest.approx(48.135), pytest.approx(11.5), 520.25, 3.5, "sea")
+    assert place_of(order, north=b"S\0")[0] == pytest.approx(-48.135)
+    assert place_of(order, east=b"w\0")[1] == pytest.approx(-11.5)
+    for side, height_m, above in ((1, -520.25, "sea"), (2, 520.25, "ellipsoid"), (3, -520.25, "ellipsoid")):
+        assert place_of(order, side=bytes([side]))[2::2] == (height_m, above)
+    assert np.isnan(place_of(order, height=None)[2]) and np.isnan(place_of(order, error=(0, 1))[3])
+    assert place_of(order, side=None)[2:] == (520.25, 3.5, "sea")
+    assert place_of(order, latitude=(90, 1, 0, 1, 0, 1), longitude=(180, 1, 0, 1, 0, 1))[:2] == (90, 180)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"north": b"E\0"},
+        {"north": None},
+        {"east": b"N\0"},
+        {"latitude": (90, 1, 1, 1, 0, 1)},
+        {"longitude": (180, 1, 0, 1, 1, 1)},
+        {"latitude": (48, 1, 0, 0, 0, 1)},
+        {"latitude": (48, 1, 0, 1)},
+        {"height": (520, 0)},
+        {"error": (3, 1, 4, 1)},
+    ],
+)
+def test_what_is_no_place_is_none(wrong):
+    assert place_of(**wrong) is None
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_exposure_and_sensitivity_are_what_exif_says(order):
+    def said(*entries):
+        return exposure_of(tiff_with(order, 0x8769, entries))
+
+    time, iso = (0x829A, RATIONAL, (1, 250)), (0x8827, SHORT, (400,))
+    assert said(time, iso) == (0.004, 400) and said(time) == (0.004, None) and said(iso) == (None, 400)
+    assert said((0x829A, RATIONAL, (99, 10)))[0] == 9.9
+    for fraction in ((10, 1), (0, 1), (1, 0)):
+        assert said((0x829A, RATIONAL, fraction))[0] is None
+    assert said((0x8827, SHORT, (0,)))[1] is None and said((0x8827, LONG, (400,)))[1] is None
+    assert exposure_of(b"no picture") == (None, None) and position_of(b"no picture") is None
+
+
+def taken(path, date=b"2024:05:01 12:30:15\0", fraction=b"2504\0", offset=b"+02:30\0", order="<"):
+    """A picture that was taken then."""
+    said = ((0x9003, ASCII, date), (0x9291, ASCII, fraction), (0x9011, ASCII, offset))
+    path.write_bytes(tiff_with(order, 0x8769, [entry for entry in said if entry[2] is not None]))
+    return path.name
+
+
+def test_times_by_exif_are_universal_where_their_offset_is_stated(tmp_path):
+    noon_ns = 1_714_566_615_000_000_000  # 2024-05-01 12:30:15 as universal time
+    for order in "<>":
+        names = [taken(tmp_path / "a.tif", order=order), taken(tmp_path / "b.tif", fraction=b"75\0", order=order)]
+        stamps, digits = stamps_of_exif(tmp_path, names)
+        expected = [noon_ns - 9_000_000_000_000 + ns for ns in (250_400_000, 750_000_000)]
+        assert stamps.t_ns.tolist() == expected and digits == 2
+    later = taken(tmp_path / "b.tif", offset=b"+00:00\0", date=b"2024:05:01 14:30:15\0")
+    names = [taken(tmp_path / "a.tif", offset=b"-01:00\0"), later]
+    expected = [noon_ns + 1_000_000_000 * hours * 3600 + 250_400_000 for hours in (1, 2)]
+    assert stamps_of_exif(tmp_path, names)[0].t_ns.tolist() == expected
+    # of the camera's own clock where none states it
+    names = [taken(tmp_path / f"{k}.tif", offset=None, fraction=b"%02d\0" % k) for k in (10, 20)]
+    assert stamps_of_exif(tmp_path, names)[0].t_ns.tolist() == [noon_ns + 100_000_000, noon_ns + 200_000_000]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "error", "said"),
+    [
+        ({"fraction": b"5\0"}, TimingError, "b.tif: its EXIF gives the time to tenths of a second only"),
+        ({"fraction": None}, TimingError, "b.tif: its EXIF gives the time to whole seconds only"),
+        ({"fraction": b"2x\0"}, TimingError, "whole seconds only"),
+        ({"date": None}, FormatError, "b.tif: its EXIF has no DateTimeOriginal"),
+        ({"date": b"2024-05-01 12:30:15\0"}, FormatError, "no DateTimeOriginal"),
+        ({"offset": None}, TimingError, "b.tif: its EXIF does not state the offset from universal time, that of a.tif"),
+    ],
+)
+def test_times_by_exif_that_cannot_be_compared_are_refused(tmp_path, wrong, error, said):
+    names = [taken(tmp_path / "a.tif"), taken(tmp_path / "b.tif", **wrong)]
+    with pytest.raises(error, match=said):
+        stamps_of_exif(tmp_path, names)
+
+
+def test_pictures_without_exif_have_no_time(tmp_path):
+    (tmp_path / "a.png").write_bytes(cv2.imencode(".png", np.zeros((8, 8), np.uint8))[1].tobytes())
+    with pytest.raises(FormatError, match=r"a.png: has no EXIF, which is to give its time"):
+        stamps_of_exif(tmp_path, ["a.png"])
+    (tmp_path / "b.tif").write_bytes(tiff_with("<", 0x8769, [])[:24])
+    with pytest.raises(FormatError, match=r"b.tif: its EXIF is damaged or empty"):
+        stamps_of_exif(tmp_path, ["b.tif"])
+    with pytest.raises(FormatError, match="no such picture"):
+        stamps_of_exif(tmp_path, ["c.tif"])

@@ -282,3 +282,62 @@ def test_loops_are_judged_as_one_by_one(monkeypatch):
     assert sound == {pair for pair, good in zip(pairs, verified, strict=True) if good}
     looked_at = {pair for pair, good in zip(pairs, verified & (covered >= 0.5), strict=True) if good}
     assert set(found) == expected & looked_at and len(found) > 20 and len(looked_at - expected) > 20
+
+
+def sighted(centres, points, rng, *, noise_rad=0.0):
+    """Observations of all points by all frames, so noisy."""
+    frame, point = np.divmod(np.arange(len(centres) * len(points)), len(points))
+    rays = points[point] - centres[frame]
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    rays += noise_rad * rng.standard_normal(rays.shape)
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    return Observations(frame=frame, point=point, feature=point, rays=rays), np.arange(len(centres) + 1) * len(points)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(("noise_rad", "most_rad"), [(0.0, 1e-9), (5e-4, 0.02)])
+def test_the_first_step_is_to_the_first_frame_with_parallax_and_leads_where_it_is(sign, noise_rad, most_rad):
+    rng = np.random.default_rng(31)
+    points = np.column_stack([rng.uniform(-1, 1, (120, 2)), rng.uniform(1.5, 3, 120)])
+    true = sign * np.array([0.8, 0.36, 0.48])
+    centres = 0.03 * np.arange(12)[:, None] * true
+    seen, bounds = sighted(centres, points, rng, noise_rad=noise_rad)
+    other, direction = relative_track._find_beginning(seen, bounds, 0)
+    first = seen.rays[: len(points)]
+    apart = [np.median(np.linalg.norm(np.cross(first, seen.rays[bounds[j] : bounds[j + 1]]), axis=1)) for j in range(9)]
+    assert other == next(j for j in range(1, 9) if apart[j] >= 0.04) and 2 <= other < 8
+    assert np.linalg.norm(direction) == pytest.approx(1) and np.arccos(min(1.0, direction @ true)) <= most_rad + 1e-7
+
+
+def test_without_parallax_or_with_few_points_nothing_begins():
+    rng = np.random.default_rng(32)
+    points = np.column_stack([rng.uniform(-1, 1, (40, 2)), rng.uniform(1.5, 3, 40)])
+    still, bounds = sighted(0.002 * np.arange(20)[:, None] * [1.0, 0, 0], points, rng)
+    assert relative_track._find_beginning(still, bounds, 0) is None
+    moving = 0.1 * np.arange(4)[:, None] * [1.0, 0, 0]
+    for count, begins in ((15, False), (16, True)):
+        assert (relative_track._find_beginning(*sighted(moving, points[:count], rng), 0) is not None) == begins
+
+
+@pytest.mark.parametrize(("wrong", "located"), [(0.0, True), (0.4, True), (0.9, False)])
+def test_a_frame_is_located_by_most_of_what_it_sees(wrong, located):
+    rng = np.random.default_rng(33)
+    points = np.column_stack([rng.uniform(-1, 1, (200, 2)), rng.uniform(1.5, 3, 200)])
+    true = np.array([0.1, -0.05, 0.02])
+    rays = points - true
+    bad = rng.permutation(200) < 200 * wrong
+    rays[bad] += rng.uniform(-1, 1, (int(bad.sum()), 3))
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    off = np.linalg.norm(np.cross((points - true) / np.linalg.norm(points - true, axis=1)[:, None], rays), axis=1)
+    unknown = np.arange(200) % 10 == 0
+    known = np.where(unknown[:, None], np.nan, points)
+    found = relative_track._locate_frame(known, rays, true + 0.01 * np.array([3, 2, -2]), np.array([0.05, 0, 0]))
+    assert (found is not None) == located
+    if found is not None:
+        centre, trusted = found
+        assert np.linalg.norm(centre - true) < (1e-3 if wrong else 1e-9)
+        # what is off by three times an error's size triangulates nothing; of new points nobody knows
+        clear = unknown | (np.abs(off - 0.012) > 2e-3)
+        assert np.array_equal(trusted[clear], (unknown | (off < 0.012))[clear])
+    few = relative_track._locate_frame(known[:8], rays[:8], true, np.array([0.05, 0, 0]))
+    assert few is None  # one of the eight is unknown

@@ -6,9 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.signal import welch
 
 from colmap_inertial.core.geometry import quat_conjugate, quat_exp, quat_log, quat_multiply, quat_rotate
 from colmap_inertial.tools.simulate import Motion, MotionOptions, make_motion
+from colmap_inertial.tools.simulate.motion import HANDHELD, _draw_hand
 
 KINDS = ("orbit", "walk", "roam", "constant_velocity", "pure_rotation", "static")
 
@@ -80,6 +82,49 @@ def test_vigour_scales_the_hand_and_bad_options_are_rejected():
     np.testing.assert_allclose(soft, 0.5 * loud, atol=1e-9)
     with pytest.raises(ValueError, match="duration_s"):
         MotionOptions(duration_s=0.0)
+
+
+@pytest.mark.parametrize("vigour", [1.0, 0.5])
+def test_the_hand_has_the_spectra_that_are_tabulated(vigour):
+    """Power of velocities by Welch's method, the mean of ten hands; the table is interpolated in its logarithms."""
+    hands = [_draw_hand(60 * 200, np.random.default_rng(s), low_hz=0.05, vigour=vigour) for s in range(10)]
+    velocity = np.diff([np.concatenate(hand, axis=1) for hand in hands], axis=1) * 60
+    frequency, power = welch(velocity, 60, nperseg=60 * 25, axis=1)
+    power = power.mean(axis=0) / vigour**2
+    # what a difference over a step leaves of a sine
+    power /= np.sinc(frequency / 60)[:, None] ** 2
+    inside = (frequency > 0.4) & (frequency < 9)
+    tables = [HANDHELD.horizontal_m2_s2_hz] * 2 + [HANDHELD.vertical_m2_s2_hz] + [HANDHELD.rotation_rad2_s2_hz] * 3
+    for column, table in enumerate(tables):
+        log = np.interp(np.log(frequency[inside]), np.log(HANDHELD.frequency_hz), np.log(table))
+        ratio = power[inside, column] / np.exp(log)
+        assert np.exp(np.log(ratio).mean()) == pytest.approx(1, rel=0.1) and 0.3 < ratio.min() < ratio.max() < 3
+    beyond = frequency > 16
+    assert power[beyond].max() < 1e-3 * power[inside].min()
+
+
+def test_without_a_hand_an_orbit_sweeps_its_arc_around_its_start():
+    start, arc_deg, sweep_s = (1.0, -2.0, 0.5), 80.0, 5.0
+    motion = motion_of(
+        "orbit", vigour=0.0, duration_s=60.0, radius_m=2.0, height_m=0.6, arc_deg=arc_deg, sweep_s=sweep_s,
+        heading_deg=30.0, start_m=start,
+    )  # fmt: skip
+    k = motion.at(np.linspace(0, 60, 2000))
+    away = k.cam_in_world_m - start
+    across = np.hypot(away[:, 0], away[:, 1])
+    assert (across.min(), across.max()) == (pytest.approx(1.8, abs=0.01), pytest.approx(2.2, abs=0.01))
+    assert (away[:, 2].min(), away[:, 2].max()) == (pytest.approx(0.48, abs=0.01), pytest.approx(0.72, abs=0.01))
+    azimuth_deg = np.rad2deg(np.arctan2(away[:, 1], away[:, 0])) - 30
+    assert (azimuth_deg.min(), azimuth_deg.max()) == (pytest.approx(-40, abs=0.1), pytest.approx(40, abs=0.1))
+    # from one end to the other in a sweep
+    ends = motion.at(np.array([0.0, sweep_s, 2 * sweep_s])).cam_in_world_m - start
+    assert np.rad2deg(np.arctan2(ends[:, 1], ends[:, 0])) - 30 == pytest.approx([-40, 40, -40], abs=0.1)
+    axes = quat_rotate(k.world_from_cam_xyzw[:, None, :], np.eye(3))
+    assert (
+        np.linalg.norm(np.cross(axes[:, 2], away), axis=1).max() < 1e-3
+        and (np.sum(axes[:, 2] * away, axis=1) < 0).all()
+    )
+    assert np.abs(axes[:, 0, 2]).max() < 1e-3 and (axes[:, 1, 2] < 0).all()  # level, and not upside down
 
 
 def test_spectrum_matches_the_motion_capture_recordings(shared_data, monkeypatch):

@@ -21,7 +21,11 @@ from colmap_inertial.tools.simulate import (
     SfmOptions,
     simulate_recording,
 )
+from colmap_inertial.tools.simulate.recipe import SceneRecipe
 from colmap_inertial.tools.simulate.recording import rolling_shutter_bias_s
+from colmap_inertial.tools.simulate.rests import RestOptions
+from colmap_inertial.tools.simulate.sensors import draw_imu_errors
+from colmap_inertial.tools.simulate.tracks import TrackOptions
 
 NO_ERRORS = ImuOptions(
     gyro_density_rad_s_rthz=0.0,
@@ -162,6 +166,92 @@ def test_stamps_follow_the_clock_offset_its_rate_and_the_accelerometers_delay():
     np.testing.assert_allclose(np.diff(truth.imu.gyro_t_cam_s), 1 / 200 / rate, atol=1e-9)
     assert truth.imu.gyro_t_cam_s[0] < 0 and truth.imu.gyro_t_cam_s[-1] > 30
     assert not np.any(np.isin(imu.gyro_t_s, imu.accel_t_s))
+
+
+def test_devices_differ_by_the_declared_standard_deviations():
+    """The scatter of 600 devices, each parameter by a standard deviation of its own."""
+    options = ImuOptions(
+        gyro_bias_rad_s_sd=0.01,
+        accel_bias_m_s2_sd=0.02,
+        gyro_scale_sd=0.03,
+        gyro_misalignment_sd=0.04,
+        accel_scale_sd=0.05,
+        accel_misalignment_sd=0.06,
+        mounting_rad_sd=0.07,
+        lever_arm_m_sd=(0.08, 0.09, 0.1),
+        accel_delay_s=(0.3, 0.12),
+        clock_rate_sd=0.13,
+        clock_offset_s=(5.0, 7.0),
+    )
+    rng = np.random.default_rng(0)
+    devices = [draw_imu_errors(options, 10.0, rng) for _ in range(600)]
+
+    def drawn(of):
+        return np.array([of(one) for one in devices])
+
+    diagonal = np.eye(3, dtype=bool)
+    nominal = quat_conjugate(np.array(options.cam_from_imu_xyzw))
+    delay_s = drawn(lambda one: one.accel_time_offset_s - one.gyro_time_offset_s)
+    for values, sd in (
+        (drawn(lambda one: one.gyro_bias_rad_s), 0.01),
+        (drawn(lambda one: one.accel_bias_m_s2), 0.02),
+        (drawn(lambda one: one.gyro_matrix[diagonal]), 0.03),
+        (drawn(lambda one: one.gyro_matrix[~diagonal]), 0.04),
+        (drawn(lambda one: one.accel_matrix[diagonal]), 0.05),
+        (drawn(lambda one: one.accel_matrix[~diagonal]), 0.06),
+        (drawn(lambda one: quat_log(quat_multiply(one.cam_from_imu_xyzw, nominal))), 0.07),
+        (drawn(lambda one: one.imu_in_cam_m), np.array([0.08, 0.09, 0.1])),
+        (delay_s - 0.3, 0.12),
+        (drawn(lambda one: one.clock_rate), 0.13),
+    ):
+        assert values.std(axis=0) / sd == pytest.approx(np.ones(values.shape[1:]), rel=0.15)
+        assert np.abs(values.mean(axis=0) / sd).max() < 0.16
+    offset_s = drawn(lambda one: one.gyro_time_offset_s)
+    assert 5 <= offset_s.min() < 5.05 and 6.95 < offset_s.max() <= 7
+    assert {one.middle_s for one in devices} == {5.0}
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "said"),
+    [
+        (MotionOptions, {"duration_s": 0.0}, "duration_s"),
+        (MotionOptions, {"radius_m": -1.0}, "radius_m"),
+        (MotionOptions, {"sweep_s": 0.0}, "sweep_s"),
+        (MotionOptions, {"vigour": -0.1}, "vigour"),
+        (SceneRecipe, {"frame_rate_hz": 0.0}, "frame_rate_hz"),
+        (SceneRecipe, {"quality": 101}, "quality"),
+        (SceneRecipe, {"quality": -1}, "quality"),
+        (SceneRecipe, {"crf": 52}, "crf"),
+        (SceneRecipe, {"crf": -1}, "crf"),
+        (RestOptions, {"attitudes": 0}, "attitudes"),
+        (RestOptions, {"attitudes": 16}, "from 1 to 15"),
+        (TrackOptions, {"frame_rate_hz": 0.0}, "frame_rate_hz"),
+        (TrackOptions, {"points_per_m": 0.0}, "points_per_m"),
+        (TrackOptions, {"life_s": 0.0}, "life_s"),
+        (SfmOptions, {"frame_rate_hz": 0.0}, "frame_rate_hz"),
+        (SfmOptions, {"correlation_s": 0.0}, "correlation_s"),
+        (SfmOptions, {"metres_per_unit": (0.0, 1.0)}, "metres_per_unit"),
+        (ImuOptions, {"gyro_rate_hz": 0.0}, "rates"),
+        (ImuOptions, {"accel_rate_hz": 0.0}, "rates"),
+        (ImuOptions, {"lead_s": (2.0, 1.0)}, "lead_s"),
+        (ImuOptions, {"lead_s": (-3.0, 1.0)}, "lead_s"),
+        (ImuOptions, {"lead_s": (0.0, 3.0)}, "lead_s"),
+        (ImuOptions, {"gyro_bias_rad_s_sd": -0.1}, "negative"),
+        (ImuOptions, {"accel_density_m_s2_rthz": -0.1}, "negative"),
+    ],
+)
+def test_what_cannot_be_simulated_is_refused(kind, values, said):
+    with pytest.raises(ValueError, match=said):
+        kind(**values)
+
+
+def test_the_ends_of_what_can_be_simulated_are_allowed():
+    for quality, crf in ((0, 0), (100, 51)):
+        assert SceneRecipe(quality=quality, crf=crf).quality == quality
+    assert RestOptions(attitudes=1).attitudes == 1 and RestOptions(attitudes=15).attitudes == 15
+    assert MotionOptions(vigour=0.0).vigour == 0
+    assert ImuOptions(lead_s=(-2.9, 2.9), gyro_bias_rad_s_sd=0.0).lead_s == (-2.9, 2.9)
+    assert ImuOptions(lead_s=(1.0, 1.0)).lead_s == (1.0, 1.0)
 
 
 def test_saturation_and_quantisation():

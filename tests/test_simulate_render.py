@@ -9,8 +9,8 @@ from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, quat_from_
 from colmap_inertial.core.types import CameraModel
 from colmap_inertial.tools.simulate import Motion, MotionOptions, make_motion
 from colmap_inertial.tools.simulate.render import Renderer, ShutterCamera, colmap_camera, develop
-from colmap_inertial.tools.simulate.textures import poster
-from colmap_inertial.tools.simulate.world import Board, Quad, World, make_world
+from colmap_inertial.tools.simulate.textures import plaster, poster
+from colmap_inertial.tools.simulate.world import Board, Quad, World, _Builder, make_world
 
 WIDE = CameraModel(model="OPENCV", width=96, height=64, params=(80, 82, 47, 33, 0.08, -0.1, 0.001, -0.0005))
 #: A small part of a picture of 640 x 480.
@@ -179,3 +179,56 @@ def test_a_room_is_closed_all_around():
 def test_posters_smaller_than_their_smallest_shapes_can_be_printed():
     for side in (4, 9, 12):
         assert poster(np.random.default_rng(side), side, 3 * side).shape == (side, 3 * side, 3)
+
+
+def area_of(quad):
+    assert quad.edge_u_m @ quad.edge_v_m == pytest.approx(0, abs=1e-12)
+    return np.linalg.norm(quad.edge_u_m) * np.linalg.norm(quad.edge_v_m)
+
+
+def centre_of(quad):
+    return quad.corner_m + (quad.edge_u_m + quad.edge_v_m) / 2
+
+
+def test_a_box_is_as_large_as_it_is_to_be_and_faces_outwards():
+    builder, base, size = _Builder(np.random.default_rng(0)), np.array([1.0, -2.0, 0.5]), np.array([0.3, 0.5, 0.7])
+    builder.box(base, size, 0.4, plaster, texel_m=0.02)
+    top, *sides = builder.quads
+    assert top.normal == pytest.approx([0, 0, 1]) and centre_of(top) == pytest.approx(base + 0.7 * top.normal)
+    # by the divergence theorem; the underside lies in the origin's plane
+    volume = sum(area_of(quad) * quad.normal @ (centre_of(quad) - base) for quad in builder.quads) / 3
+    assert volume == pytest.approx(size.prod())
+    for quad, width, away in zip(sides, (0.3, 0.5, 0.3, 0.5), (0.25, 0.15, 0.25, 0.15), strict=True):
+        assert area_of(quad) == pytest.approx(0.7 * width) and centre_of(quad)[2] == pytest.approx(0.85)
+        assert quad.normal @ (centre_of(quad) - base) == pytest.approx(away)
+        assert quad.texture.shape[:2] == (round(0.7 / 0.02), round(width / 0.02))
+    assert np.linalg.norm(sides[1].normal - [np.cos(0.4), np.sin(0.4), 0]) == pytest.approx(0)
+
+
+def test_a_tin_is_closed_all_around_and_on_top():
+    builder, base = _Builder(np.random.default_rng(1)), np.array([0.2, 0.1, 0.0])
+    builder.tin(base, 0.04, 0.1, plaster)
+    sides, lid = builder.quads[:12], builder.quads[12:]
+    for quad, following in zip(sides, [*sides[1:], sides[0]], strict=True):
+        assert area_of(quad) == pytest.approx(0.1 * 2 * 0.04 * np.sin(np.pi / 12))
+        assert quad.normal @ (centre_of(quad) - base) == pytest.approx(0.04 * np.cos(np.pi / 12))
+        assert centre_of(quad)[2] == pytest.approx(0.05)
+        assert quad.corner_m + quad.edge_u_m == pytest.approx(following.corner_m)
+    ring = np.array([quad.corner_m for quad in sides])
+    assert len(lid) == 6
+    for quad in lid:
+        assert quad.normal == pytest.approx([0, 0, 1]) and 0 <= 0.1 - centre_of(quad)[2] < 0.002
+        assert centre_of(quad)[:2] == pytest.approx(base[:2])
+        for corner in (quad.corner_m, quad.corner_m + quad.edge_u_m, quad.corner_m + quad.edge_v_m):
+            assert np.linalg.norm((ring - corner)[:, :2], axis=1).min() < 1e-9
+
+
+def test_what_faces_the_lamp_is_brighter_than_what_does_not():
+    builder = _Builder(np.random.default_rng(2))
+    white = np.ones((4, 6, 3), np.float32)
+    right, back = np.array([1.0, 0, 0]), np.array([0, 1.0, 0])
+    builder.quad(np.zeros(3), right, -back, white)  # a table, from above
+    builder.quad(np.zeros(3), right, back, white)  # and from below
+    above, below = builder.quads
+    assert above.normal == pytest.approx([0, 0, 1]) and below.normal == pytest.approx([0, 0, -1])
+    assert below.texture.max() < above.texture.min() <= 1 and below.texture.min() > 0

@@ -14,7 +14,7 @@ from colmap_inertial.core.errors import FormatError, NotObservableError, OutputE
 from colmap_inertial.inertial.core.target_comparison import TargetComparison, calibrate_by_targets
 from colmap_inertial.inertial.scale import estimate_scale
 from colmap_inertial.io.calibration import read_imu_calibration, write_imu_calibration
-from colmap_inertial.reconstruction.drivers.device_store import calibrate_from_results, remember
+from colmap_inertial.reconstruction.drivers.device_store import _read_comparison, calibrate_from_results, remember
 from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, simulate_recording
 
 by_targets = partial(calibrate_by_targets, gravity_m_s2=9.81)
@@ -123,6 +123,22 @@ def write_result(folder: Path, content: dict) -> Path:
     folder.mkdir(exist_ok=True)
     (folder / "result.json").write_text(json.dumps(content))
     return folder
+
+
+def test_of_a_result_s_uncertainties_each_counts_once():
+    """The check knows its distances to a tenth of a per cent of the target's own; the scale has a part of the gain."""
+    (model,) = result(2.0)["models"]
+    small = {**model, "registered_images": 12, "sigma_log": 0.5}
+    refused = {**model, "registered_images": 90, "verdict": "refused"}
+    found = _read_comparison(Path("result.json"), [small, refused, model])
+    assert found.error_log == pytest.approx(math.log(1.02)) and found.accel_sigma_log == 0.006
+    assert found.target == "checkerboard:8x6:0.04+-0.00004" and found.target_sigma_log == pytest.approx(0.001)
+    # the check's interval holds the target's share, the scale's the gain's; both are told apart
+    check = (math.log(1.023) - math.log(1.017)) / (2 * 1.959964)
+    others = math.sqrt(check**2 - 0.001**2 + 0.0065**2 - 0.006**2)
+    assert found.sigma_log == pytest.approx(others, rel=1e-4)
+    sure = {**model, "sigma_log": 0.005, "validation": {**model["validation"], "ci95_pct": [1.99, 2.01]}}
+    assert _read_comparison(Path("result.json"), [sure]).sigma_log == 0
 
 
 def test_the_command_writes_and_remembers_what_results_show(tmp_path, monkeypatch, capsys):

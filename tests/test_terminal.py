@@ -170,7 +170,9 @@ def test_before_the_first_step_is_done_the_bytes_written_move(tmp_path):
     database = tmp_path / "database.db"
     stage = Stage(0.0, 0, 990, [database])
     assert stage.count() == "0/990"
-    database.write_bytes(bytes(3_000_000))
+    for written, shown in ((900_000, "0/990"), (1_200_000, "0/990 (1 MB)"), (3_000_000, "0/990 (3 MB)")):
+        database.write_bytes(bytes(written))
+        assert stage.count() == shown
     (tmp_path / "database.db-wal").write_bytes(bytes(9_000_000))
     assert stage.count() == "0/990 (12 MB)"
     stage.moved(1.0, 400, 990)
@@ -222,8 +224,20 @@ def test_an_error_is_json_too_where_json_was_asked_for(tmp_path, capsys):
     assert json.loads(out) == {"error": err.removeprefix("error: ").strip(), "exit_code": 2}
 
 
-def test_quiet_and_verbose_are_not_given_together(capsys):
-    code, _, err = run(capsys, "diagnose", "x", "--quiet", "--verbose")
+@pytest.mark.parametrize(
+    "command",
+    [
+        "diagnose x",
+        "scale x",
+        "apply x y --undo",
+        "validate x --images y --target z",
+        "export x y",
+        "view x",
+        "reconstruct x y",
+    ],
+)
+def test_quiet_and_verbose_are_not_given_together(command, capsys):
+    code, _, err = run(capsys, *command.split(), "--quiet", "--verbose")
     assert code == 2 and "one of --quiet and --verbose" in err
 
 

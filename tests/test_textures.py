@@ -42,3 +42,10 @@ def test_a_tartan_is_the_mean_of_its_threads(monkeypatch):
     both = inside[:, 1:] & inside[:, :-1]
     across = np.where(both, np.diff(image, axis=1), np.nan)
     assert np.nanmax(np.nanmax(across, axis=0) - np.nanmin(across, axis=0)) < 1e-6
+
+
+def test_wood_is_brown_as_its_two_colours_are_on_average():
+    """Dark grain of 13, 6 and 3 per cent, light of 50, 30 and 16, half of each; both vary in brightness alone."""
+    mean = np.mean([textures.wood(np.random.default_rng(s), 60, 90).mean(axis=(0, 1)) for s in range(40)], axis=0)
+    dark, light = 1.15 * np.array([0.13, 0.06, 0.03]), 1.05 * np.array([0.5, 0.3, 0.16])
+    assert mean == pytest.approx((dark + light) / 2, rel=0.2)

@@ -1,5 +1,6 @@
 """The viewer: what it shows is where it should be, what one measures is true, and a real browser shows it."""
 
+import contextlib
 import dataclasses
 import json
 import re
@@ -8,6 +9,7 @@ import signal
 import subprocess
 import sys
 from functools import partial
+from types import SimpleNamespace
 from urllib.parse import urlsplit
 
 import cv2
@@ -28,7 +30,7 @@ from colmap_inertial.model.project import apply_to_project
 from colmap_inertial.model.similarities import plain_factor
 from colmap_inertial.tools.view import load_scene, measure_distance, nearest_to_ray, round_length
 from colmap_inertial.tools.view.clouds import dense_cloud, read_mesh
-from colmap_inertial.tools.view.drawing import AMBER, BLUE, path_colours
+from colmap_inertial.tools.view.drawing import AMBER, BLUE, RED, Drawing, path_colours
 from colmap_inertial.tools.view.measure import ball_at_ray, length_text
 from colmap_inertial.tools.view.panel import (
     camera_text,
@@ -38,7 +40,7 @@ from colmap_inertial.tools.view.panel import (
     target_text,
     tolerance_html,
 )
-from colmap_inertial.tools.view.scene import LIMITS
+from colmap_inertial.tools.view.scene import LIMITS, _distance
 from colmap_inertial.tools.view.sources import TargetFacts
 
 METRES_PER_UNIT = 0.25
@@ -190,6 +192,12 @@ def test_round_lengths_are_1_2_5(about, expected):
     assert round_length(about) == pytest.approx(expected, rel=1e-12)
 
 
+@pytest.mark.parametrize("about", [0.0, -1.0, np.inf, np.nan])
+def test_what_is_no_length_is_not_rounded(about):
+    with pytest.raises(ValueError, match="positive"):
+        round_length(about)
+
+
 def test_lengths_have_fitting_units():
     assert [length_text(x) for x in (2000, 1, 0.5, 0.02, 0.005)] == ["2 km", "1 m", "50 cm", "2 cm", "5 mm"]
 
@@ -233,6 +241,9 @@ def test_a_click_takes_the_point_in_front_and_none_where_there_is_none():
     assert nearest_to_ray(np.zeros((0, 3)), np.zeros(3), ahead) is None
     assert ball_at_ray(points, 0.1, np.zeros(3), ahead) == 1
     assert ball_at_ray(points, 0.1, np.zeros(3), np.array([0.0, 1, 0])) is None
+    # beside the ray by 0.3, whatever the length of its direction
+    for radius, found in ((0.29, None), (0.31, 0)):
+        assert ball_at_ray(np.array([[0.3, 0, 2.0]]), radius, np.zeros(3), 7 * ahead) == found
 
 
 def test_a_refused_scale_shows_the_model_in_its_own_units_and_says_so(tmp_path):
@@ -280,9 +291,19 @@ def test_the_path_says_where_the_refinement_stretched_it(tmp_path):
     assert colours.shape == scene.path.shape
     assert tuple(colours[0, 0]) == BLUE and colours[-1, 1, 0] > colours[10, 0, 0] - 10
     assert "by up to 0.4 %" in contents_text(scene)
+    # of the last refinement that did something, and of no other treatment
+    idle, other = done | {"action": ""}, done | {"stage": "join"}
+    for treatments, most in (([done, idle, other], 0.4), ([idle, other], None)):
+        record["models"][0]["treatments"] = treatments
+        path.write_text(json.dumps(record))
+        percent = load_scene(tmp_path).path_percent
+        assert percent is None if most is None else np.abs(percent).max() == pytest.approx(most)
     record["models"][0]["treatments"] = []
     path.write_text(json.dumps(record))
     assert load_scene(tmp_path).path_percent is None and path_colours(None) == AMBER
+    # by the largest, however small
+    both = path_colours(np.array([[2e-9, -1e-9]]))[0]
+    assert tuple(both[0]) == RED and both[1] == pytest.approx((np.array(AMBER) + BLUE) / 2, abs=1)
 
 
 def test_the_largest_model_is_shown_unless_another_is_asked_for(tmp_path):
@@ -290,6 +311,12 @@ def test_the_largest_model_is_shown_unless_another_is_asked_for(tmp_path):
     assert load_scene(tmp_path / "out").source.index == 1
     scene = load_scene(tmp_path / "out", model=0)
     assert (scene.source.index, scene.scale.unit, len(scene.cameras)) == (0, "m", 8)
+    assert "Model 0 of 0, 1 (`--model`)" in contents_text(scene)
+    write_result(tmp_path / "alone", [ESTIMATE])
+    assert "--model" not in contents_text(load_scene(tmp_path / "alone"))
+    assert len(load_scene(tmp_path / "out", max_points=1).cloud.xyz) == 1
+    with pytest.raises(ValueError, match="max_points"):
+        load_scene(tmp_path / "out", max_points=0)
     with pytest.raises(FormatError, match="--model takes one of 0, 1"):
         load_scene(tmp_path / "out", model=7)
 
@@ -312,6 +339,63 @@ def test_dense_points_and_mesh_go_before_sparse_points_and_are_thinned(tmp_path)
     corners = scene.mesh.vertices[scene.mesh.faces]
     assert np.median(np.linalg.norm(corners.mean(axis=1), axis=1)) == pytest.approx(1, abs=0.05)
     assert scene.image_of(0) is not None
+
+
+VERTICES = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [np.nan, 0, 0], [1, 1, 1]], "<f4")
+TRIANGLES = [[0, 1, 2], [1, 2, 4], [2, 3, 4]]
+
+
+def write_ply(path, vertices, faces=(), *, order="little", axes="xyz", lists="list uchar int vertex_indices", cut=0):
+    """A PLY file of points, and of faces where there are some."""
+    head = [f"format {'ascii' if order is None else f'binary_{order}_endian'} 1.0"]
+    head += [f"element vertex {len(vertices)}", *(f"property float {axis}" for axis in axes)]
+    if faces is not None and len(faces):
+        head += [f"element face {len(faces)}", *(f"property {one}" for one in lists.split("; "))]
+    marks = ">" if order == "big" else "<"
+    data = np.asarray(vertices, marks + "f4").tobytes()
+    for face in faces or ():
+        data += bytes([len(face)]) + np.array(face, marks + "i4").tobytes()
+    path.write_bytes("\n".join(["ply", *head, "end_header", ""]).encode() + data[: len(data) - cut])
+    return path
+
+
+@pytest.mark.parametrize("order", ["little", "big"])
+def test_a_mesh_is_read_without_what_is_not_finite(tmp_path, order):
+    path = write_ply(tmp_path / "mesh.ply", VERTICES, TRIANGLES, order=order)
+    mesh = read_mesh(path, 3)
+    # the fourth vertex goes, and with it the face that needs it
+    assert mesh.vertices.tolist() == VERTICES[[0, 1, 2, 4]].tolist() and mesh.faces.tolist() == [[0, 1, 2], [1, 2, 3]]
+    assert mesh.rgb is None and read_mesh(path, 2) is None
+    whole = dense_cloud(path, 5)
+    assert whole.xyz.tolist() == mesh.vertices.tolist() and whole.total == 5 and whole.rgb.shape == (4, 3)
+    assert len(dense_cloud(path, 2).xyz) <= 2
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"faces": ()}, "a mesh without faces"),
+        ({"faces": [[0, 1, 2, 4]]}, "other faces than triangles"),
+        ({"faces": [[0, 1, 5]]}, "other faces than triangles"),
+        ({"cut": 1}, "truncated"),
+        ({"lists": "list uchar int vertex_indices; list uchar int more"}, "not a list of vertices alone"),
+        ({"order": None}, "only binary PLY"),
+        ({"axes": "xyw"}, "holds no points"),
+        ({"vertices": VERTICES[:0]}, "holds no points"),
+    ],
+)
+def test_what_is_no_mesh_of_triangles_is_refused(tmp_path, changed, said):
+    given = {"vertices": VERTICES, "faces": TRIANGLES} | changed
+    path = write_ply(tmp_path / "mesh.ply", **given)
+    with pytest.raises(FormatError, match=said):
+        read_mesh(path, 10)
+
+
+def test_points_that_are_cut_off_are_refused(tmp_path):
+    with pytest.raises(FormatError, match="truncated"):
+        dense_cloud(write_ply(tmp_path / "points.ply", VERTICES, cut=1), 10)
+    with pytest.raises(FormatError, match="cannot be read"):
+        dense_cloud(tmp_path, 10)
 
 
 def test_an_applied_project_is_metric_with_its_interval_or_without_one(tmp_path):
@@ -467,6 +551,13 @@ def test_what_cannot_be_shown_is_said(tmp_path, capsys):
     assert "no such folder" in capsys.readouterr().err
 
 
+def test_a_result_without_a_model_shows_nothing(tmp_path):
+    write_result(tmp_path, [ESTIMATE])
+    (tmp_path / "result.json").write_text('{"models": []}')
+    with pytest.raises(FormatError, match="holds no model to show"):
+        load_scene(tmp_path)
+
+
 @pytest.mark.parametrize("flags", [["--port", "70000"], ["--max-points", "0"]])
 def test_options_out_of_range_exit_2(capsys, flags):
     with pytest.raises(SystemExit) as stopped:
@@ -507,6 +598,121 @@ def test_an_address_of_another_machine_is_an_error_and_a_taken_port_makes_way(ou
             second.close()
     finally:
         first.close()
+
+
+class Drawn(dict):
+    """What would be drawn, by name, in place of viser's scene."""
+
+    def __getattr__(self, kind):
+        def add(name, *given, **named):
+            self[name] = SimpleNamespace(kind=kind, given=given, visible=True, **named)
+            return self[name]
+
+        return add
+
+
+def test_what_is_drawn_lies_where_the_scene_has_it(out):
+    scene, drawn = load_scene(out[0]), Drawn()
+    drawing = Drawing(scene, drawn)
+    # the base of each camera is its image, so far in front of it as a camera is drawn
+    edges = drawn["/cameras/edges"].given[0].reshape(len(scene.cameras), 8, 2, 3)
+    for k, lines in enumerate(edges):
+        turn = scene.cameras.world_from_cam_xyzw[k] * [-1, -1, -1, 1]
+        in_cam = quat_rotate(turn, lines - scene.cameras.cam_in_world[k])
+        assert in_cam[:4, 0] == pytest.approx(np.zeros((4, 3)), abs=1e-9)
+        assert in_cam[:4, 1, 2] == pytest.approx(np.full(4, 0.05 * scene.reach))
+        half = np.tan(scene.cameras.vertical_fov_rad[k] / 2) * np.array([scene.cameras.aspect[k], 1])
+        at = in_cam[:4, 1, :2] / in_cam[:4, 1, 2:] / half
+        assert at == pytest.approx(np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]))
+        assert in_cam[4:] == pytest.approx(np.stack([in_cam[:4, 1], np.roll(in_cam[:4, 1], -1, axis=0)], axis=1))
+    bodies = drawn["/cameras/bodies"]
+    corner = bodies.batched_scales[0] * bodies.given[0][2]
+    assert quat_rotate(np.roll(bodies.batched_wxyzs[0], -1), corner) + bodies.batched_positions[0] == pytest.approx(
+        edges[0, 1, 1], abs=1e-6
+    )
+    # squares of the ground's step, level, around what is seen
+    ground, up = scene.ground, scene.up_in_world
+    grid = drawn["/ground/grid"].given[0]
+    assert len(grid) == 2 * (ground.cells + 1)
+    assert np.linalg.norm(grid[:, 1] - grid[:, 0], axis=1) == pytest.approx(np.full(len(grid), ground.side_m))
+    assert grid @ up == pytest.approx(np.full(grid.shape[:2], ground.origin @ up))
+    assert grid.mean(axis=(0, 1)) == pytest.approx(ground.origin)
+    assert np.linalg.norm(grid[1] - grid[0], axis=1) == pytest.approx([ground.side_m / ground.cells] * 2)
+    bar, *ends = drawn["/ground/bar"].given[0]
+    assert np.array_equal(bar, ground.bar)
+    assert np.mean(ends, axis=1) == pytest.approx(bar) and (np.array(ends)[:, 1] - bar) @ (bar[1] - bar[0]) == (
+        pytest.approx([0, 0], abs=1e-9)
+    )
+    assert drawn["/ground/bar_length"].given[0] == length_text(ground.bar_m)
+    # gravity points down, to a corner of the ground
+    (down,), (upwards,) = drawn["/gravity/down"].given[0], drawn["/gravity/up"].given[0]
+    assert np.diff(down, axis=0)[0] == pytest.approx(-0.35 * scene.reach * up, abs=1e-9)
+    assert np.diff(upwards, axis=0)[0] == pytest.approx(0.35 * scene.reach * up, abs=1e-9)
+    assert np.linalg.norm(down[1] - ground.origin) == pytest.approx(ground.side_m / np.sqrt(2))
+    assert np.array_equal(drawn["/gravity/name"].position, down[1])
+    # points are smaller where there are many
+    assert drawing.point_size() == pytest.approx(scene.reach / 150)
+    many = dataclasses.replace(scene.cloud, xyz=np.zeros((90_000, 3)), rgb=np.zeros((90_000, 3), np.uint8))
+    crowded = Drawing(dataclasses.replace(scene, cloud=many), Drawn())
+    assert crowded.point_size() == pytest.approx(scene.reach * 0.75 / 300)
+
+
+def test_clicks_choose_the_camera_that_is_drawn_there_and_measure(out):
+    from colmap_inertial.tools.view.server import Viewer
+
+    scene = load_scene(out[0])
+    viewer = Viewer(scene, port=0)
+    client = SimpleNamespace(camera=SimpleNamespace(aspect=1.5), atomic=contextlib.nullcontext)
+
+    def click(place, away):
+        away = 0.02 * scene.reach * away / np.linalg.norm(away)
+        viewer._click(SimpleNamespace(ray_origin=tuple(place + away), ray_direction=tuple(-away), client=client))
+
+    try:
+        for k in range(len(scene.cameras)):
+            axes = quat_rotate(scene.cameras.world_from_cam_xyzw[k], np.eye(3))
+            # beside the pyramid's middle, from its side
+            drawn = scene.cameras.cam_in_world[k] + 0.05 * scene.reach * axes[2]
+            click(drawn, axes[0])
+            assert np.array_equal(client.camera.position, scene.cameras.cam_in_world[k])
+            ahead = client.camera.look_at - client.camera.position
+            assert ahead / np.linalg.norm(ahead) == pytest.approx(axes[2])
+            assert client.camera.up_direction == pytest.approx(-axes[1])
+            assert scene.cameras.names[k] in viewer._about.content.replace("\\", "")
+        # far beside all cameras there is none
+        before, level = client.camera.position, scene.ground.along
+        click(scene.centre + 3 * scene.reach * scene.up_in_world + 5 * scene.reach * level, level)
+        assert client.camera.position is before
+        viewer._measuring.value = True
+        points, away = scene.pickable(), np.array([0.3, -0.5, 0.8])
+        click(points[0], away)
+        assert viewer._measured.content == "Click the second point."
+        click(points[0] + 50 * scene.reach, away)
+        assert "No point there" in viewer._measured.content
+        click(points[5], away)
+        told = measure_distance(points[0], points[5], "m", scene.scale.relative_ci95)
+        assert viewer._measured.content == describe_distance(told)
+        assert len(viewer._temporary["measure"]) == 3
+        click(points[7], away)
+        assert viewer._measured.content == "Click the second point." and len(viewer._temporary["measure"]) == 1
+    finally:
+        viewer.close()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_first_view_holds_all_that_must_be_seen_and_is_no_farther(seed):
+    rng = np.random.default_rng(seed)
+    up, side = np.array([0.0, 0.0, 1.0]), np.array([np.cos(0.4), 0.0, np.sin(0.4)])
+    places = rng.uniform(-1, 1, (30, 3)) * [3, 3, 1]
+    away = _distance(side, 2.0, up, places)
+    scene = SimpleNamespace(centre=np.zeros(3), start=away * side, up_in_world=up)
+    height = 1000.0
+    x, y = np.array([on_screen(scene, place, LIMITS.aspect * height, height) for place in places]).T
+    # of the half height, what is filled by angle
+    filled = np.tan(0.5 * LIMITS.start_fov_rad * LIMITS.filled) / np.tan(0.5 * LIMITS.start_fov_rad)
+    across = np.maximum(np.abs(2 * x / (LIMITS.aspect * height) - 1), np.abs(2 * y / height - 1))
+    assert across.max() == pytest.approx(filled, rel=1e-6)
+    assert _distance(side, 2.0, up, 1e-3 * places) == 3 and _distance(side, 2.0, up, 1e3 * places) == 12
 
 
 def on_screen(scene, place, width, height):

@@ -85,7 +85,8 @@ def parse(args: Sequence[str]) -> Speaker:
     FormatError
         For a ``--config`` file that cannot be read.
     InertialError
-        For ``--calibration`` without a file, and for a command or an option that there is not, with the nearest one.
+        For ``--calibration`` without a file, for a command or an option that there is not, with the nearest one, and
+        for ``--quiet`` with ``--verbose``.
     """
     if not args or args[0] in (*_HELP, _HELP_ALL):
         print_overview(DESCRIPTION, _GROUPS, ReadLimits)
@@ -108,7 +109,10 @@ def parse(args: Sequence[str]) -> Speaker:
         choices.append(Annotated[cls, settings])
     args = _move_lists_last(args)
     command: Any = Union[tuple(choices)]  # noqa: UP007 (built at run time)
-    return tyro.cli(command, prog="colmap-inertial", description=DESCRIPTION, args=list(args), config=_CONFIG)
+    made: Speaker = tyro.cli(command, prog="colmap-inertial", description=DESCRIPTION, args=list(args), config=_CONFIG)
+    if made.quiet and made.verbose:
+        raise InertialError("give one of --quiet and --verbose")
+    return made
 
 
 def _expand_options(args: Sequence[str]) -> list[str]:

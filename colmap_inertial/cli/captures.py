@@ -60,7 +60,6 @@ class Reconstruct(DeviceCommand, ConfiguredCommand):
     extra `cluster`, and OUT under the same path everywhere). With --deterministic they do not change the result."""
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         if self.workers is not None and self.workers < 1:
             raise ValueError(f"workers must be at least 1, not {self.workers}")
         if self.workers is not None and self.scheduler is not None:

@@ -246,7 +246,6 @@ class CalibrateImu(Reader):
     """Keep the calibration under this name of the device: `reconstruct` and `scale` then use it by themselves."""
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         if not self.recording:
             raise ValueError("name the recording, or results that have a target")
 

@@ -33,10 +33,6 @@ class Speaker:
     verbose: bool = False
     """Also print the log."""
 
-    def __post_init__(self) -> None:
-        if self.quiet and self.verbose:
-            raise ValueError("give one of --quiet and --verbose")
-
     if TYPE_CHECKING:  # a field of some commands, computed by others
 
         @property
