@@ -31,8 +31,10 @@ FEATURES, RATIO = 2000, 0.8
 def write_akaze(capture: Path, database: Path) -> None:
     """Fill a database with OpenCV's AKAZE and matches of all pairs."""
     described = load_capture(capture)
-    finder, matcher = cv2.xfeatures2d.AKAZE_create(threshold=1e-4), cv2.BFMatcher(cv2.NORM_HAMMING)
-    descriptors = {}
+    database.unlink(missing_ok=True)
+    # OpenCV 5 has it in its extra modules
+    create = cv2.AKAZE_create if hasattr(cv2, "AKAZE_create") else cv2.xfeatures2d.AKAZE_create
+    finder, matcher, descriptors = create(threshold=1e-4), cv2.BFMatcher(cv2.NORM_HAMMING), {}
     with pycolmap.Database.open(str(database)) as opened:
         known = described.camera
         camera = pycolmap.Camera(model=known.model, width=known.width, height=known.height, params=known.params)
@@ -53,6 +55,7 @@ def write_akaze(capture: Path, database: Path) -> None:
 
 def fill(colmap: Path, capture: Path, database: Path) -> None:
     """Let an installed COLMAP find features in a capture's images and match all pairs."""
+    database.unlink(missing_ok=True)
     described = load_capture(capture)
     if described.camera is None:
         raise ValueError("the capture declares no camera")

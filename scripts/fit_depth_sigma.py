@@ -5,7 +5,8 @@
 FOLDER takes the worlds (``photo_world.py``) and their sweeps; what is there already is used. Printed: the factors of
 ``SigmaModel`` (``imaging/plane_sweep/confidence.py``) and, by the standard deviations that the package has, those of
 ``PlaneModel`` (``smoothing.py``); and for the worlds that judge the share of depths within twice their standard
-deviation, by decile of it.
+deviation, by decile of it. At last, of the worlds that fit and of each that judges: the same of the depths that the
+package keeps, as shares of their depth.
 
 The factors are the 95 % quantile of the logarithm of errors, by iteratively reweighted least squares. Two standard
 deviations are meant to hold 95 % of the errors; errors are far from Gaussian.
@@ -28,8 +29,10 @@ from colmap_inertial.imaging.plane_sweep import (
     MEASURES,
     PLANE_MEASURES,
     estimate_sigma,
+    keep_certain,
     measure_pixels,
     measure_planes,
+    smooth_depth,
 )
 
 QUANTILE, ROUNDS = 0.95, 60
@@ -67,12 +70,28 @@ def collect(folder: Path, seeds: Sequence[int], widths: Sequence[int], *, planes
                 )
             else:
                 found, motion_px = measure_pixels(agreement, camera, partners)
-                known &= agreement.depth > 0
                 inverse = 1 / np.where(agreement.depth > 0, agreement.depth, np.inf)
-            some = np.flatnonzero(known)[::EVERY]
+            some = np.flatnonzero(known & (inverse > 0))[::EVERY]
             measures.append(found.reshape(len(found), -1)[:, some].T.astype(np.float64))
             errors.append(np.abs(inverse.ravel()[some] - 1 / truth[name].ravel()[some]) * motion_px.ravel()[some])
     return np.concatenate(measures), np.concatenate(errors)
+
+
+def print_kept(folder: Path, seeds: Sequence[int], widths: Sequence[int]) -> None:
+    """Of the depths that are kept, by decile of their standard deviation: how many are within two of it."""
+    shares, ratios = [], []
+    for seed, width in itertools.product(seeds, widths):
+        swept, truth = swept_world(folder, seed, width)
+        for view, name in enumerate(swept.names):
+            agreement, camera, partners = swept.compare(view), swept.sights.views[view], swept.partners(view)
+            own = agreement.depth, estimate_sigma(agreement, camera, partners)
+            depth, sigma = keep_certain(*smooth_depth(*own, swept.picture(view), camera, partners))
+            kept = (truth[name] < NEARER_M) & (depth > 0)
+            shares.append((sigma[kept] / depth[kept])[::EVERY])
+            ratios.append((np.abs(depth - truth[name])[kept] / sigma[kept])[::EVERY])
+    share, ratio = np.concatenate(shares), np.concatenate(ratios)
+    deciles = " ".join(f"{(ratio[one] <= 2).mean():.3f}" for one in np.array_split(np.argsort(share), 10))
+    print(f"seeds {seeds}: {deciles}, all {(ratio <= 2).mean():.3f}")
 
 
 def fit_quantile(measures: Array, values: Array, quantile: float) -> Array:
@@ -103,6 +122,8 @@ def main() -> None:
         twice_px = np.exp(measures @ factors)
         for decile in np.array_split(np.argsort(twice_px), 10):
             print(f"{twice_px[decile].mean():8.3f} px: {(errors[decile] <= twice_px[decile]).mean():.3f} within")
+    for seeds in (arguments.fit, *([seed] for seed in arguments.judge)):
+        print_kept(arguments.folder, seeds, arguments.widths)
 
 
 if __name__ == "__main__":

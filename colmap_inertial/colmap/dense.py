@@ -25,6 +25,7 @@ from colmap_inertial.colmap.depth_maps import (
     digest_of_model,
     find_maps,
     fuse_maps,
+    fusion_options,
     map_file,
     mesh_points,
     patch_match,
@@ -162,7 +163,9 @@ def _densify(
     maps = [fingerprint(place) for place in _map_folders(folder)]
     record = session.workspace.stamps / f"dense_{index}_measured.json"
     outputs = [fused, folder / "fused.ply.vis", record]
+    chosen = fusion_options(maker, context)
     made_by: dict[str, object] = {"maps": maps, "colmap": context.colmap.identity("fusion")}
+    made_by["options"] = [chosen.min_num_pixels, chosen.max_reproj_error]
     runner.run(f"dense_{index}_fused", made_by, outputs, fuse, after=before)
     count(len(names) * _WORK.fused)
     with a_record_of_ours(record):

@@ -1,6 +1,6 @@
 """Depth and normal maps of a dense workspace by our own plane sweep, where there is no CUDA for COLMAP's patch-match.
 
-First the depths of each picture by itself, which are kept aside; then, where others agree with them, the maps that
+First the depths of each picture by itself, which are kept aside; then, from those that others agree with, the maps that
 COLMAP's fusion reads. Both file by file, so that a sweep that was cut off goes on where it was.
 """
 
@@ -54,7 +54,7 @@ class SweptWorkspace:
 
     def begin(self, identity: object) -> None:
         """Go on with a sweep of the same pictures and model, or remove what there is of another one."""
-        record, content = self.raw / "made_from.json", convert_to_plain({"identity": identity})
+        record, content = self.raw / "made_from.json", convert_to_plain({"identity": identity, "smoothed": True})
         if record.is_file() and read_json(record) == content:
             return
         remove(self.raw)
@@ -128,7 +128,7 @@ class SweptWorkspace:
             write_map(target, sweep_depth(self._grey(view), sights.views[view], partners, depths, threads=threads))
 
     def _confirm(self, view: int) -> None:
-        """The maps of one picture: depths that other pictures' depths agree with, and are certain enough."""
+        """The maps of one picture: depths that others agree with, or planes through these have, if certain."""
         files = [map_file(self.folder, what, self.names[view], kind) for what, kind in _MAPS]
         if not self._raw_file(view).is_file() or all(file.is_file() for file in files):
             return

@@ -76,8 +76,10 @@ class Entry:
         if not kinds or None in kinds or rows.itemsize != self.size:
             raise ValueError(f"{self.key} holds samples of {self.size} bytes of the types {members!r}")
         values = np.frombuffer(self.data, rows)
+        with np.errstate(invalid="ignore"):
+            columns = [values[name].astype(np.float64) for name in rows.names or ()]
         per_one = [_FIXED_POINT.get(letter.encode("latin-1"), 1.0) for letter in members]
-        return np.stack([values[name].astype(np.float64) for name in rows.names or ()], axis=1) / per_one
+        return np.stack(columns, axis=1) / per_one
 
     def text(self) -> str:
         """The contents as text, up to the first zero."""

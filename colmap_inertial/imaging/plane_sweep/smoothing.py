@@ -16,13 +16,13 @@ from colmap_inertial.imaging.plane_sweep.pinhole import ROWS_AT_ONCE, Pinhole
 class PlaneModel:
     """Logarithm of twice the standard deviation in pixels of a plane's depth; as `SigmaModel`."""
 
-    constant: float = 0.351
+    constant: float = 0.548
     #: Times logarithms: of the weight of the depths that the plane is fitted to,
-    support: float = -0.727
+    support: float = -0.657
     #: of their scatter about it, in px,
-    scatter: float = 0.453
+    scatter: float = 0.664
     #: and of the squared distance from their middle, in their own spread.
-    leverage: float = 0.099
+    leverage: float = 0.039
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,12 +37,13 @@ class SmoothingLimits:
     blur_px: float = 0.8
     #: A depth counts in full up to this standard deviation.
     certain_px: float = 0.75
-    #: The smaller one of two standard deviations is too small by so much (``scripts/fit_depth_sigma.py``, deciles of
-    #: what is kept).
+    #: The smaller one of two standard deviations is too small by so much (``scripts/fit_depth_sigma.py``, last table).
     chosen: float = 1.2
     #: Coordinates are counted in so many pixels, and their standard deviation is at least this.
     unit_px: float = 100.0
     least_spread_px: float = 0.3
+    #: With less weight around, a pixel is far from all depths, and there is no plane.
+    least_support: float = 0.01
     #: Added to measures before the logarithm is taken: smaller values tell nothing.
     support_floor: float = 0.003
     floor_px: float = 0.05
@@ -79,11 +80,7 @@ def smooth_depth(
     """
     measures, inverse, motion_px = measure_planes(depth, sigma, picture, camera, partners)
     twice_px = np.exp(np.tensordot(np.array(astuple(PLANE), dtype=np.float32), measures, axes=1))
-    known = depth[depth > 0]
-    if not known.size:
-        return depth, sigma
-    # a plane is never nearer or farther than all depths
-    there = (inverse >= 1 / known.max()) & (inverse <= 1 / known.min())
+    there = inverse > 0
     plane = np.divide(1, inverse, out=np.zeros_like(inverse), where=there)
     # compared as standard deviations of the inverse depth, which are those of matches
     plane_sigma = _LIMITS.chosen * 0.5 * twice_px / motion_px
@@ -106,7 +103,7 @@ def measure_planes(
     measures
         (4, H, W) in the order of :class:`PlaneModel`.
     inverse
-        (H, W) inverse depths of the planes.
+        (H, W) inverse depths of the planes; 0 where there is none.
     motion_px
         (H, W) by how many pixels a change of inverse depth moves a pixel in the partners, root mean square.
 
@@ -119,6 +116,8 @@ def measure_planes(
 
     motion_px = measure_motion(camera, partners)
     guide = cv2.GaussianBlur(picture, (0, 0), _LIMITS.blur_px)
+    if guide.ndim == 2:  # edges are sums over three channels
+        guide = cv2.merge([guide] * 3)
     known = depth > 0
     inverse = np.divide(1, depth, out=np.zeros_like(depth), where=known)
     sigma_px = np.maximum(sigma * inverse**2 * motion_px, 1e-9)
@@ -131,6 +130,10 @@ def measure_planes(
         fitted = _fit_planes(inverse[rows], weight[rows], np.ascontiguousarray(guide[rows]))
         planes[:, begin:end] = fitted[:, begin - first : end - first]
     value, support, scatter, leverage = planes
+    if known.any():
+        # a plane is never nearer or farther than all depths
+        near, far = (inverse[known].max(), inverse[known].min())
+        value = np.where((support >= _LIMITS.least_support) & (value >= far) & (value <= near), value, np.float32(0))
     measures = np.stack(
         [
             np.ones_like(value),
