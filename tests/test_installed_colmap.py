@@ -105,7 +105,7 @@ def program(path, text):
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
-    return copy_scene(tmp_path_factory.mktemp("installed") / "capture", first=16)
+    return copy_scene(tmp_path_factory.mktemp("installed") / "capture", first=16, half=False)
 
 
 @pytest.fixture(scope="module")
