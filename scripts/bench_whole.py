@@ -2,8 +2,7 @@
 
     python scripts/bench_whole.py FOLDER [--euroc DATASET] [--walk FRAMES] [--loop FRAMES] [--laps LAPS] [--back]
         [--repeated SCENES] [--drawn] [--long FRAMES ...] [--streets] [--density D] [--seeds SEED ...] [--workers N]
-        [--json FILE]
-        [--mappers {incremental,one,global,bare} ...]
+        [--json FILE] [--mappers {incremental,one,global,bare} ...]
 
 FOLDER takes captures and reconstructions. ``--euroc``: the 100 keyframes of V1_01_easy (DATASET has ``keyframes/``,
 ``mav0/`` and ``gt/``), bare COLMAP matching every pair. ``--walk``: a simulated walk around a room back to its start

@@ -227,7 +227,7 @@ def test_pictures_far_apart_tell_no_readout():
 )
 def test_acceleration_is_what_turning_drift_bias_and_lever_arm_leave(amplitude_m_s2, rms_m_s2):
     t_s = np.arange(0, 12, 1 / 400)
-    # turns to and fro about the upright, with a bias, and with the IMU half a metre beside that axis
+    # turns back and forth about the upright, with a bias, and with the IMU half a metre beside that axis
     angle, spin = 0.8 * np.cos(np.pi * t_s), -0.8 * np.pi**2 * np.cos(np.pi * t_s)
     rate = -0.8 * np.pi * np.sin(np.pi * t_s)
     zero, lever_m = np.zeros_like(t_s), np.array([0.5, 0.0, 0.1])
