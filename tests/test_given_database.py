@@ -279,7 +279,9 @@ def test_verified_pairs_are_kept_where_nothing_moves(capture, names, akaze, tmp_
 
 
 @pytest.mark.skipif(shutil.which("colmap") is None, reason="no colmap is installed")
-def test_a_database_of_an_installed_colmap_goes_on(capture, names, tmp_path):
+def test_a_database_of_an_installed_colmap_goes_on(names, tmp_path):
+    # in half the size, one of its models in five begins with the wrong one of a plane's two poses
+    capture = copy_scene(tmp_path / "capture", first=FIRST, half=False)
     path, quiet = tmp_path / "installed.db", {**os.environ, "QT_QPA_PLATFORM": "offscreen"}
     for words in (
         f"feature_extractor --image_path {capture / 'frames'} --SiftExtraction.max_num_features 400 "
