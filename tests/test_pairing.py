@@ -15,9 +15,11 @@ from colmap_inertial.colmap.gyro_orientations import (
     estimate_bias_correction,
     estimate_gyro_orientations,
 )
+from colmap_inertial.colmap.loop_graph import select_loops
 from colmap_inertial.colmap.loops import LoopSearch, candidates, key_frames
 from colmap_inertial.colmap.pairing import match_capture
 from colmap_inertial.colmap.relative_track import (
+    LoopPose,
     Observations,
     RelativeTrack,
     estimate_relative_track,
@@ -26,7 +28,6 @@ from colmap_inertial.colmap.relative_track import (
 from colmap_inertial.colmap.sparse import mapping_device
 from colmap_inertial.colmap.two_views import (
     Covisibility,
-    LoopPose,
     TwoViews,
     compare,
     count_verified,
@@ -430,12 +431,12 @@ def test_of_loops_that_contradict_each_other_only_those_with_by_far_the_most_mat
         }
 
     true, shifted = [(0, 37), (1, 38), (2, 39)], [(0, 38), (1, 39)]
-    assert search_of(headings, way).select_consistent({}) == set()
-    assert search_of(headings, way).select_consistent(said(true, 100)) == set(true)
+    assert select_loops(way, headings, {}) == set()
+    assert select_loops(way, headings, said(true, 100)) == set(true)
     both = {**said(true, 100), **said(shifted, 60, off=1.5)}
-    assert search_of(headings, way).select_consistent(both) == set(true)
+    assert select_loops(way, headings, both) == set(true)
     both = {**said(true, 100), **said(shifted, 150, off=1.5)}
-    assert search_of(headings, way).select_consistent(both) == set()
+    assert select_loops(way, headings, both) == set()
 
 
 def sightings_along(centre, start_from_cam, rng, *, noise_rad=1e-3, reach=2.5):

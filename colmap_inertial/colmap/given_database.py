@@ -15,13 +15,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from colmap_inertial.colmap.relative_track import FramePair
 from colmap_inertial.colmap.sparse import (
     KeypointRecords,
     apply_keypoint_stages,
     register_images,
     writing_database,
 )
-from colmap_inertial.colmap.two_views import Features, FramePair, open_features
+from colmap_inertial.colmap.two_views import Features, open_features
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.types import CameraModel
 from colmap_inertial.io.files import check_names

@@ -2,14 +2,13 @@
 
 What looks the same may be a copy of it. So a loop must agree with the gyroscope's rotation and with the relative track
 (``relative_track.py``) between both frames, within their uncertainty after so long; its neighbours must show the same;
-and of loops that contradict each other (J. G. Mangelson et al., *Pairwise consistent measurement set maximization*,
-ICRA 2018), only those with by far the most matches behind them stay.
+and it must agree with the track as other loops correct it (``loop_graph.py``).
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,11 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from colmap_inertial.colmap.gyro_orientations import GyroOrientations
-from colmap_inertial.colmap.relative_track import DRIFT, RelativeTrack
+from colmap_inertial.colmap.loop_graph import select_likely_loops, select_loops
+from colmap_inertial.colmap.relative_track import FramePair, LoopPose, RelativeTrack
 from colmap_inertial.colmap.two_views import (
     Covisibility,
-    FramePair,
-    LoopPose,
     compare,
     delete_matches,
     localise_frames,
@@ -42,17 +40,9 @@ class LoopSearchLimits:
     best: int = 3
     #: A loop's matches cover this share of what both pictures show.
     least_covered: float = 0.5
-    #: Places of a loop's frames and lengths by its matches are as sure as this share of how far away its points are.
-    place_sigma: float = 0.1
-    length_sigma: float = 0.1
     #: Frames farther apart than this many times how far away things are show nothing in common.
     reach: float = 2.0
     sure_sigmas: float = 3.0
-    #: Three numbers whose squares add up to more, each over its variance, disagree; one number likewise.
-    agree_3: float = 16.3
-    agree_1: float = 10.8
-    #: Of loops that contradict each other, one must have so many times the matches behind it.
-    by_far: float = 2.0
     #: So many of the pairs of frames beside a candidate must show the same loop.
     least_witnesses: int = 2
 
@@ -180,7 +170,7 @@ class LoopSearch:
         more = sorted(set().union(*(beside[pair] for pair in likely if pair in voted)) - set(first))
         match(more)
         verified_beside, poses_beside = self._judge(more)
-        consistent = self.select_consistent({**poses, **poses_beside})
+        consistent = select_loops(self.track, self.orientations, {**poses, **poses_beside})
         enough = _LIMITS.least_witnesses
         closed = {pair for pair in consistent & set(likely) if len(beside[pair] & consistent) >= enough}
         closed |= set().union(*(beside[pair] & consistent for pair in closed))
@@ -193,36 +183,6 @@ class LoopSearch:
             refused=len((verified | verified_beside) - closed),
             closed=tuple(sorted(closed)),
         )
-
-    def select_consistent(self, poses: Mapping[FramePair, LoopPose]) -> set[FramePair]:
-        """Select loops that no other contradicts, or none with half as many matches behind it.
-
-        A loop says where one of its frames is, seen from the other. The track from there to the frames of another loop
-        nearby, no farther than ``nearest`` frames, is short and so precise; the other loop must agree with it.
-        """
-        from scipy.spatial import cKDTree
-
-        pairs = sorted(poses)
-        if not pairs:
-            return set()
-        i, j = split_pairs(pairs)
-        step = np.array([poses[pair].step for pair in pairs])
-        ratio = np.array([poses[pair].ratio for pair in pairs])
-        depth = np.array([poses[pair].depth for pair in pairs])
-        matches = np.array([poses[pair].matches for pair in pairs], dtype=np.float64)
-        a, b = cKDTree(np.stack([i, j], axis=1)).query_pairs(self.nearest, p=np.inf, output_type="ndarray").T
-        early, late = self._displacements(i[a], i[b]), self._displacements(j[a], j[b])
-        off = step[a] + ratio[a, None] * late[0] - early[0] - step[b]
-        noise = (_LIMITS.place_sigma * np.hypot(depth[a], depth[b])) ** 2
-        noise = noise + (_LIMITS.length_sigma * np.linalg.norm(late[0], axis=1)) ** 2
-        covariance = early[1] + ratio[a, None, None] ** 2 * late[1] + noise[:, None, None] * np.eye(3)
-        against = _squared(off, covariance) > _LIMITS.agree_3
-        behind, rival = matches.copy(), np.zeros(len(pairs))
-        for node, other in ((a, b), (b, a)):
-            np.add.at(behind, node[~against], matches[other[~against]])
-        for node, other in ((a[against], b[against]), (b[against], a[against])):
-            np.maximum.at(rival, node, behind[other])
-        return set(itertools.compress(pairs, (behind >= _LIMITS.by_far * rival).tolist()))
 
     def _displacements(self, i: IndexArray, j: IndexArray) -> tuple[Array, Array]:
         """(M, 3) displacements from frames i to frames j, in any order, and (M, 3, 3) their covariances."""
@@ -269,18 +229,8 @@ class LoopSearch:
         some = list(itertools.compress(pairs, likely))
         localised = localise_frames(self.database, self.names, some, self.track) if some else []
         poses = {pair: pose for pair, pose in zip(some, localised, strict=True) if pose is not None}
-        if poses:
-            i, j = split_pairs(list(poses))
-            loops = list(poses.values())
-            rotations = np.array([pose.start_from_second for pose in loops])
-            first_from_second = self.orientations.start_from_cam[i].swapaxes(1, 2) @ rotations
-            displacement, covariance = self._displacements(i, j)
-            off = displacement - np.array([pose.step for pose in loops])
-            noise = (_LIMITS.place_sigma * np.array([pose.depth for pose in loops])) ** 2
-            longer = np.log([pose.ratio for pose in loops]) ** 2 / (DRIFT**2 * (j - i) + _LIMITS.length_sigma**2)
-            fits = _squared(off, covariance + noise[:, None, None] * np.eye(3)) < _LIMITS.agree_3
-            fits &= (longer < _LIMITS.agree_1) & self.orientations.agree(i, j, first_from_second)
-            poses = dict(itertools.compress(poses.items(), fits.tolist()))
+        agree = select_likely_loops(self.track, self.orientations, poses)
+        poses = {pair: pose for pair, pose in poses.items() if pair in agree}
         return {pairs[k] for k in np.flatnonzero(verified).tolist()}, poses
 
     def _pairs_beside(self, pair: FramePair, step: int) -> set[FramePair]:
@@ -293,8 +243,3 @@ class LoopSearch:
 def _within(step: int, pair: FramePair, others: Set[FramePair]) -> set[FramePair]:
     """Those of other pairs whose frames lie no farther than ``step`` from a pair's."""
     return {near for near in others - {pair} if max(abs(near[0] - pair[0]), abs(near[1] - pair[1])) <= step}
-
-
-def _squared(off: Array, covariance: Array) -> Array:
-    """(M,) squares of (M, 3) vectors over their covariances (M, 3, 3)."""
-    return np.asarray(np.sum(off * np.linalg.solve(covariance, off[..., None])[..., 0], axis=1))

@@ -14,7 +14,7 @@ import numpy as np
 from colmap_inertial.colmap.given_database import can_match, read_matched_pairs
 from colmap_inertial.colmap.gyro_orientations import GyroOrientations, estimate_gyro_orientations
 from colmap_inertial.colmap.loops import LoopSearch, name_pairs, split_pairs
-from colmap_inertial.colmap.relative_track import RelativeTrack, estimate_relative_track
+from colmap_inertial.colmap.relative_track import FramePair, RelativeTrack, estimate_relative_track
 from colmap_inertial.colmap.sparse import (
     MatchRecord,
     image_pairs,
@@ -24,7 +24,6 @@ from colmap_inertial.colmap.sparse import (
 )
 from colmap_inertial.colmap.two_views import (
     Covisibility,
-    FramePair,
     count_verified,
     delete_matches,
     read_observations,

@@ -36,6 +36,9 @@ class TrackLimits:
 
 _LIMITS = TrackLimits()
 
+#: Places of two frames in time, the earlier one first.
+FramePair = tuple[int, int]
+
 #: How far the logarithm of its length walks from frame to frame.
 DRIFT = 0.02
 
@@ -115,6 +118,31 @@ class RelativeTrack:
         feature, at = self.observations.feature[mine], self.points[self.observations.point[mine]]
         known = np.isfinite(at).all(axis=1)
         return feature[known], at[known]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LoopPose:
+    """The pose of a frame by points that another one, long before or after, had seen.
+
+    Attributes
+    ----------
+    step
+        (3,) from the first frame to the second, in the length of the track at the first.
+    start_from_second
+        (3, 3) orientation of the second.
+    ratio
+        Length of the track at the first frame over that at the second.
+    depth
+        How far away the points are.
+    matches
+        How many points there are.
+    """
+
+    step: Array
+    start_from_second: Array
+    ratio: float
+    depth: float
+    matches: int
 
 
 def link_observations(

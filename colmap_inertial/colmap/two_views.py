@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from colmap_inertial.colmap.gyro_orientations import RayPairs
-from colmap_inertial.colmap.relative_track import Observations, RelativeTrack, link_observations
+from colmap_inertial.colmap.relative_track import FramePair, LoopPose, Observations, RelativeTrack, link_observations
 from colmap_inertial.core.arrays import Array, BoolArray, IndexArray, UInt8Array
 from colmap_inertial.core.geometry import matrix_from_quat, so3_log
 from colmap_inertial.core.threads import one_blas_thread
@@ -21,9 +21,6 @@ from colmap_inertial.model.database import UNREADABLE, check_records
 
 if TYPE_CHECKING:
     import pycolmap
-
-#: Places of two frames in time, the earlier one first.
-FramePair = tuple[int, int]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,31 +226,6 @@ def read_observations(
                 ray = features.rays(name, feature[own]) @ start_from_cam[k].T
                 rays[own] = ray / np.linalg.norm(ray, axis=1, keepdims=True)
     return Observations(frame=frame, point=point, feature=feature, rays=rays)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class LoopPose:
-    """The pose of a frame by points that another one, long before or after, had seen.
-
-    Attributes
-    ----------
-    step
-        (3,) from the first frame to the second, in the length of the track at the first.
-    start_from_second
-        (3, 3) orientation of the second.
-    ratio
-        Length of the track at the first frame over that at the second.
-    depth
-        How far away the points are.
-    matches
-        How many points there are.
-    """
-
-    step: Array
-    start_from_second: Array
-    ratio: float
-    depth: float
-    matches: int
 
 
 def localise_frames(
