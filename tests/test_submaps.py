@@ -493,3 +493,53 @@ def test_places_that_settle_are_given_and_those_that_do_not_are_refused():
     assert np.allclose(placed.translation, [[5, 6, 7]]) and np.allclose(cov, np.eye(PLACEMENT)) and squares < 1e-20
     with pytest.raises(np.linalg.LinAlgError, match="do not converge"):
         minimised(start, fleeing, limits)
+
+
+@pytest.mark.parametrize(("bad", "tries"), [({0}, 2), ({0, 1}, 3), ({0, 1, 2}, 3)], ids=["once", "twice", "always"])
+def test_a_part_with_large_residuals_is_mapped_again_with_other_seeds(ring, tmp_path, monkeypatch, bad, tries):
+    ring, _ = ring
+    capture, asked, mapped = ring.capture(), [], submaps.map_parts
+
+    def began_wrong(chunks, executor, registered):
+        """The second part has residuals of 5 px less a tenth of its seed, with some seeds."""
+        asked.append([(chunk.name, chunk.work.options["random_seed"]) for chunk in chunks])
+        for chunk, models in zip(chunks, mapped(chunks, executor, registered), strict=True):
+            seed = chunk.work.options["random_seed"] - capture.pipeline.random_seed
+            for model in models.values() if chunk.name == "mapping part 2" and seed in bad else ():
+                for point in model.points3D.values():
+                    point.error = 5.0 - 0.1 * seed
+            yield models
+
+    monkeypatch.setattr(submaps, "map_parts", began_wrong)
+    parts = [(0, 20), (14, 34), (28, 48)]
+    made = submaps.map_runs(capture, tmp_path, tmp_path, parts, executor=Processes(number=2), registered=lambda _: None)
+    seed = capture.pipeline.random_seed
+    assert asked[0] == [(f"mapping part {k}", seed) for k in (1, 2, 3)]
+    assert asked[1:] == [[("mapping part 2", seed + k)] for k in range(1, tries)]
+    assert [(part.begin, part.end) for part in made] == parts
+    error_px = made[1].model.compute_mean_reprojection_error()
+    assert error_px == pytest.approx(4.8) if len(bad) == 3 else error_px < 1
+
+
+@pytest.mark.parametrize(
+    ("found", "than", "better"),
+    [
+        ((20, 0.5), (20, 0.6), True),
+        ((20, 0.6), (20, 0.5), False),
+        ((18, 0.5), (20, 0.6), False),
+        ((0, 0), (20, 2), False),
+    ],
+)
+def test_models_of_a_part_are_better_with_smaller_residuals_of_about_as_many_images(found, than, better):
+    class Model:
+        def __init__(self, images, error_px):
+            self.images, self.error_px = images, error_px
+
+        def num_reg_images(self):
+            return self.images
+
+        def compute_mean_reprojection_error(self):
+            return self.error_px
+
+    of = [{0: Model(*either)} if either[0] else {} for either in (found, than)]
+    assert submaps._is_better(*of) == bool(better)
