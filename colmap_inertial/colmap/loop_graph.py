@@ -146,7 +146,7 @@ class _Graph:
         # a bias turns all steps the same way: what the variance grows by, and not that of each step alone
         variance = np.maximum.accumulate(orientations.sigma_rad(np.full(len(nodes), nodes[0]), nodes) ** 2)
         turn = np.sqrt(np.diff(variance) + _LIMITS.least_rotation_rad**2)
-        depth = np.nan_to_num(np.array([track.depth(k) for k in nodes[1:]]))
+        depth = np.nan_to_num(np.array([track.depth(k) for k in nodes[1:]]), nan=1.0)  # the first step's length
         drift = DRIFT**2 * count
         off = np.sqrt((drift / 3 + turn**2 / 3 + _LIMITS.of_path**2) * path**2 + (_LIMITS.of_depth * depth) ** 2)
         odometry = _Edges(
@@ -157,13 +157,11 @@ class _Graph:
             start_from_b=orientations.start_from_cam[nodes[1:]],
             sigma=np.column_stack([off, off, off, np.sqrt(drift), turn, turn, turn]),
         )
-        zero = np.zeros(len(nodes))
-        start_from_cam = orientations.start_from_cam[nodes]
         return cls(
             place=place,
-            log_length=zero,
-            turn=np.tile(zero[:, None], 3),
-            start_from_cam=start_from_cam,
+            log_length=np.zeros(len(nodes)),
+            turn=np.zeros((len(nodes), 3)),
+            start_from_cam=orientations.start_from_cam[nodes],
             odometry=odometry,
         )
 
@@ -339,12 +337,14 @@ def _group(off: Array, loops: _Edges, matches: Array) -> tuple[IndexArray, Index
 
 def _close(graph: _Graph, loops: _Edges, depth: Array, matches: Array) -> tuple[_Graph, BoolArray]:
     """Accept loops, the surest ones first, as long as there are any that agree; the graph with them, and which."""
-    accepted = np.zeros(len(depth), dtype=np.bool_)
+    accepted, dropped = np.zeros((2, len(depth)), dtype=np.bool_)
     graph = graph.adjusted(loops.only(accepted))
     for _ in range(len(depth)):
         off, _ = graph.residuals(loops)
-        accepted &= _agree(off, loops.covariance)
-        left = np.flatnonzero(~accepted)
+        # what others moved too far away stays out, so that the rounds end
+        dropped |= accepted & ~_agree(off, loops.covariance)
+        accepted &= ~dropped
+        left = np.flatnonzero(~accepted & ~dropped)
         if not len(left):
             break
         covariance = graph.covariances(loops.only(left))

@@ -262,11 +262,14 @@ def localise_frames(
             if usable.sum() < _LIMITS.least_placed // 2:
                 continue
             there = np.linalg.norm(at_second[other[usable]] - track.centre[j], axis=1)
+            ratio, depth = float(np.median(away[both[usable]] / there)), float(np.median(away[fit]))
+            if not (0 < ratio < np.inf and 0 < depth < np.inf):  # a point at the camera's very place
+                continue
             poses[-1] = LoopPose(
                 step=centre - track.centre[i],
                 start_from_second=second_from_start.rotation.matrix().T,
-                ratio=float(np.median(away[both[usable]] / there)),
-                depth=float(np.median(away[fit])),
+                ratio=ratio,
+                depth=depth,
                 matches=int(fit.sum()),
             )
     return poses
