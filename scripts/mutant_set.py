@@ -1825,8 +1825,8 @@ MUTANTS = (
     ),
     Mutant(
         "colmap/loop_graph.py",
-        "squared < _NOISE.agree_7",
-        "squared >= 0",
+        "_squared(off, covariance) < _NOISE.agree_7",
+        "_squared(off, covariance) >= 0",
         "a loop need not lead where the track does",
         ("loop_graph",),
     ),

@@ -8,7 +8,7 @@ from test_pairing import circle, headings_of, way_along
 from colmap_inertial.colmap import loop_graph
 from colmap_inertial.colmap.loop_graph import select_likely_loops, select_loops
 from colmap_inertial.colmap.relative_track import DRIFT, LoopPose
-from colmap_inertial.core.geometry import so3_exp
+from colmap_inertial.core.geometry import so3_exp, so3_log
 
 RATE_HZ, DEPTH_M = 8.0, 2.0
 
@@ -101,6 +101,68 @@ def test_the_only_loop_of_a_long_walk_is_closed_and_one_beside_it_with_as_many_m
     assert select_loops(walk.track, walk.orientations, true | copies) == set()
     few = {(i + 16, i + 240): walk.loop(i + 16, i + 240, (3.0, 0, 0), matches=45) for i in range(6)}
     assert select_loops(walk.track, walk.orientations, true | few) == true.keys()
+    # what is farther away is no surer
+    far = {pair: replace(pose, depth=1.6 * pose.depth) for pair, pose in few.items()}
+    assert select_loops(walk.track, walk.orientations, true | far) == true.keys()
+    far = {pair: replace(pose, depth=1.6 * pose.depth) for pair, pose in copies.items()}
+    assert select_loops(walk.track, walk.orientations, true | far) == set()
+
+
+def test_loops_are_found_where_the_orientation_has_turned_far():
+    rng = np.random.default_rng(0)
+    walk = DriftingWalk(*laps(4000, 240), rng)
+    assert np.linalg.norm(so3_log(walk.true_from_start[-1])) > 0.8
+    loops = {(i, 3600 + i): walk.loop(i, 3600 + i) for i in range(0, 240, 30)}
+    assert select_loops(walk.track, walk.orientations, loops) == loops.keys()
+
+
+def test_a_gain_that_is_off_costs_no_loop_after_turning_back():
+    """An eight: the variance of the heading falls when the camera turns back, that of each turn does not."""
+    heading = np.concatenate([np.zeros(40), np.linspace(0, 360, 200), np.full(40, 360.0), np.linspace(360, 0, 200)])
+    heading = np.concatenate([heading, np.zeros(40)])
+    step = 0.15 * np.stack([np.cos(np.radians(heading)), 0 * heading, -np.sin(np.radians(heading))], axis=1)
+    place = np.concatenate([np.zeros((1, 3)), np.cumsum(step, axis=0)[:-1]])
+    walk = DriftingWalk(place, heading, np.random.default_rng(1), drift=0.005, bias_sigma=1e-4)
+    off = so3_exp(np.stack([0 * heading, 0.02 * np.radians(heading), 0 * heading], axis=1))
+    steps = np.exp(-walk.log_length[:-1, None]) * (np.diff(place, axis=0)[:, None, :] @ off[:-1])[:, 0]
+    walk.true_from_start = off
+    walk.track = way_along(np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)]))
+    second, third = np.arange(240, 280), np.arange(480, 520, 2)
+    near = [int(second[np.argmin(np.linalg.norm(place[second] - place[k], axis=1))]) for k in third]
+    loops = {(i, int(j)): walk.loop(i, int(j)) for i, j in zip(near, third, strict=True)}
+    assert select_likely_loops(walk.track, walk.orientations, loops) == loops.keys()
+
+
+def test_rotations_across_a_gap_of_the_gyroscope_are_not_believed():
+    walk = DriftingWalk(*laps(300, 240), np.random.default_rng(2), drift=0.003)
+    turned = so3_exp(np.array([0, 0, 0.5]))
+    walk.true_from_start[150:] = turned @ walk.true_from_start[150:]
+    steps = (np.diff(walk.place_m, axis=0)[:, None, :] @ walk.true_from_start[:-1])[:, 0]
+    walk.track = way_along(np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)]))
+    walk.log_length[:] = 0
+    loops = {(i, i + 240): walk.loop(i, i + 240) for i in range(0, 60, 6)}
+    assert not select_likely_loops(walk.track, walk.orientations, loops)
+    parts = replace(walk.orientations, part=(np.arange(300) >= 150).astype(np.intp))
+    assert select_likely_loops(walk.track, parts, loops) == loops.keys()
+
+
+def test_loops_that_pull_apart_are_not_both_in_the_graph():
+    walk = DriftingWalk(*laps(300, 240), np.random.default_rng(6), drift=0.0, bias_sigma=1e-6)
+    (part,) = loop_graph._parts(walk.track, {(i, i + 240): walk.loop(i, i + 240, noise=0) for i in (0, 2)})
+    loops, depth, matches = loop_graph._attach(walk.track, walk.orientations, part)
+    graph = loop_graph._Graph.of(walk.track, walk.orientations, part.nodes)
+    loops.step[:] += np.array([[0.8, 0, 0], [-0.8, 0, 0]])
+    surer = replace(loops, sigma=loops.sigma * np.array([0.05, 0.05, 0.05, 1, 1, 1, 1]))
+    closed, accepted = loop_graph._close(graph, surer, 1e3 * depth, matches)
+    np.testing.assert_allclose(closed.place, graph.adjusted(surer.only(accepted)).place, atol=1e-4)
+    assert accepted.sum() < 2
+
+
+def test_poses_that_are_no_numbers_end_the_grouping():
+    _, edges = a_graph()
+    off = np.full((len(edges.a), 7), np.nan)
+    best, group = loop_graph._group(off, edges, np.ones(len(edges.a)))
+    assert len(best) == len(group) == 3
 
 
 def test_loops_of_each_part_of_a_track_are_judged_by_that_part():
@@ -143,7 +205,7 @@ def moved(graph, change):
         graph,
         place=graph.place + by[:, :3],
         log_length=graph.log_length + by[:, 3],
-        turn=graph.turn + by[:, 4:],
+        turn=so3_exp(by[:, 4:]) @ graph.turn,
     )
 
 
@@ -160,11 +222,10 @@ def differences(graph, edges):
 def test_derivatives_are_those_of_the_residuals():
     graph, edges = a_graph()
     rng = np.random.default_rng(2)
-    change = np.zeros((len(graph.place), 7))
-    change[:, :4] = 0.2 * rng.standard_normal((len(graph.place), 4))
-    graph = moved(graph, change)
-    # rotations of measured orientations are small here, as where they are adjusted
-    edges = replace(edges, start_from_b=graph.start_from_cam[edges.b])
+    graph = moved(graph, 0.3 * rng.standard_normal((len(graph.place), 7)))
+    # what remains is small, as where a graph is adjusted
+    turned = np.swapaxes(graph.turn[edges.a], 1, 2) @ graph.turn[edges.b] @ graph.start_from_cam[edges.b]
+    edges = replace(edges, start_from_b=so3_exp(0.02 * rng.standard_normal((len(edges.a), 3))) @ turned)
     full = np.zeros((7 * len(edges.a), 7 * len(graph.place)))
     for k, (rows, columns) in enumerate(zip(graph.residuals(edges)[1], edges.columns, strict=True)):
         full[7 * k : 7 * k + 7, columns] = rows

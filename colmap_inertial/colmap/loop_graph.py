@@ -35,12 +35,16 @@ class Orientations(Protocol):
         """(M,) standard deviations of the rotations between frames i and j."""
         ...
 
+    def known(self, i: IndexArray, j: IndexArray) -> BoolArray:
+        """(M,) whether the rotations between frames i and j were measured."""
+        ...
+
 
 @dataclass(frozen=True, kw_only=True)
 class LoopNoise:
     """Standard deviations of a loop's pose, and limits of its acceptance."""
 
-    #: Places of a loop's frames and lengths by its matches are as sure as this share of how far away its points are.
+    #: Places of a loop's frames, as a share of how far away its points are; logarithms of lengths; rotations.
     place_sigma: float = 0.1
     length_sigma: float = 0.1
     rotation_sigma_rad: float = math.radians(1.5)
@@ -50,7 +54,7 @@ class LoopNoise:
     sure: float = 0.1
     #: Of others, those compete that are predicted no worse than so many times the best one, and no more at once.
     alike: float = 1.5
-    rivals: int = 100
+    rivals: int = 30
     #: Of loops that contradict each other, one must have so many times the matches behind it.
     by_far: float = 2.0
 
@@ -65,6 +69,8 @@ class GraphLimits:
     of_path: float = 0.02
     of_depth: float = 1e-3
     least_rotation_rad: float = 1e-4
+    #: Of a rotation that the gyroscope did not measure.
+    gap_rad: float = 1.0
     #: Gauss-Newton: rounds, and the largest step at rest.
     rounds: int = 10
     step: float = 1e-3
@@ -121,8 +127,8 @@ class _Graph:
     Attributes
     ----------
     place, log_length, turn
-        (K, 3), (K,) and (K, 3): where a node is, how much longer the track is there, and the rotation vector by which
-        its orientation is off.
+        (K, 3), (K,) and (K, 3, 3): where a node is, how much longer the track is there, and the rotation by which its
+        orientation is off.
     start_from_cam
         (K, 3, 3) orientations by the gyroscope.
     odometry
@@ -143,9 +149,11 @@ class _Graph:
         place, count = track.centre[nodes] - track.centre[nodes[0]], np.diff(nodes)
         walked = np.cumsum(np.linalg.norm(np.diff(track.centre, axis=0, prepend=track.centre[:1]), axis=1))
         path = np.diff(walked[nodes])
-        # a bias turns all steps the same way: what the variance grows by, and not that of each step alone
-        variance = np.maximum.accumulate(orientations.sigma_rad(np.full(len(nodes), nodes[0]), nodes) ** 2)
-        turn = np.sqrt(np.diff(variance) + _LIMITS.least_rotation_rad**2)
+        # a bias turns all steps the same way, and the variance of the sum is the square of the sum
+        sigma = orientations.sigma_rad(nodes[:-1], nodes[1:])
+        summed = np.concatenate([[0.0], np.cumsum(np.sqrt(sigma**2 - sigma.min() ** 2))])
+        turn = np.sqrt(np.diff(summed**2) + _LIMITS.least_rotation_rad**2)
+        turn = np.where(orientations.known(nodes[:-1], nodes[1:]), turn, _LIMITS.gap_rad)
         depth = np.nan_to_num(np.array([track.depth(k) for k in nodes[1:]]), nan=1.0)  # the first step's length
         drift = DRIFT**2 * count
         off = np.sqrt((drift / 3 + turn**2 / 3 + _LIMITS.of_path**2) * path**2 + (_LIMITS.of_depth * depth) ** 2)
@@ -160,7 +168,7 @@ class _Graph:
         return cls(
             place=place,
             log_length=np.zeros(len(nodes)),
-            turn=np.zeros((len(nodes), 3)),
+            turn=np.tile(np.eye(3), (len(nodes), 1, 1)),
             start_from_cam=orientations.start_from_cam[nodes],
             odometry=odometry,
         )
@@ -168,21 +176,21 @@ class _Graph:
     def residuals(self, edges: _Edges) -> tuple[Array, Array]:
         """(M, 7) by how much edges are off, and (M, 7, 14) derivatives by both nodes."""
         a, b = edges.a, edges.b
-        a_from_start, shorter = so3_exp(-self.turn[a]), np.exp(-self.log_length[a])
+        a_from_start, shorter = np.swapaxes(self.turn[a], 1, 2), np.exp(-self.log_length[a])
         apart = self.place[b] - self.place[a]
         scaled = shorter[:, None, None] * a_from_start
         step = np.einsum("mij,mj->mi", scaled, apart)
-        orientation = a_from_start @ so3_exp(self.turn[b]) @ self.start_from_cam[b]
-        off = [
-            step - edges.step,
-            (self.log_length[b] - self.log_length[a] - edges.longer)[:, None],
-            so3_log(orientation @ np.swapaxes(edges.start_from_b, 1, 2)),
-        ]
+        orientation = a_from_start @ self.turn[b] @ self.start_from_cam[b]
+        twist = so3_log(orientation @ np.swapaxes(edges.start_from_b, 1, 2))
+        longer = self.log_length[b] - self.log_length[a] - edges.longer
         by = np.zeros((len(a), PLACEMENT, 2 * PLACEMENT))
         by[:, :3, :3], by[:, :3, 7:10], by[:, :3, 3], by[:, :3, 4:7] = -scaled, scaled, -step, scaled @ skew(apart)
         by[:, 3, 3], by[:, 3, 10] = -1, 1
-        by[:, 4:, 4:7], by[:, 4:, 11:] = -np.eye(3), np.eye(3)
-        return np.concatenate(off, axis=1), by
+        # derivative of the logarithm by a rotation on the left, to second order
+        across = skew(twist)
+        by[:, 4:, 11:] = (np.eye(3) - 0.5 * across + across @ across / 12) @ a_from_start
+        by[:, 4:, 4:7] = -by[:, 4:, 11:]
+        return np.column_stack([step - edges.step, longer, twist]), by
 
     def adjusted(self, loops: _Edges) -> _Graph:
         """The graph with these loops."""
@@ -198,15 +206,14 @@ class _Graph:
             off, by = off / edges.sigma, by / edges.sigma[:, :, None]
             information = coo_matrix(((np.swapaxes(by, 1, 2) @ by).ravel(), (rows, others)), shape=(size, size)).tocsc()
             gradient = np.bincount(columns.ravel(), np.einsum("mra,mr->ma", by, off).ravel(), size)
-            factor = splu(
-                information[PLACEMENT:, PLACEMENT:], permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}
-            )
+            options = {"SymmetricMode": True}
+            factor = splu(information[PLACEMENT:, PLACEMENT:], "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
             step = np.concatenate([np.zeros(PLACEMENT), -factor.solve(gradient[PLACEMENT:])]).reshape(-1, PLACEMENT)
             graph = replace(
                 graph,
                 place=graph.place + step[:, :3],
                 log_length=graph.log_length + step[:, 3],
-                turn=graph.turn + step[:, 4:],
+                turn=so3_exp(step[:, 4:]) @ graph.turn,
                 factor=factor,
             )
             if np.abs(step).max() < _LIMITS.step:
@@ -330,6 +337,7 @@ def _group(off: Array, loops: _Edges, matches: Array) -> tuple[IndexArray, Index
         _, first, member = np.unique(nodes[left], axis=0, return_index=True, return_inverse=True)
         of_member = left[first][member.ravel()]
         agree = _agree(off[left] - off[of_member], loops.covariance[left] + loops.covariance[of_member])
+        agree |= left == of_member
         group[left[agree]] = len(best) + member.ravel()[agree]
         best, left = np.concatenate([best, left[first]]), left[~agree]
     return best, group
@@ -339,20 +347,24 @@ def _close(graph: _Graph, loops: _Edges, depth: Array, matches: Array) -> tuple[
     """Accept loops, the surest ones first, as long as there are any that agree; the graph with them, and which."""
     accepted, dropped = np.zeros((2, len(depth)), dtype=np.bool_)
     graph = graph.adjusted(loops.only(accepted))
-    for _ in range(len(depth)):
+    for _ in range(2 * len(depth)):
         off, _ = graph.residuals(loops)
-        # what others moved too far away stays out, so that the rounds end
-        dropped |= accepted & ~_agree(off, loops.covariance)
-        accepted &= ~dropped
+        worst = np.argmax(np.where(accepted, _squared(off, loops.covariance), 0.0))
+        if accepted[worst] and not _agree(off[worst], loops.covariance[worst]):
+            # others moved it too far away; it stays out, so that the rounds end
+            accepted[worst], dropped[worst] = False, True
+            graph = graph.adjusted(loops.only(accepted))
+            continue
         left = np.flatnonzero(~accepted & ~dropped)
         if not len(left):
             break
         covariance = graph.covariances(loops.only(left))
         agree = _agree(off[left], covariance + loops.only(left).covariance)
         left, covariance = left[agree], covariance[agree]
-        sigma = _place_sigma(covariance) / depth[left]
-        chosen = np.flatnonzero(sigma < _NOISE.sure)
+        sigma = _place_sigma(covariance)
+        chosen = np.flatnonzero(sigma < _NOISE.sure * depth[left])
         if not len(chosen) and len(left):
+            sigma = sigma * np.exp(graph.log_length[loops.a[left]])  # all in one length
             chosen = np.argsort(sigma, kind="stable")[: _NOISE.rivals]
             chosen = chosen[sigma[chosen] <= _NOISE.alike * sigma[chosen[0]]]
             rest = loops.only(left)
@@ -381,11 +393,17 @@ def _prevail(
     agree = _agree(expected, covariance - gain @ np.swapaxes(joint, 2, 3))
     agree[np.arange(len(some)), some] = True
     behind = agree @ matches
-    rival = np.max(np.where(~agree[:, some], behind, 0.0), axis=1)
+    of_all = matches.copy()  # of those that do not compete now, their own
+    of_all[some] = behind
+    rival = np.max(np.where(agree, 0.0, of_all), axis=1)
     return np.asarray(behind >= _NOISE.by_far * rival)
 
 
 def _agree(off: Array, covariance: Array) -> BoolArray:
     """(...,) whether vectors (..., 7) are as small as their covariances (..., 7, 7) say."""
-    squared = np.sum(off * np.linalg.solve(covariance, off[..., None])[..., 0], axis=-1)
-    return np.asarray(squared < _NOISE.agree_7)
+    return np.asarray(_squared(off, covariance) < _NOISE.agree_7)
+
+
+def _squared(off: Array, covariance: Array) -> Array:
+    """(...,) squares of vectors (..., 7) over their covariances (..., 7, 7)."""
+    return np.asarray(np.sum(off * np.linalg.solve(covariance, off[..., None])[..., 0], axis=-1))
