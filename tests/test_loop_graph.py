@@ -133,6 +133,21 @@ def test_a_gain_that_is_off_costs_no_loop_after_turning_back():
     assert select_likely_loops(walk.track, walk.orientations, loops) == loops.keys()
 
 
+def test_orientations_are_as_unsure_as_the_bias_makes_them():
+    """Nobody turns, all steps are alike: the bias is all there is, and turns frame after frame the same way."""
+    along = np.linspace(0, 20, 401)
+    walk = DriftingWalk(np.stack([along, 0 * along, 0 * along], axis=1), 0 * along, np.random.default_rng(1))
+    nodes = np.arange(0, 401, 8)
+    graph = loop_graph._Graph.of(walk.track, walk.orientations, nodes)
+    ends = replace(graph.odometry.only([0]), a=np.array([0]), b=np.array([50]))
+    (covariance,) = graph.adjusted(graph.odometry.only(slice(0))).covariances(ends)
+    # the rotation between the sensors is the same at both ends
+    still_rad, whole_rad = walk.orientations.sigma_rad(np.array([0, 0]), np.array([0, 400]))
+    grown_rad = np.sqrt(whole_rad**2 - still_rad**2)
+    assert 0.93 < np.sqrt(np.diagonal(covariance)[4:]).mean() / grown_rad < 1.05  # a bias that walks is left out
+    assert grown_rad > np.radians(2)
+
+
 def test_rotations_across_a_gap_of_the_gyroscope_are_not_believed():
     walk = DriftingWalk(*laps(300, 240), np.random.default_rng(2), drift=0.003)
     turned = so3_exp(np.array([0, 0, 0.5]))

@@ -150,8 +150,10 @@ class _Graph:
         walked = np.cumsum(np.linalg.norm(np.diff(track.centre, axis=0, prepend=track.centre[:1]), axis=1))
         path = np.diff(walked[nodes])
         # a bias turns all steps the same way, and the variance of the sum is the square of the sum
-        sigma = orientations.sigma_rad(nodes[:-1], nodes[1:])
-        summed = np.concatenate([[0.0], np.cumsum(np.sqrt(sigma**2 - sigma.min() ** 2))])
+        # but for what does not grow from frame to frame: the rotation between the sensors, and their clocks' offset
+        still = orientations.sigma_rad(nodes, nodes) ** 2
+        grown = orientations.sigma_rad(nodes[:-1], nodes[1:]) ** 2 - (still[:-1] + still[1:]) / 2
+        summed = np.concatenate([[0.0], np.cumsum(np.sqrt(np.maximum(grown, 0.0)))])
         turn = np.sqrt(np.diff(summed**2) + _LIMITS.least_rotation_rad**2)
         turn = np.where(orientations.known(nodes[:-1], nodes[1:]), turn, _LIMITS.gap_rad)
         depth = np.nan_to_num(np.array([track.depth(k) for k in nodes[1:]]), nan=1.0)  # the first step's length
