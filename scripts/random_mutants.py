@@ -7,9 +7,9 @@
 ``map`` runs the tests once under coverage and writes which tests run which lines, and how long each takes. ``draw``
 draws faults at random, at least 12 in each room and of each kind alike: a sign, a factor in place of a divisor, a
 transpose, the order of two operands or arguments, a power, minimum for maximum, a bound that is one off, a dropped
-term, a unit, a condition turned round, a check that is left out. Each is made in a copy of the package. The tests that
-run its line are run until one fails, the quickest first, then the files of these tests. Printed: each fault, and the
-share caught by room.
+term, a unit, a condition turned round, a check that is left out. Each is made in a copy of the package. Tests that run
+its line, the quickest and those that run little beside its module, are run until one fails. Printed: each fault, and
+the share caught by room.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from pathlib import Path
 
 from mutants import PACKAGE, ROOT, Trial
 
-#: Tests of one fault: so many of the quickest that run its line, then their files for so long (s).
-MOST_TESTS = 40
-MOST_FILES_S = 240.0
+#: Tests of one fault that run its line: so many of the quickest, and for so long (s) those of its module.
+MOST_QUICK = 30
+MOST_S = 60.0
 LEAST_IN_A_ROOM = 12
 
 _SWAPPED = {ast.Add: "-", ast.Sub: "+", ast.Mult: "/", ast.Div: "*"}
@@ -262,50 +262,51 @@ def write_map(file: Path) -> None:
 
 
 class Tests:
-    """Which tests run a line, the quickest first."""
+    """Which tests run a line: the quickest, and those that run little beside its module."""
 
     def __init__(self, file: Path) -> None:
         known = json.loads(file.read_text())
         self._lines, self._seconds = known["lines"], known["seconds"]
-        self._files: Counter[str] = Counter()
-        for name, seconds in self._seconds.items():
-            self._files[name.partition("::")[0]] += seconds
-        #: Lines of a module that a file of tests runs, and of all modules.
+        #: Lines of a module that a test runs, and of all modules.
         self._run: Counter[tuple[str, str]] = Counter()
         self._run_by: Counter[str] = Counter()
         for module, numbers in self._lines.items():
             for contexts in numbers.values():
-                for file in {name.partition("::")[0] for name in contexts}:
-                    self._run[file, module] += 1
-                    self._run_by[file] += 1
+                for name in {_function(context) for context in contexts}:
+                    self._run[name, module] += 1
+                    self._run_by[name] += 1
 
-    def of(self, fault: Fault) -> tuple[list[str], list[str]]:
-        """The quickest tests that run the line, and files of such tests, those first that test its module most."""
+    def of(self, fault: Fault) -> list[str]:
+        """Tests that run the line, the quickest first."""
         lines = self._lines.get(fault.file, {})
         # what runs when the module is imported, such as a default, is of every test that runs anything of the module
         contexts = lines.get(str(fault.line)) or sorted(set().union(*lines.values()))
-        names = {re.sub(r"\[.*", "", name, flags=re.DOTALL) for name in contexts}
-        quickest = sorted(names, key=lambda name: self._seconds.get(name, 10.0))[:MOST_TESTS]
-        files, left_s = [], MOST_FILES_S
-        for file in sorted(
-            {name.partition("::")[0] for name in names},
-            key=lambda file: -self._run[file, fault.file] / self._run_by[file],
-        ):
-            if self._files[file] < left_s:
-                left_s -= self._files[file]
-                files.append(file)
-        return quickest, files
+        by_time = sorted({_function(context) for context in contexts}, key=self._time)
+        by_share = sorted(by_time, key=lambda name: -self._run[name, fault.file] / self._run_by[name])
+        chosen, left_s = set(by_time[:MOST_QUICK]), MOST_S
+        for name in by_share:
+            if self._time(name) < left_s:
+                left_s -= self._time(name)
+                chosen.add(name)
+        return [name for name in by_time if name in chosen]
+
+    def _time(self, name: str) -> float:
+        return self._seconds.get(name, 10.0)
+
+
+def _function(context: str) -> str:
+    """The function of a test, without its parameters."""
+    return re.sub(r"\[.*", "", context, flags=re.DOTALL)
 
 
 def _tried(trial: Trial, fault: Fault, tests: Tests) -> dict[str, object]:
     text = (ROOT / PACKAGE / fault.file).read_text(encoding="utf-8")
     begun = time.perf_counter()
-    quickest, files = tests.of(fault)
-    state, by = ("survived", "no test runs this line") if not quickest else ("survived", "")
-    with trial.module(fault.file, fault.applied(text)):
-        for some in (quickest, files):
-            if some and state == "survived":
-                state, by = trial.tested(some)
+    chosen = tests.of(fault)
+    state, by = "survived", "no test runs this line"
+    if chosen:
+        with trial.module(fault.file, fault.applied(text)):
+            state, by = trial.tested(chosen)
     return {**asdict(fault), "room": fault.room, "state": state, "by": by, "seconds": time.perf_counter() - begun}
 
 
