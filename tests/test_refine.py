@@ -345,6 +345,21 @@ def test_a_gap_of_the_gyroscope_links_nothing():
     assert judge._freedom(whole) == 6 * whole.inertial.linked.sum() - 3
 
 
+def test_frames_more_than_ten_seconds_apart_are_not_linked():
+    options = walk(30.0, points_per_m=10.0)
+    tracks = tracks_of(options)
+    since_s = dict(zip(tracks.timing.names, tracks.timing.t_s - tracks.timing.t_s[0], strict=True))
+    for until_s, apart in ((13.0, 0), (17.0, 1)):
+        model = tracks.reconstruction()
+        for image in list(model.images.values()):
+            if 5.0 < since_s[image.name] < until_s:
+                model.deregister_frame(image.frame_id)
+        seen = setup.read_seen(model, tracks.timing)
+        known = known_of(tracks, options)
+        problem, _ = setup.make_problem(seen, tracks.timing, tracks.imu, known, seen.observations.xy_px)
+        assert np.sum(~problem.inertial.linked) == apart
+
+
 def test_speed_costs_nothing_where_the_imu_says_it(small):
     _, problem, start, _ = small
     fast = replace(start, velocity_m_s=start.velocity_m_s + 30.0)
