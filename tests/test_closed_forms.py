@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from colmap_inertial.checks.diagnose.frames import _readout
 from colmap_inertial.checks.diagnose.imu import acceleration_rms_m_s2, scatter_of
+from colmap_inertial.checks.report import signals, still
 from colmap_inertial.checks.validate.overlays import _ticks
 from colmap_inertial.checks.validate.views import load_views
 from colmap_inertial.checks.words import digits, fixed, half_width_pct, length, length_error
@@ -633,3 +634,22 @@ def test_a_column_of_phyphox_is_found_by_its_pattern():
     assert _column(table, r"time.*") == 0 and _column(table, r"gyroscope x.*") == 1
     with pytest.raises(FormatError, match="no column like 'accelerometer'"):
         _column(table, "accelerometer")
+
+
+@pytest.mark.parametrize(
+    ("share", "colour"), [(-1.0, "#000000"), (0.25, "#402010"), (0.75, "#c0a090"), (2.0, "#ffffff")]
+)
+def test_a_colour_between_two_lies_at_its_share_of_the_way(share, colour):
+    assert still._mix([[0.0, "#000000"], [0.5, "#804020"], [1.0, "#ffffff"]], share) == colour
+
+
+def test_the_spectrum_of_white_noise_is_its_density_up_to_half_the_rate():
+    t_s = np.arange(0.0, 60.0, 0.005)
+    noise = 0.1 * np.random.default_rng(4).standard_normal((len(t_s), 3))
+    found = signals._estimate_spectrum(t_s, noise)
+    hz, density = (np.asarray(found[name], dtype=float) for name in ("hz", "density"))
+    # of a vector: of three axes, one-sided
+    expected = 0.1 * np.sqrt(3 * 2 * 0.005)
+    # 120 bins from the lowest frequency, of parts of 8 s, to half the rate
+    assert np.log(hz[-2] / hz[-22]) == pytest.approx(20 * np.log(100 * 8) / 120, rel=0.02)
+    np.testing.assert_allclose(density[hz > 10], expected, rtol=0.1)
