@@ -636,11 +636,10 @@ def test_a_column_of_phyphox_is_found_by_its_pattern():
         _column(table, "accelerometer")
 
 
-@pytest.mark.parametrize(
-    ("share", "colour"), [(-1.0, "#000000"), (0.25, "#402010"), (0.75, "#c0a090"), (2.0, "#ffffff")]
-)
-def test_a_colour_between_two_lies_at_its_share_of_the_way(share, colour):
-    assert still._mix([[0.0, "#000000"], [0.5, "#804020"], [1.0, "#ffffff"]], share) == colour
+def test_a_colour_between_two_lies_at_its_share_of_the_way():
+    scale = [[0.0, "#000000"], [0.5, "#804020"], [1.0, "#ffffff"]]
+    colours = [still._mix(scale, share) for share in (-1.0, 0.25, 0.75, 2.0)]
+    assert colours == ["#000000", "#402010", "#c0a090", "#ffffff"]
 
 
 def test_the_spectrum_of_white_noise_is_its_density_up_to_half_the_rate():
@@ -652,4 +651,5 @@ def test_the_spectrum_of_white_noise_is_its_density_up_to_half_the_rate():
     expected = 0.1 * np.sqrt(3 * 2 * 0.005)
     # 120 bins from the lowest frequency, of parts of 8 s, to half the rate
     assert np.log(hz[-2] / hz[-22]) == pytest.approx(20 * np.log(100 * 8) / 120, rel=0.02)
-    np.testing.assert_allclose(density[hz > 10], expected, rtol=0.1)
+    np.testing.assert_allclose(density[hz > 10], expected, rtol=0.15)
+    assert np.mean(density[hz > 10]) == pytest.approx(expected, rel=0.02)
