@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
@@ -99,13 +98,14 @@ def test_a_camera_that_turns_in_one_second_alone_is_stopped_before_mapping():
     assert "rotation-too-little" not in lively.codes
 
 
-@pytest.mark.parametrize("gain", [1.31, 0.7])
-@pytest.mark.parametrize("declared", [True, False])
-def test_a_gain_of_the_gyroscope_shows_in_a_video_with_any_intrinsics(gain, declared):
-    base = simulated(3)
-    shown = replace(pictures(base, np.random.default_rng(1)), camera=LENS if declared else None)
-    assert "gyro-gain" not in diagnose(shown).codes
-    wrong = replace(shown, imu=replace(base.imu, gyro_rad_s=gain * base.imu.gyro_rad_s))
-    told = diagnose(wrong)
-    assert "gyro-gain" in told.codes
-    assert "focal-length" not in told.codes
+def test_a_gain_of_the_gyroscope_shows_in_a_video_with_any_intrinsics(subtests):
+    for gain in (1.31, 0.7):
+        for declared in (True, False):
+            with subtests.test(gain=gain, declared=declared):
+                base = simulated(3)
+                shown = replace(pictures(base, np.random.default_rng(1)), camera=LENS if declared else None)
+                assert "gyro-gain" not in diagnose(shown).codes
+                wrong = replace(shown, imu=replace(base.imu, gyro_rad_s=gain * base.imu.gyro_rad_s))
+                told = diagnose(wrong)
+                assert "gyro-gain" in told.codes
+                assert "focal-length" not in told.codes

@@ -246,15 +246,16 @@ def test_clocks_hundreds_of_seconds_apart_are_found_for_video_and_for_keyframes(
         assert abs(calibration.gyro_time_offset_s - truth.gyro_time_offset_s) < 0.004
 
 
-@pytest.mark.parametrize(("first", "last"), [(0.0, 35.0), (25.0, 70.0), (20.0, 40.0)])
-def test_the_imu_may_start_late_or_end_early(first, last):
-    simulated = simulate_recording(RecordingOptions(imu=STATED), seed=5)
-    imu = simulated.imu
-    elapsed = imu.gyro_t_s - imu.gyro_t_s[0]
-    keep = (elapsed >= first) & (elapsed <= last)
-    part = replace(imu, gyro_t_s=imu.gyro_t_s[keep], gyro_rad_s=imu.gyro_rad_s[keep])
-    calibration = align_camera_imu(simulated.trajectory, part)
-    assert abs(calibration.gyro_time_offset_s - simulated.truth.calibration.gyro_time_offset_s) < 0.004
+def test_the_imu_may_start_late_or_end_early(subtests):
+    for first, last in ((0.0, 35.0), (25.0, 70.0), (20.0, 40.0)):
+        with subtests.test(first=first, last=last):
+            simulated = simulate_recording(RecordingOptions(imu=STATED), seed=5)
+            imu = simulated.imu
+            elapsed = imu.gyro_t_s - imu.gyro_t_s[0]
+            keep = (elapsed >= first) & (elapsed <= last)
+            part = replace(imu, gyro_t_s=imu.gyro_t_s[keep], gyro_rad_s=imu.gyro_rad_s[keep])
+            calibration = align_camera_imu(simulated.trajectory, part)
+            assert abs(calibration.gyro_time_offset_s - simulated.truth.calibration.gyro_time_offset_s) < 0.004
 
 
 def test_the_offset_of_drifting_clocks_holds_in_the_middle_of_what_both_recorded():
@@ -300,19 +301,22 @@ def test_the_offset_is_between_raw_stamps_whatever_the_epochs():
     assert epoch_shift_s(simulated.imu, there.epoch_ns) == -1.7e9
 
 
-@pytest.mark.parametrize("rate", [-0.01, 0.002, 0.01])
-def test_clocks_that_run_at_different_rates_are_followed(rate):
-    simulated = simulate_recording(RecordingOptions(imu=replace(STATED, clock_rate_sd=0.0)), seed=3)
-    imu = simulated.imu
-    drifting = replace(imu, gyro_t_s=imu.gyro_t_s * (1 + rate), accel_t_s=imu.accel_t_s * (1 + rate))
-    alignment = align_clocks(simulated.trajectory, drifting)
-    assert alignment.calibration.clock_rate == pytest.approx(-rate, abs=max(3 * alignment.clock_rate_sigma, 2e-5))
-    steady = CameraTimedImu.from_recording(drifting, alignment.calibration, simulated.trajectory.epoch_ns)
-    # the true time of each sample on the camera's clock
-    true_s = imu.gyro_t_s + simulated.truth.calibration.gyro_time_offset_s
-    assert np.abs(steady.gyro_t_s - true_s).max() < 0.004
-    assert "ppm" in steady.imu.repairs[-1]
-    assert alignment.drifts() and alignment.settled() is alignment.calibration
+def test_clocks_that_run_at_different_rates_are_followed(subtests):
+    for rate in (-0.01, 0.002, 0.01):
+        with subtests.test(rate=rate):
+            simulated = simulate_recording(RecordingOptions(imu=replace(STATED, clock_rate_sd=0.0)), seed=3)
+            imu = simulated.imu
+            drifting = replace(imu, gyro_t_s=imu.gyro_t_s * (1 + rate), accel_t_s=imu.accel_t_s * (1 + rate))
+            alignment = align_clocks(simulated.trajectory, drifting)
+            assert alignment.calibration.clock_rate == pytest.approx(
+                -rate, abs=max(3 * alignment.clock_rate_sigma, 2e-5)
+            )
+            steady = CameraTimedImu.from_recording(drifting, alignment.calibration, simulated.trajectory.epoch_ns)
+            # the true time of each sample on the camera's clock
+            true_s = imu.gyro_t_s + simulated.truth.calibration.gyro_time_offset_s
+            assert np.abs(steady.gyro_t_s - true_s).max() < 0.004
+            assert "ppm" in steady.imu.repairs[-1]
+            assert alignment.drifts() and alignment.settled() is alignment.calibration
 
 
 def test_a_clock_rate_that_is_small_or_in_doubt_is_not_corrected():
@@ -461,8 +465,9 @@ def test_sparse_keyframes_of_a_drone_give_the_factory_s_rotation(shared_data):
     assert abs(calibration.gyro_time_offset_s) < 0.002  # one clock, synchronised in hardware
 
 
-@pytest.mark.parametrize("frames", [5, 7, 12, 30])
-def test_a_blink_of_a_recording_is_refused_not_tripped_over(frames):
-    recording = simulate_recording(RecordingOptions(), seed=3)
-    with pytest.raises(NotObservableError):
-        align_camera_imu(recording.trajectory.select(slice(0, frames)), recording.imu)
+def test_a_blink_of_a_recording_is_refused_not_tripped_over(subtests):
+    for frames in (5, 7, 12, 30):
+        with subtests.test(frames=frames):
+            recording = simulate_recording(RecordingOptions(), seed=3)
+            with pytest.raises(NotObservableError):
+                align_camera_imu(recording.trajectory.select(slice(0, frames)), recording.imu)

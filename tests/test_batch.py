@@ -177,13 +177,14 @@ def test_flags_and_a_configuration_reach_every_capture(tmp_path):
     assert (command.options.seed, command.options.mapping.overlap, command.batch.workers) == (5, 3, 2)
 
 
-@pytest.mark.parametrize(
-    "flags", [["--workers", "0"], ["--attempts", "0"], ["--workers", "2", "--scheduler", "tcp://nowhere:1"]]
-)
-def test_impossible_values_are_refused(capsys, tmp_path, flags):
-    with pytest.raises(SystemExit) as stopped:
-        main(["batch", str(tmp_path), str(tmp_path / "out"), *flags])
-    assert stopped.value.code == 2
+def test_impossible_values_are_refused(subtests, capsys, tmp_path_factory):
+    for flags in (["--workers", "0"], ["--attempts", "0"], ["--workers", "2", "--scheduler", "tcp://nowhere:1"]):
+        with subtests.test(flags=flags):
+            tmp_path = tmp_path_factory.mktemp("given")
+            capsys.readouterr()
+            with pytest.raises(SystemExit) as stopped:
+                main(["batch", str(tmp_path), str(tmp_path / "out"), *flags])
+            assert stopped.value.code == 2
 
 
 def test_workers_share_the_processors(monkeypatch):
@@ -310,11 +311,12 @@ def test_a_folder_of_something_else_is_left_alone(manifest, tmp_path):
     assert [path.name for path in (tmp_path / "photos").iterdir()] == ["a.jpg"]
 
 
-@pytest.mark.parametrize("cuda", [False, True])
-def test_dense_captures_want_a_gpu_where_colmap_uses_one(monkeypatch, cuda):
-    monkeypatch.setattr(pycolmap, "has_cuda", cuda)
-    assert needs_gpu(ReconstructOptions(dense=True)) == cuda
-    assert not needs_gpu(ReconstructOptions())
+def test_dense_captures_want_a_gpu_where_colmap_uses_one(subtests):
+    for cuda in (False, True):
+        with subtests.test(cuda=cuda), pytest.MonkeyPatch.context() as monkeypatch:
+            monkeypatch.setattr(pycolmap, "has_cuda", cuda)
+            assert needs_gpu(ReconstructOptions(dense=True)) == cuda
+            assert not needs_gpu(ReconstructOptions())
 
 
 def test_without_dask_the_extra_is_named(monkeypatch, manifest, tmp_path):

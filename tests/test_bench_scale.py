@@ -42,19 +42,20 @@ def simulated(seed, *, duration_s=30.0, kind="orbit", **sfm):
     return simulate_recording(RecordingOptions(motion=motion, imu=imu, sfm=SfmOptions(**{**STILL, **sfm})), seed=seed)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_the_baseline_recovers_everything_from_perfect_recordings(seed):
-    from linear_scale import estimate_linear
+def test_the_baseline_recovers_everything_from_perfect_recordings(subtests):
+    for seed in (1, 2, 3):
+        with subtests.test(seed=seed):
+            from linear_scale import estimate_linear
 
-    s = simulated(seed)
-    found = estimate_linear(s.trajectory, s.imu, s.truth.calibration)
-    assert found.metres_per_unit == pytest.approx(s.truth.metres_per_unit, rel=0.003)
-    assert np.allclose(found.gravity_in_world_m_s2, s.truth.gravity_in_world_m_s2, atol=0.05)
-    size = np.linalg.norm(found.accel_bias_in_cam_m_s2)
-    assert size == pytest.approx(np.linalg.norm(s.truth.accel_bias_m_s2), abs=0.03)
-    aligned = align_camera_imu(s.trajectory, s.imu)
-    again = estimate_linear(s.trajectory, s.imu, aligned)
-    assert again.metres_per_unit == pytest.approx(s.truth.metres_per_unit, rel=0.005)
+            s = simulated(seed)
+            found = estimate_linear(s.trajectory, s.imu, s.truth.calibration)
+            assert found.metres_per_unit == pytest.approx(s.truth.metres_per_unit, rel=0.003)
+            assert np.allclose(found.gravity_in_world_m_s2, s.truth.gravity_in_world_m_s2, atol=0.05)
+            size = np.linalg.norm(found.accel_bias_in_cam_m_s2)
+            assert size == pytest.approx(np.linalg.norm(s.truth.accel_bias_m_s2), abs=0.03)
+            aligned = align_camera_imu(s.trajectory, s.imu)
+            again = estimate_linear(s.trajectory, s.imu, aligned)
+            assert again.metres_per_unit == pytest.approx(s.truth.metres_per_unit, rel=0.005)
 
 
 def test_noise_of_the_positions_shrinks_the_baseline_s_scale():

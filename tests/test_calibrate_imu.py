@@ -100,31 +100,38 @@ def test_a_phone_is_found_out_and_its_readings_become_true():
         calibrate_imu(corrected)
 
 
-@pytest.mark.parametrize("attitudes", [6, 8])
-def test_few_attitudes_leave_misalignments_to_their_prior_and_say_so(attitudes):
-    truth = simulate_rests(RestOptions(attitudes=attitudes), seed=attitudes)
-    found = calibrated(truth)
-    assert found.verdict == "weak"
-    assert f"{attitudes} attitudes determine gains and biases of the accelerometer, not its misal" in found.reasons[0]
-    calibration = found.calibration
-    np.testing.assert_array_equal(calibration.accel_gain.ravel()[BESIDE], 0.0)
-    np.testing.assert_allclose(np.sqrt(np.diagonal(calibration.cov))[BESIDE], 2**0.5 * 0.005)
-    sigma = np.sqrt(np.diagonal(calibration.cov))[GAINS]
-    error = (calibration.accel_gain - truth.accel_gain).ravel()[GAINS]
-    assert np.all(np.abs(error) < 3.5 * sigma)
-    assert sigma.max() < 2e-3
+def test_few_attitudes_leave_misalignments_to_their_prior_and_say_so(subtests):
+    for attitudes in (6, 8):
+        with subtests.test(attitudes=attitudes):
+            truth = simulate_rests(RestOptions(attitudes=attitudes), seed=attitudes)
+            found = calibrated(truth)
+            assert found.verdict == "weak"
+            assert (
+                f"{attitudes} attitudes determine gains and biases of the accelerometer, not its misal"
+                in found.reasons[0]
+            )
+            calibration = found.calibration
+            np.testing.assert_array_equal(calibration.accel_gain.ravel()[BESIDE], 0.0)
+            np.testing.assert_allclose(np.sqrt(np.diagonal(calibration.cov))[BESIDE], 2**0.5 * 0.005)
+            sigma = np.sqrt(np.diagonal(calibration.cov))[GAINS]
+            error = (calibration.accel_gain - truth.accel_gain).ravel()[GAINS]
+            assert np.all(np.abs(error) < 3.5 * sigma)
+            assert sigma.max() < 2e-3
 
 
-@pytest.mark.parametrize("seed", [1, 3, 5])
-def test_a_device_that_warms_up_is_named_and_not_good(seed):
-    imu = simulate_rests(RestOptions(), seed=seed).recording
-    warm = 1 - np.exp(-(imu.accel_t_s - imu.accel_t_s[0])[:, None] / 40)
-    drifting = dataclasses.replace(imu, accel_m_s2=imu.accel_m_s2 + 0.02 * np.array([1.0, -1, 1]) * warm)
-    found = calibrate_imu(drifting, gravity_m_s2=9.81, gravity_sigma_m_s2=5e-4)
-    assert found.verdict == "weak"
-    (named,) = (reason for reason in found.reasons if "as that of a device that warms up" in reason)
-    assert 0.015 < float(named.split("drifted by ")[1].split(" m/s2")[0]) < 0.05
-    assert not any("warms up:" in reason for reason in calibrated(simulate_rests(RestOptions(), seed=seed)).reasons)
+def test_a_device_that_warms_up_is_named_and_not_good(subtests):
+    for seed in (1, 3, 5):
+        with subtests.test(seed=seed):
+            imu = simulate_rests(RestOptions(), seed=seed).recording
+            warm = 1 - np.exp(-(imu.accel_t_s - imu.accel_t_s[0])[:, None] / 40)
+            drifting = dataclasses.replace(imu, accel_m_s2=imu.accel_m_s2 + 0.02 * np.array([1.0, -1, 1]) * warm)
+            found = calibrate_imu(drifting, gravity_m_s2=9.81, gravity_sigma_m_s2=5e-4)
+            assert found.verdict == "weak"
+            (named,) = (reason for reason in found.reasons if "as that of a device that warms up" in reason)
+            assert 0.015 < float(named.split("drifted by ")[1].split(" m/s2")[0]) < 0.05
+            assert not any(
+                "warms up:" in reason for reason in calibrated(simulate_rests(RestOptions(), seed=seed)).reasons
+            )
 
 
 def test_what_is_too_little_is_refused_with_what_to_do():
@@ -297,11 +304,12 @@ def lying(rng, *, seconds=20.0, accel_m_s2=0.02, gyro_rad_s=1e-3) -> ImuRecordin
     return ImuRecording(gyro_t_s=t_s, gyro_rad_s=gyro, accel_t_s=t_s, accel_m_s2=accel + np.array([0, 0, 9.81]))
 
 
-@pytest.mark.parametrize(("sensor", "most"), [("accel_m_s2", 0.5), ("gyro_rad_s", 0.03)])
-def test_what_shakes_as_a_hand_does_lies_nowhere(sensor, most):
-    rng = np.random.default_rng(5)
-    assert candidate_rests(lying(rng, **{sensor: 0.8 * most}))
-    assert not candidate_rests(lying(rng, **{sensor: 1.3 * most}))
+def test_what_shakes_as_a_hand_does_lies_nowhere(subtests):
+    for sensor, most in (("accel_m_s2", 0.5), ("gyro_rad_s", 0.03)):
+        with subtests.test(sensor=sensor, most=most):
+            rng = np.random.default_rng(5)
+            assert candidate_rests(lying(rng, **{sensor: 0.8 * most}))
+            assert not candidate_rests(lying(rng, **{sensor: 1.3 * most}))
 
 
 @pytest.mark.parametrize("step_s", [0.02, 0.8], ids=["quick", "slower than blocks"])

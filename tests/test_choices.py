@@ -29,9 +29,8 @@ from colmap_inertial.reconstruction.drivers.result import Fragment
 from colmap_inertial.tools.batch.manifest import BatchCapture
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
+def test_an_option_is_refused_where_it_is_given(subtests):
+    for make, message in (
         (lambda: ReconstructOptions(world="zup"), r"world: 'zup' is not one of .*; did you mean 'z-up'"),
         (lambda: ReconstructOptions(deblur="weiner"), "did you mean 'wiener'"),
         (lambda: ReconstructOptions(dense="yes"), "dense: 'yes' is not true or false"),
@@ -40,38 +39,31 @@ from colmap_inertial.tools.batch.manifest import BatchCapture
         (lambda: MappingOptions(gravity_priors=1), "gravity_priors: 1 is not true or false"),
         (lambda: ScaleOptions(max_offset_s="1"), "max_offset_s: '1' is not a number"),
         (lambda: ScaleOptions(latitude_deg=100), "from -90 to 90"),
-    ],
-)
-def test_an_option_is_refused_where_it_is_given(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
+    ):
+        with subtests.test(make=make, message=message), pytest.raises(ValueError, match=message):
+            make()
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
+def test_a_field_that_there_is_not_is_refused_with_the_nearest_one(subtests):
+    for make, message in (
         (lambda: ReconstructOptions(wolrd="z-up"), "ReconstructOptions has no field 'wolrd'; did you mean 'world'?"),
         (lambda: AlignOptions(min_overlp=0.3), "AlignOptions has no field 'min_overlp'; did you mean 'min_overlap'?"),
         (lambda: DeblurOptions(qqq=1), "DeblurOptions has no field 'qqq'"),
-    ],
-)
-def test_a_field_that_there_is_not_is_refused_with_the_nearest_one(make, message):
-    with pytest.raises(TypeError, match=re.escape(message) + "$"):
-        make()
+    ):
+        with subtests.test(message=message), pytest.raises(TypeError, match=re.escape(message) + "$"):
+            make()
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
+def test_options_of_all_rooms_are_checked(subtests):
+    for make, message in (
         (lambda: AlignOptions(max_offset_s="1"), "max_offset_s: '1' is not a number"),
         (lambda: DeblurOptions(threads=1.5), "threads: 1.5 is not a whole number"),
         (lambda: BatchCapture(name="a", path="b", options=ScaleOptions()), "is not a ReconstructOptions"),
-    ],
-)
-def test_options_of_all_rooms_are_checked(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
-    assert BatchCapture(name="a", path="b").path == Path("b")
+    ):
+        with subtests.test(make=make, message=message):
+            with pytest.raises(ValueError, match=message):
+                make()
+            assert BatchCapture(name="a", path="b").path == Path("b")
 
 
 def test_results_print_on_a_screen_and_in_a_notebook():
@@ -113,20 +105,17 @@ def test_options_in_the_place_of_others_are_refused_before_the_work(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(
-    ("t_s", "rates", "message"),
-    [
+def test_an_array_is_refused_where_it_is_given(subtests):
+    for t_s, rates, message in (
         (np.arange(9) * 5e6, np.zeros((9, 3)), "gyro_t_s: spans 4e.07.*give seconds, not nanoseconds"),
         (np.arange(9) * 5.0, np.zeros((9, 3)), "samples lie 5 s apart"),
         (np.arange(9) * 5e-3, np.zeros((3, 9)), r"gyro_rad_s: shape \(3, 9\), expected \(9, 3\); transpose it"),
         (np.arange(9)[::-1], np.zeros((9, 3)), "times must increase"),
         (["a"] * 9, np.zeros((9, 3)), "gyro_t_s: is no array of numbers"),
         (np.arange(9) * 5e-3, np.full((9, 3), np.nan), "not finite"),
-    ],
-)
-def test_an_array_is_refused_where_it_is_given(t_s, rates, message):
-    with pytest.raises(ValueError, match=message):
-        ImuRecording(gyro_t_s=t_s, gyro_rad_s=rates, accel_t_s=np.arange(9) * 5e-3, accel_m_s2=np.zeros((9, 3)))
+    ):
+        with subtests.test(t_s=t_s, rates=rates, message=message), pytest.raises(ValueError, match=message):
+            ImuRecording(gyro_t_s=t_s, gyro_rad_s=rates, accel_t_s=np.arange(9) * 5e-3, accel_m_s2=np.zeros((9, 3)))
 
 
 def test_poses_in_nanoseconds_are_refused_before_memory_is_asked_for():

@@ -151,18 +151,21 @@ def test_an_option_of_two_groups_needs_its_group(capsys):
     assert code == 2 and "--mapping.max-image-size and --dense-options.max-image-size" in err
 
 
-@pytest.mark.parametrize("command", ["reconstruct", "diagnose"])
-def test_a_video_without_an_imu_and_one_that_is_none_say_so(capsys, tmp_path, command):
-    from imu_files import video_track, write_mp4
+def test_a_video_without_an_imu_and_one_that_is_none_say_so(subtests, capsys, tmp_path_factory):
+    for command in ("reconstruct", "diagnose"):
+        with subtests.test(command=command):
+            tmp_path = tmp_path_factory.mktemp("given")
+            capsys.readouterr()
+            from imu_files import video_track, write_mp4
 
-    video = tmp_path / "clip.mp4"
-    write_mp4(video, [video_track(3)])
-    out = [tmp_path / "out"] if command == "reconstruct" else []
-    code, _, err = run(capsys, command, video, *out)
-    assert code == 2 and "is a video without an IMU that is known here" in err and "[video] and [imu]" in err
-    video.write_text("hello, I am a text\n")
-    code, _, err = run(capsys, command, video, *out)
-    assert code == 2 and "is named like a video and is none that is known here: it begins with text" in err
+            video = tmp_path / "clip.mp4"
+            write_mp4(video, [video_track(3)])
+            out = [tmp_path / "out"] if command == "reconstruct" else []
+            code, _, err = run(capsys, command, video, *out)
+            assert code == 2 and "is a video without an IMU that is known here" in err and "[video] and [imu]" in err
+            video.write_text("hello, I am a text\n")
+            code, _, err = run(capsys, command, video, *out)
+            assert code == 2 and "is named like a video and is none that is known here: it begins with text" in err
 
 
 def test_the_installed_command_runs():
@@ -350,12 +353,15 @@ def test_impossible_values_are_refused_before_any_work(capsys, project, tmp_path
     assert not target.exists()
 
 
-@pytest.mark.parametrize("flags", [["--seed", "-1"], ["--mapping.overlap", "0"], ["--mapping.max-num-features", "-5"]])
-def test_impossible_options_of_a_reconstruction_leave_no_folder(capsys, tmp_path, flags):
-    code, _, err = run(capsys, "reconstruct", tmp_path / "capture.toml", tmp_path / "out", *flags)
-    assert code == 2
-    assert "must be" in err
-    assert not (tmp_path / "out").exists()
+def test_impossible_options_of_a_reconstruction_leave_no_folder(subtests, capsys, tmp_path_factory):
+    for flags in (["--seed", "-1"], ["--mapping.overlap", "0"], ["--mapping.max-num-features", "-5"]):
+        with subtests.test(flags=flags):
+            tmp_path = tmp_path_factory.mktemp("given")
+            capsys.readouterr()
+            code, _, err = run(capsys, "reconstruct", tmp_path / "capture.toml", tmp_path / "out", *flags)
+            assert code == 2
+            assert "must be" in err
+            assert not (tmp_path / "out").exists()
 
 
 def test_outputs_never_replace_what_is_not_an_earlier_result(capsys, project, tmp_path):

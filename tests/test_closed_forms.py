@@ -64,14 +64,15 @@ def recording():
     return simulate_recording(RecordingOptions(), seed=3)
 
 
-@pytest.mark.parametrize(("pose_rad", "rate_rad_rts"), [(2e-3, 4e-3), (1e-3, 2e-3), (4e-4, 8e-3)])
-def test_noise_of_poses_and_gyroscope_is_told_apart(pose_rad, rate_rad_rts):
-    rng, dt_s = np.random.default_rng(1), np.full(3000, 0.2)
-    poses = pose_rad * rng.standard_normal((3001, 3))
-    residual = np.diff(poses, axis=0) + rate_rad_rts * np.sqrt(dt_s)[:, None] * rng.standard_normal((3000, 3))
-    pose, rate = _noise_of(residual, dt_s, np.ones(3000), 1e-12)
-    assert np.sqrt(pose) == pytest.approx(pose_rad, rel=0.15)
-    assert np.sqrt(rate) == pytest.approx(rate_rad_rts, rel=0.1)
+def test_noise_of_poses_and_gyroscope_is_told_apart(subtests):
+    for pose_rad, rate_rad_rts in ((2e-3, 4e-3), (1e-3, 2e-3), (4e-4, 8e-3)):
+        with subtests.test(pose_rad=pose_rad, rate_rad_rts=rate_rad_rts):
+            rng, dt_s = np.random.default_rng(1), np.full(3000, 0.2)
+            poses = pose_rad * rng.standard_normal((3001, 3))
+            residual = np.diff(poses, axis=0) + rate_rad_rts * np.sqrt(dt_s)[:, None] * rng.standard_normal((3000, 3))
+            pose, rate = _noise_of(residual, dt_s, np.ones(3000), 1e-12)
+            assert np.sqrt(pose) == pytest.approx(pose_rad, rel=0.15)
+            assert np.sqrt(rate) == pytest.approx(rate_rad_rts, rel=0.1)
 
 
 def test_steady_gravity_is_steady(recording):
@@ -92,10 +93,10 @@ def test_of_a_quick_video_the_least_blurred_frame_of_each_slot_counts():
     assert _slots(np.arange(3) / 30, blur[:3]).tolist() == [0, 1, 2]
 
 
-@pytest.mark.parametrize("times", [{"exposure_s": -0.001}, {"readout_s": -0.001}, {"readout_s": np.nan}])
-def test_no_shutter_takes_less_than_no_time(times):
-    with pytest.raises(ValueError, match="must not be negative"):
-        FrameShutter(**{"width": 64, "height": 48, "t_s": 0.0, "exposure_s": 0.01, **times})
+def test_no_shutter_takes_less_than_no_time(subtests):
+    for times in ({"exposure_s": -0.001}, {"readout_s": -0.001}, {"readout_s": np.nan}):
+        with subtests.test(times=times), pytest.raises(ValueError, match="must not be negative"):
+            FrameShutter(**{"width": 64, "height": 48, "t_s": 0.0, "exposure_s": 0.01, **times})
 
 
 def test_what_a_gyroscope_felt_just_before_an_uncertain_exposure_counts(recording):
@@ -144,19 +145,20 @@ def test_a_hand_knocks_where_it_takes_and_leaves():
     assert felt[:20].mean() > 5 and felt[-20:].mean() > 5
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_turned_device_turns_as_its_gyroscope_says_from_one_rest_to_the_next(seed):
-    rng = np.random.default_rng(seed)
-    up, up_next = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
-    turn = _Turn.draw(up, up_next, RestOptions(tremor_rad=0.2), rng)
-    assert 1.5 <= turn.duration_s <= 3.0
-    ends = matrix_from_quat(turn.attitude(np.array([0.0, turn.duration_s])))
-    assert ends[0] == pytest.approx(np.eye(3), abs=1e-9) and ends[1] @ up_next == pytest.approx(up, abs=1e-9)
-    assert turn.rate_rad_s(np.array([0.0, turn.duration_s])) == pytest.approx(np.zeros((2, 3)), abs=1e-9)
-    at_s, step_s = np.linspace(0.05, 0.95, 40) * turn.duration_s, 1e-4
-    before, after = (turn.attitude(at_s + sign * step_s) for sign in (-1, 1))
-    rate = quat_log(quat_multiply(quat_conjugate(before), after)) / (2 * step_s)
-    assert np.abs(turn.rate_rad_s(at_s) - rate).max() < 1e-4 * np.abs(rate).max()
+def test_a_turned_device_turns_as_its_gyroscope_says_from_one_rest_to_the_next(subtests):
+    for seed in range(3):
+        with subtests.test(seed=seed):
+            rng = np.random.default_rng(seed)
+            up, up_next = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
+            turn = _Turn.draw(up, up_next, RestOptions(tremor_rad=0.2), rng)
+            assert 1.5 <= turn.duration_s <= 3.0
+            ends = matrix_from_quat(turn.attitude(np.array([0.0, turn.duration_s])))
+            assert ends[0] == pytest.approx(np.eye(3), abs=1e-9) and ends[1] @ up_next == pytest.approx(up, abs=1e-9)
+            assert turn.rate_rad_s(np.array([0.0, turn.duration_s])) == pytest.approx(np.zeros((2, 3)), abs=1e-9)
+            at_s, step_s = np.linspace(0.05, 0.95, 40) * turn.duration_s, 1e-4
+            before, after = (turn.attitude(at_s + sign * step_s) for sign in (-1, 1))
+            rate = quat_log(quat_multiply(quat_conjugate(before), after)) / (2 * step_s)
+            assert np.abs(turn.rate_rad_s(at_s) - rate).max() < 1e-4 * np.abs(rate).max()
 
 
 def test_readings_at_rest_become_gravity_by_the_true_calibration():
@@ -242,32 +244,33 @@ def test_acceleration_is_what_turning_drift_bias_and_lever_arm_leave(amplitude_m
     assert found == pytest.approx(rms_m_s2, rel=0.05, abs=0.01)
 
 
-@pytest.mark.parametrize("kind", ["lasting", "walk", "lasting, broken", "each by itself"])
-def test_errors_that_last_weigh_as_by_the_whole_covariance(kind):
-    rng, sigma, lasting_s = np.random.default_rng(11), 0.3, 0.6
-    t_s = np.cumsum([0.1, 0.05, 0.4, 2.0, 0.2, 0.9])
-    values, dt_s = rng.standard_normal((len(t_s), 3)), np.diff(t_s)
-    apart_s, first_s = np.abs(t_s[:, None] - t_s), np.minimum(t_s[:, None], t_s)
-    variance = 0.5 * lasting_s * sigma**2
-    whole = np.ones(len(dt_s), dtype=bool)
-    if kind == "lasting":
-        cov, group = (
-            variance * np.exp(-apart_s / lasting_s),
-            lasting_group(values, DRIFT, sigma, lasting_s, dt_s, ~whole),
-        )
-    elif kind == "each by itself":
-        cov, group = variance * np.eye(len(t_s)), state_group(values, DRIFT, variance**0.5)
-    elif kind == "walk":
-        cov, group = sigma**2 * first_s, walk_group(values, DRIFT, sigma, dt_s)
-    else:
-        whole[2] = False
-        cov, group = sigma**2 * first_s, lasting_group(values, DRIFT, sigma, lasting_s, dt_s, ~whole)
-        # either side of the break is a walk of its own
-        cov[:3, 3:] = cov[3:, :3] = 0.0
-    squares = np.sum(values * np.linalg.solve(cov, values))
-    starts = {"each by itself": [], "lasting, broken": [0, 3]}.get(kind, [0])
-    first = sum(np.sum(values[i] ** 2) / cov[i, i] for i in starts)
-    assert np.sum(group.residual**2) + first == pytest.approx(squares, rel=1e-4)
+def test_errors_that_last_weigh_as_by_the_whole_covariance(subtests):
+    for kind in ("lasting", "walk", "lasting, broken", "each by itself"):
+        with subtests.test(kind=kind):
+            rng, sigma, lasting_s = np.random.default_rng(11), 0.3, 0.6
+            t_s = np.cumsum([0.1, 0.05, 0.4, 2.0, 0.2, 0.9])
+            values, dt_s = rng.standard_normal((len(t_s), 3)), np.diff(t_s)
+            apart_s, first_s = np.abs(t_s[:, None] - t_s), np.minimum(t_s[:, None], t_s)
+            variance = 0.5 * lasting_s * sigma**2
+            whole = np.ones(len(dt_s), dtype=bool)
+            if kind == "lasting":
+                cov, group = (
+                    variance * np.exp(-apart_s / lasting_s),
+                    lasting_group(values, DRIFT, sigma, lasting_s, dt_s, ~whole),
+                )
+            elif kind == "each by itself":
+                cov, group = variance * np.eye(len(t_s)), state_group(values, DRIFT, variance**0.5)
+            elif kind == "walk":
+                cov, group = sigma**2 * first_s, walk_group(values, DRIFT, sigma, dt_s)
+            else:
+                whole[2] = False
+                cov, group = sigma**2 * first_s, lasting_group(values, DRIFT, sigma, lasting_s, dt_s, ~whole)
+                # either side of the break is a walk of its own
+                cov[:3, 3:] = cov[3:, :3] = 0.0
+            squares = np.sum(values * np.linalg.solve(cov, values))
+            starts = {"each by itself": [], "lasting, broken": [0, 3]}.get(kind, [0])
+            first = sum(np.sum(values[i] ** 2) / cov[i, i] for i in starts)
+            assert np.sum(group.residual**2) + first == pytest.approx(squares, rel=1e-4)
 
 
 def test_gains_surprise_where_they_are_farther_off_than_chance_has_it():
@@ -421,21 +424,20 @@ def test_numbers_and_lengths_are_written_as_people_do():
     assert length_error(0.25) == "2.5 cm" and half_width_pct(2.0, (1.9, 2.1)) == pytest.approx(5.0)
 
 
-@pytest.mark.parametrize(
-    ("at_s", "words"), [(110.0, "+5.0 +- 2.0 % larger before 10 s"), (150.0, "-4.8 +- 2.0 % larger after 50 s")]
-)
-def test_a_scale_that_breaks_is_told_by_lengths_and_undone_in_the_smaller_part(at_s, words):
-    t_s = np.linspace(100.0, 160.0, 61)
-    truth = np.stack([3 * np.sin(0.1 * t_s), 0.05 * t_s, np.cos(0.2 * t_s)], axis=1)
-    # metres per unit are 5 % more behind the break, where lengths of the model are that much shorter
-    longer = np.where(t_s[1:] <= at_s, 1.0, 1 / 1.05)
-    model = np.concatenate([truth[:1], truth[0] + np.cumsum(np.diff(truth, axis=0) * longer[:, None], axis=0)])
-    value, cov = np.array([np.log(1.05)]), np.array([[(0.02 / 1.96) ** 2]])
-    fault = ShapeFault(kind="break", value=value, cov=cov, by_scale=np.zeros(1), at_s=at_s + 0.1)
-    assert words in fault.sentence(t_s, 1.0)
-    # either part is as large as in the larger one
-    steps = np.diff(fault.undo(t_s, model), axis=0) / np.diff(truth, axis=0)
-    assert steps == pytest.approx(np.full_like(steps, longer[-1] if at_s == 110.0 else 1.0), rel=1e-9)
+def test_a_scale_that_breaks_is_told_by_lengths_and_undone_in_the_smaller_part(subtests):
+    for at_s, words in ((110.0, "+5.0 +- 2.0 % larger before 10 s"), (150.0, "-4.8 +- 2.0 % larger after 50 s")):
+        with subtests.test(at_s=at_s, words=words):
+            t_s = np.linspace(100.0, 160.0, 61)
+            truth = np.stack([3 * np.sin(0.1 * t_s), 0.05 * t_s, np.cos(0.2 * t_s)], axis=1)
+            # metres per unit are 5 % more behind the break, where lengths of the model are that much shorter
+            longer = np.where(t_s[1:] <= at_s, 1.0, 1 / 1.05)
+            model = np.concatenate([truth[:1], truth[0] + np.cumsum(np.diff(truth, axis=0) * longer[:, None], axis=0)])
+            value, cov = np.array([np.log(1.05)]), np.array([[(0.02 / 1.96) ** 2]])
+            fault = ShapeFault(kind="break", value=value, cov=cov, by_scale=np.zeros(1), at_s=at_s + 0.1)
+            assert words in fault.sentence(t_s, 1.0)
+            # either part is as large as in the larger one
+            steps = np.diff(fault.undo(t_s, model), axis=0) / np.diff(truth, axis=0)
+            assert steps == pytest.approx(np.full_like(steps, longer[-1] if at_s == 110.0 else 1.0), rel=1e-9)
 
 
 def test_a_drift_of_the_scale_is_undone_and_told_from_end_to_end():
@@ -468,24 +470,25 @@ def test_the_excitation_is_the_acceleration_of_the_camera_and_not_of_its_imu():
     assert found == pytest.approx(0.3 * (2 * np.pi * hz) ** 2 / np.sqrt(2), rel=0.02)
 
 
-@pytest.mark.parametrize(("points", "known"), [(12, False), (400, True)])
-def test_noise_is_told_by_what_poses_and_points_do_not_adapt_to(points, known):
-    pycolmap.set_random_seed(4)
-    options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, 2 if points == 12 else 8
-    options.num_points3D = points
-    model = pycolmap.synthesize_dataset(options)
-    noise = pycolmap.SyntheticNoiseOptions()
-    noise.point2D_stddev = 0.4
-    pycolmap.synthesize_noise(noise, model)
-    adjusted = pycolmap.BundleAdjustmentOptions()
-    adjusted.print_summary = adjusted.refine_focal_length = adjusted.refine_extra_params = False
-    if known:
-        pycolmap.bundle_adjustment(model, adjusted)
-    model.update_point_3d_errors()
-    found = _noise_px(model)
-    # two images of twelve points have as many numbers as poses and points
-    assert found == (pytest.approx(0.4, rel=0.1) if known else None)
+def test_noise_is_told_by_what_poses_and_points_do_not_adapt_to(subtests):
+    for points, known in ((12, False), (400, True)):
+        with subtests.test(points=points, known=known):
+            pycolmap.set_random_seed(4)
+            options = pycolmap.SyntheticDatasetOptions()
+            options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, 2 if points == 12 else 8
+            options.num_points3D = points
+            model = pycolmap.synthesize_dataset(options)
+            noise = pycolmap.SyntheticNoiseOptions()
+            noise.point2D_stddev = 0.4
+            pycolmap.synthesize_noise(noise, model)
+            adjusted = pycolmap.BundleAdjustmentOptions()
+            adjusted.print_summary = adjusted.refine_focal_length = adjusted.refine_extra_params = False
+            if known:
+                pycolmap.bundle_adjustment(model, adjusted)
+            model.update_point_3d_errors()
+            found = _noise_px(model)
+            # two images of twelve points have as many numbers as poses and points
+            assert found == (pytest.approx(0.4, rel=0.1) if known else None)
 
 
 def test_the_scatter_of_readings_is_that_of_their_white_noise():
@@ -597,20 +600,21 @@ def test_cells_of_a_surface_are_as_large_as_pixels_on_it(tmp_path, away, focal_p
     assert dense._choose_octree(path, model)[0] == dense._MOST_DEPTH
 
 
-@pytest.mark.parametrize("share", [0.0, 0.2, 0.5])
-def test_a_picture_between_two_frames_lies_at_its_share_of_the_way(share):
-    frames = np.random.default_rng(4).integers(0, 255, (2, 16, 16)).astype(np.uint8)
-    between = _distance(*(_normalise(frame) for frame in frames))
-    candidates = object.__new__(_Candidates)
-    candidates._frames, candidates.distance = [frames], np.array([[share * between, (1 - share) * between]])
-    assert candidates.fraction_to_next(0) == pytest.approx(share)
-    # off the way between them by as much from both
-    candidates.distance = np.hypot(candidates.distance, 0.3)
-    assert candidates.fraction_to_next(0) == pytest.approx(share)
-    candidates.distance[0, 1] = np.inf
-    assert candidates.fraction_to_next(0) == 0
-    candidates._frames, candidates.distance = [frames[[0, 0]]], np.array([[0.1, 0.1]])
-    assert candidates.fraction_to_next(0) == 0.5
+def test_a_picture_between_two_frames_lies_at_its_share_of_the_way(subtests):
+    for share in (0.0, 0.2, 0.5):
+        with subtests.test(share=share):
+            frames = np.random.default_rng(4).integers(0, 255, (2, 16, 16)).astype(np.uint8)
+            between = _distance(*(_normalise(frame) for frame in frames))
+            candidates = object.__new__(_Candidates)
+            candidates._frames, candidates.distance = [frames], np.array([[share * between, (1 - share) * between]])
+            assert candidates.fraction_to_next(0) == pytest.approx(share)
+            # off the way between them by as much from both
+            candidates.distance = np.hypot(candidates.distance, 0.3)
+            assert candidates.fraction_to_next(0) == pytest.approx(share)
+            candidates.distance[0, 1] = np.inf
+            assert candidates.fraction_to_next(0) == 0
+            candidates._frames, candidates.distance = [frames[[0, 0]]], np.array([[0.1, 0.1]])
+            assert candidates.fraction_to_next(0) == 0.5
 
 
 def test_nodes_without_a_ray_take_the_vector_of_the_nearest_one():

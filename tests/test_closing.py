@@ -240,28 +240,30 @@ def test_pairs_far_apart_in_time_are_believed_where_somebody_looked(tmp_path, mo
     assert asked == [nearest]
 
 
-@pytest.mark.parametrize(("all_see_it", "directly"), [(False, True), (True, False)])
-def test_a_large_model_is_solved_directly_unless_all_images_see_the_same(tmp_path, monkeypatch, all_see_it, directly):
-    import pycolmap
+def test_a_large_model_is_solved_directly_unless_all_images_see_the_same(subtests, tmp_path_factory):
+    for all_see_it, directly in ((False, True), (True, False)):
+        with subtests.test(all_see_it=all_see_it, directly=directly), pytest.MonkeyPatch.context() as monkeypatch:
+            tmp_path = tmp_path_factory.mktemp("given")
+            import pycolmap
 
-    ring = make(tmp_path)
-    if all_see_it:
-        elements = [pycolmap.TrackElement(k + 1, 0) for k in range(FRAMES)]
-        for element in elements:
-            if ring.model.image(element.image_id).point2D(0).has_point3D():
-                ring.model.delete_observation(element.image_id, 0)
-        ring.model.add_point3D(np.zeros(3), pycolmap.Track(elements), np.zeros(3, dtype=np.uint8))
-    assert (loop_closure._work(ring.model) == loop_closure._work_of(FRAMES)) == all_see_it
-    as_it_is = pycolmap.BundleAdjustmentOptions().ceres.max_num_images_direct_sparse_cpu_solver
-    adjustment = loop_closure._adjustment(ring.options, ring.model, of_parts=False)
-    # what is small is as COLMAP has it, and a model of parts ends early
-    first_region = adjustment.ceres.solver_options.initial_trust_region_radius
-    assert adjustment.ceres.solver_options.function_tolerance == 0
-    of_parts = loop_closure._adjustment(ring.options, ring.model, of_parts=True)
-    assert of_parts.ceres.solver_options.function_tolerance == loop_closure.CLOSURE.least_gain
-    assert of_parts.ceres.solver_options.initial_trust_region_radius > 1e5 * first_region
-    assert adjustment.ceres.max_num_images_direct_sparse_cpu_solver == as_it_is
-    monkeypatch.setattr(loop_closure, "LONGEST", FRAMES - 8)
-    adjustment = loop_closure._adjustment(ring.options, ring.model, of_parts=False)
-    assert adjustment.ceres.max_num_images_direct_sparse_cpu_solver == (FRAMES if directly else as_it_is)
-    assert adjustment.ceres.solver_options.function_tolerance > 0
+            ring = make(tmp_path)
+            if all_see_it:
+                elements = [pycolmap.TrackElement(k + 1, 0) for k in range(FRAMES)]
+                for element in elements:
+                    if ring.model.image(element.image_id).point2D(0).has_point3D():
+                        ring.model.delete_observation(element.image_id, 0)
+                ring.model.add_point3D(np.zeros(3), pycolmap.Track(elements), np.zeros(3, dtype=np.uint8))
+            assert (loop_closure._work(ring.model) == loop_closure._work_of(FRAMES)) == all_see_it
+            as_it_is = pycolmap.BundleAdjustmentOptions().ceres.max_num_images_direct_sparse_cpu_solver
+            adjustment = loop_closure._adjustment(ring.options, ring.model, of_parts=False)
+            # what is small is as COLMAP has it, and a model of parts ends early
+            first_region = adjustment.ceres.solver_options.initial_trust_region_radius
+            assert adjustment.ceres.solver_options.function_tolerance == 0
+            of_parts = loop_closure._adjustment(ring.options, ring.model, of_parts=True)
+            assert of_parts.ceres.solver_options.function_tolerance == loop_closure.CLOSURE.least_gain
+            assert of_parts.ceres.solver_options.initial_trust_region_radius > 1e5 * first_region
+            assert adjustment.ceres.max_num_images_direct_sparse_cpu_solver == as_it_is
+            monkeypatch.setattr(loop_closure, "LONGEST", FRAMES - 8)
+            adjustment = loop_closure._adjustment(ring.options, ring.model, of_parts=False)
+            assert adjustment.ceres.max_num_images_direct_sparse_cpu_solver == (FRAMES if directly else as_it_is)
+            assert adjustment.ceres.solver_options.function_tolerance > 0

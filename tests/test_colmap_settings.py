@@ -119,17 +119,19 @@ def test_of_a_project_ini_counts_what_differs_and_a_setting_goes_before_it(tmp_p
         read_settings((), ini)
 
 
-@pytest.mark.parametrize("absolute", [True, False])
-def test_a_step_is_made_again_by_its_own_settings_and_by_files_that_they_name(tmp_path, monkeypatch, absolute):
-    monkeypatch.chdir(tmp_path)
-    mask = tmp_path / "mask.png"
-    mask.write_bytes(b"1")
-    named = mask if absolute else mask.name
-    settings = ColmapSettings((f"ImageReader.camera_mask_path={named}", "Mapper.init_num_trials=60"))
-    assert settings.of("mapping") == ("Mapper.init_num_trials=60",)
-    before = settings.identity("features"), settings.identity("mapping")
-    mask.write_bytes(b"22")
-    assert settings.identity("features") != before[0] and settings.identity("mapping") == before[1]
+def test_a_step_is_made_again_by_its_own_settings_and_by_files_that_they_name(subtests, tmp_path_factory):
+    for absolute in (True, False):
+        with subtests.test(absolute=absolute), pytest.MonkeyPatch.context() as monkeypatch:
+            tmp_path = tmp_path_factory.mktemp("given")
+            monkeypatch.chdir(tmp_path)
+            mask = tmp_path / "mask.png"
+            mask.write_bytes(b"1")
+            named = mask if absolute else mask.name
+            settings = ColmapSettings((f"ImageReader.camera_mask_path={named}", "Mapper.init_num_trials=60"))
+            assert settings.of("mapping") == ("Mapper.init_num_trials=60",)
+            before = settings.identity("features"), settings.identity("mapping")
+            mask.write_bytes(b"22")
+            assert settings.identity("features") != before[0] and settings.identity("mapping") == before[1]
 
 
 def test_the_command_line_takes_it_several_times_and_swallows_no_path(tmp_path):

@@ -72,26 +72,30 @@ def test_sound_cameras_are_all_kept_and_aligned_as_ever(walk):
     assert np.array_equal(aligned.calibration.cov, plain.calibration.cov)
 
 
-@pytest.mark.parametrize("deg", [12, 54, 175])
-@pytest.mark.parametrize("wrong", [[0], [17], [29], [4, 5, 21]])
-def test_wrong_keyframes_are_named_with_their_degrees(walk, wrong, deg):
-    trajectory = turned(keyframes(walk, step=round(0.5 / np.median(np.diff(walk.trajectory.t_s)))), wrong, deg)
-    aligned, consensus = align_by_consensus(trajectory, walk.imu)
-    assert [one.name for one in consensus.wrong] == [trajectory.names[i] for i in wrong]
-    assert [one.deviation_deg for one in consensus.wrong] == pytest.approx([deg] * len(wrong), abs=1.5)
-    assert not consensus.seams
-    assert error_deg(aligned, walk.truth.calibration) < 1.0
+def test_wrong_keyframes_are_named_with_their_degrees(subtests, walk):
+    for deg in (12, 54, 175):
+        for wrong in ([0], [17], [29], [4, 5, 21]):
+            with subtests.test(deg=deg, wrong=wrong):
+                trajectory = turned(
+                    keyframes(walk, step=round(0.5 / np.median(np.diff(walk.trajectory.t_s)))), wrong, deg
+                )
+                aligned, consensus = align_by_consensus(trajectory, walk.imu)
+                assert [one.name for one in consensus.wrong] == [trajectory.names[i] for i in wrong]
+                assert [one.deviation_deg for one in consensus.wrong] == pytest.approx([deg] * len(wrong), abs=1.5)
+                assert not consensus.seams
+                assert error_deg(aligned, walk.truth.calibration) < 1.0
 
 
-@pytest.mark.parametrize(("first", "last"), [(0, 9), (10, 19), (20, 30)])
-def test_a_seam_is_placed_and_the_largest_part_is_kept(walk, first, last):
-    trajectory = keyframes(walk, step=round(0.5 / np.median(np.diff(walk.trajectory.t_s))))
-    aligned, consensus = align_by_consensus(torn(trajectory, slice(first, last), 25), walk.imu)
-    assert not consensus.wrong
-    assert [seam.name for seam in consensus.seams] == [trajectory.names[i] for i in (first, last) if 0 < i < 30]
-    assert [seam.turn_deg for seam in consensus.seams] == pytest.approx([25] * len(consensus.seams), abs=1.5)
-    assert np.flatnonzero(~consensus.kept).tolist() == list(range(first, last))
-    assert error_deg(aligned, walk.truth.calibration) < 1.0
+def test_a_seam_is_placed_and_the_largest_part_is_kept(subtests, walk):
+    for first, last in ((0, 9), (10, 19), (20, 30)):
+        with subtests.test(first=first, last=last):
+            trajectory = keyframes(walk, step=round(0.5 / np.median(np.diff(walk.trajectory.t_s))))
+            aligned, consensus = align_by_consensus(torn(trajectory, slice(first, last), 25), walk.imu)
+            assert not consensus.wrong
+            assert [seam.name for seam in consensus.seams] == [trajectory.names[i] for i in (first, last) if 0 < i < 30]
+            assert [seam.turn_deg for seam in consensus.seams] == pytest.approx([25] * len(consensus.seams), abs=1.5)
+            assert np.flatnonzero(~consensus.kept).tolist() == list(range(first, last))
+            assert error_deg(aligned, walk.truth.calibration) < 1.0
 
 
 def test_one_frame_of_a_video_goes_and_the_scale_holds(walk):

@@ -117,16 +117,17 @@ def test_features_see_what_was_deblurred_smoothed_by_its_blur(treat):
         assert (found.frame.smoothing_px > 0) == smoothed and found.values["kept_share"] == kept
 
 
-@pytest.mark.parametrize(("method", "clear"), [("wiener", True), ("path", True), ("deepgyro", False)])
-def test_frames_that_speak_for_themselves_must_speak_clearly_for_a_filter(method, clear):
-    plan = SimpleNamespace(view=object(), method=method, parallaxes={}, deblur=((), verdict_of(None)))
-    stage = DeblurStage.of_plan(plan, drop=False, smoothing=False)
-    assert stage.gate.min_support == (GATE_LIMITS.clear_support if clear else 0.0)
-    assert not stage.drop and stage.smoothing == 0 and bool(stage.weights) == (method == "deepgyro")
-    plan.deblur = ((), verdict_of(True))
-    stage = DeblurStage.of_plan(plan)
-    assert stage.gate == GateOptions() and stage.drop and stage.smoothing == deblur.SMOOTHING.share
-    plan.deblur = None
-    assert DeblurStage.of_plan(plan) is None
-    with pytest.raises(ValueError, match="not fourier"):
-        DeblurStage(view=object(), decisions=(), verdict=verdict_of(True), method="fourier")
+def test_frames_that_speak_for_themselves_must_speak_clearly_for_a_filter(subtests):
+    for method, clear in (("wiener", True), ("path", True), ("deepgyro", False)):
+        with subtests.test(method=method, clear=clear):
+            plan = SimpleNamespace(view=object(), method=method, parallaxes={}, deblur=((), verdict_of(None)))
+            stage = DeblurStage.of_plan(plan, drop=False, smoothing=False)
+            assert stage.gate.min_support == (GATE_LIMITS.clear_support if clear else 0.0)
+            assert not stage.drop and stage.smoothing == 0 and bool(stage.weights) == (method == "deepgyro")
+            plan.deblur = ((), verdict_of(True))
+            stage = DeblurStage.of_plan(plan)
+            assert stage.gate == GateOptions() and stage.drop and stage.smoothing == deblur.SMOOTHING.share
+            plan.deblur = None
+            assert DeblurStage.of_plan(plan) is None
+            with pytest.raises(ValueError, match="not fourier"):
+                DeblurStage(view=object(), decisions=(), verdict=verdict_of(True), method="fourier")

@@ -150,28 +150,29 @@ def test_the_layout_is_the_one_that_all_trainers_take(known, exported):
     assert made.images == 6 and made.points == 16 and made.notes == ()
 
 
-@pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.__name__)
-def test_readers_see_cameras_points_and_up_where_the_model_has_them(known, exported, reader):
-    folder, _ = exported
-    seen = reader(folder)
-    names = json.loads((folder / "export.json").read_text())["names"]
-    assert sorted(seen.names) == sorted(names)
-    model = known.model
-    for name, centre in seen.centres().items():
-        image = model.find_image_with_name(names[name])
-        np.testing.assert_allclose(centre, image.projection_center(), atol=1e-6)
-        rotation = image.cam_from_world().rotation.matrix()
-        np.testing.assert_allclose(seen.poses[name][:, :3], rotation, atol=1e-6)
-        np.testing.assert_allclose(seen.poses[name][:, 2], rotation @ [0, 0, 1], atol=1e-6)  # up in the camera
-        fx, fy, cx, cy = seen.intrinsics[name]
-        np.testing.assert_allclose([fx, fy], model.camera(image.camera_id).params[:2], rtol=1e-12)
-        assert (cx, cy) == (seen.sizes[name][0] / 2, seen.sizes[name][1] / 2)
-        assert cv2.imread(str(folder / "images" / name)).shape[1::-1] == seen.sizes[name]
-    order = np.lexsort(seen.points.T)
-    points = np.array([p.xyz for p in model.points3D.values()])
-    colours = np.array([p.color for p in model.points3D.values()])
-    np.testing.assert_allclose(seen.points[order], points[np.lexsort(points.T)], atol=1e-6)
-    np.testing.assert_array_equal(seen.colours[order], colours[np.lexsort(points.T)])
+def test_readers_see_cameras_points_and_up_where_the_model_has_them(subtests, known, exported):
+    for reader in READERS:
+        with subtests.test(reader=reader):
+            folder, _ = exported
+            seen = reader(folder)
+            names = json.loads((folder / "export.json").read_text())["names"]
+            assert sorted(seen.names) == sorted(names)
+            model = known.model
+            for name, centre in seen.centres().items():
+                image = model.find_image_with_name(names[name])
+                np.testing.assert_allclose(centre, image.projection_center(), atol=1e-6)
+                rotation = image.cam_from_world().rotation.matrix()
+                np.testing.assert_allclose(seen.poses[name][:, :3], rotation, atol=1e-6)
+                np.testing.assert_allclose(seen.poses[name][:, 2], rotation @ [0, 0, 1], atol=1e-6)  # up in the camera
+                fx, fy, cx, cy = seen.intrinsics[name]
+                np.testing.assert_allclose([fx, fy], model.camera(image.camera_id).params[:2], rtol=1e-12)
+                assert (cx, cy) == (seen.sizes[name][0] / 2, seen.sizes[name][1] / 2)
+                assert cv2.imread(str(folder / "images" / name)).shape[1::-1] == seen.sizes[name]
+            order = np.lexsort(seen.points.T)
+            points = np.array([p.xyz for p in model.points3D.values()])
+            colours = np.array([p.color for p in model.points3D.values()])
+            np.testing.assert_allclose(seen.points[order], points[np.lexsort(points.T)], atol=1e-6)
+            np.testing.assert_array_equal(seen.colours[order], colours[np.lexsort(points.T)])
 
 
 def centroid(picture, xy):
@@ -185,19 +186,20 @@ def centroid(picture, xy):
     return xy
 
 
-@pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.__name__)
-def test_pictures_show_points_where_readers_project_them(known, exported, reader):
-    folder, _ = exported
-    seen = reader(folder)
-    looked = 0
-    for name in seen.names:
-        picture = cv2.imread(str(folder / "images" / name), cv2.IMREAD_GRAYSCALE).astype(float)
-        for xy in seen.project(name, seen.points):
-            inside = (xy > 12).all() and (xy < np.array(seen.sizes[name]) - 12).all()
-            if inside:
-                assert np.abs(centroid(picture, xy) - xy).max() < 0.1, name
-                looked += 1
-    assert looked > 60
+def test_pictures_show_points_where_readers_project_them(subtests, known, exported):
+    for reader in READERS:
+        with subtests.test(reader=reader):
+            folder, _ = exported
+            seen = reader(folder)
+            looked = 0
+            for name in seen.names:
+                picture = cv2.imread(str(folder / "images" / name), cv2.IMREAD_GRAYSCALE).astype(float)
+                for xy in seen.project(name, seen.points):
+                    inside = (xy > 12).all() and (xy < np.array(seen.sizes[name]) - 12).all()
+                    if inside:
+                        assert np.abs(centroid(picture, xy) - xy).max() < 0.1, name
+                        looked += 1
+            assert looked > 60
 
 
 def test_keypoints_move_along_and_those_without_a_point_go(known, exported):
@@ -257,20 +259,22 @@ def test_cameras_of_a_rig_stay_one(tmp_path):
     assert sum(tracks.values()) == sum(image.num_points2D() for image in made.images.values()) > 100
 
 
-@pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.__name__)
-def test_apply_scales_an_export_whole(exported, tmp_path, reader):
-    folder, _ = exported
-    applied = apply_to_project(folder, tmp_path / "made", plain_factor(2.5))
-    assert {change.path for change in applied.changes} == {
-        "sparse/0",
-        "sparse_pc.ply",
-        "transforms.json",
-        "export.json",
-    }
-    before, after = reader(folder), reader(tmp_path / "made")
-    for name, centre in before.centres().items():
-        np.testing.assert_allclose(after.centres()[name], 2.5 * centre, atol=1e-9)
-    np.testing.assert_allclose(after.points, 2.5 * before.points, rtol=1e-6)
+def test_apply_scales_an_export_whole(subtests, exported, tmp_path_factory):
+    for reader in READERS:
+        with subtests.test(reader=reader):
+            tmp_path = tmp_path_factory.mktemp("given")
+            folder, _ = exported
+            applied = apply_to_project(folder, tmp_path / "made", plain_factor(2.5))
+            assert {change.path for change in applied.changes} == {
+                "sparse/0",
+                "sparse_pc.ply",
+                "transforms.json",
+                "export.json",
+            }
+            before, after = reader(folder), reader(tmp_path / "made")
+            for name, centre in before.centres().items():
+                np.testing.assert_allclose(after.centres()[name], 2.5 * centre, atol=1e-9)
+            np.testing.assert_allclose(after.points, 2.5 * before.points, rtol=1e-6)
 
 
 def test_what_an_export_says_of_itself_holds_after_apply_and_comes_back(exported, tmp_path):
@@ -297,28 +301,34 @@ def test_what_an_export_says_of_itself_holds_after_apply_and_comes_back(exported
     assert again == said
 
 
-@pytest.mark.parametrize(("world", "up"), [("z-up", [0, 0, 1]), ("y-down", [0, -1, 0]), (None, None)])
-def test_an_export_without_a_scale_is_in_metres_once_one_was_applied(known, tmp_path, world, up):
-    out = tmp_path / "out"
-    (out / "sparse" / "0").mkdir(parents=True)
-    known.model.write_binary(str(out / "sparse" / "0"))
-    export_model(out, tmp_path / "export", image_folder=known.out / "images", unscaled=True)
-    said = json.loads((tmp_path / "export" / "export.json").read_text())
-    assert len(said["notes"]) == 2
-    estimate = ScaleEstimate(
-        metres_per_unit=2.5, sigma_log=0.01, ci95=(2.45, 2.55), verdict="trusted", method="joint",
-        gravity_in_world_m_s2=np.array([3.0, -9.0, 2.0]), cov=np.diag([1e-4, *[1e-3] * 6]),
-    )  # fmt: skip
-    given = plain_factor(2.5) if world is None else Similarity.from_scale(estimate, world=world, provenance="by IMU")
-    apply_to_project(tmp_path / "export", tmp_path / "made", given)
-    made = json.loads((tmp_path / "made" / "export.json").read_text())
-    assert (made["unit"], made["up_in_world"], made["scale"]["metres_per_unit"]) == ("m", up, 2.5)
-    # a factor says nothing of gravity
-    assert made["notes"] == ([] if world else said["notes"][1:]) and "gravity" in said["notes"][1]
-    if world:
-        np.testing.assert_allclose(made["scale"]["relative_ci95"], [np.exp(-0.0196), np.exp(0.0196)], rtol=1e-4)
-    undo_project(tmp_path / "made", tmp_path / "again")
-    assert json.loads((tmp_path / "again" / "export.json").read_text()) == said
+def test_an_export_without_a_scale_is_in_metres_once_one_was_applied(subtests, known, tmp_path_factory):
+    for world, up in (("z-up", [0, 0, 1]), ("y-down", [0, -1, 0]), (None, None)):
+        with subtests.test(world=world, up=up):
+            tmp_path = tmp_path_factory.mktemp("given")
+            out = tmp_path / "out"
+            (out / "sparse" / "0").mkdir(parents=True)
+            known.model.write_binary(str(out / "sparse" / "0"))
+            export_model(out, tmp_path / "export", image_folder=known.out / "images", unscaled=True)
+            said = json.loads((tmp_path / "export" / "export.json").read_text())
+            assert len(said["notes"]) == 2
+            estimate = ScaleEstimate(
+                metres_per_unit=2.5, sigma_log=0.01, ci95=(2.45, 2.55), verdict="trusted", method="joint",
+                gravity_in_world_m_s2=np.array([3.0, -9.0, 2.0]), cov=np.diag([1e-4, *[1e-3] * 6]),
+            )  # fmt: skip
+            given = (
+                plain_factor(2.5)
+                if world is None
+                else Similarity.from_scale(estimate, world=world, provenance="by IMU")
+            )
+            apply_to_project(tmp_path / "export", tmp_path / "made", given)
+            made = json.loads((tmp_path / "made" / "export.json").read_text())
+            assert (made["unit"], made["up_in_world"], made["scale"]["metres_per_unit"]) == ("m", up, 2.5)
+            # a factor says nothing of gravity
+            assert made["notes"] == ([] if world else said["notes"][1:]) and "gravity" in said["notes"][1]
+            if world:
+                np.testing.assert_allclose(made["scale"]["relative_ci95"], [np.exp(-0.0196), np.exp(0.0196)], rtol=1e-4)
+            undo_project(tmp_path / "made", tmp_path / "again")
+            assert json.loads((tmp_path / "again" / "export.json").read_text()) == said
 
 
 def test_of_two_similarities_undone_in_turn_the_first_one_made_an_export_metres(tmp_path):
@@ -333,24 +343,25 @@ def test_of_two_similarities_undone_in_turn_the_first_one_made_an_export_metres(
     assert json.loads((tmp_path / "5.json").read_text()) == said | {"notes": ["a"]}
 
 
-@pytest.mark.parametrize(("key", "value"), [("unit", "2m"), ("unit", "9e m"), ("up_in_world", "z")])
-def test_an_export_that_was_changed_is_copied_or_refused(tmp_path, key, value):
-    source, target = tmp_path / "export.json", tmp_path / "made.json"
-    source.write_text(json.dumps({"format": EXPORT_FORMAT, "unit": "m", key: value}))
-    if value == "2m":  # no unit of ours
-        assert transform_export(source, target, plain_factor(2.0)) == ()
-        assert json.loads(target.read_text())["unit"] == "2m"
-    else:
-        with pytest.raises(FormatError, match="--keep"):
-            transform_export(source, target, plain_factor(2.0))
+def test_an_export_that_was_changed_is_copied_or_refused(subtests, tmp_path_factory):
+    for key, value in (("unit", "2m"), ("unit", "9e m"), ("up_in_world", "z")):
+        with subtests.test(key=key, value=value):
+            tmp_path = tmp_path_factory.mktemp("given")
+            source, target = tmp_path / "export.json", tmp_path / "made.json"
+            source.write_text(json.dumps({"format": EXPORT_FORMAT, "unit": "m", key: value}))
+            if value == "2m":  # no unit of ours
+                assert transform_export(source, target, plain_factor(2.0)) == ()
+                assert json.loads(target.read_text())["unit"] == "2m"
+            else:
+                with pytest.raises(FormatError, match="--keep"):
+                    transform_export(source, target, plain_factor(2.0))
 
 
 # --- lenses ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("kind", "params"),
-    [
+def test_pinholes_see_nothing_that_the_lens_does_not_see(subtests):
+    for kind, params in (
         ("SIMPLE_RADIAL", [500.0, 320, 240, -0.3]),
         ("SIMPLE_RADIAL", [500.0, 320, 240, 0.3]),
         ("RADIAL", [300.0, 350, 200, -0.25, 0.06]),
@@ -360,28 +371,27 @@ def test_an_export_that_was_changed_is_copied_or_refused(tmp_path, key, value):
         ("FULL_OPENCV", [500.0, 500.0, 320, 240, -0.2, 0.1, 0, 0, 0.02, 0.01, 0, 0]),
         ("FOV", [400.0, 400.0, 320, 240, 0.9]),
         ("THIN_PRISM_FISHEYE", [250.0, 250.0, 320, 240, 0.01, 0, 0, 0, 0, 0, 0.001, 0.001]),
-    ],
-)
-def test_pinholes_see_nothing_that_the_lens_does_not_see(kind, params):
-    camera = pycolmap.Camera(camera_id=1, model=kind, width=640, height=480, params=params)
-    made = Undistortion.of(camera, Path("model"))
-    width, height = made.pinhole.width, made.pinhole.height
-    assert 200 < width <= 1.6 * 640 and 150 < height <= 1.6 * 480
-    assert made.pinhole.params[2:] == (width / 2, height / 2)
-    edge = np.concatenate(
-        [np.stack([np.linspace(0, width, 99), np.full(99, y)], -1) for y in (0, height)]
-        + [np.stack([np.full(99, x), np.linspace(0, height, 99)], -1) for x in (0, width)]
-    )
-    source = made.source_px(edge)
-    assert (source > -0.05).all() and (source < np.array([640, 480]) + 0.05).all()
-    np.testing.assert_allclose(made.moved_px(source), edge, atol=1e-3)
-    # resampling between nodes is as good as at every pixel
-    v, u = np.mgrid[:480, :640].astype(np.float32)
-    ramp = np.stack([u / 3, v / 3, (u + v) / 5], -1)
-    x, y = 37, 51
-    seen = made.resampled(np.round(ramp).astype(np.uint8))[y, x].astype(float)
-    at = made.source_px(np.array([[x + 0.5, y + 0.5]]))[0] - 0.5
-    assert np.abs(seen - [at[0] / 3, at[1] / 3, at.sum() / 5]).max() < 0.8
+    ):
+        with subtests.test(kind=kind, params=params):
+            camera = pycolmap.Camera(camera_id=1, model=kind, width=640, height=480, params=params)
+            made = Undistortion.of(camera, Path("model"))
+            width, height = made.pinhole.width, made.pinhole.height
+            assert 200 < width <= 1.6 * 640 and 150 < height <= 1.6 * 480
+            assert made.pinhole.params[2:] == (width / 2, height / 2)
+            edge = np.concatenate(
+                [np.stack([np.linspace(0, width, 99), np.full(99, y)], -1) for y in (0, height)]
+                + [np.stack([np.full(99, x), np.linspace(0, height, 99)], -1) for x in (0, width)]
+            )
+            source = made.source_px(edge)
+            assert (source > -0.05).all() and (source < np.array([640, 480]) + 0.05).all()
+            np.testing.assert_allclose(made.moved_px(source), edge, atol=1e-3)
+            # resampling between nodes is as good as at every pixel
+            v, u = np.mgrid[:480, :640].astype(np.float32)
+            ramp = np.stack([u / 3, v / 3, (u + v) / 5], -1)
+            x, y = 37, 51
+            seen = made.resampled(np.round(ramp).astype(np.uint8))[y, x].astype(float)
+            at = made.source_px(np.array([[x + 0.5, y + 0.5]]))[0] - 0.5
+            assert np.abs(seen - [at[0] / 3, at[1] / 3, at.sum() / 5]).max() < 0.8
 
 
 def test_a_camera_that_sees_all_around_is_refused():
@@ -857,9 +867,11 @@ def test_formats_that_need_a_path_say_so(known, tmp_path):
     assert all(row["t_s"] == row["vx_m_s"] == "" for row in rows)
 
 
-@pytest.mark.parametrize(("name", "module"), [("las", "laspy"), ("gltf", "pygltflib")])
-def test_formats_without_their_package_name_the_extra(known, tmp_path, monkeypatch, name, module):
-    monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(MissingExtraError, match=rf"extra `{name}`: pip install '{module}"):
-        export_model(known.out, tmp_path / "made", name)
-    assert not (tmp_path / "made").exists()
+def test_formats_without_their_package_name_the_extra(subtests, known, tmp_path_factory):
+    for name, module in (("las", "laspy"), ("gltf", "pygltflib")):
+        with subtests.test(name=name, module=module), pytest.MonkeyPatch.context() as monkeypatch:
+            tmp_path = tmp_path_factory.mktemp("given")
+            monkeypatch.setitem(sys.modules, module, None)
+            with pytest.raises(MissingExtraError, match=rf"extra `{name}`: pip install '{module}"):
+                export_model(known.out, tmp_path / "made", name)
+            assert not (tmp_path / "made").exists()

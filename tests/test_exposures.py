@@ -127,14 +127,15 @@ def test_a_gain_that_nothing_tells_is_refused():
         match_brightness(black, white[:32])
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_brightening_multiplies_linear_light(dtype):
-    short = np.random.default_rng(3).integers(0, np.iinfo(dtype).max, (20, 30, 3)).astype(dtype)
-    brightness = replace(match_brightness(short, short, stated=3.0), gain=3.0, colours=(1.0, 0.5, 1.2))
-    found = brightened(short, brightness)
-    light = linear_from_srgb(short / np.iinfo(dtype).max) * 3.0 * np.array([1.0, 0.5, 1.2])
-    assert found.dtype == np.float32
-    assert np.allclose(linear_from_srgb(found.astype(float)), np.minimum(light, 1), atol=1e-5)
+def test_brightening_multiplies_linear_light(subtests):
+    for dtype in (np.uint8, np.uint16):
+        with subtests.test(dtype=dtype):
+            short = np.random.default_rng(3).integers(0, np.iinfo(dtype).max, (20, 30, 3)).astype(dtype)
+            brightness = replace(match_brightness(short, short, stated=3.0), gain=3.0, colours=(1.0, 0.5, 1.2))
+            found = brightened(short, brightness)
+            light = linear_from_srgb(short / np.iinfo(dtype).max) * 3.0 * np.array([1.0, 0.5, 1.2])
+            assert found.dtype == np.float32
+            assert np.allclose(linear_from_srgb(found.astype(float)), np.minimum(light, 1), atol=1e-5)
 
 
 def test_the_gyroscope_tells_where_the_long_exposure_shows_what_the_short_one_does(scene):
@@ -287,24 +288,25 @@ def test_exposure_fusion_is_opencv_s_and_brings_lamps_back():
         fuse_mertens([found, found[:50]])
 
 
-@pytest.mark.parametrize("channels", [1, 3])
-def test_exposure_fusion_takes_lamps_of_the_short_exposure_and_none_of_its_noise(channels):
-    gain, shape = 8.0, (120, 160, channels)
-    truth = np.broadcast_to(np.linspace(0.1, 0.6, 160)[:, None], shape).copy()
-    truth[40:70, 60:90] = 3.0  # a lamp, with something written on it
-    truth[52:58, 70:80] = 1.5
-    noise = 0.01 * np.random.default_rng(5).standard_normal(shape)
-    long = srgb_from_linear(truth).astype(np.float32).squeeze()
-    dark = srgb_from_linear(truth / gain + noise).astype(np.float32).squeeze()
-    clipped = truth[..., 0] > 1
-    found = darken_fused(long, dark, clipped, gain)
-    np.testing.assert_allclose(found[clipped], dark[clipped], atol=0.002)
-    wall = (slice(90, 120), slice(None))
-    np.testing.assert_allclose(found[wall], srgb_from_linear(truth / gain).squeeze()[wall], atol=1e-5)
-    blended = fuse_mertens([found, long])
-    assert (blended >= 0.98).mean() < 0.5 * (long >= 0.98).mean()
-    of_noisy, of_clean = (np.diff(fuse_mertens([one, long])[wall], axis=0).std() for one in (dark, found))
-    assert of_clean < 0.05 * of_noisy
+def test_exposure_fusion_takes_lamps_of_the_short_exposure_and_none_of_its_noise(subtests):
+    for channels in (1, 3):
+        with subtests.test(channels=channels):
+            gain, shape = 8.0, (120, 160, channels)
+            truth = np.broadcast_to(np.linspace(0.1, 0.6, 160)[:, None], shape).copy()
+            truth[40:70, 60:90] = 3.0  # a lamp, with something written on it
+            truth[52:58, 70:80] = 1.5
+            noise = 0.01 * np.random.default_rng(5).standard_normal(shape)
+            long = srgb_from_linear(truth).astype(np.float32).squeeze()
+            dark = srgb_from_linear(truth / gain + noise).astype(np.float32).squeeze()
+            clipped = truth[..., 0] > 1
+            found = darken_fused(long, dark, clipped, gain)
+            np.testing.assert_allclose(found[clipped], dark[clipped], atol=0.002)
+            wall = (slice(90, 120), slice(None))
+            np.testing.assert_allclose(found[wall], srgb_from_linear(truth / gain).squeeze()[wall], atol=1e-5)
+            blended = fuse_mertens([found, long])
+            assert (blended >= 0.98).mean() < 0.5 * (long >= 0.98).mean()
+            of_noisy, of_clean = (np.diff(fuse_mertens([one, long])[wall], axis=0).std() for one in (dark, found))
+            assert of_clean < 0.05 * of_noisy
 
 
 def test_a_fused_image_that_departs_from_the_short_one_gives_way_to_it():
@@ -328,15 +330,16 @@ def test_a_fused_image_that_departs_from_the_short_one_gives_way_to_it():
     np.testing.assert_array_equal(replace_departures(fused[..., 0], short[..., 0])[:, clean], fused[:, clean, 0])
 
 
-@pytest.mark.parametrize(("times", "share"), [(1.9, 0.0), (2.5, 0.5), (3.1, 1.0)])
-def test_without_noise_departures_are_measured_by_the_rounding_to_8_bits(times, share):
+def test_without_noise_departures_are_measured_by_the_rounding_to_8_bits(subtests):
     """Whose variance is a twelfth of a code's square: up to twice that stays, from three times on is replaced."""
-    short = np.full((60, 80, 3), 0.4, np.float32)
-    pattern = (-1.0) ** np.add.outer(np.arange(60), np.arange(80))
-    departed = short + (np.sqrt(times / 12) / 255 * pattern[..., None]).astype(np.float32)
-    found = replace_departures(departed, short)
-    inner = (slice(13, -13), slice(13, -13))
-    assert np.abs(found - departed - share * (short - departed))[inner].max() < 2e-5
+    for times, share in ((1.9, 0.0), (2.5, 0.5), (3.1, 1.0)):
+        with subtests.test(times=times, share=share):
+            short = np.full((60, 80, 3), 0.4, np.float32)
+            pattern = (-1.0) ** np.add.outer(np.arange(60), np.arange(80))
+            departed = short + (np.sqrt(times / 12) / 255 * pattern[..., None]).astype(np.float32)
+            found = replace_departures(departed, short)
+            inner = (slice(13, -13), slice(13, -13))
+            assert np.abs(found - departed - share * (short - departed))[inner].max() < 2e-5
 
 
 def registered_at(shift_px, *, by_gyro=False, agreement=0.5):
@@ -345,22 +348,25 @@ def registered_at(shift_px, *, by_gyro=False, agreement=0.5):
     )
 
 
-@pytest.mark.parametrize("by_gyro", [False, True])
-def test_a_mapping_moves_what_was_shifted_before(by_gyro):
-    step_px, rows, columns = 10, 13, 17
-    x, y = step_px * np.arange(columns), step_px * np.arange(rows)[:, None]
-    before = np.stack(np.broadcast_arrays(0.01 * x + 0.5, -0.02 * y), axis=-1)
-    start = registered_at(before, by_gyro=by_gyro)
-    turn, move = 0.01, np.array([3.0, -2.0])
-    mapping = np.array([[1, -turn, move[0]], [turn, 1, move[1]], [0, 0, 1.0]])
-    found = registration._apply_mapping(mapping, start, step_px)
-    x, y = np.broadcast_arrays(x, y)
-    to_x, to_y = x - turn * y + move[0], y + turn * x + move[1]
-    # beyond the grid, what was shifted at its edge
-    inside = (to_x >= 0) & (to_x <= 160) & (to_y >= 0) & (to_y <= 120)
-    expected = np.stack([to_x - x + 0.01 * to_x + 0.5, to_y - y - 0.02 * to_y], axis=-1)
-    assert np.abs(found - expected)[inside].max() < 1e-9 and inside.mean() > 0.7
-    assert registration._apply_mapping(np.array([[1, 0, 0], [0, 1, 0], [0.01, 0, -1.0]]), start, step_px) is None
+def test_a_mapping_moves_what_was_shifted_before(subtests):
+    for by_gyro in (False, True):
+        with subtests.test(by_gyro=by_gyro):
+            step_px, rows, columns = 10, 13, 17
+            x, y = step_px * np.arange(columns), step_px * np.arange(rows)[:, None]
+            before = np.stack(np.broadcast_arrays(0.01 * x + 0.5, -0.02 * y), axis=-1)
+            start = registered_at(before, by_gyro=by_gyro)
+            turn, move = 0.01, np.array([3.0, -2.0])
+            mapping = np.array([[1, -turn, move[0]], [turn, 1, move[1]], [0, 0, 1.0]])
+            found = registration._apply_mapping(mapping, start, step_px)
+            x, y = np.broadcast_arrays(x, y)
+            to_x, to_y = x - turn * y + move[0], y + turn * x + move[1]
+            # beyond the grid, what was shifted at its edge
+            inside = (to_x >= 0) & (to_x <= 160) & (to_y >= 0) & (to_y <= 120)
+            expected = np.stack([to_x - x + 0.01 * to_x + 0.5, to_y - y - 0.02 * to_y], axis=-1)
+            assert np.abs(found - expected)[inside].max() < 1e-9 and inside.mean() > 0.7
+            assert (
+                registration._apply_mapping(np.array([[1, 0, 0], [0, 1, 0], [0.01, 0, -1.0]]), start, step_px) is None
+            )
 
 
 def test_a_mapping_that_leads_far_is_none_and_a_gyroscope_allows_less():

@@ -97,14 +97,17 @@ def test_the_first_gain_needs_no_alignment():
     assert wrong.gain == pytest.approx(9, rel=0.15) and wrong.contradicts
 
 
-@pytest.mark.parametrize("seed", [5, 6])
-def test_the_first_gain_is_found_where_bright_stripes_lie_on_dark_ones(seed):
-    rng = np.random.default_rng(seed)
-    wall = cv2.resize(rng.uniform(0.02, 0.9, (40, 60, 3)).astype(np.float32), (960, 640), interpolation=cv2.INTER_CUBIC)
-    stripes = np.where(np.arange(960) // 64 % 2, np.float32(1), np.float32(0.25))
-    wall = np.clip(wall, 0.01, 1) * stripes[None, :, None]
-    short, long = codes(wall[:, :640] / 9), codes(wall[:, 192:832])  # three stripes on
-    assert first_brightness(short, long).gain == pytest.approx(9, rel=0.02)
+def test_the_first_gain_is_found_where_bright_stripes_lie_on_dark_ones(subtests):
+    for seed in (5, 6):
+        with subtests.test(seed=seed):
+            rng = np.random.default_rng(seed)
+            wall = cv2.resize(
+                rng.uniform(0.02, 0.9, (40, 60, 3)).astype(np.float32), (960, 640), interpolation=cv2.INTER_CUBIC
+            )
+            stripes = np.where(np.arange(960) // 64 % 2, np.float32(1), np.float32(0.25))
+            wall = np.clip(wall, 0.01, 1) * stripes[None, :, None]
+            short, long = codes(wall[:, :640] / 9), codes(wall[:, 192:832])  # three stripes on
+            assert first_brightness(short, long).gain == pytest.approx(9, rel=0.02)
 
 
 def test_of_two_that_do_not_go_together_the_one_that_shows_more_is_taken(good):

@@ -34,16 +34,19 @@ def test_a_list_s_length_out_of_range(tmp_path, count):
         transform_ply(path, tmp_path / "b.ply", plain_factor(2))
 
 
-@pytest.mark.parametrize("text", ["a = " + 5000 * "[" + 5000 * "]", "[" + ".".join(["a"] * 20000) + "]", "a = \0"])
-def test_a_nested_config(tmp_path, capsys, text):
-    path = tmp_path / "config.toml"
-    path.write_text(text)
-    with pytest.raises(FormatError, match=r"config\.toml"):
-        read_config(path, ReconstructOptions)
-    with pytest.raises(SystemExit) as stopped:
-        main(["reconstruct", "a", "b", "--config", str(path)])
-    assert stopped.value.code == 2
-    assert capsys.readouterr().err.startswith(f"error: {path}")
+def test_a_nested_config(subtests, tmp_path_factory, capsys):
+    for text in ("a = " + 5000 * "[" + 5000 * "]", "[" + ".".join(["a"] * 20000) + "]", "a = \0"):
+        with subtests.test(text=text):
+            tmp_path = tmp_path_factory.mktemp("given")
+            capsys.readouterr()
+            path = tmp_path / "config.toml"
+            path.write_text(text)
+            with pytest.raises(FormatError, match=r"config\.toml"):
+                read_config(path, ReconstructOptions)
+            with pytest.raises(SystemExit) as stopped:
+                main(["reconstruct", "a", "b", "--config", str(path)])
+            assert stopped.value.code == 2
+            assert capsys.readouterr().err.startswith(f"error: {path}")
 
 
 def test_a_nul_in_the_path_of_a_config():
@@ -51,25 +54,30 @@ def test_a_nul_in_the_path_of_a_config():
         read_config("a\0b.toml", ReconstructOptions)
 
 
-@pytest.mark.parametrize(
-    "line", ['path = "a\\u0000"', 'config = "a\\u0000"', 'options.calibration = "a\\u0000"', 'project.imu = "a\\u0000"']
-)
-def test_a_nul_in_a_manifest(tmp_path, line):
-    path = tmp_path / "batch.toml"
-    path.write_text("[[capture]]\n" + ("" if line.startswith("path") else 'path = "a"\n') + line)
-    with pytest.raises(FormatError, match=r"batch\.toml.*NUL character"):
-        read_manifest(path)
+def test_a_nul_in_a_manifest(subtests, tmp_path_factory):
+    for line in (
+        'path = "a\\u0000"',
+        'config = "a\\u0000"',
+        'options.calibration = "a\\u0000"',
+        'project.imu = "a\\u0000"',
+    ):
+        with subtests.test(line=line):
+            tmp_path = tmp_path_factory.mktemp("given")
+            path = tmp_path / "batch.toml"
+            path.write_text("[[capture]]\n" + ("" if line.startswith("path") else 'path = "a"\n') + line)
+            with pytest.raises(FormatError, match=r"batch\.toml.*NUL character"):
+                read_manifest(path)
 
 
-@pytest.mark.parametrize(
-    ("old", "new"), [(b"CREATE TABLE", b"CREATE \xffABLE"), (b"000.png", b"\xff\xfe0.png"), (b"priors", b"prior\xff")]
-)
-def test_text_of_a_database_that_is_no_utf_8(tmp_path, old, new):
-    path = tmp_path / "database.db"
-    model_project.write_database(path, model_project.sparse_model(np.random.default_rng(4)))
-    path.write_bytes(path.read_bytes().replace(old, new))
-    with pytest.raises(FormatError, match=r"database\.db: SQLite cannot read it"):
-        transform_database(path, tmp_path / "copy.db", [], {})
+def test_text_of_a_database_that_is_no_utf_8(subtests, tmp_path_factory):
+    for old, new in ((b"CREATE TABLE", b"CREATE \xffABLE"), (b"000.png", b"\xff\xfe0.png"), (b"priors", b"prior\xff")):
+        with subtests.test(old=old, new=new):
+            tmp_path = tmp_path_factory.mktemp("given")
+            path = tmp_path / "database.db"
+            model_project.write_database(path, model_project.sparse_model(np.random.default_rng(4)))
+            path.write_bytes(path.read_bytes().replace(old, new))
+            with pytest.raises(FormatError, match=r"database\.db: SQLite cannot read it"):
+                transform_database(path, tmp_path / "copy.db", [], {})
 
 
 @pytest.fixture(scope="module")
@@ -137,18 +145,24 @@ except OutputError as error:
 """
 
 
-@pytest.mark.parametrize("limit", ["0", "4096", "40000", "90000"])
-def test_a_database_that_cannot_grow(tmp_path, limit):
-    assert cv2.imwrite(str(tmp_path / "a.png"), np.random.default_rng(0).integers(0, 255, (64, 64), dtype=np.uint8))
-    done = subprocess.run([sys.executable, "-c", LIMITED, str(tmp_path), limit], capture_output=True, text=True)
-    assert done.stderr.splitlines()[-1].startswith(f"{tmp_path / 'x.db'}: COLMAP cannot write")
-    assert done.returncode == 1
+def test_a_database_that_cannot_grow(subtests, tmp_path_factory):
+    for limit in ("0", "4096", "40000", "90000"):
+        with subtests.test(limit=limit):
+            tmp_path = tmp_path_factory.mktemp("given")
+            assert cv2.imwrite(
+                str(tmp_path / "a.png"), np.random.default_rng(0).integers(0, 255, (64, 64), dtype=np.uint8)
+            )
+            done = subprocess.run([sys.executable, "-c", LIMITED, str(tmp_path), limit], capture_output=True, text=True)
+            assert done.stderr.splitlines()[-1].startswith(f"{tmp_path / 'x.db'}: COLMAP cannot write")
+            assert done.returncode == 1
 
 
-@pytest.mark.parametrize("scale", ['"a"', "{}", "0", "-1", "true"])
-def test_the_scale_of_a_transforms_file_that_is_no_number(tmp_path, scale):
-    path = tmp_path / "transforms.json"
-    frames = [{"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}]
-    path.write_text(f'{{"frames": {json.dumps(frames)}, "scale": {scale}, "offset": [0, 0, 0]}}')
-    with pytest.raises(FormatError, match="no number"):
-        transform_transforms(path, tmp_path / "out.json", plain_factor(2.0))
+def test_the_scale_of_a_transforms_file_that_is_no_number(subtests, tmp_path_factory):
+    for scale in ('"a"', "{}", "0", "-1", "true"):
+        with subtests.test(scale=scale):
+            tmp_path = tmp_path_factory.mktemp("given")
+            path = tmp_path / "transforms.json"
+            frames = [{"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}]
+            path.write_text(f'{{"frames": {json.dumps(frames)}, "scale": {scale}, "offset": [0, 0, 0]}}')
+            with pytest.raises(FormatError, match="no number"):
+                transform_transforms(path, tmp_path / "out.json", plain_factor(2.0))

@@ -3,7 +3,6 @@
 import sys
 from pathlib import Path
 
-import pytest
 from cases import loop_over
 from fuzz_readers import Reader
 
@@ -44,13 +43,16 @@ def _build(folder: Path) -> list[Path]:
     return [folder / "a"]
 
 
-@pytest.mark.parametrize(
-    ("error", "counted"),
-    [(FormatError("a", "damaged"), "refused"), (KeyError("a"), "foreign"), (MemoryError(), "large")],
-)
-def test_each_outcome_is_counted_as_what_it_is(tmp_path, error, counted):
-    reader = Reader(_build, _fails(error))
-    files = whole_files(reader, tmp_path)
-    found = [outcome(reader, tmp_path, files, (0, number))[0] for number in range(20)]
-    assert counted in found and set(found) <= {"read", counted}
-    assert (tmp_path / "a").read_bytes() == b"whole"
+def test_each_outcome_is_counted_as_what_it_is(subtests, tmp_path_factory):
+    for error, counted in (
+        (FormatError("a", "damaged"), "refused"),
+        (KeyError("a"), "foreign"),
+        (MemoryError(), "large"),
+    ):
+        with subtests.test(error=error, counted=counted):
+            tmp_path = tmp_path_factory.mktemp("given")
+            reader = Reader(_build, _fails(error))
+            files = whole_files(reader, tmp_path)
+            found = [outcome(reader, tmp_path, files, (0, number))[0] for number in range(20)]
+            assert counted in found and set(found) <= {"read", counted}
+            assert (tmp_path / "a").read_bytes() == b"whole"

@@ -46,19 +46,23 @@ def test_slerp_agrees_with_scipy_inside_and_continues_outside():
     )
 
 
-@pytest.mark.parametrize("count", [0, 1, 7, 300])
-def test_running_products_agree_with_a_loop(count):
-    expected = [Rotation.identity()]
-    for q in QUATS[:count]:
-        expected.append(expected[-1] * Rotation.from_quat(q))
-    matrices = np.array([rotation.as_matrix() for rotation in expected])
-    np.testing.assert_allclose(g.matrix_from_quat(g.quat_cumulative(QUATS[:count])), matrices, atol=1e-12)
+def test_running_products_agree_with_a_loop(subtests):
+    for count in (0, 1, 7, 300):
+        with subtests.test(count=count):
+            expected = [Rotation.identity()]
+            for q in QUATS[:count]:
+                expected.append(expected[-1] * Rotation.from_quat(q))
+            matrices = np.array([rotation.as_matrix() for rotation in expected])
+            np.testing.assert_allclose(g.matrix_from_quat(g.quat_cumulative(QUATS[:count])), matrices, atol=1e-12)
 
 
-@pytest.mark.parametrize("b", [[0, 0, -2.0], [0, 3.0, 0], [1.0, 1, 1], [0, 0, 5.0]])
-def test_rotation_between_takes_one_direction_to_the_other(b):
-    a = np.array([0, 0, 1.0])
-    np.testing.assert_allclose(g.quat_rotate(g.rotation_between(a, np.array(b)), a), b / np.linalg.norm(b), atol=1e-9)
+def test_rotation_between_takes_one_direction_to_the_other(subtests):
+    for b in ([0, 0, -2.0], [0, 3.0, 0], [1.0, 1, 1], [0, 0, 5.0]):
+        with subtests.test(b=b):
+            a = np.array([0, 0, 1.0])
+            np.testing.assert_allclose(
+                g.quat_rotate(g.rotation_between(a, np.array(b)), a), b / np.linalg.norm(b), atol=1e-9
+            )
 
 
 def test_pixel_origin_matches_colmap():

@@ -134,13 +134,14 @@ def test_heading_and_place_lie_within_their_intervals(errors):
         assert np.median(sigma) < 2
 
 
-@pytest.mark.parametrize(("slow_m", "alike_s"), [(3.0, 5.0), (1.0, 20.0), (6.0, 60.0), (3.0, 300.0)])
-def test_intervals_hold_however_long_errors_are_alike(slow_m, alike_s):
+def test_intervals_hold_however_long_errors_are_alike(subtests):
     """The study by scripts/study_georeference.py, smaller."""
-    row = measure(slow_m, alike_s, walks=12, stated=True, seed=5)
-    for name in ("place", "heading"):
-        assert row[f"{name}_covered"] >= 0.83, (name, row)
-        assert row[f"{name}_ratio"] < 4, (name, row)
+    for slow_m, alike_s in ((3.0, 5.0), (1.0, 20.0), (6.0, 60.0), (3.0, 300.0)):
+        with subtests.test(slow_m=slow_m, alike_s=alike_s):
+            row = measure(slow_m, alike_s, walks=12, stated=True, seed=5)
+            for name in ("place", "heading"):
+                assert row[f"{name}_covered"] >= 0.83, (name, row)
+                assert row[f"{name}_ratio"] < 4, (name, row)
 
 
 def test_a_correlation_that_the_positions_do_not_show_is_said_to_be_assumed():
@@ -214,14 +215,15 @@ def test_positions_that_lag_are_known_to(pace_m_s, turning, most_sigma_s):
         assert np.median(along) > 0.29 * pace_m_s
 
 
-@pytest.mark.parametrize("delay_s", [0.0, 0.25, 1.1])
-def test_exact_positions_tell_their_delay_exactly(delay_s):
-    one, found = late(3, pace_m_s=5.0, turning=1.0, delay_s=delay_s, white_m=0.02, rate_hz=5.0)
-    assert found.delay_sigma_s < 0.01
-    assert abs(found.delay_s - delay_s) < 3 * found.delay_sigma_s
-    assert np.linalg.norm(one.place_error_m(found)[:2]) < 4 * found.position_sigma_m
-    assert found.residual_rms_m == pytest.approx(0.02, rel=0.2)
-    assert found.length_ratio == pytest.approx(1.0, abs=4 * found.length_ratio_sigma)
+def test_exact_positions_tell_their_delay_exactly(subtests):
+    for delay_s in (0.0, 0.25, 1.1):
+        with subtests.test(delay_s=delay_s):
+            one, found = late(3, pace_m_s=5.0, turning=1.0, delay_s=delay_s, white_m=0.02, rate_hz=5.0)
+            assert found.delay_sigma_s < 0.01
+            assert abs(found.delay_s - delay_s) < 3 * found.delay_sigma_s
+            assert np.linalg.norm(one.place_error_m(found)[:2]) < 4 * found.position_sigma_m
+            assert found.residual_rms_m == pytest.approx(0.02, rel=0.2)
+            assert found.length_ratio == pytest.approx(1.0, abs=4 * found.length_ratio_sigma)
 
 
 def test_the_path_goes_straight_on_between_and_beyond_its_images():
@@ -292,17 +294,21 @@ def test_it_comes_back_from_its_json():
         assert again.as_json() == one.as_json()
 
 
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [("latitude_deg", "91"), ("longitude_deg", "1e300"), ("longitude_deg", "1e999"), ("height_m", "1e999")],
-)
-def test_no_place_on_earth_is_taken_from_a_file(tmp_path, key, value):
-    content = walk(7).fitted().as_json()
-    content["origin"][key] = 123456789
-    text = json.dumps({"models": [{"model": 0, **content}]}).replace("123456789", value)
-    (tmp_path / "georeference.json").write_text(text)
-    with pytest.raises(FormatError, match=r"was damaged since it was written|1e999 is not a number"):
-        read_georeference(tmp_path / "georeference.json", 0)
+def test_no_place_on_earth_is_taken_from_a_file(subtests, tmp_path_factory):
+    for key, value in (
+        ("latitude_deg", "91"),
+        ("longitude_deg", "1e300"),
+        ("longitude_deg", "1e999"),
+        ("height_m", "1e999"),
+    ):
+        with subtests.test(key=key, value=value):
+            tmp_path = tmp_path_factory.mktemp("given")
+            content = walk(7).fitted().as_json()
+            content["origin"][key] = 123456789
+            text = json.dumps({"models": [{"model": 0, **content}]}).replace("123456789", value)
+            (tmp_path / "georeference.json").write_text(text)
+            with pytest.raises(FormatError, match=r"was damaged since it was written|1e999 is not a number"):
+                read_georeference(tmp_path / "georeference.json", 0)
 
 
 def test_positions_meet_the_path_by_name_or_by_time():
@@ -337,19 +343,21 @@ def test_a_real_gopro_s_positions_are_read(shared_data):
         positions_in_video(shared_data / "gopro" / "karma.mp4")
 
 
-@pytest.mark.parametrize("key", [b"GPS5", b"GPS9"])
-def test_gopro_positions_without_a_fix_are_left_out(tmp_path, key):
-    imu = recorded(200.0, 200.0)
-    t_s = np.arange(float(imu.gyro_t_s[0]), float(imu.gyro_t_s[-1]), 0.1)
-    place = np.stack([48 + 1e-5 * t_s, -11 - 1e-5 * t_s, 500 + t_s], axis=1)
-    found = positions_in_video(imu_files.write_gopro(tmp_path / "a.mp4", imu, gps=(key, t_s, place, 2)))
-    gone = (t_s >= t_s[0] + 2.002) & (t_s < t_s[0] + 3.003)
-    assert len(found.latitude_deg) == np.sum(~gone)
-    np.testing.assert_allclose(found.latitude_deg, place[~gone, 0], atol=1e-7)
-    np.testing.assert_allclose(found.longitude_deg, place[~gone, 1], atol=1e-7)
-    np.testing.assert_allclose(found.height_m, place[~gone, 2], atol=1e-3)
-    np.testing.assert_allclose(found.sigma_m, 1.4 * 1.5)
-    assert found.height_above == ("sea" if key == b"GPS5" else "unknown")
+def test_gopro_positions_without_a_fix_are_left_out(subtests, tmp_path_factory):
+    for key in (b"GPS5", b"GPS9"):
+        with subtests.test(key=key):
+            tmp_path = tmp_path_factory.mktemp("given")
+            imu = recorded(200.0, 200.0)
+            t_s = np.arange(float(imu.gyro_t_s[0]), float(imu.gyro_t_s[-1]), 0.1)
+            place = np.stack([48 + 1e-5 * t_s, -11 - 1e-5 * t_s, 500 + t_s], axis=1)
+            found = positions_in_video(imu_files.write_gopro(tmp_path / "a.mp4", imu, gps=(key, t_s, place, 2)))
+            gone = (t_s >= t_s[0] + 2.002) & (t_s < t_s[0] + 3.003)
+            assert len(found.latitude_deg) == np.sum(~gone)
+            np.testing.assert_allclose(found.latitude_deg, place[~gone, 0], atol=1e-7)
+            np.testing.assert_allclose(found.longitude_deg, place[~gone, 1], atol=1e-7)
+            np.testing.assert_allclose(found.height_m, place[~gone, 2], atol=1e-3)
+            np.testing.assert_allclose(found.sigma_m, 1.4 * 1.5)
+            assert found.height_above == ("sea" if key == b"GPS5" else "unknown")
 
 
 def test_camm_positions_are_read(tmp_path):

@@ -194,9 +194,8 @@ def test_what_cannot_be_gone_on_with_is_refused_in_words(capture, names, akaze, 
     refused(tmp_path / "other.db", "is no COLMAP database: it has no table cameras")
 
 
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
+def test_damage_is_said_before_colmap_ends_the_process(subtests, akaze, tmp_path_factory):
+    for change, said in (
         ("UPDATE keypoints SET data = x'00' WHERE image_id = 3", "1 rows of keypoints are not as long as they say"),
         ("UPDATE keypoints SET cols = 3", "rows of keypoints are not as long"),
         ("UPDATE matches SET rows = rows + 1", "rows of matches are not as long"),
@@ -204,15 +203,15 @@ def test_what_cannot_be_gone_on_with_is_refused_in_words(capture, names, akaze, 
         ("DELETE FROM cameras", "an image has no camera"),
         ("UPDATE images SET name = '../x.jpg' WHERE image_id = 1", r"\.\./x\.jpg"),
         ("DELETE FROM keypoints", "holds no keypoints"),
-    ],
-)
-def test_damage_is_said_before_colmap_ends_the_process(akaze, tmp_path, change, said):
-    torn = tmp_path / "torn.db"
-    shutil.copyfile(akaze, torn)
-    with contextlib.closing(sqlite3.connect(torn)) as database, database:
-        database.execute(change)
-    with pytest.raises(FormatError, match=said):
-        read_given(torn)
+    ):
+        with subtests.test(change=change, said=said):
+            tmp_path = tmp_path_factory.mktemp("given")
+            torn = tmp_path / "torn.db"
+            shutil.copyfile(akaze, torn)
+            with contextlib.closing(sqlite3.connect(torn)) as database, database:
+                database.execute(change)
+            with pytest.raises(FormatError, match=said):
+                read_given(torn)
 
 
 def test_matches_of_keypoints_that_there_are_not_are_refused(capture, names, akaze, tmp_path):

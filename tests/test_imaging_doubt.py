@@ -51,36 +51,37 @@ def moving(seed=6):
     return FarScene.make(seed, vigour=2.0, size=8).gyro()
 
 
-@pytest.mark.parametrize("what", ["rotation", "offset", "bias", "extent"])
-def test_errors_spread_the_blur_as_its_covariance_says(what):
-    gyro, rng = moving(), np.random.default_rng(1)
-    sigma = {"rotation": 0.03, "offset": 0.004, "bias": 0.05, "extent": 0.1}[what]
-    told = {
-        "rotation": MotionErrors(rotation_cov_rad2=sigma**2 * np.eye(3), extent_sigma=0.0),
-        "offset": MotionErrors(offset_sigma_s=sigma, extent_sigma=0.0),
-        "bias": MotionErrors(rate_cov_rad2_s2=sigma**2 * np.eye(3), extent_sigma=0.0),
-        "extent": MotionErrors(extent_sigma=sigma),
-    }[what]
-    fields = []
-    for _ in range(60):
-        three, one = sigma * rng.standard_normal(3), sigma * rng.standard_normal()
-        if what == "rotation":
-            turned = quat_multiply(quat_exp(three), gyro.cam_from_imu_xyzw)
-            fields.append(chords(replace(gyro, cam_from_imu_xyzw=turned)))
-        elif what == "offset":
-            fields.append(chords(replace(gyro, offset_s=gyro.offset_s + one)))
-        elif what == "bias":
-            fields.append(chords(replace(gyro, path=GyroPath(gyro.path.t_s, gyro.path.rate_rad_s, three))))
-        else:
-            middle_s = SHUTTER.t_s + 0.5 * SHUTTER.exposure_s
-            exposure_s = SHUTTER.exposure_s * (1 + one)
-            other = replace(SHUTTER, exposure_s=exposure_s, t_s=middle_s - 0.5 * exposure_s)
-            fields.append(chords(gyro, other))
-    known = replace(gyro, errors=told)
-    cov = blur_field(known, CAMERA, SHUTTER, step_px=240).cov_px2
-    close(spread(np.array(fields)), cov, 0.4)  # sixty draws
-    assert cov[1, 1, 0] + cov[1, 1, 2] > 0.04  # px^2
-    np.testing.assert_array_equal(blur_path(known, CAMERA, SHUTTER, step_px=240).cov_px2, cov)
+def test_errors_spread_the_blur_as_its_covariance_says(subtests):
+    for what in ("rotation", "offset", "bias", "extent"):
+        with subtests.test(what=what):
+            gyro, rng = moving(), np.random.default_rng(1)
+            sigma = {"rotation": 0.03, "offset": 0.004, "bias": 0.05, "extent": 0.1}[what]
+            told = {
+                "rotation": MotionErrors(rotation_cov_rad2=sigma**2 * np.eye(3), extent_sigma=0.0),
+                "offset": MotionErrors(offset_sigma_s=sigma, extent_sigma=0.0),
+                "bias": MotionErrors(rate_cov_rad2_s2=sigma**2 * np.eye(3), extent_sigma=0.0),
+                "extent": MotionErrors(extent_sigma=sigma),
+            }[what]
+            fields = []
+            for _ in range(60):
+                three, one = sigma * rng.standard_normal(3), sigma * rng.standard_normal()
+                if what == "rotation":
+                    turned = quat_multiply(quat_exp(three), gyro.cam_from_imu_xyzw)
+                    fields.append(chords(replace(gyro, cam_from_imu_xyzw=turned)))
+                elif what == "offset":
+                    fields.append(chords(replace(gyro, offset_s=gyro.offset_s + one)))
+                elif what == "bias":
+                    fields.append(chords(replace(gyro, path=GyroPath(gyro.path.t_s, gyro.path.rate_rad_s, three))))
+                else:
+                    middle_s = SHUTTER.t_s + 0.5 * SHUTTER.exposure_s
+                    exposure_s = SHUTTER.exposure_s * (1 + one)
+                    other = replace(SHUTTER, exposure_s=exposure_s, t_s=middle_s - 0.5 * exposure_s)
+                    fields.append(chords(gyro, other))
+            known = replace(gyro, errors=told)
+            cov = blur_field(known, CAMERA, SHUTTER, step_px=240).cov_px2
+            close(spread(np.array(fields)), cov, 0.4)  # sixty draws
+            assert cov[1, 1, 0] + cov[1, 1, 2] > 0.04  # px^2
+            np.testing.assert_array_equal(blur_path(known, CAMERA, SHUTTER, step_px=240).cov_px2, cov)
 
 
 def test_noise_is_read_off_the_readings_and_spreads_the_blur():

@@ -160,13 +160,14 @@ def test_a_wrong_gyroscope_loses_no_matches(error):
     assert ratio(12, error) >= 0.95
 
 
-@pytest.mark.parametrize("blur_px", [5, 10, 20])
-def test_a_sharp_frame_stays_as_it_is(blur_px):
-    for pair in PAIRS.values():
-        shutter, image = shot(pair[0], 0.2)
-        field = scaled(predicted(shutter, "none"), blur_px / 0.2)
-        gated = deblur_gated(image, field)
-        assert gated.image is image and not gated.deblurred and "does not show the blur" in gated.reason
+def test_a_sharp_frame_stays_as_it_is(subtests):
+    for blur_px in (5, 10, 20):
+        with subtests.test(blur_px=blur_px):
+            for pair in PAIRS.values():
+                shutter, image = shot(pair[0], 0.2)
+                field = scaled(predicted(shutter, "none"), blur_px / 0.2)
+                gated = deblur_gated(image, field)
+                assert gated.image is image and not gated.deblurred and "does not show the blur" in gated.reason
 
 
 @pytest.mark.parametrize("blur_px", [6, 10, 20])
@@ -192,18 +193,21 @@ def test_a_sharp_frame_of_white_texture_stays_as_it_is_among_blurred_ones():
     assert gated.image is image and "does not show the blur" in gated.reason
 
 
-@pytest.mark.parametrize("blur_px", [10, 25])
-def test_the_image_tells_extent_and_direction(blur_px):
-    shutter, image = shot(0.98, blur_px)
-    field = predicted(shutter, "none")
-    for factor in (0.8, 1.0, 1.2):
-        evidence = blur_evidence(image, scaled(field, factor))
-        assert evidence.support > 8 and evidence.extent_is_plausible
-        assert evidence.extent_factor == pytest.approx(1 / factor, rel=0.06)
-    turned = replace(field, vector_px=field.vector_px[..., ::-1] * np.float32([1, -1]))
-    assert blur_evidence(image, turned).support < 4
-    flipped = replace(field, vector_px=field.vector_px * np.float32([1, -1]))
-    assert blur_evidence(image, flipped).mirrored_support == pytest.approx(blur_evidence(image, field).support, rel=0.2)
+def test_the_image_tells_extent_and_direction(subtests):
+    for blur_px in (10, 25):
+        with subtests.test(blur_px=blur_px):
+            shutter, image = shot(0.98, blur_px)
+            field = predicted(shutter, "none")
+            for factor in (0.8, 1.0, 1.2):
+                evidence = blur_evidence(image, scaled(field, factor))
+                assert evidence.support > 8 and evidence.extent_is_plausible
+                assert evidence.extent_factor == pytest.approx(1 / factor, rel=0.06)
+            turned = replace(field, vector_px=field.vector_px[..., ::-1] * np.float32([1, -1]))
+            assert blur_evidence(image, turned).support < 4
+            flipped = replace(field, vector_px=field.vector_px * np.float32([1, -1]))
+            assert blur_evidence(image, flipped).mirrored_support == pytest.approx(
+                blur_evidence(image, field).support, rel=0.2
+            )
 
 
 def test_tiles_are_weighed_once_for_the_blur_and_its_mirror_image(monkeypatch):
@@ -219,23 +223,24 @@ def test_tiles_are_weighed_once_for_the_blur_and_its_mirror_image(monkeypatch):
     assert mirrored == pytest.approx(measure_blur_share(image, flipped), rel=1e-6)
 
 
-@pytest.mark.parametrize("blur_px", [6, 12, 25])
-def test_the_share_of_the_blur_that_shows_is_the_textures_and_not_the_sky_s(blur_px):
+def test_the_share_of_the_blur_that_shows_is_the_textures_and_not_the_sky_s(subtests):
     """Of a picture of which two thirds are a sky of noise, too."""
-    field = predicted(shot(0.98, blur_px)[0], "none")
-    shares = []
-    for image in (shot(0.98, blur_px)[1], shot(0.98, 0.2)[1]):
-        cloudless = image.copy()
-        noise = 2 * np.random.default_rng(1).standard_normal((2 * HEIGHT // 3, WIDTH, 1))
-        cloudless[: len(noise)] = np.rint(170 + noise).astype(np.uint8)
-        shares += [measure_blur_share(image, field), measure_blur_share(cloudless, field)]
-    blurred, blurred_below_sky, sharp, sharp_below_sky = shares
-    assert 0.5 < blurred < 1.3 and 0.5 < blurred_below_sky < 1.3
-    assert abs(sharp) < GATE_LIMITS.least_share / 2 and abs(sharp_below_sky) < GATE_LIMITS.least_share / 2
-    flat = np.full((HEIGHT, WIDTH), 90, np.uint8)
-    assert measure_blur_share(flat, field) is None
-    noise = np.random.default_rng(0).normal(128, 6, (HEIGHT, WIDTH)).astype(np.uint8)
-    assert measure_blur_share(noise, field) is None
+    for blur_px in (6, 12, 25):
+        with subtests.test(blur_px=blur_px):
+            field = predicted(shot(0.98, blur_px)[0], "none")
+            shares = []
+            for image in (shot(0.98, blur_px)[1], shot(0.98, 0.2)[1]):
+                cloudless = image.copy()
+                noise = 2 * np.random.default_rng(1).standard_normal((2 * HEIGHT // 3, WIDTH, 1))
+                cloudless[: len(noise)] = np.rint(170 + noise).astype(np.uint8)
+                shares += [measure_blur_share(image, field), measure_blur_share(cloudless, field)]
+            blurred, blurred_below_sky, sharp, sharp_below_sky = shares
+            assert 0.5 < blurred < 1.3 and 0.5 < blurred_below_sky < 1.3
+            assert abs(sharp) < GATE_LIMITS.least_share / 2 and abs(sharp_below_sky) < GATE_LIMITS.least_share / 2
+            flat = np.full((HEIGHT, WIDTH), 90, np.uint8)
+            assert measure_blur_share(flat, field) is None
+            noise = np.random.default_rng(0).normal(128, 6, (HEIGHT, WIDTH)).astype(np.uint8)
+            assert measure_blur_share(noise, field) is None
 
 
 def judge_sky(image, seed):
@@ -393,28 +398,29 @@ def test_what_moved_with_the_camera_keeps_its_pixels():
     assert share < 0.02
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-@pytest.mark.parametrize("vertical", [False, True])
-def test_blocks_of_a_sharp_edge_keep_their_pixels_and_fade_into_the_next(dtype, vertical):
+def test_blocks_of_a_sharp_edge_keep_their_pixels_and_fade_into_the_next(subtests):
     """A step among ramps as long as the blur: weights are one in the step's blocks, and linear to the next middles."""
-    top = 60000 if dtype == np.uint16 else 240
-    ramp = top * (0.25 + 0.5 * np.clip((np.arange(320) - 140) / 40, 0, 1))
-    image = np.tile(ramp, (192, 1))
-    image[64:128] = np.where(np.arange(320) < 160, 0.25 * top, 0.75 * top)
-    image = np.rint(image).astype(dtype)
-    grey, length = (image.T, (0.0, 40.0)) if vertical else (image, (40.0, 0.0))
-    field = BlurField.uniform(*grey.shape[::-1], length)
-    out, share = keep_sharp(grey, np.zeros_like(grey), field)
-    weight = (out / grey).T if vertical else out / grey
-    rows = np.interp(np.arange(192), [47.5, 79.5, 111.5, 143.5], [0, 1, 1, 0])
-    columns = np.interp(np.arange(320), [111.5, 143.5, 175.5, 207.5], [0, 1, 1, 0])
-    assert np.abs(weight - rows[:, None] * columns).max() < 0.02
-    assert share == pytest.approx(4 / 60)
-    # three channels alike; without blur nothing is too sharp for it
-    colour = np.repeat(grey[..., None], 3, axis=2)
-    coloured, _ = keep_sharp(colour, np.zeros_like(colour), field)
-    assert np.abs(coloured.astype(float) - out[..., None]).max() <= 0.01 * top
-    assert keep_sharp(grey, np.zeros_like(grey), BlurField.uniform(*grey.shape[::-1], (0.0, 0.0)))[1] == 0
+    for dtype in (np.uint8, np.uint16):
+        for vertical in (False, True):
+            with subtests.test(dtype=dtype, vertical=vertical):
+                top = 60000 if dtype == np.uint16 else 240
+                ramp = top * (0.25 + 0.5 * np.clip((np.arange(320) - 140) / 40, 0, 1))
+                image = np.tile(ramp, (192, 1))
+                image[64:128] = np.where(np.arange(320) < 160, 0.25 * top, 0.75 * top)
+                image = np.rint(image).astype(dtype)
+                grey, length = (image.T, (0.0, 40.0)) if vertical else (image, (40.0, 0.0))
+                field = BlurField.uniform(*grey.shape[::-1], length)
+                out, share = keep_sharp(grey, np.zeros_like(grey), field)
+                weight = (out / grey).T if vertical else out / grey
+                rows = np.interp(np.arange(192), [47.5, 79.5, 111.5, 143.5], [0, 1, 1, 0])
+                columns = np.interp(np.arange(320), [111.5, 143.5, 175.5, 207.5], [0, 1, 1, 0])
+                assert np.abs(weight - rows[:, None] * columns).max() < 0.02
+                assert share == pytest.approx(4 / 60)
+                # three channels alike; without blur nothing is too sharp for it
+                colour = np.repeat(grey[..., None], 3, axis=2)
+                coloured, _ = keep_sharp(colour, np.zeros_like(colour), field)
+                assert np.abs(coloured.astype(float) - out[..., None]).max() <= 0.01 * top
+                assert keep_sharp(grey, np.zeros_like(grey), BlurField.uniform(*grey.shape[::-1], (0.0, 0.0)))[1] == 0
 
 
 def blur_of(px, reasons=None):
@@ -438,20 +444,20 @@ def test_every_frame_has_a_decision_with_a_reason():
     assert actions == ["keep", "keep", "deblur"]
 
 
-@pytest.mark.parametrize(
-    ("values", "said"),
-    [
+def test_thresholds_that_make_no_sense_are_refused(subtests):
+    for values, said in (
         ({"skip_below_own_px": -0.1}, "skip_below_own_px"),
         ({"skip_below_px": -0.1}, "skip_below_px"),
         ({"skip_below_px": 9.0, "drop_above_px": 9.0}, "drop_above_px"),
         ({"bridge_s": 0.0}, "bridge_s"),
         ({"bridge_deg": 0.0}, "bridge_deg"),
-    ],
-)
-def test_thresholds_that_make_no_sense_are_refused(values, said):
-    with pytest.raises(ValueError, match=said):
-        GateOptions(**values)
-    assert GateOptions(skip_below_own_px=0.0, skip_below_px=0.0, bridge_s=1e-3, bridge_deg=1e-3).skip_below_px == 0
+    ):
+        with subtests.test(values=values, said=said):
+            with pytest.raises(ValueError, match=said):
+                GateOptions(**values)
+            assert (
+                GateOptions(skip_below_own_px=0.0, skip_below_px=0.0, bridge_s=1e-3, bridge_deg=1e-3).skip_below_px == 0
+            )
 
 
 def test_frames_that_bridge_a_gap_stay_the_least_blurred_first():

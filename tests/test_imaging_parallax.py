@@ -210,21 +210,20 @@ def test_frames_within_two_seconds_of_a_model_s_have_its_depths_and_the_camera_s
         assert np.abs(one.inverse_depth - 1).max() < 1e-5
 
 
-@pytest.mark.parametrize(
-    ("speed_m_s", "sigma_m_s", "known"),
-    [
+def test_velocities_count_where_they_are_known_to_three_tenths_of_what_is_not_slow(subtests):
+    for speed_m_s, sigma_m_s, known in (
         (1.0, 0.29, True),
         (1.0, 0.31, False),
         (0.2, 0.059, True),
         (0.2, 0.061, False),
         (0, 0.029, True),
         (0, 0.031, False),
-    ],
-)
-def test_velocities_count_where_they_are_known_to_three_tenths_of_what_is_not_slow(
-    monkeypatch, speed_m_s, sigma_m_s, known
-):
-    assert bool(told_of(monkeypatch, speed_m_s, sigma_m_s)) == known
+    ):
+        with (
+            subtests.test(speed_m_s=speed_m_s, sigma_m_s=sigma_m_s, known=known),
+            pytest.MonkeyPatch.context() as monkeypatch,
+        ):
+            assert bool(told_of(monkeypatch, speed_m_s, sigma_m_s)) == known
 
 
 def test_a_model_of_few_images_tells_nothing(monkeypatch):

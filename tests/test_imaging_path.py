@@ -84,22 +84,23 @@ def test_smearing_the_sharp_picture_along_the_path_gives_the_rendered_blur(direc
     assert all(error["right"] < 0.6 * error[wrong] for wrong in ("straight", "sign", "reversed")), error
 
 
-@pytest.mark.parametrize("direction", ["down", "up", "right", "left"])
-def test_the_path_is_where_the_lines_see_the_content(direction):
+def test_the_path_is_where_the_lines_see_the_content(subtests):
     """Against the fixed-point iteration that rectification uses, and the field's chord."""
-    _, gyro = handheld(vigour=2.0, seed=6)
-    camera = ShutterCamera(model=MODEL, exposure_s=0.03, readout_s=0.02, readout_direction=direction)
-    lens, shutter = colmap_camera(MODEL), shutter_of(camera, BEGIN_S)
-    path = blur_path(gyro, lens, shutter)
-    rows, columns = path.path_px.shape[1:3]
-    nodes = np.stack(np.meshgrid(64 * np.arange(columns) + 0.5, 64 * np.arange(rows) + 0.5), axis=-1)
-    directions = rays(lens, nodes.reshape(-1, 2)).reshape(rows, columns, 3)
-    for k, since_s in ((0, -0.03 * 8 / 17), (8, 0.0), (13, 0.03 * 5 / 17)):
-        world = np.einsum("yxij,yxj->yxi", gyro.start_from_cam(shutter.middle_s(nodes) + since_s), directions)
-        seen = project_by_lines(world.reshape(-1, 3), nodes.reshape(-1, 2), gyro, lens, shutter)
-        np.testing.assert_allclose(path.path_px[k], seen.reshape(nodes.shape) - nodes, atol=0.02)
-    chord = blur_field(gyro, lens, shutter, step_px=64).vector_px
-    np.testing.assert_allclose(path.field().vector_px, chord, atol=0.15)
+    for direction in ("down", "up", "right", "left"):
+        with subtests.test(direction=direction):
+            _, gyro = handheld(vigour=2.0, seed=6)
+            camera = ShutterCamera(model=MODEL, exposure_s=0.03, readout_s=0.02, readout_direction=direction)
+            lens, shutter = colmap_camera(MODEL), shutter_of(camera, BEGIN_S)
+            path = blur_path(gyro, lens, shutter)
+            rows, columns = path.path_px.shape[1:3]
+            nodes = np.stack(np.meshgrid(64 * np.arange(columns) + 0.5, 64 * np.arange(rows) + 0.5), axis=-1)
+            directions = rays(lens, nodes.reshape(-1, 2)).reshape(rows, columns, 3)
+            for k, since_s in ((0, -0.03 * 8 / 17), (8, 0.0), (13, 0.03 * 5 / 17)):
+                world = np.einsum("yxij,yxj->yxi", gyro.start_from_cam(shutter.middle_s(nodes) + since_s), directions)
+                seen = project_by_lines(world.reshape(-1, 3), nodes.reshape(-1, 2), gyro, lens, shutter)
+                np.testing.assert_allclose(path.path_px[k], seen.reshape(nodes.shape) - nodes, atol=0.02)
+            chord = blur_field(gyro, lens, shutter, step_px=64).vector_px
+            np.testing.assert_allclose(path.field().vector_px, chord, atol=0.15)
 
 
 def test_translation_past_what_is_near_bends_the_path_too():

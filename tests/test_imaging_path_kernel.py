@@ -38,15 +38,16 @@ def light_of(width, height, channels=1, seed=3):
     return (blocks * slope + 0.01 * rng.standard_normal((height, width, channels))).astype(np.float32)
 
 
-@pytest.mark.parametrize("instruction_set", SETS)
-@pytest.mark.parametrize("side", [32, 64, 256, 512])
-def test_a_tile_s_transform_is_numpy_s_and_comes_back(side, instruction_set):
-    tile = np.random.default_rng(side).standard_normal((side, side)).astype(np.float32)
-    spectrum, back = np.empty((side, side // 2 + 1, 2), np.float32), np.empty_like(tile)
-    _path.transform(tile, spectrum, back, instruction_set)
-    expected = np.fft.fft(np.fft.rfft(tile, axis=0), axis=1).T
-    np.testing.assert_allclose(spectrum[..., 0] + 1j * spectrum[..., 1], expected, atol=2e-6 * side)
-    np.testing.assert_allclose(back / side**2, tile, atol=3e-6)
+def test_a_tile_s_transform_is_numpy_s_and_comes_back(subtests):
+    for instruction_set in SETS:
+        for side in (32, 64, 256, 512):
+            with subtests.test(instruction_set=instruction_set, side=side):
+                tile = np.random.default_rng(side).standard_normal((side, side)).astype(np.float32)
+                spectrum, back = np.empty((side, side // 2 + 1, 2), np.float32), np.empty_like(tile)
+                _path.transform(tile, spectrum, back, instruction_set)
+                expected = np.fft.fft(np.fft.rfft(tile, axis=0), axis=1).T
+                np.testing.assert_allclose(spectrum[..., 0] + 1j * spectrum[..., 1], expected, atol=2e-6 * side)
+                np.testing.assert_allclose(back / side**2, tile, atol=3e-6)
 
 
 @pytest.mark.parametrize("instruction_set", SETS)
@@ -120,23 +121,24 @@ def test_threads_change_no_bit_and_colours_do_not_mix():
         np.testing.assert_allclose(one[..., c], alone[..., 0], atol=1e-6)
 
 
-@pytest.mark.parametrize("extent_px", [3.0, 20.0, 21.0, 60.0, 200.0])
-def test_tiles_add_up_to_one_wherever_there_is_image(extent_px):
-    tiling = Tiling.covering(1000, 333, extent_px)
-    assert tiling.margin >= min(0.6 * extent_px, 0.15 * tiling.side) and tiling.hop > tiling.ramp
-    rows, columns = tiling.count
-    for count, size in ((rows, 333), (columns, 1000)):
-        assert (count - 1) * tiling.hop + tiling.ramp < size or count == 1  # none too many
-        total = np.zeros((count - 1) * tiling.hop + tiling.side)
-        for k in range(count):
-            total[k * tiling.hop : k * tiling.hop + tiling.side] += shares_of(tiling, k, count)
-        np.testing.assert_allclose(total[tiling.before : tiling.before + size], 1, atol=1e-6)
-    # no seam: what is near a tile's edge counts little there
-    for window in (tiling.window_in(), tiling.window_out()):
-        assert (np.diff(window[: tiling.side // 2]) >= 0).all() and np.array_equal(window, window[::-1])
-        assert window[0] < 0.01 and window[tiling.side // 2] == 1
-    rows, columns = sources_of(tiling)
-    np.testing.assert_array_equal(rows[tiling.before - 2 : tiling.before + 335], [2, 1, *range(333), 331, 330])
+def test_tiles_add_up_to_one_wherever_there_is_image(subtests):
+    for extent_px in (3.0, 20.0, 21.0, 60.0, 200.0):
+        with subtests.test(extent_px=extent_px):
+            tiling = Tiling.covering(1000, 333, extent_px)
+            assert tiling.margin >= min(0.6 * extent_px, 0.15 * tiling.side) and tiling.hop > tiling.ramp
+            rows, columns = tiling.count
+            for count, size in ((rows, 333), (columns, 1000)):
+                assert (count - 1) * tiling.hop + tiling.ramp < size or count == 1  # none too many
+                total = np.zeros((count - 1) * tiling.hop + tiling.side)
+                for k in range(count):
+                    total[k * tiling.hop : k * tiling.hop + tiling.side] += shares_of(tiling, k, count)
+                np.testing.assert_allclose(total[tiling.before : tiling.before + size], 1, atol=1e-6)
+            # no seam: what is near a tile's edge counts little there
+            for window in (tiling.window_in(), tiling.window_out()):
+                assert (np.diff(window[: tiling.side // 2]) >= 0).all() and np.array_equal(window, window[::-1])
+                assert window[0] < 0.01 and window[tiling.side // 2] == 1
+            rows, columns = sources_of(tiling)
+            np.testing.assert_array_equal(rows[tiling.before - 2 : tiling.before + 335], [2, 1, *range(333), 331, 330])
 
 
 def test_a_tile_has_the_path_of_its_middle():
@@ -192,22 +194,23 @@ def test_a_path_that_changes_within_a_tile_is_as_uncertain_there():
     assert not tiling.spreads(BlurPath.straight(BlurField.uniform(width, height, (30.0, 10.0), step_px=64))).any()
 
 
-@pytest.mark.parametrize("restore", [path_wiener, half_quadratic])
-def test_pixels_without_blur_and_around_what_is_clipped_stay(restore):
-    width, height = 400, 300
-    light = light_of(width, height)[..., 0]
-    image = np.clip(40 + 150 * light, 0, 240).astype(np.uint8)
-    image[140:160, 190:210] = 255
-    still = BlurPath(width=width, height=height, path_px=np.zeros((17, 6, 8, 2)))
-    np.testing.assert_array_equal(restore(image, still), image)
-    path = bent(width, height, (9.0, 0.0), bend=0.0)
-    out = restore(image, path)
-    np.testing.assert_array_equal(out[140:160, 175:225], image[140:160, 175:225])
-    assert (out[:100] != image[:100]).mean() > 0.5
-    deep = restore(image.astype(np.uint16) * 257, path)
-    assert deep.dtype == np.uint16 and np.abs(deep / 257 - out).max() < 1.5
-    colours = restore(np.stack([image] * 3, axis=-1), path, DeblurOptions(threads=2))
-    np.testing.assert_array_equal(colours, np.stack([out] * 3, axis=-1))
+def test_pixels_without_blur_and_around_what_is_clipped_stay(subtests):
+    for restore in (path_wiener, half_quadratic):
+        with subtests.test(restore=restore):
+            width, height = 400, 300
+            light = light_of(width, height)[..., 0]
+            image = np.clip(40 + 150 * light, 0, 240).astype(np.uint8)
+            image[140:160, 190:210] = 255
+            still = BlurPath(width=width, height=height, path_px=np.zeros((17, 6, 8, 2)))
+            np.testing.assert_array_equal(restore(image, still), image)
+            path = bent(width, height, (9.0, 0.0), bend=0.0)
+            out = restore(image, path)
+            np.testing.assert_array_equal(out[140:160, 175:225], image[140:160, 175:225])
+            assert (out[:100] != image[:100]).mean() > 0.5
+            deep = restore(image.astype(np.uint16) * 257, path)
+            assert deep.dtype == np.uint16 and np.abs(deep / 257 - out).max() < 1.5
+            colours = restore(np.stack([image] * 3, axis=-1), path, DeblurOptions(threads=2))
+            np.testing.assert_array_equal(colours, np.stack([out] * 3, axis=-1))
 
 
 def test_what_does_not_fit_is_refused():
@@ -233,30 +236,33 @@ def test_smoothing_is_in_linear_light_and_keeps_the_type():
     np.testing.assert_array_equal(smoothed(flat, 1.2), flat)
 
 
-@pytest.mark.parametrize("size", [(640, 400), (641, 401)])
-def test_colours_come_back_from_luma_and_half_chroma(size):
-    width, height = size
-    rng = np.random.default_rng(2)
-    coarse = cv2.resize(rng.random((13, 20, 3), dtype=np.float32), (width, height), interpolation=cv2.INTER_CUBIC)
-    image = np.clip(30 + 190 * coarse, 0, 255).astype(np.uint8)
-    luma, chroma = split_colours(image, 1)
-    assert luma.shape == (height, width) and chroma.shape == (2, -(-height // 2), -(-width // 2))
-    light = decode_table(image.dtype)[image]
-    np.testing.assert_allclose(luma, light @ [0.2126, 0.7152, 0.0722], atol=1e-5)
-    one, many = (join_colours(luma, chroma, threads) for threads in (1, 3))
-    np.testing.assert_array_equal(one, many)
-    # between pixels of half the size, lines are interpolated as OpenCV does
-    lines = rng.random((4, *chroma.shape[1:]), dtype=np.float32)
-    planes = [cv2.resize(p, (2 * p.shape[1], 2 * p.shape[0]))[:height, :width] for p in lines]
-    r, b = (planes[i] * luma + planes[i + 1] for i in (0, 2))
-    for name in _wiener.instruction_sets():
-        _wiener.join(luma, lines, joined := np.empty_like(one), red=0.3, blue=0.2, instruction_set=name)
-        green = luma - 0.3 * r - 0.2 * b
-        np.testing.assert_allclose(joined, np.stack([green + r, green, green + b], axis=-1), atol=1e-5)
-    # what is coarser than the window comes back, and a place stays where it was
-    assert np.abs(one - light).mean() < 2e-3
-    shifted = np.roll(one, 1, axis=1)
-    assert np.abs(shifted - light)[:, 4:-4].mean() > 2 * np.abs(one - light)[:, 4:-4].mean()
+def test_colours_come_back_from_luma_and_half_chroma(subtests):
+    for size in ((640, 400), (641, 401)):
+        with subtests.test(size=size):
+            width, height = size
+            rng = np.random.default_rng(2)
+            coarse = cv2.resize(
+                rng.random((13, 20, 3), dtype=np.float32), (width, height), interpolation=cv2.INTER_CUBIC
+            )
+            image = np.clip(30 + 190 * coarse, 0, 255).astype(np.uint8)
+            luma, chroma = split_colours(image, 1)
+            assert luma.shape == (height, width) and chroma.shape == (2, -(-height // 2), -(-width // 2))
+            light = decode_table(image.dtype)[image]
+            np.testing.assert_allclose(luma, light @ [0.2126, 0.7152, 0.0722], atol=1e-5)
+            one, many = (join_colours(luma, chroma, threads) for threads in (1, 3))
+            np.testing.assert_array_equal(one, many)
+            # between pixels of half the size, lines are interpolated as OpenCV does
+            lines = rng.random((4, *chroma.shape[1:]), dtype=np.float32)
+            planes = [cv2.resize(p, (2 * p.shape[1], 2 * p.shape[0]))[:height, :width] for p in lines]
+            r, b = (planes[i] * luma + planes[i + 1] for i in (0, 2))
+            for name in _wiener.instruction_sets():
+                _wiener.join(luma, lines, joined := np.empty_like(one), red=0.3, blue=0.2, instruction_set=name)
+                green = luma - 0.3 * r - 0.2 * b
+                np.testing.assert_allclose(joined, np.stack([green + r, green, green + b], axis=-1), atol=1e-5)
+            # what is coarser than the window comes back, and a place stays where it was
+            assert np.abs(one - light).mean() < 2e-3
+            shifted = np.roll(one, 1, axis=1)
+            assert np.abs(shifted - light)[:, 4:-4].mean() > 2 * np.abs(one - light)[:, 4:-4].mean()
 
 
 @pytest.mark.parametrize("restore", [path_wiener, half_quadratic])

@@ -194,19 +194,20 @@ def test_camera_and_gyroscope_count_from_epochs_of_their_own():
     assert gyro.covers(np.array([2.5, 0.5]), np.array([2.6, 0.6])).tolist() == [True, False]
 
 
-@pytest.mark.parametrize("readout_s", [0.0, 0.03])
-def test_the_gyroscope_must_cover_the_last_line_s_exposure(readout_s):
-    gyro, camera = turning([0.1, 0.0, 0.0], span_s=2.0), colmap_camera(PINHOLE)
-    # the gyroscope's last sample is at 1.995 + 0.254 s
-    timing = FrameTiming(names=("a",), t_s=[2.22], exposure_s=[0.01], readout_s=readout_s)
-    predicted = predict_blur_px(gyro, camera, timing, width=640, height=480)
-    assert np.isfinite(predicted.px[0]) == (readout_s == 0)
-    shutter = FrameShutter.of(timing, 0, width=640, height=480)
-    if readout_s:
-        with pytest.raises(NotObservableError, match="does not cover"):
-            blur_field(gyro, camera, shutter)
-    else:
-        blur_field(gyro, camera, shutter)
+def test_the_gyroscope_must_cover_the_last_line_s_exposure(subtests):
+    for readout_s in (0.0, 0.03):
+        with subtests.test(readout_s=readout_s):
+            gyro, camera = turning([0.1, 0.0, 0.0], span_s=2.0), colmap_camera(PINHOLE)
+            # the gyroscope's last sample is at 1.995 + 0.254 s
+            timing = FrameTiming(names=("a",), t_s=[2.22], exposure_s=[0.01], readout_s=readout_s)
+            predicted = predict_blur_px(gyro, camera, timing, width=640, height=480)
+            assert np.isfinite(predicted.px[0]) == (readout_s == 0)
+            shutter = FrameShutter.of(timing, 0, width=640, height=480)
+            if readout_s:
+                with pytest.raises(NotObservableError, match="does not cover"):
+                    blur_field(gyro, camera, shutter)
+            else:
+                blur_field(gyro, camera, shutter)
 
 
 def test_no_exposure_means_no_blur():

@@ -94,22 +94,25 @@ def test_a_long_filter_equals_the_wiener_filter_in_the_frequency_domain(vector_p
     assert psnr(spatial, spectral, 1.0) >= 40
 
 
-@pytest.mark.parametrize(("extent_px", "sigma"), [(3.3, 0.01), (20.0, 0.01), (41.25, 0.0)])
-def test_the_taps_have_the_least_mean_square_error_of_their_length(extent_px, sigma):
-    prior = Prior.for_noise(sigma)
-    half = optimal_taps(extent_px, prior)
-    reach = len(half) - 1
-    assert reach == np.ceil(2 * extent_px) + 1
-    assert half[0] + 2 * half[1:].sum() == pytest.approx(1)
-    # Least squares in the frequency domain, written out: |W K - 1|^2 S + |W|^2, W a sum of cosines.
-    f = (np.arange(8192) + 0.5) / 16384
-    basis = np.concatenate([np.ones((len(f), 1)), 2 * np.cos(2 * np.pi * np.outer(f, np.arange(1, reach + 1)))], axis=1)
-    power = 1 / (prior.eps + prior.alpha * 4 * np.sin(np.pi * f) ** 2)
-    transfer = np.sinc(extent_px * f)
-    normal = basis.T @ (basis * (power * transfer**2 + 1)[:, None])
-    best = solve(normal, basis.T @ (power * transfer), assume_a="pos")
-    best /= best[0] + 2 * best[1:].sum()
-    np.testing.assert_allclose(half, best, atol=2e-4 * np.abs(best).max())
+def test_the_taps_have_the_least_mean_square_error_of_their_length(subtests):
+    for extent_px, sigma in ((3.3, 0.01), (20.0, 0.01), (41.25, 0.0)):
+        with subtests.test(extent_px=extent_px, sigma=sigma):
+            prior = Prior.for_noise(sigma)
+            half = optimal_taps(extent_px, prior)
+            reach = len(half) - 1
+            assert reach == np.ceil(2 * extent_px) + 1
+            assert half[0] + 2 * half[1:].sum() == pytest.approx(1)
+            # Least squares in the frequency domain, written out: |W K - 1|^2 S + |W|^2, W a sum of cosines.
+            f = (np.arange(8192) + 0.5) / 16384
+            basis = np.concatenate(
+                [np.ones((len(f), 1)), 2 * np.cos(2 * np.pi * np.outer(f, np.arange(1, reach + 1)))], axis=1
+            )
+            power = 1 / (prior.eps + prior.alpha * 4 * np.sin(np.pi * f) ** 2)
+            transfer = np.sinc(extent_px * f)
+            normal = basis.T @ (basis * (power * transfer**2 + 1)[:, None])
+            best = solve(normal, basis.T @ (power * transfer), assume_a="pos")
+            best /= best[0] + 2 * best[1:].sum()
+            np.testing.assert_allclose(half, best, atol=2e-4 * np.abs(best).max())
 
 
 @pytest.mark.parametrize("vector_px", [(14.0, 5.0), (-6.0, 13.0)])
@@ -155,16 +158,17 @@ def test_the_major_axis_may_change_within_an_image():
 # Compiled against numpy ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", INSTRUCTION_SETS)
-@pytest.mark.parametrize(("vector_px", "rate"), [((17, 4), 0.0), ((3, -9), 0.01), ((9, 9), 0.02), ((0, 0), 0.05)])
-def test_every_instruction_set_gives_the_reference_s_light(name, vector_px, rate):
-    light = texture(height=100, width=150)[..., 1].astype(np.float32)
-    cells = Cells.of(turning(100, 150, vector_px, rate))
-    table = wiener._table(cells, 0.01)
-    result, _ = wiener._compiled(light[..., None], cells, table, instruction_set=name)
-    share = share_reference(np.zeros(light.shape, dtype=bool), cells)
-    expected = light + share * (filter_reference(light, cells, table) - light)
-    np.testing.assert_allclose(result[..., 0], expected, atol=2e-5)
+def test_every_instruction_set_gives_the_reference_s_light(subtests):
+    for name in INSTRUCTION_SETS:
+        for vector_px, rate in (((17, 4), 0.0), ((3, -9), 0.01), ((9, 9), 0.02), ((0, 0), 0.05)):
+            with subtests.test(name=name, vector_px=vector_px, rate=rate):
+                light = texture(height=100, width=150)[..., 1].astype(np.float32)
+                cells = Cells.of(turning(100, 150, vector_px, rate))
+                table = wiener._table(cells, 0.01)
+                result, _ = wiener._compiled(light[..., None], cells, table, instruction_set=name)
+                share = share_reference(np.zeros(light.shape, dtype=bool), cells)
+                expected = light + share * (filter_reference(light, cells, table) - light)
+                np.testing.assert_allclose(result[..., 0], expected, atol=2e-5)
 
 
 @pytest.mark.parametrize("name", INSTRUCTION_SETS)
@@ -233,33 +237,38 @@ def test_python_goes_on_while_an_image_is_deblurred():
 # The whole -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 37), (37, 1), (7, 5), (16, 16), (17, 33), (2, 2, 3), (40, 3, 1)])
-@pytest.mark.parametrize("vector_px", [(12.0, 3.0), (2.0, -9.0), (0.7, 0.2)])
-def test_images_of_any_size(shape, vector_px):
-    image = np.random.default_rng(1).integers(0, 240, shape, dtype=np.uint8)
-    before = image.copy()
-    field = BlurField.uniform(shape[1], shape[0], vector_px)
-    result = deblur(image, field)
-    assert result.shape == image.shape
-    assert result.dtype == image.dtype
-    np.testing.assert_array_equal(image, before)
-    assert np.abs(result.astype(int) - deblur_reference(image, field)).max() <= 1
+def test_images_of_any_size(subtests):
+    for shape in ((1, 1), (1, 37), (37, 1), (7, 5), (16, 16), (17, 33), (2, 2, 3), (40, 3, 1)):
+        for vector_px in ((12.0, 3.0), (2.0, -9.0), (0.7, 0.2)):
+            with subtests.test(shape=shape, vector_px=vector_px):
+                image = np.random.default_rng(1).integers(0, 240, shape, dtype=np.uint8)
+                before = image.copy()
+                field = BlurField.uniform(shape[1], shape[0], vector_px)
+                result = deblur(image, field)
+                assert result.shape == image.shape
+                assert result.dtype == image.dtype
+                np.testing.assert_array_equal(image, before)
+                assert np.abs(result.astype(int) - deblur_reference(image, field)).max() <= 1
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-@pytest.mark.parametrize("vector_px", [(0.0, 0.0), (0.3, -0.3)])
-def test_no_blur_leaves_every_bit(dtype, vector_px):
-    image = np.random.default_rng(2).integers(0, np.iinfo(dtype).max, (50, 70, 3), dtype=dtype, endpoint=True)
-    np.testing.assert_array_equal(deblur(image, BlurField.uniform(70, 50, vector_px)), image)
+def test_no_blur_leaves_every_bit(subtests):
+    for dtype in (np.uint8, np.uint16):
+        for vector_px in ((0.0, 0.0), (0.3, -0.3)):
+            with subtests.test(dtype=dtype, vector_px=vector_px):
+                image = np.random.default_rng(2).integers(
+                    0, np.iinfo(dtype).max, (50, 70, 3), dtype=dtype, endpoint=True
+                )
+                np.testing.assert_array_equal(deblur(image, BlurField.uniform(70, 50, vector_px)), image)
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_a_flat_image_stays_flat(dtype):
-    top = np.iinfo(dtype).max
-    for value in (0, top // 100, top // 2, 24 * top // 25):
-        image = np.full((40, 60), value, dtype=dtype)
-        result = deblur(image, BlurField.uniform(60, 40, (11.0, 5.0)))
-        assert np.abs(result.astype(int) - int(value)).max() <= (0 if dtype is np.uint8 else 1)
+def test_a_flat_image_stays_flat(subtests):
+    for dtype in (np.uint8, np.uint16):
+        with subtests.test(dtype=dtype):
+            top = np.iinfo(dtype).max
+            for value in (0, top // 100, top // 2, 24 * top // 25):
+                image = np.full((40, 60), value, dtype=dtype)
+                result = deblur(image, BlurField.uniform(60, 40, (11.0, 5.0)))
+                assert np.abs(result.astype(int) - int(value)).max() <= (0 if dtype is np.uint8 else 1)
 
 
 def test_short_blurs_fade_in_without_a_step():
@@ -288,20 +297,21 @@ def test_blurs_far_longer_than_the_image_work():
     assert deblur(image, BlurField.uniform(30, 20, (150.0, 149.0))).shape == image.shape
 
 
-@pytest.mark.parametrize(
-    ("length_px", "gain_db"), [(6, 0.4), (10, 1.4), (20, 1.5), (30, 1.5)], ids=lambda value: f"{value}"
-)
-@pytest.mark.parametrize("angle_deg", [0, 25, 80])
-def test_a_blurred_and_noisy_picture_comes_closer_to_the_sharp_one(length_px, gain_db, angle_deg):
-    angle = np.deg2rad(angle_deg)
-    vector_px = (length_px * np.cos(angle), length_px * np.sin(angle))
-    light = texture(brightest=0.8)
-    rng = np.random.default_rng(5)
-    blurred = smeared(light, vector_px)
-    noisy = coded(linear_from_srgb(np.clip(srgb_from_linear(blurred) + 0.01 * rng.standard_normal(light.shape), 0, 1)))
-    truth = coded(light)
-    result = deblur(noisy, BlurField.uniform(WIDTH, HEIGHT, vector_px))
-    assert psnr(result, truth) > psnr(noisy, truth) + gain_db
+def test_a_blurred_and_noisy_picture_comes_closer_to_the_sharp_one(subtests):
+    for length_px, gain_db in ((6, 0.4), (10, 1.4), (20, 1.5), (30, 1.5)):
+        for angle_deg in (0, 25, 80):
+            with subtests.test(length_px=length_px, gain_db=gain_db, angle_deg=angle_deg):
+                angle = np.deg2rad(angle_deg)
+                vector_px = (length_px * np.cos(angle), length_px * np.sin(angle))
+                light = texture(brightest=0.8)
+                rng = np.random.default_rng(5)
+                blurred = smeared(light, vector_px)
+                noisy = coded(
+                    linear_from_srgb(np.clip(srgb_from_linear(blurred) + 0.01 * rng.standard_normal(light.shape), 0, 1))
+                )
+                truth = coded(light)
+                result = deblur(noisy, BlurField.uniform(WIDTH, HEIGHT, vector_px))
+                assert psnr(result, truth) > psnr(noisy, truth) + gain_db
 
 
 def test_clipped_lights_do_not_ring():
@@ -357,36 +367,41 @@ def test_sixteen_bits_keep_their_precision():
     assert np.std(wide - exact) < 0.05 * np.std(narrow - exact)
 
 
-@pytest.mark.parametrize("sigma", [0.003, 0.01, 0.03])
-@pytest.mark.parametrize("axis", ["x", "y"])
-def test_noise_is_estimated_from_a_blurred_image(sigma, axis):
-    light = 0.1 + 0.6 * smeared(texture(), (15.0, 0.0) if axis == "x" else (0.0, 15.0))
-    image = coded(np.clip(light + sigma * np.random.default_rng(7).standard_normal(light.shape), 0, 1), np.uint16)
-    assert estimate_noise(image, axis) == pytest.approx(sigma, rel=0.2)
+def test_noise_is_estimated_from_a_blurred_image(subtests):
+    for sigma in (0.003, 0.01, 0.03):
+        for axis in ("x", "y"):
+            with subtests.test(sigma=sigma, axis=axis):
+                light = 0.1 + 0.6 * smeared(texture(), (15.0, 0.0) if axis == "x" else (0.0, 15.0))
+                image = coded(
+                    np.clip(light + sigma * np.random.default_rng(7).standard_normal(light.shape), 0, 1), np.uint16
+                )
+                assert estimate_noise(image, axis) == pytest.approx(sigma, rel=0.2)
 
 
-@pytest.mark.parametrize("vector_px", [(15.0, 2.0), (-2.0, 15.0)])
-def test_the_noise_is_looked_for_along_the_blur(vector_px):
-    # fine texture: across the blur, detail would be taken for noise
-    grain = gaussian_filter(np.random.default_rng(6).standard_normal((HEIGHT, WIDTH)), 0.7)
-    light = 0.4 + 0.3 * smeared(np.clip(0.5 + grain, 0, 1)[..., None].repeat(3, axis=2), vector_px)
-    image = coded(light + 0.004 * np.random.default_rng(7).standard_normal(light.shape))
-    field = BlurField.uniform(WIDTH, HEIGHT, vector_px)
-    told, found = deblur(image, field, DeblurOptions(noise=0.004)), deblur(image, field)
-    assert psnr(found, told.astype(np.float64)) > 45
-    assert psnr(found, image.astype(np.float64)) < 33  # it is not left alone
+def test_the_noise_is_looked_for_along_the_blur(subtests):
+    for vector_px in ((15.0, 2.0), (-2.0, 15.0)):
+        with subtests.test(vector_px=vector_px):
+            # fine texture: across the blur, detail would be taken for noise
+            grain = gaussian_filter(np.random.default_rng(6).standard_normal((HEIGHT, WIDTH)), 0.7)
+            light = 0.4 + 0.3 * smeared(np.clip(0.5 + grain, 0, 1)[..., None].repeat(3, axis=2), vector_px)
+            image = coded(light + 0.004 * np.random.default_rng(7).standard_normal(light.shape))
+            field = BlurField.uniform(WIDTH, HEIGHT, vector_px)
+            told, found = deblur(image, field, DeblurOptions(noise=0.004)), deblur(image, field)
+            assert psnr(found, told.astype(np.float64)) > 45
+            assert psnr(found, image.astype(np.float64)) < 33  # it is not left alone
 
 
-@pytest.mark.parametrize("sigma_px", [0.0, 0.5, 0.7, 1.5, 4.0])
-def test_a_gaussian_s_weights_have_its_mass_and_width(sigma_px):
-    weights = gaussian_weights(sigma_px)
-    both = np.concatenate([weights[:0:-1], weights])
-    at = np.arange(len(both)) - len(both) // 2
-    assert both.sum() == pytest.approx(1) and len(weights) == np.ceil(3 * sigma_px) + 1
-    if sigma_px:
-        assert weights[1] / weights[0] == pytest.approx(np.exp(-0.5 / sigma_px**2))
-    if sigma_px > 0.5:  # else pixels are too coarse for it
-        assert (both @ at**2) ** 0.5 == pytest.approx(sigma_px, rel=0.02)
+def test_a_gaussian_s_weights_have_its_mass_and_width(subtests):
+    for sigma_px in (0.0, 0.5, 0.7, 1.5, 4.0):
+        with subtests.test(sigma_px=sigma_px):
+            weights = gaussian_weights(sigma_px)
+            both = np.concatenate([weights[:0:-1], weights])
+            at = np.arange(len(both)) - len(both) // 2
+            assert both.sum() == pytest.approx(1) and len(weights) == np.ceil(3 * sigma_px) + 1
+            if sigma_px:
+                assert weights[1] / weights[0] == pytest.approx(np.exp(-0.5 / sigma_px**2))
+            if sigma_px > 0.5:  # else pixels are too coarse for it
+                assert (both @ at**2) ** 0.5 == pytest.approx(sigma_px, rel=0.02)
 
 
 def test_smoothing_grows_with_the_roots_of_noise_and_blur_up_to_its_end():

@@ -37,9 +37,8 @@ def test_the_accelerometer_leaves_three_columns_for_the_gyroscope(readings):
     assert imu_text._accel(table(accel, gyro), 0) == (1, "m/s2")
 
 
-@pytest.mark.parametrize(
-    ("text", "line", "said"),
-    [
+def test_a_table_that_is_none_is_named_with_its_line(subtests):
+    for text, line, said in (
         ("", None, "holds no rows of numbers"),
         ("# t, x\n\n", None, "holds no rows of numbers"),
         ("t,x\n", None, "holds a header and no rows"),
@@ -50,34 +49,38 @@ def test_the_accelerometer_leaves_three_columns_for_the_gyroscope(readings):
         ("t,x\n1,2\n\n3,4,5\n6,7\n", 4, "3 cells where the other lines have 2"),
         (",".join("1" * 20_000) + "\n", 1, "has more than .* columns"),
         ("t,x\n" + ",".join("1" * 20_000) + "\n", 1, "has more than .* columns"),
-    ],
-)
-def test_a_table_that_is_none_is_named_with_its_line(text, line, said):
-    with pytest.raises(FormatError, match=said) as caught:
-        parse_table(Path("a.csv"), text)
-    assert caught.value.line == line
+    ):
+        with subtests.test(text=text, line=line, said=said):
+            with pytest.raises(FormatError, match=said) as caught:
+                parse_table(Path("a.csv"), text)
+            assert caught.value.line == line
 
 
-@pytest.mark.parametrize("delimiter", [",", ";", "\t", " "])
-def test_a_table_has_its_header_numbers_and_lines(delimiter):
-    text = "t,x,y\n1,2,3\r\n\n4,5,6\n# inside\n7,8,9\n1,2".replace(",", delimiter)
-    table = parse_table(Path("a.csv"), text)
-    assert table.header == ("t", "x", "y") and table.width == 3 and table.line_numbers.tolist() == [2, 4, 6]
-    assert table.numbers([0, 2]).tolist() == [[1, 3], [4, 6], [7, 9]]
-    # a comment, and a last line that was cut off
-    passed, cut = table.repairs
-    assert "passed over 1 lines" in passed and "last line (7)" in cut
-    assert (table.column(1), table.column(3), table.column("y")) == (0, 2, 2)
-    for name, said in ((0, "no column 0: columns count from 1 to 3"), (4, "no column 4"), ("z", 'no column "z"')):
-        with pytest.raises(FormatError, match=said):
-            table.column(name)
-    table.require_width("t x y")
-    with pytest.raises(FormatError, match="3 columns; expected t x"):
-        table.require_width("t x")
-    alone = parse_table(Path("a.csv"), "1 2\n3 4\n")
-    with pytest.raises(FormatError, match="has no header"):
-        alone.column("t")
-    assert alone.header is None and parse_table(Path("a.csv"), "# t x\n1 2\n3 4\n").header == ("t", "x")
+def test_a_table_has_its_header_numbers_and_lines(subtests):
+    for delimiter in (",", ";", "\t", " "):
+        with subtests.test(delimiter=delimiter):
+            text = "t,x,y\n1,2,3\r\n\n4,5,6\n# inside\n7,8,9\n1,2".replace(",", delimiter)
+            table = parse_table(Path("a.csv"), text)
+            assert table.header == ("t", "x", "y") and table.width == 3 and table.line_numbers.tolist() == [2, 4, 6]
+            assert table.numbers([0, 2]).tolist() == [[1, 3], [4, 6], [7, 9]]
+            # a comment, and a last line that was cut off
+            passed, cut = table.repairs
+            assert "passed over 1 lines" in passed and "last line (7)" in cut
+            assert (table.column(1), table.column(3), table.column("y")) == (0, 2, 2)
+            for name, said in (
+                (0, "no column 0: columns count from 1 to 3"),
+                (4, "no column 4"),
+                ("z", 'no column "z"'),
+            ):
+                with pytest.raises(FormatError, match=said):
+                    table.column(name)
+            table.require_width("t x y")
+            with pytest.raises(FormatError, match="3 columns; expected t x"):
+                table.require_width("t x")
+            alone = parse_table(Path("a.csv"), "1 2\n3 4\n")
+            with pytest.raises(FormatError, match="has no header"):
+                alone.column("t")
+            assert alone.header is None and parse_table(Path("a.csv"), "# t x\n1 2\n3 4\n").header == ("t", "x")
 
 
 def test_samples_of_one_stamp_are_no_recording(tmp_path):

@@ -127,21 +127,19 @@ def test_the_next_recording_of_a_device_keeps_the_delay_and_opens_the_offset() -
     np.testing.assert_array_equal(prior.imu_in_cam_m, before.imu_in_cam_m)
 
 
-@pytest.mark.parametrize(
-    ("said", "offsets_s", "gyro_s", "accel_s", "delay_s"),
-    [
+def test_an_offset_of_one_sensor_carries_the_other_s(subtests) -> None:
+    for said, offsets_s, gyro_s, accel_s, delay_s in (
         ({"gyro_time_offset_s": 3.0}, (3.0, 3.0), 0.002, np.hypot(0.002, 0.02), 0.02),
         ({"accel_time_offset_s": 3.0}, (3.0, 3.0), np.hypot(0.002, 0.02), 0.002, 0.02),
         ({"gyro_time_offset_s": 3.0, "accel_time_offset_s": 3.5}, (3.0, 3.5), 0.002, 0.002, 0.002 * 2**0.5),
         ({"gyro_time_offset_s": 3.0, "time_offset_sigma_s": 0.1}, (3.0, 3.0), 0.1, np.hypot(0.1, 0.02), 0.02),
-    ],
-)
-def test_an_offset_of_one_sensor_carries_the_other_s(said, offsets_s, gyro_s, accel_s, delay_s) -> None:
-    prior = calibration_prior(Declared(**said))
-    assert (prior.gyro_time_offset_s, prior.accel_time_offset_s) == offsets_s
-    assert prior.sigma("gyro_time_offset_s") == pytest.approx(gyro_s)
-    assert prior.sigma("accel_time_offset_s") == pytest.approx(accel_s)
-    assert sd_of_delay(prior) == pytest.approx(delay_s)
+    ):
+        with subtests.test(said=said, offsets_s=offsets_s, gyro_s=gyro_s, accel_s=accel_s, delay_s=delay_s):
+            prior = calibration_prior(Declared(**said))
+            assert (prior.gyro_time_offset_s, prior.accel_time_offset_s) == offsets_s
+            assert prior.sigma("gyro_time_offset_s") == pytest.approx(gyro_s)
+            assert prior.sigma("accel_time_offset_s") == pytest.approx(accel_s)
+            assert sd_of_delay(prior) == pytest.approx(delay_s)
 
 
 def test_what_is_stated_is_as_sure_as_it_is_said_to_be() -> None:

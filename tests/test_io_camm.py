@@ -48,17 +48,14 @@ def test_packets_are_found_in_samples_of_one_or_several():
     assert found[1][1].shape == (0, 8) and found[5][1].shape == (0, 24) and found[6][1].shape == (0, 56)
 
 
-@pytest.mark.parametrize(
-    ("samples", "said"),
-    [
+def test_packets_that_are_cut_off_are_named(subtests):
+    for samples, said in (
         ([turn(1.0), bytes(3)], "shorter than its head"),
         ([turn(1.0), turn(2.0), pull(3.0)[:-1]], "packet 3 of type 3 of its camm track is cut off"),
         ([turn(1.0), turn(2.0) + pull(3.0)[:-4], turn(4.0)], "of type 3 of its camm track is cut off"),
-    ],
-)
-def test_packets_that_are_cut_off_are_named(samples, said):
-    with pytest.raises(FormatError, match=said):
-        _packets(*opened(samples))
+    ):
+        with subtests.test(samples=samples, said=said), pytest.raises(FormatError, match=said):
+            _packets(*opened(samples))
 
 
 def fix(kind=3, lat=48.0, lon=11.0, height=500.0, sigma=2.5):

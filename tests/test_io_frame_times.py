@@ -11,9 +11,8 @@ from colmap_inertial.io.frame_times import frame_log, stamps_in_order, stamps_of
 HERE = Path("frames")
 
 
-@pytest.mark.parametrize(
-    ("pattern", "names", "times_ns"),
-    [
+def test_names_hold_times_as_a_pattern_says(subtests):
+    for pattern, names, times_ns in (
         ("ns", ["b_12.png", "a_7.png"], {"a_7.png": 7, "b_12.png": 12}),
         ("ms", ["cam0_1500.25.png"], {"cam0_1500.25.png": 1_500_250_000}),
         ("cam0_{us}_*", ["cam0_5_x.png", "cam0_3_7.png"], {"cam0_3_7.png": 3000, "cam0_5_x.png": 5000}),
@@ -23,17 +22,15 @@ HERE = Path("frames")
         ("cam?/{ns}", ["cam1/5.png", "x/9.png"], {"cam1/5.png": 5}),
         ("PXL_%Y%m%d_%H%M%S%f", ["PXL_20240501_123015250.jpg"], {"PXL_20240501_123015250.jpg": 1714566615250000000}),
         ("%Y%j%H%M%S%f", ["2024122123015000001.jpg"], {"2024122123015000001.jpg": 1714566615000001000}),
-    ],
-)
-def test_names_hold_times_as_a_pattern_says(pattern, names, times_ns):
-    found = stamps_of_pattern(HERE, names, pattern)
-    assert dict(zip(found.names, found.t_ns.tolist(), strict=True)) == times_ns
-    assert (np.diff(found.t_ns) > 0).all()
+    ):
+        with subtests.test(pattern=pattern, names=names, times_ns=times_ns):
+            found = stamps_of_pattern(HERE, names, pattern)
+            assert dict(zip(found.names, found.t_ns.tolist(), strict=True)) == times_ns
+            assert (np.diff(found.t_ns) > 0).all()
 
 
-@pytest.mark.parametrize(
-    ("pattern", "name", "said"),
-    [
+def test_a_name_or_pattern_without_a_time_is_named(subtests):
+    for pattern, name, said in (
         ("ns", "frame.png", "the name holds no number"),
         ("ns", "12_34.png", "several numbers of one length"),
         ("cam0_{ns}", "cam1_5.png", r"cam1_5.png: the name does not fit"),
@@ -44,42 +41,38 @@ def test_names_hold_times_as_a_pattern_says(pattern, names, times_ns):
         ("%H%M%S%f", "123015250.png", "does not say how names hold times"),
         ("%Y%m%d_%H%M%S%f", "20241301_123015250.png", "does not fit"),
         ("cam0/ns", "cam1/5.png", "no image lies in a folder 'cam0'"),
-    ],
-)
-def test_a_name_or_pattern_without_a_time_is_named(pattern, name, said):
-    with pytest.raises(TimingError, match=said):
-        stamps_of_pattern(HERE, [name], pattern)
+    ):
+        with subtests.test(pattern=pattern, name=name, said=said), pytest.raises(TimingError, match=said):
+            stamps_of_pattern(HERE, [name], pattern)
 
 
-@pytest.mark.parametrize(
-    ("text", "unit", "times_ns"),
-    [
+def test_a_log_has_a_time_for_each_frame(subtests, tmp_path_factory):
+    for text, unit, times_ns in (
         ("t_ns\n5\n7\n", None, [5, 7]),
         ("frame,timestamp [ms]\n0,1.5\n1,2.5\n", None, [1_500_000, 2_500_000]),
         ("5\n7\n", "us", [5000, 7000]),
         ("t_s,x\n1,2\n3,4\n", "s", [10**9, 3 * 10**9]),
-    ],
-)
-def test_a_log_has_a_time_for_each_frame(tmp_path, text, unit, times_ns):
-    (tmp_path / "log.csv").write_text(text)
-    assert stamps_of_log(tmp_path / "log.csv", unit).tolist() == times_ns
+    ):
+        with subtests.test(text=text, unit=unit, times_ns=times_ns):
+            tmp_path = tmp_path_factory.mktemp("given")
+            (tmp_path / "log.csv").write_text(text)
+            assert stamps_of_log(tmp_path / "log.csv", unit).tolist() == times_ns
 
 
-@pytest.mark.parametrize(
-    ("text", "unit", "error", "said"),
-    [
+def test_a_log_without_clear_times_is_named(subtests, tmp_path_factory):
+    for text, unit, error, said in (
         ("5,6\n7,8\n", "ns", TimingError, "2 columns and no header; name the time column"),
         ("5\n7\n", None, TimingError, "does not say the unit of its times"),
         ("t_ns,t_ms\n5,6\n7,8\n", None, TimingError, "several columns of times"),
         ("x,y\n5,6\n7,8\n", None, TimingError, "no column of times"),
         ("t_ns\n5\n7\n", "ms", TimingError, "the header says ns, time_unit says ms"),
         ("timestamp [weeks]\n5\n7\n", None, FormatError, "weeks"),
-    ],
-)
-def test_a_log_without_clear_times_is_named(tmp_path, text, unit, error, said):
-    (tmp_path / "log.csv").write_text(text)
-    with pytest.raises(error, match=said):
-        stamps_of_log(tmp_path / "log.csv", unit)
+    ):
+        with subtests.test(text=text, unit=unit, error=error, said=said):
+            tmp_path = tmp_path_factory.mktemp("given")
+            (tmp_path / "log.csv").write_text(text)
+            with pytest.raises(error, match=said):
+                stamps_of_log(tmp_path / "log.csv", unit)
 
 
 def test_frames_of_a_log_follow_each_other():

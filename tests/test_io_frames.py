@@ -49,33 +49,35 @@ def test_names_that_are_nanoseconds_time_frames_exactly_and_in_order(tmp_path: P
     assert capture.image_folder == tmp_path / "frames"
 
 
-@pytest.mark.parametrize(
-    ("name", "unit", "t_ns"),
-    [
+def test_the_number_in_a_name_is_its_time(subtests: pytest.Subtests, tmp_path_factory: pytest.TempPathFactory) -> None:
+    for name, unit, t_ns in (
         ("frame_000123.png", "ms", 123_000_000),
         ("cam0_1403715273262142976.png", "ns", EPOCH_NS),
         ("12.345678.png", "s", 12_345_678_000),
         ("a/b2/000007.png", "us", 7_000),
-    ],
-)
-def test_the_number_in_a_name_is_its_time(tmp_path: Path, name: str, unit: str, t_ns: int) -> None:
-    folder = folder_of(tmp_path, [name])
-    timing = read_frame_timing(capture_of(folder, f'pattern = "**/*.png"\ntimes = "name"\ntime_unit = "{unit}"'))
-    assert (timing.names, timing.epoch_ns) == ((name,), t_ns)
+    ):
+        with subtests.test(name=name, unit=unit, t_ns=t_ns):
+            tmp_path = tmp_path_factory.mktemp("given")
+            folder = folder_of(tmp_path, [name])
+            timing = read_frame_timing(
+                capture_of(folder, f'pattern = "**/*.png"\ntimes = "name"\ntime_unit = "{unit}"')
+            )
+            assert (timing.names, timing.epoch_ns) == ((name,), t_ns)
 
 
-@pytest.mark.parametrize(
-    ("names", "said"),
-    [
+def test_names_that_cannot_be_times_are_refused(
+    subtests: pytest.Subtests, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    for names, said in (
         (["a.png", "1.png"], "no number"),
         (["2024_1200.png"], "several numbers"),
         (["a_10.png", "b_10.png"], "same time"),
-    ],
-)
-def test_names_that_cannot_be_times_are_refused(tmp_path: Path, names: list[str], said: str) -> None:
-    folder = folder_of(tmp_path, names)
-    with pytest.raises(TimingError, match=said):
-        read_frame_timing(capture_of(folder, 'times = "name"\ntime_unit = "ms"'))
+    ):
+        with subtests.test(names=names, said=said):
+            tmp_path = tmp_path_factory.mktemp("given")
+            folder = folder_of(tmp_path, names)
+            with pytest.raises(TimingError, match=said):
+                read_frame_timing(capture_of(folder, 'times = "name"\ntime_unit = "ms"'))
 
 
 def test_pictures_without_times_say_how_to_give_them(tmp_path: Path) -> None:
@@ -83,21 +85,20 @@ def test_pictures_without_times_say_how_to_give_them(tmp_path: Path) -> None:
         read_frame_timing(capture_of(folder_of(tmp_path, ["1.png"]), ""))
 
 
-@pytest.mark.parametrize(
-    ("text", "t_ns", "unit"),
-    [
+def test_a_csv_times_frames(subtests: pytest.Subtests, tmp_path_factory: pytest.TempPathFactory) -> None:
+    for text, t_ns, unit in (
         ("name,t_s\nb.png,0.5\na.png,0.25\n", [250_000_000, 500_000_000], ""),
         (f"#timestamp [ns],filename\n{EPOCH_NS},a.png\n{EPOCH_NS + 1},b.png\n", [EPOCH_NS, EPOCH_NS + 1], ""),
         ("filename;time [ms]\na.png;1.5\nb.png;2.5\nabsent.png;9\n", [1_500_000, 2_500_000], ""),
         ("image timestamp\na.png 1000\nb.png 2000\n", [1_000_000, 2_000_000], 'time_unit = "us"'),
-    ],
-)
-def test_a_csv_times_frames(tmp_path: Path, text: str, t_ns: list[int], unit: str) -> None:
-    folder = folder_of(tmp_path, ["a.png", "b.png"])
-    (tmp_path / "t.csv").write_text(text)
-    timing = read_frame_timing(capture_of(folder, f'times = "t.csv"\n{unit}'))
-    assert timing.names == ("a.png", "b.png")
-    assert [timing.epoch_ns + round(t * 1e9) for t in timing.t_s] == t_ns
+    ):
+        with subtests.test(text=text, t_ns=t_ns, unit=unit):
+            tmp_path = tmp_path_factory.mktemp("given")
+            folder = folder_of(tmp_path, ["a.png", "b.png"])
+            (tmp_path / "t.csv").write_text(text)
+            timing = read_frame_timing(capture_of(folder, f'times = "t.csv"\n{unit}'))
+            assert timing.names == ("a.png", "b.png")
+            assert [timing.epoch_ns + round(t * 1e9) for t in timing.t_s] == t_ns
 
 
 @loop_over(
@@ -151,26 +152,25 @@ def test_frame_times_alone_come_from_a_csv_or_a_capture(tmp_path: Path) -> None:
     assert read_frame_times(tmp_path).names == ("1.png", "2.png")
 
 
-@pytest.mark.parametrize(
-    ("suffix", "shape"),
-    [
+def test_pixels_are_what_colmap_reads(subtests: pytest.Subtests, tmp_path_factory: pytest.TempPathFactory) -> None:
+    for suffix, shape in [
         (suffix, shape)
         for suffix in SUFFIXES
         for shape in ((24, 32, 3), (24, 32))
         if (suffix, len(shape)) not in ((".pgm", 3), (".ppm", 2))
-    ],
-)
-def test_pixels_are_what_colmap_reads(tmp_path: Path, suffix: str, shape: tuple[int, ...]) -> None:
-    import pycolmap
+    ]:
+        with subtests.test(suffix=suffix, shape=shape):
+            tmp_path = tmp_path_factory.mktemp("given")
+            import pycolmap
 
-    path = tmp_path / f"a{suffix}"
-    cv2.imwrite(str(path), picture(5, shape))
-    ours = read_image(path)
-    theirs = pycolmap.Bitmap.read(str(path), ours.ndim == 3).to_array()
-    assert ours.shape[:2] == theirs.shape[:2]
-    # two JPEG decoders may round differently
-    allowed = 2 if suffix in (".jpg", ".jpeg") else 0
-    assert np.abs(ours.astype(int) - theirs.reshape(ours.shape)).max() <= allowed
+            path = tmp_path / f"a{suffix}"
+            cv2.imwrite(str(path), picture(5, shape))
+            ours = read_image(path)
+            theirs = pycolmap.Bitmap.read(str(path), ours.ndim == 3).to_array()
+            assert ours.shape[:2] == theirs.shape[:2]
+            # two JPEG decoders may round differently
+            allowed = 2 if suffix in (".jpg", ".jpeg") else 0
+            assert np.abs(ours.astype(int) - theirs.reshape(ours.shape)).max() <= allowed
 
 
 def test_sixteen_bits_stay_and_alpha_goes(tmp_path: Path) -> None:
@@ -197,15 +197,20 @@ def test_exif_orientation_is_left_alone_as_colmap_leaves_it(tmp_path: Path) -> N
     assert pycolmap.Bitmap.read(str(tmp_path / "turned.jpg"), True).to_array().shape == (24, 32, 3)
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
-def test_a_picture_that_is_cut_off_is_named(tmp_path: Path, suffix: str, capfd: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / f"a{suffix}"
-    cv2.imwrite(str(path), picture(3, (240, 320) if suffix == ".pgm" else (240, 320, 3)))
-    whole = path.read_bytes()
-    for share in (0.0, 0.01, 0.3, 0.9, 0.999):
-        path.write_bytes(whole[: int(share * len(whole))])
-        with pytest.raises(FormatError, match=path.name):
-            read_image(path)
+def test_a_picture_that_is_cut_off_is_named(
+    subtests: pytest.Subtests, tmp_path_factory: pytest.TempPathFactory, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for suffix in SUFFIXES:
+        with subtests.test(suffix=suffix):
+            tmp_path = tmp_path_factory.mktemp("given")
+            capfd.readouterr()
+            path = tmp_path / f"a{suffix}"
+            cv2.imwrite(str(path), picture(3, (240, 320) if suffix == ".pgm" else (240, 320, 3)))
+            whole = path.read_bytes()
+            for share in (0.0, 0.01, 0.3, 0.9, 0.999):
+                path.write_bytes(whole[: int(share * len(whole))])
+                with pytest.raises(FormatError, match=path.name):
+                    read_image(path)
 
 
 def test_a_flipped_bit_in_a_png_is_noticed(tmp_path: Path) -> None:

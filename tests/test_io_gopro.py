@@ -99,12 +99,16 @@ def test_an_impossible_temperature_is_none(tmp_path: Path, imu: ImuRecording) ->
         assert read_imu(path).temperature_c == read
 
 
-@pytest.mark.parametrize("kind", [b"c", b"F", b"?"])
-def test_a_temperature_that_is_no_number_spoils_no_recording(tmp_path: Path, imu: ImuRecording, kind: bytes) -> None:
-    path = tmp_path / "text.mp4"
-    imu_files.write_gopro(path, imu, imu_files.GoPro(temperature_c=41.5, temperature_as=(kind, 4)))
-    found = read_imu(path)
-    assert found.temperature_c is None and len(found.gyro_t_s) == len(imu.gyro_t_s)
+def test_a_temperature_that_is_no_number_spoils_no_recording(
+    subtests: pytest.Subtests, tmp_path_factory: pytest.TempPathFactory, imu: ImuRecording
+) -> None:
+    for kind in (b"c", b"F", b"?"):
+        with subtests.test(kind=kind):
+            tmp_path = tmp_path_factory.mktemp("given")
+            path = tmp_path / "text.mp4"
+            imu_files.write_gopro(path, imu, imu_files.GoPro(temperature_c=41.5, temperature_as=(kind, 4)))
+            found = read_imu(path)
+            assert found.temperature_c is None and len(found.gyro_t_s) == len(imu.gyro_t_s)
 
 
 def test_karma_s_frames_have_exposures_and_no_readout(karma: Path) -> None:
@@ -186,13 +190,17 @@ def test_karma_turns_as_its_gyroscope_says(karma: Path) -> None:
 # --- layouts --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("order", ["XzY", "YxZ", "ZXY", "yXZ", "zYX"])
-@pytest.mark.parametrize("with_matrix", [True, False])
-def test_any_stated_channel_order_gives_the_same_axes(tmp_path: Path, imu: ImuRecording, order, with_matrix) -> None:
-    path = imu_files.write_gopro(tmp_path / "a.mp4", imu, replace(imu_files.MAX, order=order))
-    if not with_matrix:
-        path.write_bytes(path.read_bytes().replace(b"MTRX", b"mtrx"))
-    np.testing.assert_allclose(read_imu(path).gyro_rad_s, imu.gyro_rad_s, atol=0.6 / 939)
+def test_any_stated_channel_order_gives_the_same_axes(
+    subtests: pytest.Subtests, tmp_path_factory: pytest.TempPathFactory, imu: ImuRecording
+) -> None:
+    for order in ("XzY", "YxZ", "ZXY", "yXZ", "zYX"):
+        for with_matrix in (True, False):
+            with subtests.test(order=order, with_matrix=with_matrix):
+                tmp_path = tmp_path_factory.mktemp("given")
+                path = imu_files.write_gopro(tmp_path / "a.mp4", imu, replace(imu_files.MAX, order=order))
+                if not with_matrix:
+                    path.write_bytes(path.read_bytes().replace(b"MTRX", b"mtrx"))
+                np.testing.assert_allclose(read_imu(path).gyro_rad_s, imu.gyro_rad_s, atol=0.6 / 939)
 
 
 def test_samples_that_were_lost_leave_a_gap_and_nothing_else(tmp_path: Path, imu: ImuRecording) -> None:
@@ -284,9 +292,8 @@ def test_an_entry_beyond_its_payload_names_the_byte() -> None:
         list(entries(struct.pack(">4scBH", b"GYRO", b"s", 6, 100) + bytes(12)))
 
 
-@pytest.mark.parametrize(
-    ("kind", "packed", "values"),
-    [
+def test_numbers_are_read_by_their_type(subtests) -> None:
+    for kind, packed, values in (
         ("b", "b", (-3, 100)),
         ("B", "B", (3, 200)),
         ("s", "h", (-300, 30000)),
@@ -297,14 +304,15 @@ def test_an_entry_beyond_its_payload_names_the_byte() -> None:
         ("J", "Q", (2**40, 5)),
         ("f", "f", (-0.25, 1e6)),
         ("d", "d", (-0.1, 1e300)),
-    ],
-)
-def test_numbers_are_read_by_their_type(kind, packed, values) -> None:
-    data = struct.pack(f">{2 * packed}", *values)
-    (alone,) = entries(struct.pack(">4scBH", b"DATA", kind.encode(), len(data) // 2, 2) + data + bytes(-len(data) % 4))
-    assert alone.numbers().tolist() == [[value] for value in values]
-    (both,) = entries(struct.pack(">4scBH", b"DATA", b"?", len(data), 1) + data + bytes(-len(data) % 4))
-    assert both.numbers(2 * kind).tolist() == [list(values)]
+    ):
+        with subtests.test(kind=kind, packed=packed, values=values):
+            data = struct.pack(f">{2 * packed}", *values)
+            (alone,) = entries(
+                struct.pack(">4scBH", b"DATA", kind.encode(), len(data) // 2, 2) + data + bytes(-len(data) % 4)
+            )
+            assert alone.numbers().tolist() == [[value] for value in values]
+            (both,) = entries(struct.pack(">4scBH", b"DATA", b"?", len(data), 1) + data + bytes(-len(data) % 4))
+            assert both.numbers(2 * kind).tolist() == [list(values)]
 
 
 def test_fixed_point_numbers_are_fractions_also_among_others() -> None:
@@ -319,24 +327,29 @@ def test_fixed_point_numbers_are_fractions_also_among_others() -> None:
     assert mixed.numbers("sqQ").tolist() == [[7, 0.5, 2]]
 
 
-@pytest.mark.parametrize(("kind", "members"), [(b"x", ""), (b"s", ""), (b"?", "s"), (b"?", "sx"), (b"?", "")])
-def test_samples_of_no_known_type_or_another_size_are_refused(kind, members) -> None:
-    (entry,) = entries(struct.pack(">4scBH", b"DATA", kind, 3, 1) + bytes(4))
-    with pytest.raises(ValueError, match="DATA holds samples of 3 bytes"):
-        entry.numbers(members)
+def test_samples_of_no_known_type_or_another_size_are_refused(subtests) -> None:
+    for kind, members in ((b"x", ""), (b"s", ""), (b"?", "s"), (b"?", "sx"), (b"?", "")):
+        with subtests.test(kind=kind, members=members):
+            (entry,) = entries(struct.pack(">4scBH", b"DATA", kind, 3, 1) + bytes(4))
+            with pytest.raises(ValueError, match="DATA holds samples of 3 bytes"):
+                entry.numbers(members)
 
 
 # --- the container --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("suffix", ["mp4", "mov"])
-@pytest.mark.parametrize("b_frames", [0, 2])
-def test_frame_times_of_the_index_are_ffmpeg_s(tmp_path: Path, suffix: str, b_frames: int) -> None:
-    path = write_video(tmp_path / f"a.{suffix}", b_frames=b_frames)
-    track = read_movie(path).track(handler="vide")
-    assert track is not None and (track.width_px, track.height_px) == (64, 48)
-    # the edit list's delay is in ticks of the movie's clock: a millisecond
-    np.testing.assert_allclose(np.sort(track.t_ns), video_stamps_ns(path), atol=1_000_000)
+def test_frame_times_of_the_index_are_ffmpeg_s(
+    subtests: pytest.Subtests, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    for suffix in ("mp4", "mov"):
+        for b_frames in (0, 2):
+            with subtests.test(suffix=suffix, b_frames=b_frames):
+                tmp_path = tmp_path_factory.mktemp("given")
+                path = write_video(tmp_path / f"a.{suffix}", b_frames=b_frames)
+                track = read_movie(path).track(handler="vide")
+                assert track is not None and (track.width_px, track.height_px) == (64, 48)
+                # the edit list's delay is in ticks of the movie's clock: a millisecond
+                np.testing.assert_allclose(np.sort(track.t_ns), video_stamps_ns(path), atol=1_000_000)
 
 
 def test_chunks_offsets_and_edit_lists_are_followed(tmp_path: Path) -> None:

@@ -83,9 +83,8 @@ def test_the_first_of_two_streams_of_a_kind_counts_and_empty_ones_do_not():
     assert found.values.tolist() == [[-7000, 5]]
 
 
-@pytest.mark.parametrize(
-    ("payloads", "said"),
-    [
+def test_streams_that_contradict_themselves_are_named(subtests):
+    for payloads, said in (
         (
             [device(stream(entry(b"SCAL", b"s", "h", (1,), (2,)), gyro((1, 2, 3))))],
             r"GYRO has 3 channels and the scale \[1",
@@ -101,11 +100,9 @@ def test_the_first_of_two_streams_of_a_kind_counts_and_empty_ones_do_not():
             [device(stream(gyro((1, 2, 3))))[:-4]],
             "payload 1 at byte 0: the entry b'DEVC' at byte 0 of the payload states",
         ),
-    ],
-)
-def test_streams_that_contradict_themselves_are_named(payloads, said):
-    with pytest.raises(FormatError, match=said):
-        read(*payloads)
+    ):
+        with subtests.test(payloads=payloads, said=said), pytest.raises(FormatError, match=said):
+            read(*payloads)
 
 
 def test_samples_lie_evenly_but_where_some_were_lost_or_came_from_before():
@@ -128,9 +125,7 @@ def test_samples_lie_evenly_but_where_some_were_lost_or_came_from_before():
     )
 
 
-@pytest.mark.parametrize(
-    ("stamps_ns", "said"), [([5], "one payload alone"), ([5, 5, 5], "do not increase"), ([9, 5, 1], "do not increase")]
-)
-def test_stamps_without_a_pace_are_refused(stamps_ns, said):
-    with pytest.raises(ValueError, match=said):
-        spread(np.array(stamps_ns), np.full(len(stamps_ns), 4), 2, 0.02)
+def test_stamps_without_a_pace_are_refused(subtests):
+    for stamps_ns, said in (([5], "one payload alone"), ([5, 5, 5], "do not increase"), ([9, 5, 1], "do not increase")):
+        with subtests.test(stamps_ns=stamps_ns, said=said), pytest.raises(ValueError, match=said):
+            spread(np.array(stamps_ns), np.full(len(stamps_ns), 4), 2, 0.02)

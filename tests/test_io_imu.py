@@ -84,20 +84,18 @@ def test_csv_units_are_converted_once(tmp_path: Path) -> None:
         np.testing.assert_allclose(np.diff(imu.gyro_t_s), 0.005, atol=2e-9)
 
 
-@pytest.mark.parametrize(
-    ("unit", "token", "nanoseconds"),
-    [
+def test_stamps_keep_every_nanosecond(subtests: pytest.Subtests) -> None:
+    for unit, token, nanoseconds in (
         ("s", "1403715273.262142976", 1403715273262142976),
         ("s", "-1.5", -1500000000),
         ("ms", "4.328040426741000265e+06", 4328040426741),
         ("us", "1403715273262142.9764", 1403715273262142976),
         ("ns", "9007199254740993", 9007199254740993),
-    ],
-)
-def test_stamps_keep_every_nanosecond(unit: str, token: str, nanoseconds: int) -> None:
-    from colmap_inertial.io.units import stamps_ns
+    ):
+        with subtests.test(unit=unit, token=token, nanoseconds=nanoseconds):
+            from colmap_inertial.io.units import stamps_ns
 
-    assert stamps_ns(Path("x"), [token], unit).tolist() == [nanoseconds]
+            assert stamps_ns(Path("x"), [token], unit).tolist() == [nanoseconds]
 
 
 def test_columns_of_any_order_and_delimiter_are_found(tmp_path: Path) -> None:
@@ -254,11 +252,15 @@ def test_damage_is_named_with_its_line(clean: tuple[Path, list[str]], change, er
     assert said in str(caught.value) and "imu.csv" in str(caught.value)
 
 
-@pytest.mark.parametrize("unit", ["s", "ms", "us"])
-def test_stamps_in_a_smaller_unit_than_declared_are_refused(tmp_path: Path, unit: str) -> None:
-    path = write_csv(tmp_path / "unit.csv", rows(*handheld()), HEADER.replace("[ns]", f"[{unit}]"))
-    with pytest.raises(TimingError, match="unit"):
-        read_imu(path)
+def test_stamps_in_a_smaller_unit_than_declared_are_refused(
+    subtests: pytest.Subtests, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    for unit in ("s", "ms", "us"):
+        with subtests.test(unit=unit):
+            tmp_path = tmp_path_factory.mktemp("given")
+            path = write_csv(tmp_path / "unit.csv", rows(*handheld()), HEADER.replace("[ns]", f"[{unit}]"))
+            with pytest.raises(TimingError, match="unit"):
+                read_imu(path)
 
 
 def test_milliseconds_read_as_nanoseconds_are_refused(tmp_path: Path) -> None:

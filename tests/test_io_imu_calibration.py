@@ -218,19 +218,17 @@ def test_options_take_one_file_or_several_and_keep_them_in_the_configuration(bot
         read_config(tmp_path / "config.toml", ReconstructOptions)
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
+def test_files_may_stand_anywhere_among_the_words_of_a_command(subtests) -> None:
+    for words in (
         "reconstruct in out --calibration a.json b.json",
         "reconstruct --calibration a.json b.json in out",
         "reconstruct in --calibration a.json out --calibration b.json --seed 3",
-    ],
-)
-def test_files_may_stand_anywhere_among_the_words_of_a_command(words) -> None:
-    command = parse(words.split())
-    assert (command.capture, command.out) == (Path("in"), Path("out"))
-    assert command.options.calibration == (Path("a.json"), Path("b.json"))
-    assert parse(["deblur", "--calibration", "phone.cal", "in", "out"]).calibration == (Path("phone.cal"),)
+    ):
+        with subtests.test(words=words):
+            command = parse(words.split())
+            assert (command.capture, command.out) == (Path("in"), Path("out"))
+            assert command.options.calibration == (Path("a.json"), Path("b.json"))
+            assert parse(["deblur", "--calibration", "phone.cal", "in", "out"]).calibration == (Path("phone.cal"),)
 
 
 # --- the command, and what it remembers ------------------------------------------------------------------------------

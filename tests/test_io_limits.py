@@ -58,66 +58,67 @@ def test_a_text_of_yaml_is_no_longer_than_calibrations_are(tmp_path):
 PARTS = ".".join(["a"] * 6000)
 
 
-@pytest.mark.parametrize("read", [read_toml, lambda path: read_config(path, ReconstructOptions)])
-@pytest.mark.parametrize(
-    "text",
-    [
-        f"{PARTS} = 1",
-        f"[{PARTS}]",
-        f"[[{PARTS}]]",
-        f"x = {{y = 1, {PARTS} = 1}}",
-        ". ".join(['"a"', "'b'"] * 3000) + " = 1",
-        f'x = {{a = """b"""", {PARTS} = 1}}',
-        f"x = {{a = '''b''''', {PARTS} = 1}}",
-        f'x = "#" # "\n{PARTS} = 1',
-        f'x = "\\""\n{PARTS} = 1',
-        f'x = """\\""" """\n{PARTS} = 1',
-    ],
-)
-def test_keys_of_toml_have_few_parts(tmp_path, read, text):
-    path = tmp_path / "capture.toml"
-    path.write_text(text)
-    tracemalloc.start()
-    try:
-        with pytest.raises(FormatError, match="has a key of more than 32 parts"):
-            read(path)
-        assert tracemalloc.get_traced_memory()[1] < 4e6
-    finally:
-        tracemalloc.stop()
+def test_keys_of_toml_have_few_parts(subtests, tmp_path_factory):
+    for read in (read_toml, lambda path: read_config(path, ReconstructOptions)):
+        for text in (
+            f"{PARTS} = 1",
+            f"[{PARTS}]",
+            f"[[{PARTS}]]",
+            f"x = {{y = 1, {PARTS} = 1}}",
+            ". ".join(['"a"', "'b'"] * 3000) + " = 1",
+            f'x = {{a = """b"""", {PARTS} = 1}}',
+            f"x = {{a = '''b''''', {PARTS} = 1}}",
+            f'x = "#" # "\n{PARTS} = 1',
+            f'x = "\\""\n{PARTS} = 1',
+            f'x = """\\""" """\n{PARTS} = 1',
+        ):
+            with subtests.test(read=read, text=text):
+                tmp_path = tmp_path_factory.mktemp("given")
+                path = tmp_path / "capture.toml"
+                path.write_text(text)
+                tracemalloc.start()
+                try:
+                    with pytest.raises(FormatError, match="has a key of more than 32 parts"):
+                        read(path)
+                    assert tracemalloc.get_traced_memory()[1] < 4e6
+                finally:
+                    tracemalloc.stop()
 
 
-@pytest.mark.parametrize("quote", ['"', "'", '"""', "'''"])
-def test_dots_in_texts_and_numbers_of_toml_are_no_parts(tmp_path, quote):
-    path = tmp_path / "capture.toml"
-    many = ", ".join(["1.5"] * 500)
-    path.write_text(f'a = {quote}{PARTS}{quote}\nb.c."d.e" = [{many}] # {PARTS}\nt = 1979-05-27 07:32:00.999\n')
-    section = read_toml(path)
-    assert section.text("a") == PARTS and section.names() == ["a", "b", "t"]
+def test_dots_in_texts_and_numbers_of_toml_are_no_parts(subtests, tmp_path_factory):
+    for quote in ('"', "'", '"""', "'''"):
+        with subtests.test(quote=quote):
+            tmp_path = tmp_path_factory.mktemp("given")
+            path = tmp_path / "capture.toml"
+            many = ", ".join(["1.5"] * 500)
+            path.write_text(f'a = {quote}{PARTS}{quote}\nb.c."d.e" = [{many}] # {PARTS}\nt = 1979-05-27 07:32:00.999\n')
+            section = read_toml(path)
+            assert section.text("a") == PARTS and section.names() == ["a", "b", "t"]
 
 
-@pytest.mark.parametrize(
-    "text", ["[" + "a." * 150_000 + "a]", "a" * 500_000, '"\\"' * 200_000, "'''" * 170_001, "[" * 500_000]
-)
-def test_a_text_of_toml_is_refused_soon(tmp_path, text):
-    path = tmp_path / "capture.toml"
-    path.write_text(text)
-    start_s = time.thread_time()
-    with pytest.raises(FormatError):
-        read_toml(path)
-    assert time.thread_time() - start_s < 5.0
-    path.write_text("#" * 2_100_000)
-    with pytest.raises(FormatError, match="has 2100000 characters; such a file has at most 2097152"):
-        read_toml(path)
+def test_a_text_of_toml_is_refused_soon(subtests, tmp_path_factory):
+    for text in ("[" + "a." * 150_000 + "a]", "a" * 500_000, '"\\"' * 200_000, "'''" * 170_001, "[" * 500_000):
+        with subtests.test(text=text):
+            tmp_path = tmp_path_factory.mktemp("given")
+            path = tmp_path / "capture.toml"
+            path.write_text(text)
+            start_s = time.thread_time()
+            with pytest.raises(FormatError):
+                read_toml(path)
+            assert time.thread_time() - start_s < 5.0
+            path.write_text("#" * 2_100_000)
+            with pytest.raises(FormatError, match="has 2100000 characters; such a file has at most 2097152"):
+                read_toml(path)
 
 
-@pytest.mark.parametrize(
-    ("depth", "kind", "million"), [(8, 2, 125), (16, 2, 62.5), (8, 6, 53.6), (16, 6, 26.8), (1, 3, 250)]
-)
-def test_pixels_of_more_bytes_count_more(tmp_path, depth, kind, million):
-    path = tmp_path / "a.png"
-    path.write_bytes(png(16000, 16000).replace(b"\x01\x00\x00\x00\x00", bytes([depth, kind, 0, 0, 0]), 1))
-    with pytest.raises(FormatError, match=f"more than {million} million are not decoded"):
-        read_image(path)
+def test_pixels_of_more_bytes_count_more(subtests, tmp_path_factory):
+    for depth, kind, million in ((8, 2, 125), (16, 2, 62.5), (8, 6, 53.6), (16, 6, 26.8), (1, 3, 250)):
+        with subtests.test(depth=depth, kind=kind, million=million):
+            tmp_path = tmp_path_factory.mktemp("given")
+            path = tmp_path / "a.png"
+            path.write_bytes(png(16000, 16000).replace(b"\x01\x00\x00\x00\x00", bytes([depth, kind, 0, 0, 0]), 1))
+            with pytest.raises(FormatError, match=f"more than {million} million are not decoded"):
+                read_image(path)
 
 
 def jpeg(width, height, *, progressive=False, scans=False):
@@ -139,34 +140,34 @@ def jpeg_progressive(width, height):
     return jpeg(width, height, progressive=True)
 
 
-@pytest.mark.parametrize(
-    ("encode", "side", "million"),
-    [
+def test_a_picture_of_too_many_pixels_is_not_decoded(subtests, tmp_path_factory):
+    for encode, side, million in (
         (png, 20000, 250),
         (jpeg, 12000, 125),
         (jpeg, 65535, 125),
         (jpeg_progressive, 10000, 83.3),
         (jpeg_in_scans, 10000, 83.3),
-    ],
-)
-def test_a_picture_of_too_many_pixels_is_not_decoded(tmp_path, encode, side, million):
-    path = tmp_path / "large.png"
-    path.write_bytes(encode(side, side))
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    with pytest.raises(
-        FormatError, match=rf"large\.png: has \d+ x \d+ pixels; more than {million} million are not decoded"
     ):
-        read_image(path)
-    assert read_preview(path, 100)[0] is None
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB
+        with subtests.test(encode=encode, side=side, million=million):
+            tmp_path = tmp_path_factory.mktemp("given")
+            path = tmp_path / "large.png"
+            path.write_bytes(encode(side, side))
+            before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+            with pytest.raises(
+                FormatError, match=rf"large\.png: has \d+ x \d+ pixels; more than {million} million are not decoded"
+            ):
+                read_image(path)
+            assert read_preview(path, 100)[0] is None
+            assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB
 
 
-@pytest.mark.parametrize("encode", [jpeg, jpeg_progressive, jpeg_in_scans])
-def test_a_photograph_of_200_million_pixels_is_no_flat_one(encode):
-    data = encode(16384, 12288)
-    with pytest.raises(FormatError, match="pixels"):
-        require_modest("flat.jpg", data)
-    require_modest("photograph.jpg", data + bytes(20_000_000))  # 0.8 bits a pixel
+def test_a_photograph_of_200_million_pixels_is_no_flat_one(subtests):
+    for encode in (jpeg, jpeg_progressive, jpeg_in_scans):
+        with subtests.test(encode=encode):
+            data = encode(16384, 12288)
+            with pytest.raises(FormatError, match="pixels"):
+                require_modest("flat.jpg", data)
+            require_modest("photograph.jpg", data + bytes(20_000_000))  # 0.8 bits a pixel
 
 
 KINDS = [(suffix, np.uint8) for suffix in (".png", ".jpg", ".bmp", ".pgm", ".tif")]
@@ -330,7 +331,7 @@ def test_every_command_takes_them(tmp_path, capsys):
         assert hasattr(command, "limits") or "limits" in {f.name for f in fields(command)}
 
 
-@pytest.mark.parametrize("values", [{"megapixels": 0}, {"table_columns": -1}, {"file_gib": 0.0}, {"megapixels": 2000}])
-def test_impossible_limits_are_refused(values):
-    with pytest.raises(ValueError, match=next(iter(values))):
-        ReadLimits(**values)
+def test_impossible_limits_are_refused(subtests):
+    for values in ({"megapixels": 0}, {"table_columns": -1}, {"file_gib": 0.0}, {"megapixels": 2000}):
+        with subtests.test(values=values), pytest.raises(ValueError, match=next(iter(values))):
+            ReadLimits(**values)

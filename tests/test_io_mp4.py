@@ -71,9 +71,8 @@ def test_samples_lie_in_their_chunks_and_are_shown_when_the_lists_say(tmp_path):
     assert read_movie(write_movie(path, hdlr=box(b"hdlr", bytes(8), b"soun", bytes(12)))).tracks == ()
 
 
-@pytest.mark.parametrize(
-    ("changed", "said"),
-    [
+def test_damage_of_the_index_is_named(subtests, tmp_path_factory):
+    for changed, said in (
         ({"mdhd": box(b"mdhd", bytes(12), struct.pack(">II", 0, 0), bytes(4))}, "a timescale of 0"),
         ({"mdhd": box(b"mdhd", bytes(20))}, r"a header is cut off \(20 bytes, 24 needed\)"),
         ({"hdlr": box(b"hdlr", bytes(8))}, r"a handler is cut off"),
@@ -92,11 +91,11 @@ def test_samples_lie_in_their_chunks_and_are_shown_when_the_lists_say(tmp_path):
         ({"edts": box(b"edts", box(b"elst", bytes(4)))}, "elst is cut off"),
         ({"udta": struct.pack(">I4s", 7, b"udta")}, "the box 'udta' states a size of 7 bytes"),
         ({"udta": struct.pack(">I4s", 99, b"udta")}, "the box 'udta' states a size of 99 bytes where 8 are left"),
-    ],
-)
-def test_damage_of_the_index_is_named(tmp_path, changed, said):
-    with pytest.raises(FormatError, match=said):
-        read_movie(write_movie(tmp_path / "a.mp4", **changed))
+    ):
+        with subtests.test(changed=changed, said=said):
+            tmp_path = tmp_path_factory.mktemp("given")
+            with pytest.raises(FormatError, match=said):
+                read_movie(write_movie(tmp_path / "a.mp4", **changed))
 
 
 def test_samples_beyond_the_file_or_over_each_other_are_refused(tmp_path):
@@ -127,9 +126,8 @@ def test_frames_are_in_order_and_none_shown_with_another(tmp_path):
         read_movie(write_movie(path, hdlr=box(b"hdlr", bytes(8), b"meta", bytes(12)))).frame_times_ns()
 
 
-@pytest.mark.parametrize(
-    ("content", "said"),
-    [
+def test_a_file_without_a_whole_index_is_refused(subtests, tmp_path_factory):
+    for content, said in (
         (b"", "holds no index"),
         (box(b"ftyp", b"isom") + box(b"mdat", bytes(9)), "holds no index"),
         (
@@ -140,10 +138,10 @@ def test_frames_are_in_order_and_none_shown_with_another(tmp_path):
         (struct.pack(">I4sQ", 1, b"moov", 9) + bytes(40), "the box 'moov' at byte 0 states a size of 9"),
         (struct.pack(">I4sQ", 1, b"moov", 1 << 40) + bytes(40), "its index at byte 0 ends beyond"),
         (struct.pack(">I4s", 1, b"moov") + bytes(4), "the box 'moov' at byte 0 states a size of 0"),
-    ],
-)
-def test_a_file_without_a_whole_index_is_refused(tmp_path, content, said):
-    path = tmp_path / "a.mp4"
-    path.write_bytes(content)
-    with pytest.raises(FormatError, match=said):
-        read_movie(path)
+    ):
+        with subtests.test(content=content, said=said):
+            tmp_path = tmp_path_factory.mktemp("given")
+            path = tmp_path / "a.mp4"
+            path.write_bytes(content)
+            with pytest.raises(FormatError, match=said):
+                read_movie(path)

@@ -165,29 +165,35 @@ def test_the_advice_for_an_accelerometer_of_any_mirrored_axes_restores_it(
     assert restored >= 22  # of 24; see the test of the gyroscope's axes
 
 
-@pytest.mark.parametrize(("first", "second"), [(0, 1), (0, 2), (1, 2)])
 def test_exchanged_accelerometer_columns_are_named_and_corrected_through_a_capture(
-    recordings: dict[str, ImuRecording], shared_data: Path, tmp_path: Path, first: int, second: int
+    subtests: pytest.Subtests,
+    recordings: dict[str, ImuRecording],
+    shared_data: Path,
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> None:
-    folder = shared_data / "inertial_scale/D3"
-    columns = [2, 3, 4]
-    columns[first], columns[second] = columns[second], columns[first]
-    text = "".join(
-        f'[imu.{sensor}]\nfile = "{folder / name}"\ntime = 1\ntime_unit = "ns"\ncolumns = {chosen}\nunit = "{unit}"\n'
-        for sensor, name, chosen, unit in (
-            ("gyro", "gyroscope.txt", [2, 3, 4], "rad/s"),
-            ("accel", "accelerometer.txt", columns, "m/s2"),
-        )
-    )
-    capture = tmp_path / "capture.toml"
-    capture.write_text(text)
-    said = f"accelerometer's {'xyz'[first]} and {'xyz'[second]} columns that are exchanged"
-    with pytest.raises(FormatError, match=said) as caught:
-        read_imu(capture)
-    assert {"gyro", "accel"} == set(settings(str(caught.value)))
-    axes = settings(str(caught.value))["accel"]
-    capture.write_text(text + f'axes = "{axes}"\nmirrored = true\n')
-    np.testing.assert_array_equal(read_imu(capture).accel_m_s2, recordings["inertial_scale/D3"].accel_m_s2)
+    for first, second in ((0, 1), (0, 2), (1, 2)):
+        with subtests.test(first=first, second=second):
+            tmp_path = tmp_path_factory.mktemp("given")
+            folder = shared_data / "inertial_scale/D3"
+            columns = [2, 3, 4]
+            columns[first], columns[second] = columns[second], columns[first]
+            text = "".join(
+                f'[imu.{sensor}]\nfile = "{folder / name}"\ntime = 1\ntime_unit = "ns"\n'
+                f'columns = {chosen}\nunit = "{unit}"\n'
+                for sensor, name, chosen, unit in (
+                    ("gyro", "gyroscope.txt", [2, 3, 4], "rad/s"),
+                    ("accel", "accelerometer.txt", columns, "m/s2"),
+                )
+            )
+            capture = tmp_path / "capture.toml"
+            capture.write_text(text)
+            said = f"accelerometer's {'xyz'[first]} and {'xyz'[second]} columns that are exchanged"
+            with pytest.raises(FormatError, match=said) as caught:
+                read_imu(capture)
+            assert {"gyro", "accel"} == set(settings(str(caught.value)))
+            axes = settings(str(caught.value))["accel"]
+            capture.write_text(text + f'axes = "{axes}"\nmirrored = true\n')
+            np.testing.assert_array_equal(read_imu(capture).accel_m_s2, recordings["inertial_scale/D3"].accel_m_s2)
 
 
 def test_axes_to_set_replace_those_that_were_set(recordings: dict[str, ImuRecording]) -> None:
@@ -205,23 +211,29 @@ def test_axes_to_set_replace_those_that_were_set(recordings: dict[str, ImuRecord
     assert str(settings(str(caught.value))["accel"]) == "x,y,z"
 
 
-@pytest.mark.parametrize(("stated", "true"), [("-z,y,x", "y,-x,z"), ("y,z,x", "-z,y,x"), ("x,y,z", "y,z,x")])
-def test_axes_to_set_are_those_of_the_file_s_columns(recordings: dict[str, ImuRecording], stated, true) -> None:
-    imu = recordings["inertial_scale/D1"]
-    columns = imu.gyro_rad_s @ Axes.parse(true).matrix
-    np.testing.assert_array_equal(Axes.parse(true).apply(columns), imu.gyro_rad_s)
-    altered = replace(imu, gyro_rad_s=Axes.parse(stated).apply(columns))
-    with pytest.raises(FormatError) as caught:
-        RawImu(imu=altered, path=Path("x"), gyro_axes=Axes.parse(stated)).check()
-    assert str(settings(str(caught.value))["gyro"]) == true
+def test_axes_to_set_are_those_of_the_file_s_columns(
+    subtests: pytest.Subtests, recordings: dict[str, ImuRecording]
+) -> None:
+    for stated, true in (("-z,y,x", "y,-x,z"), ("y,z,x", "-z,y,x"), ("x,y,z", "y,z,x")):
+        with subtests.test(stated=stated, true=true):
+            imu = recordings["inertial_scale/D1"]
+            columns = imu.gyro_rad_s @ Axes.parse(true).matrix
+            np.testing.assert_array_equal(Axes.parse(true).apply(columns), imu.gyro_rad_s)
+            altered = replace(imu, gyro_rad_s=Axes.parse(stated).apply(columns))
+            with pytest.raises(FormatError) as caught:
+                RawImu(imu=altered, path=Path("x"), gyro_axes=Axes.parse(stated)).check()
+            assert str(settings(str(caught.value))["gyro"]) == true
 
 
-@pytest.mark.parametrize("name", HANDHELD)
-def test_a_wrong_unit_of_a_slow_gyroscope_is_noticed_by_gravity(recordings: dict[str, ImuRecording], name: str) -> None:
-    imu = recordings[name]
-    for factor, unit in ((180 / np.pi, "deg/s"), (np.pi / 180, "rad/s")):
-        with pytest.raises(FormatError, match=f'unit = "{unit}" under'):
-            check_consistent(RawImu(imu=replace(imu, gyro_rad_s=imu.gyro_rad_s * factor), path=Path("x")))
+def test_a_wrong_unit_of_a_slow_gyroscope_is_noticed_by_gravity(
+    subtests: pytest.Subtests, recordings: dict[str, ImuRecording]
+) -> None:
+    for name in HANDHELD:
+        with subtests.test(name=name):
+            imu = recordings[name]
+            for factor, unit in ((180 / np.pi, "deg/s"), (np.pi / 180, "rad/s")):
+                with pytest.raises(FormatError, match=f'unit = "{unit}" under'):
+                    check_consistent(RawImu(imu=replace(imu, gyro_rad_s=imu.gyro_rad_s * factor), path=Path("x")))
 
 
 def test_a_gyroscope_in_a_moving_car_and_one_in_strong_shake_are_accepted(shared_data: Path) -> None:

@@ -93,50 +93,56 @@ def moved_rows(rows):
     return after
 
 
-@pytest.mark.parametrize("chunk", [4 << 20, 256])
-@pytest.mark.parametrize("kind", FORMATS)
-def test_positions_and_normals_move_and_every_other_byte_stays(tmp_path, monkeypatch, kind, chunk):
-    monkeypatch.setattr(ply, "_CHUNK_BYTES", chunk)
-    source, target = tmp_path / "a.ply", tmp_path / "b.ply"
-    data, rows = odd_ply(kind)
-    source.write_bytes(data)
-    assert transform_ply(source, target, SIMILARITY) == ("positions", "normals")
-    assert source.read_bytes() == data
-    got = target.read_bytes()
-    expected, _ = odd_ply(kind, rows=moved_rows(rows))
-    if kind == "ascii":
-        # The last digit may differ from that of this test's own product; all else is the same text
-        before, after, wanted = (text.split(b"\n") for text in (data, got, expected))
-        assert len(before) == len(after) == len(wanted)
-        for old, new, want in zip(before, after, wanted, strict=True):
-            if len(old.split(b"  ")) != len(FIELDS):
-                assert old == new
-                continue
-            old, new, want = (line.split(b"  ") for line in (old, new, want))
-            for (name, _), o, n, w in zip(FIELDS, old, new, want, strict=True):
-                if name in ("x", "y", "z", "nx", "ny", "nz"):
-                    assert float(n) == pytest.approx(float(w), abs=1e-6 if name[0] == "n" else 1e-13)
+def test_positions_and_normals_move_and_every_other_byte_stays(subtests, tmp_path_factory):
+    for chunk in (4 << 20, 256):
+        for kind in FORMATS:
+            with subtests.test(chunk=chunk, kind=kind), pytest.MonkeyPatch.context() as monkeypatch:
+                tmp_path = tmp_path_factory.mktemp("given")
+                monkeypatch.setattr(ply, "_CHUNK_BYTES", chunk)
+                source, target = tmp_path / "a.ply", tmp_path / "b.ply"
+                data, rows = odd_ply(kind)
+                source.write_bytes(data)
+                assert transform_ply(source, target, SIMILARITY) == ("positions", "normals")
+                assert source.read_bytes() == data
+                got = target.read_bytes()
+                expected, _ = odd_ply(kind, rows=moved_rows(rows))
+                if kind == "ascii":
+                    # The last digit may differ from that of this test's own product; all else is the same text
+                    before, after, wanted = (text.split(b"\n") for text in (data, got, expected))
+                    assert len(before) == len(after) == len(wanted)
+                    for old, new, want in zip(before, after, wanted, strict=True):
+                        if len(old.split(b"  ")) != len(FIELDS):
+                            assert old == new
+                            continue
+                        old, new, want = (line.split(b"  ") for line in (old, new, want))
+                        for (name, _), o, n, w in zip(FIELDS, old, new, want, strict=True):
+                            if name in ("x", "y", "z", "nx", "ny", "nz"):
+                                assert float(n) == pytest.approx(float(w), abs=1e-6 if name[0] == "n" else 1e-13)
+                            else:
+                                assert o == n
                 else:
-                    assert o == n
-    else:
-        start, order = data.index(b"end_header\n") + 11 + 24, FORMATS[kind]
-        dtype = np.dtype([(name, order + kind) for name, kind in FIELDS])
-        end = start + 40 * dtype.itemsize
-        assert (got[:start], got[end:]) == (data[:start], data[end:])
-        after, wanted = np.frombuffer(got[start:end], dtype), np.frombuffer(expected[start:end], dtype)
-        for name, _ in FIELDS:
-            if name in ("x", "y", "z", "nx", "ny", "nz"):
-                np.testing.assert_allclose(after[name], wanted[name], atol=1e-6 if name[0] == "n" else 1e-13)
-            else:
-                assert after[name].tobytes() == wanted[name].tobytes()
+                    start, order = data.index(b"end_header\n") + 11 + 24, FORMATS[kind]
+                    dtype = np.dtype([(name, order + kind) for name, kind in FIELDS])
+                    end = start + 40 * dtype.itemsize
+                    assert (got[:start], got[end:]) == (data[:start], data[end:])
+                    after, wanted = np.frombuffer(got[start:end], dtype), np.frombuffer(expected[start:end], dtype)
+                    for name, _ in FIELDS:
+                        if name in ("x", "y", "z", "nx", "ny", "nz"):
+                            np.testing.assert_allclose(
+                                after[name], wanted[name], atol=1e-6 if name[0] == "n" else 1e-13
+                            )
+                        else:
+                            assert after[name].tobytes() == wanted[name].tobytes()
 
 
-@pytest.mark.parametrize("kind", FORMATS)
-def test_the_identity_changes_no_byte(tmp_path, kind):
-    data, _ = odd_ply(kind)
-    (tmp_path / "a.ply").write_bytes(data)
-    transform_ply(tmp_path / "a.ply", tmp_path / "b.ply", IDENTITY)
-    assert (tmp_path / "b.ply").read_bytes() == data
+def test_the_identity_changes_no_byte(subtests, tmp_path_factory):
+    for kind in FORMATS:
+        with subtests.test(kind=kind):
+            tmp_path = tmp_path_factory.mktemp("given")
+            data, _ = odd_ply(kind)
+            (tmp_path / "a.ply").write_bytes(data)
+            transform_ply(tmp_path / "a.ply", tmp_path / "b.ply", IDENTITY)
+            assert (tmp_path / "b.ply").read_bytes() == data
 
 
 def test_a_windows_header_and_points_that_are_not_a_number_pass(tmp_path):
@@ -188,42 +194,46 @@ def test_splats_are_refused_rather_than_half_transformed(tmp_path):
         transform_ply(tmp_path / "a.ply", tmp_path / "b.ply", SIMILARITY)
 
 
-@pytest.mark.parametrize("kind", FORMATS)
-def test_a_file_cut_anywhere_is_refused(tmp_path, kind):
-    data, _ = odd_ply(kind)
-    path = tmp_path / "a.ply"
-    for n in np.random.default_rng(3).integers(0, len(data) - (2 if kind == "ascii" else 0), 150):
-        write_anew(path, data[:n])
-        with pytest.raises(FormatError):
-            transform_ply(path, tmp_path / "b.ply", SIMILARITY)
-    if kind != "ascii":
-        path.write_bytes(data + b"\0")
-        with pytest.raises(FormatError, match="1 bytes follow"):
-            transform_ply(path, tmp_path / "b.ply", SIMILARITY)
-
-
-@pytest.mark.parametrize("kind", FORMATS)
-def test_only_errors_of_our_own_escape(tmp_path, kind):
-    data, _ = odd_ply(kind)
-    path = tmp_path / "a.ply"
-    rng = np.random.default_rng(zlib.crc32(kind.encode()))
-    refused = 0
-    for i in range(150):
-        damaged = mutated(data, rng)
-        write_anew(path, damaged)
-        try:
-            transform_ply(path, tmp_path / "b.ply", SIMILARITY)
-        except InertialError as error:
-            refused += 1
-            assert str(path) in str(error)
-        except Exception as error:
-            error.add_note(f"mutation {i}: {damaged[:300]!r}")
-            raise
-        else:
-            # What passes has the length that its header says: nothing was dropped on the way
+def test_a_file_cut_anywhere_is_refused(subtests, tmp_path_factory):
+    for kind in FORMATS:
+        with subtests.test(kind=kind):
+            tmp_path = tmp_path_factory.mktemp("given")
+            data, _ = odd_ply(kind)
+            path = tmp_path / "a.ply"
+            for n in np.random.default_rng(3).integers(0, len(data) - (2 if kind == "ascii" else 0), 150):
+                write_anew(path, data[:n])
+                with pytest.raises(FormatError):
+                    transform_ply(path, tmp_path / "b.ply", SIMILARITY)
             if kind != "ascii":
-                assert len(damaged) == (tmp_path / "b.ply").stat().st_size
-    assert refused > 60
+                path.write_bytes(data + b"\0")
+                with pytest.raises(FormatError, match="1 bytes follow"):
+                    transform_ply(path, tmp_path / "b.ply", SIMILARITY)
+
+
+def test_only_errors_of_our_own_escape(subtests, tmp_path_factory):
+    for kind in FORMATS:
+        with subtests.test(kind=kind):
+            tmp_path = tmp_path_factory.mktemp("given")
+            data, _ = odd_ply(kind)
+            path = tmp_path / "a.ply"
+            rng = np.random.default_rng(zlib.crc32(kind.encode()))
+            refused = 0
+            for i in range(150):
+                damaged = mutated(data, rng)
+                write_anew(path, damaged)
+                try:
+                    transform_ply(path, tmp_path / "b.ply", SIMILARITY)
+                except InertialError as error:
+                    refused += 1
+                    assert str(path) in str(error)
+                except Exception as error:
+                    error.add_note(f"mutation {i}: {damaged[:300]!r}")
+                    raise
+                else:
+                    # What passes has the length that its header says: nothing was dropped on the way
+                    if kind != "ascii":
+                        assert len(damaged) == (tmp_path / "b.ply").stat().st_size
+            assert refused > 60
 
 
 def test_meshes_of_open3d_are_read_by_open3d_afterwards(tmp_path):

@@ -49,9 +49,11 @@ def test_a_video_that_names_its_camera_gets_the_published_readout(tmp_path: Path
     assert (capture.readout_s, capture.readout_source) == (0.02, "")
 
 
-@pytest.mark.parametrize("other", [{"model": "iPhone 30"}, {"rate": 60}, {"size": (320, 240)}])
-def test_another_camera_or_mode_has_none(tmp_path: Path, other: dict[str, object]) -> None:
-    assert readout_of_video(film(tmp_path / "a.mov", **other)) is None  # type: ignore[arg-type]
+def test_another_camera_or_mode_has_none(subtests: pytest.Subtests, tmp_path_factory: pytest.TempPathFactory) -> None:
+    for other in ({"model": "iPhone 30"}, {"rate": 60}, {"size": (320, 240)}):
+        with subtests.test(other=other):
+            tmp_path = tmp_path_factory.mktemp("given")
+            assert readout_of_video(film(tmp_path / "a.mov", **other)) is None  # type: ignore[arg-type]
 
 
 def test_what_is_no_video_has_none(tmp_path: Path) -> None:

@@ -213,21 +213,22 @@ def test_opencamera_and_stray_scanner_give_frame_times(tmp_path: Path, one_clock
     assert (log.camera.width, log.camera.height) == (1920, 1440)
 
 
-@pytest.mark.parametrize(
-    ("header", "readout_s", "direction"),
-    [
+def test_gcsv_gives_the_readout(
+    subtests: pytest.Subtests, tmp_path_factory: pytest.TempPathFactory, one_clock: ImuRecording
+) -> None:
+    for header, readout_s, direction in (
         ("", None, "down"),
         ("frame_readout_time,18.5", 0.0185, "down"),
         ("frame_readout_time,18.5\nframe_readout_direction,1", 0.0185, "up"),
         ("frame_readout_time,18.5\nframe_readout_direction,2", 0.0185, "right"),
         ("frame_readout_time,18.5\nframe_readout_direction,RightToLeft", 0.0185, "left"),
-    ],
-)
-def test_gcsv_gives_the_readout(tmp_path: Path, one_clock: ImuRecording, header, readout_s, direction) -> None:
-    path = imu_files.write_gcsv(tmp_path / "a.gcsv", one_clock, header=header)
-    log = log_of(path)
-    assert (log.readout_s, log.readout_direction, len(log.t_s)) == (readout_s, direction, 0)
-    assert read_imu(path).device == "simulated mycam_v2"
+    ):
+        with subtests.test(header=header, readout_s=readout_s, direction=direction):
+            tmp_path = tmp_path_factory.mktemp("given")
+            path = imu_files.write_gcsv(tmp_path / "a.gcsv", one_clock, header=header)
+            log = log_of(path)
+            assert (log.readout_s, log.readout_direction, len(log.t_s)) == (readout_s, direction, 0)
+            assert read_imu(path).device == "simulated mycam_v2"
 
 
 def test_camm_gives_exposure_and_readout(tmp_path: Path, imu: ImuRecording) -> None:
@@ -321,20 +322,24 @@ def test_a_video_without_an_imu_says_so(tmp_path: Path) -> None:
         read_imu(path)
 
 
-@pytest.mark.parametrize(("delimiter", "decimal"), [(",", "."), (";", ","), ("\t", ".")])
-def test_phyphox_is_read_whatever_delimiter_was_chosen(tmp_path: Path, imu: ImuRecording, delimiter, decimal) -> None:
-    import zipfile
+def test_phyphox_is_read_whatever_delimiter_was_chosen(
+    subtests: pytest.Subtests, tmp_path_factory: pytest.TempPathFactory, imu: ImuRecording
+) -> None:
+    for delimiter, decimal in ((",", "."), (";", ","), ("\t", ".")):
+        with subtests.test(delimiter=delimiter, decimal=decimal):
+            tmp_path = tmp_path_factory.mktemp("given")
+            import zipfile
 
-    path = imu_files.write_phyphox(tmp_path, imu, delimiter=delimiter, decimal=decimal)
-    assert [one.name for one in imu_formats() if one.accepts(path)] == ["phyphox"]
-    found = read_imu(path)
-    assert found.device == "phyphox"
-    np.testing.assert_allclose(found.gyro_rad_s, imu.gyro_rad_s, rtol=1e-8, atol=1e-12)
-    np.testing.assert_allclose(found.accel_m_s2, imu.accel_m_s2, rtol=1e-8)
-    np.testing.assert_allclose(np.diff(found.gyro_t_s), np.diff(imu.gyro_t_s), atol=2e-8)
-    with zipfile.ZipFile(path) as archive:
-        archive.extractall(tmp_path / "unpacked")
-    np.testing.assert_array_equal(read_imu(tmp_path / "unpacked").accel_m_s2, found.accel_m_s2)
+            path = imu_files.write_phyphox(tmp_path, imu, delimiter=delimiter, decimal=decimal)
+            assert [one.name for one in imu_formats() if one.accepts(path)] == ["phyphox"]
+            found = read_imu(path)
+            assert found.device == "phyphox"
+            np.testing.assert_allclose(found.gyro_rad_s, imu.gyro_rad_s, rtol=1e-8, atol=1e-12)
+            np.testing.assert_allclose(found.accel_m_s2, imu.accel_m_s2, rtol=1e-8)
+            np.testing.assert_allclose(np.diff(found.gyro_t_s), np.diff(imu.gyro_t_s), atol=2e-8)
+            with zipfile.ZipFile(path) as archive:
+                archive.extractall(tmp_path / "unpacked")
+            np.testing.assert_array_equal(read_imu(tmp_path / "unpacked").accel_m_s2, found.accel_m_s2)
 
 
 def test_phyphox_without_gravity_says_what_to_record(tmp_path: Path, imu: ImuRecording) -> None:

@@ -111,13 +111,17 @@ def write_packed(folder: Path, imu: ImuRecording, kind: str, packed_by: str, mor
     return imu_files.write_rosbag(folder / name, imu, kind=kind, packed_by=packed_by, more=more)
 
 
-@pytest.mark.parametrize(("kind", "packed_by"), PACKED)
-def test_packed_ros_recordings_are_read_as_others(tmp_path: Path, imu: ImuRecording, kind: str, packed_by: str) -> None:
-    (tmp_path / "packed").mkdir()
-    whole = read_imu(write_packed(tmp_path, imu, kind, ""))
-    packed = read_imu(write_packed(tmp_path / "packed", imu, kind, packed_by))
-    for field in dataclasses.fields(ImuRecording):
-        np.testing.assert_array_equal(getattr(packed, field.name), getattr(whole, field.name))
+def test_packed_ros_recordings_are_read_as_others(
+    subtests: pytest.Subtests, tmp_path_factory: pytest.TempPathFactory, imu: ImuRecording
+) -> None:
+    for kind, packed_by in PACKED:
+        with subtests.test(kind=kind, packed_by=packed_by):
+            tmp_path = tmp_path_factory.mktemp("given")
+            (tmp_path / "packed").mkdir()
+            whole = read_imu(write_packed(tmp_path, imu, kind, ""))
+            packed = read_imu(write_packed(tmp_path / "packed", imu, kind, packed_by))
+            for field in dataclasses.fields(ImuRecording):
+                np.testing.assert_array_equal(getattr(packed, field.name), getattr(whole, field.name))
 
 
 @pytest.mark.parametrize(("kind", "packed_by"), PACKED)

@@ -58,22 +58,26 @@ def capture_of(folder: Path, video: str, rest: str = "") -> Path:
     return folder
 
 
-@pytest.mark.parametrize("suffix", ["mp4", "mkv", "mov"])
-@pytest.mark.parametrize("b_frames", [0, 2])
 def test_variable_rate_and_container_start_are_exact_to_a_microsecond(
-    tmp_path: Path, suffix: str, b_frames: int
+    subtests: pytest.Subtests, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    write_video(tmp_path / f"a.{suffix}", b_frames=b_frames)
-    timing, frames = read_frames(capture_of(tmp_path, f'file = "a.{suffix}"'))
-    assert timing.epoch_ns == 100_000_000
-    np.testing.assert_allclose(timing.t_s + timing.epoch_ns / 1e9, np.array(VARIABLE_MS) / 1e3, atol=1e-6, rtol=0)
-    levels = []
-    for i, frame in enumerate(frames):
-        assert frame.name == timing.names[i] == f"frame_{VARIABLE_MS[i] * 1000:012d}.png"
-        assert frame.t_s == timing.t_s[i] and frame.image.shape == (48, 64, 3)
-        levels.append(float(frame.image.mean()))
-    np.testing.assert_allclose(levels, [20 + 15 * i for i in range(12)], atol=3)
-    assert load_capture(tmp_path).image_folder is None
+    for suffix in ("mp4", "mkv", "mov"):
+        for b_frames in (0, 2):
+            with subtests.test(suffix=suffix, b_frames=b_frames):
+                tmp_path = tmp_path_factory.mktemp("given")
+                write_video(tmp_path / f"a.{suffix}", b_frames=b_frames)
+                timing, frames = read_frames(capture_of(tmp_path, f'file = "a.{suffix}"'))
+                assert timing.epoch_ns == 100_000_000
+                np.testing.assert_allclose(
+                    timing.t_s + timing.epoch_ns / 1e9, np.array(VARIABLE_MS) / 1e3, atol=1e-6, rtol=0
+                )
+                levels = []
+                for i, frame in enumerate(frames):
+                    assert frame.name == timing.names[i] == f"frame_{VARIABLE_MS[i] * 1000:012d}.png"
+                    assert frame.t_s == timing.t_s[i] and frame.image.shape == (48, 64, 3)
+                    levels.append(float(frame.image.mean()))
+                np.testing.assert_allclose(levels, [20 + 15 * i for i in range(12)], atol=3)
+                assert load_capture(tmp_path).image_folder is None
 
 
 def test_a_recorders_own_frame_times_replace_the_stamps(tmp_path: Path) -> None:
@@ -335,22 +339,26 @@ def test_a_change_of_size_is_refused_at_its_time(tmp_path: Path) -> None:
     assert len(list(decode_reduced(video, stamps[:14], 64))) == 14
 
 
-@pytest.mark.parametrize("turn", [90, 180, 270])
-def test_a_rotation_mark_leaves_the_sensor_s_rows_alone(tmp_path: Path, turn: int) -> None:
-    video = write_pattern(tmp_path / "a.mp4", 6)
-    before = [frame.image for frame in read_frames(capture_of(tmp_path, 'file = "a.mp4"'))[1]]
-    c, s = round(np.cos(np.radians(turn))), round(np.sin(np.radians(turn)))
-    matrix = struct.pack(">9i", *(int(v * 2**16) for v in (c, s, 0, -s, c, 0)), 0, 0, 2**30)
-    patched(video, b"tkhd", 40, matrix)
-    assert next(decode_grey(video))[1] % 360 == -turn % 360  # FFmpeg counts the other way round
-    timing, frames = read_frames(capture_of(tmp_path, 'file = "a.mp4"', "[timing]\nreadout_s = 0.02"))
-    assert timing.readout_direction == "down"
-    for frame, expected in zip(frames, before, strict=True):
-        np.testing.assert_array_equal(frame.image, expected)
-    camera = '[camera]\nmodel = "SIMPLE_PINHOLE"\nwidth = 240\nheight = 320\nparams = [300, 120, 160]\n'
-    camera += 'pixel_origin = "corner"'
-    with pytest.raises(FormatError, match=r"is 320x240.* declared as 240x320.*not turned by 90 degrees"):
-        list(read_frames(capture_of(tmp_path, 'file = "a.mp4"', camera))[1])
+def test_a_rotation_mark_leaves_the_sensor_s_rows_alone(
+    subtests: pytest.Subtests, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    for turn in (90, 180, 270):
+        with subtests.test(turn=turn):
+            tmp_path = tmp_path_factory.mktemp("given")
+            video = write_pattern(tmp_path / "a.mp4", 6)
+            before = [frame.image for frame in read_frames(capture_of(tmp_path, 'file = "a.mp4"'))[1]]
+            c, s = round(np.cos(np.radians(turn))), round(np.sin(np.radians(turn)))
+            matrix = struct.pack(">9i", *(int(v * 2**16) for v in (c, s, 0, -s, c, 0)), 0, 0, 2**30)
+            patched(video, b"tkhd", 40, matrix)
+            assert next(decode_grey(video))[1] % 360 == -turn % 360  # FFmpeg counts the other way round
+            timing, frames = read_frames(capture_of(tmp_path, 'file = "a.mp4"', "[timing]\nreadout_s = 0.02"))
+            assert timing.readout_direction == "down"
+            for frame, expected in zip(frames, before, strict=True):
+                np.testing.assert_array_equal(frame.image, expected)
+            camera = '[camera]\nmodel = "SIMPLE_PINHOLE"\nwidth = 240\nheight = 320\nparams = [300, 120, 160]\n'
+            camera += 'pixel_origin = "corner"'
+            with pytest.raises(FormatError, match=r"is 320x240.* declared as 240x320.*not turned by 90 degrees"):
+                list(read_frames(capture_of(tmp_path, 'file = "a.mp4"', camera))[1])
 
 
 #: Weights of red and blue in the luma of FFmpeg's colour matrices 1 (BT.709), 5, 6 (BT.601), 9 (BT.2020).
@@ -371,62 +379,65 @@ def rgb_of(yuv: np.ndarray, matrix: int, full: bool, bits: int) -> np.ndarray:
     return np.clip(np.stack([r, (y - red * r - blue * b) / (1 - red - blue), b], axis=-1), 0, 1)
 
 
-@pytest.mark.parametrize("bits", [8, 10])
-@pytest.mark.parametrize("height", [240, 720])
-def test_colours_are_those_that_the_video_states(tmp_path: Path, bits: int, height: int) -> None:
-    width, one = 64, 2 ** (bits - 8)
-    pix_fmt, kind = ("yuv444p", np.uint8) if bits == 8 else ("yuv444p10le", np.uint16)
-    yuv = np.empty((height, width, 3), kind)
-    yuv[..., 0] = np.linspace(16, 235, width) * one
-    yuv[..., 1:] = 100 * one, 160 * one
-    for matrix, stated_range in itertools.product((2, *LUMA), (0, 1, 2)):
-        with av.open(str(tmp_path / "a.mkv"), "w") as container:
-            stream = container.add_stream("ffv1", rate=30)
-            stream.width, stream.height, stream.pix_fmt = width, height, pix_fmt
-            stream.codec_context.colorspace, stream.codec_context.color_range = matrix, stated_range
-            frame = av.VideoFrame(width, height, pix_fmt)
-            for i, plane in enumerate(frame.planes):
-                rows = np.zeros((height, plane.line_size), np.uint8)
-                rows[:, : width * yuv.itemsize] = np.ascontiguousarray(yuv[..., i]).view(np.uint8)
-                plane.update(rows.tobytes())
-            frame.pts, frame.time_base = 0, Fraction(1, 30)
-            frame.colorspace, frame.color_range = matrix, stated_range
-            container.mux(stream.encode(frame))
-            container.mux(stream.encode())
-        [(_, image)] = decode_video(tmp_path / "a.mkv", np.array([0]))
-        # without a statement: limited range; high definition is BT.709, the rest BT.601
-        meant = matrix if matrix != 2 else (1 if height >= 720 else 6)
-        expected = rgb_of(yuv, meant, stated_range == 2, bits)
-        # FFmpeg takes white of 10 bit in limited range to 65280 of 65535
-        tolerance = 0.8 / 255 if bits == 8 else 1.0 / 255
-        assert image.dtype == kind and np.abs(image / np.iinfo(kind).max - expected).max() < tolerance
-        [(_, grey)] = decode_reduced(tmp_path / "a.mkv", np.array([0]), 4000)
-        assert np.array_equal(grey, yuv[..., 0] // one)
+def test_colours_are_those_that_the_video_states(
+    subtests: pytest.Subtests, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    for bits in (8, 10):
+        for height in (240, 720):
+            with subtests.test(bits=bits, height=height):
+                tmp_path = tmp_path_factory.mktemp("given")
+                width, one = 64, 2 ** (bits - 8)
+                pix_fmt, kind = ("yuv444p", np.uint8) if bits == 8 else ("yuv444p10le", np.uint16)
+                yuv = np.empty((height, width, 3), kind)
+                yuv[..., 0] = np.linspace(16, 235, width) * one
+                yuv[..., 1:] = 100 * one, 160 * one
+                for matrix, stated_range in itertools.product((2, *LUMA), (0, 1, 2)):
+                    with av.open(str(tmp_path / "a.mkv"), "w") as container:
+                        stream = container.add_stream("ffv1", rate=30)
+                        stream.width, stream.height, stream.pix_fmt = width, height, pix_fmt
+                        stream.codec_context.colorspace, stream.codec_context.color_range = matrix, stated_range
+                        frame = av.VideoFrame(width, height, pix_fmt)
+                        for i, plane in enumerate(frame.planes):
+                            rows = np.zeros((height, plane.line_size), np.uint8)
+                            rows[:, : width * yuv.itemsize] = np.ascontiguousarray(yuv[..., i]).view(np.uint8)
+                            plane.update(rows.tobytes())
+                        frame.pts, frame.time_base = 0, Fraction(1, 30)
+                        frame.colorspace, frame.color_range = matrix, stated_range
+                        container.mux(stream.encode(frame))
+                        container.mux(stream.encode())
+                    [(_, image)] = decode_video(tmp_path / "a.mkv", np.array([0]))
+                    # without a statement: limited range; high definition is BT.709, the rest BT.601
+                    meant = matrix if matrix != 2 else (1 if height >= 720 else 6)
+                    expected = rgb_of(yuv, meant, stated_range == 2, bits)
+                    # FFmpeg takes white of 10 bit in limited range to 65280 of 65535
+                    tolerance = 0.8 / 255 if bits == 8 else 1.0 / 255
+                    assert image.dtype == kind and np.abs(image / np.iinfo(kind).max - expected).max() < tolerance
+                    [(_, grey)] = decode_reduced(tmp_path / "a.mkv", np.array([0]), 4000)
+                    assert np.array_equal(grey, yuv[..., 0] // one)
 
 
-@pytest.mark.parametrize(
-    ("codec", "pix_fmt", "size"),
-    [
+def test_codecs_depths_and_odd_sizes(subtests: pytest.Subtests, tmp_path_factory: pytest.TempPathFactory) -> None:
+    for codec, pix_fmt, size in (
         ("libx265", "yuv420p", (320, 240)),
         ("libx265", "yuv420p10le", (320, 240)),
         ("ffv1", "yuv420p", (321, 241)),
         ("libx264", "yuv444p", (321, 241)),
         ("libx264", "yuvj420p", (322, 242)),
         ("mjpeg", "yuvj422p", (320, 240)),
-    ],
-)
-def test_codecs_depths_and_odd_sizes(tmp_path: Path, codec: str, pix_fmt: str, size: tuple[int, int]) -> None:
-    write_pattern(tmp_path / "a.mkv", 20, codec=codec, pix_fmt=pix_fmt, size=size)
-    write_pattern(tmp_path / "true.mkv", 20, codec="ffv1", pix_fmt="bgr0", size=size)
-    timing, frames = read_frames(capture_of(tmp_path, 'file = "a.mkv"'))
-    np.testing.assert_allclose(timing.t_s, np.arange(20) / 30, atol=5.1e-4)  # Matroska counts milliseconds
-    _, truth = read_frames(capture_of(tmp_path, 'file = "true.mkv"'))
-    for frame, true in zip(frames, truth, strict=True):
-        assert frame.image.shape == true.image.shape == (size[1], size[0], 3)
-        assert frame.image.dtype == (np.uint16 if "10" in pix_fmt else np.uint8)
-        found = frame.image / (257 if "10" in pix_fmt else 1)
-        grey, expected = (cv2.cvtColor(x.astype(np.float32), cv2.COLOR_RGB2GRAY) for x in (found, true.image))
-        assert np.sqrt(np.mean((grey - expected) ** 2)) < 16
+    ):
+        with subtests.test(codec=codec, pix_fmt=pix_fmt, size=size):
+            tmp_path = tmp_path_factory.mktemp("given")
+            write_pattern(tmp_path / "a.mkv", 20, codec=codec, pix_fmt=pix_fmt, size=size)
+            write_pattern(tmp_path / "true.mkv", 20, codec="ffv1", pix_fmt="bgr0", size=size)
+            timing, frames = read_frames(capture_of(tmp_path, 'file = "a.mkv"'))
+            np.testing.assert_allclose(timing.t_s, np.arange(20) / 30, atol=5.1e-4)  # Matroska counts milliseconds
+            _, truth = read_frames(capture_of(tmp_path, 'file = "true.mkv"'))
+            for frame, true in zip(frames, truth, strict=True):
+                assert frame.image.shape == true.image.shape == (size[1], size[0], 3)
+                assert frame.image.dtype == (np.uint16 if "10" in pix_fmt else np.uint8)
+                found = frame.image / (257 if "10" in pix_fmt else 1)
+                grey, expected = (cv2.cvtColor(x.astype(np.float32), cv2.COLOR_RGB2GRAY) for x in (found, true.image))
+                assert np.sqrt(np.mean((grey - expected) ** 2)) < 16
 
 
 def test_most_damage_is_an_error_with_its_time(tmp_path: Path) -> None:
@@ -451,14 +462,18 @@ def test_most_damage_is_an_error_with_its_time(tmp_path: Path) -> None:
     assert unnoticed <= 8
 
 
-@pytest.mark.parametrize("kind", ["mp4", "mkv", "avi"])
-def test_a_video_that_ends_early_says_where(tmp_path: Path, kind: str) -> None:
-    video = write_pattern(tmp_path / f"a.{kind}", muxer={"movflags": "faststart"} if kind == "mp4" else {})
-    whole = video.read_bytes()
-    for share in (0.5, 0.9):
-        video.write_bytes(whole[: int(share * len(whole))])
-        with pytest.raises(FormatError, match=rf"a\.{kind}: is cut off: .*, the last at \d\.\d\d\d s"):
-            video_stamps_ns(video)
+def test_a_video_that_ends_early_says_where(
+    subtests: pytest.Subtests, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    for kind in ("mp4", "mkv", "avi"):
+        with subtests.test(kind=kind):
+            tmp_path = tmp_path_factory.mktemp("given")
+            video = write_pattern(tmp_path / f"a.{kind}", muxer={"movflags": "faststart"} if kind == "mp4" else {})
+            whole = video.read_bytes()
+            for share in (0.5, 0.9):
+                video.write_bytes(whole[: int(share * len(whole))])
+                with pytest.raises(FormatError, match=rf"a\.{kind}: is cut off: .*, the last at \d\.\d\d\d s"):
+                    video_stamps_ns(video)
 
 
 def test_a_recording_that_was_not_finished_has_no_index(tmp_path: Path) -> None:
@@ -488,23 +503,26 @@ def add_stream(path: Path, other: Path, *, cover: bool = False, first: bool = Fa
     return out
 
 
-@pytest.mark.parametrize("first", [False, True])
-def test_the_filmed_stream_is_found_among_others(tmp_path: Path, first: bool) -> None:
-    video = write_video(tmp_path / "a.mp4")
-    other = write_pattern(tmp_path / "small.mp4", 20, size=(32, 24))
-    both = add_stream(video, other, first=first)
-    assert np.array_equal(video_stamps_ns(both), video_stamps_ns(video))
-    cover = write_pattern(tmp_path / "cover.mp4", 1, codec="mjpeg", pix_fmt="yuvj420p", size=(640, 480))
-    both = add_stream(video, cover, cover=True, first=first)
-    assert np.array_equal(video_stamps_ns(both), video_stamps_ns(video))
-    same = write_pattern(tmp_path / "same.mp4", 20, size=(64, 48))
-    with pytest.raises(FormatError, match=r"2 video streams of 64x48; .*-map"):
-        video_stamps_ns(add_stream(video, same, first=first))
+def test_the_filmed_stream_is_found_among_others(
+    subtests: pytest.Subtests, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    for first in (False, True):
+        with subtests.test(first=first):
+            tmp_path = tmp_path_factory.mktemp("given")
+            video = write_video(tmp_path / "a.mp4")
+            other = write_pattern(tmp_path / "small.mp4", 20, size=(32, 24))
+            both = add_stream(video, other, first=first)
+            assert np.array_equal(video_stamps_ns(both), video_stamps_ns(video))
+            cover = write_pattern(tmp_path / "cover.mp4", 1, codec="mjpeg", pix_fmt="yuvj420p", size=(640, 480))
+            both = add_stream(video, cover, cover=True, first=first)
+            assert np.array_equal(video_stamps_ns(both), video_stamps_ns(video))
+            same = write_pattern(tmp_path / "same.mp4", 20, size=(64, 48))
+            with pytest.raises(FormatError, match=r"2 video streams of 64x48; .*-map"):
+                video_stamps_ns(add_stream(video, same, first=first))
 
 
-@pytest.mark.parametrize(
-    ("sizes", "lacking", "cut_off"),
-    [
+def test_an_avi_ends_inside_its_last_list_or_not(subtests, tmp_path_factory):
+    for sizes, lacking, cut_off in (
         ([92], 0, False),
         ([100], 0, False),  # the head of 8 bytes counted, too
         ([101], 0, True),
@@ -512,9 +530,9 @@ def test_the_filmed_stream_is_found_among_others(tmp_path: Path, first: bool) ->
         ([92, 92], 20, True),
         ([92, 92], 100, False),  # a whole list is gone, which nothing shows
         ([93], 0, False),
-    ],
-)
-def test_an_avi_ends_inside_its_last_list_or_not(tmp_path, sizes, lacking, cut_off):
-    lists = [b"RIFF" + struct.pack("<I", size) + b"AVI " + bytes(88 + (size == 93) * 2) for size in sizes]
-    (tmp_path / "a.avi").write_bytes(b"".join(lists)[: sum(map(len, lists)) - lacking])
-    assert video._ends_inside_riff(tmp_path / "a.avi") == cut_off
+    ):
+        with subtests.test(sizes=sizes, lacking=lacking, cut_off=cut_off):
+            tmp_path = tmp_path_factory.mktemp("given")
+            lists = [b"RIFF" + struct.pack("<I", size) + b"AVI " + bytes(88 + (size == 93) * 2) for size in sizes]
+            (tmp_path / "a.avi").write_bytes(b"".join(lists)[: sum(map(len, lists)) - lacking])
+            assert video._ends_inside_riff(tmp_path / "a.avi") == cut_off

@@ -80,9 +80,8 @@ def test_samples_are_numbers_as_they_were_sent(tmp_path):
     assert read_video_imu_capture(recorded(tmp_path, *before), DeclaredUnits()).epoch_ns == -7_000_000_000
 
 
-@pytest.mark.parametrize(
-    ("content", "said"),
-    [
+def test_what_cannot_be_samples_is_named(subtests, tmp_path_factory):
+    for content, said in (
         ([sample(0, gyro=b""), sample(1, gyro=b"")], "holds no gyroscope samples"),
         ([sample(0), sample(1), sample(2, gyro=floats(2, 1.0, 2.0))], "IMU sample 3 has 8 bytes"),
         ([sample(0, gyro=whole(2, 7))], "not three numbers"),
@@ -90,11 +89,11 @@ def test_samples_are_numbers_as_they_were_sent(tmp_path):
         ([sample(0), sample(1)[:-1]], "are left"),
         ([sample(0), b"\x80"], "a number that does not end"),
         ([sample(0), b"\xff" * 11 + b"\x01"], "a number that does not end"),
-    ],
-)
-def test_what_cannot_be_samples_is_named(tmp_path, content, said):
-    with pytest.raises(FormatError, match=said):
-        read_video_imu_capture(recorded(tmp_path, *content), DeclaredUnits())
+    ):
+        with subtests.test(content=content, said=said):
+            tmp_path = tmp_path_factory.mktemp("given")
+            with pytest.raises(FormatError, match=said):
+                read_video_imu_capture(recorded(tmp_path, *content), DeclaredUnits())
 
 
 def test_frames_have_their_times_and_all_that_the_phone_says_of_them(tmp_path):
@@ -124,14 +123,13 @@ def test_a_moving_lens_or_the_camera_s_facts_tell_of_a_stabilised_picture(tmp_pa
         assert (log.stabilised, log.stabilisation) == (stabilised, words)
 
 
-@pytest.mark.parametrize(
-    ("content", "said"),
-    [
+def test_what_cannot_be_frames_is_named(subtests, tmp_path_factory):
+    for content, said in (
         ([sample(0)], "holds no frames"),
         ([frame(0), frame(1, t=b"")], "a frame has no time"),
         ([frame(0), frame(1, iso=message(6, b"1"))], "a frame's number that is none"),
-    ],
-)
-def test_what_cannot_be_frames_is_named(tmp_path, content, said):
-    with pytest.raises(FormatError, match=said):
-        read_video_imu_capture_frames(recorded(tmp_path, *content))
+    ):
+        with subtests.test(content=content, said=said):
+            tmp_path = tmp_path_factory.mktemp("given")
+            with pytest.raises(FormatError, match=said):
+                read_video_imu_capture_frames(recorded(tmp_path, *content))

@@ -180,12 +180,13 @@ def test_the_equations_are_the_derivatives_of_their_squares(walked, halves):
         assert expected == pytest.approx(slope, rel=0.1 if column in clocks else 0.02, abs=5e-3), column
 
 
-@pytest.mark.parametrize("limits", [JoinOptions(sigma_m=1e-3), JoinOptions(sigma_deg=1e-3)])
-def test_what_is_not_known_to_the_limits_stays_apart(walked, halves, limits):
-    joined = join_submodels(halves[1], walked.imu, limits)
-    (gap,) = joined.gaps
-    assert not joined.groups and not gap.joined
-    assert "the limit is" in gap.reason and ("cm" in gap.reason) == (limits.sigma_m < 0.1)
+def test_what_is_not_known_to_the_limits_stays_apart(subtests, walked, halves):
+    for limits in (JoinOptions(sigma_m=1e-3), JoinOptions(sigma_deg=1e-3)):
+        with subtests.test(limits=limits):
+            joined = join_submodels(halves[1], walked.imu, limits)
+            (gap,) = joined.gaps
+            assert not joined.groups and not gap.joined
+            assert "the limit is" in gap.reason and ("cm" in gap.reason) == (limits.sigma_m < 0.1)
 
 
 def in_the_gap(imu, t_s):
@@ -203,21 +204,22 @@ def test_a_silent_imu_joins_nothing(walked, halves):
     assert "the IMU itself recorded nothing for 0.3" in gap.reason
 
 
-@pytest.mark.parametrize("sensor", ["gyro", "accel"])
-def test_motion_that_the_imu_contradicts_stays_apart(walked, halves, sensor):
-    imu = walked.imu
-    if sensor == "gyro":
-        rates = imu.gyro_rad_s.copy()
-        rates[in_the_gap(imu, imu.gyro_t_s)] += [0.3, 0.3, 0.0]
-        other = replace(imu, gyro_rad_s=rates)
-    else:
-        forces = imu.accel_m_s2.copy()
-        forces[in_the_gap(imu, imu.accel_t_s)] += [2.0, 1.0, 0.0]
-        other = replace(imu, accel_m_s2=forces)
-    (gap,) = join_submodels(halves[1], other, LIMITS).gaps
-    assert not gap.joined
-    assert "contradicts the motion before and after it" in gap.reason
-    assert gap.chi2 > 100 * gap.dof
+def test_motion_that_the_imu_contradicts_stays_apart(subtests, walked, halves):
+    for sensor in ("gyro", "accel"):
+        with subtests.test(sensor=sensor):
+            imu = walked.imu
+            if sensor == "gyro":
+                rates = imu.gyro_rad_s.copy()
+                rates[in_the_gap(imu, imu.gyro_t_s)] += [0.3, 0.3, 0.0]
+                other = replace(imu, gyro_rad_s=rates)
+            else:
+                forces = imu.accel_m_s2.copy()
+                forces[in_the_gap(imu, imu.accel_t_s)] += [2.0, 1.0, 0.0]
+                other = replace(imu, accel_m_s2=forces)
+            (gap,) = join_submodels(halves[1], other, LIMITS).gaps
+            assert not gap.joined
+            assert "contradicts the motion before and after it" in gap.reason
+            assert gap.chi2 > 100 * gap.dof
 
 
 @pytest.mark.parametrize("lost_s", [0.2, 0.02])
@@ -407,10 +409,10 @@ def test_numbers_that_clash_become_new_ones(tmp_path):
     assert len(again.cameras) == 1
 
 
-@pytest.mark.parametrize("wrong", [{"sigma_m": 0.0}, {"sigma_deg": -1.0}])
-def test_limits_are_positive(wrong):
-    with pytest.raises(ValueError, match="must be positive"):
-        JoinOptions(**wrong)
+def test_limits_are_positive(subtests):
+    for wrong in ({"sigma_m": 0.0}, {"sigma_deg": -1.0}):
+        with subtests.test(wrong=wrong), pytest.raises(ValueError, match="must be positive"):
+            JoinOptions(**wrong)
 
 
 def test_a_project_of_two_models_becomes_one(walked, tmp_path, capsys):

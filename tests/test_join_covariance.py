@@ -171,31 +171,32 @@ def apply(similarity, points):
     return similarity.scale * points @ matrix_from_quat(similarity.rotation_xyzw).T + similarity.translation_m
 
 
-@pytest.mark.parametrize("world", ["y-down", "z-up"])
-def test_the_similarity_of_a_submodel_moves_its_points_and_is_as_sure_as_where_it_lies(world):
-    placed, points, _ = placements()
-    placed = replace(placed, gravity_m_s2=np.array([3.0, -7.0, 6.0]))
-    moves = [joined_model._metric_move(placed, k, world) for k in range(3)]
-    # the world is turned upright, and what was the first one's origin stays
-    apart = np.array([apply(moves[k], points) for k in range(3)])
-    before = np.array([placed.points(k, points) for k in range(3)])
-    up = matrix_from_quat(moves[0].rotation_xyzw) @ placed.places.rotation[0].T
-    np.testing.assert_allclose(apart, before @ up.T + placed.origins[0], atol=1e-9)
-    down = up @ placed.gravity_m_s2 / np.linalg.norm(placed.gravity_m_s2)
-    np.testing.assert_allclose(down, [0, 1, 0] if world == "y-down" else [0, 0, -1], atol=1e-9)
-    for k in range(3):
-        by = np.zeros((7, 7))
-        for column in range(7):
-            ends = []
-            for sign in (1, -1):
-                change = np.zeros(21)
-                change[7 * k + column] = sign * 1e-6
-                ends.append(parameters(joined_model._metric_move(changed(placed, change), k, world), moves[k]))
-            by[:, column] = (ends[0] - ends[1]) / 2e-6
-        own = slice(7 * k, 7 * k + 7)
-        expected_cov = placed.inflation * by @ placed.cov[own, own] @ by.T
-        found = joined_model._similarity_cov(placed, k, moves[k])
-        assert found == pytest.approx(expected_cov, rel=1e-6, abs=1e-12)
+def test_the_similarity_of_a_submodel_moves_its_points_and_is_as_sure_as_where_it_lies(subtests):
+    for world in ("y-down", "z-up"):
+        with subtests.test(world=world):
+            placed, points, _ = placements()
+            placed = replace(placed, gravity_m_s2=np.array([3.0, -7.0, 6.0]))
+            moves = [joined_model._metric_move(placed, k, world) for k in range(3)]
+            # the world is turned upright, and what was the first one's origin stays
+            apart = np.array([apply(moves[k], points) for k in range(3)])
+            before = np.array([placed.points(k, points) for k in range(3)])
+            up = matrix_from_quat(moves[0].rotation_xyzw) @ placed.places.rotation[0].T
+            np.testing.assert_allclose(apart, before @ up.T + placed.origins[0], atol=1e-9)
+            down = up @ placed.gravity_m_s2 / np.linalg.norm(placed.gravity_m_s2)
+            np.testing.assert_allclose(down, [0, 1, 0] if world == "y-down" else [0, 0, -1], atol=1e-9)
+            for k in range(3):
+                by = np.zeros((7, 7))
+                for column in range(7):
+                    ends = []
+                    for sign in (1, -1):
+                        change = np.zeros(21)
+                        change[7 * k + column] = sign * 1e-6
+                        ends.append(parameters(joined_model._metric_move(changed(placed, change), k, world), moves[k]))
+                    by[:, column] = (ends[0] - ends[1]) / 2e-6
+                own = slice(7 * k, 7 * k + 7)
+                expected_cov = placed.inflation * by @ placed.cov[own, own] @ by.T
+                found = joined_model._similarity_cov(placed, k, moves[k])
+                assert found == pytest.approx(expected_cov, rel=1e-6, abs=1e-12)
 
 
 def test_a_similarity_after_another_is_both_in_turn():

@@ -70,27 +70,31 @@ def test_mountings_differ_by_the_mahalanobis_distance_of_both():
         assert mounting_differs(submodel([0], fit=one), submodel([0], fit=other)) == differs
 
 
-@pytest.mark.parametrize("gap_s", [0.1, 40.0])
-def test_clocks_differ_by_what_delays_and_their_rates_leave(gap_s):
+def test_clocks_differ_by_what_delays_and_their_rates_leave(subtests):
     """Variance of the difference of two predicted stamps, by drawing what is predicted from."""
-    rng = np.random.default_rng(3)
-    own = post.NODE + np.array([post.DELAY, post.CLOCK_RATE])
-    covs = [1e-6 * fitted(rng) for _ in range(2)]
-    since_s = (3.0, -2.0)
-    drawn = [rng.multivariate_normal(np.zeros(2), cov[np.ix_(own, own)], 200_000) for cov in covs]
-    off = [d[:, 0] + d[:, 1] * since for d, since in zip(drawn, since_s, strict=True)]
-    drift = rng.normal(0, PRIORS.clock_rate * gap_s, 200_000)
-    sigma = float(np.std(off[1] - off[0] + drift))
-    for share, differs in ((0.97, False), (1.03, True), (-0.97, False), (-1.03, True)):
-        away = share * sigma * np.sqrt(chi2_limit(1, real=True))
-        fits = [
-            SimpleNamespace(
-                since_middle_s=np.array([since]), cov=cov, stamp_s=np.array([at + 100.0 + more]), t_s=np.array([at])
-            )
-            for since, cov, at, more in zip(since_s, covs, (1.0, 1.0 + gap_s), (0.0, away), strict=True)
-        ]
-        both = [submodel([1.0], fit=fits[0]), submodel([1.0 + gap_s], fit=fits[1])]
-        assert clocks_differ(both, ImuLink(first=0, second=1, from_node=0, to_node=0)) == differs
+    for gap_s in (0.1, 40.0):
+        with subtests.test(gap_s=gap_s):
+            rng = np.random.default_rng(3)
+            own = post.NODE + np.array([post.DELAY, post.CLOCK_RATE])
+            covs = [1e-6 * fitted(rng) for _ in range(2)]
+            since_s = (3.0, -2.0)
+            drawn = [rng.multivariate_normal(np.zeros(2), cov[np.ix_(own, own)], 200_000) for cov in covs]
+            off = [d[:, 0] + d[:, 1] * since for d, since in zip(drawn, since_s, strict=True)]
+            drift = rng.normal(0, PRIORS.clock_rate * gap_s, 200_000)
+            sigma = float(np.std(off[1] - off[0] + drift))
+            for share, differs in ((0.97, False), (1.03, True), (-0.97, False), (-1.03, True)):
+                away = share * sigma * np.sqrt(chi2_limit(1, real=True))
+                fits = [
+                    SimpleNamespace(
+                        since_middle_s=np.array([since]),
+                        cov=cov,
+                        stamp_s=np.array([at + 100.0 + more]),
+                        t_s=np.array([at]),
+                    )
+                    for since, cov, at, more in zip(since_s, covs, (1.0, 1.0 + gap_s), (0.0, away), strict=True)
+                ]
+                both = [submodel([1.0], fit=fits[0]), submodel([1.0 + gap_s], fit=fits[1])]
+                assert clocks_differ(both, ImuLink(first=0, second=1, from_node=0, to_node=0)) == differs
 
 
 def test_images_that_agree_are_those_of_a_loop_over_all():

@@ -228,11 +228,13 @@ def test_a_database_that_is_gone_is_said(returned, stage, tmp_path, caplog):
     assert not (tmp_path / "none.db").exists()
 
 
-@pytest.mark.parametrize("kept", [0.0, 0.5])
-def test_a_database_that_cannot_be_read_is_said_in_a_sentence(returned, stage, tmp_path, kept):
-    _, models, database = returned
-    data = database.read_bytes()
-    broken = tmp_path / "database.db"
-    broken.write_bytes(data[: int(kept * len(data))] or b"no database" * 99)
-    with pytest.raises(FormatError, match="put it back as it was"):
-        replace(stage, database=broken).join_models(models)
+def test_a_database_that_cannot_be_read_is_said_in_a_sentence(subtests, returned, stage, tmp_path_factory):
+    for kept in (0.0, 0.5):
+        with subtests.test(kept=kept):
+            tmp_path = tmp_path_factory.mktemp("given")
+            _, models, database = returned
+            data = database.read_bytes()
+            broken = tmp_path / "database.db"
+            broken.write_bytes(data[: int(kept * len(data))] or b"no database" * 99)
+            with pytest.raises(FormatError, match="put it back as it was"):
+                replace(stage, database=broken).join_models(models)

@@ -137,21 +137,26 @@ def test_meshes_keep_their_faces_and_colours(made):
         assert relative_error(xyz(vertices(made / "back" / "dense" / name)[1]), xyz(before)) <= 1e-6
 
 
-@pytest.mark.parametrize("name", ["textured.obj", "ascii.ply"])
-def test_text_meshes_by_opencv_move_and_keep_every_other_line(made, name):
-    before, after, back = ((made / p / "dense" / name).read_text().split("\n") for p in ("project", "metric", "back"))
-    assert len(before) == len(after)
-    points = []
-    for old, new, old_again in zip(before, after, back, strict=True):
-        words = old.removeprefix("v ").split()
-        if len(words) == 3 and all("." in word for word in words):
-            points.append([[float(v) for v in line.removeprefix("v ").split()] for line in (old, new, old_again)])
-        else:
-            assert old == new == old_again
-    points = np.array(points)
-    assert len(points) == 8
-    assert relative_error(points[:, 1], moved(points[:, 0])) <= 1e-6
-    assert relative_error(points[:, 2], points[:, 0]) <= 1e-6
+def test_text_meshes_by_opencv_move_and_keep_every_other_line(subtests, made):
+    for name in ("textured.obj", "ascii.ply"):
+        with subtests.test(name=name):
+            before, after, back = (
+                (made / p / "dense" / name).read_text().split("\n") for p in ("project", "metric", "back")
+            )
+            assert len(before) == len(after)
+            points = []
+            for old, new, old_again in zip(before, after, back, strict=True):
+                words = old.removeprefix("v ").split()
+                if len(words) == 3 and all("." in word for word in words):
+                    points.append(
+                        [[float(v) for v in line.removeprefix("v ").split()] for line in (old, new, old_again)]
+                    )
+                else:
+                    assert old == new == old_again
+            points = np.array(points)
+            assert len(points) == 8
+            assert relative_error(points[:, 1], moved(points[:, 0])) <= 1e-6
+            assert relative_error(points[:, 2], points[:, 0]) <= 1e-6
 
 
 def test_normals_of_an_obj_mesh_turn_and_keep_their_length(tmp_path):
@@ -183,23 +188,24 @@ def test_depth_maps_scale_and_unknown_depth_stays_unknown(made):
         np.testing.assert_allclose(back, before, rtol=5e-7)
 
 
-@pytest.mark.parametrize("name", ["project", "metric"])
-def test_depth_maps_and_points_agree_before_and_after(made, name):
-    # Every sparse point lies on the ball: its depth by the model is the depth map's where it is seen
-    model = read_model(made / name / "dense" / "sparse")
-    size = 1.0 if name == "project" else SIMILARITY.scale
-    differences = []
-    for image_id in model.reg_image_ids():
-        image = model.image(image_id)
-        depth = depth_map(made / name / "dense" / "stereo" / "depth_maps" / f"{image.name}.geometric.bin")
-        for point in image.points2D:
-            if point.has_point3D():
-                cam = image.cam_from_world() * model.point3D(point.point3D_id).xyz
-                u, v = image.camera.img_from_cam(cam)
-                if 0 <= u < WIDTH and 0 <= v < HEIGHT and depth[int(v), int(u)] > 0:
-                    differences.append(abs(depth[int(v), int(u)] - cam[2]) / size)
-    assert len(differences) > 500
-    assert np.median(differences) < 0.01
+def test_depth_maps_and_points_agree_before_and_after(subtests, made):
+    for name in ("project", "metric"):
+        with subtests.test(name=name):
+            # Every sparse point lies on the ball: its depth by the model is the depth map's where it is seen
+            model = read_model(made / name / "dense" / "sparse")
+            size = 1.0 if name == "project" else SIMILARITY.scale
+            differences = []
+            for image_id in model.reg_image_ids():
+                image = model.image(image_id)
+                depth = depth_map(made / name / "dense" / "stereo" / "depth_maps" / f"{image.name}.geometric.bin")
+                for point in image.points2D:
+                    if point.has_point3D():
+                        cam = image.cam_from_world() * model.point3D(point.point3D_id).xyz
+                        u, v = image.camera.img_from_cam(cam)
+                        if 0 <= u < WIDTH and 0 <= v < HEIGHT and depth[int(v), int(u)] > 0:
+                            differences.append(abs(depth[int(v), int(u)] - cam[2]) / size)
+            assert len(differences) > 500
+            assert np.median(differences) < 0.01
 
 
 def test_colmap_fuses_the_metric_workspace_to_the_same_cloud(made, tmp_path):

@@ -44,9 +44,8 @@ def test_what_colmap_writes_is_whole(whole):
     assert (first, second) == ("a.jpg", "b.jpg") and features.tolist() == [[i, i] for i in range(30)]
 
 
-@pytest.mark.parametrize(
-    ("table", "change"),
-    [
+def test_records_of_another_size_are_refused_with_their_table(subtests, whole, tmp_path_factory):
+    for table, change in (
         ("keypoints", "cols = 4"),
         ("keypoints", "rows = -30"),
         ("keypoints", "data = NULL"),
@@ -58,15 +57,15 @@ def test_what_colmap_writes_is_whole(whole):
         ("two_view_geometries", "camera1 = x'00'"),
         ("two_view_geometries", f"camera1 = CAST({COUNT} AS BLOB)"),
         ("two_view_geometries", "camera1 = CAST(substr(camera1, 1, 40) AS BLOB)"),
-    ],
-)
-def test_records_of_another_size_are_refused_with_their_table(whole, tmp_path, table, change):
-    path = tmp_path / "database.db"
-    shutil.copyfile(whole, path)
-    with contextlib.closing(sqlite3.connect(path)) as database, database:
-        database.execute(f"UPDATE {table} SET {change}")
-    with pytest.raises(FormatError, match=f"a record of {table} has another size"):
-        check_records(path)
+    ):
+        with subtests.test(table=table, change=change):
+            tmp_path = tmp_path_factory.mktemp("given")
+            path = tmp_path / "database.db"
+            shutil.copyfile(whole, path)
+            with contextlib.closing(sqlite3.connect(path)) as database, database:
+                database.execute(f"UPDATE {table} SET {change}")
+            with pytest.raises(FormatError, match=f"a record of {table} has another size"):
+                check_records(path)
 
 
 #: A million million rows, from nothing.

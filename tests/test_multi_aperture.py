@@ -50,59 +50,67 @@ def random_problem(height, width, candidates, views, seed=0):
     )
 
 
-@pytest.mark.parametrize("instruction_set", INSTRUCTION_SETS)
-@pytest.mark.parametrize("sides", SIDES)
-def test_compiled_costs_are_the_reference_s_bit_for_bit(sides, instruction_set):
-    *sizes, radius = sides
-    reference, others, where = random_problem(*sizes)
-    rng = np.random.default_rng(1)
-    views = len(others)
-    tables = rng.integers(0, 60, (views, 256, 256), dtype=np.uint8)
-    blend = rng.integers(-300, 300, views + 2).astype(np.int32)
-    light = {"blend": blend, "blend_table": np.arange(256, dtype=np.uint8)}
-    ends = rng.integers(0, sizes[1] // 4 + 1, (views, sizes[0], 2), dtype=np.int32)
-    shown = {"shown": np.stack([ends[..., 0], sizes[1] - ends[..., 1]], axis=-1).astype(np.int32)}
-    nothing = {"shown": np.repeat(ends[..., :1], 2, axis=-1)}
-    ways = ({}, {"least": 9}, {"tables": tables}, light, {"tables": tables, **light})
-    for more in (*ways, shown, {**shown, **light}, {**shown, "tables": tables}, nothing):
-        wanted = matching_costs_reference(reference, others, radius=radius, **where, **more)
-        for threads in (1, 2, 3):
-            cost = np.full(wanted.shape, 77, dtype=np.uint8)
-            _apertures.matching_costs(
-                reference,
-                others,
-                cost=cost,
-                radius=radius,
-                threads=threads,
-                instruction_set=instruction_set,
-                **where,
-                **more,
-            )
-            assert np.array_equal(cost, wanted)
+def test_compiled_costs_are_the_reference_s_bit_for_bit(subtests):
+    for instruction_set in INSTRUCTION_SETS:
+        for sides in SIDES:
+            with subtests.test(instruction_set=instruction_set, sides=sides):
+                *sizes, radius = sides
+                reference, others, where = random_problem(*sizes)
+                rng = np.random.default_rng(1)
+                views = len(others)
+                tables = rng.integers(0, 60, (views, 256, 256), dtype=np.uint8)
+                blend = rng.integers(-300, 300, views + 2).astype(np.int32)
+                light = {"blend": blend, "blend_table": np.arange(256, dtype=np.uint8)}
+                ends = rng.integers(0, sizes[1] // 4 + 1, (views, sizes[0], 2), dtype=np.int32)
+                shown = {"shown": np.stack([ends[..., 0], sizes[1] - ends[..., 1]], axis=-1).astype(np.int32)}
+                nothing = {"shown": np.repeat(ends[..., :1], 2, axis=-1)}
+                ways = ({}, {"least": 9}, {"tables": tables}, light, {"tables": tables, **light})
+                for more in (*ways, shown, {**shown, **light}, {**shown, "tables": tables}, nothing):
+                    wanted = matching_costs_reference(reference, others, radius=radius, **where, **more)
+                    for threads in (1, 2, 3):
+                        cost = np.full(wanted.shape, 77, dtype=np.uint8)
+                        _apertures.matching_costs(
+                            reference,
+                            others,
+                            cost=cost,
+                            radius=radius,
+                            threads=threads,
+                            instruction_set=instruction_set,
+                            **where,
+                            **more,
+                        )
+                        assert np.array_equal(cost, wanted)
 
 
-@pytest.mark.parametrize("instruction_set", INSTRUCTION_SETS)
-@pytest.mark.parametrize("sides", SIDES)
-def test_compiled_semi_global_matching_is_the_reference_s_bit_for_bit(sides, instruction_set):
-    height, width, candidates = sides[:3]
-    rng = np.random.default_rng(2)
-    cost = rng.integers(0, 256, (height, width, candidates), dtype=np.uint8)
-    guide = rng.integers(0, 256, (height, width), dtype=np.uint8)
-    for small, jump in (semi_global.jump_table(3), (4000, np.full(256, 4000, dtype=np.uint16))):
-        wanted = semi_global_reference(cost, guide, small=small, jump=jump)
-        padded = -(-candidates // _apertures.PADDING) * _apertures.PADDING
-        for threads in (1, 2):
-            total = np.empty((height, width, padded), dtype=np.uint16)
-            _apertures.semi_global(
-                cost, guide, small=small, jump=jump, total=total, threads=threads, instruction_set=instruction_set
-            )
-            assert np.array_equal(total[..., :candidates], wanted)
-        least, index = np.empty((2, height, width), dtype=np.uint16)
-        aside = np.empty((height, width), dtype=np.float32)
-        _apertures.winners(total, least=least, index=index, aside=aside, candidates=candidates)
-        assert np.array_equal(index, wanted.argmin(axis=-1))
-        assert np.array_equal(least, wanted.min(axis=-1))
-        assert np.abs(aside).max() <= 0.5
+def test_compiled_semi_global_matching_is_the_reference_s_bit_for_bit(subtests):
+    for instruction_set in INSTRUCTION_SETS:
+        for sides in SIDES:
+            with subtests.test(instruction_set=instruction_set, sides=sides):
+                height, width, candidates = sides[:3]
+                rng = np.random.default_rng(2)
+                cost = rng.integers(0, 256, (height, width, candidates), dtype=np.uint8)
+                guide = rng.integers(0, 256, (height, width), dtype=np.uint8)
+                for small, jump in (semi_global.jump_table(3), (4000, np.full(256, 4000, dtype=np.uint16))):
+                    wanted = semi_global_reference(cost, guide, small=small, jump=jump)
+                    padded = -(-candidates // _apertures.PADDING) * _apertures.PADDING
+                    for threads in (1, 2):
+                        total = np.empty((height, width, padded), dtype=np.uint16)
+                        _apertures.semi_global(
+                            cost,
+                            guide,
+                            small=small,
+                            jump=jump,
+                            total=total,
+                            threads=threads,
+                            instruction_set=instruction_set,
+                        )
+                        assert np.array_equal(total[..., :candidates], wanted)
+                    least, index = np.empty((2, height, width), dtype=np.uint16)
+                    aside = np.empty((height, width), dtype=np.float32)
+                    _apertures.winners(total, least=least, index=index, aside=aside, candidates=candidates)
+                    assert np.array_equal(index, wanted.argmin(axis=-1))
+                    assert np.array_equal(least, wanted.min(axis=-1))
+                    assert np.abs(aside).max() <= 0.5
 
 
 def test_kernels_refuse_arrays_that_do_not_fit():
@@ -216,16 +224,17 @@ def test_apertures_behind_each_other_are_refused():
 PLANE = ApertureOptions(threads=1, disparity_px=(-4.0, 12.0))
 
 
-@pytest.mark.parametrize("slope", [(0.0, 0.0), (0.02, 0.0), (-0.01, 0.015)])
-@pytest.mark.parametrize("middle_px", [-2.3, 5.0])
-def test_planes_are_found_to_a_fraction_of_a_pixel(slope, middle_px):
-    planes, truth, rig = plane_views(160, 120, middle_px, slope)
-    found = estimate_disparity(planes, rectify(rig, projectors(rig)), PLANE)
-    inner = (slice(16, -16), slice(16, -16))
-    error = np.abs(found.disparity_px - truth)[inner]
-    assert np.median(error) < 0.2  # candidates are half a pixel apart
-    assert (error > 0.5).mean() < 0.01
-    assert found.measured[inner].mean() > 0.98
+def test_planes_are_found_to_a_fraction_of_a_pixel(subtests):
+    for slope in ((0.0, 0.0), (0.02, 0.0), (-0.01, 0.015)):
+        for middle_px in (-2.3, 5.0):
+            with subtests.test(slope=slope, middle_px=middle_px):
+                planes, truth, rig = plane_views(160, 120, middle_px, slope)
+                found = estimate_disparity(planes, rectify(rig, projectors(rig)), PLANE)
+                inner = (slice(16, -16), slice(16, -16))
+                error = np.abs(found.disparity_px - truth)[inner]
+                assert np.median(error) < 0.2  # candidates are half a pixel apart
+                assert (error > 0.5).mean() < 0.01
+                assert found.measured[inner].mean() > 0.98
 
 
 def test_apertures_that_are_turned_bent_and_set_back_see_a_wall_where_it_is():
@@ -331,15 +340,16 @@ def test_memory_is_bounded():
         assert max(last - first for *_, first, last in parts) * row <= max(semi_global.MATCHING.memory_bytes, 98 * row)
 
 
-@pytest.mark.parametrize("shape", [(1, 40), (40, 1), (1, 1), (5, 7)])
-def test_tiny_pictures_are_fused(shape):
-    height, width = shape
-    rig = four_apertures(width, height)
-    rng = np.random.default_rng(6)
-    planes = [rng.integers(0, 256, shape, dtype=np.uint8) for _ in range(4)]
-    fused = fuse_apertures(planes, rig, rectify(rig, projectors(rig)), ApertureOptions(threads=1))
-    assert fused.image.shape == (*shape, 3)
-    assert np.isfinite(fused.disparity_px).all()
+def test_tiny_pictures_are_fused(subtests):
+    for shape in ((1, 40), (40, 1), (1, 1), (5, 7)):
+        with subtests.test(shape=shape):
+            height, width = shape
+            rig = four_apertures(width, height)
+            rng = np.random.default_rng(6)
+            planes = [rng.integers(0, 256, shape, dtype=np.uint8) for _ in range(4)]
+            fused = fuse_apertures(planes, rig, rectify(rig, projectors(rig)), ApertureOptions(threads=1))
+            assert fused.image.shape == (*shape, 3)
+            assert np.isfinite(fused.disparity_px).all()
 
 
 def test_an_even_picture_has_no_measured_disparity():
@@ -366,24 +376,25 @@ def test_pictures_that_do_not_belong_to_the_rig_are_refused():
 # --- fusion ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_fused_colours_are_those_of_the_reference(dtype):
-    base = texture(240, 200, seed=0)
-    colours = [base, 0.6 * base + 0.4 * texture(240, 200, seed=1), 0.7 * base + 0.3 * texture(240, 200, seed=2)]
-    planes, truth, rig = plane_views(160, 120, 5.0, (0.02, 0.01), colours=colours)
-    scale = np.iinfo(dtype).max // 255
-    planes = [plane.astype(dtype) * dtype(scale) for plane in planes]
-    canvas = rectify(rig, projectors(rig))
-    options = ApertureOptions(threads=1, disparity_px=(0.0, 10.0), use_luminance=False)
-    fused = fuse_apertures(planes, rig, canvas, options)
-    assert fused.image.dtype == dtype
-    assert np.array_equal(fused.image[..., 1], planes[0])
-    wanted = plane_views(160, 120, 0.0, (0.0, 0.0), colours=colours)[0]  # green, red, blue from one place
-    inner = (slice(16, -16), slice(16, -16))
-    got = fused.image[..., [1, 0, 2]] / scale
-    assert psnr_db(got[inner], np.stack(wanted[:3], axis=-1)[inner]) > 38
-    depth = canvas.focal_px * 0.01 / truth
-    assert np.nanmedian(np.abs(fused.depth / depth - 1)[inner]) < 0.02
+def test_fused_colours_are_those_of_the_reference(subtests):
+    for dtype in (np.uint8, np.uint16):
+        with subtests.test(dtype=dtype):
+            base = texture(240, 200, seed=0)
+            colours = [base, 0.6 * base + 0.4 * texture(240, 200, seed=1), 0.7 * base + 0.3 * texture(240, 200, seed=2)]
+            planes, truth, rig = plane_views(160, 120, 5.0, (0.02, 0.01), colours=colours)
+            scale = np.iinfo(dtype).max // 255
+            planes = [plane.astype(dtype) * dtype(scale) for plane in planes]
+            canvas = rectify(rig, projectors(rig))
+            options = ApertureOptions(threads=1, disparity_px=(0.0, 10.0), use_luminance=False)
+            fused = fuse_apertures(planes, rig, canvas, options)
+            assert fused.image.dtype == dtype
+            assert np.array_equal(fused.image[..., 1], planes[0])
+            wanted = plane_views(160, 120, 0.0, (0.0, 0.0), colours=colours)[0]  # green, red, blue from one place
+            inner = (slice(16, -16), slice(16, -16))
+            got = fused.image[..., [1, 0, 2]] / scale
+            assert psnr_db(got[inner], np.stack(wanted[:3], axis=-1)[inner]) > 38
+            depth = canvas.focal_px * 0.01 / truth
+            assert np.nanmedian(np.abs(fused.depth / depth - 1)[inner]) < 0.02
 
 
 def test_hidden_pixels_continue_the_background():
@@ -521,23 +532,25 @@ def test_noise_is_measured_and_clean_pictures_are_left_alone():
     assert measure_noise(np.zeros((4, 4), dtype=np.uint8)) == 0
 
 
-@pytest.mark.parametrize("noise", [4.0, 9.0])
-def test_smoothing_leaves_differences_that_noise_hardly_makes(noise):
-    rng = np.random.default_rng(12)
-    white = noise * rng.standard_normal((300, 400)).astype(np.float32)
-    width_px, tells = smoothing(np.clip(np.rint(128 + white), 0, 255).astype(np.uint8), noise)
-    assert width_px == pytest.approx(smoothing(np.full((300, 400), 128, np.uint8), 4 * noise)[0] / 2)
-    smoothed = cv2.GaussianBlur(white, (0, 0), width_px)
-    # a difference of two pixels, one and a half of its standard deviations
-    assert tells == pytest.approx(1.5 * np.sqrt(2) * smoothed.std(), abs=0.6)
+def test_smoothing_leaves_differences_that_noise_hardly_makes(subtests):
+    for noise in (4.0, 9.0):
+        with subtests.test(noise=noise):
+            rng = np.random.default_rng(12)
+            white = noise * rng.standard_normal((300, 400)).astype(np.float32)
+            width_px, tells = smoothing(np.clip(np.rint(128 + white), 0, 255).astype(np.uint8), noise)
+            assert width_px == pytest.approx(smoothing(np.full((300, 400), 128, np.uint8), 4 * noise)[0] / 2)
+            smoothed = cv2.GaussianBlur(white, (0, 0), width_px)
+            # a difference of two pixels, one and a half of its standard deviations
+            assert tells == pytest.approx(1.5 * np.sqrt(2) * smoothed.std(), abs=0.6)
 
 
-@pytest.mark.parametrize(("times", "smooths"), [(1.3, True), (1.75, False)])
-def test_nothing_is_smoothed_where_texture_stands_out_of_the_noise(times, smooths):
+def test_nothing_is_smoothed_where_texture_stands_out_of_the_noise(subtests):
     """By half again as much as the noise."""
-    rng, noise = np.random.default_rng(13), 8.0
-    codes = np.clip(np.rint(128 + noise * np.hypot(1, times) * rng.standard_normal((200, 300))), 0, 255)
-    assert (smoothing(codes.astype(np.uint8), noise)[0] > 0) == smooths
+    for times, smooths in ((1.3, True), (1.75, False)):
+        with subtests.test(times=times, smooths=smooths):
+            rng, noise = np.random.default_rng(13), 8.0
+            codes = np.clip(np.rint(128 + noise * np.hypot(1, times) * rng.standard_normal((200, 300))), 0, 255)
+            assert (smoothing(codes.astype(np.uint8), noise)[0] > 0) == smooths
 
 
 def test_refocusing_leaves_what_is_in_focus_and_blurs_the_rest():

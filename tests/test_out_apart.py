@@ -21,27 +21,33 @@ def listing(folder):
     return sorted(folder.rglob("*"))
 
 
-@pytest.mark.parametrize("out", ["", "out", "deep/er/out"])
-def test_an_output_among_the_pictures_is_refused(capture, tmp_path, out):
-    (folder,) = picture_folders(load_capture(capture))
-    before = listing(capture)
-    with pytest.raises(OutputError, match="the folder of the capture's pictures; choose a folder outside of it"):
-        reconstruct(capture, folder / out, TINY)
-    (tmp_path / "link").symlink_to(folder)
-    with pytest.raises(OutputError, match="the capture's pictures"):
-        reconstruct(capture, tmp_path / "link" / "out", TINY)
-    assert listing(capture) == before
+def test_an_output_among_the_pictures_is_refused(subtests, capture, tmp_path_factory):
+    for out in ("", "out", "deep/er/out"):
+        with subtests.test(out=out):
+            tmp_path = tmp_path_factory.mktemp("given")
+            (folder,) = picture_folders(load_capture(capture))
+            before = listing(capture)
+            with pytest.raises(
+                OutputError, match="the folder of the capture's pictures; choose a folder outside of it"
+            ):
+                reconstruct(capture, folder / out, TINY)
+            (tmp_path / "link").symlink_to(folder)
+            with pytest.raises(OutputError, match="the capture's pictures"):
+                reconstruct(capture, tmp_path / "link" / "out", TINY)
+            assert listing(capture) == before
 
 
-@pytest.mark.parametrize("command", ["reconstruct", "deblur"])
-def test_the_command_line_says_so(capture, capsys, command):
-    (folder,) = picture_folders(load_capture(capture))
-    before = listing(capture)
-    with pytest.raises(SystemExit) as stopped:
-        main([command, str(capture), str(folder / "out")])
-    assert stopped.value.code == 2
-    assert "choose a folder outside of it" in capsys.readouterr().err
-    assert listing(capture) == before
+def test_the_command_line_says_so(subtests, capture, capsys):
+    for command in ("reconstruct", "deblur"):
+        with subtests.test(command=command):
+            capsys.readouterr()
+            (folder,) = picture_folders(load_capture(capture))
+            before = listing(capture)
+            with pytest.raises(SystemExit) as stopped:
+                main([command, str(capture), str(folder / "out")])
+            assert stopped.value.code == 2
+            assert "choose a folder outside of it" in capsys.readouterr().err
+            assert listing(capture) == before
 
 
 def test_every_folder_of_pictures_counts_and_others_do_not(tmp_path):
@@ -57,7 +63,9 @@ def test_every_folder_of_pictures_counts_and_others_do_not(tmp_path):
         pass
 
 
-@pytest.mark.parametrize("pattern", ["../*.png", "/etc/*.png", "a/../../*"])
-def test_a_pattern_stays_in_its_folder(tmp_path, pattern):
-    with pytest.raises(FormatError, match="leads out of it"):
-        image_names(ImageFolder(folder=tmp_path, pattern=pattern))
+def test_a_pattern_stays_in_its_folder(subtests, tmp_path_factory):
+    for pattern in ("../*.png", "/etc/*.png", "a/../../*"):
+        with subtests.test(pattern=pattern):
+            tmp_path = tmp_path_factory.mktemp("given")
+            with pytest.raises(FormatError, match="leads out of it"):
+                image_names(ImageFolder(folder=tmp_path, pattern=pattern))

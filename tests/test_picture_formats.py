@@ -22,14 +22,16 @@ def picture(dtype=np.uint8, channels=3):
     return np.clip(coarse.reshape(120, 160, channels) * np.iinfo(dtype).max, 0, np.iinfo(dtype).max).astype(dtype)
 
 
-@pytest.mark.parametrize("subsampling", [0, 1, 2])
-@pytest.mark.parametrize("quality", [85, 90, 95, 98])
-def test_a_jpeg_keeps_quality_and_sampling(tmp_path, quality, subsampling):
-    Image.fromarray(picture()).save(tmp_path / "a.jpg", quality=quality, subsampling=subsampling)
-    encode_image(tmp_path / "b.jpg", picture(), tmp_path / "a.jpg")
-    with Image.open(tmp_path / "a.jpg") as before, Image.open(tmp_path / "b.jpg") as after:
-        assert JpegImagePlugin.get_sampling(after) == JpegImagePlugin.get_sampling(before) == subsampling
-        assert after.quantization[0] == before.quantization[0]
+def test_a_jpeg_keeps_quality_and_sampling(subtests, tmp_path_factory):
+    for subsampling in (0, 1, 2):
+        for quality in (85, 90, 95, 98):
+            with subtests.test(subsampling=subsampling, quality=quality):
+                tmp_path = tmp_path_factory.mktemp("given")
+                Image.fromarray(picture()).save(tmp_path / "a.jpg", quality=quality, subsampling=subsampling)
+                encode_image(tmp_path / "b.jpg", picture(), tmp_path / "a.jpg")
+                with Image.open(tmp_path / "a.jpg") as before, Image.open(tmp_path / "b.jpg") as after:
+                    assert JpegImagePlugin.get_sampling(after) == JpegImagePlugin.get_sampling(before) == subsampling
+                    assert after.quantization[0] == before.quantization[0]
 
 
 def test_a_coarse_or_grey_jpeg_is_written_within_limits(tmp_path):
@@ -87,18 +89,20 @@ def _entry(tag, kind, count, value):
     return b"".join(n.to_bytes(size, "big") for n, size in ((tag, 2), (kind, 2), (count, 4), (value, 4)))
 
 
-@pytest.mark.parametrize("ending", [".png", ".tif"])
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_alpha_stays_where_pixels_do(tmp_path, ending, dtype):
-    before = picture(dtype, 4)
-    cv2.imwrite(str(tmp_path / f"a{ending}"), before)
-    for moved in (False, True):
-        encode_image(tmp_path / f"b{ending}", before[..., 2::-1] // 2, tmp_path / f"a{ending}", moved=moved)
-        made = cv2.imread(str(tmp_path / f"b{ending}"), cv2.IMREAD_UNCHANGED)
-        np.testing.assert_array_equal(made[..., :3], before[..., :3] // 2)
-        assert made.shape[2] == (3 if moved else 4)
-        if not moved:
-            np.testing.assert_array_equal(made[..., 3], before[..., 3])
+def test_alpha_stays_where_pixels_do(subtests, tmp_path_factory):
+    for ending in (".png", ".tif"):
+        for dtype in (np.uint8, np.uint16):
+            with subtests.test(ending=ending, dtype=dtype):
+                tmp_path = tmp_path_factory.mktemp("given")
+                before = picture(dtype, 4)
+                cv2.imwrite(str(tmp_path / f"a{ending}"), before)
+                for moved in (False, True):
+                    encode_image(tmp_path / f"b{ending}", before[..., 2::-1] // 2, tmp_path / f"a{ending}", moved=moved)
+                    made = cv2.imread(str(tmp_path / f"b{ending}"), cv2.IMREAD_UNCHANGED)
+                    np.testing.assert_array_equal(made[..., :3], before[..., :3] // 2)
+                    assert made.shape[2] == (3 if moved else 4)
+                    if not moved:
+                        np.testing.assert_array_equal(made[..., 3], before[..., 3])
 
 
 def test_a_webp_that_has_a_time_is_named(tmp_path):
@@ -146,21 +150,21 @@ def place_of(order="<", **changed):
     return position_of(tiff_with(order, 0x8825, [entry for entry in said.values() if entry is not None]))
 
 
-@pytest.mark.parametrize("order", ["<", ">"])
-def test_a_place_is_what_its_fractions_say(order):
-    assert place_of(order) == (pytest.approx(48.135), pytest.approx(11.5), 520.25, 3.5, "sea")
-    assert place_of(order, north=b"S\0")[0] == pytest.approx(-48.135)
-    assert place_of(order, east=b"w\0")[1] == pytest.approx(-11.5)
-    for side, height_m, above in ((1, -520.25, "sea"), (2, 520.25, "ellipsoid"), (3, -520.25, "ellipsoid")):
-        assert place_of(order, side=bytes([side]))[2::2] == (height_m, above)
-    assert np.isnan(place_of(order, height=None)[2]) and np.isnan(place_of(order, error=(0, 1))[3])
-    assert place_of(order, side=None)[2:] == (520.25, 3.5, "sea")
-    assert place_of(order, latitude=(90, 1, 0, 1, 0, 1), longitude=(180, 1, 0, 1, 0, 1))[:2] == (90, 180)
+def test_a_place_is_what_its_fractions_say(subtests):
+    for order in ("<", ">"):
+        with subtests.test(order=order):
+            assert place_of(order) == (pytest.approx(48.135), pytest.approx(11.5), 520.25, 3.5, "sea")
+            assert place_of(order, north=b"S\0")[0] == pytest.approx(-48.135)
+            assert place_of(order, east=b"w\0")[1] == pytest.approx(-11.5)
+            for side, height_m, above in ((1, -520.25, "sea"), (2, 520.25, "ellipsoid"), (3, -520.25, "ellipsoid")):
+                assert place_of(order, side=bytes([side]))[2::2] == (height_m, above)
+            assert np.isnan(place_of(order, height=None)[2]) and np.isnan(place_of(order, error=(0, 1))[3])
+            assert place_of(order, side=None)[2:] == (520.25, 3.5, "sea")
+            assert place_of(order, latitude=(90, 1, 0, 1, 0, 1), longitude=(180, 1, 0, 1, 0, 1))[:2] == (90, 180)
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
+def test_what_is_no_place_is_none(subtests):
+    for wrong in (
         {"north": b"E\0"},
         {"north": None},
         {"east": b"N\0"},
@@ -170,10 +174,9 @@ def test_a_place_is_what_its_fractions_say(order):
         {"latitude": (48, 1, 0, 1)},
         {"height": (520, 0)},
         {"error": (3, 1, 4, 1)},
-    ],
-)
-def test_what_is_no_place_is_none(wrong):
-    assert place_of(**wrong) is None
+    ):
+        with subtests.test(wrong=wrong):
+            assert place_of(**wrong) is None
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
@@ -213,21 +216,20 @@ def test_times_by_exif_are_universal_where_their_offset_is_stated(tmp_path):
     assert stamps_of_exif(tmp_path, names)[0].t_ns.tolist() == [noon_ns + 100_000_000, noon_ns + 200_000_000]
 
 
-@pytest.mark.parametrize(
-    ("wrong", "error", "said"),
-    [
+def test_times_by_exif_that_cannot_be_compared_are_refused(subtests, tmp_path_factory):
+    for wrong, error, said in (
         ({"fraction": b"5\0"}, TimingError, "b.tif: its EXIF gives the time to tenths of a second only"),
         ({"fraction": None}, TimingError, "b.tif: its EXIF gives the time to whole seconds only"),
         ({"fraction": b"2x\0"}, TimingError, "whole seconds only"),
         ({"date": None}, FormatError, "b.tif: its EXIF has no DateTimeOriginal"),
         ({"date": b"2024-05-01 12:30:15\0"}, FormatError, "no DateTimeOriginal"),
         ({"offset": None}, TimingError, "b.tif: its EXIF does not state the offset from universal time, that of a.tif"),
-    ],
-)
-def test_times_by_exif_that_cannot_be_compared_are_refused(tmp_path, wrong, error, said):
-    names = [taken(tmp_path / "a.tif"), taken(tmp_path / "b.tif", **wrong)]
-    with pytest.raises(error, match=said):
-        stamps_of_exif(tmp_path, names)
+    ):
+        with subtests.test(wrong=wrong, error=error, said=said):
+            tmp_path = tmp_path_factory.mktemp("given")
+            names = [taken(tmp_path / "a.tif"), taken(tmp_path / "b.tif", **wrong)]
+            with pytest.raises(error, match=said):
+                stamps_of_exif(tmp_path, names)
 
 
 def test_pictures_without_exif_have_no_time(tmp_path):

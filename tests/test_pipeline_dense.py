@@ -329,30 +329,32 @@ def need_open3d():
         pytest.skip(f"open3d cannot be loaded: {error}")
 
 
-@pytest.mark.parametrize(("maker", "at"), [("plane sweep", 0.5), ("patch-match", 0.0)])
-def test_a_mesh_by_distances_takes_pixels_where_their_maker_does(tmp_path, maker, at):
+def test_a_mesh_by_distances_takes_pixels_where_their_maker_does(subtests, tmp_path_factory):
     """A slanted plane seen from one place: half a pixel would move it by 10 mm."""
-    need_open3d()
-    camera = pycolmap.Camera(
-        camera_id=1, model="PINHOLE", width=200, height=150, params=[180.0, 180.0, 100.0, 75.0]
-    )  # fmt: skip
-    model, normal, distance = pycolmap.Reconstruction(), np.array([-0.8, 0.0, -0.6]), -1.5
-    model.add_camera_with_trivial_rig(camera)
-    pixel_y, pixel_x = np.indices((150, 200)) + at
-    rays_of = np.stack([(pixel_x - 100) / 180, (pixel_y - 75) / 180, np.ones((150, 200))], axis=-1)
-    depth = distance / (rays_of @ normal)
-    for i in range(1, 5):
-        image = pycolmap.Image(name=f"{i}.png", camera_id=1, image_id=i)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
-        write_map(tmp_path / "stereo" / "depth_maps" / f"{i}.png.geometric.bin", depth.astype(np.float32))
-        (tmp_path / "images").mkdir(exist_ok=True)
-        cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), np.full((150, 200, 3), 128, np.uint8))
-    (tmp_path / "sparse").mkdir()
-    model.write_binary(str(tmp_path / "sparse"))
-    tsdf_mesh(tmp_path, [f"{i}.png" for i in range(1, 5)], tmp_path / "mesh.ply", maker=maker, kind="geometric")
-    found = vertices(tmp_path / "mesh.ply")
-    assert len(found) > 1000
-    assert abs(np.mean(found @ normal - distance)) < 0.002
+    for maker, at in (("plane sweep", 0.5), ("patch-match", 0.0)):
+        with subtests.test(maker=maker, at=at):
+            tmp_path = tmp_path_factory.mktemp("given")
+            need_open3d()
+            camera = pycolmap.Camera(
+                camera_id=1, model="PINHOLE", width=200, height=150, params=[180.0, 180.0, 100.0, 75.0]
+            )  # fmt: skip
+            model, normal, distance = pycolmap.Reconstruction(), np.array([-0.8, 0.0, -0.6]), -1.5
+            model.add_camera_with_trivial_rig(camera)
+            pixel_y, pixel_x = np.indices((150, 200)) + at
+            rays_of = np.stack([(pixel_x - 100) / 180, (pixel_y - 75) / 180, np.ones((150, 200))], axis=-1)
+            depth = distance / (rays_of @ normal)
+            for i in range(1, 5):
+                image = pycolmap.Image(name=f"{i}.png", camera_id=1, image_id=i)
+                model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+                write_map(tmp_path / "stereo" / "depth_maps" / f"{i}.png.geometric.bin", depth.astype(np.float32))
+                (tmp_path / "images").mkdir(exist_ok=True)
+                cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), np.full((150, 200, 3), 128, np.uint8))
+            (tmp_path / "sparse").mkdir()
+            model.write_binary(str(tmp_path / "sparse"))
+            tsdf_mesh(tmp_path, [f"{i}.png" for i in range(1, 5)], tmp_path / "mesh.ply", maker=maker, kind="geometric")
+            found = vertices(tmp_path / "mesh.ply")
+            assert len(found) > 1000
+            assert abs(np.mean(found @ normal - distance)) < 0.002
 
 
 def test_a_mesh_by_distances_lies_on_the_walls_and_replaces_the_other(unfinished, box, capsys):

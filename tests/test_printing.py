@@ -70,19 +70,23 @@ def test_a_message_on_the_terminal(tmp_path, capsys):
     assert stopped.value.code == 2 and SHOWN in told.err and "\x1b" not in told.out + told.err
 
 
-@pytest.mark.parametrize("at", ["capture", "out", "json"])
-def test_a_folder_whose_name_is_no_utf_8(tmp_path, at):
-    name = os.fsdecode(os.fsencode(tmp_path) + b"/n\xff")
-    os.mkdir(name)
-    args = {"capture": [name, str(tmp_path / "out")], "out": [str(tmp_path), f"{name}/out"]}
-    words = args.get(at, [str(tmp_path), str(tmp_path / "out"), "--json", f"{name}/a.json"])
-    command = [sys.executable, "-m", "colmap_inertial", "reconstruct", *words]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert (
-        done.returncode == 2 and done.stderr.startswith("error: ") and "is no UTF-8 or holds a control" in done.stderr
-    )
-    with pytest.raises(FormatError, match="rename it"):
-        require_utf8(tmp_path, name)
+def test_a_folder_whose_name_is_no_utf_8(subtests, tmp_path_factory):
+    for at in ("capture", "out", "json"):
+        with subtests.test(at=at):
+            tmp_path = tmp_path_factory.mktemp("given")
+            name = os.fsdecode(os.fsencode(tmp_path) + b"/n\xff")
+            os.mkdir(name)
+            args = {"capture": [name, str(tmp_path / "out")], "out": [str(tmp_path), f"{name}/out"]}
+            words = args.get(at, [str(tmp_path), str(tmp_path / "out"), "--json", f"{name}/a.json"])
+            command = [sys.executable, "-m", "colmap_inertial", "reconstruct", *words]
+            done = subprocess.run(command, capture_output=True, text=True)
+            assert (
+                done.returncode == 2
+                and done.stderr.startswith("error: ")
+                and "is no UTF-8 or holds a control" in done.stderr
+            )
+            with pytest.raises(FormatError, match="rename it"):
+                require_utf8(tmp_path, name)
 
 
 def test_a_report(tmp_path):

@@ -152,37 +152,41 @@ def dense(problem, at, by, residual):
     return info, rhs
 
 
-@pytest.mark.parametrize("instruction_set", _inertial.instruction_sets())
-@pytest.mark.parametrize("folded", [False, True])
-def test_the_compiled_step_and_covariance_are_those_of_the_whole_system(folded, instruction_set, monkeypatch):
-    kernel = functools.partial(_inertial.reduce_points, instruction_set=instruction_set)
-    monkeypatch.setattr(_system, "_inertial", SimpleNamespace(reduce_points=kernel))
-    options = walk(4.0, readout_s=0.02, points_per_m=30.0, frame_rate_hz=3.0)
-    problem, start, _ = problem_of(tracks_of(options), options)
-    x = nudged(start, np.random.default_rng(2))
-    at = _evaluate(problem, x, problem.observations)
-    by, residual = _weighted(problem, at)
-    layout = Layout.of(problem.observations, len(x.velocity_m_s))
-    if folded:
-        count = len(layout.place)
-        layout = Layout.make(
-            np.random.default_rng(0).permutation(count), 15, *np.indices((count, count)).reshape(2, -1)
-        )
-    prior = (problem.prior.info, -problem.prior.info @ at.offset)
-    system = System.build(layout, problem.observations, by, residual, at.rows, prior, damping=0.0)
-    solved = system.factored()
-    step = solved.step(system, problem.observations, by)
-    states, shared, points = step.states, step.shared, step.points
-    info, rhs = dense(problem, at, by, residual)
-    unit = 1 / np.sqrt(np.diagonal(info))
-    scaled = np.linalg.inv(info * unit[:, None] * unit)
-    expected = unit * (scaled @ (unit * rhs))
-    n, q = states.size, len(shared)
-    sigma = unit * np.sqrt(np.diagonal(scaled))
-    found = np.concatenate([states.ravel(), shared, points.ravel()])
-    assert np.abs((found - expected) / sigma).max() < 1e-3
-    cov = (scaled * unit[:, None] * unit)[n : n + q, n : n + q]
-    assert np.sqrt(np.diagonal(solved.shared_cov())) == pytest.approx(np.sqrt(np.diagonal(cov)), rel=1e-4)
+def test_the_compiled_step_and_covariance_are_those_of_the_whole_system(subtests):
+    for instruction_set in _inertial.instruction_sets():
+        for folded in (False, True):
+            with (
+                subtests.test(instruction_set=instruction_set, folded=folded),
+                pytest.MonkeyPatch.context() as monkeypatch,
+            ):
+                kernel = functools.partial(_inertial.reduce_points, instruction_set=instruction_set)
+                monkeypatch.setattr(_system, "_inertial", SimpleNamespace(reduce_points=kernel))
+                options = walk(4.0, readout_s=0.02, points_per_m=30.0, frame_rate_hz=3.0)
+                problem, start, _ = problem_of(tracks_of(options), options)
+                x = nudged(start, np.random.default_rng(2))
+                at = _evaluate(problem, x, problem.observations)
+                by, residual = _weighted(problem, at)
+                layout = Layout.of(problem.observations, len(x.velocity_m_s))
+                if folded:
+                    count = len(layout.place)
+                    layout = Layout.make(
+                        np.random.default_rng(0).permutation(count), 15, *np.indices((count, count)).reshape(2, -1)
+                    )
+                prior = (problem.prior.info, -problem.prior.info @ at.offset)
+                system = System.build(layout, problem.observations, by, residual, at.rows, prior, damping=0.0)
+                solved = system.factored()
+                step = solved.step(system, problem.observations, by)
+                states, shared, points = step.states, step.shared, step.points
+                info, rhs = dense(problem, at, by, residual)
+                unit = 1 / np.sqrt(np.diagonal(info))
+                scaled = np.linalg.inv(info * unit[:, None] * unit)
+                expected = unit * (scaled @ (unit * rhs))
+                n, q = states.size, len(shared)
+                sigma = unit * np.sqrt(np.diagonal(scaled))
+                found = np.concatenate([states.ravel(), shared, points.ravel()])
+                assert np.abs((found - expected) / sigma).max() < 1e-3
+                cov = (scaled * unit[:, None] * unit)[n : n + q, n : n + q]
+                assert np.sqrt(np.diagonal(solved.shared_cov())) == pytest.approx(np.sqrt(np.diagonal(cov)), rel=1e-4)
 
 
 def test_frames_stand_in_order_of_time_unless_a_loop_closes():
@@ -250,26 +254,27 @@ def test_what_only_damping_holds_is_not_at_rest(small, monkeypatch):
     assert not solve(problem, off).converged
 
 
-@pytest.mark.parametrize("fewest", [0, 2])
-def test_frames_that_hardly_see_anything_stop_nothing(small, fewest):
-    _, problem, start, _ = small
-    seen = problem.observations
-    keep = np.ones(len(seen.frame), dtype=bool)
-    for frame in (5, len(start.velocity_m_s) - 1):
-        keep[np.flatnonzero(seen.frame == frame)[fewest:]] = False
-    problem = replace(problem, observations=seen.select(keep))
-    linked = problem.inertial.linked.copy()
-    linked[-1] = False  # nor does the IMU hold the last one
-    problem = replace(problem, inertial=replace(problem.inertial, linked=linked))
-    rng = np.random.default_rng(4)
-    off = nudged(start, rng)
-    alone = solve(pictures.pictures_alone(problem, problem.observations.xy_px), off)
-    whole = solve(problem, off)
-    assert alone.converged
-    assert whole.converged
-    assert not np.array_equal(alone.estimate.points_m, off.points_m)
-    sigma = np.sqrt(np.diagonal(factored(problem, whole.estimate).shared_cov()))
-    assert np.isfinite(sigma).all()
+def test_frames_that_hardly_see_anything_stop_nothing(subtests, small):
+    for fewest in (0, 2):
+        with subtests.test(fewest=fewest):
+            _, problem, start, _ = small
+            seen = problem.observations
+            keep = np.ones(len(seen.frame), dtype=bool)
+            for frame in (5, len(start.velocity_m_s) - 1):
+                keep[np.flatnonzero(seen.frame == frame)[fewest:]] = False
+            problem = replace(problem, observations=seen.select(keep))
+            linked = problem.inertial.linked.copy()
+            linked[-1] = False  # nor does the IMU hold the last one
+            problem = replace(problem, inertial=replace(problem.inertial, linked=linked))
+            rng = np.random.default_rng(4)
+            off = nudged(start, rng)
+            alone = solve(pictures.pictures_alone(problem, problem.observations.xy_px), off)
+            whole = solve(problem, off)
+            assert alone.converged
+            assert whole.converged
+            assert not np.array_equal(alone.estimate.points_m, off.points_m)
+            sigma = np.sqrt(np.diagonal(factored(problem, whole.estimate).shared_cov()))
+            assert np.isfinite(sigma).all()
 
 
 def test_a_recording_of_less_than_half_is_refused():
@@ -488,19 +493,20 @@ def test_standard_deviations_of_the_calibration_are_honest(small):
     assert abs(x.offset_s) < 3e-4
 
 
-@pytest.mark.parametrize("share", [1e-3, -1e-3])
-def test_what_a_small_step_promises_is_what_it_gives(small, share):
+def test_what_a_small_step_promises_is_what_it_gives(subtests, small):
     """A gain of the whole cost, robust and with all priors, by the linear model of the solver."""
-    _, problem, start, _ = small
-    at = _evaluate(problem, nudged(start, np.random.default_rng(11), 3e-4), problem.observations)
-    by, residual = _weighted(problem, at)
-    layout = Layout.of(problem.observations, len(start.velocity_m_s))
-    system = solver._built(problem, layout, at, by, residual, 1e-4)
-    step = solver._step(system, problem.observations, by)
-    step = replace(step, **{field.name: share * getattr(step, field.name) for field in fields(step)})
-    promised = solver._promised(problem, at, residual, step)
-    gained = at.cost - _evaluate(problem, step.taken(at.estimate), problem.observations).cost
-    assert np.sign(promised) == np.sign(share) and gained == pytest.approx(promised, rel=0.01)
+    for share in (1e-3, -1e-3):
+        with subtests.test(share=share):
+            _, problem, start, _ = small
+            at = _evaluate(problem, nudged(start, np.random.default_rng(11), 3e-4), problem.observations)
+            by, residual = _weighted(problem, at)
+            layout = Layout.of(problem.observations, len(start.velocity_m_s))
+            system = solver._built(problem, layout, at, by, residual, 1e-4)
+            step = solver._step(system, problem.observations, by)
+            step = replace(step, **{field.name: share * getattr(step, field.name) for field in fields(step)})
+            promised = solver._promised(problem, at, residual, step)
+            gained = at.cost - _evaluate(problem, step.taken(at.estimate), problem.observations).cost
+            assert np.sign(promised) == np.sign(share) and gained == pytest.approx(promised, rel=0.01)
 
 
 def test_observations_that_tell_more_pull_as_much_and_hold_so_many_times_as_firmly(small):
@@ -517,19 +523,24 @@ def test_observations_that_tell_more_pull_as_much_and_hold_so_many_times_as_firm
     np.testing.assert_allclose(pull_firm, pull, rtol=1e-9)
 
 
-@pytest.mark.parametrize("robust_px", [0.5, 3.0])
-def test_weights_are_the_slope_of_the_robust_cost(robust_px):
-    residual = np.random.default_rng(1).normal(0, 2.0, (40, 2))
-    costs, step = solver.robust_cost(residual, 0.4, robust_px), 1e-6
-    for axis in range(2):
-        ends = [solver.robust_cost(residual + sign * step * np.eye(2)[axis], 0.4, robust_px) for sign in (1, -1)]
-        weight = 1 / 0.4**2 / (1 + np.sum(residual**2, axis=1) / robust_px**2)
-        np.testing.assert_allclose((ends[0] - ends[1]) / (2 * step), weight * residual[:, axis], rtol=1e-6, atol=1e-8)
-    # of small residuals, half squares over variances
-    small = 1e-4 * residual
-    squares = 0.5 * np.sum(small**2, axis=1) / 0.4**2
-    np.testing.assert_allclose(solver.robust_cost(small, 0.4, robust_px), squares, rtol=1e-5)
-    assert (costs < 0.5 * np.sum(residual**2, axis=1) / 0.4**2).all()
+def test_weights_are_the_slope_of_the_robust_cost(subtests):
+    for robust_px in (0.5, 3.0):
+        with subtests.test(robust_px=robust_px):
+            residual = np.random.default_rng(1).normal(0, 2.0, (40, 2))
+            costs, step = solver.robust_cost(residual, 0.4, robust_px), 1e-6
+            for axis in range(2):
+                ends = [
+                    solver.robust_cost(residual + sign * step * np.eye(2)[axis], 0.4, robust_px) for sign in (1, -1)
+                ]
+                weight = 1 / 0.4**2 / (1 + np.sum(residual**2, axis=1) / robust_px**2)
+                np.testing.assert_allclose(
+                    (ends[0] - ends[1]) / (2 * step), weight * residual[:, axis], rtol=1e-6, atol=1e-8
+                )
+            # of small residuals, half squares over variances
+            small = 1e-4 * residual
+            squares = 0.5 * np.sum(small**2, axis=1) / 0.4**2
+            np.testing.assert_allclose(solver.robust_cost(small, 0.4, robust_px), squares, rtol=1e-5)
+            assert (costs < 0.5 * np.sum(residual**2, axis=1) / 0.4**2).all()
 
 
 def test_known_numbers_stay_where_they_are(small):

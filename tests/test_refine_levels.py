@@ -31,16 +31,17 @@ def solved():
     return problem, start
 
 
-@pytest.mark.parametrize("times", [0.25, 1.0, 8.0])
-def test_the_noise_is_the_simulator_s_whatever_was_thought_of_it(solved, times):
-    problem, start = solved
-    thought = at_level(problem, times * TRUE)
-    x = solve(thought, start).estimate
-    measured = apply_measured_noise(thought, x)
-    assert measured.inertial.noise.accel_density_m_s2_rthz == pytest.approx(TRUE, rel=0.25)
-    kept = vars(replace(measured.inertial.noise, accel_density_m_s2_rthz=times * TRUE))
-    assert kept == vars(thought.inertial.noise)
-    assert found(thought, x) == measured.inertial.noise.accel_density_m_s2_rthz
+def test_the_noise_is_the_simulator_s_whatever_was_thought_of_it(subtests, solved):
+    for times in (0.25, 1.0, 8.0):
+        with subtests.test(times=times):
+            problem, start = solved
+            thought = at_level(problem, times * TRUE)
+            x = solve(thought, start).estimate
+            measured = apply_measured_noise(thought, x)
+            assert measured.inertial.noise.accel_density_m_s2_rthz == pytest.approx(TRUE, rel=0.25)
+            kept = vars(replace(measured.inertial.noise, accel_density_m_s2_rthz=times * TRUE))
+            assert kept == vars(thought.inertial.noise)
+            assert found(thought, x) == measured.inertial.noise.accel_density_m_s2_rthz
 
 
 def test_the_level_is_that_of_the_greatest_likelihood(solved, monkeypatch):
@@ -64,29 +65,30 @@ def test_the_level_is_that_of_the_greatest_likelihood(solved, monkeypatch):
     assert values[1] > max(values[0], values[2]) + 1
 
 
-@pytest.mark.parametrize("times", [0.2, 1.0, 2.0])
-def test_observations_weigh_as_much_as_they_tell(solved, times):
-    from scipy.special import exp1
+def test_observations_weigh_as_much_as_they_tell(subtests, solved):
+    for times in (0.2, 1.0, 2.0):
+        with subtests.test(times=times):
+            from scipy.special import exp1
 
-    problem, start = solved
-    alone = pictures.pictures_alone(problem, problem.observations.xy_px)
-    x = solve(alone, start).estimate
-    # of normal errors and a loss of scale k standard deviations, half the squares over the scale's are exponential
-    sigma_px = times * 0.5
-    scaled = replace(
-        alone, observations=replace(alone.observations, xy_px=_with_noise(alone, x, sigma_px)), robust_px=1.0
-    )
-    noise = pictures.measure_picture_noise(scaled, x)
-    k = 0.5 * (noise.robust_px / noise.sigma_px) ** 2
-    weight = k * np.exp(k) * exp1(k)
-    slope = k * (1 - weight)
-    variance = k * (weight - slope)
-    # nothing was fitted to these
-    left = 1 - (3 * len(x.points_m) + 6 * len(x.velocity_m_s)) / (2 * len(alone.observations.frame))
-    assert noise.sigma_px * left**0.5 == pytest.approx(sigma_px, rel=0.03)
-    assert noise.robust_px == pytest.approx(max(1.0, 2 * noise.sigma_px))
-    assert noise.weighed_px / noise.sigma_px == pytest.approx((variance / slope) ** 0.5, rel=0.03)
-    assert noise.informs == pytest.approx(slope / weight, rel=0.03)
+            problem, start = solved
+            alone = pictures.pictures_alone(problem, problem.observations.xy_px)
+            x = solve(alone, start).estimate
+            # of normal errors and a loss of scale k standard deviations, half the squares are exponential
+            sigma_px = times * 0.5
+            scaled = replace(
+                alone, observations=replace(alone.observations, xy_px=_with_noise(alone, x, sigma_px)), robust_px=1.0
+            )
+            noise = pictures.measure_picture_noise(scaled, x)
+            k = 0.5 * (noise.robust_px / noise.sigma_px) ** 2
+            weight = k * np.exp(k) * exp1(k)
+            slope = k * (1 - weight)
+            variance = k * (weight - slope)
+            # nothing was fitted to these
+            left = 1 - (3 * len(x.points_m) + 6 * len(x.velocity_m_s)) / (2 * len(alone.observations.frame))
+            assert noise.sigma_px * left**0.5 == pytest.approx(sigma_px, rel=0.03)
+            assert noise.robust_px == pytest.approx(max(1.0, 2 * noise.sigma_px))
+            assert noise.weighed_px / noise.sigma_px == pytest.approx((variance / slope) ** 0.5, rel=0.03)
+            assert noise.informs == pytest.approx(slope / weight, rel=0.03)
 
 
 def test_noise_is_measured_beside_what_was_fitted_to_it():

@@ -16,47 +16,52 @@ from colmap_inertial.inertial.refine.solve import factored, solve
 from colmap_inertial.inertial.refine.world import derive_log_size, find_world
 
 
-@pytest.mark.parametrize(
-    ("frames", "reach", "state", "wide", "group"),
-    [(1, 1, 5, 3, 3), (7, 2, 5, 3, 3), (23, 4, 5, 3, 4), (24, 24, 5, 3, 4), (60, 9, 5, 5, 8), (61, 15, 15, 9, 12)],
-)
-def test_solutions_and_marginals_are_those_of_the_dense_inverse(frames, reach, state, wide, group):
+def test_solutions_and_marginals_are_those_of_the_dense_inverse(subtests):
     """Frames see as far as ``reach``, each otherwise; numbers that are not wide are coupled with neighbours alone."""
-    rng = np.random.default_rng(frames)
-    pairs = [(a, b) for a in range(frames) for b in range(a + 1) if a - b < max(2, rng.integers(1, reach + 2))]
-    both = np.array([*pairs, *(pair[::-1] for pair in pairs)])
-    place = rng.permutation(frames) if wide == state else np.arange(frames)
-    layout = Layout.make(place, wide, *both.T, state=state, group=group)
-    matrix = np.zeros((frames, state, frames, state))
-    for a, b in pairs:
-        block = rng.standard_normal((state, state))
-        if a - b > 1:
-            block[wide:] = block[:, wide:] = 0.0
-        matrix[a, :, b] += block
-        matrix[b, :, a] += block.T
-    whole = matrix.reshape(frames * state, -1)
-    whole += np.abs(whole).sum(axis=1).max() * np.eye(len(whole))
-    values = np.zeros(layout.size_bytes // 8)
-    (own, lower), (following, _), diagonal = layout.entries
-    values[own] = matrix[np.arange(frames), :, np.arange(frames)].ravel()[lower]
-    values[following] = matrix[np.arange(1, frames), :, np.arange(frames - 1)].ravel()
-    values[diagonal[whole.shape[0] :]] = 1.0
-    offset, end = layout.offsets
-    for a, b in pairs:
-        if a - b > 1:
-            first, last = sorted((place[a], place[b]))
-            assert last < end[first]
-            block = matrix[a, :wide, b, :wide] if place[a] == last else matrix[a, :wide, b, :wide].T
-            at = offset[first] + (wide * last + np.arange(wide)[:, None]) * group * wide + np.arange(wide)
-            values[at] = block
-    order = (np.argsort(place)[:, None] * state + np.arange(state)).ravel()
-    inverse = np.linalg.inv(whole[np.ix_(order, order)])
-    factor = PanelFactor.of(layout, values)
-    rhs = rng.standard_normal((len(whole), 4))
-    assert factor.solve(rhs) == pytest.approx(inverse @ rhs, abs=1e-12)
-    expected = inverse.reshape(frames, state, frames, state)[np.arange(frames), :, np.arange(frames)]
-    assert factor.marginals() == pytest.approx(expected, abs=1e-12)
-    assert factor.log_determinant() == pytest.approx(np.linalg.slogdet(whole)[1])
+    for frames, reach, state, wide, group in (
+        (1, 1, 5, 3, 3),
+        (7, 2, 5, 3, 3),
+        (23, 4, 5, 3, 4),
+        (24, 24, 5, 3, 4),
+        (60, 9, 5, 5, 8),
+        (61, 15, 15, 9, 12),
+    ):
+        with subtests.test(frames=frames, reach=reach, state=state, wide=wide, group=group):
+            rng = np.random.default_rng(frames)
+            pairs = [(a, b) for a in range(frames) for b in range(a + 1) if a - b < max(2, rng.integers(1, reach + 2))]
+            both = np.array([*pairs, *(pair[::-1] for pair in pairs)])
+            place = rng.permutation(frames) if wide == state else np.arange(frames)
+            layout = Layout.make(place, wide, *both.T, state=state, group=group)
+            matrix = np.zeros((frames, state, frames, state))
+            for a, b in pairs:
+                block = rng.standard_normal((state, state))
+                if a - b > 1:
+                    block[wide:] = block[:, wide:] = 0.0
+                matrix[a, :, b] += block
+                matrix[b, :, a] += block.T
+            whole = matrix.reshape(frames * state, -1)
+            whole += np.abs(whole).sum(axis=1).max() * np.eye(len(whole))
+            values = np.zeros(layout.size_bytes // 8)
+            (own, lower), (following, _), diagonal = layout.entries
+            values[own] = matrix[np.arange(frames), :, np.arange(frames)].ravel()[lower]
+            values[following] = matrix[np.arange(1, frames), :, np.arange(frames - 1)].ravel()
+            values[diagonal[whole.shape[0] :]] = 1.0
+            offset, end = layout.offsets
+            for a, b in pairs:
+                if a - b > 1:
+                    first, last = sorted((place[a], place[b]))
+                    assert last < end[first]
+                    block = matrix[a, :wide, b, :wide] if place[a] == last else matrix[a, :wide, b, :wide].T
+                    at = offset[first] + (wide * last + np.arange(wide)[:, None]) * group * wide + np.arange(wide)
+                    values[at] = block
+            order = (np.argsort(place)[:, None] * state + np.arange(state)).ravel()
+            inverse = np.linalg.inv(whole[np.ix_(order, order)])
+            factor = PanelFactor.of(layout, values)
+            rhs = rng.standard_normal((len(whole), 4))
+            assert factor.solve(rhs) == pytest.approx(inverse @ rhs, abs=1e-12)
+            expected = inverse.reshape(frames, state, frames, state)[np.arange(frames), :, np.arange(frames)]
+            assert factor.marginals() == pytest.approx(expected, abs=1e-12)
+            assert factor.log_determinant() == pytest.approx(np.linalg.slogdet(whole)[1])
 
 
 def test_marginals_of_a_long_walk_stay_those_of_its_solutions():

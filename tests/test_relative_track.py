@@ -27,35 +27,38 @@ def similarity(found, true):
     return scale, found.mean(axis=0) - scale * true.mean(axis=0)
 
 
-@pytest.mark.parametrize("path", ["circle", "line", "stops"])
-def test_exact_rays_give_places_and_points_exactly(path):
-    count = 40
-    along = np.linspace(0, 6, count)
-    centre = {
-        "circle": circle(count),
-        "line": np.stack([along, 0.1 * along, 0 * along], axis=1),
-        "stops": np.stack(
-            [np.interp(along, [0, 2, 3, 5, 6], [0, 2, 2, 4, 3.5]), 0.3 * np.sin(along), 0 * along], axis=1
-        ),
-    }[path]
-    headings = headings_of(np.linspace(0, 360 if path == "circle" else 20, count), 0.5 * np.arange(count))
-    rng = np.random.default_rng(3)
-    points = centre[rng.integers(count, size=1500)] + rng.uniform(-1, 1, (1500, 3)) * [3, 3, 1]
-    seen = sightings_along(centre, headings.start_from_cam, np.random.default_rng(3), noise_rad=0.0)
-    way = estimate_relative_track(seen, count)
-    assert (way.part == 0).all()
-    scale, offset = similarity(way.centre, centre)
-    np.testing.assert_allclose(way.centre, scale * centre + offset, atol=1e-6 * scale)
-    known = np.isfinite(way.points[:, 0])
-    assert known.mean() > 0.15
-    np.testing.assert_allclose(way.points[known], scale * points[: len(way.points)][known] + offset, atol=1e-4 * scale)
-    # the first is the origin, and the length of the first step with parallax is one
-    assert not way.centre[0].any()
-    assert np.abs(np.linalg.norm(way.centre[1:9], axis=1) - 1).min() < 1e-12
-    # points lie where they are seen, not behind
-    away = way.points[seen.point] - way.centre[seen.frame]
-    good = np.isfinite(away[:, 0])
-    assert (np.sum(away[good] * seen.rays[good], axis=1) > 0).all()
+def test_exact_rays_give_places_and_points_exactly(subtests):
+    for path in ("circle", "line", "stops"):
+        with subtests.test(path=path):
+            count = 40
+            along = np.linspace(0, 6, count)
+            centre = {
+                "circle": circle(count),
+                "line": np.stack([along, 0.1 * along, 0 * along], axis=1),
+                "stops": np.stack(
+                    [np.interp(along, [0, 2, 3, 5, 6], [0, 2, 2, 4, 3.5]), 0.3 * np.sin(along), 0 * along], axis=1
+                ),
+            }[path]
+            headings = headings_of(np.linspace(0, 360 if path == "circle" else 20, count), 0.5 * np.arange(count))
+            rng = np.random.default_rng(3)
+            points = centre[rng.integers(count, size=1500)] + rng.uniform(-1, 1, (1500, 3)) * [3, 3, 1]
+            seen = sightings_along(centre, headings.start_from_cam, np.random.default_rng(3), noise_rad=0.0)
+            way = estimate_relative_track(seen, count)
+            assert (way.part == 0).all()
+            scale, offset = similarity(way.centre, centre)
+            np.testing.assert_allclose(way.centre, scale * centre + offset, atol=1e-6 * scale)
+            known = np.isfinite(way.points[:, 0])
+            assert known.mean() > 0.15
+            np.testing.assert_allclose(
+                way.points[known], scale * points[: len(way.points)][known] + offset, atol=1e-4 * scale
+            )
+            # the first is the origin, and the length of the first step with parallax is one
+            assert not way.centre[0].any()
+            assert np.abs(np.linalg.norm(way.centre[1:9], axis=1) - 1).min() < 1e-12
+            # points lie where they are seen, not behind
+            away = way.points[seen.point] - way.centre[seen.frame]
+            good = np.isfinite(away[:, 0])
+            assert (np.sum(away[good] * seen.rays[good], axis=1) > 0).all()
 
 
 def test_false_matches_hardly_move_the_track():
@@ -92,53 +95,55 @@ def test_what_is_seen_and_how_far_away_it_is():
         assert way.depth(k) == pytest.approx(np.median(far)) if rows else np.isnan(way.depth(k))
 
 
-@pytest.mark.parametrize("span", [(0, 30), (7, 25), (12, 13), (9, 9)])
-def test_covariances_of_the_track_are_the_scatter_of_tracks_whose_length_walks(span):
+def test_covariances_of_the_track_are_the_scatter_of_tracks_whose_length_walks(subtests):
     """Each step is as long as the one before but for a chance factor; a heading's error is there all the way."""
-    i, j = span
-    rng = np.random.default_rng(0)
-    centre = np.cumsum(rng.standard_normal((31, 3)) + np.array([0.5, 0, 0]), axis=0)
-    steps = np.diff(centre[i : j + 1], axis=0)
-    way = way_along(centre)
-    found = way.covariance(np.array([i]), np.array([j]), np.zeros(1))[0]
-    factors = np.cumsum(DRIFT * rng.standard_normal((60_000, len(steps))), axis=1)
-    off = factors @ steps
-    np.testing.assert_allclose(found, off.T @ off / 60_000, atol=0.03 * np.trace(found) + 1e-12)
-    # by so much is what is left at each frame turned, in any direction
-    left = centre[j] - centre[i : j + 1]
-    turned = way.covariance(np.array([i]), np.array([j]), np.array([0.3]))[0] - found
-    np.testing.assert_allclose(turned, 0.3**2 * np.mean(np.sum(left**2, axis=1)) * np.eye(3), atol=1e-10)
+    for span in ((0, 30), (7, 25), (12, 13), (9, 9)):
+        with subtests.test(span=span):
+            i, j = span
+            rng = np.random.default_rng(0)
+            centre = np.cumsum(rng.standard_normal((31, 3)) + np.array([0.5, 0, 0]), axis=0)
+            steps = np.diff(centre[i : j + 1], axis=0)
+            way = way_along(centre)
+            found = way.covariance(np.array([i]), np.array([j]), np.zeros(1))[0]
+            factors = np.cumsum(DRIFT * rng.standard_normal((60_000, len(steps))), axis=1)
+            off = factors @ steps
+            np.testing.assert_allclose(found, off.T @ off / 60_000, atol=0.03 * np.trace(found) + 1e-12)
+            # by so much is what is left at each frame turned, in any direction
+            left = centre[j] - centre[i : j + 1]
+            turned = way.covariance(np.array([i]), np.array([j]), np.array([0.3]))[0] - found
+            np.testing.assert_allclose(turned, 0.3**2 * np.mean(np.sum(left**2, axis=1)) * np.eye(3), atol=1e-10)
 
 
-@pytest.mark.parametrize("most", [800, 3])
-def test_points_of_matches_are_those_of_a_search_through_all_of_them(monkeypatch, most):
-    monkeypatch.setattr(relative_track, "_LIMITS", relative_track.TrackLimits(most_observations=most))
-    rng = np.random.default_rng(9)
-    # feature of 60 things in each of 6 frames; some matches of neighbours are false
-    features = [60, 61, 62, 63, 64, 65]
-    feature_of = [rng.permutation(count)[:60] for count in features]
-    seen = rng.random((6, 60)) < 0.7
-    matches = []
-    for i in range(6):
-        for j in range(i + 1, 6):
-            both = np.flatnonzero(seen[i] & seen[j] & (rng.random(60) < 0.6))
-            pairs = np.stack([feature_of[i][both], feature_of[j][both]], axis=1)
-            matches.append((i, j, np.concatenate([pairs, rng.integers(0, 60, (int(j == i + 1), 2))])))
-    group = {(k, f): {(k, f)} for k in range(6) for f in range(features[k])}
-    for i, j, pairs in matches:
-        for a, b in pairs.tolist():
-            both = group[i, a] | group[j, b]
-            for member in both:
-                group[member] = both
-    groups = {frozenset(one) for one in group.values()}
-    expected = {one for one in groups if len(one) >= 3 and len({k for k, _ in one}) == len(one)}
-    frame, feature, point = link_observations(features, matches)
-    assert np.all(np.diff(frame) >= 0) and set(point.tolist()) == set(range(int(point.max()) + 1))
-    of_point = [np.flatnonzero(point == p) for p in range(int(point.max()) + 1)]
-    found = {frozenset(zip(frame[mine].tolist(), feature[mine].tolist(), strict=True)) for mine in of_point}
-    every = -(-sum(map(len, expected)) // (most * 6))
-    assert found <= expected and len(found) == -(-len(expected) // max(1, every))
-    assert len(expected) > 5 and (most > 3 or len(frame) < sum(map(len, expected)))
+def test_points_of_matches_are_those_of_a_search_through_all_of_them(subtests):
+    for most in (800, 3):
+        with subtests.test(most=most), pytest.MonkeyPatch.context() as monkeypatch:
+            monkeypatch.setattr(relative_track, "_LIMITS", relative_track.TrackLimits(most_observations=most))
+            rng = np.random.default_rng(9)
+            # feature of 60 things in each of 6 frames; some matches of neighbours are false
+            features = [60, 61, 62, 63, 64, 65]
+            feature_of = [rng.permutation(count)[:60] for count in features]
+            seen = rng.random((6, 60)) < 0.7
+            matches = []
+            for i in range(6):
+                for j in range(i + 1, 6):
+                    both = np.flatnonzero(seen[i] & seen[j] & (rng.random(60) < 0.6))
+                    pairs = np.stack([feature_of[i][both], feature_of[j][both]], axis=1)
+                    matches.append((i, j, np.concatenate([pairs, rng.integers(0, 60, (int(j == i + 1), 2))])))
+            group = {(k, f): {(k, f)} for k in range(6) for f in range(features[k])}
+            for i, j, pairs in matches:
+                for a, b in pairs.tolist():
+                    both = group[i, a] | group[j, b]
+                    for member in both:
+                        group[member] = both
+            groups = {frozenset(one) for one in group.values()}
+            expected = {one for one in groups if len(one) >= 3 and len({k for k, _ in one}) == len(one)}
+            frame, feature, point = link_observations(features, matches)
+            assert np.all(np.diff(frame) >= 0) and set(point.tolist()) == set(range(int(point.max()) + 1))
+            of_point = [np.flatnonzero(point == p) for p in range(int(point.max()) + 1)]
+            found = {frozenset(zip(frame[mine].tolist(), feature[mine].tolist(), strict=True)) for mine in of_point}
+            every = -(-sum(map(len, expected)) // (most * 6))
+            assert found <= expected and len(found) == -(-len(expected) // max(1, every))
+            assert len(expected) > 5 and (most > 3 or len(frame) < sum(map(len, expected)))
 
 
 def test_key_frames_and_candidates_are_those_of_a_loop():
@@ -244,19 +249,26 @@ def sighted(centres, points, rng, *, noise_rad=0.0):
     return Observations(frame=frame, point=point, feature=point, rays=rays), np.arange(len(centres) + 1) * len(points)
 
 
-@pytest.mark.parametrize("sign", [1, -1])
-@pytest.mark.parametrize(("noise_rad", "most_rad"), [(0.0, 1e-9), (5e-4, 0.02)])
-def test_the_first_step_is_to_the_first_frame_with_parallax_and_leads_where_it_is(sign, noise_rad, most_rad):
-    rng = np.random.default_rng(31)
-    points = np.column_stack([rng.uniform(-1, 1, (120, 2)), rng.uniform(1.5, 3, 120)])
-    true = sign * np.array([0.8, 0.36, 0.48])
-    centres = 0.03 * np.arange(12)[:, None] * true
-    seen, bounds = sighted(centres, points, rng, noise_rad=noise_rad)
-    other, direction = relative_track._find_beginning(seen, bounds, 0)
-    first = seen.rays[: len(points)]
-    apart = [np.median(np.linalg.norm(np.cross(first, seen.rays[bounds[j] : bounds[j + 1]]), axis=1)) for j in range(9)]
-    assert other == next(j for j in range(1, 9) if apart[j] >= 0.04) and 2 <= other < 8
-    assert np.linalg.norm(direction) == pytest.approx(1) and np.arccos(min(1.0, direction @ true)) <= most_rad + 1e-7
+def test_the_first_step_is_to_the_first_frame_with_parallax_and_leads_where_it_is(subtests):
+    for sign in (1, -1):
+        for noise_rad, most_rad in ((0.0, 1e-9), (5e-4, 0.02)):
+            with subtests.test(sign=sign, noise_rad=noise_rad, most_rad=most_rad):
+                rng = np.random.default_rng(31)
+                points = np.column_stack([rng.uniform(-1, 1, (120, 2)), rng.uniform(1.5, 3, 120)])
+                true = sign * np.array([0.8, 0.36, 0.48])
+                centres = 0.03 * np.arange(12)[:, None] * true
+                seen, bounds = sighted(centres, points, rng, noise_rad=noise_rad)
+                other, direction = relative_track._find_beginning(seen, bounds, 0)
+                first = seen.rays[: len(points)]
+                apart = [
+                    np.median(np.linalg.norm(np.cross(first, seen.rays[bounds[j] : bounds[j + 1]]), axis=1))
+                    for j in range(9)
+                ]
+                assert other == next(j for j in range(1, 9) if apart[j] >= 0.04) and 2 <= other < 8
+                assert (
+                    np.linalg.norm(direction) == pytest.approx(1)
+                    and np.arccos(min(1.0, direction @ true)) <= most_rad + 1e-7
+                )
 
 
 def test_without_parallax_or_with_few_points_nothing_begins():
@@ -269,25 +281,30 @@ def test_without_parallax_or_with_few_points_nothing_begins():
         assert (relative_track._find_beginning(*sighted(moving, points[:count], rng), 0) is not None) == begins
 
 
-@pytest.mark.parametrize(("wrong", "located"), [(0.0, True), (0.4, True), (0.9, False)])
-def test_a_frame_is_located_by_most_of_what_it_sees(wrong, located):
-    rng = np.random.default_rng(33)
-    points = np.column_stack([rng.uniform(-1, 1, (200, 2)), rng.uniform(1.5, 3, 200)])
-    true = np.array([0.1, -0.05, 0.02])
-    rays = points - true
-    bad = rng.permutation(200) < 200 * wrong
-    rays[bad] += rng.uniform(-1, 1, (int(bad.sum()), 3))
-    rays /= np.linalg.norm(rays, axis=1)[:, None]
-    off = np.linalg.norm(np.cross((points - true) / np.linalg.norm(points - true, axis=1)[:, None], rays), axis=1)
-    unknown = np.arange(200) % 10 == 0
-    known = np.where(unknown[:, None], np.nan, points)
-    found = relative_track._locate_frame(known, rays, true + 0.01 * np.array([3, 2, -2]), np.array([0.05, 0, 0]))
-    assert (found is not None) == located
-    if found is not None:
-        centre, trusted = found
-        assert np.linalg.norm(centre - true) < (1e-3 if wrong else 1e-9)
-        # what is off by three times an error's size triangulates nothing; of new points nobody knows
-        clear = unknown | (np.abs(off - 0.012) > 2e-3)
-        assert np.array_equal(trusted[clear], (unknown | (off < 0.012))[clear])
-    few = relative_track._locate_frame(known[:8], rays[:8], true, np.array([0.05, 0, 0]))
-    assert few is None  # one of the eight is unknown
+def test_a_frame_is_located_by_most_of_what_it_sees(subtests):
+    for wrong, located in ((0.0, True), (0.4, True), (0.9, False)):
+        with subtests.test(wrong=wrong, located=located):
+            rng = np.random.default_rng(33)
+            points = np.column_stack([rng.uniform(-1, 1, (200, 2)), rng.uniform(1.5, 3, 200)])
+            true = np.array([0.1, -0.05, 0.02])
+            rays = points - true
+            bad = rng.permutation(200) < 200 * wrong
+            rays[bad] += rng.uniform(-1, 1, (int(bad.sum()), 3))
+            rays /= np.linalg.norm(rays, axis=1)[:, None]
+            off = np.linalg.norm(
+                np.cross((points - true) / np.linalg.norm(points - true, axis=1)[:, None], rays), axis=1
+            )
+            unknown = np.arange(200) % 10 == 0
+            known = np.where(unknown[:, None], np.nan, points)
+            found = relative_track._locate_frame(
+                known, rays, true + 0.01 * np.array([3, 2, -2]), np.array([0.05, 0, 0])
+            )
+            assert (found is not None) == located
+            if found is not None:
+                centre, trusted = found
+                assert np.linalg.norm(centre - true) < (1e-3 if wrong else 1e-9)
+                # what is off by three times an error's size triangulates nothing; of new points nobody knows
+                clear = unknown | (np.abs(off - 0.012) > 2e-3)
+                assert np.array_equal(trusted[clear], (unknown | (off < 0.012))[clear])
+            few = relative_track._locate_frame(known[:8], rays[:8], true, np.array([0.05, 0, 0]))
+            assert few is None  # one of the eight is unknown

@@ -8,7 +8,6 @@ import tomllib
 from importlib.metadata import distribution
 from pathlib import Path
 
-import pytest
 import yaml
 
 import colmap_inertial
@@ -78,27 +77,32 @@ def test_links_of_the_readme_lead_to_files_and_become_addresses(tmp_path):
     assert "](https://code.example/it/raw/v0.2.0/docs/images/desk.jpg)" in made
 
 
-@pytest.mark.parametrize("urls", ["", '\n[project.urls]\nRepository = "https://code.example/it"\n'])
-def test_the_address_stands_in_one_place(tmp_path, urls):
-    (tmp_path / "scripts").mkdir()
-    shutil.copy(ROOT / "scripts" / "index_readme.py", tmp_path / "scripts")
-    (tmp_path / "pyproject.toml").write_text(f'[project]\nversion = "1.2"\n{urls}')
-    (tmp_path / "README.md").write_text("[a](docs/a.md#b) [c](#c) [d](https://d.example)")
-    done = subprocess.run([sys.executable, "scripts/index_readme.py"], cwd=tmp_path, capture_output=True, text=True)
-    text = (tmp_path / "README.md").read_text()
-    if urls:
-        assert done.returncode == 0
-        assert text == "[a](https://code.example/it/blob/v1.2/docs/a.md#b) [c](#c) [d](https://d.example)"
-    else:
-        assert done.returncode == 2 and "fill in [project.urls]" in done.stderr and "docs/a.md" in text
+def test_the_address_stands_in_one_place(subtests, tmp_path_factory):
+    for urls in ("", '\n[project.urls]\nRepository = "https://code.example/it"\n'):
+        with subtests.test(urls=urls):
+            tmp_path = tmp_path_factory.mktemp("given")
+            (tmp_path / "scripts").mkdir()
+            shutil.copy(ROOT / "scripts" / "index_readme.py", tmp_path / "scripts")
+            (tmp_path / "pyproject.toml").write_text(f'[project]\nversion = "1.2"\n{urls}')
+            (tmp_path / "README.md").write_text("[a](docs/a.md#b) [c](#c) [d](https://d.example)")
+            done = subprocess.run(
+                [sys.executable, "scripts/index_readme.py"], cwd=tmp_path, capture_output=True, text=True
+            )
+            text = (tmp_path / "README.md").read_text()
+            if urls:
+                assert done.returncode == 0
+                assert text == "[a](https://code.example/it/blob/v1.2/docs/a.md#b) [c](#c) [d](https://d.example)"
+            else:
+                assert done.returncode == 2 and "fill in [project.urls]" in done.stderr and "docs/a.md" in text
 
 
-@pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.name)
-def test_workflows_run_what_is_there(path):
-    text = path.read_text()
-    jobs = yaml.safe_load(text)["jobs"]
-    assert jobs and all(job["steps"] for job in jobs.values())
-    for name in re.findall(r"(?:scripts|tests)/[\w./]+", text):
-        assert (ROOT / name).is_file(), name
-    if "macos" in text:
-        assert "NOT VERIFIED YET" in text
+def test_workflows_run_what_is_there(subtests):
+    for path in WORKFLOWS:
+        with subtests.test(path=path):
+            text = path.read_text()
+            jobs = yaml.safe_load(text)["jobs"]
+            assert jobs and all(job["steps"] for job in jobs.values())
+            for name in re.findall(r"(?:scripts|tests)/[\w./]+", text):
+                assert (ROOT / name).is_file(), name
+            if "macos" in text:
+                assert "NOT VERIFIED YET" in text

@@ -285,28 +285,29 @@ def test_long_lines_of_stills_keep_their_peaks_and_closed_ones_all_their_corners
     assert len(ring[0]) == count
 
 
-@pytest.mark.parametrize(
-    "places", [{"x": [1.0, 3.0, 5.0], "y": [10.0, 20.0]}, {"x0": 1.0, "dx": 2.0, "y0": 10.0, "dy": 10.0}], ids=str
-)
-def test_the_cells_of_a_table_fill_its_axes(places):
-    heat = {"type": "heatmap", **places, "z": [[0, 1, 2], [3, 4, 5]], "colorbar": {"title": {"text": "n"}}}
-    heat["colorscale"] = [[0, "#000000"], [1, "#ffffff"]]
-    spec = figures.layout(300, figures.axis("x"), figures.axis("y"))
-    still = Drawing(draw_still({"data": [heat], "layout": spec}, "heat"))
-    cells = [
-        re.findall(r"[\d.]+", a["d"]) for tag, a in still.shapes if tag == "path" and "fill" in a and "z" in a["d"]
-    ]
-    left, low, right, high = np.array(cells, dtype=float)[:, :4].T
-    beside = left.min() - STYLE.left, STYLE.width - STYLE.right_axis - right.max()
-    assert beside[0] == pytest.approx(beside[1], abs=0.1) and 0 <= beside[0] < 0.03 * STYLE.width
-    assert (right - left) == pytest.approx((right.max() - left.min()) / 3, abs=0.1) and len(cells) == 6
-    # columns are at their numbers
-    ticks = {word: float(attrs["x"]) for word, attrs in texts_of(still) if attrs["text-anchor"] == "middle"}
-    middles = sorted({round(v) for v in 0.5 * (left + right)})
-    known = [(ticks[word], at) for word, at in zip("135", middles, strict=True) if word in ticks]
-    assert known and all(abs(tick - at) < 1 for tick, at in known)
-    # the first row at the bottom
-    assert low - high == pytest.approx((low.max() - high.min()) / 2, abs=0.2) and np.argmax(low) < 3
+def test_the_cells_of_a_table_fill_its_axes(subtests):
+    for places in ({"x": [1.0, 3.0, 5.0], "y": [10.0, 20.0]}, {"x0": 1.0, "dx": 2.0, "y0": 10.0, "dy": 10.0}):
+        with subtests.test(places=places):
+            heat = {"type": "heatmap", **places, "z": [[0, 1, 2], [3, 4, 5]], "colorbar": {"title": {"text": "n"}}}
+            heat["colorscale"] = [[0, "#000000"], [1, "#ffffff"]]
+            spec = figures.layout(300, figures.axis("x"), figures.axis("y"))
+            still = Drawing(draw_still({"data": [heat], "layout": spec}, "heat"))
+            cells = [
+                re.findall(r"[\d.]+", a["d"])
+                for tag, a in still.shapes
+                if tag == "path" and "fill" in a and "z" in a["d"]
+            ]
+            left, low, right, high = np.array(cells, dtype=float)[:, :4].T
+            beside = left.min() - STYLE.left, STYLE.width - STYLE.right_axis - right.max()
+            assert beside[0] == pytest.approx(beside[1], abs=0.1) and 0 <= beside[0] < 0.03 * STYLE.width
+            assert (right - left) == pytest.approx((right.max() - left.min()) / 3, abs=0.1) and len(cells) == 6
+            # columns are at their numbers
+            ticks = {word: float(attrs["x"]) for word, attrs in texts_of(still) if attrs["text-anchor"] == "middle"}
+            middles = sorted({round(v) for v in 0.5 * (left + right)})
+            known = [(ticks[word], at) for word, at in zip("135", middles, strict=True) if word in ticks]
+            assert known and all(abs(tick - at) < 1 for tick, at in known)
+            # the first row at the bottom
+            assert low - high == pytest.approx((low.max() - high.min()) / 2, abs=0.2) and np.argmax(low) < 3
 
 
 def test_a_drift_and_distances_are_drawn_as_they_were_measured():
@@ -340,21 +341,32 @@ def test_a_drift_and_distances_are_drawn_as_they_were_measured():
     assert shown["y"][:3] == pytest.approx([0, 0.2, 0.4])
 
 
-@pytest.mark.parametrize(("size_px", "times"), [(0.5, 115), (400.0, 1)])
-def test_a_shutter_s_movements_are_drawn_in_their_picture(size_px, times):
-    at, way = np.array([[100.0, 50], [640, 360], [1200, 700]]), np.array([[0.2, 0.1], [0, 1], [-0.6, -0.8]])
-    worst = {"at_px": at.tolist(), "shift_px": (size_px * way).tolist(), "width": 1280, "height": 720, "name": "a.jpg"}
-    figure = figures.shutter_field(worst)
-    lines, ends = figure["data"]
-    # the largest movement about a twelfth as long as the picture is wide, or as long as it is
-    moved = at + (times * size_px if times == 1 else 0.09 * 1280) * way
-    assert np.stack([ends["x"], ends["y"]], axis=1) == pytest.approx(moved, abs=0.5)
-    assert lines["x"][::3] == at[:, 0].tolist() and lines["y"][1::3] == ends["y"] and lines["x"][2::3] == [None] * 3
-    assert ends["text"][1] == f"{size_px:.2f} px"
-    spec = figure["layout"]
-    (left, right), (bottom, top) = spec["xaxis"]["range"], spec["yaxis"]["range"]
-    # the picture with a margin, y downwards
-    assert -left == pytest.approx(right - 1280) and -top == pytest.approx(bottom - 720) and 0 < -left < 200
+def test_a_shutter_s_movements_are_drawn_in_their_picture(subtests):
+    for size_px, times in ((0.5, 115), (400.0, 1)):
+        with subtests.test(size_px=size_px, times=times):
+            at, way = np.array([[100.0, 50], [640, 360], [1200, 700]]), np.array([[0.2, 0.1], [0, 1], [-0.6, -0.8]])
+            worst = {
+                "at_px": at.tolist(),
+                "shift_px": (size_px * way).tolist(),
+                "width": 1280,
+                "height": 720,
+                "name": "a.jpg",
+            }
+            figure = figures.shutter_field(worst)
+            lines, ends = figure["data"]
+            # the largest movement about a twelfth as long as the picture is wide, or as long as it is
+            moved = at + (times * size_px if times == 1 else 0.09 * 1280) * way
+            assert np.stack([ends["x"], ends["y"]], axis=1) == pytest.approx(moved, abs=0.5)
+            assert (
+                lines["x"][::3] == at[:, 0].tolist()
+                and lines["y"][1::3] == ends["y"]
+                and lines["x"][2::3] == [None] * 3
+            )
+            assert ends["text"][1] == f"{size_px:.2f} px"
+            spec = figure["layout"]
+            (left, right), (bottom, top) = spec["xaxis"]["range"], spec["yaxis"]["range"]
+            # the picture with a margin, y downwards
+            assert -left == pytest.approx(right - 1280) and -top == pytest.approx(bottom - 720) and 0 < -left < 200
 
 
 def test_intervals_and_colours_of_stills_are_as_long_as_they_say():
@@ -395,32 +407,34 @@ def test_the_grid_under_a_scene_lies_at_whole_steps():
     assert along.tolist() == [[-0.3, 0.5, 1.0], [1.1, 0.5, 1.0]]
 
 
-@pytest.mark.parametrize("unit", ["m/s2", "units/s2"])
-def test_accelerations_and_spectra_have_axes_on_which_their_curves_lie(unit):
-    curves = {side: [{"t_s": [0.0, 1.0], "values": [a, -b]} for a, b in sizes] for side, sizes in (
-        ("accelerometer", ((1.0, 0.5), (9.0, 12.0), (0.1, 0.2))), ("camera", ((30.0, 20.0), (0.0, 0.0), (2.0, 5.0)))
-    )}  # fmt: skip
-    figure = figures.accelerations({"camera_unit": unit, **curves})
-    spec, metric = figure["layout"], unit == "m/s2"
-    domains = [spec[f"yaxis{key}"]["domain"] for key in ("", 2, 3)]
-    assert domains[0][1] == 1 and domains[2][0] == pytest.approx(0) and domains[1][0] - domains[2][1] > 0.01
-    assert [high - low for low, high in domains] == pytest.approx([0.3] * 3)
-    assert ("yaxis4" in spec) is not metric
-    if not metric:
-        for trace in figure["data"]:
-            low, high = spec[f"yaxis{trace['yaxis'][1:]}"]["range"]
-            # zero in the middle, and the curve next to it
-            assert low == -high < min(trace["y"]) and max(trace["y"]) < high
-            assert high < 2 * max(map(abs, trace["y"])) or high < 1.2 * max(1.0, SIZES.hand_m_s2)
-    spectrum = {"camera_unit": unit, "curves": {
-        "imu": {"hz": [1.0, 20.0], "density": [1e-3, 0.5]}, "camera": {"hz": [1.0, 8.0], "density": [2.0, 9.0]}
-    }}  # fmt: skip
-    spec = figures.spectra(spectrum, unit="mm/s²", factor=1000.0)["layout"]
-    # over more than two decades, at tens alone
-    assert spec["yaxis"]["dtick"] == 1 and spec["xaxis"]["dtick"] == "D2"
-    assert ("yaxis2" in spec) is not metric and spec.get("yaxis2", {"dtick": "D2"})["dtick"] == "D2"
-    imu, camera = figures.spectra(spectrum, unit="mm/s²", factor=1000.0)["data"]
-    assert imu["y"] == [1.0, 500.0] and camera["y"] == ([2000.0, 9000.0] if metric else [2.0, 9.0])
+def test_accelerations_and_spectra_have_axes_on_which_their_curves_lie(subtests):
+    for unit in ("m/s2", "units/s2"):
+        with subtests.test(unit=unit):
+            curves = {side: [{"t_s": [0.0, 1.0], "values": [a, -b]} for a, b in sizes] for side, sizes in (
+                ("accelerometer", ((1.0, 0.5), (9.0, 12.0), (0.1, 0.2))),
+                ("camera", ((30.0, 20.0), (0.0, 0.0), (2.0, 5.0))),
+            )}  # fmt: skip
+            figure = figures.accelerations({"camera_unit": unit, **curves})
+            spec, metric = figure["layout"], unit == "m/s2"
+            domains = [spec[f"yaxis{key}"]["domain"] for key in ("", 2, 3)]
+            assert domains[0][1] == 1 and domains[2][0] == pytest.approx(0) and domains[1][0] - domains[2][1] > 0.01
+            assert [high - low for low, high in domains] == pytest.approx([0.3] * 3)
+            assert ("yaxis4" in spec) is not metric
+            if not metric:
+                for trace in figure["data"]:
+                    low, high = spec[f"yaxis{trace['yaxis'][1:]}"]["range"]
+                    # zero in the middle, and the curve next to it
+                    assert low == -high < min(trace["y"]) and max(trace["y"]) < high
+                    assert high < 2 * max(map(abs, trace["y"])) or high < 1.2 * max(1.0, SIZES.hand_m_s2)
+            spectrum = {"camera_unit": unit, "curves": {
+                "imu": {"hz": [1.0, 20.0], "density": [1e-3, 0.5]}, "camera": {"hz": [1.0, 8.0], "density": [2.0, 9.0]}
+            }}  # fmt: skip
+            spec = figures.spectra(spectrum, unit="mm/s²", factor=1000.0)["layout"]
+            # over more than two decades, at tens alone
+            assert spec["yaxis"]["dtick"] == 1 and spec["xaxis"]["dtick"] == "D2"
+            assert ("yaxis2" in spec) is not metric and spec.get("yaxis2", {"dtick": "D2"})["dtick"] == "D2"
+            imu, camera = figures.spectra(spectrum, unit="mm/s²", factor=1000.0)["data"]
+            assert imu["y"] == [1.0, 500.0] and camera["y"] == ([2000.0, 9000.0] if metric else [2.0, 9.0])
 
 
 def test_the_picture_of_a_model_shows_near_over_far_and_up_upwards(full):
@@ -700,21 +714,23 @@ def test_the_same_run_gives_the_same_bytes(full, tmp_path):
     assert first == second
 
 
-@pytest.mark.parametrize(
-    "name", ["result.json", "config.toml", "report_data", "report_data/recording.json", "validation/0"]
-)
-def test_links_in_what_the_report_is_made_of_are_refused(full, tmp_path, name):
-    out = copy_of(full, tmp_path)
-    for report in ("report.html", "report.json"):
-        (out / report).unlink(missing_ok=True)
-    place, elsewhere = out / name, tmp_path / "elsewhere"
-    if place.exists():
-        shutil.move(place, elsewhere)
-    place.parent.mkdir(exist_ok=True)
-    place.symlink_to(elsewhere)
-    with pytest.raises(FormatError, match=r"is a link to .*elsewhere; links in an output folder are not followed"):
-        write_report(out)
-    assert not (out / "report.html").exists() and not (out / "report.json").exists()
+def test_links_in_what_the_report_is_made_of_are_refused(subtests, full, tmp_path_factory):
+    for name in ("result.json", "config.toml", "report_data", "report_data/recording.json", "validation/0"):
+        with subtests.test(name=name):
+            tmp_path = tmp_path_factory.mktemp("given")
+            out = copy_of(full, tmp_path)
+            for report in ("report.html", "report.json"):
+                (out / report).unlink(missing_ok=True)
+            place, elsewhere = out / name, tmp_path / "elsewhere"
+            if place.exists():
+                shutil.move(place, elsewhere)
+            place.parent.mkdir(exist_ok=True)
+            place.symlink_to(elsewhere)
+            with pytest.raises(
+                FormatError, match=r"is a link to .*elsewhere; links in an output folder are not followed"
+            ):
+                write_report(out)
+            assert not (out / "report.html").exists() and not (out / "report.json").exists()
 
 
 def test_a_long_recording_with_several_models_stays_below_five_megabytes(tmp_path):
@@ -869,31 +885,32 @@ def test_without_an_alignment_only_the_speed_of_turning_is_compared():
     assert "missing" in record["acceleration"]
 
 
-@pytest.mark.parametrize(
-    ("spoilt", "said"),
-    [
+def test_a_recording_that_cannot_be_used_is_not_said_to_disagree_with_the_pictures(subtests, full, tmp_path_factory):
+    for spoilt, said in (
         ({"accel_t_s": np.zeros(0), "accel_m_s2": np.zeros((0, 3))}, "no accelerometer"),
         ({"accel_in_g": True}, "it is in g"),
-    ],
-)
-def test_a_recording_that_cannot_be_used_is_not_said_to_disagree_with_the_pictures(full, tmp_path, spoilt, said):
-    trajectory, imu, _, _, _ = recorded()
-    imu = dataclasses.replace(imu, **({"accel_m_s2": imu.accel_m_s2 / 9.80665} if "accel_in_g" in spoilt else spoilt))
-    estimate = estimate_scale(trajectory, imu)
-    assert estimate.verdict == "refused"
-    record = signal_record(trajectory, imu, estimate, None)
-    assert record["alignment"] == "not tried"
-    assert said in record["acceleration"]["missing"]
-    out = copy_of(full, tmp_path)
-    stored = json.loads((out / "report_data" / "model_0.json").read_text(encoding="utf-8"))
-    write_json(out / "report_data" / "model_0.json", {**stored, "signals": record})
-    result = json.loads((out / "result.json").read_text(encoding="utf-8"))
-    result["models"][0] |= {**estimate.as_json(), "excitation_m_s2": 0.5, "validation": None}
-    _, page = report_of_changed(out, result)
-    assert "could not be aligned" not in page.text
-    assert "cannot be used as it is" in page.text
-    assert "camera acceleration" not in page.text  # which would be of the scale that was refused
-    assert "COLMAP's own model (colmap/sparse/0) is complete" in page.text
+    ):
+        with subtests.test(spoilt=spoilt, said=said):
+            tmp_path = tmp_path_factory.mktemp("given")
+            trajectory, imu, _, _, _ = recorded()
+            imu = dataclasses.replace(
+                imu, **({"accel_m_s2": imu.accel_m_s2 / 9.80665} if "accel_in_g" in spoilt else spoilt)
+            )
+            estimate = estimate_scale(trajectory, imu)
+            assert estimate.verdict == "refused"
+            record = signal_record(trajectory, imu, estimate, None)
+            assert record["alignment"] == "not tried"
+            assert said in record["acceleration"]["missing"]
+            out = copy_of(full, tmp_path)
+            stored = json.loads((out / "report_data" / "model_0.json").read_text(encoding="utf-8"))
+            write_json(out / "report_data" / "model_0.json", {**stored, "signals": record})
+            result = json.loads((out / "result.json").read_text(encoding="utf-8"))
+            result["models"][0] |= {**estimate.as_json(), "excitation_m_s2": 0.5, "validation": None}
+            _, page = report_of_changed(out, result)
+            assert "could not be aligned" not in page.text
+            assert "cannot be used as it is" in page.text
+            assert "camera acceleration" not in page.text  # which would be of the scale that was refused
+            assert "COLMAP's own model (colmap/sparse/0) is complete" in page.text
 
 
 @pytest.mark.skipif(not hasattr(pycolmap.CameraModelId, "EQUIRECTANGULAR"), reason="pycolmap has no such camera yet")

@@ -72,15 +72,16 @@ def around(holds):
 # --- one picture ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
-def test_any_size_and_type_comes_back_as_it_was_with_the_network_s_result(size, dtype):
-    a, b = picture(*size, dtype), picture(*size, dtype, seed=1)
-    top = 1 if dtype == np.float32 else np.iinfo(dtype).max
-    true = a.astype(np.float64) / top * 0.7 + 0.3 * (b.astype(np.float64) / top)
-    restored = ready(small.mixing(0.3)).restore(a, b)
-    assert restored.dtype == dtype and restored.shape == a.shape
-    assert np.abs(restored.astype(np.float64) / top - true).max() <= (1e-6 if top == 1 else 0.51 / top)
+def test_any_size_and_type_comes_back_as_it_was_with_the_network_s_result(subtests):
+    for size in SIZES:
+        for dtype in (np.uint8, np.uint16, np.float32):
+            with subtests.test(size=size, dtype=dtype):
+                a, b = picture(*size, dtype), picture(*size, dtype, seed=1)
+                top = 1 if dtype == np.float32 else np.iinfo(dtype).max
+                true = a.astype(np.float64) / top * 0.7 + 0.3 * (b.astype(np.float64) / top)
+                restored = ready(small.mixing(0.3)).restore(a, b)
+                assert restored.dtype == dtype and restored.shape == a.shape
+                assert np.abs(restored.astype(np.float64) / top - true).max() <= (1e-6 if top == 1 else 0.51 / top)
 
 
 def test_a_grey_picture_is_seen_three_times_and_becomes_the_mean():
@@ -95,13 +96,16 @@ def test_what_the_network_makes_beyond_black_and_white_is_clipped():
     assert (ready(small.mixing(0.0, channels=(2.0, -1.0, 1.0))).restore(white, white)[3, 3] == [255, 0, 250]).all()
 
 
-@pytest.mark.parametrize("size", [(37, 50), (64, 70), (90, 131)])
-def test_edges_are_mirrored_to_a_multiple_of_16(size):
-    a = picture(*size, np.float32)
-    restored = ready(small.box()).restore(a, a)
-    true = cv2.blur(a, (5, 5), borderType=cv2.BORDER_REFLECT_101)
-    inside = tuple(slice(2, None if n % 16 else -2) for n in size)  # at least two pixels are put beyond the others
-    np.testing.assert_allclose(restored[inside], true[inside], atol=1e-6)
+def test_edges_are_mirrored_to_a_multiple_of_16(subtests):
+    for size in ((37, 50), (64, 70), (90, 131)):
+        with subtests.test(size=size):
+            a = picture(*size, np.float32)
+            restored = ready(small.box()).restore(a, a)
+            true = cv2.blur(a, (5, 5), borderType=cv2.BORDER_REFLECT_101)
+            inside = tuple(
+                slice(2, None if n % 16 else -2) for n in size
+            )  # at least two pixels are put beyond the others
+            np.testing.assert_allclose(restored[inside], true[inside], atol=1e-6)
 
 
 def test_pictures_of_other_layouts_in_memory_are_the_same():
@@ -199,20 +203,21 @@ def test_a_network_never_sees_more_than_a_frame_of_full_hd(size):
     assert (len(parts) == 1) == (min(size) == 1080)
 
 
-@pytest.mark.parametrize("size", [(500, 700), (613, 531)])
-@pytest.mark.parametrize("model", [small.coarse, small.box])
-def test_parts_do_not_show(monkeypatch, size, model):
-    assert 182 < small.COARSE_REACH_PX <= _tiles.OVERLAP_PX
-    a, b = picture(*size, np.float32), picture(*size, np.float32, seed=1)
-    network = ready(model())
-    whole = network.restore(a, b)
-    monkeypatch.setattr(_tiles, "tiles", partial(_tiles.tiles, most_px=500**2))
-    assert len(_tiles.tiles(*size)) == 4
-    assert np.abs(network.restore(a, b) - whole).max() < 1e-6
-    # it would: less around them changes the result
-    if model is small.coarse:
-        monkeypatch.setattr(_tiles, "OVERLAP_PX", 160)
-        assert np.abs(network.restore(a, b) - whole).max() > 1e-2
+def test_parts_do_not_show(subtests):
+    for size in ((500, 700), (613, 531)):
+        for model in (small.coarse, small.box):
+            with subtests.test(size=size, model=model), pytest.MonkeyPatch.context() as monkeypatch:
+                assert 182 < small.COARSE_REACH_PX <= _tiles.OVERLAP_PX
+                a, b = picture(*size, np.float32), picture(*size, np.float32, seed=1)
+                network = ready(model())
+                whole = network.restore(a, b)
+                monkeypatch.setattr(_tiles, "tiles", partial(_tiles.tiles, most_px=500**2))
+                assert len(_tiles.tiles(*size)) == 4
+                assert np.abs(network.restore(a, b) - whole).max() < 1e-6
+                # it would: less around them changes the result
+                if model is small.coarse:
+                    monkeypatch.setattr(_tiles, "OVERLAP_PX", 160)
+                    assert np.abs(network.restore(a, b) - whole).max() > 1e-2
 
 
 def test_blur_goes_to_its_part(monkeypatch):
@@ -353,11 +358,12 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("what", WRONG)
-def test_what_is_no_network_for_pictures_is_told(what):
-    model, words = WRONG[what]
-    with pytest.raises(FormatError, match=f"small.onnx: .*{words}"):
-        ready(model)
+def test_what_is_no_network_for_pictures_is_told(subtests):
+    for what in WRONG:
+        with subtests.test(what=what):
+            model, words = WRONG[what]
+            with pytest.raises(FormatError, match=f"small.onnx: .*{words}"):
+                ready(model)
 
 
 def test_cuda_asked_for_by_name_must_be_there(weights, monkeypatch):
@@ -383,32 +389,34 @@ def test_cuda_that_does_not_start_is_an_error_by_name_and_no_error_otherwise(wei
 # --- DeepGyro and LSD2 ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-@pytest.mark.parametrize("channels", [1, 3])
-def test_a_network_that_takes_the_filter_s_word_makes_what_the_filter_makes(dtype, channels):
-    image, blur = scene(170, 230, dtype, channels), turning(230, 170)
-    path = BlurPath.straight(blur)
-    filtered = path_wiener(image, path)
-    made = deepgyro.deblur(image, path, network=ready(small.mixing(1.0)))
-    assert made.dtype == dtype and made.shape == image.shape
-    fully = around(np.hypot(*np.moveaxis(blur.per_pixel(), -1, 0)) > 1)
-    np.testing.assert_array_equal(made[fully], filtered[fully])
-    assert (made[fully] != image[fully]).mean() > 0.5
+def test_a_network_that_takes_the_filter_s_word_makes_what_the_filter_makes(subtests):
+    for dtype in (np.uint8, np.uint16):
+        for channels in (1, 3):
+            with subtests.test(dtype=dtype, channels=channels):
+                image, blur = scene(170, 230, dtype, channels), turning(230, 170)
+                path = BlurPath.straight(blur)
+                filtered = path_wiener(image, path)
+                made = deepgyro.deblur(image, path, network=ready(small.mixing(1.0)))
+                assert made.dtype == dtype and made.shape == image.shape
+                fully = around(np.hypot(*np.moveaxis(blur.per_pixel(), -1, 0)) > 1)
+                np.testing.assert_array_equal(made[fully], filtered[fully])
+                assert (made[fully] != image[fully]).mean() > 0.5
 
 
-@pytest.mark.parametrize("channels", [1, 3])
-def test_pixels_without_blur_stay_bit_for_bit(channels):
-    image, blur = scene(170, 230, channels=channels), turning(230, 170)
-    darker = ready(small.mixing(0.0, channels=(0.5, 0.5, 0.5)))
-    original = image.copy()
-    made = deepgyro.deblur(image, BlurPath.straight(blur), network=darker)
-    length = np.hypot(*np.moveaxis(blur.per_pixel(), -1, 0))
-    still = around(length < 0.5)
-    assert still.mean() > 0.03
-    np.testing.assert_array_equal(made[still], image[still])
-    full = around(length > 1)
-    assert np.abs(made[full] - 0.5 * image[full]).max() < 0.51
-    np.testing.assert_array_equal(image, original)
+def test_pixels_without_blur_stay_bit_for_bit(subtests):
+    for channels in (1, 3):
+        with subtests.test(channels=channels):
+            image, blur = scene(170, 230, channels=channels), turning(230, 170)
+            darker = ready(small.mixing(0.0, channels=(0.5, 0.5, 0.5)))
+            original = image.copy()
+            made = deepgyro.deblur(image, BlurPath.straight(blur), network=darker)
+            length = np.hypot(*np.moveaxis(blur.per_pixel(), -1, 0))
+            still = around(length < 0.5)
+            assert still.mean() > 0.03
+            np.testing.assert_array_equal(made[still], image[still])
+            full = around(length > 1)
+            assert np.abs(made[full] - 0.5 * image[full]).max() < 0.51
+            np.testing.assert_array_equal(image, original)
 
 
 def test_blur_longer_than_the_network_knows_is_the_filter_s():

@@ -409,13 +409,14 @@ def test_long_blur_is_smoothed_for_features_more_than_short_up_to_a_limit():
     assert smoothing_for(5) < smoothing_for(10) < smoothing_for(30) == smoothing_for(60) == SMOOTHING.most_px
 
 
-@pytest.mark.parametrize(("trusted", "gone"), [(True, True), (None, False)])
-def test_frames_are_dropped_only_by_a_gyroscope_that_the_images_bear_out(trusted, gone):
-    decision = FrameDecision(name="a.jpg", blur_px=90.0, action="drop", reason="too much blur")
-    verdict = RecordingVerdict(trusted=trusted, support=9.0, extent_factor=1.0, frames=9, reason="")
-    stage = DeblurStage(view=VIEW, decisions=(decision,), verdict=verdict, workers=1)
-    (frame,) = stage(iter([Frame(name="a.jpg", image=np.zeros((480, 640), np.uint8), t_s=0.5)]))
-    assert frame.dropped is gone and frame.treatments[-1].reason == "too much blur"
+def test_frames_are_dropped_only_by_a_gyroscope_that_the_images_bear_out(subtests):
+    for trusted, gone in ((True, True), (None, False)):
+        with subtests.test(trusted=trusted, gone=gone):
+            decision = FrameDecision(name="a.jpg", blur_px=90.0, action="drop", reason="too much blur")
+            verdict = RecordingVerdict(trusted=trusted, support=9.0, extent_factor=1.0, frames=9, reason="")
+            stage = DeblurStage(view=VIEW, decisions=(decision,), verdict=verdict, workers=1)
+            (frame,) = stage(iter([Frame(name="a.jpg", image=np.zeros((480, 640), np.uint8), t_s=0.5)]))
+            assert frame.dropped is gone and frame.treatments[-1].reason == "too much blur"
 
 
 def panned(length_px):
@@ -426,18 +427,19 @@ def panned(length_px):
     return np.rint(255 * cv2.filter2D(light, -1, kernel) ** (1 / 2.2)).astype(np.uint8)
 
 
-@pytest.mark.parametrize("doubt", ["", "nothing tells the sign"])
-def test_a_frame_that_would_be_dropped_is_deblurred_where_all_stay(doubt):
-    decision = FrameDecision(name="a.jpg", blur_px=90.0, action="drop", reason="too much blur")
-    verdict = RecordingVerdict(trusted=True, support=9.0, extent_factor=1.0, frames=9, reason="")
-    view = replace(VIEW, sign_doubt=doubt, timing=replace(TIMING, exposure_s=[0.04, 0.04]))
-    field = blur_field(view.motion(), colmap_camera(view.camera), view.shutter(0))
-    image = panned(round(float(np.median(field.extent_px()))))
-    stage = DeblurStage(view=view, decisions=(decision,), verdict=verdict, drop=False, workers=1)
-    (frame,) = stage(iter([Frame(name="a.jpg", image=image, t_s=0.5)]))
-    # the camera pans evenly: the blur is a straight line, the same for both signs
-    assert not frame.dropped and frame.treatments[-1].action == "deblurred"
-    assert np.abs(np.diff(frame.image.astype(int))).mean() > 1.1 * np.abs(np.diff(image.astype(int))).mean()
+def test_a_frame_that_would_be_dropped_is_deblurred_where_all_stay(subtests):
+    for doubt in ("", "nothing tells the sign"):
+        with subtests.test(doubt=doubt):
+            decision = FrameDecision(name="a.jpg", blur_px=90.0, action="drop", reason="too much blur")
+            verdict = RecordingVerdict(trusted=True, support=9.0, extent_factor=1.0, frames=9, reason="")
+            view = replace(VIEW, sign_doubt=doubt, timing=replace(TIMING, exposure_s=[0.04, 0.04]))
+            field = blur_field(view.motion(), colmap_camera(view.camera), view.shutter(0))
+            image = panned(round(float(np.median(field.extent_px()))))
+            stage = DeblurStage(view=view, decisions=(decision,), verdict=verdict, drop=False, workers=1)
+            (frame,) = stage(iter([Frame(name="a.jpg", image=image, t_s=0.5)]))
+            # the camera pans evenly: the blur is a straight line, the same for both signs
+            assert not frame.dropped and frame.treatments[-1].action == "deblurred"
+            assert np.abs(np.diff(frame.image.astype(int))).mean() > 1.1 * np.abs(np.diff(image.astype(int))).mean()
 
 
 def test_a_frame_with_curved_blur_stays_where_nothing_tells_the_sign():

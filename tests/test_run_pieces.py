@@ -127,10 +127,10 @@ def test_gaps_lie_between_the_last_image_of_a_model_and_the_first_of_the_next():
     assert [(gap.first, gap.second) for gap in _beside(spans, {0: "no IMU"})] == [(2, 0)] and not _beside(spans, {})
 
 
-@pytest.mark.parametrize("text", ["nan,1,2", "1,inf,2", "1,2,x", "1,2", "-1", "one", "1234567890"])
-def test_what_is_neither_a_point_nor_a_marker_is_refused(text):
-    with pytest.raises(InertialError, match="--between"):
-        _place(text, None)
+def test_what_is_neither_a_point_nor_a_marker_is_refused(subtests):
+    for text in ("nan,1,2", "1,inf,2", "1,2,x", "1,2", "-1", "one", "1234567890"):
+        with subtests.test(text=text), pytest.raises(InertialError, match="--between"):
+            _place(text, None)
 
 
 def test_a_point_is_exact_and_a_marker_needs_markers():
@@ -183,9 +183,8 @@ def of_capture(**changed):
     return known | {"within_tolerance": None, "validation_error": None} | changed
 
 
-@pytest.mark.parametrize(
-    ("models", "code", "said"),
-    [
+def test_a_batch_judges_a_capture_by_the_worst_that_counts(subtests):
+    for models, code, said in (
         ([of_capture()], 0, None),
         ([of_capture(), of_capture(sparse_metric=None, reasons=["it hardly moved"])], 0, None),
         (
@@ -201,12 +200,11 @@ def of_capture(**changed):
         ),
         ([of_capture(within_tolerance=True), of_capture(validation_error="not seen")], 0, None),
         ([of_capture(validation_error="not seen"), of_capture()], TargetNotFoundError.exit_code, "^not seen$"),
-    ],
-)
-def test_a_batch_judges_a_capture_by_the_worst_that_counts(models, code, said):
-    found, error = _verdict(models)
-    assert found == code
-    assert error is None if said is None else re.search(said, error)
+    ):
+        with subtests.test(models=models, code=code, said=said):
+            found, error = _verdict(models)
+            assert found == code
+            assert error is None if said is None else re.search(said, error)
 
 
 def test_a_summary_has_a_row_of_the_model_with_the_most_images(tmp_path):
@@ -416,9 +414,8 @@ def taken_by(cameras, *, focal_px=(), folders=()):
     return SimpleNamespace(reconstruction=model, timing=timing)
 
 
-@pytest.mark.parametrize(
-    ("model", "alternate"),
-    [
+def test_cameras_take_turns_where_they_come_back_often(subtests):
+    for model, alternate in (
         (taken_by([1] * 20), False),
         (taken_by([1] * 10 + [2] * 10), False),
         (taken_by([1, 2] * 10), True),
@@ -432,37 +429,36 @@ def taken_by(cameras, *, focal_px=(), folders=()):
         (taken_by(range(20), focal_px=[500, 560] * 10), True),
         (taken_by(range(20), focal_px=[500, 540] * 10), False),
         (taken_by(range(20), focal_px=np.linspace(500, 900, 20).tolist()), False),
-    ],
-)
-def test_cameras_take_turns_where_they_come_back_often(model, alternate):
-    assert _alternate(model) == alternate
+    ):
+        with subtests.test(model=model, alternate=alternate):
+            assert _alternate(model) == alternate
 
 
-@pytest.mark.parametrize(
-    ("shown", "telling", "skies", "trusted"),
-    [
+def test_frames_speak_for_themselves_where_too_few_confirm_the_gyroscope(subtests):
+    for shown, telling, skies, trusted in (
         (0, 0, 0, True),
         (19, 20, 0, True),
         (18, 20, 0, None),
         (18, 20, 10, None),
         (17, 20, 11, True),
         (16, 20, 11, None),
-    ],
-)
-def test_frames_speak_for_themselves_where_too_few_confirm_the_gyroscope(shown, telling, skies, trusted):
-    enough = SimpleNamespace(enough=True)
-    looked = [
-        SimpleNamespace(evidence=enough, blur_px=GATE_LIMITS.must_show_px, shows=k < shown, is_mostly_sky=k < skies)
-        for k in range(telling)
-    ]
-    # of no account: too little to see, and too little blur
-    looked += [
-        SimpleNamespace(evidence=SimpleNamespace(enough=tells), blur_px=px, shows=False, is_mostly_sky=False)
-        for tells, px in ((False, 99.0), (True, 0.9 * GATE_LIMITS.must_show_px))
-    ] * 20
-    verdict = RecordingVerdict(trusted=True, support=5.0, extent_factor=1.0, frames=9, reason="as it was")
-    found = judging.judge_each_frame(verdict, looked)
-    assert found.trusted is trusted
-    assert found.reason == "as it was" if trusted else f"{shown} of {telling} frames" in found.reason
-    doubted = replace(verdict, trusted=False)
-    assert judging.judge_each_frame(doubted, looked) is doubted
+    ):
+        with subtests.test(shown=shown, telling=telling, skies=skies, trusted=trusted):
+            enough = SimpleNamespace(enough=True)
+            looked = [
+                SimpleNamespace(
+                    evidence=enough, blur_px=GATE_LIMITS.must_show_px, shows=k < shown, is_mostly_sky=k < skies
+                )
+                for k in range(telling)
+            ]
+            # of no account: too little to see, and too little blur
+            looked += [
+                SimpleNamespace(evidence=SimpleNamespace(enough=tells), blur_px=px, shows=False, is_mostly_sky=False)
+                for tells, px in ((False, 99.0), (True, 0.9 * GATE_LIMITS.must_show_px))
+            ] * 20
+            verdict = RecordingVerdict(trusted=True, support=5.0, extent_factor=1.0, frames=9, reason="as it was")
+            found = judging.judge_each_frame(verdict, looked)
+            assert found.trusted is trusted
+            assert found.reason == "as it was" if trusted else f"{shown} of {telling} frames" in found.reason
+            doubted = replace(verdict, trusted=False)
+            assert judging.judge_each_frame(doubted, looked) is doubted

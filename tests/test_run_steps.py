@@ -155,20 +155,22 @@ def test_an_input_is_another_one_when_it_was_written_again(tmp_path):
     assert fingerprint(path) != before
 
 
-@pytest.mark.parametrize(("size", "at"), [(3, 1), (4 << 20, 3_000_000), (20 << 20, 5), (20 << 20, (20 << 20) - 5)])
-def test_an_input_is_another_one_when_it_was_changed_with_size_and_time_kept(tmp_path, size, at):
-    path = tmp_path / "frame.png"
-    path.write_bytes(bytes(size))
-    os.utime(path, ns=(10**18, 10**18))
-    before = fingerprint(path)
-    (tmp_path / "link.png").hardlink_to(path)
-    path.chmod(0o600)
-    assert fingerprint(path) == before
-    with open(path, "r+b") as file:
-        file.seek(at)
-        file.write(b"x")
-    os.utime(path, ns=(10**18, 10**18))
-    assert fingerprint(path) != before
+def test_an_input_is_another_one_when_it_was_changed_with_size_and_time_kept(subtests, tmp_path_factory):
+    for size, at in ((3, 1), (4 << 20, 3_000_000), (20 << 20, 5), (20 << 20, (20 << 20) - 5)):
+        with subtests.test(size=size, at=at):
+            tmp_path = tmp_path_factory.mktemp("given")
+            path = tmp_path / "frame.png"
+            path.write_bytes(bytes(size))
+            os.utime(path, ns=(10**18, 10**18))
+            before = fingerprint(path)
+            (tmp_path / "link.png").hardlink_to(path)
+            path.chmod(0o600)
+            assert fingerprint(path) == before
+            with open(path, "r+b") as file:
+                file.seek(at)
+                file.write(b"x")
+            os.utime(path, ns=(10**18, 10**18))
+            assert fingerprint(path) != before
 
 
 def test_nothing_is_written_into_the_folder_of_a_run_that_is_at_work(tmp_path):
@@ -823,21 +825,27 @@ class Shown:
         self.sigmas = np.full((19, 12), other)
 
 
-@pytest.mark.parametrize(("clear", "trusted"), [(20, True), (10, None), (1, None)])
-def test_a_gyroscope_is_trusted_for_all_frames_where_nearly_all_bear_it_out(clear, trusted):
-    verdict = RecordingVerdict(trusted=True, support=9.0, extent_factor=1.0, frames=20, reason="")
-    clearly, hardly = Looked(Shown(20.0), 0.8, 20.0), Looked(Shown(-1.0), 0.2, 20.0)
-    assert judge_each_frame(verdict, [clearly] * clear + [hardly] * (20 - clear)).trusted is trusted
-    # a faint dip is none of a wrong gyroscope where detail lacks along the blur, and no other direction has a dip
-    faintly, elsewhere = Looked(Shown(1.0), 0.5, 20.0), Looked(Shown(1.0, other=6.0), 0.5, 20.0)
-    assert judge_each_frame(verdict, [clearly] * clear + [faintly] * (20 - clear)).trusted is True
-    assert judge_each_frame(verdict, [clearly] * clear + [elsewhere] * (20 - clear)).trusted is trusted
-    # of a sky, what stands below it must show the gyroscope's direction rather than the mirrored one, in most frames
-    below, neither = (Looked(Shown(1.0, other=6.0, standing=40.0), 0.5, 20.0, mirrored) for mirrored in (0.1, 0.4))
-    assert judge_each_frame(verdict, [clearly] * clear + [below] * (20 - clear)).trusted is True
-    assert judge_each_frame(verdict, [clearly] * clear + [neither] * (20 - clear)).trusted is trusted
-    # short blur tells nothing
-    assert judge_each_frame(verdict, [clearly] * clear + [replace(hardly, blur_px=5.0)] * (20 - clear)).trusted is True
+def test_a_gyroscope_is_trusted_for_all_frames_where_nearly_all_bear_it_out(subtests):
+    for clear, trusted in ((20, True), (10, None), (1, None)):
+        with subtests.test(clear=clear, trusted=trusted):
+            verdict = RecordingVerdict(trusted=True, support=9.0, extent_factor=1.0, frames=20, reason="")
+            clearly, hardly = Looked(Shown(20.0), 0.8, 20.0), Looked(Shown(-1.0), 0.2, 20.0)
+            assert judge_each_frame(verdict, [clearly] * clear + [hardly] * (20 - clear)).trusted is trusted
+            # a faint dip is none of a wrong gyroscope where detail lacks along the blur and no other dips
+            faintly, elsewhere = Looked(Shown(1.0), 0.5, 20.0), Looked(Shown(1.0, other=6.0), 0.5, 20.0)
+            assert judge_each_frame(verdict, [clearly] * clear + [faintly] * (20 - clear)).trusted is True
+            assert judge_each_frame(verdict, [clearly] * clear + [elsewhere] * (20 - clear)).trusted is trusted
+            # of a sky, what stands below it must show the gyroscope's direction, not the mirrored one
+            below, neither = (
+                Looked(Shown(1.0, other=6.0, standing=40.0), 0.5, 20.0, mirrored) for mirrored in (0.1, 0.4)
+            )
+            assert judge_each_frame(verdict, [clearly] * clear + [below] * (20 - clear)).trusted is True
+            assert judge_each_frame(verdict, [clearly] * clear + [neither] * (20 - clear)).trusted is trusted
+            # short blur tells nothing
+            assert (
+                judge_each_frame(verdict, [clearly] * clear + [replace(hardly, blur_px=5.0)] * (20 - clear)).trusted
+                is True
+            )
 
 
 def test_a_gyroscope_that_few_dips_show_is_borne_out_by_what_stands_below_the_sky():

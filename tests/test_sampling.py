@@ -1,7 +1,6 @@
 """Samples over time: gaps and integrals."""
 
 import numpy as np
-import pytest
 
 from colmap_inertial.core.sampling import Coverage, integral_at, is_gap, subtract_running_mean
 
@@ -14,14 +13,19 @@ def test_a_gap_is_longer_than_asked_in_seconds_and_in_usual_steps():
     assert not is_gap(np.array([3.0])).any()
 
 
-@pytest.mark.parametrize(
-    ("begin_s", "end_s", "covered"),
-    [(0.0, 1.0, True), (0.5, 1.005, True), (0.5, 1.05, False), (1.05, 1.1, False), (1.2, 2.0, True), (1.9, 2.01, False),
-     (-0.01, 0.5, False)],
-)  # fmt: skip
-def test_what_lies_inside_and_has_no_gap_is_covered(begin_s, end_s, covered):
-    t_s = np.concatenate([np.arange(0, 101) / 100, 1.01 + np.arange(1) / 100, 1.2 + np.arange(81) / 100])
-    assert Coverage(t_s).covers(np.array([begin_s]), np.array([end_s])).tolist() == [covered]
+def test_what_lies_inside_and_has_no_gap_is_covered(subtests):
+    for begin_s, end_s, covered in (
+        (0.0, 1.0, True),
+        (0.5, 1.005, True),
+        (0.5, 1.05, False),
+        (1.05, 1.1, False),
+        (1.2, 2.0, True),
+        (1.9, 2.01, False),
+        (-0.01, 0.5, False),
+    ):
+        with subtests.test(begin_s=begin_s, end_s=end_s, covered=covered):
+            t_s = np.concatenate([np.arange(0, 101) / 100, 1.01 + np.arange(1) / 100, 1.2 + np.arange(81) / 100])
+            assert Coverage(t_s).covers(np.array([begin_s]), np.array([end_s])).tolist() == [covered]
 
 
 def test_an_integral_is_that_of_straight_lines_between_samples():

@@ -20,15 +20,19 @@ def test_the_interval_is_symmetric_in_the_logarithm_and_covers_95_percent():
     assert np.mean((draws > low) & (draws < high)) == pytest.approx(0.95, abs=0.003)
 
 
-@pytest.mark.parametrize(
-    ("sigma", "verdict"),
-    [(0.0152, "trusted"), (0.0154, "weak"), (0.150, "weak"), (0.152, "refused"), (np.inf, "refused")],
-)
-def test_the_width_of_the_interval_decides_the_verdict(sigma, verdict):
-    assert verdict_of(1.0, sigma)[0] == verdict
-    low, high = verdict_of(1.0, sigma)[1]
-    if np.isfinite(sigma):
-        assert half_width(sigma) == pytest.approx((high - low) / 2)
+def test_the_width_of_the_interval_decides_the_verdict(subtests):
+    for sigma, verdict in (
+        (0.0152, "trusted"),
+        (0.0154, "weak"),
+        (0.150, "weak"),
+        (0.152, "refused"),
+        (np.inf, "refused"),
+    ):
+        with subtests.test(sigma=sigma, verdict=verdict):
+            assert verdict_of(1.0, sigma)[0] == verdict
+            low, high = verdict_of(1.0, sigma)[1]
+            if np.isfinite(sigma):
+                assert half_width(sigma) == pytest.approx((high - low) / 2)
 
 
 def test_few_degrees_of_freedom_widen_as_student_has_it():

@@ -468,15 +468,16 @@ def test_the_streams_tell_the_noise_of_quiet_sensors_and_bound_that_of_rough_one
     assert vibrating.spread["accel_density_m_s2_rthz"] > 3 * hand.spread["accel_density_m_s2_rthz"]
 
 
-@pytest.mark.parametrize("rate_hz", [100.0, 400.0])
-def test_roughness_is_the_density_of_white_noise_and_not_the_motion(rate_hz):
-    rng = np.random.default_rng(5)
-    t_s = np.arange(0.0, 20.0, 1 / rate_hz)
-    motion = 3.0 * np.sin(2 * np.pi * 1.5 * t_s)[:, None] * [1.0, 0.5, -0.7]
-    density = 2e-3
-    noisy = motion + density * np.sqrt(rate_hz) * rng.standard_normal((len(t_s), 3))
-    assert roughness(t_s, noisy) == pytest.approx(density, rel=0.05)
-    assert roughness(t_s[:3], noisy[:3]) == 0.0
+def test_roughness_is_the_density_of_white_noise_and_not_the_motion(subtests):
+    for rate_hz in (100.0, 400.0):
+        with subtests.test(rate_hz=rate_hz):
+            rng = np.random.default_rng(5)
+            t_s = np.arange(0.0, 20.0, 1 / rate_hz)
+            motion = 3.0 * np.sin(2 * np.pi * 1.5 * t_s)[:, None] * [1.0, 0.5, -0.7]
+            density = 2e-3
+            noisy = motion + density * np.sqrt(rate_hz) * rng.standard_normal((len(t_s), 3))
+            assert roughness(t_s, noisy) == pytest.approx(density, rel=0.05)
+            assert roughness(t_s[:3], noisy[:3]) == 0.0
 
 
 def test_a_lever_arm_along_the_optical_axis_is_found_where_the_device_is_no_phone():
@@ -590,13 +591,14 @@ def test_a_pause_of_the_imu_is_bridged_and_named(recording, calibration):
     assert any("gyroscope pauses once, for 0.6" in note for note in estimate.notes)
 
 
-@pytest.mark.parametrize("shift_m", [0.05, 0.5])
-def test_a_break_of_the_path_does_no_harm_and_is_named(recording, calibration, shift_m):
-    centre = recording.trajectory.cam_in_world.copy()
-    centre[280:] += np.array([1.0, -0.5, 0.3]) * shift_m / recording.truth.metres_per_unit
-    estimate = joint(replace(recording.trajectory, cam_in_world=centre), recording.imu, calibration)
-    assert estimate.ci95[0] < recording.truth.metres_per_unit < estimate.ci95[1]
-    assert shift_m < 0.1 or any("jump" in note for note in estimate.notes)
+def test_a_break_of_the_path_does_no_harm_and_is_named(subtests, recording, calibration):
+    for shift_m in (0.05, 0.5):
+        with subtests.test(shift_m=shift_m):
+            centre = recording.trajectory.cam_in_world.copy()
+            centre[280:] += np.array([1.0, -0.5, 0.3]) * shift_m / recording.truth.metres_per_unit
+            estimate = joint(replace(recording.trajectory, cam_in_world=centre), recording.imu, calibration)
+            assert estimate.ci95[0] < recording.truth.metres_per_unit < estimate.ci95[1]
+            assert shift_m < 0.1 or any("jump" in note for note in estimate.notes)
 
 
 @pytest.mark.parametrize("kind", ["static", "pure_rotation", "constant_velocity"])

@@ -208,13 +208,14 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("command", "given", "options"), ALLOWED)
-def test_options_are_allowed_up_to_their_ends(command, given, options):
-    made = command(**given, **options)
-    assert {name: getattr(made, name) for name in options} == options
+def test_options_are_allowed_up_to_their_ends(subtests):
+    for command, given, options in ALLOWED:
+        with subtests.test(command=command, given=given, options=options):
+            made = command(**given, **options)
+            assert {name: getattr(made, name) for name in options} == options
 
 
-@pytest.mark.parametrize(("command", "given", "options", "said"), REFUSED)
-def test_options_beyond_their_ends_or_against_each_other_are_refused(command, given, options, said):
-    with pytest.raises(ValueError, match=said):
-        command(**given, **options)
+def test_options_beyond_their_ends_or_against_each_other_are_refused(subtests):
+    for command, given, options, said in REFUSED:
+        with subtests.test(said=said), pytest.raises(ValueError, match=said):
+            command(**given, **options)

@@ -52,11 +52,12 @@ def test_skips_are_failures_where_that_is_asked_for(tmp_path, switch, outcome):
     assert "skipped, which --no-skips does not allow: Skipped: no browser" in done.stdout
 
 
-@pytest.mark.parametrize("name", ["quick.txt", "slow.txt"])
-def test_the_lists_name_files_that_are_there(name):
-    listed = (ROOT / "tests" / name).read_text().split()
-    assert len(set(listed)) == len(listed)
-    assert [file for file in listed if not (ROOT / "tests" / file).is_file()] == []
+def test_the_lists_name_files_that_are_there(subtests):
+    for name in ("quick.txt", "slow.txt"):
+        with subtests.test(name=name):
+            listed = (ROOT / "tests" / name).read_text().split()
+            assert len(set(listed)) == len(listed)
+            assert [file for file in listed if not (ROOT / "tests" / file).is_file()] == []
 
 
 #: A project of which an extra takes another, with a version and a marker.

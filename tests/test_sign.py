@@ -1,7 +1,6 @@
 """A gyroscope of the wrong sign is told from the right one by the way between frames."""
 
 import numpy as np
-import pytest
 
 from colmap_inertial.motion.sign import compare_signs
 
@@ -15,14 +14,15 @@ def seen(inertial, seed, noise_rad=0.004):
     return inertial + noise_rad * rng.standard_normal(inertial.shape), np.full(len(inertial), noise_rad)
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_the_sign_is_told_also_among_pairs_that_were_measured_wrongly(seed):
-    inertial = turns(seed)
-    visual, sigma_rad = seen(inertial, seed)
-    visual[::4] = turns(seed + 50)[::4]
-    assert compare_signs(visual, inertial, sigma_rad).right is True
-    wrong = compare_signs(visual, -inertial, sigma_rad)
-    assert wrong.right is False and "other way" in wrong.reason
+def test_the_sign_is_told_also_among_pairs_that_were_measured_wrongly(subtests):
+    for seed in range(5):
+        with subtests.test(seed=seed):
+            inertial = turns(seed)
+            visual, sigma_rad = seen(inertial, seed)
+            visual[::4] = turns(seed + 50)[::4]
+            assert compare_signs(visual, inertial, sigma_rad).right is True
+            wrong = compare_signs(visual, -inertial, sigma_rad)
+            assert wrong.right is False and "other way" in wrong.reason
 
 
 def test_still_unknown_and_unrelated_turns_tell_nothing():

@@ -19,22 +19,23 @@ def motion_of(kind, seed=0, **options):
     return make_motion(MotionOptions(kind=kind, **options), np.random.default_rng(seed))
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_derivatives_agree_with_central_differences(kind):
-    motion, h = motion_of(kind, duration_s=20.0), 1e-4
-    t = np.random.default_rng(1).uniform(0, 20, 200)
-    before, at, after = motion.at(t - h), motion.at(t), motion.at(t + h)
-    for value, derivative in (
-        ("cam_in_world_m", "velocity_in_world_m_s"),
-        ("velocity_in_world_m_s", "accel_in_world_m_s2"),
-        ("rate_in_cam_rad_s", "rate_dot_in_cam_rad_s2"),
-    ):
-        difference = (getattr(after, value) - getattr(before, value)) / (2 * h)
-        np.testing.assert_allclose(difference, getattr(at, derivative), atol=2e-4, rtol=1e-5)
-    turn = quat_log(quat_multiply(quat_conjugate(before.world_from_cam_xyzw), after.world_from_cam_xyzw))
-    np.testing.assert_allclose(turn / (2 * h), at.rate_in_cam_rad_s, atol=2e-5)
-    np.testing.assert_array_equal(motion.rate_in_cam_rad_s(t), at.rate_in_cam_rad_s)
-    np.testing.assert_array_equal(motion.cam_in_world_m(t), at.cam_in_world_m)
+def test_derivatives_agree_with_central_differences(subtests):
+    for kind in KINDS:
+        with subtests.test(kind=kind):
+            motion, h = motion_of(kind, duration_s=20.0), 1e-4
+            t = np.random.default_rng(1).uniform(0, 20, 200)
+            before, at, after = motion.at(t - h), motion.at(t), motion.at(t + h)
+            for value, derivative in (
+                ("cam_in_world_m", "velocity_in_world_m_s"),
+                ("velocity_in_world_m_s", "accel_in_world_m_s2"),
+                ("rate_in_cam_rad_s", "rate_dot_in_cam_rad_s2"),
+            ):
+                difference = (getattr(after, value) - getattr(before, value)) / (2 * h)
+                np.testing.assert_allclose(difference, getattr(at, derivative), atol=2e-4, rtol=1e-5)
+            turn = quat_log(quat_multiply(quat_conjugate(before.world_from_cam_xyzw), after.world_from_cam_xyzw))
+            np.testing.assert_allclose(turn / (2 * h), at.rate_in_cam_rad_s, atol=2e-5)
+            np.testing.assert_array_equal(motion.rate_in_cam_rad_s(t), at.rate_in_cam_rad_s)
+            np.testing.assert_array_equal(motion.cam_in_world_m(t), at.cam_in_world_m)
 
 
 def test_a_motion_passes_through_its_samples_and_follows_a_known_curve():
@@ -84,23 +85,26 @@ def test_vigour_scales_the_hand_and_bad_options_are_rejected():
         MotionOptions(duration_s=0.0)
 
 
-@pytest.mark.parametrize("vigour", [1.0, 0.5])
-def test_the_hand_has_the_spectra_that_are_tabulated(vigour):
+def test_the_hand_has_the_spectra_that_are_tabulated(subtests):
     """Power of velocities by Welch's method, the mean of ten hands; the table is interpolated in its logarithms."""
-    hands = [_draw_hand(60 * 200, np.random.default_rng(s), low_hz=0.05, vigour=vigour) for s in range(10)]
-    velocity = np.diff([np.concatenate(hand, axis=1) for hand in hands], axis=1) * 60
-    frequency, power = welch(velocity, 60, nperseg=60 * 25, axis=1)
-    power = power.mean(axis=0) / vigour**2
-    # what a difference over a step leaves of a sine
-    power /= np.sinc(frequency / 60)[:, None] ** 2
-    inside = (frequency > 0.4) & (frequency < 9)
-    tables = [HANDHELD.horizontal_m2_s2_hz] * 2 + [HANDHELD.vertical_m2_s2_hz] + [HANDHELD.rotation_rad2_s2_hz] * 3
-    for column, table in enumerate(tables):
-        log = np.interp(np.log(frequency[inside]), np.log(HANDHELD.frequency_hz), np.log(table))
-        ratio = power[inside, column] / np.exp(log)
-        assert np.exp(np.log(ratio).mean()) == pytest.approx(1, rel=0.1) and 0.3 < ratio.min() < ratio.max() < 3
-    beyond = frequency > 16
-    assert power[beyond].max() < 1e-3 * power[inside].min()
+    for vigour in (1.0, 0.5):
+        with subtests.test(vigour=vigour):
+            hands = [_draw_hand(60 * 200, np.random.default_rng(s), low_hz=0.05, vigour=vigour) for s in range(10)]
+            velocity = np.diff([np.concatenate(hand, axis=1) for hand in hands], axis=1) * 60
+            frequency, power = welch(velocity, 60, nperseg=60 * 25, axis=1)
+            power = power.mean(axis=0) / vigour**2
+            # what a difference over a step leaves of a sine
+            power /= np.sinc(frequency / 60)[:, None] ** 2
+            inside = (frequency > 0.4) & (frequency < 9)
+            tables = (
+                [HANDHELD.horizontal_m2_s2_hz] * 2 + [HANDHELD.vertical_m2_s2_hz] + [HANDHELD.rotation_rad2_s2_hz] * 3
+            )
+            for column, table in enumerate(tables):
+                log = np.interp(np.log(frequency[inside]), np.log(HANDHELD.frequency_hz), np.log(table))
+                ratio = power[inside, column] / np.exp(log)
+                assert np.exp(np.log(ratio).mean()) == pytest.approx(1, rel=0.1) and 0.3 < ratio.min() < ratio.max() < 3
+            beyond = frequency > 16
+            assert power[beyond].max() < 1e-3 * power[inside].min()
 
 
 def test_without_a_hand_an_orbit_sweeps_its_arc_around_its_start():

@@ -211,9 +211,8 @@ def test_devices_differ_by_the_declared_standard_deviations():
     assert {one.middle_s for one in devices} == {5.0}
 
 
-@pytest.mark.parametrize(
-    ("kind", "values", "said"),
-    [
+def test_what_cannot_be_simulated_is_refused(subtests):
+    for kind, values, said in (
         (MotionOptions, {"duration_s": 0.0}, "duration_s"),
         (MotionOptions, {"radius_m": -1.0}, "radius_m"),
         (MotionOptions, {"sweep_s": 0.0}, "sweep_s"),
@@ -238,11 +237,9 @@ def test_devices_differ_by_the_declared_standard_deviations():
         (ImuOptions, {"lead_s": (0.0, 3.0)}, "lead_s"),
         (ImuOptions, {"gyro_bias_rad_s_sd": -0.1}, "negative"),
         (ImuOptions, {"accel_density_m_s2_rthz": -0.1}, "negative"),
-    ],
-)
-def test_what_cannot_be_simulated_is_refused(kind, values, said):
-    with pytest.raises(ValueError, match=said):
-        kind(**values)
+    ):
+        with subtests.test(kind=kind, values=values, said=said), pytest.raises(ValueError, match=said):
+            kind(**values)
 
 
 def test_the_ends_of_what_can_be_simulated_are_allowed():
@@ -261,11 +258,12 @@ def test_saturation_and_quantisation():
     np.testing.assert_array_equal(steps, np.round(steps))
 
 
-@pytest.mark.parametrize("preset", sorted(IMU_PRESETS))
-def test_presets_measure_gravity_at_rest(preset):
-    simulated = record(IMU_PRESETS[preset], motion=STATIC)
-    magnitude = np.linalg.norm(simulated.imu.accel_m_s2.mean(axis=0))
-    assert abs(magnitude - 9.8) < 1.0
+def test_presets_measure_gravity_at_rest(subtests):
+    for preset in sorted(IMU_PRESETS):
+        with subtests.test(preset=preset):
+            simulated = record(IMU_PRESETS[preset], motion=STATIC)
+            magnitude = np.linalg.norm(simulated.imu.accel_m_s2.mean(axis=0))
+            assert abs(magnitude - 9.8) < 1.0
 
 
 def test_perfect_poses_are_the_truth_in_the_model_frame():

@@ -22,17 +22,18 @@ def seen_at(tracks, t_s):
     return np.asarray(colmap_camera(tracks.camera).img_from_cam(in_cam)), in_cam[:, 2]
 
 
-@pytest.mark.parametrize("readout_s", [0.0, 0.03])
-def test_each_point_is_seen_where_it_projects_when_its_line_exposes(readout_s):
-    tracks = simulate_tracks(replace(WALK, readout_s=readout_s, noise_px=0.0), seed=1)
-    # the first of 960 lines exposes at the frame's time
-    t_s = tracks.timing.t_s[tracks.frame] + readout_s * (tracks.xy_px[:, 1] - 0.5) / 960
-    xy, depth = seen_at(tracks, t_s)
-    assert np.abs(xy - tracks.xy_px).max() < 1e-3 and depth.min() > 0.5
-    assert (tracks.xy_px > 5).all() and (tracks.xy_px < [1275, 955]).all()
-    if readout_s:
-        at_once, _ = seen_at(tracks, tracks.timing.pose_t_s()[tracks.frame])
-        assert np.linalg.norm(at_once - tracks.xy_px, axis=1).max() > 3
+def test_each_point_is_seen_where_it_projects_when_its_line_exposes(subtests):
+    for readout_s in (0.0, 0.03):
+        with subtests.test(readout_s=readout_s):
+            tracks = simulate_tracks(replace(WALK, readout_s=readout_s, noise_px=0.0), seed=1)
+            # the first of 960 lines exposes at the frame's time
+            t_s = tracks.timing.t_s[tracks.frame] + readout_s * (tracks.xy_px[:, 1] - 0.5) / 960
+            xy, depth = seen_at(tracks, t_s)
+            assert np.abs(xy - tracks.xy_px).max() < 1e-3 and depth.min() > 0.5
+            assert (tracks.xy_px > 5).all() and (tracks.xy_px < [1275, 955]).all()
+            if readout_s:
+                at_once, _ = seen_at(tracks, tracks.timing.pose_t_s()[tracks.frame])
+                assert np.linalg.norm(at_once - tracks.xy_px, axis=1).max() > 3
 
 
 def test_points_are_followed_for_a_while_through_three_frames_or_more():

@@ -337,22 +337,23 @@ def test_an_acceleration_that_is_linear_between_samples_is_integrated_exactly():
     assert np.allclose(inertial.sums(at_s[:, 0]), np.stack(expected, axis=1))
 
 
-@pytest.mark.parametrize("sensor", ["gyro", "accel"])
-def test_each_sensor_is_read_by_its_own_time_offset(sensor):
-    simulated = simulate_recording(RecordingOptions(motion=MotionOptions(duration_s=8.0)), seed=3)
-    smooth = smooth_simulated(simulated)
-    offset, t_s = f"{sensor}_time_offset_s", f"{sensor}_t_s"
-    calibration = simulated.truth.calibration
-    late = replace(
-        simulated,
-        imu=replace(simulated.imu, **{t_s: getattr(simulated.imu, t_s) - 0.25}),
-        truth=replace(
-            simulated.truth, calibration=replace(calibration, **{offset: getattr(calibration, offset) + 0.25})
-        ),
-    )
-    again = smooth_simulated(late)
-    assert np.allclose(again.cam_in_world, smooth.cam_in_world, atol=1e-6)
-    assert np.allclose(again.accel_in_world, smooth.accel_in_world, atol=1e-4)
+def test_each_sensor_is_read_by_its_own_time_offset(subtests):
+    for sensor in ("gyro", "accel"):
+        with subtests.test(sensor=sensor):
+            simulated = simulate_recording(RecordingOptions(motion=MotionOptions(duration_s=8.0)), seed=3)
+            smooth = smooth_simulated(simulated)
+            offset, t_s = f"{sensor}_time_offset_s", f"{sensor}_t_s"
+            calibration = simulated.truth.calibration
+            late = replace(
+                simulated,
+                imu=replace(simulated.imu, **{t_s: getattr(simulated.imu, t_s) - 0.25}),
+                truth=replace(
+                    simulated.truth, calibration=replace(calibration, **{offset: getattr(calibration, offset) + 0.25})
+                ),
+            )
+            again = smooth_simulated(late)
+            assert np.allclose(again.cam_in_world, smooth.cam_in_world, atol=1e-6)
+            assert np.allclose(again.accel_in_world, smooth.accel_in_world, atol=1e-4)
 
 
 def test_the_imu_makes_keyframes_a_second_apart_into_a_path():

@@ -109,12 +109,14 @@ def assert_moved(before, after, similarity, atol=1e-6):
     np.testing.assert_array_equal(after["opacity"], before["opacity"])
 
 
-@pytest.mark.parametrize("degree", range(4))
-def test_positions_covariances_and_colours_of_splats_move_with_the_model(tmp_path, degree):
-    rows = write_splats(tmp_path / "a.ply", degree)
-    changed = transform_ply(tmp_path / "a.ply", tmp_path / "b.ply", SIMILARITY)
-    assert changed == ("positions", "normals", "sizes", "rotations", *(["colours"] if degree else []))
-    assert_moved(rows, read_splats(tmp_path / "b.ply", rows), SIMILARITY)
+def test_positions_covariances_and_colours_of_splats_move_with_the_model(subtests, tmp_path_factory):
+    for degree in range(4):
+        with subtests.test(degree=degree):
+            tmp_path = tmp_path_factory.mktemp("given")
+            rows = write_splats(tmp_path / "a.ply", degree)
+            changed = transform_ply(tmp_path / "a.ply", tmp_path / "b.ply", SIMILARITY)
+            assert changed == ("positions", "normals", "sizes", "rotations", *(["colours"] if degree else []))
+            assert_moved(rows, read_splats(tmp_path / "b.ply", rows), SIMILARITY)
 
 
 def test_splats_in_text_and_without_normals_move_too(tmp_path):
@@ -123,30 +125,31 @@ def test_splats_in_text_and_without_normals_move_too(tmp_path):
     assert_moved(rows, read_splats(tmp_path / "b.ply", rows), SIMILARITY)
 
 
-@pytest.mark.parametrize("degree", range(4))
-def test_rotations_of_harmonics_are_orthogonal_and_compose(degree):
-    rng = np.random.default_rng(0)
-    a, b = (matrix_from_quat(rng.standard_normal(4)) for _ in range(2))
-    one, two, both = (sh_rotation(r, degree) for r in (a, b, a @ b))
-    np.testing.assert_allclose(one @ one.T, np.eye(2 * degree + 1), atol=1e-12)
-    np.testing.assert_allclose(one @ two, both, atol=1e-12)
-    # the bands are orthonormal over the sphere
-    z, weights = np.polynomial.legendre.leggauss(8)
-    turn = np.arange(16) * np.pi / 8
-    d = np.stack([np.outer(np.sqrt(1 - z**2), np.cos(turn)), np.outer(np.sqrt(1 - z**2), np.sin(turn)),
-                  np.outer(z, np.ones(16))], -1).reshape(-1, 3)  # fmt: skip
-    basis = sh_basis(d, degree)
-    gram = np.einsum("n,ni,nj->ij", np.repeat(weights, 16) * np.pi / 8, basis, basis)
-    np.testing.assert_allclose(gram, np.eye(2 * degree + 1), atol=1e-12)
+def test_rotations_of_harmonics_are_orthogonal_and_compose(subtests):
+    for degree in range(4):
+        with subtests.test(degree=degree):
+            rng = np.random.default_rng(0)
+            a, b = (matrix_from_quat(rng.standard_normal(4)) for _ in range(2))
+            one, two, both = (sh_rotation(r, degree) for r in (a, b, a @ b))
+            np.testing.assert_allclose(one @ one.T, np.eye(2 * degree + 1), atol=1e-12)
+            np.testing.assert_allclose(one @ two, both, atol=1e-12)
+            # the bands are orthonormal over the sphere
+            z, weights = np.polynomial.legendre.leggauss(8)
+            turn = np.arange(16) * np.pi / 8
+            d = np.stack([np.outer(np.sqrt(1 - z**2), np.cos(turn)), np.outer(np.sqrt(1 - z**2), np.sin(turn)),
+                          np.outer(z, np.ones(16))], -1).reshape(-1, 3)  # fmt: skip
+            basis = sh_basis(d, degree)
+            gram = np.einsum("n,ni,nj->ij", np.repeat(weights, 16) * np.pi / 8, basis, basis)
+            np.testing.assert_allclose(gram, np.eye(2 * degree + 1), atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("drop", "said"), [(("rot_3",), "lack rot_3"), (("f_rest_4",), "23 fields f_rest"), (("opacity",), "lack opacity")]
-)
-def test_splats_that_are_not_whole_are_refused(tmp_path, drop, said):
-    write_splats(tmp_path / "a.ply", 2, drop=drop)
-    with pytest.raises(FormatError, match=said):
-        transform_ply(tmp_path / "a.ply", tmp_path / "b.ply", SIMILARITY)
+def test_splats_that_are_not_whole_are_refused(subtests, tmp_path_factory):
+    for drop, said in ((("rot_3",), "lack rot_3"), (("f_rest_4",), "23 fields f_rest"), (("opacity",), "lack opacity")):
+        with subtests.test(drop=drop, said=said):
+            tmp_path = tmp_path_factory.mktemp("given")
+            write_splats(tmp_path / "a.ply", 2, drop=drop)
+            with pytest.raises(FormatError, match=said):
+                transform_ply(tmp_path / "a.ply", tmp_path / "b.ply", SIMILARITY)
 
 
 def test_packed_splats_are_refused(tmp_path):

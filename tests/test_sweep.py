@@ -85,25 +85,26 @@ def test_the_range_of_depths_holds_what_is_seen():
     assert depth_range(Sights.of([REFERENCE], sights.points, [np.zeros(0, dtype=int)]), 0) is None
 
 
-@pytest.mark.parametrize("view", AROUND)
-def test_a_candidate_leads_where_the_partner_sees_the_point(view):
-    depths = (0.6, 6.0)
-    canvas = _make_canvas(REFERENCE, view, depths)
-    inverse = np.linspace(1 / depths[1], 1 / depths[0], 7)
-    columns, rows = (_sample_positions(REFERENCE, canvas, inverse, axis) for axis in (0, 1))
-    matrix, offset = view.seen_from(REFERENCE)
-    compared = 0
-    for d, q in enumerate(inverse):
-        for x, y in ((0, 0), (60, 40), (119, 3), (17, 89)):
-            seen = matrix @ np.array([x, y, 1.0]) / q + offset
-            px = seen[:2] / seen[2]
-            inside = seen[2] > 0 and (px >= 1).all() and px[0] <= view.width - 2 and px[1] <= view.height - 2
-            at = np.array([columns[d, x], rows[d, y]])
-            if inside:
-                turned = canvas.canvas_from_view @ [*px, 1.0]
-                np.testing.assert_allclose(at / 16, turned[:2] / turned[2], atol=1 / 31)
-                compared += 1
-    assert compared > 8
+def test_a_candidate_leads_where_the_partner_sees_the_point(subtests):
+    for view in AROUND:
+        with subtests.test(view=view):
+            depths = (0.6, 6.0)
+            canvas = _make_canvas(REFERENCE, view, depths)
+            inverse = np.linspace(1 / depths[1], 1 / depths[0], 7)
+            columns, rows = (_sample_positions(REFERENCE, canvas, inverse, axis) for axis in (0, 1))
+            matrix, offset = view.seen_from(REFERENCE)
+            compared = 0
+            for d, q in enumerate(inverse):
+                for x, y in ((0, 0), (60, 40), (119, 3), (17, 89)):
+                    seen = matrix @ np.array([x, y, 1.0]) / q + offset
+                    px = seen[:2] / seen[2]
+                    inside = seen[2] > 0 and (px >= 1).all() and px[0] <= view.width - 2 and px[1] <= view.height - 2
+                    at = np.array([columns[d, x], rows[d, y]])
+                    if inside:
+                        turned = canvas.canvas_from_view @ [*px, 1.0]
+                        np.testing.assert_allclose(at / 16, turned[:2] / turned[2], atol=1 / 31)
+                        compared += 1
+            assert compared > 8
 
 
 def test_depths_of_a_room_are_found():
@@ -219,38 +220,39 @@ def test_tiles_hold_each_pixel_once_and_the_candidates_that_are_there():
             assert 0 <= tile.candidates.start <= value < tile.candidates.stop <= 160
 
 
-@pytest.mark.parametrize("ahead", [1.2, 0.0, -0.8])
-def test_a_window_counts_where_the_partner_shows_all_of_it(ahead):
+def test_a_window_counts_where_the_partner_shows_all_of_it(subtests):
     """Nearer than the reference, a partner shows the same window over more pixels; farther, over fewer."""
-    rolled = camera((0.15, -0.4 + ahead, 0.3), (0, 0, 30))
-    depths = (2.0, 2.6)
-    canvas = _make_canvas(REFERENCE, rolled, depths)
-    inverse = np.linspace(1 / depths[1], 1 / depths[0], 3)
-    columns, rows = (_sample_positions(REFERENCE, canvas, inverse, axis)[None] for axis in (0, 1))
-    # a cost of 255 says that no view shows the window
-    y, x = np.indices((90, 120))
-    reference = (np.abs(x % 8 - 4) + np.abs(y % 8 - 4)).astype(np.uint8) * 20
-    blank = np.zeros((1, canvas.height, canvas.width), np.uint8)
-    cost = np.empty((90, 120, 3), dtype=np.uint8)
-    shown = _find_shown_columns((rolled.height, rolled.width), canvas)[None]
-    _apertures.matching_costs(
-        reference, blank, columns=columns, rows=rows, cost=cost, share=shares(1), unseen=255, radius=2, shown=shown,
-        least=0,
-    )  # fmt: skip
-    used, compared = cost != 255, 0
-    matrix, offset = rolled.seen_from(REFERENCE)
-    corners = np.array([(i, j) for i in (-2, 2) for j in (-2, 2)])
-    for d, q in enumerate(inverse):
-        at = np.stack([x, y], axis=-1)[2:-2, 2:-2, None] + corners
-        seen = np.concatenate([at, np.ones((*at.shape[:-1], 1))], axis=-1) @ matrix.T / q + offset
-        px = seen[..., :2] / seen[..., 2:]
-        room = np.minimum(px, [rolled.width - 1, rolled.height - 1] - px).min(axis=(-1, -2))
-        mine = used[2:-2, 2:-2, d]
-        assert not mine[room < -0.1].any()
-        # the pixels between which a value lies are to be there, too: one more on each side of the turned picture
-        assert mine[room > 2.0].all()
-        compared += int((np.abs(room) < 4).sum())
-    assert compared > 500
+    for ahead in (1.2, 0.0, -0.8):
+        with subtests.test(ahead=ahead):
+            rolled = camera((0.15, -0.4 + ahead, 0.3), (0, 0, 30))
+            depths = (2.0, 2.6)
+            canvas = _make_canvas(REFERENCE, rolled, depths)
+            inverse = np.linspace(1 / depths[1], 1 / depths[0], 3)
+            columns, rows = (_sample_positions(REFERENCE, canvas, inverse, axis)[None] for axis in (0, 1))
+            # a cost of 255 says that no view shows the window
+            y, x = np.indices((90, 120))
+            reference = (np.abs(x % 8 - 4) + np.abs(y % 8 - 4)).astype(np.uint8) * 20
+            blank = np.zeros((1, canvas.height, canvas.width), np.uint8)
+            cost = np.empty((90, 120, 3), dtype=np.uint8)
+            shown = _find_shown_columns((rolled.height, rolled.width), canvas)[None]
+            _apertures.matching_costs(
+                reference, blank, columns=columns, rows=rows, cost=cost, share=shares(1), unseen=255, radius=2,
+                shown=shown, least=0,
+            )  # fmt: skip
+            used, compared = cost != 255, 0
+            matrix, offset = rolled.seen_from(REFERENCE)
+            corners = np.array([(i, j) for i in (-2, 2) for j in (-2, 2)])
+            for d, q in enumerate(inverse):
+                at = np.stack([x, y], axis=-1)[2:-2, 2:-2, None] + corners
+                seen = np.concatenate([at, np.ones((*at.shape[:-1], 1))], axis=-1) @ matrix.T / q + offset
+                px = seen[..., :2] / seen[..., 2:]
+                room = np.minimum(px, [rolled.width - 1, rolled.height - 1] - px).min(axis=(-1, -2))
+                mine = used[2:-2, 2:-2, d]
+                assert not mine[room < -0.1].any()
+                # the pixels between which a value lies are to be there, too: one more on each side
+                assert mine[room > 2.0].all()
+                compared += int((np.abs(room) < 4).sum())
+            assert compared > 500
 
 
 def test_what_lies_outside_of_the_range_is_not_known():

@@ -55,28 +55,31 @@ def confirmed(reference, others):
     return kept, shares, beyond
 
 
-@pytest.mark.parametrize("ahead", [False, True])
-def test_depths_that_others_confirm_are_those_of_a_loop_over_pixels(ahead):
-    rng = np.random.default_rng(4)
-    small = {"width": 40, "height": 30, "focal": (33.0, 34.0)}
-    # from ahead, part of what is seen lies behind the other view, and none of what it sees is far away
-    views = [camera((0.1, -0.4, 0.3), **small), camera((0.4, -0.4, 0.3), (0, 4, 0), **small)]
-    views.append(
-        camera((0.0, 1.2, 0.2), (0, 60, 0), **small) if ahead else camera((0.0, -0.1, 0.1), (2, 2, 3), **small)
-    )
-    noisy = []
-    for view in views:
-        one = depth_view(view)
-        factor = np.exp(rng.normal(0, 0.01, one.depth.shape)) * np.where(rng.random(one.depth.shape) < 0.1, 0, 1)
-        noisy.append(replace(one, depth=(one.depth * factor).astype("f4")))
-    found, (expected, agreeing, beyond) = confirm_depth(noisy[0], noisy[1:]), confirmed(noisy[0], noisy[1:])
-    # single precision decides otherwise at a threshold
-    differs = np.abs(found.depth - expected) > 1e-4 * expected
-    assert differs.mean() < 2e-3 and (expected > 0).mean() > 0.3
-    known = noisy[0].depth > 0
-    for share, loop in ((found.agreeing, agreeing), (found.beyond, beyond)):
-        assert (np.abs(share - loop) > 1e-6)[known].mean() < 2e-3
-        assert loop.max() > 0
+def test_depths_that_others_confirm_are_those_of_a_loop_over_pixels(subtests):
+    for ahead in (False, True):
+        with subtests.test(ahead=ahead):
+            rng = np.random.default_rng(4)
+            small = {"width": 40, "height": 30, "focal": (33.0, 34.0)}
+            # from ahead, part of what is seen lies behind the other view, and none of what it sees is far away
+            views = [camera((0.1, -0.4, 0.3), **small), camera((0.4, -0.4, 0.3), (0, 4, 0), **small)]
+            views.append(
+                camera((0.0, 1.2, 0.2), (0, 60, 0), **small) if ahead else camera((0.0, -0.1, 0.1), (2, 2, 3), **small)
+            )
+            noisy = []
+            for view in views:
+                one = depth_view(view)
+                factor = np.exp(rng.normal(0, 0.01, one.depth.shape)) * np.where(
+                    rng.random(one.depth.shape) < 0.1, 0, 1
+                )
+                noisy.append(replace(one, depth=(one.depth * factor).astype("f4")))
+            found, (expected, agreeing, beyond) = confirm_depth(noisy[0], noisy[1:]), confirmed(noisy[0], noisy[1:])
+            # single precision decides otherwise at a threshold
+            differs = np.abs(found.depth - expected) > 1e-4 * expected
+            assert differs.mean() < 2e-3 and (expected > 0).mean() > 0.3
+            known = noisy[0].depth > 0
+            for share, loop in ((found.agreeing, agreeing), (found.beyond, beyond)):
+                assert (np.abs(share - loop) > 1e-6)[known].mean() < 2e-3
+                assert loop.max() > 0
 
 
 def test_the_range_of_depths_by_quantiles():
@@ -117,40 +120,45 @@ def test_points_by_view_and_views_by_point_are_the_same():
     assert pairs == back and len(sights.of_point) == len(pairs)
 
 
-@pytest.mark.parametrize("baseline", [(0.3, 0.0, 0.0), (0.0, -0.4, 0.0), (0.4, 0.3, 0.0)])
-def test_candidates_are_a_step_apart_in_the_partner_s_picture(baseline):
+def test_candidates_are_a_step_apart_in_the_partner_s_picture(subtests):
     """Sideways, a point moves by focal times baseline times inverse depth."""
-    near, far = 1.5, 9.0
-    inverse = depth._choose_candidates(REFERENCE, [np.array(baseline), np.zeros(3)], near, far)
-    assert inverse[0] == 1 / far and inverse[-1] == 1 / near and np.ptp(np.diff(inverse)) < 1e-12
-    step_px = REFERENCE.focal_px.max() * np.linalg.norm(baseline) * np.diff(inverse)[0]
-    widest = depth._LIMITS.step_px
-    assert step_px <= widest + 1e-9
-    # one candidate fewer would be more than a step
-    assert step_px * (len(inverse) - 1) / (len(inverse) - 2) > widest
-    few = depth._choose_candidates(REFERENCE, [np.array([1e-6, 0, 0])], near, far)
-    many = depth._choose_candidates(REFERENCE, [np.array([100.0, 0, 0])], near, far)
-    assert (len(few), len(many)) == (depth._LIMITS.least_candidates, depth._LIMITS.most_candidates)
+    for baseline in ((0.3, 0.0, 0.0), (0.0, -0.4, 0.0), (0.4, 0.3, 0.0)):
+        with subtests.test(baseline=baseline):
+            near, far = 1.5, 9.0
+            inverse = depth._choose_candidates(REFERENCE, [np.array(baseline), np.zeros(3)], near, far)
+            assert inverse[0] == 1 / far and inverse[-1] == 1 / near and np.ptp(np.diff(inverse)) < 1e-12
+            step_px = REFERENCE.focal_px.max() * np.linalg.norm(baseline) * np.diff(inverse)[0]
+            widest = depth._LIMITS.step_px
+            assert step_px <= widest + 1e-9
+            # one candidate fewer would be more than a step
+            assert step_px * (len(inverse) - 1) / (len(inverse) - 2) > widest
+            few = depth._choose_candidates(REFERENCE, [np.array([1e-6, 0, 0])], near, far)
+            many = depth._choose_candidates(REFERENCE, [np.array([100.0, 0, 0])], near, far)
+            assert (len(few), len(many)) == (depth._LIMITS.least_candidates, depth._LIMITS.most_candidates)
 
 
-@pytest.mark.parametrize("shift", [0.0, 25.0])
-def test_a_turned_view_is_cut_to_what_the_limit_allows(shift):
+def test_a_turned_view_is_cut_to_what_the_limit_allows(subtests):
     """A wide lens shows far more than the reference sees: the middle of what is shared stays."""
-    wide = camera((0.1, -0.39, 0.3), width=400, height=300, focal=(20.0, 20.0))
-    narrow = replace(REFERENCE, centre_px=REFERENCE.centre_px + shift)
-    canvas = depth._make_canvas(narrow, wide, (0.02, 6.0))
-    baseline = narrow.cam_from_world @ (wide.cam_in_world - narrow.cam_in_world)
-    for axis, (start, size) in enumerate(((canvas.left, canvas.width), (canvas.top, canvas.height))):
-        whole = (narrow.width, narrow.height)[axis]
-        at = np.arange(whole)[:, None] - narrow.centre_px[axis]
-        inverse = np.linspace(1 / 6.0, 1 / 0.02, 9)
-        shrinks = 1 - inverse * baseline[2]
-        shown = (at - narrow.focal_px[axis] * inverse * baseline[axis]) / shrinks + narrow.centre_px[axis]
-        low, high = shown[:, shrinks >= depth._LIMITS.closest].min(), shown[:, shrinks >= depth._LIMITS.closest].max()
-        most = depth._LIMITS.largest * whole
-        assert high - low > most + 10
-        assert most <= size <= most + 3
-        assert start + size / 2 == pytest.approx((low + high) / 2, abs=2)
+    for shift in (0.0, 25.0):
+        with subtests.test(shift=shift):
+            wide = camera((0.1, -0.39, 0.3), width=400, height=300, focal=(20.0, 20.0))
+            narrow = replace(REFERENCE, centre_px=REFERENCE.centre_px + shift)
+            canvas = depth._make_canvas(narrow, wide, (0.02, 6.0))
+            baseline = narrow.cam_from_world @ (wide.cam_in_world - narrow.cam_in_world)
+            for axis, (start, size) in enumerate(((canvas.left, canvas.width), (canvas.top, canvas.height))):
+                whole = (narrow.width, narrow.height)[axis]
+                at = np.arange(whole)[:, None] - narrow.centre_px[axis]
+                inverse = np.linspace(1 / 6.0, 1 / 0.02, 9)
+                shrinks = 1 - inverse * baseline[2]
+                shown = (at - narrow.focal_px[axis] * inverse * baseline[axis]) / shrinks + narrow.centre_px[axis]
+                low, high = (
+                    shown[:, shrinks >= depth._LIMITS.closest].min(),
+                    shown[:, shrinks >= depth._LIMITS.closest].max(),
+                )
+                most = depth._LIMITS.largest * whole
+                assert high - low > most + 10
+                assert most <= size <= most + 3
+                assert start + size / 2 == pytest.approx((low + high) / 2, abs=2)
 
 
 def test_a_tile_has_the_candidates_of_its_own_half_and_a_margin():

@@ -176,9 +176,8 @@ def test_the_command_writes_and_remembers_what_results_show(tmp_path, monkeypatc
     assert json.loads(capsys.readouterr().out)["compared"] == 1
 
 
-@pytest.mark.parametrize(
-    ("content", "said"),
-    [
+def test_a_result_that_shows_nothing_is_refused_by_name(subtests, tmp_path_factory):
+    for content, said in (
         (result(validation={"scale_error_pct": None}), "no scale with a measured target"),
         (result(verdict="refused"), "no scale with a measured target"),
         (result(imu_calibration={"attitudes": 12}), "calibration of the IMU went into its scale"),
@@ -188,14 +187,14 @@ def test_the_command_writes_and_remembers_what_results_show(tmp_path, monkeypatc
         (result(parts=None), "not that of the joint method"),
         ({"capture": "x"}, "is no result"),
         (result(capture="b"), "as another of these results"),
-    ],
-)
-def test_a_result_that_shows_nothing_is_refused_by_name(tmp_path, content, said):
-    sound = write_result(tmp_path / "sound", result(capture="b"))
-    with pytest.raises(FormatError, match=said) as caught:
-        calibrate_from_results([sound, write_result(tmp_path / "other", content)], tmp_path / "out.json")
-    assert str(tmp_path / "other" / "result.json") in str(caught.value)
-    assert not (tmp_path / "out.json").exists()
+    ):
+        with subtests.test(content=content, said=said):
+            tmp_path = tmp_path_factory.mktemp("given")
+            sound = write_result(tmp_path / "sound", result(capture="b"))
+            with pytest.raises(FormatError, match=said) as caught:
+                calibrate_from_results([sound, write_result(tmp_path / "other", content)], tmp_path / "out.json")
+            assert str(tmp_path / "other" / "result.json") in str(caught.value)
+            assert not (tmp_path / "out.json").exists()
 
 
 def test_a_calibration_by_rests_is_not_replaced_by_targets_and_a_place_is_for_rests(tmp_path, monkeypatch, capsys):

@@ -143,19 +143,20 @@ def test_no_time_is_said_where_a_step_takes_longer_than_all_was_to():
     assert stage.ends_in(12.0) == "0:01 left" and stage.ends_in(14.0) == ""
 
 
-@pytest.mark.parametrize("share", [0.1, 0.2, 0.5, 0.8])
-def test_a_stage_whose_steps_grow_dearer_ends_when_it_says(share):
+def test_a_stage_whose_steps_grow_dearer_ends_when_it_says(subtests):
     """As a mapper's: to the power of 1.2, and an adjustment of all at the end, 12 % of the time."""
-    stage, total = Stage(0.0, 0, 500, name="mapping"), 500.0
-    for done in range(1, round(500 * share) + 1):
-        now_s = 0.88 * total * (done / 500) ** 1.2
-        stage.moved(now_s, done, 500)
-    assert stage.left_s(now_s) == pytest.approx(total - now_s, rel=0.02)
-    if share < 0.3:
-        assert Stage(0.0, 0, 500).left_s(now_s) is None
-        linear = Stage(0.0, 0, 500)
-        linear.moved(now_s, done, 500)
-        assert linear.left_s(now_s) < 0.65 * (total - now_s)
+    for share in (0.1, 0.2, 0.5, 0.8):
+        with subtests.test(share=share):
+            stage, total = Stage(0.0, 0, 500, name="mapping"), 500.0
+            for done in range(1, round(500 * share) + 1):
+                now_s = 0.88 * total * (done / 500) ** 1.2
+                stage.moved(now_s, done, 500)
+            assert stage.left_s(now_s) == pytest.approx(total - now_s, rel=0.02)
+            if share < 0.3:
+                assert Stage(0.0, 0, 500).left_s(now_s) is None
+                linear = Stage(0.0, 0, 500)
+                linear.moved(now_s, done, 500)
+                assert linear.left_s(now_s) < 0.65 * (total - now_s)
 
 
 def test_work_is_shown_as_a_share_and_its_unknown_end_not_at_all():
@@ -189,17 +190,19 @@ def estimate(verdict, reasons, notes):
 JUMPS = "poses jump at 40 places, which hardly counts"
 
 
-@pytest.mark.parametrize("width", ["80", "140"])
-@pytest.mark.parametrize("verdict", ["trusted", "weak", "refused"])
-def test_only_what_decided_the_verdict_stands_as_reason(verdict, width, monkeypatch, capsys):
-    monkeypatch.setenv("COLUMNS", width)
-    reasons = () if verdict == "trusted" else ("the clip is short", "its poses are few")
-    show_scale(estimate(verdict, reasons, (JUMPS,)), Path("model"))
-    out = capsys.readouterr().out
-    rows = [line.strip("\u2502 ") for line in out.splitlines()]
-    assert [row.split(maxsplit=1)[1] for row in rows if row.startswith("Reason")] == list(reasons[:1])
-    assert [row.split(maxsplit=1)[1] for row in rows if row.startswith("Note")] == [JUMPS]
-    assert max(map(len, out.splitlines())) <= int(width)
+def test_only_what_decided_the_verdict_stands_as_reason(subtests, capsys):
+    for width in ("80", "140"):
+        for verdict in ("trusted", "weak", "refused"):
+            with subtests.test(width=width, verdict=verdict), pytest.MonkeyPatch.context() as monkeypatch:
+                capsys.readouterr()
+                monkeypatch.setenv("COLUMNS", width)
+                reasons = () if verdict == "trusted" else ("the clip is short", "its poses are few")
+                show_scale(estimate(verdict, reasons, (JUMPS,)), Path("model"))
+                out = capsys.readouterr().out
+                rows = [line.strip("\u2502 ") for line in out.splitlines()]
+                assert [row.split(maxsplit=1)[1] for row in rows if row.startswith("Reason")] == list(reasons[:1])
+                assert [row.split(maxsplit=1)[1] for row in rows if row.startswith("Note")] == [JUMPS]
+                assert max(map(len, out.splitlines())) <= int(width)
 
 
 def test_json_goes_to_standard_output_alone(project, capsys):
@@ -224,9 +227,8 @@ def test_an_error_is_json_too_where_json_was_asked_for(tmp_path, capsys):
     assert json.loads(out) == {"error": err.removeprefix("error: ").strip(), "exit_code": 2}
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
+def test_quiet_and_verbose_are_not_given_together(subtests, capsys):
+    for command in (
         "diagnose x",
         "scale x",
         "apply x y --undo",
@@ -234,11 +236,11 @@ def test_an_error_is_json_too_where_json_was_asked_for(tmp_path, capsys):
         "export x y",
         "view x",
         "reconstruct x y",
-    ],
-)
-def test_quiet_and_verbose_are_not_given_together(command, capsys):
-    code, _, err = run(capsys, *command.split(), "--quiet", "--verbose")
-    assert code == 2 and "one of --quiet and --verbose" in err
+    ):
+        with subtests.test(command=command):
+            capsys.readouterr()
+            code, _, err = run(capsys, *command.split(), "--quiet", "--verbose")
+            assert code == 2 and "one of --quiet and --verbose" in err
 
 
 def test_verbose_prints_the_log_of_a_run_and_json_says_that_nothing_was_done(project, tmp_path, capsys):
@@ -332,18 +334,17 @@ def test_a_refused_scale_ends_with_what_to_look_at(still, tmp_path, capsys):
     assert err.count("(no-motion)") == 1
 
 
-@pytest.mark.parametrize(
-    ("checked", "words"),
-    [
+def test_nothing_found_says_what_was_not_checked(subtests, capsys):
+    for checked, words in (
         (("gyroscope", "accelerometer", "frame times"), "whether camera and gyroscope match"),
         (("gyroscope", "frame times", "pictures"), "gravity and scale (no accelerometer)"),
         (("gyroscope", "accelerometer", "frame times", "pictures"), ""),
-    ],
-)
-def test_nothing_found_says_what_was_not_checked(checked, words, capsys):
-    from colmap_inertial.cli.terminal import show_diagnosis
+    ):
+        with subtests.test(checked=checked, words=words):
+            capsys.readouterr()
+            from colmap_inertial.cli.terminal import show_diagnosis
 
-    for findings in ((), (CUT,)):
-        show_diagnosis(Diagnosis(findings=findings, checked=checked), Path("capture"))
-        last = capsys.readouterr().out.splitlines()[-1]
-        assert last.startswith(f"not checked: {words}") if words else "not checked" not in last
+            for findings in ((), (CUT,)):
+                show_diagnosis(Diagnosis(findings=findings, checked=checked), Path("capture"))
+                last = capsys.readouterr().out.splitlines()[-1]
+                assert last.startswith(f"not checked: {words}") if words else "not checked" not in last

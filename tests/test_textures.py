@@ -17,21 +17,22 @@ MEAN = {
 }
 
 
-@pytest.mark.parametrize("name", MEAN)
-def test_reflectances_are_those_of_things_and_few_are_cut_off(name):
-    middle, away = MEAN[name]
-    for seed in range(3):
-        image = getattr(textures, name)(np.random.default_rng(seed), 200, 300)
-        assert image.shape == (200, 300, 3) and image.dtype == np.float32
-        assert image.min() >= 0 and image.max() <= 1
-        assert image.mean() == pytest.approx(middle, abs=away)
-        assert np.mean((image <= 0.02) | (image >= 0.92)) < 0.25
-        again, other = (getattr(textures, name)(np.random.default_rng(s), 200, 300) for s in (seed, seed + 9))
-        assert np.array_equal(image, again) and not np.array_equal(image, other)
-        # something to see from near and from far
-        for scale in (1, 4, 16):
-            small = cv2.resize(image, None, fx=1 / scale, fy=1 / scale, interpolation=cv2.INTER_AREA)
-            assert np.abs(np.diff(small, axis=1)).mean() > 0.004, scale
+def test_reflectances_are_those_of_things_and_few_are_cut_off(subtests):
+    for name in MEAN:
+        with subtests.test(name=name):
+            middle, away = MEAN[name]
+            for seed in range(3):
+                image = getattr(textures, name)(np.random.default_rng(seed), 200, 300)
+                assert image.shape == (200, 300, 3) and image.dtype == np.float32
+                assert image.min() >= 0 and image.max() <= 1
+                assert image.mean() == pytest.approx(middle, abs=away)
+                assert np.mean((image <= 0.02) | (image >= 0.92)) < 0.25
+                again, other = (getattr(textures, name)(np.random.default_rng(s), 200, 300) for s in (seed, seed + 9))
+                assert np.array_equal(image, again) and not np.array_equal(image, other)
+                # something to see from near and from far
+                for scale in (1, 4, 16):
+                    small = cv2.resize(image, None, fx=1 / scale, fy=1 / scale, interpolation=cv2.INTER_AREA)
+                    assert np.abs(np.diff(small, axis=1)).mean() > 0.004, scale
 
 
 def test_a_tartan_is_the_mean_of_its_threads(monkeypatch):

@@ -104,13 +104,14 @@ def estimate(gravity, cov=None):
     )
 
 
-@pytest.mark.parametrize(("world", "down"), [("z-up", [0, 0, -1]), ("y-down", [0, 1, 0])])
-def test_the_similarity_turns_gravity_down(world, down):
-    gravity = np.array([3.0, -2.0, 9.0])
-    similarity = Similarity.from_scale(estimate(gravity), world=world)
-    assert similarity.scale == 2.0
-    turned = quat_rotate(similarity.rotation_xyzw, gravity / np.linalg.norm(gravity))
-    np.testing.assert_allclose(turned, down, atol=1e-12)
+def test_the_similarity_turns_gravity_down(subtests):
+    for world, down in (("z-up", [0, 0, -1]), ("y-down", [0, 1, 0])):
+        with subtests.test(world=world, down=down):
+            gravity = np.array([3.0, -2.0, 9.0])
+            similarity = Similarity.from_scale(estimate(gravity), world=world)
+            assert similarity.scale == 2.0
+            turned = quat_rotate(similarity.rotation_xyzw, gravity / np.linalg.norm(gravity))
+            np.testing.assert_allclose(turned, down, atol=1e-12)
 
 
 def test_the_covariance_of_gravity_becomes_a_tilt_covariance():

@@ -331,28 +331,38 @@ def test_an_aprilgrid_partly_out_of_view_has_the_right_size(tmp_path):
     assert result.corners_used < 5 * 64
 
 
-@pytest.mark.parametrize("name", [n for n in pycolmap.CameraModelId.__members__ if n != "INVALID"])
-def test_every_camera_model_gives_rays_that_project_back(name):
-    camera = pycolmap.Camera.create_from_model_name(1, name, 500.0, 800, 600)
-    distorted = camera.params.copy()
-    known = {"k": -0.03, "k1": -0.03, "k2": 0.01, "p1": 0.001, "omega": 0.5, "alpha": 0.4, "k0": 0.01, "s0": 0.001}
-    for i, parameter in enumerate(p.strip() for p in camera.params_info.split(",")):
-        distorted[i] = known.get(parameter, distorted[i])
-    camera.params = distorted
-    target = parse_target("checkerboard:7x5:0.05")
-    pose = look_at(np.array([0.1, -0.1, -0.5]), roll_rad=0.5)
-    in_cam = target.corners_m @ pose.rotation.T + pose.translation
-    px = camera.img_from_cam(in_cam)
-    sighting = sight(0, camera, Detection(part=0, corner=np.arange(35), xy_px=px))
-    np.testing.assert_array_equal(sighting.corner, np.arange(35))
-    np.testing.assert_allclose(sighting.ray, in_cam / np.linalg.norm(in_cam, axis=1, keepdims=True), atol=1e-5)
-    # a small turn of the rays moves the pixels as the derivative says
-    turned = in_cam + np.cross([0.0004, -0.0003, 0.0005], in_cam)
-    change = camera.img_from_cam(turned) - camera.img_from_cam(in_cam)
-    predicted = np.einsum(
-        "mij,mj->mi", sighting.px_from_tangent, turned / np.linalg.norm(turned, axis=1, keepdims=True)
-    )
-    np.testing.assert_allclose(predicted, change, atol=2e-3)
+def test_every_camera_model_gives_rays_that_project_back(subtests):
+    for name in [n for n in pycolmap.CameraModelId.__members__ if n != "INVALID"]:
+        with subtests.test(name=name):
+            camera = pycolmap.Camera.create_from_model_name(1, name, 500.0, 800, 600)
+            distorted = camera.params.copy()
+            known = {
+                "k": -0.03,
+                "k1": -0.03,
+                "k2": 0.01,
+                "p1": 0.001,
+                "omega": 0.5,
+                "alpha": 0.4,
+                "k0": 0.01,
+                "s0": 0.001,
+            }
+            for i, parameter in enumerate(p.strip() for p in camera.params_info.split(",")):
+                distorted[i] = known.get(parameter, distorted[i])
+            camera.params = distorted
+            target = parse_target("checkerboard:7x5:0.05")
+            pose = look_at(np.array([0.1, -0.1, -0.5]), roll_rad=0.5)
+            in_cam = target.corners_m @ pose.rotation.T + pose.translation
+            px = camera.img_from_cam(in_cam)
+            sighting = sight(0, camera, Detection(part=0, corner=np.arange(35), xy_px=px))
+            np.testing.assert_array_equal(sighting.corner, np.arange(35))
+            np.testing.assert_allclose(sighting.ray, in_cam / np.linalg.norm(in_cam, axis=1, keepdims=True), atol=1e-5)
+            # a small turn of the rays moves the pixels as the derivative says
+            turned = in_cam + np.cross([0.0004, -0.0003, 0.0005], in_cam)
+            change = camera.img_from_cam(turned) - camera.img_from_cam(in_cam)
+            predicted = np.einsum(
+                "mij,mj->mi", sighting.px_from_tangent, turned / np.linalg.norm(turned, axis=1, keepdims=True)
+            )
+            np.testing.assert_allclose(predicted, change, atol=2e-3)
 
 
 def test_pixel_origins_agree_from_file_to_figure(sharp):

@@ -113,23 +113,24 @@ def test_two_aprilgrids_in_view_are_told_apart():
         assert min(np.abs(d.xy_px - t[d.corner]).max() for t in truth) < 0.3
 
 
-@pytest.mark.parametrize("gamma", [1.0, 2.2])
-@pytest.mark.parametrize("dictionary", ["DICT_4X4_50", "DICT_APRILTAG_36h11"])
-def test_a_single_marker_has_its_true_size_whatever_the_gamma(dictionary, gamma):
+def test_a_single_marker_has_its_true_size_whatever_the_gamma(subtests):
     """A threshold, or the corner refinement of OpenCV's marker detector, makes it 0.4 to 2 % too small here."""
-    target = parse_target(f"aruco:{dictionary}:0.1")
-    rng = np.random.default_rng(6)
-    sizes = []
-    for pose in orbit(rng, 4, distance_m=(0.6, 1.0)):
-        texture = cells(marker_bits(dictionary, 7), 0.1, (-0.05, -0.05))
-        found = detect(render(CAMERA, pose, texture, rng, gamma=gamma), target)
-        assert [d.part for d in found] == [7]
-        error = found[0].xy_px - true_px(target, pose)[found[0].corner]
-        assert np.abs(error).max() < 0.15
-        truth = true_px(target, pose)[28:32]
-        centred, true_centred = found[0].xy_px - found[0].xy_px.mean(axis=0), truth - truth.mean(axis=0)
-        sizes.append(np.linalg.norm(centred) / np.linalg.norm(true_centred) - 1)
-    assert abs(np.mean(sizes)) < 1e-3
+    for gamma in (1.0, 2.2):
+        for dictionary in ("DICT_4X4_50", "DICT_APRILTAG_36h11"):
+            with subtests.test(gamma=gamma, dictionary=dictionary):
+                target = parse_target(f"aruco:{dictionary}:0.1")
+                rng = np.random.default_rng(6)
+                sizes = []
+                for pose in orbit(rng, 4, distance_m=(0.6, 1.0)):
+                    texture = cells(marker_bits(dictionary, 7), 0.1, (-0.05, -0.05))
+                    found = detect(render(CAMERA, pose, texture, rng, gamma=gamma), target)
+                    assert [d.part for d in found] == [7]
+                    error = found[0].xy_px - true_px(target, pose)[found[0].corner]
+                    assert np.abs(error).max() < 0.15
+                    truth = true_px(target, pose)[28:32]
+                    centred, true_centred = found[0].xy_px - found[0].xy_px.mean(axis=0), truth - truth.mean(axis=0)
+                    sizes.append(np.linalg.norm(centred) / np.linalg.norm(true_centred) - 1)
+                assert abs(np.mean(sizes)) < 1e-3
 
 
 def test_nothing_is_found_where_there_is_nothing():
@@ -179,15 +180,16 @@ def test_a_homography_is_fitted_to_edges_of_which_some_were_seen_elsewhere():
         np.testing.assert_allclose(_project(first + found, xy), _project(first + change, xy), atol=0.1)
 
 
-@pytest.mark.parametrize("half", [3, 8, 11])
-def test_corners_near_any_border_are_left_out_alike(half):
-    size, (y, x) = np.array([80, 60]), np.indices((60, 80))
-    for near, kept in ((half + 0.5, False), (half + 1.5, True)):
-        for axis in (0, 1):
-            for place in (near, size[axis] - 1 - near):
-                corner = np.array([30.5, 30.5])
-                corner[axis] = place
-                image = np.where((x > corner[0]) == (y > corner[1]), 40, 200).astype(np.uint8)
-                xy, good = _refine(image, corner[None], np.array([float(half)]), allowed_px=3.0)
-                assert good.tolist() == [kept], (near, axis, place)
-                assert not kept or xy[0] == pytest.approx(corner, abs=0.05)
+def test_corners_near_any_border_are_left_out_alike(subtests):
+    for half in (3, 8, 11):
+        with subtests.test(half=half):
+            size, (y, x) = np.array([80, 60]), np.indices((60, 80))
+            for near, kept in ((half + 0.5, False), (half + 1.5, True)):
+                for axis in (0, 1):
+                    for place in (near, size[axis] - 1 - near):
+                        corner = np.array([30.5, 30.5])
+                        corner[axis] = place
+                        image = np.where((x > corner[0]) == (y > corner[1]), 40, 200).astype(np.uint8)
+                        xy, good = _refine(image, corner[None], np.array([float(half)]), allowed_px=3.0)
+                        assert good.tolist() == [kept], (near, axis, place)
+                        assert not kept or xy[0] == pytest.approx(corner, abs=0.05)

@@ -203,18 +203,21 @@ def test_corners_are_triangulated_from_the_cameras_alone():
     assert not triangulate(once, START)[2].any()
 
 
-@pytest.mark.parametrize("axis", range(3))
-@pytest.mark.parametrize("turn_rad", [-2.1, 2.1])
-def test_a_start_that_is_far_off_comes_to_rest_at_the_truth(axis, turn_rad):
-    obs = simulate(np.random.default_rng(14), 4, noise_px=0.0)
-    turned = Placement(
-        log_scale=0.1, rotation=so3_exp(turn_rad * np.eye(3)[axis])[None], centre=np.array([[0.05, -0.05, 0.02]])
-    )
-    found = settle(obs, turned)
-    assert abs(found.log_scale) < 1e-6
-    np.testing.assert_allclose(found.rotation[0], np.eye(3), atol=1e-6)
-    with pytest.raises(NotObservableError, match="does not settle"):
-        settle(obs, turned, most_iterations=1)
+def test_a_start_that_is_far_off_comes_to_rest_at_the_truth(subtests):
+    for axis in range(3):
+        for turn_rad in (-2.1, 2.1):
+            with subtests.test(axis=axis, turn_rad=turn_rad):
+                obs = simulate(np.random.default_rng(14), 4, noise_px=0.0)
+                turned = Placement(
+                    log_scale=0.1,
+                    rotation=so3_exp(turn_rad * np.eye(3)[axis])[None],
+                    centre=np.array([[0.05, -0.05, 0.02]]),
+                )
+                found = settle(obs, turned)
+                assert abs(found.log_scale) < 1e-6
+                np.testing.assert_allclose(found.rotation[0], np.eye(3), atol=1e-6)
+                with pytest.raises(NotObservableError, match="does not settle"):
+                    settle(obs, turned, most_iterations=1)
 
 
 def test_with_pose_errors_the_fit_rests_where_these_weigh_as_they_are():
@@ -229,28 +232,29 @@ def test_with_pose_errors_the_fit_rests_where_these_weigh_as_they_are():
     assert rhs @ np.linalg.solve(s, rhs) < 1e-3 * (rhs_plain @ np.linalg.solve(s_plain, rhs_plain))
 
 
-@pytest.mark.parametrize("unit", [0.01, 1.0, 100.0])
-def test_two_views_place_a_target_in_a_model_of_any_unit(unit):
-    rng, views, sightings = np.random.default_rng(16), [], []
-    for i, pose in enumerate(orbit(rng, 2)):
-        px = CAMERA.img_from_cam(TARGET.corners_m @ pose.rotation.T + pose.translation)
-        sightings.append(sight(i, CAMERA, Detection(part=0, corner=np.arange(len(px)), xy_px=px)))
-        views.append(
-            View(
-                name=str(i), path=None, camera=CAMERA, cam_from_world=pose.rotation,
-                cam_from_world_t=unit * np.asarray(pose.translation),
-            )
-        )  # fmt: skip
-    found = _place_by_pair(*sightings, 0, TARGET, views)
-    assert found is not None and found.log_scale == pytest.approx(np.log(unit), abs=1e-5)
-    # a camera that looks the other way saw nothing in front of it
-    about = np.diag([-1.0, 1, -1])
-    for i, view in enumerate(views):
-        turned = views.copy()
-        turned[i] = replace(
-            view, cam_from_world=about @ view.cam_from_world, cam_from_world_t=about @ view.cam_from_world_t
-        )
-        assert _place_by_pair(*sightings, 0, TARGET, turned) is None
+def test_two_views_place_a_target_in_a_model_of_any_unit(subtests):
+    for unit in (0.01, 1.0, 100.0):
+        with subtests.test(unit=unit):
+            rng, views, sightings = np.random.default_rng(16), [], []
+            for i, pose in enumerate(orbit(rng, 2)):
+                px = CAMERA.img_from_cam(TARGET.corners_m @ pose.rotation.T + pose.translation)
+                sightings.append(sight(i, CAMERA, Detection(part=0, corner=np.arange(len(px)), xy_px=px)))
+                views.append(
+                    View(
+                        name=str(i), path=None, camera=CAMERA, cam_from_world=pose.rotation,
+                        cam_from_world_t=unit * np.asarray(pose.translation),
+                    )
+                )  # fmt: skip
+            found = _place_by_pair(*sightings, 0, TARGET, views)
+            assert found is not None and found.log_scale == pytest.approx(np.log(unit), abs=1e-5)
+            # a camera that looks the other way saw nothing in front of it
+            about = np.diag([-1.0, 1, -1])
+            for i, view in enumerate(views):
+                turned = views.copy()
+                turned[i] = replace(
+                    view, cam_from_world=about @ view.cam_from_world, cam_from_world_t=about @ view.cam_from_world_t
+                )
+                assert _place_by_pair(*sightings, 0, TARGET, turned) is None
 
 
 @pytest.mark.parametrize("axis", [0, 1])

@@ -20,15 +20,16 @@ def test_a_checkerboard_counts_inner_corners_row_by_row():
     np.testing.assert_allclose(target.corners_m.mean(axis=0), 0, atol=1e-12)
 
 
-@pytest.mark.parametrize(("spec", "turns"), [("checkerboard:9x6:0.025", 2), ("checkerboard:7x7:0.025", 4)])
-def test_a_checkerboard_looks_the_same_after_half_turns_and_a_square_one_after_quarter_turns(spec, turns):
-    target = parse_target(spec)
-    assert len(target.relabelings) == turns
-    for numbers in target.relabelings:  # each is a turn of the board into itself, never a mirror image
-        moved = target.corners_m[numbers][:, :2]
-        turn, *_ = np.linalg.lstsq(target.corners_m[:, :2], moved, rcond=None)
-        np.testing.assert_allclose(target.corners_m[:, :2] @ turn, moved, atol=1e-12)
-        assert np.linalg.det(turn) == pytest.approx(1)
+def test_a_checkerboard_looks_the_same_after_half_turns_and_a_square_one_after_quarter_turns(subtests):
+    for spec, turns in (("checkerboard:9x6:0.025", 2), ("checkerboard:7x7:0.025", 4)):
+        with subtests.test(spec=spec, turns=turns):
+            target = parse_target(spec)
+            assert len(target.relabelings) == turns
+            for numbers in target.relabelings:  # each is a turn of the board into itself, never a mirror image
+                moved = target.corners_m[numbers][:, :2]
+                turn, *_ = np.linalg.lstsq(target.corners_m[:, :2], moved, rcond=None)
+                np.testing.assert_allclose(target.corners_m[:, :2] @ turn, moved, atol=1e-12)
+                assert np.linalg.det(turn) == pytest.approx(1)
 
 
 def test_a_charuco_board_counts_squares_and_has_one_numbering():
@@ -58,18 +59,22 @@ def test_single_markers_are_rigid_parts_of_their_own():
     assert set(target.part[pairs].ravel()) == {3, 7}
 
 
-@pytest.mark.parametrize(
-    "spec", ["checkerboard:9x6:0.025", "charuco:7x5:0.04:0.03:4X4_50", "aprilgrid:6x6:0.088:0.3", "aruco:4X4_50:0.1"]
-)
-def test_control_and_check_corners_are_disjoint_and_both_measure_lengths(spec):
-    target = parse_target(spec)
-    seen = np.ones(len(target.part), dtype=bool) if target.kind != "aruco" else np.isin(target.part, [2, 4])
-    control = target.control(seen)
-    pairs = target.pairs(seen)
-    both = control[pairs]
-    assert (both.all(axis=1)).sum() > 5
-    assert (~both.any(axis=1)).sum() > 5
-    assert 0.3 < control[seen].mean() < 0.7
+def test_control_and_check_corners_are_disjoint_and_both_measure_lengths(subtests):
+    for spec in (
+        "checkerboard:9x6:0.025",
+        "charuco:7x5:0.04:0.03:4X4_50",
+        "aprilgrid:6x6:0.088:0.3",
+        "aruco:4X4_50:0.1",
+    ):
+        with subtests.test(spec=spec):
+            target = parse_target(spec)
+            seen = np.ones(len(target.part), dtype=bool) if target.kind != "aruco" else np.isin(target.part, [2, 4])
+            control = target.control(seen)
+            pairs = target.pairs(seen)
+            both = control[pairs]
+            assert (both.all(axis=1)).sum() > 5
+            assert (~both.any(axis=1)).sum() > 5
+            assert 0.3 < control[seen].mean() < 0.7
 
 
 def test_a_lone_marker_gives_one_side_to_each_set():

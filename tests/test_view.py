@@ -159,15 +159,17 @@ def test_points_and_cameras_are_where_the_metric_model_has_them(out):
     assert scene.path.shape == (len(cameras) - 1, 2, 3)
 
 
-@pytest.mark.parametrize(("world", "up"), [("z-up", [0, 0, 1]), ("y-down", [0, -1, 0])])
-def test_up_is_against_gravity_in_either_world(tmp_path, world, up):
-    write_result(tmp_path / "out", [ESTIMATE], world=world)
-    scene = load_scene(tmp_path / "out")
-    assert scene.gravity_known
-    np.testing.assert_allclose(scene.up_in_world, up, atol=1e-12)
-    np.testing.assert_allclose(
-        [scene.ground.along @ scene.up_in_world, scene.ground.across @ scene.up_in_world], 0, atol=1e-12
-    )
+def test_up_is_against_gravity_in_either_world(subtests, tmp_path_factory):
+    for world, up in (("z-up", [0, 0, 1]), ("y-down", [0, -1, 0])):
+        with subtests.test(world=world, up=up):
+            tmp_path = tmp_path_factory.mktemp("given")
+            write_result(tmp_path / "out", [ESTIMATE], world=world)
+            scene = load_scene(tmp_path / "out")
+            assert scene.gravity_known
+            np.testing.assert_allclose(scene.up_in_world, up, atol=1e-12)
+            np.testing.assert_allclose(
+                [scene.ground.along @ scene.up_in_world, scene.ground.across @ scene.up_in_world], 0, atol=1e-12
+            )
 
 
 def test_the_scale_bar_is_round_level_as_long_as_it_says_and_in_view(out):
@@ -185,17 +187,16 @@ def test_the_scale_bar_is_round_level_as_long_as_it_says_and_in_view(out):
         assert np.arccos(seen @ view / np.linalg.norm(seen) / np.linalg.norm(view)) < 0.75 * LIMITS.start_fov_rad
 
 
-@pytest.mark.parametrize(
-    ("about", "expected"), [(1, 1), (1.99, 1), (2, 2), (4.9, 2), (0.0501, 0.05), (999, 500), (1000, 1000), (0.2, 0.2)]
-)
-def test_round_lengths_are_1_2_5(about, expected):
-    assert round_length(about) == pytest.approx(expected, rel=1e-12)
+def test_round_lengths_are_1_2_5(subtests):
+    for about, expected in ((1, 1), (1.99, 1), (2, 2), (4.9, 2), (0.0501, 0.05), (999, 500), (1000, 1000), (0.2, 0.2)):
+        with subtests.test(about=about, expected=expected):
+            assert round_length(about) == pytest.approx(expected, rel=1e-12)
 
 
-@pytest.mark.parametrize("about", [0.0, -1.0, np.inf, np.nan])
-def test_what_is_no_length_is_not_rounded(about):
-    with pytest.raises(ValueError, match="positive"):
-        round_length(about)
+def test_what_is_no_length_is_not_rounded(subtests):
+    for about in (0.0, -1.0, np.inf, np.nan):
+        with subtests.test(about=about), pytest.raises(ValueError, match="positive"):
+            round_length(about)
 
 
 def test_lengths_have_fitting_units():
@@ -359,21 +360,25 @@ def write_ply(path, vertices, faces=(), *, order="little", axes="xyz", lists="li
     return path
 
 
-@pytest.mark.parametrize("order", ["little", "big"])
-def test_a_mesh_is_read_without_what_is_not_finite(tmp_path, order):
-    path = write_ply(tmp_path / "mesh.ply", VERTICES, TRIANGLES, order=order)
-    mesh = read_mesh(path, 3)
-    # the fourth vertex goes, and with it the face that needs it
-    assert mesh.vertices.tolist() == VERTICES[[0, 1, 2, 4]].tolist() and mesh.faces.tolist() == [[0, 1, 2], [1, 2, 3]]
-    assert mesh.rgb is None and read_mesh(path, 2) is None
-    whole = dense_cloud(path, 5)
-    assert whole.xyz.tolist() == mesh.vertices.tolist() and whole.total == 5 and whole.rgb.shape == (4, 3)
-    assert len(dense_cloud(path, 2).xyz) <= 2
+def test_a_mesh_is_read_without_what_is_not_finite(subtests, tmp_path_factory):
+    for order in ("little", "big"):
+        with subtests.test(order=order):
+            tmp_path = tmp_path_factory.mktemp("given")
+            path = write_ply(tmp_path / "mesh.ply", VERTICES, TRIANGLES, order=order)
+            mesh = read_mesh(path, 3)
+            # the fourth vertex goes, and with it the face that needs it
+            assert mesh.vertices.tolist() == VERTICES[[0, 1, 2, 4]].tolist() and mesh.faces.tolist() == [
+                [0, 1, 2],
+                [1, 2, 3],
+            ]
+            assert mesh.rgb is None and read_mesh(path, 2) is None
+            whole = dense_cloud(path, 5)
+            assert whole.xyz.tolist() == mesh.vertices.tolist() and whole.total == 5 and whole.rgb.shape == (4, 3)
+            assert len(dense_cloud(path, 2).xyz) <= 2
 
 
-@pytest.mark.parametrize(
-    ("changed", "said"),
-    [
+def test_what_is_no_mesh_of_triangles_is_refused(subtests, tmp_path_factory):
+    for changed, said in (
         ({"faces": ()}, "a mesh without faces"),
         ({"faces": [[0, 1, 2, 4]]}, "other faces than triangles"),
         ({"faces": [[0, 1, 5]]}, "other faces than triangles"),
@@ -382,13 +387,13 @@ def test_a_mesh_is_read_without_what_is_not_finite(tmp_path, order):
         ({"order": None}, "only binary PLY"),
         ({"axes": "xyw"}, "holds no points"),
         ({"vertices": VERTICES[:0]}, "holds no points"),
-    ],
-)
-def test_what_is_no_mesh_of_triangles_is_refused(tmp_path, changed, said):
-    given = {"vertices": VERTICES, "faces": TRIANGLES} | changed
-    path = write_ply(tmp_path / "mesh.ply", **given)
-    with pytest.raises(FormatError, match=said):
-        read_mesh(path, 10)
+    ):
+        with subtests.test(changed=changed, said=said):
+            tmp_path = tmp_path_factory.mktemp("given")
+            given = {"vertices": VERTICES, "faces": TRIANGLES} | changed
+            path = write_ply(tmp_path / "mesh.ply", **given)
+            with pytest.raises(FormatError, match=said):
+                read_mesh(path, 10)
 
 
 def test_points_that_are_cut_off_are_refused(tmp_path):
@@ -484,31 +489,30 @@ def test_cameras_that_see_all_around_are_drawn_with_a_nominal_field_of_view(tmp_
     np.testing.assert_allclose(np.tan(0.5 * scene.cameras.vertical_fov_rad), 0.5)
 
 
-@pytest.mark.parametrize(
-    ("places", "images"),
-    [
+def test_folders_of_both_layouts_are_shown_in_metres_with_the_images_that_fit(subtests, tmp_path_factory):
+    for places, images in (
         (("colmap/sparse", "sparse"), ("images",)),
         (OLD, ("images_rectified", "images")),
         (OLD, ("images",)),
         (OLD, ("project_metric/images",)),
-    ],
-)
-def test_folders_of_both_layouts_are_shown_in_metres_with_the_images_that_fit(tmp_path, places, images):
-    out = tmp_path / "out"
-    (model,) = write_result(out, [ESTIMATE], places=places)
-    for image in model.images.values():
-        for folder in images:
-            (out / folder / image.name).parent.mkdir(parents=True, exist_ok=True)
-            (out / folder / image.name).touch()
-    scene = load_scene(out)
-    assert scene.source.scale.unit == "m"
-    np.testing.assert_allclose(scene.cloud.xyz, places_in_m(model)[0], atol=1e-5)
-    assert scene.image_of(0) == out / images[0] / scene.cameras.names[0]
-    # and what is left of it when somebody keeps the project alone
-    shutil.rmtree(out / ".stages")
-    (out / "result.json").unlink()
-    scene = load_scene(out)
-    assert scene.source.scale.unit == "m" and scene.source.folder == out / places[1] / "0"
+    ):
+        with subtests.test(places=places, images=images):
+            tmp_path = tmp_path_factory.mktemp("given")
+            out = tmp_path / "out"
+            (model,) = write_result(out, [ESTIMATE], places=places)
+            for image in model.images.values():
+                for folder in images:
+                    (out / folder / image.name).parent.mkdir(parents=True, exist_ok=True)
+                    (out / folder / image.name).touch()
+            scene = load_scene(out)
+            assert scene.source.scale.unit == "m"
+            np.testing.assert_allclose(scene.cloud.xyz, places_in_m(model)[0], atol=1e-5)
+            assert scene.image_of(0) == out / images[0] / scene.cameras.names[0]
+            # and what is left of it when somebody keeps the project alone
+            shutil.rmtree(out / ".stages")
+            (out / "result.json").unlink()
+            scene = load_scene(out)
+            assert scene.source.scale.unit == "m" and scene.source.folder == out / places[1] / "0"
 
 
 def test_images_of_an_existing_project_are_found(tmp_path):
@@ -558,20 +562,24 @@ def test_a_result_without_a_model_shows_nothing(tmp_path):
         load_scene(tmp_path)
 
 
-@pytest.mark.parametrize("flags", [["--port", "70000"], ["--max-points", "0"]])
-def test_options_out_of_range_exit_2(capsys, flags):
-    with pytest.raises(SystemExit) as stopped:
-        main(["view", "out", *flags])
-    assert stopped.value.code == 2
+def test_options_out_of_range_exit_2(subtests, capsys):
+    for flags in (["--port", "70000"], ["--max-points", "0"]):
+        with subtests.test(flags=flags):
+            capsys.readouterr()
+            with pytest.raises(SystemExit) as stopped:
+                main(["view", "out", *flags])
+            assert stopped.value.code == 2
 
 
-@pytest.mark.parametrize(
-    ("error_pct", "proved", "words"),
-    [(1.0, True, "Within its"), (-3.0, False, "Outside its"), (1.0, False, "Not proved to be within its")],
-)
-def test_a_target_is_outside_its_tolerance_only_where_its_error_is(error_pct, proved, words):
-    facts = {"ci95_pct": (-5, 5), "tolerance_pct": 2.0, "distances": (), "corners": {}}
-    assert words in tolerance_html(TargetFacts(spec="x", error_pct=error_pct, within_tolerance=proved, **facts))
+def test_a_target_is_outside_its_tolerance_only_where_its_error_is(subtests):
+    for error_pct, proved, words in (
+        (1.0, True, "Within its"),
+        (-3.0, False, "Outside its"),
+        (1.0, False, "Not proved to be within its"),
+    ):
+        with subtests.test(error_pct=error_pct, proved=proved, words=words):
+            facts = {"ci95_pct": (-5, 5), "tolerance_pct": 2.0, "distances": (), "corners": {}}
+            assert words in tolerance_html(TargetFacts(spec="x", error_pct=error_pct, within_tolerance=proved, **facts))
 
 
 def test_without_viser_the_extra_is_named(monkeypatch, out, capsys):
@@ -699,20 +707,21 @@ def test_clicks_choose_the_camera_that_is_drawn_there_and_measure(out):
         viewer.close()
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_the_first_view_holds_all_that_must_be_seen_and_is_no_farther(seed):
-    rng = np.random.default_rng(seed)
-    up, side = np.array([0.0, 0.0, 1.0]), np.array([np.cos(0.4), 0.0, np.sin(0.4)])
-    places = rng.uniform(-1, 1, (30, 3)) * [3, 3, 1]
-    away = _distance(side, 2.0, up, places)
-    scene = SimpleNamespace(centre=np.zeros(3), start=away * side, up_in_world=up)
-    height = 1000.0
-    x, y = np.array([on_screen(scene, place, LIMITS.aspect * height, height) for place in places]).T
-    # of the half height, what is filled by angle
-    filled = np.tan(0.5 * LIMITS.start_fov_rad * LIMITS.filled) / np.tan(0.5 * LIMITS.start_fov_rad)
-    across = np.maximum(np.abs(2 * x / (LIMITS.aspect * height) - 1), np.abs(2 * y / height - 1))
-    assert across.max() == pytest.approx(filled, rel=1e-6)
-    assert _distance(side, 2.0, up, 1e-3 * places) == 3 and _distance(side, 2.0, up, 1e3 * places) == 12
+def test_the_first_view_holds_all_that_must_be_seen_and_is_no_farther(subtests):
+    for seed in range(4):
+        with subtests.test(seed=seed):
+            rng = np.random.default_rng(seed)
+            up, side = np.array([0.0, 0.0, 1.0]), np.array([np.cos(0.4), 0.0, np.sin(0.4)])
+            places = rng.uniform(-1, 1, (30, 3)) * [3, 3, 1]
+            away = _distance(side, 2.0, up, places)
+            scene = SimpleNamespace(centre=np.zeros(3), start=away * side, up_in_world=up)
+            height = 1000.0
+            x, y = np.array([on_screen(scene, place, LIMITS.aspect * height, height) for place in places]).T
+            # of the half height, what is filled by angle
+            filled = np.tan(0.5 * LIMITS.start_fov_rad * LIMITS.filled) / np.tan(0.5 * LIMITS.start_fov_rad)
+            across = np.maximum(np.abs(2 * x / (LIMITS.aspect * height) - 1), np.abs(2 * y / height - 1))
+            assert across.max() == pytest.approx(filled, rel=1e-6)
+            assert _distance(side, 2.0, up, 1e-3 * places) == 3 and _distance(side, 2.0, up, 1e3 * places) == 12
 
 
 def on_screen(scene, place, width, height):
