@@ -68,9 +68,8 @@ def test_a_setting_reaches_colmap_s_options():
     assert context.colmap.apply(pycolmap.PoissonMeshingOptions()).trim == 5
 
 
-@pytest.mark.parametrize(
-    ("setting", "said"),
-    [
+def test_what_colmap_does_not_have_is_refused(subtests):
+    for setting, said in (
         ("Mapper.init_num_trial=3", r"no such option; did you mean Mapper\.init_num_trials\?"),
         ("SiftExtraction.max_image_size=3", r"did you mean FeatureExtraction\.max_image_size\?"),
         ("Maper.init_num_trials=3", r"no such section; did you mean Mapper\?"),
@@ -85,13 +84,12 @@ def test_a_setting_reaches_colmap_s_options():
         ("AlikedExtraction.min_score=1", "the installed pycolmap has no AlikedExtraction"),
         ("Mapper.init_num_trials", "write SECTION.option=value"),
         ("x=1", "write SECTION.option=value"),
-    ],
-)
-def test_what_colmap_does_not_have_is_refused(setting, said):
-    if "Aliked" in setting and hasattr(pycolmap.FeatureExtractionOptions(), "aliked"):
-        pytest.skip("this pycolmap has ALIKED")
-    with pytest.raises(InertialError, match=f"^--colmap .*{said}"):
-        read_settings((setting,), None)
+    ):
+        with subtests.test(setting=setting, said=said):
+            if "Aliked" in setting and hasattr(pycolmap.FeatureExtractionOptions(), "aliked"):
+                pytest.skip("this pycolmap has ALIKED")
+            with pytest.raises(InertialError, match=f"^--colmap .*{said}"):
+                read_settings((setting,), None)
 
 
 def test_of_a_project_ini_counts_what_differs_and_a_setting_goes_before_it(tmp_path):

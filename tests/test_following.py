@@ -81,34 +81,35 @@ def test_a_rotation_is_that_of_most_rays(subtests):
             assert np.linalg.norm(so3_log(found.T @ turn)) < (2e-3 if share_wrong else 1e-9)
 
 
-@pytest.mark.parametrize("by_gyroscope", [True, False])
-def test_the_baseline_is_what_rotation_leaves_of_the_motion(by_gyroscope):
+def test_the_baseline_is_what_rotation_leaves_of_the_motion(subtests):
     """Points two metres away; a camera that turns, and one that moves by a tenth of a metre as well."""
-    rng, camera = np.random.default_rng(6), colmap_camera(PINHOLE)
-    px = np.column_stack([rng.uniform(80, 560, 150), rng.uniform(80, 400, 150)])
-    points = 2 * np.column_stack([np.asarray(camera.cam_from_img(px))[:, :2], np.ones(150)])
-    turn = so3_exp(np.array([0.03, 0.05, -0.04]))
-    known = np.stack([np.eye(3), turn.T])
-    compare = _Compare(known if by_gyroscope else np.full((2, 3, 3), np.nan), camera, 640, 480)
+    for by_gyroscope in (True, False):
+        with subtests.test(by_gyroscope=by_gyroscope):
+            rng, camera = np.random.default_rng(6), colmap_camera(PINHOLE)
+            px = np.column_stack([rng.uniform(80, 560, 150), rng.uniform(80, 400, 150)])
+            points = 2 * np.column_stack([np.asarray(camera.cam_from_img(px))[:, :2], np.ones(150)])
+            turn = so3_exp(np.array([0.03, 0.05, -0.04]))
+            known = np.stack([np.eye(3), turn.T])
+            compare = _Compare(known if by_gyroscope else np.full((2, 3, 3), np.nan), camera, 640, 480)
 
-    def followed(place, xy):
-        return _FollowedImage(place, np.arange(150), np.asarray(xy) / 640, 1.0)
+            def followed(place, xy):
+                return _FollowedImage(place, np.arange(150), np.asarray(xy) / 640, 1.0)
 
-    before = followed(0, px)
-    for step_m in (0.0, 0.1):
-        moved = (points - [step_m, 0, 0]) @ turn.T
-        seen = np.asarray(camera.img_from_cam(moved))
-        baseline, motion, overlap = compare(before, followed(1, seen))
-        assert motion == pytest.approx(np.median(np.linalg.norm(seen - px, axis=1)) / 640)
-        assert overlap == 1
-        turned = np.asarray(camera.img_from_cam(points @ turn.T))
-        if by_gyroscope or step_m == 0:
-            off = np.median(np.linalg.norm(seen - turned, axis=1)) / 640
-            assert baseline == pytest.approx(off, abs=1e-6)
-    # too few in common tell nothing but that
-    few = _FollowedImage(1, np.arange(140, 290), px / 640, 1.0)
-    baseline, motion, overlap = compare(before, few)
-    assert np.isnan(baseline) and np.isnan(motion) and overlap == pytest.approx(10 / 150)
+            before = followed(0, px)
+            for step_m in (0.0, 0.1):
+                moved = (points - [step_m, 0, 0]) @ turn.T
+                seen = np.asarray(camera.img_from_cam(moved))
+                baseline, motion, overlap = compare(before, followed(1, seen))
+                assert motion == pytest.approx(np.median(np.linalg.norm(seen - px, axis=1)) / 640)
+                assert overlap == 1
+                turned = np.asarray(camera.img_from_cam(points @ turn.T))
+                if by_gyroscope or step_m == 0:
+                    off = np.median(np.linalg.norm(seen - turned, axis=1)) / 640
+                    assert baseline == pytest.approx(off, abs=1e-6)
+            # too few in common tell nothing but that
+            few = _FollowedImage(1, np.arange(140, 290), px / 640, 1.0)
+            baseline, motion, overlap = compare(before, few)
+            assert np.isnan(baseline) and np.isnan(motion) and overlap == pytest.approx(10 / 150)
 
 
 def test_a_clock_counts_up_to_the_limit_that_its_offset_may_err_by():

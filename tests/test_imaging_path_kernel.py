@@ -265,20 +265,23 @@ def test_colours_come_back_from_luma_and_half_chroma(subtests):
             assert np.abs(shifted - light)[:, 4:-4].mean() > 2 * np.abs(one - light)[:, 4:-4].mean()
 
 
-@pytest.mark.parametrize("restore", [path_wiener, half_quadratic])
-def test_colours_are_as_near_to_the_sharp_picture_as_channels_filtered_one_by_one(restore):
-    width, height = 640, 400
-    rng = np.random.default_rng(4)
-    # patches, light and dark, of colours as mixed as those of photographs
-    tints = rng.uniform(0.1, 0.7, (height // 25, width // 25 + 1, 1)) * rng.uniform(0.6, 1.4, (height // 25, 26, 3))
-    patches = tints.repeat(25, axis=0).repeat(25, axis=1)[:height, :width]
-    length, encode = 15, lambda light: np.rint(255 * srgb_from_linear(np.clip(light, 0, 1))).astype(np.uint8)
-    kernel = np.full((1, length), 1 / length)
-    blurred = cv2.filter2D(patches, -1, kernel, borderType=cv2.BORDER_REFLECT_101)
-    blurred = encode(0.9 * blurred + 0.005 * rng.standard_normal(blurred.shape))
-    sharp = encode(0.9 * patches).astype(float)
-    path = BlurPath.straight(BlurField.uniform(width, height, (float(length), 0.0)))
-    each = np.stack([restore(np.ascontiguousarray(blurred[..., c]), path) for c in range(3)], axis=-1)
-    before, together, alone = (np.mean((p - sharp) ** 2) for p in (blurred, restore(blurred, path), each))
-    # such patches suit sparse gradients in every channel better than photographs do
-    assert together < 0.6 * before and together < (1.1 if restore is path_wiener else 1.25) * alone
+def test_colours_are_as_near_to_the_sharp_picture_as_channels_filtered_one_by_one(subtests):
+    for restore in (path_wiener, half_quadratic):
+        with subtests.test(restore=restore):
+            width, height = 640, 400
+            rng = np.random.default_rng(4)
+            # patches, light and dark, of colours as mixed as those of photographs
+            tints = rng.uniform(0.1, 0.7, (height // 25, width // 25 + 1, 1)) * rng.uniform(
+                0.6, 1.4, (height // 25, 26, 3)
+            )
+            patches = tints.repeat(25, axis=0).repeat(25, axis=1)[:height, :width]
+            length, encode = 15, lambda light: np.rint(255 * srgb_from_linear(np.clip(light, 0, 1))).astype(np.uint8)
+            kernel = np.full((1, length), 1 / length)
+            blurred = cv2.filter2D(patches, -1, kernel, borderType=cv2.BORDER_REFLECT_101)
+            blurred = encode(0.9 * blurred + 0.005 * rng.standard_normal(blurred.shape))
+            sharp = encode(0.9 * patches).astype(float)
+            path = BlurPath.straight(BlurField.uniform(width, height, (float(length), 0.0)))
+            each = np.stack([restore(np.ascontiguousarray(blurred[..., c]), path) for c in range(3)], axis=-1)
+            before, together, alone = (np.mean((p - sharp) ** 2) for p in (blurred, restore(blurred, path), each))
+            # such patches suit sparse gradients in every channel better than photographs do
+            assert together < 0.6 * before and together < (1.1 if restore is path_wiener else 1.25) * alone

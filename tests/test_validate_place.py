@@ -34,30 +34,31 @@ def seen_from(view, rotation, centre, corners, world):
     return sighting, pose
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_exact_rays_of_two_views_place_the_target_exactly(monkeypatch, seed):
+def test_exact_rays_of_two_views_place_the_target_exactly(subtests):
     """By the rays alone: the fit that follows would hide an error of the start."""
-    monkeypatch.setattr(place, "settle", lambda obs, at, **_: at)
-    monkeypatch.setattr(place, "observe", lambda *_: None)
-    rng = np.random.default_rng(seed)
-    scale, rotation, centre = 2.5, so3_exp(rng.uniform(-1, 1, 3)), rng.uniform(-1, 1, 3)
-    world = scale * TARGET.corners_m @ rotation.T + centre
-    middle = world.mean(axis=0)
-    sightings, views = [], []
-    for view in range(2):
-        turn = so3_exp(rng.uniform(-2, 2, 3))
-        # it looks at the target from some metres away, a little past its middle
-        away = turn.T @ np.array([0.1, -0.05, 2.0 + view])
-        corners = np.sort(rng.permutation(len(world))[:10])
-        sighting, pose = seen_from(view, turn, middle - away, corners, world)
-        sightings.append(sighting)
-        views.append(pose)
-    assert len(np.intersect1d(sightings[0].corner, sightings[1].corner)) >= 4
-    found = place._place_by_pair(*sightings, 0, TARGET, views)
-    assert found is not None
-    assert np.exp(found.log_scale) == pytest.approx(scale, rel=1e-9)
-    assert found.rotation.reshape(3, 3) == pytest.approx(rotation, abs=1e-9)
-    assert found.centre.reshape(3) == pytest.approx(centre, abs=1e-9)
+    for seed in range(4):
+        with subtests.test(seed=seed), pytest.MonkeyPatch.context() as monkeypatch:
+            monkeypatch.setattr(place, "settle", lambda obs, at, **_: at)
+            monkeypatch.setattr(place, "observe", lambda *_: None)
+            rng = np.random.default_rng(seed)
+            scale, rotation, centre = 2.5, so3_exp(rng.uniform(-1, 1, 3)), rng.uniform(-1, 1, 3)
+            world = scale * TARGET.corners_m @ rotation.T + centre
+            middle = world.mean(axis=0)
+            sightings, views = [], []
+            for view in range(2):
+                turn = so3_exp(rng.uniform(-2, 2, 3))
+                # it looks at the target from some metres away, a little past its middle
+                away = turn.T @ np.array([0.1, -0.05, 2.0 + view])
+                corners = np.sort(rng.permutation(len(world))[:10])
+                sighting, pose = seen_from(view, turn, middle - away, corners, world)
+                sightings.append(sighting)
+                views.append(pose)
+            assert len(np.intersect1d(sightings[0].corner, sightings[1].corner)) >= 4
+            found = place._place_by_pair(*sightings, 0, TARGET, views)
+            assert found is not None
+            assert np.exp(found.log_scale) == pytest.approx(scale, rel=1e-9)
+            assert found.rotation.reshape(3, 3) == pytest.approx(rotation, abs=1e-9)
+            assert found.centre.reshape(3) == pytest.approx(centre, abs=1e-9)
 
 
 def test_rays_that_meet_behind_the_views_place_nothing():
