@@ -146,17 +146,14 @@ def test_nothing_is_found_in_clean_recordings(
     assert diagnose(Recorded(imu=read_imu(shared_data / "euroc_v101"))).findings == ()
 
 
-@pytest.mark.parametrize(("code", "severity", "alter"), [pytest.param(*row[1:], id=row[0]) for row in IMU_ALTERATIONS])
 def test_what_is_wrong_with_an_imu_is_found(
-    clean: dict[str, Recording],
-    simulated: SimulatedRecording,
-    code: str,
-    severity: str,
-    alter: Callable[[ImuRecording], ImuRecording],
+    subtests: pytest.Subtests, clean: dict[str, Recording], simulated: SimulatedRecording
 ) -> None:
     recordings = {**{name: clean[name][1] for name in HANDHELD[::2]}, "simulated": simulated.imu}
-    missed = {name: found(diagnose(Recorded(imu=alter(imu))), code) for name, imu in recordings.items()}
-    assert set(missed.values()) == {severity}, missed
+    for wrong, code, severity, alter in IMU_ALTERATIONS:
+        with subtests.test(wrong):
+            missed = {name: found(diagnose(Recorded(imu=alter(imu))), code) for name, imu in recordings.items()}
+            assert set(missed.values()) == {severity}, missed
 
 
 # --- the camera against the inertial samples -------------------------------------------------------------------------

@@ -74,20 +74,23 @@ ALTERATIONS = {
 }
 
 
-@pytest.mark.parametrize("name", RECORDINGS)
-@pytest.mark.parametrize("said", ALTERATIONS)
 def test_every_altered_recording_is_refused_with_what_to_set(
-    recordings: dict[str, ImuRecording], name: str, said: str
+    subtests: pytest.Subtests, recordings: dict[str, ImuRecording]
 ) -> None:
-    with pytest.raises(FormatError, match=said):
-        RawImu(imu=ALTERATIONS[said](recordings[name]), path=Path("x")).check()
+    for name in RECORDINGS:
+        for said in ALTERATIONS:
+            with subtests.test(name=name, said=said), pytest.raises(FormatError, match=said):
+                RawImu(imu=ALTERATIONS[said](recordings[name]), path=Path("x")).check()
 
 
-@pytest.mark.parametrize("seconds", [60.0, 25.0, 5.0, 1.0])
-def test_no_part_of_a_clean_recording_is_refused(recordings: dict[str, ImuRecording], seconds: float) -> None:
-    for imu in recordings.values():
-        for part in pieces(imu, seconds):
-            RawImu(imu=part, path=Path("x")).check()
+def test_no_part_of_a_clean_recording_is_refused(
+    subtests: pytest.Subtests, recordings: dict[str, ImuRecording]
+) -> None:
+    for seconds in (60.0, 25.0, 5.0, 1.0):
+        with subtests.test(seconds=seconds):
+            for imu in recordings.values():
+                for part in pieces(imu, seconds):
+                    RawImu(imu=part, path=Path("x")).check()
 
 
 HANDHELD = RECORDINGS[:-1]
@@ -110,20 +113,21 @@ def settings(message: str) -> dict[str, Axes]:
     return named
 
 
-@pytest.mark.parametrize("name", HANDHELD[::2])
 def test_nearly_every_wrong_axis_of_a_gyroscope_is_noticed_and_named_rightly(
-    recordings: dict[str, ImuRecording], name: str
+    subtests: pytest.Subtests, recordings: dict[str, ImuRecording]
 ) -> None:
-    imu = recordings[name]
-    noticed = 0
-    for wrong in SIGNED_PERMUTATIONS[1:]:
-        altered = replace(imu, gyro_rad_s=imu.gyro_rad_s @ wrong.T)
-        try:
-            RawImu(imu=altered, path=Path("x")).check()
-        except FormatError as error:
-            noticed += 1
-            np.testing.assert_array_equal(settings(str(error))["gyro"].matrix @ wrong, np.eye(3))
-    assert noticed >= 45  # of 47; turns about the horizontal axis that the hand nods about look alike
+    for name in HANDHELD[::2]:
+        with subtests.test(name=name):
+            imu = recordings[name]
+            noticed = 0
+            for wrong in SIGNED_PERMUTATIONS[1:]:
+                altered = replace(imu, gyro_rad_s=imu.gyro_rad_s @ wrong.T)
+                try:
+                    RawImu(imu=altered, path=Path("x")).check()
+                except FormatError as error:
+                    noticed += 1
+                    np.testing.assert_array_equal(settings(str(error))["gyro"].matrix @ wrong, np.eye(3))
+            assert noticed >= 45  # of 47; turns about the horizontal axis that the hand nods about look alike
 
 
 def test_a_mirrored_accelerometer_is_noticed_and_named(recordings: dict[str, ImuRecording]) -> None:

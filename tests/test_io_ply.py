@@ -266,9 +266,8 @@ def small_ply(form, body, *, count="uchar", vertices=2, faces=1, end="end_header
     return header.encode() + end.encode() + body
 
 
-@pytest.mark.parametrize(
-    ("body", "words"),
-    [
+def test_each_line_of_a_text_file_has_the_values_that_it_should(subtests, tmp_path_factory):
+    for body, words in (
         ("0 0 0 1\n1 2 3 255\n3 0 1 1\n", None),
         ("0 0 0 1\n1 2 3 2.0\n0\n\n", None),
         ("0 0 0 1\n1 2 3 2\n3 0 1 1\nmore\n", "line 14: damaged: text follows the last element"),
@@ -286,17 +285,17 @@ def small_ply(form, body, *, count="uchar", vertices=2, faces=1, end="end_header
         ("0 0 0 1\n1 2 3 2\n3 0 1 2\n", "line 13: a face refers to none of the 2 vertices"),
         ("0 0 0 1\n1 2 3 2\n3 0 1 -1\n", "line 13: a face refers to none of the 2 vertices"),
         ("0 0 0 1\n1 2 3 2\n2 0 1 1\n", "line 13: 4 values where element face has 3"),
-    ],
-)
-def test_each_line_of_a_text_file_has_the_values_that_it_should(tmp_path, body, words):
-    path, out = tmp_path / "a.ply", tmp_path / "b.ply"
-    path.write_bytes(small_ply("ascii", body.encode()))
-    if words is None:
-        transform_ply(path, out, SIMILARITY)
-        assert out.read_bytes().endswith(body.partition("\n")[2].partition("\n")[2].encode())
-        return
-    with pytest.raises(FormatError, match=words):
-        transform_ply(path, out, SIMILARITY)
+    ):
+        with subtests.test(body=body, words=words):
+            tmp_path = tmp_path_factory.mktemp("given")
+            path, out = tmp_path / "a.ply", tmp_path / "b.ply"
+            path.write_bytes(small_ply("ascii", body.encode()))
+            if words is None:
+                transform_ply(path, out, SIMILARITY)
+                assert out.read_bytes().endswith(body.partition("\n")[2].partition("\n")[2].encode())
+                continue
+            with pytest.raises(FormatError, match=words):
+                transform_ply(path, out, SIMILARITY)
 
 
 def test_a_list_of_fewer_values_than_none_is_refused(tmp_path):
@@ -309,9 +308,8 @@ def test_a_list_of_fewer_values_than_none_is_refused(tmp_path):
 VERTICES = np.zeros(2, [("xyz", "<f4", 3), ("label", "u1")]).tobytes()
 
 
-@pytest.mark.parametrize(
-    ("data", "words"),
-    [
+def test_a_binary_file_has_the_bytes_that_it_should(subtests, tmp_path_factory):
+    for data, words in (
         (small_ply("binary_little_endian", VERTICES + bytes([1, 0, 0, 0, 0])), None),
         (small_ply("binary_little_endian", VERTICES, faces=0, end=""), "does not end"),
         (small_ply("binary_little_endian", VERTICES, faces=0, end="comment" + "x" * 100_000), "does not end"),
@@ -321,14 +319,14 @@ VERTICES = np.zeros(2, [("xyz", "<f4", 3), ("label", "u1")]).tobytes()
         (small_ply("binary_little_endian", VERTICES + bytes([255]), count="char"), "a list of -1 values in element"),
         (small_ply("binary_little_endian", VERTICES + bytes([1, 2, 0, 0, 0])), "none of the 2 vertices"),
         (small_ply("binary_little_endian", VERTICES + bytes([1, 0, 0, 0, 0, 7])), "1 bytes follow"),
-    ],
-)
-def test_a_binary_file_has_the_bytes_that_it_should(tmp_path, data, words):
-    path = tmp_path / "a.ply"
-    path.write_bytes(data)
-    if words is None:
-        transform_ply(path, tmp_path / "b.ply", SIMILARITY)
-        assert len((tmp_path / "b.ply").read_bytes()) == len(data)
-        return
-    with pytest.raises(FormatError, match=words):
-        transform_ply(path, tmp_path / "b.ply", SIMILARITY)
+    ):
+        with subtests.test(data=data, words=words):
+            tmp_path = tmp_path_factory.mktemp("given")
+            path = tmp_path / "a.ply"
+            path.write_bytes(data)
+            if words is None:
+                transform_ply(path, tmp_path / "b.ply", SIMILARITY)
+                assert len((tmp_path / "b.ply").read_bytes()) == len(data)
+                continue
+            with pytest.raises(FormatError, match=words):
+                transform_ply(path, tmp_path / "b.ply", SIMILARITY)

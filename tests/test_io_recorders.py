@@ -120,25 +120,31 @@ LAYOUTS = {
 }
 
 
-@pytest.mark.parametrize("name", LAYOUTS)
 def test_the_same_recording_comes_back_from_every_layout(
-    tmp_path: Path, imu: ImuRecording, one_clock: ImuRecording, name: str
+    subtests: pytest.Subtests, tmp_path_factory: pytest.TempPathFactory, imu: ImuRecording, one_clock: ImuRecording
 ) -> None:
-    layout = LAYOUTS[name]
-    truth = one_clock if layout.one_clock else imu
-    path = layout.write(tmp_path, truth)
-    accepting = [candidate.name for candidate in imu_formats() if candidate.accepts(path)]
-    assert accepting[0] == layout.format
-    read = read_imu(path)
-    assert read.repairs == ()
-    # sensors of a video count from its first frame: only their times against each other are the recording's
-    start = truth.epoch_ns if layout.absolute else read.epoch_ns + round((read.gyro_t_s[0] - truth.gyro_t_s[0]) * 1e9)
-    shift = (read.epoch_ns - start) * 1e-9
-    np.testing.assert_allclose(read.gyro_t_s + shift, truth.gyro_t_s, atol=layout.t_s, rtol=0)
-    accel = truth.accel_t_s >= (truth.gyro_t_s[0] if name == "camm" else -1.0)
-    np.testing.assert_allclose(read.accel_t_s + shift, truth.accel_t_s[accel], atol=layout.t_s, rtol=0)
-    np.testing.assert_allclose(read.gyro_rad_s, truth.gyro_rad_s, atol=layout.gyro, rtol=0)
-    np.testing.assert_allclose(read.accel_m_s2, truth.accel_m_s2[accel], atol=layout.accel, rtol=0)
+    for name in LAYOUTS:
+        with subtests.test(name=name):
+            tmp_path = tmp_path_factory.mktemp("given")
+            layout = LAYOUTS[name]
+            truth = one_clock if layout.one_clock else imu
+            path = layout.write(tmp_path, truth)
+            accepting = [candidate.name for candidate in imu_formats() if candidate.accepts(path)]
+            assert accepting[0] == layout.format
+            read = read_imu(path)
+            assert read.repairs == ()
+            # sensors of a video count from its first frame: only their times against each other are the recording's
+            start = (
+                truth.epoch_ns
+                if layout.absolute
+                else read.epoch_ns + round((read.gyro_t_s[0] - truth.gyro_t_s[0]) * 1e9)
+            )
+            shift = (read.epoch_ns - start) * 1e-9
+            np.testing.assert_allclose(read.gyro_t_s + shift, truth.gyro_t_s, atol=layout.t_s, rtol=0)
+            accel = truth.accel_t_s >= (truth.gyro_t_s[0] if name == "camm" else -1.0)
+            np.testing.assert_allclose(read.accel_t_s + shift, truth.accel_t_s[accel], atol=layout.t_s, rtol=0)
+            np.testing.assert_allclose(read.gyro_rad_s, truth.gyro_rad_s, atol=layout.gyro, rtol=0)
+            np.testing.assert_allclose(read.accel_m_s2, truth.accel_m_s2[accel], atol=layout.accel, rtol=0)
 
 
 @pytest.fixture(scope="module")

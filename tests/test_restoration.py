@@ -177,22 +177,23 @@ def test_pictures_that_do_not_go_together_are_a_mistake():
 # --- parts ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(12))
-def test_parts_cover_every_pixel_once_with_what_lies_around(seed):
-    rng = np.random.default_rng(seed)
-    height, width = (int(n) for n in rng.integers(1, 2500, 2))
-    most = int(rng.integers(400**2, 1500**2))
-    kept = np.zeros((height, width), int)
-    for row, column in _tiles.tiles(height, width, most):
-        assert row.size * column.size <= most
-        for span, size in ((row, height), (column, width)):
-            whole = -(-size // 16) * 16
-            assert span.begin % 16 == span.end % 16 == 0 and span.begin >= 0 and span.end <= whole
-            assert span.begin == 0 or span.keep_begin - span.begin >= 192
-            assert span.end == whole or span.end - span.keep_end >= 192
-        (rows, _), (columns, _) = row.kept(height), column.kept(width)
-        kept[rows, columns] += 1
-    assert (kept == 1).all()
+def test_parts_cover_every_pixel_once_with_what_lies_around(subtests):
+    for seed in range(12):
+        with subtests.test(seed=seed):
+            rng = np.random.default_rng(seed)
+            height, width = (int(n) for n in rng.integers(1, 2500, 2))
+            most = int(rng.integers(400**2, 1500**2))
+            kept = np.zeros((height, width), int)
+            for row, column in _tiles.tiles(height, width, most):
+                assert row.size * column.size <= most
+                for span, size in ((row, height), (column, width)):
+                    whole = -(-size // 16) * 16
+                    assert span.begin % 16 == span.end % 16 == 0 and span.begin >= 0 and span.end <= whole
+                    assert span.begin == 0 or span.keep_begin - span.begin >= 192
+                    assert span.end == whole or span.end - span.keep_end >= 192
+                (rows, _), (columns, _) = row.kept(height), column.kept(width)
+                kept[rows, columns] += 1
+            assert (kept == 1).all()
 
 
 @pytest.mark.parametrize("size", [(1080, 1920), (1920, 1080), (3000, 4000), (6000, 8000), (12, 150_000)])
