@@ -144,11 +144,9 @@ def _estimate_rotation(first: _Features, second: _Features) -> tuple[Array, int]
     essential, inside = cv2.findEssentialMat(
         a, b, np.eye(3), method=cv2.USAC_FAST, prob=0.999, threshold=reach, maxIters=1000
     )
-    if essential is None or essential.shape != (3, 3):
+    if essential is None or essential.shape != (3, 3) or np.count_nonzero(inside) < _LIMITS.least_matches:
         return None
     kept = inside.ravel() > 0
-    if kept.sum() < _LIMITS.least_matches:
-        return None
     a, b = a[kept], b[kept]
     turned, share = _fit_pure_rotation(a, b, _LIMITS.turned_px * first.pixel_rad)
     if share > _LIMITS.turned_share:
@@ -160,16 +158,13 @@ def _estimate_rotation(first: _Features, second: _Features) -> tuple[Array, int]
 
 
 def _match_descriptors(first: Float32Array, second: Float32Array) -> IndexArray:
-    """(M, 2) pairs of descriptors that are clearly nearest: all distances at once, in a third of cv2.BFMatcher's time.
+    """(M, 2) pairs of descriptors that are clearly nearest: all distances at once, in half the time of cv2.BFMatcher.
 
     SIFT's values are whole numbers, of which float32 holds the squares exactly.
     """
     off = np.sum(first**2, axis=1)[:, None] + np.sum(second**2, axis=1) - 2 * (first @ second.T)
-    nearest = np.argmin(off, axis=1)
-    rows = np.arange(len(first))
-    off_nearest = off[rows, nearest]
-    off[rows, nearest] = np.inf
-    clear = np.flatnonzero(off_nearest < _LIMITS.ratio**2 * np.min(off, axis=1))
+    nearest, two = np.argmin(off, axis=1), np.partition(off, 1, axis=1)[:, :2]
+    clear = np.flatnonzero(two[:, 0] < _LIMITS.ratio**2 * two[:, 1])
     return np.stack([clear, nearest[clear]], axis=1)
 
 
