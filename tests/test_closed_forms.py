@@ -11,9 +11,13 @@ from scipy.spatial.transform import Rotation
 from colmap_inertial.checks.diagnose.frames import _readout
 from colmap_inertial.checks.diagnose.imu import acceleration_rms_m_s2, scatter_of
 from colmap_inertial.checks.report import signals, still
+from colmap_inertial.checks.validate.measure import _list_remarks
 from colmap_inertial.checks.validate.overlays import _ticks
+from colmap_inertial.checks.validate.place import _choose_pairs
+from colmap_inertial.checks.validate.targets import parse_target
 from colmap_inertial.checks.validate.views import load_views
 from colmap_inertial.checks.words import digits, fixed, half_width_pct, length, length_error
+from colmap_inertial.cli.help import Option, _shorten
 from colmap_inertial.colmap import dense
 from colmap_inertial.colmap.loops import key_frames
 from colmap_inertial.colmap.sparse import require_room_for_features
@@ -29,7 +33,10 @@ from colmap_inertial.core.geometry import (
 )
 from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.core.types import CameraTrajectory, FrameTiming, ImuRecording
+from colmap_inertial.core.types.consensus import RotationConsensus
+from colmap_inertial.imaging.blur_field import check_nodes
 from colmap_inertial.imaging.gyro_camera import FrameShutter
+from colmap_inertial.imaging.multi_aperture._sampling import convert_to_codes
 from colmap_inertial.imaging.psf import _fill_nodes
 from colmap_inertial.inertial import scale
 from colmap_inertial.inertial.core.factors import lasting_group, state_group, walk_group
@@ -43,7 +50,9 @@ from colmap_inertial.io.gopro import _stabilisation
 from colmap_inertial.io.phyphox import _column
 from colmap_inertial.io.rig_frames import _find_nearest
 from colmap_inertial.io.video_match import _Candidates, _distance, _normalise
+from colmap_inertial.model.pose_covariances import _pose_information
 from colmap_inertial.model.readout import _noise_px
+from colmap_inertial.motion.align import _clock_search
 from colmap_inertial.motion.align._clock_search import Intervals, _best_rotation, _fit
 from colmap_inertial.motion.align._fit import _noise_of
 from colmap_inertial.motion.align.conventions import quick_accelerations
@@ -56,7 +65,9 @@ from colmap_inertial.reconstruction.preparation import plan
 from colmap_inertial.reconstruction.preparation.plan import _most_turned_rad
 from colmap_inertial.reconstruction.preparation.selection import _slots
 from colmap_inertial.tools.simulate import ImuOptions, RecordingOptions, simulate_recording
+from colmap_inertial.tools.simulate.motion import MotionOptions
 from colmap_inertial.tools.simulate.rests import RestOptions, _triangular, _Turn, simulate_rests
+from colmap_inertial.tools.simulate.tracks import TrackOptions, simulate_tracks
 
 
 @pytest.fixture(scope="module")
@@ -657,3 +668,99 @@ def test_the_spectrum_of_white_noise_is_its_density_up_to_half_the_rate():
     assert np.log(hz[-2] / hz[-22]) == pytest.approx(20 * np.log(100 * 8) / 120, rel=0.02)
     np.testing.assert_allclose(density[hz > 10], expected, rtol=0.15)
     assert np.mean(density[hz > 10]) == pytest.approx(expected, rel=0.02)
+
+
+def test_gains_of_dense_frames_are_those_of_what_overlaps_about_its_mean():
+    """By FFT for all offsets at once, and here by sums, one offset after the other."""
+    rng, step_s, late = np.random.default_rng(2), _clock_search._GRID_S, 13
+    rate = [0.5, -0.2, 0.3] + 0.4 * rng.standard_normal((160, 3))
+    path = SimpleNamespace(t_s=step_s * np.arange(161), rate_rad_s=np.zeros((161, 3)))
+    # trapezia between samples: the mean of neighbours is the rate of a cell
+    for i, of_cell in enumerate(rate):
+        path.rate_rad_s[i + 1] = 2 * of_cell - path.rate_rad_s[i]
+    visual = rate[late : late + 120] + [0.1, 0.2, -0.1] + 0.1 * rng.standard_normal((120, 3))
+    begin_s = step_s * np.arange(120)
+    intervals = Intervals(begin_s=begin_s, end_s=begin_s + step_s, turn_rad=visual * step_s)
+    offsets_s, gains, per_second = _clock_search._correlate(intervals, path, (-1.0, 1.0), 0.5, np.eye(3))
+    assert len(offsets_s) > 30 and offsets_s[np.argmax(gains)] == pytest.approx(-late * step_s)
+    for offset_s, gain in zip(offsets_s, gains, strict=True):
+        shift = -round(offset_s / step_s)
+        cells = np.arange(max(0, -shift), min(120, 160 - shift))
+        v, g = (x - x.mean(axis=0) for x in (visual[cells], rate[cells + shift]))
+        left = max(np.sum((v - g) ** 2), 1e-3 * np.sum(v**2))
+        assert gain == pytest.approx(0.5 * per_second * step_s * len(cells) * np.log(np.sum(v**2) / left), abs=1e-6)
+
+
+def test_codes_of_16_bit_go_over_the_square_root():
+    image = np.array([[0, 2500, 10_000]], dtype=np.uint16)
+    np.testing.assert_array_equal(convert_to_codes(np.repeat(image, 2000, axis=0)), [[0, 128, 255]] * 2000)
+    np.testing.assert_array_equal(convert_to_codes(np.array([[7]], np.uint8)), [[7]])
+
+
+def test_one_value_that_is_not_finite_is_enough_to_refuse_nodes():
+    values = np.ones((2, 3))
+    assert check_nodes("x", values, (2, 3)).dtype == np.float32
+    values[1, 2] = np.nan
+    with pytest.raises(ValueError, match="x: must be finite"):
+        check_nodes("x", values, (2, 3))
+
+
+def test_deviations_of_cameras_that_were_registered_again_are_the_later_ones():
+    def consensus(names, deviation_deg, part):
+        return RotationConsensus(
+            names=names,
+            t_s=np.arange(len(names), dtype=float),
+            judged=np.ones(len(names), dtype=bool),
+            deviation_deg=np.array(deviation_deg),
+            part=np.array(part),
+            ref_from_part_xyzw=np.array([[0.0, 0.0, 0.0, 1.0]]),
+        )
+
+    before = consensus(("a", "b", "c"), [0.5, 40.0, 90.0], [0, -1, -1])
+    after = before.updated(consensus(("b", "a"), [0.25, 0.75], [0, 0]))
+    assert after.deviations_deg == {"a": 0.75, "b": 0.25, "c": 90.0}
+    assert after.registered_again == ("b",) and [camera.name for camera in after.wrong] == ["c"]
+
+
+def test_sightings_are_paired_where_their_lines_of_sight_meet():
+    views = [SimpleNamespace(cam_from_world=np.eye(3))] * 3
+    rays = [Rotation.from_euler("y", deg, degrees=True).apply([0.0, 0.0, 1.0]) for deg in (0.0, 20.0, 40.0)]
+    sightings = [SimpleNamespace(view=i, ray=ray[None]) for i, ray in enumerate(rays)]
+    assert _choose_pairs(sightings, views, 0) == [(0, 1), (0, 2), (1, 2)]
+    assert _choose_pairs([sightings[0], sightings[0]], views, 0) == []  # of one view
+
+
+def test_few_views_are_remarked_on_below_five():
+    search = SimpleNamespace(sightings=[], searched=range(9), views=range(9), target=parse_target("aruco:4X4_50:0.1"))
+    fit = SimpleNamespace(noise=SimpleNamespace(pose_ratio=np.zeros(2)))
+    said = [_list_remarks(search, None, fit, tuple(range(count))) for count in (4, 5)]
+    assert [any("the interval is wide" in line for line in lines) for lines in said] == [True, False]
+
+
+def test_a_long_text_of_an_option_becomes_its_first_sentence():
+    long = "A length in metres. " + "More of it, which few need to know. " * 5
+    texts = ("Short. As it is", long, "x" * 200)
+    options = [
+        Option(
+            names=("a",),
+            group="",
+            field="a",
+            value="",
+            text=text,
+            default="",
+            positional=False,
+            required=False,
+            source=object,
+        )
+        for text in texts
+    ]
+    assert [option.text for option in _shorten(options)] == ["Short. As it is", "A length in metres.", "x" * 200 + "."]
+
+
+def test_a_perfect_model_s_observations_err_by_a_twentieth_of_a_pixel_at_least():
+    tracks = simulate_tracks(TrackOptions(motion=MotionOptions(duration_s=3.0), noise_px=0.0), seed=1)
+    model = tracks.reconstruction()
+    image = next(iter(model.images.values()))
+    place = {number: point.xyz for number, point in model.points3D.items()}
+    variance_px2 = _pose_information(image.camera, image, image.cam_from_world(), place)[1]
+    assert variance_px2 == pytest.approx(0.05**2)
