@@ -33,9 +33,8 @@ from pathlib import Path
 
 from mutants import PACKAGE, ROOT, Trial
 
-#: Tests of one fault that run its line: so many of the quickest, and for so long (s) those of its module.
-MOST_QUICK = 30
-MOST_S = 60.0
+#: Tests of one fault that run its line: the quickest for so long (s), and as long those of little but its module.
+MOST_S = 25.0
 LEAST_IN_A_ROOM = 12
 
 _SWAPPED = {ast.Add: "-", ast.Sub: "+", ast.Mult: "/", ast.Div: "*"}
@@ -257,7 +256,7 @@ def write_map(file: Path) -> None:
         seconds: dict[str, float] = {}
         for case in re.finditer(r'<testcase classname="([^"]*)" name="([^"]*)" time="([^"]*)"', times.read_text()):
             name = f"{case[1].replace('.', '/')}.py::{case[2].partition('[')[0]}"
-            seconds[name] = max(seconds.get(name, 0.0), float(case[3]))
+            seconds[name] = seconds.get(name, 0.0) + float(case[3])
     file.write_text(json.dumps({"lines": lines, "seconds": seconds}))
 
 
@@ -283,11 +282,13 @@ class Tests:
         contexts = lines.get(str(fault.line)) or sorted(set().union(*lines.values()))
         by_time = sorted({_function(context) for context in contexts}, key=self._time)
         by_share = sorted(by_time, key=lambda name: -self._run[name, fault.file] / self._run_by[name])
-        chosen, left_s = set(by_time[:MOST_QUICK]), MOST_S
-        for name in by_share:
-            if self._time(name) < left_s:
-                left_s -= self._time(name)
-                chosen.add(name)
+        chosen = {by_time[0]} if by_time else set()
+        for names in (by_time, by_share):
+            left_s = MOST_S
+            for name in names:
+                if self._time(name) < left_s:
+                    left_s -= self._time(name)
+                    chosen.add(name)
         return [name for name in by_time if name in chosen]
 
     def _time(self, name: str) -> float:
