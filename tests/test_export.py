@@ -754,6 +754,8 @@ def test_gltf_shows_cameras_and_points_with_y_up(known, tmp_path):
     assert mesh["mode"] == 0
     xyz = accessor(content, buffer, mesh["attributes"]["POSITION"])
     np.testing.assert_allclose(xyz, [p.xyz for _, p in sorted(known.model.points3D.items())], atol=1e-6)
+    stated = content["accessors"][mesh["attributes"]["POSITION"]]
+    np.testing.assert_allclose([stated["min"], stated["max"]], [xyz.min(axis=0), xyz.max(axis=0)])
     colours = accessor(content, buffer, mesh["attributes"]["COLOR_0"])
     np.testing.assert_array_equal(colours[:, :3], [p.color for _, p in sorted(known.model.points3D.items())])
     names = json.loads((tmp_path / "made" / "export.json").read_text())["names"]

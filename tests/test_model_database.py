@@ -13,7 +13,7 @@ import pytest
 from colmap_inertial.colmap.given_database import read_given
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.io.sqlite import BOUNDS, open_foreign
-from colmap_inertial.model.database import PlacedModel, check_records, transform_database
+from colmap_inertial.model.database import PlacedModel, check_records, copy_database, transform_database
 from colmap_inertial.model.similarities import plain_factor
 from colmap_inertial.model.submodels.matches import read_matches
 
@@ -42,6 +42,27 @@ def test_what_colmap_writes_is_whole(whole):
     check_records(whole)
     ((first, second, features),) = read_matches(whole, lambda *_: True)
     assert (first, second) == ("a.jpg", "b.jpg") and features.tolist() == [[i, i] for i in range(30)]
+
+
+def test_only_a_whole_database_is_copied(subtests, whole, tmp_path):
+    data, source, target = whole.read_bytes(), tmp_path / "a.db", tmp_path / "b.db"
+    for text, words in (
+        (data, None),
+        (b"", None),
+        (b"x" * len(data), "not an SQLite database"),
+        (data[:99], "not an SQLite database"),
+        (data[:-1], f"truncated: {len(data) - 1} bytes instead of"),
+    ):
+        with subtests.test(words):
+            source.write_bytes(text)
+            target.unlink(missing_ok=True)
+            if words is None:
+                copy_database(source, target)
+                assert target.read_bytes() == text
+            else:
+                with pytest.raises(FormatError, match=words):
+                    copy_database(source, target)
+                assert not target.exists()
 
 
 def test_records_of_another_size_are_refused_with_their_table(subtests, whole, tmp_path_factory):
