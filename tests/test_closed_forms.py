@@ -8,6 +8,7 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
+from colmap_inertial.checks.diagnose import camera
 from colmap_inertial.checks.diagnose.frames import _readout
 from colmap_inertial.checks.diagnose.imu import acceleration_rms_m_s2, scatter_of
 from colmap_inertial.checks.report import signals, still
@@ -32,7 +33,7 @@ from colmap_inertial.core.geometry import (
     quat_rotate,
 )
 from colmap_inertial.core.options import MappingOptions
-from colmap_inertial.core.types import CameraTrajectory, FrameTiming, ImuRecording
+from colmap_inertial.core.types import CameraTrajectory, FrameTiming, ImuRecording, PositionFixes
 from colmap_inertial.core.types.consensus import RotationConsensus
 from colmap_inertial.imaging.blur_field import check_nodes
 from colmap_inertial.imaging.gyro_camera import FrameShutter
@@ -42,6 +43,7 @@ from colmap_inertial.inertial import scale
 from colmap_inertial.inertial.core.factors import lasting_group, state_group, walk_group
 from colmap_inertial.inertial.core.parameters import ACCEL_GAIN, DRIFT, GYRO_GAIN, N_GLOBALS, SCALE, Estimate, Prior
 from colmap_inertial.inertial.core.priors import AccelPart
+from colmap_inertial.inertial.georeference import _convert_to_enu
 from colmap_inertial.inertial.scale._fit import _excitation_m_s2, _gain_surprise
 from colmap_inertial.inertial.scale._shape import ShapeFault
 from colmap_inertial.inertial.scale.joint import scale_of
@@ -57,6 +59,7 @@ from colmap_inertial.motion.align._clock_search import Intervals, _best_rotation
 from colmap_inertial.motion.align._fit import _noise_of
 from colmap_inertial.motion.align.conventions import quick_accelerations
 from colmap_inertial.motion.flow import FlowOptions, _measure_quick_rotation
+from colmap_inertial.motion.smooth import _trajectory
 from colmap_inertial.motion.two_view_rotation import _fit_pure_rotation
 from colmap_inertial.pipeline.run import workspace
 from colmap_inertial.pipeline.run.workspace import require_room
@@ -764,3 +767,54 @@ def test_a_perfect_model_s_observations_err_by_a_twentieth_of_a_pixel_at_least()
     place = {number: point.xyz for number, point in model.points3D.items()}
     variance_px2 = _pose_information(image.camera, image, image.cam_from_world(), place)[1]
     assert variance_px2 == pytest.approx(0.05**2)
+
+
+def test_a_camera_that_turns_in_one_second_of_half_a_minute_turned_too_little():
+    t_s = np.arange(0.0, 30.0, 0.1)
+    angle = np.where(t_s > 20.0, np.minimum(t_s - 20.0, 1.0), 0.0)
+    turning = CameraTrajectory(
+        names=tuple(map(str, range(len(t_s)))),
+        t_s=t_s,
+        cam_from_world_xyzw=Rotation.from_euler("y", angle).as_quat(),
+        cam_in_world=np.zeros((len(t_s), 3)),
+    )
+    found = {
+        sigma_rad: list(
+            camera._check_turned(turning, SimpleNamespace(calibration=SimpleNamespace(rotation_sigma_rad=sigma_rad)))
+        )
+        for sigma_rad in (0.04, 0.06)
+    }
+    assert found[0.04] == [] and [finding.code for finding in found[0.06]] == ["rotation-too-little"]
+    assert "most at 20 s" in found[0.06][0].evidence
+
+
+def test_positions_without_a_height_lie_at_the_median_of_the_others():
+    fixes = PositionFixes(
+        latitude_deg=np.array([65.0, 65.0, 65.0]),
+        longitude_deg=np.array([25.0, 25.0, 25.001]),
+        height_m=np.array([20.0, 30.0, np.nan]),
+        sigma_m=np.ones(3),
+    )
+    origin, enu, has_height = _convert_to_enu(fixes)
+    np.testing.assert_allclose(origin, [65.0, 25.0, 25.0])
+    # a thousandth of a degree of longitude at 65 degrees north
+    np.testing.assert_allclose(enu, [[0, 0, -5], [0, 0, 5], [47.2, 0, 0]], atol=0.05)
+    assert has_height.tolist() == [True, True, False]
+
+
+def test_the_correlated_error_of_positions_is_stationary():
+    frames = 6
+    model = _trajectory._Model(
+        t_s=np.linspace(0.0, 1.0, frames),
+        measured=np.zeros((frames, 3)),
+        gained=np.zeros((frames, 2, 3)),
+        silent=np.zeros(frames - 1, dtype=bool),
+        left_out=np.zeros(frames, dtype=bool),
+        jumps=np.zeros(frames - 1, dtype=bool),
+        motion_density=1.0,
+    )
+    chain = model.chain(np.log([1e-4, 4e-4, 1e-2, 1e-2]))
+    at_first = 1 / chain.initial_information[3, 3]
+    later = chain.transition[:, 3, 3] ** 2 * at_first + chain.process_cov[:, 3, 3]
+    assert at_first == pytest.approx(4e-4)
+    np.testing.assert_allclose(later, 4e-4)

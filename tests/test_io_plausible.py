@@ -12,7 +12,7 @@ import pytest
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.types import ImuRecording
 from colmap_inertial.io.imu import read_imu
-from colmap_inertial.io.plausible import RawImu, check_consistent, check_rates
+from colmap_inertial.io.plausible import RawImu, best_mirrored_reading, check_consistent, check_rates
 from colmap_inertial.io.units import Axes
 from colmap_inertial.tools.simulate.motion import MotionKind, MotionOptions
 from colmap_inertial.tools.simulate.recording import RecordingOptions, simulate_recording
@@ -198,6 +198,16 @@ def test_exchanged_accelerometer_columns_are_named_and_corrected_through_a_captu
             axes = settings(str(caught.value))["accel"]
             capture.write_text(text + f'axes = "{axes}"\nmirrored = true\n')
             np.testing.assert_array_equal(read_imu(capture).accel_m_s2, recordings["inertial_scale/D3"].accel_m_s2)
+
+
+def test_a_mirrored_gyroscope_is_told_by_gravity(recordings: dict[str, ImuRecording]) -> None:
+    right = 0
+    for name, order in product(HANDHELD, ([1, 0, 2], [2, 1, 0])):
+        imu = recordings[name]
+        reading = best_mirrored_reading(replace(imu, gyro_rad_s=imu.gyro_rad_s[:, order]))
+        assert reading is not None and np.linalg.det(reading.matrix) < 0
+        right += np.array_equal(reading.matrix, np.eye(3)[order])
+    assert right >= 0.9 * 2 * len(HANDHELD)
 
 
 def test_axes_to_set_replace_those_that_were_set(recordings: dict[str, ImuRecording]) -> None:
