@@ -775,17 +775,13 @@ def test_a_camera_that_turns_in_one_second_of_half_a_minute_turned_too_little():
     turning = CameraTrajectory(
         names=tuple(map(str, range(len(t_s)))),
         t_s=t_s,
-        cam_from_world_xyzw=Rotation.from_euler("y", angle).as_quat(),
+        cam_from_world_xyzw=Rotation.from_rotvec(angle[:, None] * [0.0, 1.0, 0.0]).as_quat(),
         cam_in_world=np.zeros((len(t_s), 3)),
     )
-    found = {
-        sigma_rad: list(
-            camera._check_turned(turning, SimpleNamespace(calibration=SimpleNamespace(rotation_sigma_rad=sigma_rad)))
-        )
-        for sigma_rad in (0.04, 0.06)
-    }
-    assert found[0.04] == [] and [finding.code for finding in found[0.06]] == ["rotation-too-little"]
-    assert "most at 20 s" in found[0.06][0].evidence
+    open_rad = {name: SimpleNamespace(rotation_sigma_rad=rad) for name, rad in (("known", 0.04), ("open", 0.06))}
+    found = {k: list(camera._check_turned(turning, SimpleNamespace(calibration=v))) for k, v in open_rad.items()}
+    assert found["known"] == [] and [finding.code for finding in found["open"]] == ["rotation-too-little"]
+    assert "most at 20 s" in found["open"][0].evidence
 
 
 def test_positions_without_a_height_lie_at_the_median_of_the_others():
@@ -794,6 +790,7 @@ def test_positions_without_a_height_lie_at_the_median_of_the_others():
         longitude_deg=np.array([25.0, 25.0, 25.001]),
         height_m=np.array([20.0, 30.0, np.nan]),
         sigma_m=np.ones(3),
+        t_ns=np.arange(3),
     )
     origin, enu, has_height = _convert_to_enu(fixes)
     np.testing.assert_allclose(origin, [65.0, 25.0, 25.0])
