@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -561,6 +562,44 @@ def test_loops_are_sought_farther_apart_than_twice_the_overlap(database, tmp_pat
     assert doubtful == {8} and record.matched == len(matched) == len(set(matched))
     assert (record.loops_compared, record.loop_candidates, record.loops_refused, record.loops_closed) == (7, 5, 3, 1)
     assert record.apart == record.unlike == 0 and record.gyroscope == "the frames turn as the gyroscope does"
+
+
+def test_rotations_and_coverage_of_two_views_are_those_of_the_scene(tmp_path):
+    """What both see has matches, or its right half; the second camera is turned to the right and moved."""
+    rng = np.random.default_rng(3)
+    turned = so3_exp(np.array([0.0, 0.3, 0.05]))  # first_from_second
+    camera = pycolmap.Camera(model="PINHOLE", width=480, height=360, params=CAMERA.params)
+    first_px = rng.uniform(0, [480, 360], (4000, 2))
+    points = np.column_stack([camera.cam_from_img(first_px), np.ones(4000)]) * rng.uniform(2, 6, (4000, 1))
+    second_px = camera.img_from_cam((points - [0.4, 0.0, 0.0]) @ turned)
+    seen = np.flatnonzero(((second_px >= 0) & (second_px < [480, 360])).all(axis=1))
+    features_px = np.concatenate([second_px[seen], rng.uniform(0, [480, 360], (2000, 2))])
+    right = first_px[seen, 0] > np.median(first_px[seen, 0])
+    for name, matched, share in (("all.db", seen, 1.0), ("half.db", seen[right], 0.5)):
+        with pycolmap.Database.open(str(tmp_path / name)) as opened:
+            identifier = opened.write_camera(camera)
+            images = [opened.write_image(pycolmap.Image(name=name, camera_id=identifier)) for name in "ab"]
+            opened.write_keypoints(images[0], first_px.astype(np.float32))
+            opened.write_keypoints(images[1], features_px.astype(np.float32))
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+            matches = np.column_stack([matched, np.searchsorted(seen, matched)]).astype(np.uint32)
+            geometry.inlier_matches = matches
+            geometry.E = np.cross(np.eye(3), turned.T @ [-0.4, 0.0, 0.0]).T @ turned.T
+            opened.write_two_view_geometry(*images, geometry)
+        views = compare(tmp_path / name, [("a", "b")])
+        np.testing.assert_allclose(views.first_from_second[0], turned, atol=1e-3)
+        assert views.covered[0] == pytest.approx(share, abs=0.1)
+
+
+def test_a_track_is_made_of_frames_next_to_each_other(monkeypatch):
+    asked = []
+    monkeypatch.setattr(pairing, "read_observations", lambda database, names, pairs, rotations: asked.append(pairs))
+    monkeypatch.setattr(pairing, "estimate_relative_track", lambda observations, count: count)
+    close = [(0, 1), (1, 2), (5, 6), (5, 7), (5, 8), (5, 20)]
+    orientations = SimpleNamespace(start_from_cam=None)
+    assert pairing._estimate_track(Path("x"), ["a"] * 30, close, orientations) == 30
+    assert asked == [[(0, 1), (1, 2), (5, 6), (5, 7)]]
 
 
 def test_matches_are_verified_counted_and_forgotten(database, tmp_path):
