@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from colmap_inertial.checks.diagnose import camera
 from colmap_inertial.checks.diagnose.frames import _readout
 from colmap_inertial.checks.diagnose.imu import acceleration_rms_m_s2, scatter_of
-from colmap_inertial.checks.report import signals, still
+from colmap_inertial.checks.report import figure_3d, signals, still, still_3d
 from colmap_inertial.checks.validate.measure import _list_remarks
 from colmap_inertial.checks.validate.overlays import _ticks
 from colmap_inertial.checks.validate.place import _choose_pairs
@@ -815,3 +815,33 @@ def test_the_correlated_error_of_positions_is_stationary():
     later = chain.transition[:, 3, 3] ** 2 * at_first + chain.process_cov[:, 3, 3]
     assert at_first == pytest.approx(4e-4)
     np.testing.assert_allclose(later, 4e-4)
+
+
+def test_a_scene_s_box_holds_nearly_all_points_and_the_whole_path():
+    xyz = np.random.default_rng(0).uniform(-1.0, 1.0, (3, 5000))
+    xyz[:, :3] = 1000.0  # a few far ones
+    low, high = figure_3d._box(xyz, np.array([[0.0, 5.0], [0.0, 0.0], [0.0, 0.0]]))
+    # with a margin of 6 % of the longest side
+    np.testing.assert_allclose(low, [-1.34, -1.34, -1.34], atol=0.04)
+    np.testing.assert_allclose(high, [5.38, 1.34, 1.34], atol=0.04)
+
+
+def test_a_still_scene_fills_its_picture_and_stays_inside():
+    corners = np.array([[x, y, z] for x in (-2.0, 3.0) for y in (0.0, 1.0) for z in (0.0, 4.0)])
+    trace = {"mode": "lines", "name": "camera path", **dict(zip("xyz", corners.T.tolist(), strict=True))}
+    view = still_3d.StillView()
+    seen, near = still_3d._Projection(view, [trace])(corners)
+    first, last = seen.min(axis=0), seen.max(axis=0)
+    margin = np.array([first, [view.width, view.height - 16] - last])
+    assert margin.min() >= view.margin - 1e-6
+    assert np.isclose(margin, view.margin, atol=2.1).all(axis=0).any()  # the length or the height is full
+    # what is nearer to the eye is larger, and what stands up goes up
+    assert np.all(seen[1::2, 1] < seen[::2, 1])
+    a, e = np.radians([view.azimuth_deg, view.elevation_deg])
+    towards = corners @ [np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)]
+    assert np.array_equal(np.argsort(near.ravel()), np.argsort(towards))
+
+
+def test_lines_of_a_still_scene_are_half_as_wide_and_a_pixel_at_least():
+    widths = [still_3d._look({"line": {"color": "red", "width": width}})["width"] for width in (1, 4)]
+    assert widths == [1.0, pytest.approx(2.2)]
