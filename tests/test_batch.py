@@ -339,13 +339,15 @@ def start_worker(address: str, scratch: Path) -> subprocess.Popen[bytes]:
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory):
     """A Dask scheduler and two workers of one thread each: (address, worker processes). The last test kills one."""
-    pytest.importorskip("distributed", reason="dask[distributed] is not installed")
+    distributed = pytest.importorskip("distributed", reason="dask[distributed] is not installed")
     root = tmp_path_factory.mktemp("cluster")
     described = root / "scheduler.json"
     running = [dask("scheduler", "--host", "127.0.0.1", "--port", 0, "--no-dashboard", "--scheduler-file", described)]
     eventually(lambda: described.is_file() and described.read_text().endswith("}"))
     address = json.loads(described.read_text())["address"]
     running += [start_worker(address, root / name) for name in ("one", "two")]
+    with distributed.Client(address) as client:
+        client.wait_for_workers(2, timeout=60)
     yield address, running[1:]
     for process in running:
         process.kill()
