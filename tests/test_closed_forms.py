@@ -22,6 +22,7 @@ from colmap_inertial.cli.help import Option, _shorten
 from colmap_inertial.colmap import dense
 from colmap_inertial.colmap.loops import key_frames
 from colmap_inertial.colmap.sparse import require_room_for_features
+from colmap_inertial.core import summary
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import FormatError, NotObservableError, OutputError
 from colmap_inertial.core.geometry import (
@@ -38,6 +39,7 @@ from colmap_inertial.core.types.consensus import RotationConsensus
 from colmap_inertial.imaging.blur_field import check_nodes
 from colmap_inertial.imaging.gyro_camera import FrameShutter
 from colmap_inertial.imaging.multi_aperture._sampling import convert_to_codes
+from colmap_inertial.imaging.multi_aperture.disparity import background
 from colmap_inertial.imaging.psf import _fill_nodes
 from colmap_inertial.inertial import scale
 from colmap_inertial.inertial.core.factors import lasting_group, state_group, walk_group
@@ -46,7 +48,7 @@ from colmap_inertial.inertial.core.priors import AccelPart
 from colmap_inertial.inertial.georeference import _convert_to_enu
 from colmap_inertial.inertial.scale._fit import _excitation_m_s2, _gain_surprise
 from colmap_inertial.inertial.scale._shape import ShapeFault
-from colmap_inertial.inertial.scale.joint import scale_of
+from colmap_inertial.inertial.scale.joint import estimate_joint, scale_of
 from colmap_inertial.io import video
 from colmap_inertial.io.gopro import _stabilisation
 from colmap_inertial.io.phyphox import _column
@@ -71,6 +73,7 @@ from colmap_inertial.tools.simulate import ImuOptions, RecordingOptions, simulat
 from colmap_inertial.tools.simulate.motion import MotionOptions
 from colmap_inertial.tools.simulate.rests import RestOptions, _triangular, _Turn, simulate_rests
 from colmap_inertial.tools.simulate.tracks import TrackOptions, simulate_tracks
+from colmap_inertial.tools.view import scene as view_scene
 
 
 @pytest.fixture(scope="module")
@@ -845,3 +848,32 @@ def test_a_still_scene_fills_its_picture_and_stays_inside():
 def test_lines_of_a_still_scene_are_half_as_wide_and_a_pixel_at_least():
     widths = [still_3d._look({"line": {"color": "red", "width": width}})["width"] for width in (1, 4)]
     assert widths == [1.0, pytest.approx(2.2)]
+
+
+def test_a_gap_of_the_path_is_a_step_of_more_than_ten_usual_ones():
+    place = np.array([0.0, 1.0, 2.0, 11.5, 12.5, 23.0, 24.0, 25.0])
+    cameras = SimpleNamespace(cam_in_world=np.outer(place, [1.0, 0.0, 0.0]))
+    pieces, stretch = view_scene._path(SimpleNamespace(trajectory=None), cameras)
+    assert stretch is None
+    assert [piece[0][0] for piece in pieces] == [0.0, 1.0, 2.0, 11.5, 23.0, 24.0]
+
+
+def test_gaps_of_disparities_are_filled_from_the_border_s_own_column_too():
+    known = np.zeros((3, 5), dtype=bool)
+    known[:, 0] = known[:, 4] = True
+    disparity_px = np.where(known, np.array([[2.0, 0, 0, 0, 5.0]]), np.nan).astype(np.float32)
+    np.testing.assert_array_equal(background(disparity_px, known), np.tile([2.0, 5.0, 5.0, 5.0, 5.0], (3, 1)))
+    known[:, 4] = False
+    np.testing.assert_array_equal(background(disparity_px, known), np.full((3, 5), 2.0))
+
+
+def test_a_camera_that_stands_in_its_model_has_no_scale(recording):
+    still = replace(recording.trajectory, cam_in_world=np.zeros_like(recording.trajectory.cam_in_world))
+    timed = CameraTimedImu.from_recording(recording.imu, recording.truth.calibration, still.epoch_ns)
+    refused = estimate_joint(still, timed)
+    assert (refused.verdict, refused.metres_per_unit) == ("refused", None)
+    assert refused.reasons == ("the camera does not move in the model: move it, do not only turn it",)
+
+
+def test_a_text_as_long_as_its_room_is_not_cut():
+    assert [summary._cut("abcdef", width) for width in (5, 6, 7)] == ["ab...", "abcdef", "abcdef"]
