@@ -70,19 +70,20 @@ def test_a_tiff_keeps_its_profile_device_date_and_exif(tmp_path):
 
 def test_a_tiff_of_the_other_order_of_bytes_keeps_its_values(tmp_path):
     text, exposure = b"A model with a long name\0", (1, 60)
-    # header, one directory of model and EXIF, the EXIF's directory with ExposureTime and ISO, in big-endian order
+    # header, one directory of model and EXIF, the EXIF's with ExposureTime, ISO and width, in big-endian order
     head = b"MM\0*" + (8).to_bytes(4, "big")
     first = (2).to_bytes(2, "big") + _entry(272, 2, len(text), 38) + _entry(34665, 4, 1, 64) + bytes(4)
-    inner = (2).to_bytes(2, "big") + _entry(33434, 5, 1, 94) + _entry(34855, 3, 1, 800 << 16) + bytes(4)
+    inner = (3).to_bytes(2, "big") + _entry(33434, 5, 1, 106) + _entry(34855, 3, 1, 800 << 16)
+    inner += _entry(40962, 4, 1, 640) + bytes(4)
     values = b"".join(n.to_bytes(4, "big") for n in exposure)
     original = head + first + text.ljust(26, b"\0") + inner + values
-    assert len(head + first) == 38 and original.index(inner) == 64 and original.index(values, 90) == 94
+    assert len(head + first) == 38 and original.index(inner) == 64 and original.index(values, 90) == 106
     (tmp_path / "a.tif").write_bytes(original)
     encode_image(tmp_path / "b.tif", picture(np.uint16), tmp_path / "a.tif")
     with Image.open(tmp_path / "b.tif") as made:
         assert made.tag_v2[272] == "A model with a long name"
         exif = made.getexif().get_ifd(34665)
-        assert float(exif[33434]) == pytest.approx(1 / 60) and exif[34855] == 800
+        assert float(exif[33434]) == pytest.approx(1 / 60) and (exif[34855], exif[40962]) == (800, 640)
 
 
 def _entry(tag, kind, count, value):
