@@ -145,9 +145,8 @@ def test_partners_have_the_same_stem_or_are_renamed(tmp_path):
         fuse_exposures_captured(tmp_path / "b", tmp_path / "out", fuser=AVERAGE, progress=silent)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "reason"),
-    [
+def test_what_is_wrong_with_the_exposures_is_said(subtests, two_pairs, tmp_path):
+    wrong = (
         ('folder = "long"', "", "the same pictures as .images."),
         ('folder = "long"', 'folder = "short"', "the same pictures as .images."),
         ('folder = "long"', 'folder = "long"\nrename = "x"', "must be two texts"),
@@ -157,12 +156,13 @@ def test_partners_have_the_same_stem_or_are_renamed(tmp_path):
         ("short_iso = 1600", "long_delay_s = 11", "must be from -10 to 10"),
         ("short_iso = 1600", "shrot_iso = 1600", 'did you mean "short_iso"'),
         ('[images]\nfolder = "short"\ntimes = "frames.csv"', 'video = "a.mp4"', r"belongs to \[images\]"),
-    ],
-)
-def test_what_is_wrong_with_the_exposures_is_said(capture, old, new, reason):
-    changed(capture, (old, new))
-    with pytest.raises(FormatError, match=reason):
-        load_capture(capture)
+    )
+    for i, (old, new, reason) in enumerate(wrong):
+        with subtests.test(new=new, reason=reason):
+            capture = shutil.copytree(two_pairs, tmp_path / str(i))
+            changed(capture, (old, new))
+            with pytest.raises(FormatError, match=reason):
+                load_capture(capture)
 
 
 def test_a_camera_has_apertures_or_exposures(tmp_path):

@@ -54,7 +54,7 @@ def test_packets_that_are_cut_off_are_named(subtests):
         ([turn(1.0), turn(2.0), pull(3.0)[:-1]], "packet 3 of type 3 of its camm track is cut off"),
         ([turn(1.0), turn(2.0) + pull(3.0)[:-4], turn(4.0)], "of type 3 of its camm track is cut off"),
     ):
-        with subtests.test(samples=samples, said=said), pytest.raises(FormatError, match=said):
+        with subtests.test(said=said), pytest.raises(FormatError, match=said):
             _packets(*opened(samples))
 
 
@@ -85,25 +85,23 @@ def test_places_are_taken_where_there_is_a_fix_on_earth(monkeypatch):
     assert found.t_ns.tolist() == [0, 20] and found.height_m.tolist() == [500, 4] and np.isnan(found.sigma_m).all()
 
 
-@pytest.mark.parametrize(
-    ("exposure_ns", "skew_ns", "exposure_s", "readout_s"),
-    [
+def test_exposures_are_those_next_to_the_frames(subtests, monkeypatch):
+    for exposure_ns, skew_ns, exposure_s, readout_s in (
         (4_000_000, 20_000_000, 0.004, 0.02),
         (0, 0, 0.0, 0.0),
         (-1, 20_000_000, None, 0.02),
         (4_000_000, 500_000_000, 0.004, None),
         (4_000_000, -1, 0.004, None),
-    ],
-)
-def test_exposures_are_those_next_to_the_frames(monkeypatch, exposure_ns, skew_ns, exposure_s, readout_s):
-    samples = [packet(1, "2i", exposure_ns + (1000 * k if exposure_ns > 0 else 0), skew_ns) for k in range(5)]
-    movie, track = opened(samples)
-    movie.frame_times_ns = lambda: np.array([1, 19, 42], dtype=np.int64)
-    monkeypatch.setattr(camm, "_open", lambda _: (movie, track))
-    log = read_camm_frames(Path("film.mp4"))
-    if exposure_s is None:
-        assert log.exposure_s is None
-    else:
-        extra = np.array([0, 2, 4]) * 1e-6 if exposure_ns > 0 else 0.0
-        assert log.exposure_s == pytest.approx(exposure_s + extra * np.ones(3), abs=1e-12)
-    assert log.readout_s == readout_s and log.in_video_time
+    ):
+        with subtests.test(exposure_ns=exposure_ns, skew_ns=skew_ns):
+            samples = [packet(1, "2i", exposure_ns + (1000 * k if exposure_ns > 0 else 0), skew_ns) for k in range(5)]
+            movie, track = opened(samples)
+            movie.frame_times_ns = lambda: np.array([1, 19, 42], dtype=np.int64)
+            monkeypatch.setattr(camm, "_open", lambda _, found=(movie, track): found)
+            log = read_camm_frames(Path("film.mp4"))
+            if exposure_s is None:
+                assert log.exposure_s is None
+            else:
+                extra = np.array([0, 2, 4]) * 1e-6 if exposure_ns > 0 else 0.0
+                assert log.exposure_s == pytest.approx(exposure_s + extra * np.ones(3), abs=1e-12)
+            assert log.readout_s == readout_s and log.in_video_time

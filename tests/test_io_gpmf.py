@@ -101,7 +101,7 @@ def test_streams_that_contradict_themselves_are_named(subtests):
             "payload 1 at byte 0: the entry b'DEVC' at byte 0 of the payload states",
         ),
     ):
-        with subtests.test(payloads=payloads, said=said), pytest.raises(FormatError, match=said):
+        with subtests.test(said=said), pytest.raises(FormatError, match=said):
             read(*payloads)
 
 

@@ -9,6 +9,7 @@ import sqlite3
 import subprocess
 import sys
 import zlib
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -468,15 +469,18 @@ DAMAGE = {
 }
 
 
-@pytest.mark.parametrize("name", DAMAGE)
-def test_a_damaged_artefact_is_named_and_nothing_is_left(project, tmp_path, name):
-    (project / name).write_bytes(DAMAGE[name]((project / name).read_bytes()))
-    before = digest(project)
-    with pytest.raises(FormatError) as caught:
-        apply_to_project(project, tmp_path / "out", SIMILARITY)
-    assert str(project / name) in str(caught.value)
-    assert [p.name for p in tmp_path.iterdir()] == ["project"]
-    assert digest(project) == before
+def test_a_damaged_artefact_is_named_and_nothing_is_left(subtests, made, tmp_path):
+    for i, (name, damaged) in enumerate(DAMAGE.items()):
+        with subtests.test(name=name):
+            folder = tmp_path / str(i)
+            project = Path(shutil.copytree(made / "project", folder / "project"))
+            (project / name).write_bytes(damaged((project / name).read_bytes()))
+            before = digest(project)
+            with pytest.raises(FormatError) as caught:
+                apply_to_project(project, folder / "out", SIMILARITY)
+            assert str(project / name) in str(caught.value)
+            assert [p.name for p in folder.iterdir()] == ["project"]
+            assert digest(project) == before
 
 
 def test_a_full_disk_is_an_error_that_says_so(project, tmp_path, monkeypatch):
@@ -662,47 +666,53 @@ FUZZED = {
 }
 
 
-@pytest.mark.parametrize("kind", FUZZED)
-def test_only_errors_of_our_own_escape_from_damaged_files(made, tmp_path, kind):
-    build, read = FUZZED[kind]
-    path = build(tmp_path, made / "project")
-    refusals(path, lambda: read(path), key=kind, count=60)
+def test_only_errors_of_our_own_escape_from_damaged_files(subtests, made, tmp_path):
+    for kind, (build, read) in FUZZED.items():
+        with subtests.test(kind=kind):
+            folder = tmp_path / kind
+            folder.mkdir()
+            path = build(folder, made / "project")
+            refusals(path, partial(read, path), key=kind, count=60)
 
 
-@pytest.mark.parametrize("name", ["cameras", "images", "points3D", "rigs", "frames"])
-def test_a_model_file_cut_anywhere_is_refused_before_colmap_reads_it(project, name):
+def test_a_model_file_cut_anywhere_is_refused_before_colmap_reads_it(subtests, made, tmp_path):
     # COLMAP's own reader takes a cut cameras.bin for whole, and counts damaged points for hours
-    path = project / "sparse" / "0" / f"{name}.bin"
-    whole = path.read_bytes()
-    check_binary_model(path.parent)
-    for n in np.random.default_rng(0).integers(0, len(whole), 60):
-        write_anew(path, whole[:n])
-        with pytest.raises(FormatError, match=name):
-            check_binary_model(path.parent)
-    path.write_bytes(whole + b"\0")
-    with pytest.raises(FormatError, match="follow the last record"):
-        check_binary_model(path.parent)
-    damaged = bytearray(whole)
-    damaged[6] = 1
-    path.write_bytes(bytes(damaged))
-    with pytest.raises(FormatError, match="claims"):
-        read_model(path.parent)
+    for name in ("cameras", "images", "points3D", "rigs", "frames"):
+        with subtests.test(name=name):
+            model = Path(shutil.copytree(made / "project" / "sparse" / "0", tmp_path / name))
+            path = model / f"{name}.bin"
+            whole = path.read_bytes()
+            check_binary_model(model)
+            for n in np.random.default_rng(0).integers(0, len(whole), 60):
+                write_anew(path, whole[:n])
+                with pytest.raises(FormatError, match=rf"{name}\.bin"):
+                    check_binary_model(model)
+            path.write_bytes(whole + b"\0")
+            with pytest.raises(FormatError, match="follow the last record"):
+                check_binary_model(model)
+            damaged = bytearray(whole)
+            damaged[6] = 1
+            path.write_bytes(bytes(damaged))
+            with pytest.raises(FormatError, match="claims"):
+                read_model(model)
 
 
-@pytest.mark.parametrize("suffix", [".bin", ".txt"])
-@pytest.mark.parametrize("name", ["cameras", "images", "points3D", "rigs", "frames"])
-def test_a_model_with_flipped_bits_is_read_or_refused_at_once(project, name, suffix):
-    path = project / "sparse" / "0" / f"{name}{suffix}"
-    whole = path.read_bytes()
-    rng = np.random.default_rng(zlib.crc32(path.name.encode()))
-    refused = 0
-    for _ in range(40):
-        damaged = bytearray(whole)
-        for at in rng.integers(0, len(whole), 2):
-            damaged[at] ^= 1 << int(rng.integers(0, 8))
-        write_anew(path, bytes(damaged))
-        try:
-            read_model(path.parent, suffix).transform(pycolmap.Sim3d())
-        except InertialError:
-            refused += 1
-    assert refused > 0
+def test_a_model_with_flipped_bits_is_read_or_refused_at_once(subtests, made, tmp_path):
+    for suffix in (".bin", ".txt"):
+        for name in ("cameras", "images", "points3D", "rigs", "frames"):
+            with subtests.test(name=name, suffix=suffix):
+                path = made / "project" / "sparse" / "0" / f"{name}{suffix}"
+                whole = path.read_bytes()
+                model = Path(shutil.copytree(path.parent, tmp_path / path.name))
+                rng = np.random.default_rng(zlib.crc32(path.name.encode()))
+                refused = 0
+                for _ in range(40):
+                    damaged = bytearray(whole)
+                    for at in rng.integers(0, len(whole), 2):
+                        damaged[at] ^= 1 << int(rng.integers(0, 8))
+                    write_anew(model / path.name, bytes(damaged))
+                    try:
+                        read_model(model, suffix).transform(pycolmap.Sim3d())
+                    except InertialError:
+                        refused += 1
+                assert refused > 0

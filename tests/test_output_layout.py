@@ -317,17 +317,21 @@ def test_a_run_killed_while_it_places_leaves_nothing_behind_for_the_next(placing
     assert not (placing.workspace.stamps / "project").exists()
 
 
-@pytest.mark.parametrize("name", [".", "../mine", "a/../../mine", "link/file.txt"])
-def test_a_record_of_what_was_placed_cannot_name_what_lies_elsewhere(workspace, tmp_path, name):
+def test_a_record_of_what_was_placed_cannot_name_what_lies_elsewhere(subtests, tmp_path):
     """An output folder may come from a stranger; what its record names is removed."""
-    mine = tmp_path / "mine"
-    mine.mkdir()
-    (mine / "file.txt").touch()
-    (workspace.root / "link").symlink_to(mine)
-    workspace.placed.write_text(json.dumps({"paths": [name]}))
-    with pytest.raises(FormatError, match=r"placed\.json"):
-        remove_placed(workspace)
-    assert (mine / "file.txt").is_file() and workspace.owner.is_file()
+    for i, name in enumerate((".", "../mine", "a/../../mine", "link/file.txt")):
+        with subtests.test(name=name):
+            folder = tmp_path / str(i)
+            mine = folder / "mine"
+            mine.mkdir(parents=True)
+            (mine / "file.txt").touch()
+            workspace = Workspace(folder / "out")
+            workspace.open(folder / "project")
+            (workspace.root / "link").symlink_to(mine)
+            workspace.placed.write_text(json.dumps({"paths": [name]}))
+            with pytest.raises(FormatError, match=r"placed\.json"):
+                remove_placed(workspace)
+            assert (mine / "file.txt").is_file() and workspace.owner.is_file()
 
 
 @pytest.mark.parametrize("place", ["", "0", "sparse"])

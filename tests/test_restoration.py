@@ -250,12 +250,11 @@ def test_threads_are_as_many_as_asked_for_or_as_may_be_used():
         ready(small.mixing(), threads=0)
 
 
-@pytest.mark.parametrize(
-    ("processors", "workers", "expected"), [(1, 1, 1), (2, 2, 1), (4, 4, 1), (8, 4, 5), (16, 4, 13), (2, 4, 1)]
-)
-def test_workers_and_the_threads_they_share_are_as_many_as_processors(monkeypatch, processors, workers, expected):
-    monkeypatch.setattr(threads, "usable_processors", lambda: processors)
-    assert threads.threads_beside(workers) == expected
+def test_workers_and_the_threads_they_share_are_as_many_as_processors(subtests, monkeypatch):
+    for processors, workers, expected in ((1, 1, 1), (2, 2, 1), (4, 4, 1), (8, 4, 5), (16, 4, 13), (2, 4, 1)):
+        with subtests.test(processors=processors, workers=workers):
+            monkeypatch.setattr(threads, "usable_processors", partial(int, processors))
+            assert threads.threads_beside(workers) == expected
 
 
 def test_a_device_that_fails_is_told_with_what_to_do(monkeypatch):

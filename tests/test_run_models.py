@@ -12,6 +12,7 @@ from test_pipeline_parts import recording_of, session_in
 
 from colmap_inertial.checks.validate import Validation, parse_target
 from colmap_inertial.checks.words import describe_joined
+from colmap_inertial.cli import terminal
 from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.core.geometry import quat_exp, quat_multiply, quat_rotate
 from colmap_inertial.core.types import (
@@ -371,6 +372,15 @@ def test_the_change_of_the_calibration_is_the_angle_between_both(whole, project,
     stored = result_as_json(result, Capture(path=tmp_path, calibration=first))["models"][0]["calibration_change"]
     assert stored["rotation_deg"] == pytest.approx(3)
     assert stored["gyro_time_offset_s"] == pytest.approx(made.scale.calibration.gyro_time_offset_s - 5)
+
+
+def test_the_time_of_a_step_is_that_of_all_models_together(whole, tmp_path):
+    _, made = whole
+    summary = {"registered_images": 20, "points": 900, "mean_reprojection_error_px": 0.5}
+    one = ModelResult(index=0, colmap_index=0, scale=made.scale, summary=summary, sparse=tmp_path / "sparse")
+    seconds = {"features": 75.0, "metric_0": 61.0, "metric_1": 120.0, "apply_0": 0.1}
+    result = ReconstructResult(workspace=Workspace(tmp_path), models=(one,), seconds=seconds)
+    assert dict(terminal._model_lines(one, result))["time"] == "features 1:15, metric 3:01"
 
 
 # --- stages by the gyroscope -----------------------------------------------------------------------------------------
