@@ -10,12 +10,12 @@ import pytest
 from far_scene import FarScene
 
 from colmap_inertial.core.errors import NotObservableError
-from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_log, quat_multiply
+from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_log, quat_multiply, so3_exp
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.types import CameraModel, Frame, FrameTiming, ImuRecording
 from colmap_inertial.imaging.gyro_camera import FrameShutter
 from colmap_inertial.motion.align import AlignOptions, align_camera_imu
-from colmap_inertial.motion.flow import FlowOptions, check_motion, find_stabilisation, measure_rotation
+from colmap_inertial.motion.flow import FlowOptions, _fit_rate, check_motion, find_stabilisation, measure_rotation
 from colmap_inertial.motion.shutter import estimate_readout
 from colmap_inertial.tools.simulate.render import colmap_camera
 
@@ -196,3 +196,16 @@ def test_gyrostab_s_axes_and_offset_are_found(shared_data):
     assert 0.004 < found.gyro_time_offset_s < 0.016
     finding = find_stabilisation(rotation, imu, offset_s=found.gyro_time_offset_s)
     assert finding.stabilised is False and finding.share == pytest.approx(1, abs=0.1)
+
+
+@pytest.mark.parametrize("readout_s", [0.0, 0.002])
+def test_a_rate_turns_each_ray_for_as_long_as_its_lines_lie_apart(readout_s):
+    rng = np.random.default_rng(5)
+    rate, pixel_rad = np.array([0.4, -1.2, 0.8]), 1e-3
+    first = np.column_stack([rng.uniform(-0.6, 0.6, (400, 2)), np.ones(400)])
+    span_s = 0.05 + readout_s * rng.uniform(-0.5, 0.5, 400)
+    second = np.einsum("nij,nj->ni", so3_exp(-rate * span_s[:, None]), first)
+    second[:40] += 0.2 * rng.standard_normal((40, 3))  # what moves by itself
+    found, sigma, count = _fit_rate(first, second, span_s, pixel_rad)
+    np.testing.assert_allclose(found, rate, atol=1e-3)
+    assert sigma < 0.01 and 355 <= count <= 370
