@@ -334,3 +334,19 @@ def test_what_nine_parameters_leave_is_the_size_of_the_noise():
         left = noise - by @ np.linalg.lstsq(by, noise, rcond=None)[0]
         found.append(_residual(SimpleNamespace(accel_residual_m_s2=left), range(14)))
     assert np.mean(found) == pytest.approx(0.02**2, rel=0.1)
+
+
+def test_a_rest_does_not_go_on_where_one_sensor_pauses():
+    truth = simulate_rests(RestOptions(), seed=3)
+    imu = truth.recording
+    rests = candidate_rests(imu)[0]
+    longest = int(np.argmax(rests.end_s - rests.begin_s))
+    middle_s = 0.5 * (rests.begin_s[longest] + rests.end_s[longest])
+    kept = {name: np.abs(getattr(imu, f"{name}_t_s") - middle_s) > 0.4 for name in ("gyro", "accel")}
+    for name, values in (("gyro", "gyro_rad_s"), ("accel", "accel_m_s2")):
+        paused = dataclasses.replace(
+            imu,
+            **{f"{name}_t_s": getattr(imu, f"{name}_t_s")[kept[name]], values: getattr(imu, values)[kept[name]]},
+        )
+        for found in candidate_rests(paused):
+            assert not np.any((found.begin_s < middle_s) & (found.end_s > middle_s)), name
