@@ -40,7 +40,7 @@ def test_an_option_is_refused_where_it_is_given(subtests):
         (lambda: ScaleOptions(max_offset_s="1"), "max_offset_s: '1' is not a number"),
         (lambda: ScaleOptions(latitude_deg=100), "from -90 to 90"),
     ):
-        with subtests.test(make=make, message=message), pytest.raises(ValueError, match=message):
+        with subtests.test(message), pytest.raises(ValueError, match=message):
             make()
 
 
@@ -50,7 +50,7 @@ def test_a_field_that_there_is_not_is_refused_with_the_nearest_one(subtests):
         (lambda: AlignOptions(min_overlp=0.3), "AlignOptions has no field 'min_overlp'; did you mean 'min_overlap'?"),
         (lambda: DeblurOptions(qqq=1), "DeblurOptions has no field 'qqq'"),
     ):
-        with subtests.test(message=message), pytest.raises(TypeError, match=re.escape(message) + "$"):
+        with subtests.test(message), pytest.raises(TypeError, match=re.escape(message) + "$"):
             make()
 
 
@@ -60,7 +60,7 @@ def test_options_of_all_rooms_are_checked(subtests):
         (lambda: DeblurOptions(threads=1.5), "threads: 1.5 is not a whole number"),
         (lambda: BatchCapture(name="a", path="b", options=ScaleOptions()), "is not a ReconstructOptions"),
     ):
-        with subtests.test(make=make, message=message):
+        with subtests.test(message):
             with pytest.raises(ValueError, match=message):
                 make()
             assert BatchCapture(name="a", path="b").path == Path("b")
@@ -114,7 +114,7 @@ def test_an_array_is_refused_where_it_is_given(subtests):
         (["a"] * 9, np.zeros((9, 3)), "gyro_t_s: is no array of numbers"),
         (np.arange(9) * 5e-3, np.full((9, 3), np.nan), "not finite"),
     ):
-        with subtests.test(t_s=t_s, rates=rates, message=message), pytest.raises(ValueError, match=message):
+        with subtests.test(message), pytest.raises(ValueError, match=message):
             ImuRecording(gyro_t_s=t_s, gyro_rad_s=rates, accel_t_s=np.arange(9) * 5e-3, accel_m_s2=np.zeros((9, 3)))
 
 

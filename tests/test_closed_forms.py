@@ -1,6 +1,7 @@
 """Small rules of several rooms, each against a closed form or a count by hand."""
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -242,23 +243,22 @@ def test_pictures_far_apart_tell_no_readout():
         _readout(SimpleNamespace(rotation=object(), aligned=None, imu=None, is_dense=False))
 
 
-@pytest.mark.parametrize(
-    ("amplitude_m_s2", "rms_m_s2"), [(0.0, 0.0), (0.4, 0.4 / np.sqrt(2))], ids=["turning in place", "shaken"]
-)
-def test_acceleration_is_what_turning_drift_bias_and_lever_arm_leave(amplitude_m_s2, rms_m_s2):
-    t_s = np.arange(0, 12, 1 / 400)
-    # turns back and forth about the upright, with a bias, and with the IMU half a metre beside that axis
-    angle, spin = 0.8 * np.cos(np.pi * t_s), -0.8 * np.pi**2 * np.cos(np.pi * t_s)
-    rate = -0.8 * np.pi * np.sin(np.pi * t_s)
-    zero, lever_m = np.zeros_like(t_s), np.array([0.5, 0.0, 0.1])
-    world_from_imu = quat_exp(np.stack([zero, zero, angle], axis=1))
-    # gravity changes ever faster, as through a gyroscope that drifts
-    world = np.stack([zero, amplitude_m_s2 * np.sin(3 * np.pi * t_s), 9.8 + 0.3 * t_s**2], axis=1)
-    off_axis = np.stack([-(rate**2) * lever_m[0], spin * lever_m[0], zero], axis=1)
-    accel = quat_rotate(quat_conjugate(world_from_imu), world) + off_axis + [0.1, -0.2, 0.3]
-    gyro = np.stack([zero, zero, rate], axis=1)
-    found = acceleration_rms_m_s2(ImuRecording(gyro_t_s=t_s, gyro_rad_s=gyro, accel_t_s=t_s, accel_m_s2=accel))
-    assert found == pytest.approx(rms_m_s2, rel=0.05, abs=0.01)
+def test_acceleration_is_what_turning_drift_bias_and_lever_arm_leave(subtests):
+    for label, amplitude_m_s2, rms_m_s2 in (("turning in place", 0.0, 0.0), ("shaken", 0.4, 0.4 / np.sqrt(2))):
+        with subtests.test(label):
+            t_s = np.arange(0, 12, 1 / 400)
+            # turns back and forth about the upright, with a bias, and with the IMU half a metre beside that axis
+            angle, spin = 0.8 * np.cos(np.pi * t_s), -0.8 * np.pi**2 * np.cos(np.pi * t_s)
+            rate = -0.8 * np.pi * np.sin(np.pi * t_s)
+            zero, lever_m = np.zeros_like(t_s), np.array([0.5, 0.0, 0.1])
+            world_from_imu = quat_exp(np.stack([zero, zero, angle], axis=1))
+            # gravity changes ever faster, as through a gyroscope that drifts
+            world = np.stack([zero, amplitude_m_s2 * np.sin(3 * np.pi * t_s), 9.8 + 0.3 * t_s**2], axis=1)
+            off_axis = np.stack([-(rate**2) * lever_m[0], spin * lever_m[0], zero], axis=1)
+            accel = quat_rotate(quat_conjugate(world_from_imu), world) + off_axis + [0.1, -0.2, 0.3]
+            gyro = np.stack([zero, zero, rate], axis=1)
+            found = acceleration_rms_m_s2(ImuRecording(gyro_t_s=t_s, gyro_rad_s=gyro, accel_t_s=t_s, accel_m_s2=accel))
+            assert found == pytest.approx(rms_m_s2, rel=0.05, abs=0.01)
 
 
 def test_errors_that_last_weigh_as_by_the_whole_covariance(subtests):
@@ -312,36 +312,34 @@ def test_gains_surprise_where_they_are_farther_off_than_chance_has_it():
     assert surprise(3.0, unknown).mean() > 3 * surprise(3.0, known).mean()
 
 
-@pytest.mark.parametrize(
-    ("fitted", "shift"),
-    [(1.0, 0.0), (0.5, 0.0), (2.0, 0.75 * 4e-3), (30.0, 4e-3)],
-    ids=["as expected", "quieter", "twice", "all of it"],
-)
-def test_a_fit_that_overstates_the_accelerometer_s_noise_is_corrected_by_its_share(fitted, shift):
-    cov = np.zeros((N_GLOBALS, N_GLOBALS))
-    cov[SCALE, SCALE] = 2e-5
-    fit = SimpleNamespace(
-        # 300 centres, of which the states take 200
-        sums={"centre_m": (90.0, 90.0), "drift_m_rts": (10.0, 10.0)}, cov=cov, freedom=1e6, gain_surprise=2.0,
-        expected_accel_m_s2_rthz=1e-3, noise=SimpleNamespace(accel_density_m_s2_rthz=fitted * 1e-3),
-        variance_parts={"accel_gain": 1e-6, "motion": 3e-6}, level_variance=0.0,
-        estimate=SimpleNamespace(metres_per_unit=0.5),
-    )  # fmt: skip
-    found = scale_of(fit, np.linspace(0, 1e4, 100), AccelPart(calibrated=True, factor=0.5), clock_rate=1e-3)
-    assert found.shift == pytest.approx(shift, rel=0.01, abs=1e-12)
-    assert found.metres_per_unit == pytest.approx(0.5 * np.exp(shift), rel=1e-4)
-    # the surprise doubles the variance of the gains, and results of the device halve their standard deviation
-    assert found.parts["accel_gain"] ** 2 == pytest.approx(0.5 * 1e-6, rel=0.02)
-    assert found.parts["motion"] ** 2 == pytest.approx(3e-6, rel=0.02)
-    assert found.parts["clocks"] == pytest.approx(2**0.5 * 1e-3)
-    assert found.sigma_log == pytest.approx(sum(part**2 for part in found.parts.values()) ** 0.5)
+def test_a_fit_that_overstates_the_accelerometer_s_noise_is_corrected_by_its_share(subtests):
+    for label, fitted, shift in (
+        ("as expected", 1.0, 0.0),
+        ("quieter", 0.5, 0.0),
+        ("twice", 2.0, 0.75 * 4e-3),
+        ("all of it", 30.0, 4e-3),
+    ):
+        with subtests.test(label):
+            cov = np.zeros((N_GLOBALS, N_GLOBALS))
+            cov[SCALE, SCALE] = 2e-5
+            fit = SimpleNamespace(
+                # 300 centres, of which the states take 200
+                sums={"centre_m": (90.0, 90.0), "drift_m_rts": (10.0, 10.0)}, cov=cov, freedom=1e6, gain_surprise=2.0,
+                expected_accel_m_s2_rthz=1e-3, noise=SimpleNamespace(accel_density_m_s2_rthz=fitted * 1e-3),
+                variance_parts={"accel_gain": 1e-6, "motion": 3e-6}, level_variance=0.0,
+                estimate=SimpleNamespace(metres_per_unit=0.5),
+            )  # fmt: skip
+            found = scale_of(fit, np.linspace(0, 1e4, 100), AccelPart(calibrated=True, factor=0.5), clock_rate=1e-3)
+            assert found.shift == pytest.approx(shift, rel=0.01, abs=1e-12)
+            assert found.metres_per_unit == pytest.approx(0.5 * np.exp(shift), rel=1e-4)
+            # the surprise doubles the variance of the gains, and results of the device halve their standard deviation
+            assert found.parts["accel_gain"] ** 2 == pytest.approx(0.5 * 1e-6, rel=0.02)
+            assert found.parts["motion"] ** 2 == pytest.approx(3e-6, rel=0.02)
+            assert found.parts["clocks"] == pytest.approx(2**0.5 * 1e-3)
+            assert found.sigma_log == pytest.approx(sum(part**2 for part in found.parts.values()) ** 0.5)
 
 
-@pytest.mark.parametrize(("sigma_without", "believed"), [(0.4, False), (0.2, True)])
-@pytest.mark.parametrize("end", [1, -1], ids=["begin", "end"])
-def test_an_end_is_left_out_where_the_scale_is_three_times_as_sure_without_it(
-    monkeypatch, sigma_without, believed, end
-):
+def test_an_end_is_left_out_where_the_scale_is_three_times_as_sure_without_it(subtests, monkeypatch):
     count, wrong = 30, 7
     names = tuple(f"{i:02}" for i in range(count))
     path = CameraTrajectory(
@@ -350,17 +348,20 @@ def test_an_end_is_left_out_where_the_scale_is_three_times_as_sure_without_it(
         cam_from_world_xyzw=np.tile([0, 0, 0, 1.0], (count, 1)),
         cam_in_world=np.zeros((count, 3)),
     )
-    misplaced = set(names[:wrong] if end == 1 else names[-wrong:])
 
-    def estimate(trajectory, timed, options):
+    def estimate_of(misplaced, sigma_without, trajectory, timed, options):
         sigma = 1.0 if misplaced & set(trajectory.names) else sigma_without
         return SimpleNamespace(cov=sigma**2 * np.eye(7), verdict="weak")
 
-    monkeypatch.setattr(scale, "_estimate", estimate)
-    whole = estimate(path, None, None)
-    best, left_out = scale._estimate_without_end(path, None, None, (whole, ()))
-    assert set(left_out) == (misplaced if believed else set())
-    assert best.cov[0, 0] == pytest.approx(sigma_without**2 if believed else 1.0)
+    for sigma_without, believed in ((0.4, False), (0.2, True)):
+        for end, misplaced in (("begin", set(names[:wrong])), ("end", set(names[-wrong:]))):
+            with subtests.test(end, sigma_without=sigma_without):
+                estimate = partial(estimate_of, misplaced, sigma_without)
+                monkeypatch.setattr(scale, "_estimate", estimate)
+                whole = estimate(path, None, None)
+                best, left_out = scale._estimate_without_end(path, None, None, (whole, ()))
+                assert set(left_out) == (misplaced if believed else set())
+                assert best.cov[0, 0] == pytest.approx(sigma_without**2 if believed else 1.0)
 
 
 def turned_intervals(rng, noise_rad, count=240):
@@ -581,17 +582,8 @@ def test_images_of_another_camera_are_the_nearest_in_time():
     assert apart_ns == pytest.approx(1e9 * away.min(axis=1), abs=3)
 
 
-@pytest.mark.parametrize(
-    ("away", "focal_px"), [(4.0, 500.0), (1.0, 500.0), (4.0, 2000.0), (0.01, 4000.0), (400.0, 10.0)]
-)
-def test_cells_of_a_surface_are_as_large_as_pixels_on_it(tmp_path, away, focal_px):
-    """The widest axis of the points and a tenth more, halved until a cell is no larger than a pixel spans there."""
-    places = np.random.default_rng(0).uniform(0, 1, (500, 3)) * [2, 8, 1] + [5, -3, 7]
-    places[:2] = [[6, -3, 7], [6, 5, 7]]
-    header = "ply\nformat binary_little_endian 1.0\nelement vertex 500\n"
-    fields = "".join(f"property float {axis}\n" for axis in "xyz")
-    path = tmp_path / "fused.ply"
-    path.write_bytes((header + fields + "end_header\n").encode() + places.astype("<f4").tobytes())
+def seen_from(away, focal_px):
+    """A model of which pictures see points from half, from all and from thrice that depth; and its pictures."""
     turn = matrix_from_quat(quat_exp(np.array([0.3, -0.5, 0.2])))
     points, images = {}, {}
     for k, depth in enumerate((0.5 * away, away, 3 * away)):
@@ -609,12 +601,26 @@ def test_cells_of_a_surface_are_as_large_as_pixels_on_it(tmp_path, away, focal_p
     model = SimpleNamespace(
         reg_image_ids=lambda: list(images), image=images.get, camera=lambda _: camera, points3D=points
     )
-    depth, trim = dense._choose_octree(path, model)
-    cells = 1.1 * 8 / (away / focal_px)
-    expected = min(max(next(n for n in range(40) if 2**n >= cells), dense._LEAST_DEPTH), dense._MOST_DEPTH)
-    assert depth == expected and trim == depth - dense._TRIM_LEVELS
-    images.clear()
-    assert dense._choose_octree(path, model)[0] == dense._MOST_DEPTH
+    return model, images
+
+
+def test_cells_of_a_surface_are_as_large_as_pixels_on_it(subtests, tmp_path):
+    """The widest axis of the points and a tenth more, halved until a cell is no larger than a pixel spans there."""
+    places = np.random.default_rng(0).uniform(0, 1, (500, 3)) * [2, 8, 1] + [5, -3, 7]
+    places[:2] = [[6, -3, 7], [6, 5, 7]]
+    header = "ply\nformat binary_little_endian 1.0\nelement vertex 500\n"
+    fields = "".join(f"property float {axis}\n" for axis in "xyz")
+    path = tmp_path / "fused.ply"
+    path.write_bytes((header + fields + "end_header\n").encode() + places.astype("<f4").tobytes())
+    for away, focal_px in ((4.0, 500.0), (1.0, 500.0), (4.0, 2000.0), (0.01, 4000.0), (400.0, 10.0)):
+        with subtests.test(away=away, focal_px=focal_px):
+            model, images = seen_from(away, focal_px)
+            depth, trim = dense._choose_octree(path, model)
+            cells = 1.1 * 8 / (away / focal_px)
+            expected = min(max(next(n for n in range(40) if 2**n >= cells), dense._LEAST_DEPTH), dense._MOST_DEPTH)
+            assert depth == expected and trim == depth - dense._TRIM_LEVELS
+            images.clear()
+            assert dense._choose_octree(path, model)[0] == dense._MOST_DEPTH
 
 
 def test_a_picture_between_two_frames_lies_at_its_share_of_the_way(subtests):

@@ -320,7 +320,7 @@ def test_a_binary_file_has_the_bytes_that_it_should(subtests, tmp_path_factory):
         (small_ply("binary_little_endian", VERTICES + bytes([1, 2, 0, 0, 0])), "none of the 2 vertices"),
         (small_ply("binary_little_endian", VERTICES + bytes([1, 0, 0, 0, 0, 7])), "1 bytes follow"),
     ):
-        with subtests.test(data=data, words=words):
+        with subtests.test(bytes=len(data), words=words):
             tmp_path = tmp_path_factory.mktemp("given")
             path = tmp_path / "a.ply"
             path.write_bytes(data)

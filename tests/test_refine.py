@@ -97,31 +97,33 @@ def test_what_derivatives_leave_out_is_a_hundredth_of_a_pixel(small):
         assert np.abs(slope(residual, start, 0, column)).max() * 1e-3 < 0.02
 
 
-@pytest.mark.parametrize("name", ["imu", "walk", "states"])
-def test_derivatives_of_the_imu_are_those_of_finite_differences(small, name):
+def test_derivatives_of_the_imu_are_those_of_finite_differences(subtests, small):
     _, problem, start, _ = small
     x = nudged(start, np.random.default_rng(1))
 
-    def rows(y):
-        return _residuals.all_rows(problem, y)[name]
+    def residual_of(name, y):
+        return _residuals.all_rows(problem, y)[name].residual
 
-    at = rows(x)
-    count = len(at.residual)
-    whole = np.zeros((*at.residual.shape, len(x.velocity_m_s), 15))
-    whole[np.arange(count), :, np.arange(count)] = at.here
-    if at.after is not None:
-        whole[np.arange(count), :, np.arange(count) + 1] = at.after
-    # a quarter of a second's readings are not linear in their bias, nor whitened alike
-    for column in range(15):
-        expected = slope(lambda y: rows(y).residual, x, 0, column)
-        found = whole[..., column].sum(axis=2)
-        assert np.abs(found - expected).max() < 5e-3 * (1 + np.abs(whole[..., column]).max())
-    if at.by_shared is not None:
-        # the delay's derivative is one over 20 ms, as vibration makes shorter ones meaningless
-        others = [column for column in range(x.columns.count) if column != x.columns.accel_delay]
-        for column in others:
-            expected = slope(lambda y: rows(y).residual, x, 1, column)
-            assert np.abs(at.by_shared[:, :, column] - expected).max() < 5e-3 * (1 + np.abs(expected).max())
+    for name in ("imu", "walk", "states"):
+        with subtests.test(name):
+            residual = functools.partial(residual_of, name)
+            at = _residuals.all_rows(problem, x)[name]
+            count = len(at.residual)
+            whole = np.zeros((*at.residual.shape, len(x.velocity_m_s), 15))
+            whole[np.arange(count), :, np.arange(count)] = at.here
+            if at.after is not None:
+                whole[np.arange(count), :, np.arange(count) + 1] = at.after
+            # a quarter of a second's readings are not linear in their bias, nor whitened alike
+            for column in range(15):
+                expected = slope(residual, x, 0, column)
+                found = whole[..., column].sum(axis=2)
+                assert np.abs(found - expected).max() < 5e-3 * (1 + np.abs(whole[..., column]).max())
+            if at.by_shared is not None:
+                # the delay's derivative is one over 20 ms, as vibration makes shorter ones meaningless
+                others = [column for column in range(x.columns.count) if column != x.columns.accel_delay]
+                for column in others:
+                    expected = slope(residual, x, 1, column)
+                    assert np.abs(at.by_shared[:, :, column] - expected).max() < 5e-3 * (1 + np.abs(expected).max())
 
 
 def dense(problem, at, by, residual):
@@ -308,24 +310,28 @@ def test_a_point_behind_all_cameras_stops_nothing(small):
     assert np.isfinite(solution.estimate.points_m).all()
 
 
-@pytest.mark.parametrize("model", ["SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"])
-def test_every_camera_model_of_colmap_is_differentiated(model):
-    params = {
-        "SIMPLE_RADIAL": (1000.0, 640.0, 480.0, -0.05),
-        "OPENCV": (1000.0, 990.0, 640.0, 480.0, -0.05, 0.01, 0.001, -0.002),
-        "OPENCV_FISHEYE": (700.0, 690.0, 640.0, 480.0, -0.01, 0.002, 0.0, 0.0),
-        "FULL_OPENCV": (1000.0, 990.0, 640.0, 480.0, -0.05, 0.01, 0.001, -0.002, 0.0, 0.01, 0.0, 0.0),
-    }[model]
-    options = walk(3.0, points_per_m=60.0, camera=replace(PINHOLE, model=model, params=params))
-    problem, start, _ = problem_of(tracks_of(options), options)
-    every = FreeCamera(model=problem.cameras[0].model, free=tuple(range(len(params))))
-    problem, x = replace(problem, cameras=(every,)), replace(start, intrinsics=np.array(params))
-    at = _residuals.project(problem, x, problem.observations)
-    by = _residuals.derivatives(problem, x, problem.observations, at, np.ones(len(at.seen)))
-    for kind, values, columns in ((0, by.by_frame, range(6)), (1, by.by_shared, range(9, 9 + len(params)))):
-        for column in columns:
-            expected = slope(lambda y: _residuals.project(problem, y, problem.observations).residual, x, kind, column)
-            assert np.abs(values[:, :, column] - expected).max() < 1e-4 * (1 + np.abs(expected).max())
+def test_every_camera_model_of_colmap_is_differentiated(subtests):
+    def residual_of(problem, y):
+        return _residuals.project(problem, y, problem.observations).residual
+
+    for model, params in (
+        ("SIMPLE_RADIAL", (1000.0, 640.0, 480.0, -0.05)),
+        ("OPENCV", (1000.0, 990.0, 640.0, 480.0, -0.05, 0.01, 0.001, -0.002)),
+        ("OPENCV_FISHEYE", (700.0, 690.0, 640.0, 480.0, -0.01, 0.002, 0.0, 0.0)),
+        ("FULL_OPENCV", (1000.0, 990.0, 640.0, 480.0, -0.05, 0.01, 0.001, -0.002, 0.0, 0.01, 0.0, 0.0)),
+    ):
+        with subtests.test(model):
+            options = walk(3.0, points_per_m=60.0, camera=replace(PINHOLE, model=model, params=params))
+            problem, start, _ = problem_of(tracks_of(options), options)
+            every = FreeCamera(model=problem.cameras[0].model, free=tuple(range(len(params))))
+            problem, x = replace(problem, cameras=(every,)), replace(start, intrinsics=np.array(params))
+            at = _residuals.project(problem, x, problem.observations)
+            by = _residuals.derivatives(problem, x, problem.observations, at, np.ones(len(at.seen)))
+            residual = functools.partial(residual_of, problem)
+            for kind, values, columns in ((0, by.by_frame, range(6)), (1, by.by_shared, range(9, 9 + len(params)))):
+                for column in columns:
+                    expected = slope(residual, x, kind, column)
+                    assert np.abs(values[:, :, column] - expected).max() < 1e-4 * (1 + np.abs(expected).max())
 
 
 def test_a_gap_of_the_gyroscope_links_nothing():

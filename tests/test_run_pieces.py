@@ -184,24 +184,26 @@ def of_capture(**changed):
 
 
 def test_a_batch_judges_a_capture_by_the_worst_that_counts(subtests):
-    for models, code, said in (
-        ([of_capture()], 0, None),
-        ([of_capture(), of_capture(sparse_metric=None, reasons=["it hardly moved"])], 0, None),
+    for i, (models, code, said) in enumerate(
         (
-            [of_capture(sparse_metric=None, reasons=["a", "b"]), of_capture(sparse_metric=None, reasons=["c"])],
-            3,
-            "a; b; c",
-        ),
-        ([of_capture(waiting="no GPU"), of_capture(within_tolerance=False, scale_error_pct=4.0)], 2, "^no GPU$"),
-        (
-            [of_capture(within_tolerance=True), of_capture(within_tolerance=False, scale_error_pct=4.056)],
-            1,
-            r"\+4.06 %",
-        ),
-        ([of_capture(within_tolerance=True), of_capture(validation_error="not seen")], 0, None),
-        ([of_capture(validation_error="not seen"), of_capture()], TargetNotFoundError.exit_code, "^not seen$"),
+            ([of_capture()], 0, None),
+            ([of_capture(), of_capture(sparse_metric=None, reasons=["it hardly moved"])], 0, None),
+            (
+                [of_capture(sparse_metric=None, reasons=["a", "b"]), of_capture(sparse_metric=None, reasons=["c"])],
+                3,
+                "a; b; c",
+            ),
+            ([of_capture(waiting="no GPU"), of_capture(within_tolerance=False, scale_error_pct=4.0)], 2, "^no GPU$"),
+            (
+                [of_capture(within_tolerance=True), of_capture(within_tolerance=False, scale_error_pct=4.056)],
+                1,
+                r"\+4.06 %",
+            ),
+            ([of_capture(within_tolerance=True), of_capture(validation_error="not seen")], 0, None),
+            ([of_capture(validation_error="not seen"), of_capture()], TargetNotFoundError.exit_code, "^not seen$"),
+        )
     ):
-        with subtests.test(models=models, code=code, said=said):
+        with subtests.test(i=i, code=code, said=said):
             found, error = _verdict(models)
             assert found == code
             assert error is None if said is None else re.search(said, error)
@@ -299,24 +301,29 @@ def test_what_was_lost_since_a_run_is_said_with_the_error(tmp_path, monkeypatch)
         raise FormatError("a.bin", "is damaged")
 
 
-@pytest.mark.parametrize(
-    ("offers", "warned"),
-    [
-        ([{}, {"resources": {"GPU": 1}}], False),
-        ([{"resources": {"GPU": 2}}], False),
-        ([{"resources": {}}, {}], True),
-        ([], True),
-    ],
-)
-@pytest.mark.parametrize("old", [False, True])
-def test_a_cluster_without_a_gpu_is_warned_of(caplog, offers, warned, old):
+def cluster_of(offers, *, old):
+    """A scheduler that tells the workers' resources; an old one those of the first only, and takes no arguments."""
+
     def scheduler_info(**asked):
         if asked and old:
             raise TypeError(asked)
         return {"workers": dict(enumerate(offers if asked or old else offers[:1]))}
 
-    warn_without_gpu(SimpleNamespace(scheduler_info=scheduler_info), "depth maps")
-    assert ("depth maps wait for one" in caplog.text) == warned
+    return SimpleNamespace(scheduler_info=scheduler_info)
+
+
+def test_a_cluster_without_a_gpu_is_warned_of(subtests, caplog):
+    for offers, warned in (
+        ([{}, {"resources": {"GPU": 1}}], False),
+        ([{"resources": {"GPU": 2}}], False),
+        ([{"resources": {}}, {}], True),
+        ([], True),
+    ):
+        for old in (False, True):
+            with subtests.test(offers=offers, old=old):
+                caplog.clear()
+                warn_without_gpu(cluster_of(offers, old=old), "depth maps")
+                assert ("depth maps wait for one" in caplog.text) == warned
 
 
 def test_a_camera_that_nobody_states_is_guessed_as_colmap_does(monkeypatch):
@@ -415,22 +422,24 @@ def taken_by(cameras, *, focal_px=(), folders=()):
 
 
 def test_cameras_take_turns_where_they_come_back_often(subtests):
-    for model, alternate in (
-        (taken_by([1] * 20), False),
-        (taken_by([1] * 10 + [2] * 10), False),
-        (taken_by([1, 2] * 10), True),
-        # there and back is no turn: two returns in twenty are a tenth
-        (taken_by([1] * 6 + [2] * 6 + [1] * 8), False),
-        (taken_by([1] * 5 + [2] * 5 + [1] * 5 + [2] * 5), False),
-        (taken_by([1] * 5 + [2] * 5 + [1] * 4 + [2] * 3 + [1] * 3), True),
-        # each image with a camera of its own: two folders, or two focal lengths more than a tenth apart
-        (taken_by(range(20)), False),
-        (taken_by(range(20), folders=["left/", "right/"] * 10), True),
-        (taken_by(range(20), focal_px=[500, 560] * 10), True),
-        (taken_by(range(20), focal_px=[500, 540] * 10), False),
-        (taken_by(range(20), focal_px=np.linspace(500, 900, 20).tolist()), False),
+    for i, (model, alternate) in enumerate(
+        (
+            (taken_by([1] * 20), False),
+            (taken_by([1] * 10 + [2] * 10), False),
+            (taken_by([1, 2] * 10), True),
+            # there and back is no turn: two returns in twenty are a tenth
+            (taken_by([1] * 6 + [2] * 6 + [1] * 8), False),
+            (taken_by([1] * 5 + [2] * 5 + [1] * 5 + [2] * 5), False),
+            (taken_by([1] * 5 + [2] * 5 + [1] * 4 + [2] * 3 + [1] * 3), True),
+            # each image with a camera of its own: two folders, or two focal lengths more than a tenth apart
+            (taken_by(range(20)), False),
+            (taken_by(range(20), folders=["left/", "right/"] * 10), True),
+            (taken_by(range(20), focal_px=[500, 560] * 10), True),
+            (taken_by(range(20), focal_px=[500, 540] * 10), False),
+            (taken_by(range(20), focal_px=np.linspace(500, 900, 20).tolist()), False),
+        )
     ):
-        with subtests.test(model=model, alternate=alternate):
+        with subtests.test(i=i, alternate=alternate):
             assert _alternate(model) == alternate
 
 

@@ -77,11 +77,15 @@ OFF = Treatments(deblur="off", rolling_shutter="off")
 CAMERA = CameraModel(model="PINHOLE", width=64, height=48, params=(60.0, 60.0, 32.0, 24.0))
 
 
+def workspace_in(folder):
+    workspace = Workspace(folder / "out")
+    workspace.open(folder / "capture.toml")
+    return workspace
+
+
 @pytest.fixture
 def workspace(tmp_path):
-    workspace = Workspace(tmp_path / "out")
-    workspace.open(tmp_path / "capture.toml")
-    return workspace
+    return workspace_in(tmp_path)
 
 
 def recording(**changes):
@@ -91,26 +95,26 @@ def recording(**changes):
 # --- what decides ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        pytest.param({"prior": calibration_prior(Declared(gyro_time_offset_s=1.0))}, id="calibration"),
-        pytest.param({"imu": replace(IMU, gyro_rad_s=2 * IMU.gyro_rad_s)}, id="gyroscope"),
-        pytest.param({"timing": replace(TIMING, readout_s=0.02)}, id="readout"),
-        pytest.param({"every": replace(TIMING, t_s=2 * TIMING.t_s)}, id="all frames"),
-        pytest.param({"max_offset_s": 0.5}, id="largest offset"),
-        pytest.param({"seed": 1}, id="seed"),
-        pytest.param({"asked": replace(OFF, pairs=True)}, id="treatment"),
-    ],
-)
-def test_all_that_decides_a_plan_makes_it_again(workspace, change):
-    def made(*, asked=OFF, seed=0, **changes):
+def test_all_that_decides_a_plan_makes_it_again(subtests, tmp_path_factory):
+    def made(workspace, *, asked=OFF, seed=0, **changes):
         context = RunContext(scratch=workspace.stamps, seed=seed)
         session = Session(workspace=workspace, runner=StepRunner(workspace), context=context)
         run_plan(session, recording(**changes), asked)
         return session.runner.worked
 
-    assert [made(), made(), made(**change), made(**change)] == [["imaging"], [], ["imaging"], []]
+    for label, change in (
+        ("calibration", {"prior": calibration_prior(Declared(gyro_time_offset_s=1.0))}),
+        ("gyroscope", {"imu": replace(IMU, gyro_rad_s=2 * IMU.gyro_rad_s)}),
+        ("readout", {"timing": replace(TIMING, readout_s=0.02)}),
+        ("all frames", {"every": replace(TIMING, t_s=2 * TIMING.t_s)}),
+        ("largest offset", {"max_offset_s": 0.5}),
+        ("seed", {"seed": 1}),
+        ("treatment", {"asked": replace(OFF, pairs=True)}),
+    ):
+        with subtests.test(label):
+            workspace = workspace_in(tmp_path_factory.mktemp("given"))
+            worked = [made(workspace), made(workspace), made(workspace, **change), made(workspace, **change)]
+            assert worked == [["imaging"], [], ["imaging"], []]
 
 
 def test_another_network_makes_the_plan_again(workspace, monkeypatch):
@@ -325,22 +329,25 @@ def test_how_often_a_database_was_opened_is_no_damage(tmp_path):
     assert [str(path) for path in fingerprint(tmp_path)[0][3:]] == before
 
 
-@pytest.mark.parametrize("name", ["colmap", "log.txt", ".stages/lock", "images/1.jpg"])
-def test_a_folder_with_a_link_in_it_is_not_gone_on_with(workspace, tmp_path, name):
-    outside = tmp_path / "outside"
-    outside.mkdir()
-    (workspace.root / name).parent.mkdir(exist_ok=True)
-    (workspace.root / name).symlink_to(outside)
-    with (
-        pytest.raises(FormatError, match=r"is a link to .*outside; links in an output folder are not followed"),
-        open_session(workspace.root, tmp_path / "capture.toml", ReconstructOptions(), pictures=()),
-    ):
-        pass
-    assert not any(outside.iterdir())
-    (workspace.root / name).unlink()
-    os.mkfifo(workspace.root / "pipe")
-    with pytest.raises(FormatError, match=r"a device, a pipe or a socket"):
-        refuse_links(workspace.root)
+def test_a_folder_with_a_link_in_it_is_not_gone_on_with(subtests, tmp_path_factory):
+    for name in ("colmap", "log.txt", ".stages/lock", "images/1.jpg"):
+        with subtests.test(name=name):
+            tmp_path = tmp_path_factory.mktemp("given")
+            workspace = workspace_in(tmp_path)
+            outside = tmp_path / "outside"
+            outside.mkdir()
+            (workspace.root / name).parent.mkdir(exist_ok=True)
+            (workspace.root / name).symlink_to(outside)
+            with (
+                pytest.raises(FormatError, match=r"is a link to .*outside; links in an output folder are not followed"),
+                open_session(workspace.root, tmp_path / "capture.toml", ReconstructOptions(), pictures=()),
+            ):
+                pass
+            assert not any(outside.iterdir())
+            (workspace.root / name).unlink()
+            os.mkfifo(workspace.root / "pipe")
+            with pytest.raises(FormatError, match=r"a device, a pipe or a socket"):
+                refuse_links(workspace.root)
 
 
 @pytest.mark.parametrize("name", ["sparse", "sparse/0/images.bin", "log.txt"])
@@ -381,14 +388,8 @@ def test_links_of_a_project_may_stay_and_the_folder_itself_may_be_one(workspace,
         refuse_links(tmp_path / "link")
 
 
-@pytest.mark.parametrize("moves", range(8))
-def test_a_replacement_that_was_killed_is_finished_by_the_next_run(workspace, moves, monkeypatch):
-    beside = Workspace(workspace.stamps / "next")
-    for root, text, own in ((workspace, "old", "gone"), (beside, "new", "come")):
-        root.stamps.mkdir(parents=True, exist_ok=True)
-        for path in (root.result, root.config, root.images, root.root / own, root.stamps / f"{own}.json"):
-            path.write_text(json.dumps(text))
-    whole = {"come", "come.json", "config.toml", "images", "result.json"}
+def stopped_at(moves):
+    """Renames files, and is interrupted after so many that are part of the next result."""
     renames, rename = itertools.count(), os.replace
 
     def interrupted(source, target):
@@ -396,16 +397,29 @@ def test_a_replacement_that_was_killed_is_finished_by_the_next_run(workspace, mo
             raise KeyboardInterrupt
         rename(source, target)
 
-    with monkeypatch.context() as patched, contextlib.suppress(KeyboardInterrupt):
-        patched.setattr(os, "replace", interrupted)
-        replace_result(workspace)
-    replace_result(workspace)
-    there = {path.name: path for path in workspace.root.rglob("*") if path.is_file()}
-    assert set(there) == whole
-    assert not (workspace.root / "gone").exists() and not beside.root.exists()
-    assert {path.read_text() for path in workspace.root.rglob("*") if path.is_file() and path.name in whole} == {
-        '"new"'
-    }
+    return interrupted
+
+
+def test_a_replacement_that_was_killed_is_finished_by_the_next_run(subtests, tmp_path_factory):
+    whole = {"come", "come.json", "config.toml", "images", "result.json"}
+    for moves in range(8):
+        with subtests.test(moves=moves):
+            workspace = workspace_in(tmp_path_factory.mktemp("given"))
+            beside = Workspace(workspace.stamps / "next")
+            for root, text, own in ((workspace, "old", "gone"), (beside, "new", "come")):
+                root.stamps.mkdir(parents=True, exist_ok=True)
+                for path in (root.result, root.config, root.images, root.root / own, root.stamps / f"{own}.json"):
+                    path.write_text(json.dumps(text))
+            with pytest.MonkeyPatch.context() as patched, contextlib.suppress(KeyboardInterrupt):
+                patched.setattr(os, "replace", stopped_at(moves))
+                replace_result(workspace)
+            replace_result(workspace)
+            there = {path.name: path for path in workspace.root.rglob("*") if path.is_file()}
+            assert set(there) == whole
+            assert not (workspace.root / "gone").exists() and not beside.root.exists()
+            assert {
+                path.read_text() for path in workspace.root.rglob("*") if path.is_file() and path.name in whole
+            } == {'"new"'}
 
 
 def test_what_says_whose_folder_it_is_was_damaged(workspace, tmp_path):
@@ -739,35 +753,38 @@ def test_the_longest_exposure_tells_whether_anything_may_be_blurred(tmp_path, mo
     assert "looked at" in note([0.001] * 5 + [0.05])
 
 
-@pytest.mark.parametrize(
-    ("offset_sigma_s", "turned_at_s", "looked_at"),
-    [(0.001, 0.95, False), (0.1, 0.95, True), (0.001, 1.005, True), (0.001, 1.03, True), (None, 0.95, True)],
-    ids=["between frames", "clocks are not known so well", "while exposed", "while read out", "clocks are not known"],
-)
-def test_a_quick_turn_counts_where_a_frame_may_have_been_taken(
-    tmp_path, monkeypatch, offset_sigma_s, turned_at_s, looked_at
-):
+def test_a_quick_turn_counts_where_a_frame_may_have_been_taken(subtests, tmp_path_factory, monkeypatch):
     def none(recording, context):
         raise NotObservableError("the pixels' motion", "looked at")
 
     monkeypatch.setattr(imaging, "estimate_preliminary_calibration", none)
-    t_s = np.arange(-1.0, 8.0, 0.005)
-    rate = np.zeros((len(t_s), 3))
-    rate[np.abs(t_s - turned_at_s) < 0.006] = [0, 9.0, 0]
-    # stamps that are 300 s off, in another epoch
-    imu = replace(
-        IMU, gyro_t_s=t_s + 2 - 300.0, gyro_rad_s=rate, accel_t_s=t_s, accel_m_s2=np.ones((len(t_s), 3)),
-        epoch_ns=TIMING.epoch_ns - 2_000_000_000,
-    )  # fmt: skip
-    known = calibration_prior(Declared(gyro_time_offset_s=300.0) if offset_sigma_s else None)
-    cov = np.array(known.cov)
-    at = CALIBRATION_PARAMETERS.index("gyro_time_offset_s")
-    if offset_sigma_s:
-        cov[at, at] = offset_sigma_s**2
-    timing = replace(TIMING, t_s=np.arange(6.0), exposure_s=np.full(6, 0.01), readout_s=None)
-    filmed = Recording.of(replace(recording().capture, camera=CAMERA), imu, timing, replace(known, cov=cov))
-    note = plan_imaging(filmed, RunContext(scratch=tmp_path), replace(OFF, deblur=None)).deblur_note
-    assert ("looked at" in note) == looked_at and ("no frame has more than" in note) != looked_at
+    for label, offset_sigma_s, turned_at_s, looked_at in (
+        ("between frames", 0.001, 0.95, False),
+        ("clocks are not known so well", 0.1, 0.95, True),
+        ("while exposed", 0.001, 1.005, True),
+        ("while read out", 0.001, 1.03, True),
+        ("clocks are not known", None, 0.95, True),
+    ):
+        with subtests.test(label):
+            t_s = np.arange(-1.0, 8.0, 0.005)
+            rate = np.zeros((len(t_s), 3))
+            rate[np.abs(t_s - turned_at_s) < 0.006] = [0, 9.0, 0]
+            # stamps that are 300 s off, in another epoch
+            imu = replace(
+                IMU, gyro_t_s=t_s + 2 - 300.0, gyro_rad_s=rate, accel_t_s=t_s, accel_m_s2=np.ones((len(t_s), 3)),
+                epoch_ns=TIMING.epoch_ns - 2_000_000_000,
+            )  # fmt: skip
+            known = calibration_prior(Declared(gyro_time_offset_s=300.0) if offset_sigma_s else None)
+            cov = np.array(known.cov)
+            at = CALIBRATION_PARAMETERS.index("gyro_time_offset_s")
+            if offset_sigma_s:
+                cov[at, at] = offset_sigma_s**2
+            timing = replace(TIMING, t_s=np.arange(6.0), exposure_s=np.full(6, 0.01), readout_s=None)
+            filmed = Recording.of(replace(recording().capture, camera=CAMERA), imu, timing, replace(known, cov=cov))
+            note = plan_imaging(
+                filmed, RunContext(scratch=tmp_path_factory.mktemp("given")), replace(OFF, deblur=None)
+            ).deblur_note
+            assert ("looked at" in note) == looked_at and ("no frame has more than" in note) != looked_at
 
 
 @pytest.mark.parametrize("exposure_s", [None, TIMING.exposure_s], ids=["unknown", "known"])
@@ -890,21 +907,25 @@ def test_the_largest_of_the_small_models_goes_first(tmp_path, monkeypatch):
 # --- an existing project ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("turns", range(4))
-def test_the_readout_turns_with_the_pictures(tmp_path, monkeypatch, turns):
+def test_the_readout_turns_with_the_pictures(subtests, tmp_path_factory, monkeypatch):
     """Pictures of a video whose rows are read downwards, turned counterclockwise so many times."""
     stamps_ns = np.arange(4) * 10**8
     every = FrameTiming(names=tuple("abcd"), t_s=stamps_ns / 1e9, readout_s=0.02)
-    match = VideoMatch(t_ns={f"{i}.png": int(t) for i, t in enumerate(stamps_ns)}, doubtful={}, quarter_turns=turns)
     monkeypatch.setattr(existing, "video_stamps_ns", lambda video: stamps_ns)
     monkeypatch.setattr(existing, "read_frame_timing", lambda capture: every)
-    monkeypatch.setattr(existing, "match_to_video", lambda *args, **more: match)
-    capture = recording().capture
-    timing, _ = existing._video_times(capture, tmp_path / "a.mp4", tmp_path, list(match.t_ns), silent)
-    read_at = np.rot90(np.repeat(np.arange(5.0)[:, None], 5, axis=1), turns)
-    down, right = read_at[-1, 2] - read_at[0, 2], read_at[2, -1] - read_at[2, 0]
-    expected = {(4, 0): "down", (-4, 0): "up", (0, 4): "right", (0, -4): "left"}[int(down), int(right)]
-    assert timing.readout_direction == expected
+    for turns in range(4):
+        with subtests.test(turns=turns):
+            tmp_path = tmp_path_factory.mktemp("given")
+            match = VideoMatch(
+                t_ns={f"{i}.png": int(t) for i, t in enumerate(stamps_ns)}, doubtful={}, quarter_turns=turns
+            )
+            monkeypatch.setattr(existing, "match_to_video", lambda *args, match=match, **more: match)
+            capture = recording().capture
+            timing, _ = existing._video_times(capture, tmp_path / "a.mp4", tmp_path, list(match.t_ns), silent)
+            read_at = np.rot90(np.repeat(np.arange(5.0)[:, None], 5, axis=1), turns)
+            down, right = read_at[-1, 2] - read_at[0, 2], read_at[2, -1] - read_at[2, 0]
+            expected = {(4, 0): "down", (-4, 0): "up", (0, 4): "right", (0, -4): "left"}[int(down), int(right)]
+            assert timing.readout_direction == expected
 
 
 def test_another_scale_makes_the_project_again(workspace, tmp_path, monkeypatch):

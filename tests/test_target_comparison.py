@@ -177,18 +177,20 @@ def test_the_command_writes_and_remembers_what_results_show(tmp_path, monkeypatc
 
 
 def test_a_result_that_shows_nothing_is_refused_by_name(subtests, tmp_path_factory):
-    for content, said in (
-        (result(validation={"scale_error_pct": None}), "no scale with a measured target"),
-        (result(verdict="refused"), "no scale with a measured target"),
-        (result(imu_calibration={"attitudes": 12}), "calibration of the IMU went into its scale"),
-        (result(validation={"doubts": ["too few"]}), "its target may not be the stated one: too few"),
-        (earlier(), "its target may not be the stated one: two images only"),
-        (result(validation={"target": "checkerboard:8x6:0.04"}), r"is not stated; measure it, and add \+-"),
-        (result(parts=None), "not that of the joint method"),
-        ({"capture": "x"}, "is no result"),
-        (result(capture="b"), "as another of these results"),
+    for i, (content, said) in enumerate(
+        (
+            (result(validation={"scale_error_pct": None}), "no scale with a measured target"),
+            (result(verdict="refused"), "no scale with a measured target"),
+            (result(imu_calibration={"attitudes": 12}), "calibration of the IMU went into its scale"),
+            (result(validation={"doubts": ["too few"]}), "its target may not be the stated one: too few"),
+            (earlier(), "its target may not be the stated one: two images only"),
+            (result(validation={"target": "checkerboard:8x6:0.04"}), r"is not stated; measure it, and add \+-"),
+            (result(parts=None), "not that of the joint method"),
+            ({"capture": "x"}, "is no result"),
+            (result(capture="b"), "as another of these results"),
+        )
     ):
-        with subtests.test(content=content, said=said):
+        with subtests.test(i=i, said=said):
             tmp_path = tmp_path_factory.mktemp("given")
             sound = write_result(tmp_path / "sound", result(capture="b"))
             with pytest.raises(FormatError, match=said) as caught:
