@@ -290,6 +290,17 @@ def test_a_recording_of_less_than_half_is_refused():
             problem_of(short, options)
 
 
+def test_a_model_of_which_no_two_images_see_the_same_point_is_refused():
+    options = walk(6.0, points_per_m=20.0)
+    tracks = tracks_of(options)
+    model = tracks.reconstruction()
+    for number in list(model.points3D):
+        model.delete_point3D(number)
+    seen = setup.read_seen(model, tracks.timing)
+    with pytest.raises(NotObservableError, match="no two of its images see the same point"):
+        setup.make_problem(seen, tracks.timing, tracks.imu, known_of(tracks, options), seen.observations.xy_px)
+
+
 def test_points_behind_the_camera_are_no_gain(small):
     _, problem, start, _ = small
     behind = replace(start, points_m=start.points_m - 100.0)
