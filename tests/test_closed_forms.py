@@ -47,13 +47,16 @@ from colmap_inertial.inertial.core.factors import lasting_group, state_group, wa
 from colmap_inertial.inertial.core.parameters import ACCEL_GAIN, DRIFT, GYRO_GAIN, N_GLOBALS, SCALE, Estimate, Prior
 from colmap_inertial.inertial.core.priors import AccelPart
 from colmap_inertial.inertial.georeference import _convert_to_enu
+from colmap_inertial.inertial.scale import _shape
 from colmap_inertial.inertial.scale._fit import _excitation_m_s2, _gain_surprise
 from colmap_inertial.inertial.scale._shape import ShapeFault
 from colmap_inertial.inertial.scale.joint import estimate_joint, scale_of
 from colmap_inertial.io import video
+from colmap_inertial.io.android import is_opencamera
 from colmap_inertial.io.gopro import _stabilisation
 from colmap_inertial.io.phyphox import _column
 from colmap_inertial.io.rig_frames import _find_nearest
+from colmap_inertial.io.sensor_yaml import CAMERA_MODELS
 from colmap_inertial.io.video_match import _Candidates, _distance, _normalise
 from colmap_inertial.model.pose_covariances import _pose_information
 from colmap_inertial.model.readout import _noise_px
@@ -883,3 +886,25 @@ def test_a_camera_that_stands_in_its_model_has_no_scale(recording):
 
 def test_a_text_as_long_as_its_room_is_not_cut():
     assert [summary._cut("abcdef", width) for width in (5, 6, 7)] == ["ab...", "abcdef", "abcdef"]
+
+
+def test_strains_are_orthonormal_without_trace():
+    np.testing.assert_allclose(np.einsum("aij,bij->ab", _shape._STRAINS, _shape._STRAINS), np.eye(5), atol=1e-12)
+    np.testing.assert_allclose(np.trace(_shape._STRAINS, axis1=1, axis2=2), 0.0, atol=1e-12)
+    np.testing.assert_array_equal(_shape._STRAINS, np.swapaxes(_shape._STRAINS, 1, 2))
+
+
+def test_camera_models_are_colmap_s(subtests):
+    for number, (name, (count, principal)) in enumerate(CAMERA_MODELS.items()):
+        with subtests.test(name):
+            camera = pycolmap.Camera.create_from_model_name(1, name, 500.0, 640, 480)
+            assert int(camera.model) == number
+            assert len(camera.params) == count
+            assert camera.principal_point_idxs()[0] == principal
+
+
+def test_a_folder_is_opencamera_s_where_each_gyroscope_s_file_has_bare_rows(tmp_path):
+    (tmp_path / "a_gyro.csv").write_text("0.1,0.2,0.3,123\n")
+    assert is_opencamera(tmp_path)
+    (tmp_path / "b_gyro.csv").write_text("t,x,y,z\n1,2,3,4\n")
+    assert not is_opencamera(tmp_path)
