@@ -132,7 +132,7 @@ def drawn(browser, pages, kind, width, *, dark=False) -> Visit:
 # Loading a page takes seconds: tests of one that stands on the screen follow each other.
 
 
-@pytest.mark.parametrize(("kind", "width"), [("both refused", "phone"), ("full", "phone"), ("full", "desktop")])
+@pytest.mark.parametrize(("kind", "width"), [("both refused", "phone"), ("full", "desktop")])
 def test_every_plot_is_drawn_without_errors_or_requests(browser, pages, kind, width):
     drawn(browser, pages, kind, width)
 

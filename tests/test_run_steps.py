@@ -402,7 +402,7 @@ def stopped_at(moves):
 
 def test_a_replacement_that_was_killed_is_finished_by_the_next_run(subtests, tmp_path_factory):
     whole = {"come", "come.json", "config.toml", "images", "result.json"}
-    for moves in range(8):
+    for moves in range(6):
         with subtests.test(moves=moves):
             workspace = workspace_in(tmp_path_factory.mktemp("given"))
             beside = Workspace(workspace.stamps / "next")
