@@ -186,6 +186,7 @@ def test_a_recording_is_corrected_once_by_the_file_or_by_the_capture(both, tmp_p
         capture.calibration.cov[0, 0] + askew[0, 1] ** 2 + askew[0, 2] ** 2 + askew[1, 2] ** 2
     )
     np.testing.assert_array_equal(prior.cov[3:], capture.calibration.cov[3:])
+    np.testing.assert_allclose(prior_calibration(capture, None).cov, prior.cov)
     assert prior_calibration(dataclasses.replace(capture, imu_calibration=None), None) is capture.calibration
 
 

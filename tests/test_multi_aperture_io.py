@@ -56,6 +56,17 @@ def test_kalibr_s_camchain_is_read(tmp_path):
     assert np.allclose(camera.cam_from_rig[:3, 3], SHIFT)
 
 
+def test_each_camera_of_kalibr_s_chain_hangs_on_the_one_before_it(tmp_path):
+    chain = json.loads(kalibr_text())
+    further = np.eye(4)
+    further[:3, :3], further[:3, 3] = so3_exp(np.array([0.1, -0.2, 0.05])), [0.03, 0.0, 0.01]
+    chain["cam2"] = {**chain["cam1"], "T_cn_cnm1": further.tolist()}
+    (tmp_path / "camchain.yaml").write_text(json.dumps(chain))
+    known = read_rig_calibration(tmp_path / "camchain.yaml")
+    whole = further @ np.array(chain["cam1"]["T_cn_cnm1"])
+    assert np.allclose(known.camera("cam2").cam_from_rig, whole)
+
+
 def test_opencv_s_yaml_is_read_as_opencv_writes_it(tmp_path):
     path = tmp_path / "rig.yml"
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)

@@ -74,7 +74,7 @@ def write_splats(path, degree, *, kind="f8", text=False, drop=()):
     names = [name for name in names if name not in drop]
     rows = np.zeros(COUNT, [(name, f"<{kind}") for name in names])
     for name in names:
-        rows[name] = 0 if name[0] == "n" else rng.standard_normal(COUNT)
+        rows[name] = rng.standard_normal(COUNT)
     form = "ascii" if text else "binary_little_endian"
     of_type = {"f8": "double", "f4": "float"}[kind]
     head = f"ply\nformat {form} 1.0\nelement vertex {COUNT}\n" + "".join(f"property {of_type} {n}\n" for n in names)
@@ -107,6 +107,9 @@ def assert_moved(before, after, similarity, atol=1e-6):
         colour(*harmonics(after), directions @ rotation.T), colour(*harmonics(before), directions), atol=atol
     )
     np.testing.assert_array_equal(after["opacity"], before["opacity"])
+    if "nx" in before.dtype.names:
+        normals = columns(before, "nx", "ny", "nz") @ rotation.T
+        np.testing.assert_allclose(columns(after, "nx", "ny", "nz"), normals, atol=atol)
 
 
 def test_positions_covariances_and_colours_of_splats_move_with_the_model(subtests, tmp_path_factory):
