@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from colmap_inertial.checks.diagnose import camera
 from colmap_inertial.checks.diagnose.frames import _readout
 from colmap_inertial.checks.diagnose.imu import acceleration_rms_m_s2, scatter_of
-from colmap_inertial.checks.report import figure_3d, signals, still, still_3d
+from colmap_inertial.checks.report import figure_3d, figures, signals, still, still_3d
 from colmap_inertial.checks.validate.measure import _list_remarks
 from colmap_inertial.checks.validate.overlays import _ticks
 from colmap_inertial.checks.validate.place import _choose_pairs
@@ -910,3 +910,20 @@ def test_a_folder_is_opencamera_s_where_each_gyroscope_s_file_has_bare_rows(tmp_
     assert is_opencamera(tmp_path)
     (tmp_path / "b_gyro.csv").write_text("t,x,y,z\n1,2,3,4\n")
     assert not is_opencamera(tmp_path)
+
+
+def test_residuals_on_the_sensor_are_lines_from_the_middles_of_its_parts():
+    sensor = {
+        "columns": 2,
+        "rows": 2,
+        "width": 200,
+        "height": 100,
+        "mean_x_px": [0.5, 0.0, -0.25, None],
+        "mean_y_px": [0.0, 0.5, 0.25, None],
+        "rms_px": [0.5, 0.5, 0.4, None],
+    }
+    figure = figures.residuals_on_sensor(sensor)
+    lines = next(trace for trace in figure["data"] if trace["type"] == "scatter")
+    # the largest is nine tenths of a part long
+    assert lines["x"] == [50.0, 95.0, None, 150.0, 150.0, None, 50.0, 27.5, None]
+    assert lines["y"] == [25.0, 25.0, None, 25.0, 70.0, None, 75.0, 97.5, None]
