@@ -13,6 +13,7 @@ from colmap_inertial.checks.diagnose import camera
 from colmap_inertial.checks.diagnose.frames import _readout
 from colmap_inertial.checks.diagnose.imu import acceleration_rms_m_s2, scatter_of
 from colmap_inertial.checks.report import figure_3d, figures, signals, still, still_3d
+from colmap_inertial.checks.report.run_page import _round_to_sigma
 from colmap_inertial.checks.validate.measure import _list_remarks
 from colmap_inertial.checks.validate.overlays import _ticks
 from colmap_inertial.checks.validate.place import _choose_pairs
@@ -23,6 +24,7 @@ from colmap_inertial.cli.help import Option, _shorten
 from colmap_inertial.colmap import dense
 from colmap_inertial.colmap.loops import key_frames
 from colmap_inertial.colmap.sparse import require_room_for_features
+from colmap_inertial.colmap.two_views import _count_matches
 from colmap_inertial.core import summary
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import FormatError, NotObservableError, OutputError
@@ -53,7 +55,7 @@ from colmap_inertial.inertial.scale._shape import ShapeFault
 from colmap_inertial.inertial.scale.joint import estimate_joint, scale_of
 from colmap_inertial.io import video
 from colmap_inertial.io.android import is_opencamera
-from colmap_inertial.io.gopro import _stabilisation
+from colmap_inertial.io.gopro import _labels, _stabilisation
 from colmap_inertial.io.phyphox import _column
 from colmap_inertial.io.rig_frames import _find_nearest
 from colmap_inertial.io.sensor_yaml import CAMERA_MODELS
@@ -927,3 +929,20 @@ def test_residuals_on_the_sensor_are_lines_from_the_middles_of_its_parts():
     # the largest is nine tenths of a part long
     assert lines["x"] == [50.0, 95.0, None, 150.0, 150.0, None, 50.0, 27.5, None]
     assert lines["y"] == [25.0, 25.0, None, 25.0, 70.0, None, 75.0, 97.5, None]
+
+
+def test_values_are_rounded_to_the_second_digit_of_their_standard_deviation():
+    rounded = [_round_to_sigma(1234.56789, sigma) for sigma in (None, 123.0, 1.23, 0.0123)]
+    assert rounded == [("1234.57", ""), ("1235", "123"), ("1234.6", "1.2"), ("1234.568", "0.012")]
+
+
+def test_three_letters_name_the_axes_of_a_gopro():
+    np.testing.assert_array_equal(_labels("YxZ") @ [1.0, 2.0, 3.0], [-2.0, 1.0, 3.0])
+    for letters in ("XY", "XYZX", ""):
+        with pytest.raises(ValueError, match="does not name three axes"):
+            _labels(letters)
+
+
+def test_single_descriptors_are_no_matches():
+    one, many = np.full((1, 128), 45, np.uint8), np.eye(128, dtype=np.uint8)[:40] * 255
+    assert [_count_matches(*pair) for pair in ((one, many), (many, one), (many[:0], many))] == [0, 0, 0]
