@@ -105,7 +105,7 @@ def test_point_spread_functions_are_lines_of_the_right_length():
 
 def test_every_way_undoes_a_uniform_blur(subtests):
     for way in (baselines.spatial_wiener, baselines.fourier_wiener, baselines.richardson_lucy_blocks, deblur):
-        with subtests.test(way=way):
+        with subtests.test(way=way.__name__):
             sharp = pair().sharp(0)
             vector = (9.0, 4.0)
             light = cv2.filter2D(

@@ -57,25 +57,25 @@ def test_a_limit_that_numpy_cannot_be_loaded_within_is_said_too(tmp_path):
     assert done.stderr.startswith("error: only 0.067 GB of memory are allowed to a process here")
 
 
-@pytest.mark.parametrize(
-    ("error", "said"),
-    [
+def test_what_runs_out_on_the_way_is_a_sentence(subtests, capsys):
+    for error, said in (
         (MemoryError(), "the memory is used up"),
         (OSError(errno.ENOMEM, "Cannot allocate memory"), "the memory is used up"),
         (ImportError("cv2.abi3.so: failed to map segment from shared object"), "the memory is used up"),
         (OSError(errno.EMFILE, "Too many open files"), "too many files are open"),
-    ],
-)
-def test_what_runs_out_on_the_way_is_a_sentence(monkeypatch, capsys, error, said):
-    def run(self):
-        raise error
+    ):
+        with subtests.test(error=error), pytest.MonkeyPatch.context() as patch:
 
-    monkeypatch.setattr(Scale, "run", run)
-    with pytest.raises(SystemExit) as stopped:
-        main(["scale", "a", "--json", "b"])
-    assert stopped.value.code == 2
-    told = capsys.readouterr().err
-    assert told.startswith(f"error: {said}") and len(told.splitlines()) == 1
+            def run(self, error=error):
+                raise error
+
+            patch.setattr(Scale, "run", run)
+            capsys.readouterr()
+            with pytest.raises(SystemExit) as stopped:
+                main(["scale", "a", "--json", "b"])
+            assert stopped.value.code == 2
+            told = capsys.readouterr().err
+            assert told.startswith(f"error: {said}") and len(told.splitlines()) == 1
 
 
 def test_what_it_has_led_to_is_the_same_sentence(monkeypatch, capsys):
@@ -92,13 +92,18 @@ def test_what_it_has_led_to_is_the_same_sentence(monkeypatch, capsys):
     assert capsys.readouterr().err.startswith("error: the memory is used up")
 
 
-@pytest.mark.parametrize(
-    "error", [OSError(errno.EIO, "Input/output error"), ImportError("no module"), KeyError("a"), RuntimeError("b")]
-)
-def test_anything_else_keeps_its_traceback(monkeypatch, error):
-    def run(self):
-        raise error
+def test_anything_else_keeps_its_traceback(subtests):
+    for error in (
+        OSError(errno.EIO, "Input/output error"),
+        ImportError("no module"),
+        KeyError("a"),
+        RuntimeError("b"),
+    ):
+        with subtests.test(error=error), pytest.MonkeyPatch.context() as patch:
 
-    monkeypatch.setattr(Scale, "run", run)
-    with pytest.raises(type(error)):
-        main(["scale", "a", "--json", "b"])
+            def run(self, error=error):
+                raise error
+
+            patch.setattr(Scale, "run", run)
+            with pytest.raises(type(error)):
+                main(["scale", "a", "--json", "b"])

@@ -62,9 +62,8 @@ def treat(monkeypatch):
     return treated
 
 
-@pytest.mark.parametrize(
-    ("given", "said", "dropped"),
-    [
+def test_a_frame_that_is_not_deblurred_keeps_its_pixels_and_says_why(subtests, treat):
+    for given, said, dropped in (
         ({"action": "keep"}, "decided", False),
         ({"trusted": False}, "by five frames", False),
         ({"action": "drop", "trusted": False}, "by five frames", False),
@@ -74,30 +73,27 @@ def treat(monkeypatch):
         ({"length": 340.0}, "340 px of blur are too long to be undone", False),
         ({"doubt": "no sign", "departs": GATE_LIMITS.straight_px * 1.01}, "no sign, and with the other", False),
         ({"factor": None}, "judged", False),
-    ],
-)
-def test_a_frame_that_is_not_deblurred_keeps_its_pixels_and_says_why(treat, given, said, dropped):
-    found = treat(**given)
-    assert said in found.said and not found.changed and found.frame.dropped == dropped
-    assert found.done == "" and found.frame.smoothing_px == 0
-    assert found.values["kept_share"] == 1 and found.values["extent_factor"] == 1
+    ):
+        with subtests.test(given=given, said=said, dropped=dropped):
+            found = treat(**given)
+            assert said in found.said and not found.changed and found.frame.dropped == dropped
+            assert found.done == "" and found.frame.smoothing_px == 0
+            assert found.values["kept_share"] == 1 and found.values["extent_factor"] == 1
 
 
-@pytest.mark.parametrize(
-    "given",
-    [
+def test_a_frame_that_may_be_deblurred_is(subtests, treat):
+    for given in (
         {},
         {"trusted": None},
         {"action": "drop", "drop": False},
         {"length": 330.0},
         {"doubt": "no sign", "departs": GATE_LIMITS.straight_px * 0.99},
         {"departs": GATE_LIMITS.straight_px * 9},
-    ],
-)
-def test_a_frame_that_may_be_deblurred_is(treat, given):
-    found = treat(**given)
-    assert found.said == "judged" and found.changed and not found.frame.dropped and found.done == "deblurred"
-    assert found.seen["parallax"] == "slid" and found.seen["path"] == 1
+    ):
+        with subtests.test(given=given):
+            found = treat(**given)
+            assert found.said == "judged" and found.changed and not found.frame.dropped and found.done == "deblurred"
+            assert found.seen["parallax"] == "slid" and found.seen["path"] == 1
 
 
 def test_the_extent_that_the_picture_shows_is_that_of_the_field_and_the_path(treat):

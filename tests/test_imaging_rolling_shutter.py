@@ -39,7 +39,7 @@ def test_steady_panning_shears_the_picture():
 def test_points_go_where_a_global_shutter_sees_them(subtests):
     for direction in ("down", "up", "right", "left"):
         for model in (LENS, FISHEYE):
-            with subtests.test(direction=direction, model=model):
+            with subtests.test(direction=direction, model=model.model):
                 motion, gyro = handheld(vigour=2.0)
                 camera = ShutterCamera(model=model, exposure_s=0.004, readout_s=0.03, readout_direction=direction)
                 lens, shutter = colmap_camera(model), shutter_of(camera, 2.0)

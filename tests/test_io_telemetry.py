@@ -1,6 +1,7 @@
 """Cameras that telemetry-parser reads: units, axes, and what is refused."""
 
 import sys
+from itertools import product
 
 import numpy as np
 import pytest
@@ -29,23 +30,26 @@ def imu():
     return ImuRecording(gyro_t_s=t_s, gyro_rad_s=gyro, accel_t_s=t_s, accel_m_s2=accel)
 
 
-@pytest.mark.parametrize("camera", RUNCAMS)
-def test_a_log_of_counts_is_read_in_the_camera_s_axes(tmp_path, imu, camera):
+def test_a_log_of_counts_is_read_in_the_camera_s_axes(subtests, tmp_path_factory, imu):
     pytest.importorskip("telemetry_parser")
-    found = assert_read(write_runcam(tmp_path, imu, camera), imu, gyro_rad_s=6e-4, accel_m_s2=4e-4)
-    assert camera in found.device
+    for camera in RUNCAMS:
+        with subtests.test(camera=camera):
+            tmp_path = tmp_path_factory.mktemp("given")
+            found = assert_read(write_runcam(tmp_path, imu, camera), imu, gyro_rad_s=6e-4, accel_m_s2=4e-4)
+            assert camera in found.device
 
 
-@pytest.mark.parametrize("camera", INSTA360S)
-@pytest.mark.parametrize("counts", [True, False], ids=["counts", "numbers"])
-def test_an_insta360_s_records_are_read_in_the_camera_s_axes(tmp_path, imu, camera, counts):
+def test_an_insta360_s_records_are_read_in_the_camera_s_axes(subtests, tmp_path_factory, imu):
     pytest.importorskip("telemetry_parser")
-    path = write_insta360(tmp_path / "VID.mp4", imu, camera, counts=counts, readout_ms=16.5)
-    found = assert_read(path, imu, gyro_rad_s=1e-3, accel_m_s2=5e-3)
-    assert found.device == camera
-    log = read_frame_log(path)
-    assert log is not None and log.readout_s == pytest.approx(0.0165)
-    assert read_frame_log(write_insta360(tmp_path / "none.mp4", imu, camera, counts=counts)) is None
+    for camera, counts in product(INSTA360S, (True, False)):
+        with subtests.test(camera=camera, counts=counts):
+            tmp_path = tmp_path_factory.mktemp("given")
+            path = write_insta360(tmp_path / "VID.mp4", imu, camera, counts=counts, readout_ms=16.5)
+            found = assert_read(path, imu, gyro_rad_s=1e-3, accel_m_s2=5e-3)
+            assert found.device == camera
+            log = read_frame_log(path)
+            assert log is not None and log.readout_s == pytest.approx(0.0165)
+            assert read_frame_log(write_insta360(tmp_path / "none.mp4", imu, camera, counts=counts)) is None
 
 
 def test_a_gyroscope_alone_is_for_imaging(tmp_path, imu):

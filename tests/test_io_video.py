@@ -261,33 +261,35 @@ def test_frames_before_an_edit_list_s_beginning_are_no_frames_of_the_video(tmp_p
     np.testing.assert_allclose(levels, [20 + 15 * i % 220 for i in range(5, 25)], atol=3)
 
 
-@pytest.mark.parametrize("suffix", ["mp4", "mov"])
-@pytest.mark.parametrize("faststart", [True, False])
-@pytest.mark.parametrize(("from_start", "from_end"), [(55, 0), (0, 45), (37, 28)])
 def test_a_cut_longer_than_a_group_of_pictures_leaves_a_whole_video(
-    tmp_path: Path, suffix: str, faststart: bool, from_start: int, from_end: int
+    subtests: pytest.Subtests, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     """What phones write that trim without coding anew: all samples, and an edit list."""
     stamps = tuple(range(0, 4000, 40))
-    video = write_video(tmp_path / f"a.{suffix}", stamps, faststart=faststart)
-    with av.open(str(video)) as container:
-        ticks_per_frame = round(0.04 / container.streams.video[0].time_base)
-    raw = video.read_bytes()
-    # one entry: version and flags, count, duration (of the movie's clock, milliseconds), media time
-    media_time = struct.unpack_from(">i", raw, raw.index(b"elst") + 16)[0] + from_start * ticks_per_frame
-    entry = struct.pack(">ii", (100 - from_start - from_end) * 40, media_time)
-    patched(video, b"elst", 8, entry)
-    expected_s = np.array(stamps[: 100 - from_start - from_end]) / 1e3
-    np.testing.assert_allclose(video_stamps_ns(video) * 1e-9, expected_s, atol=1e-6, rtol=0)
-    _, frames = read_frames(capture_of(tmp_path, f'file = "a.{suffix}"'))
-    levels = [float(frame.image.mean()) for frame in frames]
-    np.testing.assert_allclose(levels, [20 + 15 * i % 220 for i in range(from_start, 100 - from_end)], atol=3)
-    if faststart:
-        whole = video.read_bytes()
-        for share in (0.6, 0.9):
-            video.write_bytes(whole[: int(share * len(whole))])
-            with pytest.raises(FormatError, match=r"is cut off: it holds \d+ of the 100 frames"):
-                video_stamps_ns(video)
+    for suffix, faststart, (from_start, from_end) in itertools.product(
+        ("mp4", "mov"), (True, False), ((55, 0), (0, 45), (37, 28))
+    ):
+        with subtests.test(suffix=suffix, faststart=faststart, from_start=from_start, from_end=from_end):
+            tmp_path = tmp_path_factory.mktemp("given")
+            video = write_video(tmp_path / f"a.{suffix}", stamps, faststart=faststart)
+            with av.open(str(video)) as container:
+                ticks_per_frame = round(0.04 / container.streams.video[0].time_base)
+            raw = video.read_bytes()
+            # one entry: version and flags, count, duration (of the movie's clock, milliseconds), media time
+            media_time = struct.unpack_from(">i", raw, raw.index(b"elst") + 16)[0] + from_start * ticks_per_frame
+            entry = struct.pack(">ii", (100 - from_start - from_end) * 40, media_time)
+            patched(video, b"elst", 8, entry)
+            expected_s = np.array(stamps[: 100 - from_start - from_end]) / 1e3
+            np.testing.assert_allclose(video_stamps_ns(video) * 1e-9, expected_s, atol=1e-6, rtol=0)
+            _, frames = read_frames(capture_of(tmp_path, f'file = "a.{suffix}"'))
+            levels = [float(frame.image.mean()) for frame in frames]
+            np.testing.assert_allclose(levels, [20 + 15 * i % 220 for i in range(from_start, 100 - from_end)], atol=3)
+            if faststart:
+                whole = video.read_bytes()
+                for share in (0.6, 0.9):
+                    video.write_bytes(whole[: int(share * len(whole))])
+                    with pytest.raises(FormatError, match=r"is cut off: it holds \d+ of the 100 frames"):
+                        video_stamps_ns(video)
 
 
 def test_frames_that_the_camera_dropped_do_not_cut_an_avi_file_off(tmp_path: Path) -> None:

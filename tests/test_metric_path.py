@@ -25,8 +25,7 @@ def spread(rng, size, sigma):
     return sigma**2 / size * root @ root.T
 
 
-@pytest.fixture
-def path(monkeypatch):
+def drifted_path(patch):
     """A model's path of four images with a drift that pictures left, and what the smoother says of it."""
     rng = np.random.default_rng(2)
     names = tuple(f"{k}.jpg" for k in range(COUNT))
@@ -44,10 +43,15 @@ def path(monkeypatch):
         joined_covs=dict(zip(names, cov, strict=True)),
     )
     drift = PictureDrift(names=names, cam_in_world=centre, cov=cov)
-    monkeypatch.setattr(metric, "read_seen", lambda *_: seen)
-    monkeypatch.setattr(metric, "has_rigs", lambda _: False)
-    monkeypatch.setattr(metric, "find_path_drift", lambda *_: drift)
+    patch.setattr(metric, "read_seen", lambda *_: seen)
+    patch.setattr(metric, "has_rigs", lambda _: False)
+    patch.setattr(metric, "find_path_drift", lambda *_: drift)
     return SimpleNamespace(model=model, smoothed=smoothed, drift=drift, seen=seen)
+
+
+@pytest.fixture
+def path(monkeypatch):
+    return drifted_path(monkeypatch)
 
 
 @pytest.mark.parametrize("joined", [False, True])
@@ -78,19 +82,21 @@ def test_a_path_s_covariance_is_the_scatter_of_paths_that_drifted_and_have_anoth
         assert np.array_equal(cov[k, 6:, 6:], path.smoothed.cov[k, 6:, 6:])
 
 
-@pytest.mark.parametrize("why", ["no drift", "rigs", "an image without a time", "a part that is not placed"])
-def test_where_drift_is_not_known_the_smoother_s_covariance_is_left(path, monkeypatch, why):
-    if why == "no drift":
-        monkeypatch.setattr(metric, "find_path_drift", lambda *_: None)
-    elif why == "rigs":
-        monkeypatch.setattr(metric, "has_rigs", lambda _: True)
-    elif why == "an image without a time":
-        path.seen.t_s = np.array([0.0, 1.0, np.nan, 3.0])
-    else:
-        path.model.parts = ("two",)
-        del path.model.joined_covs["2.jpg"]
-    cov, rotation = _add_drift(path.model, path.smoothed, GRAVITY)
-    assert cov is path.smoothed.cov and rotation is None
+def test_where_drift_is_not_known_the_smoother_s_covariance_is_left(subtests):
+    for why in ("no drift", "rigs", "an image without a time", "a part that is not placed"):
+        with subtests.test(why), pytest.MonkeyPatch.context() as patch:
+            path = drifted_path(patch)
+            if why == "no drift":
+                patch.setattr(metric, "find_path_drift", lambda *_: None)
+            elif why == "rigs":
+                patch.setattr(metric, "has_rigs", lambda _: True)
+            elif why == "an image without a time":
+                path.seen.t_s = np.array([0.0, 1.0, np.nan, 3.0])
+            else:
+                path.model.parts = ("two",)
+                del path.model.joined_covs["2.jpg"]
+            cov, rotation = _add_drift(path.model, path.smoothed, GRAVITY)
+            assert cov is path.smoothed.cov and rotation is None
 
 
 def test_frames_have_the_turn_and_the_velocity_of_their_instants_where_the_gyroscope_ran():

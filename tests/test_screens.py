@@ -106,17 +106,19 @@ def outcome(tmp_path, *, metric, **more):
     )
 
 
-@pytest.mark.parametrize("metric", [(True, False), (True, True), (False, False), (True,), (False,)])
-def test_a_reconstruction_says_where_metres_are_and_how_to_get_them(told, tmp_path, monkeypatch, metric):
+def test_a_reconstruction_says_where_metres_are_and_how_to_get_them(subtests, told, tmp_path_factory, monkeypatch):
     monkeypatch.setattr(terminal, "_model_lines", lambda model, result: [("scale", f"of {model.index}")])
     monkeypatch.setattr(terminal, "next_command", lambda result, source: "look")
-    (tmp_path / "sparse").mkdir()
-    words = told(terminal.show_result, outcome(tmp_path, metric=metric), Path("desk"))
-    assert ("metres without the IMU" in words) == (not any(metric))
-    assert (f"{tmp_path} is a COLMAP project in metres (sparse); in COLMAP's units" in words) == any(metric)
-    assert ("nothing here is in metres" in words) == (not any(metric))
-    assert words.endswith("next: look") and "nothing to do" not in words
-    assert all(f"Scale of {k}" in words for k in range(len(metric)))
+    for metric in ((True, False), (True, True), (False, False), (True,), (False,)):
+        with subtests.test(metric=metric):
+            tmp_path = tmp_path_factory.mktemp("given")
+            (tmp_path / "sparse").mkdir()
+            words = told(terminal.show_result, outcome(tmp_path, metric=metric), Path("desk"))
+            assert ("metres without the IMU" in words) == (not any(metric))
+            assert (f"{tmp_path} is a COLMAP project in metres (sparse); in COLMAP's units" in words) == any(metric)
+            assert ("nothing here is in metres" in words) == (not any(metric))
+            assert words.endswith("next: look") and "nothing to do" not in words
+            assert all(f"Scale of {k}" in words for k in range(len(metric)))
 
 
 def test_a_reconstruction_says_what_was_left_out_or_not_joined(told, tmp_path, monkeypatch):
@@ -165,11 +167,12 @@ def test_an_export_says_unit_model_and_command(told):
     assert "Model 1 Unit unknown: not metres Written out" in words and "Export for" not in words
 
 
-@pytest.mark.parametrize(("host", "warned"), [("127.0.0.1", False), ("localhost", False), ("0.0.0.0", True)])
-def test_a_viewer_that_others_can_reach_says_so(told, host, warned):
-    words = told(terminal.show_view, Path("out"), "http://address", host)
-    assert words.startswith("out is shown at http://address (Ctrl-C ends this)")
-    assert ("everybody on the network" in words) == warned
+def test_a_viewer_that_others_can_reach_says_so(subtests, told):
+    for host, warned in (("127.0.0.1", False), ("localhost", False), ("0.0.0.0", True)):
+        with subtests.test(host=host):
+            words = told(terminal.show_view, Path("out"), "http://address", host)
+            assert words.startswith("out is shown at http://address (Ctrl-C ends this)")
+            assert ("everybody on the network" in words) == warned
 
 
 HERE = Path("here")
@@ -210,12 +213,15 @@ REFUSED = [
 
 def test_options_are_allowed_up_to_their_ends(subtests):
     for command, given, options in ALLOWED:
-        with subtests.test(command=command, given=given, options=options):
+        with subtests.test(command=command.__name__, options=options):
             made = command(**given, **options)
             assert {name: getattr(made, name) for name in options} == options
 
 
 def test_options_beyond_their_ends_or_against_each_other_are_refused(subtests):
     for command, given, options, said in REFUSED:
-        with subtests.test(said=said), pytest.raises(ValueError, match=said):
+        with (
+            subtests.test(command=command.__name__, options=options, said=said),
+            pytest.raises(ValueError, match=said),
+        ):
             command(**given, **options)

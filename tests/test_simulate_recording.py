@@ -238,7 +238,7 @@ def test_what_cannot_be_simulated_is_refused(subtests):
         (ImuOptions, {"gyro_bias_rad_s_sd": -0.1}, "negative"),
         (ImuOptions, {"accel_density_m_s2_rthz": -0.1}, "negative"),
     ):
-        with subtests.test(kind=kind, values=values, said=said), pytest.raises(ValueError, match=said):
+        with subtests.test(kind=kind.__name__, values=values, said=said), pytest.raises(ValueError, match=said):
             kind(**values)
 
 
