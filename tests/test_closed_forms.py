@@ -899,7 +899,10 @@ def test_strains_are_orthonormal_without_trace():
 
 
 def test_camera_models_are_colmap_s(subtests):
-    for number, (name, (count, principal)) in enumerate(CAMERA_MODELS.items()):
+    known = pycolmap.CameraModelId.__members__
+    assert len(known) > 10
+    # the lowest pycolmap lacks the latest ones
+    for number, (name, (count, principal)) in enumerate((k, v) for k, v in CAMERA_MODELS.items() if k in known):
         with subtests.test(name):
             camera = pycolmap.Camera.create_from_model_name(1, name, 500.0, 640, 480)
             assert int(camera.model) == number
