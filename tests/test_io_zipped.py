@@ -105,6 +105,8 @@ def test_packed_bytes_are_those_stated_and_no_more_than_the_zip_has(both, monkey
     def claimed(opened, member):
         info = true(opened, member)
         info.compress_size = stated
+        if hasattr(info, "_end_offset"):
+            info._end_offset = None  # later Pythons refuse what reaches beyond it by themselves
         return info
 
     monkeypatch.setattr(zipfile.ZipFile, "getinfo", claimed)
