@@ -159,11 +159,16 @@ def test_the_arrow_solver_agrees_with_a_dense_inverse():
     assert np.allclose(cov, np.linalg.inv(dense)[k * m :, k * m :])
 
 
-def test_derivatives_of_all_residuals_are_those_of_finite_differences(recording, calibration):
-    data, prior = prepare(
+def prepared(recording, calibration):
+    """The data and the prior of four seconds."""
+    return prepare(
         first_seconds(recording.trajectory, 4.0), timed(recording.trajectory, recording.imu, calibration),
         gravity_m_s2=9.8, gravity_sigma_m_s2=0.02, states_hz=5.0,
     )  # fmt: skip
+
+
+def test_derivatives_of_all_residuals_are_those_of_finite_differences(recording, calibration):
+    data, prior = prepared(recording, calibration)
     rng = np.random.default_rng(6)
     k = len(data.t_s)
     x = replace(
@@ -211,10 +216,7 @@ def test_derivatives_of_all_residuals_are_those_of_finite_differences(recording,
 
 
 def test_increments_of_another_device_are_those_integrated_anew_to_second_order(recording, calibration):
-    data, prior = prepare(
-        first_seconds(recording.trajectory, 4.0), timed(recording.trajectory, recording.imu, calibration),
-        gravity_m_s2=9.8, gravity_sigma_m_s2=0.02, states_hz=5.0,
-    )  # fmt: skip
+    data, prior = prepared(recording, calibration)
     rng = np.random.default_rng(8)
 
     def moved(x, size):

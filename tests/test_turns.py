@@ -15,7 +15,12 @@ from colmap_inertial.checks.diagnose import Recorded, diagnose
 from colmap_inertial.core.geometry import so3_exp, so3_log
 from colmap_inertial.core.types import CameraModel, Frame, FrameTiming
 from colmap_inertial.imaging.gyro_camera import FrameShutter
-from colmap_inertial.motion.two_view_rotation import _estimate_rotation, _Features, measure_two_view_rotations
+from colmap_inertial.motion.two_view_rotation import (
+    _estimate_rotation,
+    _Features,
+    _match_descriptors,
+    measure_two_view_rotations,
+)
 from colmap_inertial.tools.simulate.render import colmap_camera
 
 LENS = CameraModel(model="PINHOLE", width=320, height=240, params=(250.0, 250.0, 160.0, 120.0))
@@ -103,3 +108,14 @@ def test_a_folder_of_pictures_is_compared_with_the_gyroscope(
     assert diagnose(recorded).findings == ()
     other = replace(imu, gyro_rad_s=imu.gyro_rad_s[::-1])
     assert diagnose(replace(recorded, imu=other)).codes == {"imu-does-not-fit"}
+
+
+def test_descriptors_are_matched_as_by_opencv():
+    rng = np.random.default_rng(4)
+    first = rng.integers(0, 180, (300, 128)).astype(np.float32)
+    second = np.clip(first[rng.permutation(300)] + rng.integers(-90, 91, (300, 128)), 0, 255).astype(np.float32)
+    second[:60] = first[:60]  # some have a second one that is as near, or nearly
+    neighbours = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first, second, k=2)
+    wanted = [(best.queryIdx, best.trainIdx) for best, other in neighbours if best.distance < 0.8 * other.distance]
+    assert 60 < len(wanted) < 300
+    assert _match_descriptors(first, second).tolist() == [list(pair) for pair in wanted]
