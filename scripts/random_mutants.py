@@ -6,10 +6,10 @@
 
 ``map`` runs the tests once under coverage and writes which tests run which lines, and how long each takes. ``draw``
 draws faults at random, at least 12 in each room and of each kind alike: a sign, a factor in place of a divisor, a
-transpose, the order of two operands or arguments, a power, minimum for maximum, a bound that is one off, a dropped
-term, a unit, a condition turned round, a check that is left out. Each is made in a copy of the package. Tests that run
-its line, the quickest and those that run little beside its module, are run until one fails. Printed: each fault, and
-the share caught by room.
+transpose, the order of two operands or arguments, a power, minimum for maximum, a bound of whole numbers that is one
+off, a dropped term, a unit, a condition turned round, a check that is left out. Each is made in a copy of the package.
+Tests that run its line are run until one fails: the quickest, those that run little beside its module, and those that
+compare what its functions return. Printed: each fault, and the share caught by room.
 """
 
 from __future__ import annotations
@@ -32,9 +32,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from mutants import PACKAGE, ROOT, Trial
+from record_values import functions_of, read_kept
 
-#: Tests of one fault that run its line: the quickest for so long (s), and as long those of little but its module.
-MOST_S = 25.0
+#: Tests of one fault that run its line: the quickest for so long (s), as long those of little but its module, and as
+#: long those that compare what its functions return.
+MOST_S = 15.0
 LEAST_IN_A_ROOM = 12
 
 _SWAPPED = {ast.Add: "-", ast.Sub: "+", ast.Mult: "/", ast.Div: "*"}
@@ -56,6 +58,9 @@ _SYMMETRIC = {
     "logical_or",
     "samefile",
 }
+_WHOLE = {"size", "shape", "ndim", "width", "height", "count"}
+#: Names of quantities: a unit, or what has none and is real.
+_UNIT = re.compile(r"_(s|px|m|rad|deg|hz|s2|pct|percent|share|gib|mb|db|factor|ratio|weight)$")
 _DROPPED = {"sqrt", "abs", "deg2rad", "rad2deg", "radians", "degrees", "square", "log", "log1p", "expm1", "exp"}
 
 
@@ -128,7 +133,7 @@ def changes(node: ast.AST, source: Source) -> Iterator[tuple[str, ast.AST, str]]
         yield "transpose", node, of(node.value)
     elif isinstance(node, ast.Compare) and len(node.ops) == 1:
         left, right, kind = of(node.left), of(node.comparators[0]), type(node.ops[0])
-        if kind in _ONE_OFF:
+        if kind in _ONE_OFF and _is_whole(node):
             yield "bound", node, f"{left} {_ONE_OFF[kind]} {right}"
         if kind in _TURNED:
             yield "condition", node, f"{left} {_TURNED[kind]} {right}"
@@ -157,6 +162,25 @@ def changes(node: ast.AST, source: Source) -> Iterator[tuple[str, ast.AST, str]]
             yield "unit", node, f"({text} * 10)"
     elif isinstance(node, ast.Raise) and node.exc is not None:
         yield "check", node, "pass"
+
+
+def _is_whole(node: ast.Compare) -> bool:
+    """Whether a comparison looks like one of whole numbers: between reals, ``<`` for ``<=`` changes nothing."""
+    sides = [node.left, *node.comparators]
+    whole = any(
+        (isinstance(part, ast.Constant) and isinstance(part.value, int))
+        or (isinstance(part, ast.Call) and getattr(part.func, "id", "") == "len")
+        or (isinstance(part, ast.Attribute) and part.attr in _WHOLE)
+        for side in sides
+        for part in ast.walk(side)
+    )
+    real = any(
+        (isinstance(part, ast.Constant) and isinstance(part.value, float))
+        or _UNIT.search(getattr(part, "attr", getattr(part, "id", ""))) is not None
+        for side in sides
+        for part in ast.walk(side)
+    )
+    return whole and not real
 
 
 def _skipped(tree: ast.AST) -> set[ast.AST]:
@@ -261,11 +285,15 @@ def write_map(file: Path) -> None:
 
 
 class Tests:
-    """Which tests run a line: the quickest, and those that run little beside its module."""
+    """Which tests run a line: the quickest, those that run little beside its module, those that keep its values."""
 
     def __init__(self, file: Path) -> None:
         known = json.loads(file.read_text())
         self._lines, self._seconds = known["lines"], known["seconds"]
+        #: Functions of which a test compares what they return with what they returned before.
+        self._kept: dict[str, set[str]] = defaultdict(set)
+        for test, functions in read_kept().items():
+            self._kept[_function(test)].update(functions)
         #: Lines of a module that a test runs, and of all modules.
         self._run: Counter[tuple[str, str]] = Counter()
         self._run_by: Counter[str] = Counter()
@@ -282,8 +310,14 @@ class Tests:
         contexts = lines.get(str(fault.line)) or sorted(set().union(*lines.values()))
         by_time = sorted({_function(context) for context in contexts}, key=self._time)
         by_share = sorted(by_time, key=lambda name: -self._run[name, fault.file] / self._run_by[name])
+        functions = {
+            f"{fault.file.removesuffix('.py')}:{name}"
+            for name, body in functions_of(ROOT / PACKAGE / fault.file)
+            if fault.line in body
+        }
+        by_kept = [name for name in by_time if functions & self._kept[name]]
         chosen = {by_time[0]} if by_time else set()
-        for names in (by_time, by_share):
+        for names in (by_time, by_share, by_kept):
             left_s = MOST_S
             for name in names:
                 if self._time(name) < left_s:

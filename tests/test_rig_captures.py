@@ -76,7 +76,7 @@ def test_two_videos_become_one_metric_model(filmed, known):
     (model,) = known.models
     assert model.scale.verdict == "trusted", model.scale.reasons
     # with declared poses COLMAP's model is in metres already, which the IMU confirms
-    assert abs(np.log(model.scale.metres_per_unit)) < 2e-3
+    assert abs(np.log(model.scale.metres_per_unit)) < 4e-3
     assert model.scale.ci95[0] < 1 < model.scale.ci95[1]
     names = {image.name for image in read_model(model.sparse_metric).images.values()}
     assert len(names) == 2 * len(filmed.t_s) and sum(name.startswith("right/") for name in names) == len(filmed.t_s)

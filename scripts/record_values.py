@@ -1,0 +1,177 @@
+"""Write what the package's functions return in tests, for the tests to compare with (``tests/returned_values.py``).
+
+    python scripts/record_values.py renew
+    python scripts/record_values.py run FOLDER [--other-kernels] [PYTEST'S WORDS ...]
+    python scripts/record_values.py choose --map MAP FOLDER FOLDER ...
+
+``renew`` is for a change that was meant to change values: the tests that values are kept of are run, and what they
+return now is written. Look at what the tests said before. ``run`` runs tests and writes all that functions return in
+each into a folder; ``--other-kernels`` has numpy, OpenBLAS and OpenCV calculate as an old processor would. ``choose``
+takes what several runs agree in and keeps some of it: for each line that a test runs (``random_mutants.py map``), what
+its function returns in the quickest two tests that run the line.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tests"))
+from returned_values import KEPT, PACKAGE, read_kept, same, versions  # noqa: E402
+
+#: Kernels of a processor without AVX.
+OTHER_KERNELS = {
+    "OPENBLAS_CORETYPE": "Nehalem",
+    "NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4 AVX512_ICL AVX512_SPR",
+    "OPENCV_CPU_DISABLE": "AVX512_SKX,AVX2,FP16,FMA3",
+    "OPENCV_IPP": "disabled",
+}
+#: Tests of each line that values are kept of, and how long such a test may take unless there is no other (s).
+TESTS_OF_A_LINE, LONGEST_S = 2, 3.0
+
+#: Places of a result.
+PLACES = 10
+
+#: By test: seconds, and by function and place what it returned.
+Seen = dict[str, tuple[float, dict[str, dict[str, Any]]]]
+
+
+def run(folder: Path, words: Sequence[str], *, other_kernels: bool = False) -> None:
+    """Run tests and write what functions return in each."""
+    command = [sys.executable, "-m", "pytest", "-q", "--numprocesses", "auto", "--dist", "loadfile", *words]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    environment |= OTHER_KERNELS if other_kernels else {}
+    subprocess.run([*command, f"--write-returned={folder}"], cwd=ROOT, env=environment, check=False)
+
+
+def read(folder: Path) -> Seen:
+    """What a run wrote."""
+    every = (json.loads(file.read_text()) for file in sorted(folder.glob("*.json")))
+    return {seen["test"]: (seen["seconds"], seen["returned"]) for seen in every}
+
+
+def agreed(runs: Sequence[Seen]) -> Seen:
+    """What is the same in all runs that a test was in: a hundredfold closer than tests ask."""
+    first, *others = runs
+    out: Seen = {}
+    for test, (seconds, functions) in first.items():
+        rest = [other[test][1] for other in others if test in other]
+        kept = {
+            name: {
+                place: summary
+                for place, summary in places.items()
+                if all(same(other.get(name, {}).get(place), summary, share=1e-5) for other in rest)
+            }
+            for name, places in functions.items()
+        }
+        if rest:
+            out[test] = seconds, {name: _shallowest(places) for name, places in kept.items() if places}
+    return out
+
+
+def _shallowest(places: dict[str, Any]) -> dict[str, Any]:
+    """The first places of a result that hold something; what lies deep in it was returned by another function."""
+    order = sorted(
+        (place for place in places if ".versions." not in place),
+        key=lambda place: (places[place][-1] == "NoneType", place.count(".")),
+    )
+    return {place: places[place] for place in order[:PLACES]}
+
+
+def functions_of(file: Path) -> Iterator[tuple[str, range]]:
+    """Qualified names of a module's functions, as code objects have them, and the lines of their bodies."""
+
+    def inside(node: ast.AST, prefix: str) -> Iterator[tuple[str, range]]:
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef):
+                yield prefix + child.name, range(child.body[0].lineno, child.end_lineno + 1)
+                yield from inside(child, f"{prefix}{child.name}.<locals>.")
+            elif isinstance(child, ast.ClassDef):
+                yield from inside(child, f"{prefix}{child.name}.")
+            else:
+                yield from inside(child, prefix)
+
+    yield from inside(ast.parse(file.read_text(encoding="utf-8")), "")
+
+
+def choose(seen: Seen, lines: dict[str, dict[str, list[str]]]) -> dict[str, dict[str, Any]]:
+    """By test and function what is kept."""
+    chosen: dict[str, set[str]] = defaultdict(set)
+    for module, contexts in sorted(item for item in lines.items() if item[0].endswith(".py")):
+        for name, body in functions_of(PACKAGE / module):
+            function = f"{module.removesuffix('.py')}:{name}"
+            able = {test for test, (_, functions) in seen.items() if function in functions}
+            # what is chosen for another line or function already comes first
+            costs = {test: (seen[test][0] > LONGEST_S, test not in chosen, seen[test][0], test) for test in able}
+            tests: set[str] = set()
+            for line in body:
+                of_line = able & set(contexts.get(str(line), ()))
+                ranked = sorted((test not in tests, *costs[test]) for test in of_line)
+                tests |= {rank[-1] for rank in ranked[:TESTS_OF_A_LINE]}
+            for test in tests:
+                chosen[test].add(function)
+    return {test: {name: seen[test][1][name] for name in functions} for test, functions in chosen.items()}
+
+
+def write(kept: dict[str, dict[str, Any]]) -> None:
+    """Write what tests compare with, a line a function."""
+    tests = []
+    for test in sorted(kept):
+        rows = (f"{json.dumps(name)}:{_compact(kept[test][name])}" for name in sorted(kept[test]))
+        tests.append(f"{json.dumps(test)}:{{\n" + ",\n".join(rows) + "}")
+    text = f'{{"versions":{_compact(versions())},\n"tests":{{' + ",\n".join(tests) + "}}\n"
+    KEPT.write_text(text, encoding="utf-8")
+
+
+def _compact(value: Any) -> str:
+    return json.dumps(value, separators=(",", ":"), ensure_ascii=False)
+
+
+def renew() -> None:
+    """Write anew what is kept of the tests that values are kept of."""
+    before = read_kept()
+    with tempfile.TemporaryDirectory() as folder:
+        for name in ("usual", "other"):
+            run(Path(folder) / name, sorted(before), other_kernels=name == "other")
+        seen = agreed([read(Path(folder) / name) for name in ("usual", "other")])
+    write(
+        {
+            test: {name: seen[test][1][name] for name in before[test] if name in seen[test][1]}
+            for test in before
+            if test in seen
+        }
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parts = parser.add_subparsers(dest="part", required=True)
+    parts.add_parser("renew")
+    running = parts.add_parser("run")
+    running.add_argument("folder", type=Path)
+    running.add_argument("--other-kernels", action="store_true")
+    choosing = parts.add_parser("choose")
+    choosing.add_argument("--map", type=Path, required=True)
+    choosing.add_argument("folders", type=Path, nargs="+")
+    given, rest = parser.parse_known_args()
+    if given.part == "renew":
+        renew()
+    elif given.part == "run":
+        run(given.folder.resolve(), rest, other_kernels=given.other_kernels)
+    else:
+        lines = json.loads(given.map.read_text())["lines"]
+        write(choose(agreed([read(folder) for folder in given.folders]), lines))
+
+
+if __name__ == "__main__":
+    main()
