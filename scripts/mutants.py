@@ -121,6 +121,8 @@ class Trial:
             return ("caught", failed[1]) if sound else ("broken", f"{failed[1]} fails without the fault")
         if done.returncode < 0:
             return "caught", f"tests end by signal {-done.returncode}"
+        if "ImportError while loading conftest" in done.stderr:
+            return "caught", "the package cannot be imported"
         printed = (done.stdout + done.stderr).strip().splitlines()
         return (
             ("survived", "") if done.returncode == _PASSED else ("broken", printed[-1] if printed else "pytest failed")

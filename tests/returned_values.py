@@ -39,6 +39,8 @@ TOLERANCE = 1e-3
 
 _NUMBER = re.compile(r"-?\d+\.?\d*(?:e[-+]?\d+)?")
 _PATH = re.compile(r"(?:/[\w.@+-]+){2,}")
+#: A test's own folder, which pytest numbers.
+_FOLDER = re.compile(r"\btest_\w+\d\b")
 
 
 @functools.cache
@@ -103,7 +105,7 @@ def _summary(some: list[Any]) -> list[Any]:
     numbers = [np.asarray(item).ravel() for item in some if not isinstance(item, str)]
     masked = ""
     for text in texts:
-        plain = _PATH.sub("/", text)
+        plain = _FOLDER.sub("test", _PATH.sub("/", text))
         numbers.append(np.array([float(number) for number in _NUMBER.findall(plain)][:200]))
         masked += _NUMBER.sub("#", plain)[: 240 // len(texts)]
     every = np.concatenate(numbers) if numbers else np.zeros(0)

@@ -3,6 +3,7 @@
 import dataclasses
 import importlib.util
 import json
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,7 +13,7 @@ import pytest
 from colmap_inertial import calibrate_imu, estimate_scale, gravity_at_latitude_m_s2
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.types import IMU_CAL, IMU_CALIBRATION_PARAMETERS, ImuCalibration, ImuRecording
-from colmap_inertial.inertial.static_calibration import _residual
+from colmap_inertial.inertial.static_calibration import _judged, _residual
 from colmap_inertial.inertial.static_calibration._rests import _means, candidate_rests
 from colmap_inertial.tools.simulate import RecordingOptions, RestOptions, simulate_recording, simulate_rests
 from colmap_inertial.tools.simulate.sensors import IMU_PRESETS
@@ -350,3 +351,26 @@ def test_a_rest_does_not_go_on_where_one_sensor_pauses():
         )
         for found in candidate_rests(paused):
             assert not np.any((found.begin_s < middle_s) & (found.end_s > middle_s)), name
+
+
+@pytest.mark.parametrize(
+    ("entry", "sigma", "said"),
+    [
+        pytest.param((0, 0), 0.003, "gain along x is known to .*0.59 % only", id="x"),
+        pytest.param((2, 2), 0.003, "gain along z is known to .*0.59 % only", id="z"),
+        pytest.param((2, 1), 0.003, "leave a misalignment of the accelerometer unknown", id="misalignment"),
+    ],
+)
+def test_the_worst_of_three_axes_makes_a_calibration_weak(entry, sigma, said):
+    sigmas = np.full(len(IMU_CALIBRATION_PARAMETERS), 1e-4)
+    sound = SimpleNamespace(accel_noise=1.0, turn_noise=1.0, drift_p_value=0.5)
+    rests = SimpleNamespace(attitudes=24)
+
+    def judged():
+        calibration = SimpleNamespace(cov=np.diag(sigmas**2), gravity_m_s2=9.8)
+        return _judged(calibration, sound, rests, 1e-4, apart=False)
+
+    assert judged() == ("good", ())
+    sigmas[np.arange(len(sigmas))[IMU_CAL.ACCEL_GAIN].reshape(3, 3)[entry]] = sigma
+    verdict, (why,) = judged()
+    assert verdict == "weak" and re.search(said, why)

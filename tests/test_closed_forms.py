@@ -14,6 +14,7 @@ from colmap_inertial.checks.diagnose.frames import _readout
 from colmap_inertial.checks.diagnose.imu import acceleration_rms_m_s2, scatter_of
 from colmap_inertial.checks.report import figure_3d, figures, signals, still, still_3d
 from colmap_inertial.checks.report.run_page import _round_to_sigma
+from colmap_inertial.checks.validate import measure
 from colmap_inertial.checks.validate.measure import _list_remarks
 from colmap_inertial.checks.validate.overlays import _ticks
 from colmap_inertial.checks.validate.place import _choose_pairs
@@ -21,13 +22,13 @@ from colmap_inertial.checks.validate.targets import parse_target
 from colmap_inertial.checks.validate.views import load_views
 from colmap_inertial.checks.words import digits, fixed, half_width_pct, length, length_error
 from colmap_inertial.cli.help import Option, _shorten
-from colmap_inertial.colmap import dense
+from colmap_inertial.colmap import dense, tsdf
 from colmap_inertial.colmap.loops import key_frames
 from colmap_inertial.colmap.sparse import require_room_for_features
 from colmap_inertial.colmap.two_views import _count_matches
 from colmap_inertial.core import summary
 from colmap_inertial.core.camera_clock import CameraTimedImu
-from colmap_inertial.core.errors import FormatError, NotObservableError, OutputError
+from colmap_inertial.core.errors import FormatError, NotObservableError, OutputError, TargetNotFoundError
 from colmap_inertial.core.geometry import (
     matrix_from_quat,
     quat_conjugate,
@@ -37,9 +38,18 @@ from colmap_inertial.core.geometry import (
     quat_rotate,
 )
 from colmap_inertial.core.options import MappingOptions
-from colmap_inertial.core.types import CameraTrajectory, FrameTiming, ImuRecording, PositionFixes
+from colmap_inertial.core.sampling import find_clipped
+from colmap_inertial.core.types import (
+    IMU_CAL,
+    IMU_CALIBRATION_PARAMETERS,
+    CameraTrajectory,
+    FrameTiming,
+    ImuRecording,
+    PositionFixes,
+)
 from colmap_inertial.core.types.consensus import RotationConsensus
 from colmap_inertial.imaging.blur_field import check_nodes
+from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.gyro_camera import FrameShutter
 from colmap_inertial.imaging.multi_aperture._sampling import convert_to_codes
 from colmap_inertial.imaging.multi_aperture.disparity import background
@@ -47,7 +57,7 @@ from colmap_inertial.imaging.psf import _fill_nodes
 from colmap_inertial.inertial import scale
 from colmap_inertial.inertial.core.factors import lasting_group, state_group, walk_group
 from colmap_inertial.inertial.core.parameters import ACCEL_GAIN, DRIFT, GYRO_GAIN, N_GLOBALS, SCALE, Estimate, Prior
-from colmap_inertial.inertial.core.priors import AccelPart
+from colmap_inertial.inertial.core.priors import AccelPart, gains_cov
 from colmap_inertial.inertial.georeference import _convert_to_enu
 from colmap_inertial.inertial.scale import _shape
 from colmap_inertial.inertial.scale._fit import _excitation_m_s2, _gain_surprise
@@ -949,3 +959,46 @@ def test_three_letters_name_the_axes_of_a_gopro():
 def test_single_descriptors_are_no_matches():
     one, many = np.full((1, 128), 45, np.uint8), np.eye(128, dtype=np.uint8)[:40] * 255
     assert [_count_matches(*pair) for pair in ((one, many), (many, one), (many[:0], many))] == [0, 0, 0]
+
+
+def test_readings_are_cut_off_where_their_end_is_common_and_what_is_next_to_it_is_rare():
+    spread = np.linspace(-1, 0, 25)
+    rare, common = (np.concatenate([np.repeat(spread, times), np.full(8, 5.0)]) for times in (1, 4))
+    # the next reading is far from the end: how often it comes counts all the same
+    assert find_clipped(np.stack([rare], axis=1))[:, 0].tolist() == [False] * 25 + [True] * 8
+    assert not find_clipped(np.stack([common], axis=1)).any()
+
+
+def test_a_longer_blur_path_errs_by_as_much_more():
+    path = BlurPath(width=32, height=32, step_px=32, path_px=np.ones((3, 2, 2, 2)), cov_px2=np.array([1.0, 2.0, 0.5]))
+    longer = path.times(3.0)
+    np.testing.assert_allclose(longer.path_px, 3 * path.path_px)
+    np.testing.assert_allclose(longer.cov_px2, 9 * path.cov_px2)
+
+
+def test_a_quarter_of_the_known_depths_is_near():
+    camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 100.0, 64, 48)
+    depth = np.arange(10, dtype=np.float32)[None]
+    assert tsdf._measure_typical(depth, camera) == pytest.approx((3.0, 0.03))
+    assert tsdf._measure_typical(0 * depth, camera) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(("images", "agree"), [(10, True), (11, False)])
+def test_a_fifth_of_the_images_that_show_a_target_agree_where_it_is(images, agree):
+    sightings = [SimpleNamespace(view=i) for i in range(images)]
+    search = SimpleNamespace(parts={0: sightings}, sightings=sightings, target=SimpleNamespace(spec="board"))
+    placed = {0: SimpleNamespace(chosen=[3, 7])}
+    if agree:
+        assert measure._require_agreement(search, placed) is None
+    else:
+        with pytest.raises(TargetNotFoundError, match=rf"found in {images} images, but only 2 of them agree"):
+            measure._require_agreement(search, placed)
+
+
+def test_gains_stay_unknown_as_a_calibration_says_and_by_what_moved_since():
+    cov = np.diag(np.arange(1.0, len(IMU_CALIBRATION_PARAMETERS) + 1)) * 1e-6
+    of = SimpleNamespace(accel_factor=np.eye(3), cov=cov)
+    entries = np.r_[IMU_CAL.ACCEL_GAIN, IMU_CAL.GYRO_GAIN]
+    np.testing.assert_allclose(gains_cov(SimpleNamespace(calibration=of)), cov[np.ix_(entries, entries)])
+    with pytest.raises(ValueError, match="not corrected by a calibration"):
+        gains_cov(SimpleNamespace(calibration=None))

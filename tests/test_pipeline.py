@@ -435,3 +435,14 @@ def test_reading_a_capture_without_frames_is_an_error(tmp_path):
     (capture / "capture.toml").write_text(text[:start] + text[end:])
     with pytest.raises(FormatError, match=r"\[images\] or \[video\]"):
         reconstruct(capture, tmp_path / "out")
+
+
+@pytest.mark.parametrize("command", ["reconstruct", "deblur"])
+def test_a_recording_without_frames_is_said_before_any_work(tmp_path, command, capsys):
+    (tmp_path / "imu.csv").write_text("t_ns,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z\n0,0,0,0,0,0,9.8\n")
+    capture = tmp_path / "capture.toml"
+    capture.write_text('[imu]\npath = "imu.csv"\n')
+    with pytest.raises(SystemExit, match="2"):
+        main([command, str(capture), str(tmp_path / "out")])
+    assert "has no frames: add [images] or [video]" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
