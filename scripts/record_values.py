@@ -8,7 +8,7 @@
 return now is written. Look at what the tests said before. ``run`` runs tests and writes all that functions return in
 each into a folder; ``--other-kernels`` has numpy, OpenBLAS and OpenCV calculate as an old processor would. ``choose``
 takes what several runs agree in and keeps some of it: for each line that a test runs (``random_mutants.py map``), what
-its function returns in the quickest two tests that run the line.
+its function returns in a quick test that runs the line, or in two.
 """
 
 from __future__ import annotations
@@ -36,8 +36,9 @@ OTHER_KERNELS = {
     "OPENCV_CPU_DISABLE": "AVX512_SKX,AVX2,FP16,FMA3",
     "OPENCV_IPP": "disabled",
 }
-#: Tests of each line that values are kept of, and how long such a test may take unless there is no other (s).
-TESTS_OF_A_LINE, LONGEST_S = 2, 3.0
+#: Tests of each line that values are kept of, how long such a test may take unless there is no other, and how long the
+#: second (s): to note what functions return makes a test a fifth slower.
+TESTS_OF_A_LINE, LONGEST_S, QUICK_S = 2, 3.0, 0.5
 
 #: Places of a result.
 PLACES = 10
@@ -117,7 +118,7 @@ def choose(seen: Seen, lines: dict[str, dict[str, list[str]]]) -> dict[str, dict
             for line in body:
                 of_line = able & set(contexts.get(str(line), ()))
                 ranked = sorted((test not in tests, *costs[test]) for test in of_line)
-                tests |= {rank[-1] for rank in ranked[:TESTS_OF_A_LINE]}
+                tests |= {rank[-1] for i, rank in enumerate(ranked[:TESTS_OF_A_LINE]) if i == 0 or rank[3] < QUICK_S}
             for test in tests:
                 chosen[test].add(function)
     return {test: {name: seen[test][1][name] for name in functions} for test, functions in chosen.items()}

@@ -1002,3 +1002,30 @@ def test_gains_stay_unknown_as_a_calibration_says_and_by_what_moved_since():
     np.testing.assert_allclose(gains_cov(SimpleNamespace(calibration=of)), cov[np.ix_(entries, entries)])
     with pytest.raises(ValueError, match="not corrected by a calibration"):
         gains_cov(SimpleNamespace(calibration=None))
+
+
+@pytest.mark.parametrize(("sizes", "models"), [([2, 2, 3], 2), ([2, 3, 3, 4], 3), ([3, 2], 2)])
+def test_frames_are_surveyed_again_only_while_more_of_them_register(monkeypatch, sizes, models):
+    made = iter(sizes)
+    asked = []
+
+    def model_of(names, treated):
+        asked.append(treated)
+        return tuple(f"{i}.jpg" for i in range(next(made)))
+
+    segment = [f"{i}.jpg" for i in range(9)]
+    monkeypatch.setattr(plan, "_LIMITS", replace(plan._LIMITS, surveys=5))
+    monkeypatch.setattr(plan._Surveyed, "of", lambda registered, view: SimpleNamespace(registered=registered))
+    for name, answer in {
+        "survey_parts": [segment],
+        "_decisions": None,
+        "_blurred": True,
+        "_select_blurred": segment,
+        "_group_by_segment": {0: set(segment)},
+        "_merge_parallaxes": {"0.jpg": 1.0},
+        "_decided": SimpleNamespace(deblur="yes"),
+    }.items():
+        monkeypatch.setattr(plan, name, lambda *_, answer=answer: answer)
+    treated = plan._deblurring(None, SimpleNamespace(timing=None), None, model_of, lambda _: [], None)
+    # the first model is of frames as filmed
+    assert asked == [None, *[treated] * (models - 1)]
