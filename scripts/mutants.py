@@ -121,7 +121,7 @@ class Trial:
             return ("caught", failed[1]) if sound else ("broken", f"{failed[1]} fails without the fault")
         if done.returncode < 0:
             return "caught", f"tests end by signal {-done.returncode}"
-        if "ImportError while loading conftest" in done.stderr:
+        if "ImportError while loading conftest" in done.stderr and self._passes(tests[0]):
             return "caught", "the package cannot be imported"
         printed = (done.stdout + done.stderr).strip().splitlines()
         return (

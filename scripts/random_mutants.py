@@ -166,21 +166,27 @@ def changes(node: ast.AST, source: Source) -> Iterator[tuple[str, ast.AST, str]]
 
 def _is_whole(node: ast.Compare) -> bool:
     """Whether a comparison looks like one of whole numbers: between reals, ``<`` for ``<=`` changes nothing."""
-    sides = [node.left, *node.comparators]
+    parts = [part for side in (node.left, *node.comparators) for part in _terms(side)]
     whole = any(
-        (isinstance(part, ast.Constant) and isinstance(part.value, int))
+        (isinstance(part, ast.Constant) and type(part.value) is int)
         or (isinstance(part, ast.Call) and getattr(part.func, "id", "") == "len")
         or (isinstance(part, ast.Attribute) and part.attr in _WHOLE)
-        for side in sides
-        for part in ast.walk(side)
+        or (isinstance(part, ast.Subscript) and getattr(part.value, "attr", "") == "shape")
+        for part in parts
     )
     real = any(
         (isinstance(part, ast.Constant) and isinstance(part.value, float))
         or _UNIT.search(getattr(part, "attr", getattr(part, "id", ""))) is not None
-        for side in sides
-        for part in ast.walk(side)
+        for part in parts
     )
     return whole and not real
+
+
+def _terms(side: ast.expr) -> list[ast.expr]:
+    """What is added, subtracted or multiplied on one side of a comparison; neither arguments nor indices."""
+    if isinstance(side, ast.BinOp):
+        return [*_terms(side.left), *_terms(side.right)]
+    return [side]
 
 
 def _skipped(tree: ast.AST) -> set[ast.AST]:

@@ -1,6 +1,6 @@
 """What the package's functions return while a test runs, summarised: to be compared with what they returned before.
 
-Of a function that returns nothing, its arguments are summarised as it leaves them.
+Of a function that returns nothing, or raises an error, its arguments are summarised as it leaves them.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ KEPT = Path(__file__).parent / "references" / "returned_values.json"
 LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "pycolmap", "av")
 #: Of each function the first calls are summarised: those of a later iteration depend on the last bit of the one before.
 CALLS = 4
-#: Of a sequence, so many items; of an array, so many values, evenly spaced.
+#: Of a sequence, so many items; of an array, so many values, drawn at random.
 ITEMS, VALUES = 6, 20_000
 DEEPEST = 5
-#: A summary is kept to so many digits, and compared to this share of the values' mean size.
+#: Summaries, of six digits, are compared to this share of the values' mean size.
 TOLERANCE = 1e-3
 
 _NUMBER = re.compile(r"-?\d+\.?\d*(?:e[-+]?\d+)?")
@@ -46,6 +46,12 @@ _FOLDER = re.compile(r"\btest_\w+\d\b")
 @functools.cache
 def _weights(count: int) -> np.ndarray:
     return np.random.default_rng(count).uniform(-1, 1, count)
+
+
+def _sample(values: np.ndarray) -> np.ndarray:
+    # not evenly spaced: of (N, 3) values, that may be those of one column
+    few = values.size <= VALUES
+    return values if few else values[np.random.default_rng(values.size).integers(0, values.size, VALUES)]
 
 
 def _leaves(value: Any, path: str, depth: int) -> Iterator[tuple[str, Any]]:
@@ -74,6 +80,8 @@ def _leaves(value: Any, path: str, depth: int) -> Iterator[tuple[str, Any]]:
     elif isinstance(value, dict):
         for key in list(value)[:40]:
             yield from _leaves(value[key], f"{path}.{key}" if isinstance(key, str) else f"{path}.*", depth + 1)
+    elif isinstance(value, set | frozenset):
+        yield from _leaves(sorted(value, key=str), path, depth)
     elif isinstance(value, list | tuple):
         if value and all(isinstance(item, int | float) for item in value):
             yield path, np.array(value, float)
@@ -84,7 +92,7 @@ def _leaves(value: Any, path: str, depth: int) -> Iterator[tuple[str, Any]]:
     elif isinstance(value, enum.Enum):
         yield path, value.name
     elif type(value).__module__.startswith("colmap_inertial"):
-        for name, part in getattr(value, "__dict__", {}).items():
+        for name, part in list(getattr(value, "__dict__", {}).items()):
             yield from _leaves(part, f"{path}.{name}", depth + 1)
     else:
         yield path, type(value).__name__
@@ -112,7 +120,7 @@ def _summary(some: list[Any]) -> list[Any]:
     if np.iscomplexobj(every):
         every = np.concatenate([every.real, every.imag])
     with np.errstate(all="ignore"):
-        values = every[:: max(1, every.size // VALUES)].astype(float)
+        values = _sample(every).astype(float)
         finite = np.isfinite(values)
         values = np.where(finite, values, 0.0)
         mean = float(np.abs(values).mean()) if values.size else 0.0
@@ -135,6 +143,7 @@ class Recorder:
         self._names: dict[CodeType, str | None] = {}
         self._calls: Counter[CodeType] = Counter()
         self._leaves: dict[str, dict[str, list[Any]]] = {}
+        self._error: Exception | None = None
         self.seconds = 0.0
 
     def __enter__(self) -> Recorder:
@@ -161,15 +170,14 @@ class Recorder:
             return
         self._calls[code] += 1
         into = self._leaves.setdefault(name, {})
-        sys.setprofile(None)
         try:
             if value is None:  # what it left in its arguments, or wrote
                 arguments = code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]
                 value = {argument: frame.f_locals[argument] for argument in arguments if argument in frame.f_locals}
             for place, leaf in _leaves(value, "", 0):
                 into.setdefault(place, []).append(leaf.copy() if isinstance(leaf, np.ndarray) else leaf)
-        finally:
-            sys.setprofile(self._note)
+        except Exception as error:  # not to be met by the function that returns
+            self._error = self._error or error
 
     def _name(self, code: CodeType) -> str | None:
         # neither templates nor comprehensions
@@ -180,6 +188,8 @@ class Recorder:
 
     def summaries(self) -> dict[str, dict[str, list[Any]]]:
         """By function and place in its result."""
+        if self._error is not None:
+            raise self._error
         return {name: {path: _summary(some) for path, some in leaves.items()} for name, leaves in self._leaves.items()}
 
 
@@ -209,14 +219,15 @@ def read_kept() -> dict[str, dict[str, Any]]:
 
 def versions() -> dict[str, str]:
     """Of the libraries that calculate."""
-    return {name: importlib.metadata.version(name) for name in LIBRARIES}
+    found = {each.metadata["Name"]: each.version for each in importlib.metadata.distributions()}
+    return {name: found.get(name, "not installed") for name in LIBRARIES}
 
 
 def explain(changed: Sequence[str]) -> str:
     """A failed comparison in words."""
     before, now = json.loads(KEPT.read_text())["versions"], versions()
     words = ["functions return other values than before (if that is meant: scripts/record_values.py renew)"]
-    words += [f"{name} is {now[name]}, was {before[name]}" for name in before if before[name] != now[name]]
+    words += [f"{name} is {now[name]}, was {before.get(name)}" for name in now if before.get(name) != now[name]]
     return "\n".join([*words, *changed])
 
 
