@@ -21,6 +21,7 @@ from colmap_inertial.checks.validate.place import _choose_pairs
 from colmap_inertial.checks.validate.targets import parse_target
 from colmap_inertial.checks.validate.views import load_views
 from colmap_inertial.checks.words import digits, fixed, half_width_pct, length, length_error
+from colmap_inertial.cli import process
 from colmap_inertial.cli.help import Option, _shorten
 from colmap_inertial.colmap import dense, tsdf
 from colmap_inertial.colmap.loops import key_frames
@@ -28,7 +29,7 @@ from colmap_inertial.colmap.sparse import require_room_for_features
 from colmap_inertial.colmap.two_views import _count_matches
 from colmap_inertial.core import summary
 from colmap_inertial.core.camera_clock import CameraTimedImu
-from colmap_inertial.core.errors import FormatError, NotObservableError, OutputError, TargetNotFoundError
+from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError, OutputError, TargetNotFoundError
 from colmap_inertial.core.geometry import (
     matrix_from_quat,
     quat_conjugate,
@@ -38,7 +39,7 @@ from colmap_inertial.core.geometry import (
     quat_rotate,
 )
 from colmap_inertial.core.options import MappingOptions
-from colmap_inertial.core.sampling import find_clipped
+from colmap_inertial.core.sampling import find_clipped, time_unit_factor
 from colmap_inertial.core.types import (
     IMU_CAL,
     IMU_CALIBRATION_PARAMETERS,
@@ -48,6 +49,7 @@ from colmap_inertial.core.types import (
     PositionFixes,
 )
 from colmap_inertial.core.types.consensus import RotationConsensus
+from colmap_inertial.imaging import gate
 from colmap_inertial.imaging.blur_field import check_nodes
 from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.gyro_camera import FrameShutter
@@ -1029,3 +1031,50 @@ def test_frames_are_surveyed_again_only_while_more_of_them_register(monkeypatch,
     treated = plan._deblurring(None, SimpleNamespace(timing=None), None, model_of, lambda _: [], None)
     # the first model is of frames as filmed
     assert asked == [None, *[treated] * (models - 1)]
+
+
+@pytest.mark.parametrize(
+    ("span_s", "other_s", "factor"),
+    [
+        (2e3, 2.0, 1e3),
+        (9.0e6, 3.0, 1e6),
+        (2e-9, 1.0, 1e-9),
+        (1.0, 1e3, 1e-3),
+        (4.0, 1.0, None),
+        (4e4, 1.0, None),
+        (4.9e3, 1.0, 1e3),
+    ],
+)
+def test_a_clock_in_another_unit_is_off_by_a_power_of_a_thousand(span_s, other_s, factor):
+    assert time_unit_factor(span_s, other_s) == (None if factor is None else pytest.approx(factor))
+
+
+@pytest.mark.parametrize(("support", "mirrored", "clear"), [(2.0, -1.0, True), (2.0, 1.9, False), (0.1, 0.0, False)])
+def test_frames_confirm_a_gyroscope_together_but_not_its_mirror_image(support, mirrored, clear):
+    scale = gate.GATE_LIMITS.together_support
+    together = SimpleNamespace(
+        support=support * scale, mirrored_support=mirrored * scale, extent_is_plausible=True, extent_factor=1.0
+    )
+    telling = [SimpleNamespace(support=9.0, mirrored_support=0.0)] * 9
+    assert gate._is_clear_together(telling, together) is clear
+
+
+def test_ground_that_few_images_see_is_counted_where_any_sees_it():
+    images = [[0, 1, 2], [figures.SIZES.fewest_views, 9, 0]]
+    assert figures.seldom_seen({"images": images}) == pytest.approx(0.5)
+    assert figures.seldom_seen({"images": [[0, 0]]}) == 0.0
+
+
+@pytest.mark.parametrize("fewer", [False, True])
+def test_less_memory_than_libraries_need_is_said(monkeypatch, fewer):
+    resource = pytest.importorskip("resource")
+    unlimited = (resource.RLIMIT_NOFILE, resource.RLIMIT_FSIZE)
+    least = process.LEAST_BYTES + process.THREAD_BYTES
+    monkeypatch.setattr("colmap_inertial.core.threads.usable_processors", lambda: 1)
+    limits = {resource.RLIMIT_AS: least - fewer} | dict.fromkeys(unlimited, resource.RLIM_INFINITY)
+    monkeypatch.setattr(resource, "getrlimit", lambda kind: (limits[kind], limits[kind]))
+    if not fewer:
+        assert process.require_limits(to_load=False) is None
+    else:
+        with pytest.raises(InertialError, match="of memory are allowed to a process here"):
+            process.require_limits(to_load=False)
