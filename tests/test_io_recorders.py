@@ -417,3 +417,14 @@ def test_damage_in_a_gcsv_names_its_line(tmp_path: Path, one_clock: ImuRecording
     path.write_text(text.replace(old, new, 1))
     with pytest.raises((FormatError, TimingError), match=message):
         read_imu(path)
+
+
+def test_a_gcsv_of_a_gyroscope_alone_is_read(tmp_path: Path) -> None:
+    t_ms = np.arange(400) * 5
+    gyro_rad_s = np.random.default_rng(0).normal(size=(400, 3)).round(3)
+    head = ["GYROFLOW IMU LOG", "version,1.3", "id,x", "orientation,XYZ", "tscale,0.001", "gscale,0.5", "t,gx,gy,gz"]
+    rows = [f"{t},{x},{y},{z}" for t, (x, y, z) in zip(t_ms.tolist(), gyro_rad_s, strict=True)]
+    (tmp_path / "a.gcsv").write_text("\n".join([*head, *rows]) + "\n")
+    imu = read_imu(tmp_path / "a.gcsv")
+    np.testing.assert_allclose(np.abs(imu.gyro_rad_s), np.abs(0.5 * gyro_rad_s))
+    assert len(imu.accel_t_s) == 0
