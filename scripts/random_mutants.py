@@ -316,11 +316,7 @@ class Tests:
         contexts = lines.get(str(fault.line)) or sorted(set().union(*lines.values()))
         by_time = sorted({_function(context) for context in contexts}, key=self._time)
         by_share = sorted(by_time, key=lambda name: -self._run[name, fault.file] / self._run_by[name])
-        functions = {
-            f"{fault.file.removesuffix('.py')}:{name}"
-            for name, body in functions_of(ROOT / PACKAGE / fault.file)
-            if fault.line in body
-        }
+        functions = {name for name, body in functions_of(fault.file) if fault.line in body}
         by_kept = [name for name in by_time if functions & self._kept[name]]
         chosen = {by_time[0]} if by_time else set()
         for names in (by_time, by_share, by_kept):

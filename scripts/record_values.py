@@ -45,7 +45,7 @@ TESTS_OF_A_LINE, LONGEST_S, QUICK_S = 2, 3.0, 0.5
 VARYING = ("pipeline/run/chunks", "pipeline/run/workers", "tools/batch/", "tools/view/server")
 VARYING_TESTS = tuple(f"tests/test_{name}.py::" for name in ("batch", "heal", "installed_colmap", "parts", "view"))
 
-#: Places of a result.
+#: So many places of a result are kept.
 PLACES = 10
 
 #: By test: seconds, and by function and place what it returned.
@@ -96,8 +96,8 @@ def _shallowest(places: dict[str, Any]) -> dict[str, Any]:
     return {place: places[place] for place in order[:PLACES]}
 
 
-def functions_of(file: Path) -> Iterator[tuple[str, range]]:
-    """Qualified names of a module's functions, as code objects have them, and the lines of their bodies."""
+def functions_of(module: str) -> Iterator[tuple[str, range]]:
+    """Names of a module's functions, as they are noted in tests, and the lines of their bodies."""
 
     def inside(node: ast.AST, prefix: str) -> Iterator[tuple[str, range]]:
         for child in ast.iter_child_nodes(node):
@@ -109,18 +109,15 @@ def functions_of(file: Path) -> Iterator[tuple[str, range]]:
             else:
                 yield from inside(child, prefix)
 
-    yield from inside(ast.parse(file.read_text(encoding="utf-8")), "")
+    yield from inside(ast.parse((PACKAGE / module).read_text(encoding="utf-8")), f"{module.removesuffix('.py')}:")
 
 
 def choose(seen: Seen, lines: dict[str, dict[str, list[str]]]) -> dict[str, dict[str, Any]]:
     """By test and function what is kept."""
-    seen = {
-        test: some for test, some in seen.items() if test.partition("::")[0].rpartition("/")[2] not in VARYING_TESTS
-    }
+    seen = {test: some for test, some in seen.items() if not test.startswith(VARYING_TESTS)}
     chosen: dict[str, set[str]] = defaultdict(set)
     for module, contexts in sorted(item for item in lines.items() if item[0].endswith(".py")):
-        for name, body in functions_of(PACKAGE / module):
-            function = f"{module.removesuffix('.py')}:{name}"
+        for function, body in functions_of(module):
             if function.startswith(VARYING):
                 continue
             able = {test for test, (_, functions) in seen.items() if function in functions}
@@ -163,10 +160,11 @@ def renewed(before: dict[str, dict[str, Any]], runs: Sequence[Seen]) -> dict[str
                 name: {place: places[place] for place in places if place in functions[name]} or places
                 for name, places in returned.items()
             }
-    return {test: functions for test, functions in kept.items() if functions and _exists(test)}
+    return {test: functions for test, functions in kept.items() if functions and exists(test)}
 
 
-def _exists(test: str) -> bool:
+def exists(test: str) -> bool:
+    """Whether there is such a test function."""
     file, name = test.partition("[")[0].split("::")
     return (ROOT / file).is_file() and f"def {name}(" in (ROOT / file).read_text(encoding="utf-8")
 
@@ -174,7 +172,7 @@ def _exists(test: str) -> bool:
 def renew() -> None:
     """Write anew what is kept of tests."""
     before = read_kept()
-    files = sorted({test.partition("::")[0] for test in before if _exists(test)})
+    files = sorted({test.partition("::")[0] for test in before if exists(test)})
     with tempfile.TemporaryDirectory() as folder:
         usual, other = Path(folder) / "usual", Path(folder) / "other"
         # another distribution over processes, too: what a test's helper keeps for the next ones shows

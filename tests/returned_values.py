@@ -33,6 +33,7 @@ LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "pycolmap", "av
 CALLS = 4
 #: Of a sequence, so many items; of an array, so many values, drawn at random.
 ITEMS, VALUES = 6, 20_000
+#: Values in values are followed so far.
 DEEPEST = 5
 #: Summaries, of six digits, are compared to this share of the values' mean size.
 TOLERANCE = 1e-3

@@ -101,16 +101,13 @@ def test_a_function_that_is_called_no_more_is_noticed():
 
 
 def test_tests_with_kept_values_exist():
-    for test in RETURNED:
-        file, name = test.partition("[")[0].split("::")
-        assert f"def {name}(" in (Path(__file__).parents[1] / file).read_text(), test
+    assert [test for test in RETURNED if not record_values.exists(test)] == []
     assert len(RETURNED) > 100
 
 
 TESTS = """
 import pytest
 from colmap_inertial.core.geometry import quat_exp
-from colmap_inertial.core.threads import one_blas_thread
 
 def test_turn():
     quat_exp([0.3, -0.2, 0.1])
@@ -192,7 +189,7 @@ def test_values_are_renewed_for_the_same_tests_functions_and_places():
 def test_of_each_line_a_quick_test_is_chosen_or_two(monkeypatch, tmp_path):
     (tmp_path / "m.py").write_text("class A:\n    def f(self):\n        a = 1\n        return a\n")
     monkeypatch.setattr(record_values, "PACKAGE", tmp_path)
-    assert list(record_values.functions_of(tmp_path / "m.py")) == [("A.f", range(3, 5))]
+    assert list(record_values.functions_of("m.py")) == [("m:A.f", range(3, 5))]
     of = {"m:A.f": summarise([1.0])}
     seen = {"slow": (9.0, of), "quick": (0.1, of), "second": (0.2, of), "third": (0.3, of), "other": (1.0, of)}
     lines = {"m.py": {"3": ["slow", "quick", "second", "third"], "4": ["slow", "other"]}}
@@ -200,3 +197,16 @@ def test_of_each_line_a_quick_test_is_chosen_or_two(monkeypatch, tmp_path):
     lines["m.py"]["4"].append("unseen")
     del seen["other"]
     assert sorted(record_values.choose(seen, lines)) == ["quick", "second", "slow"]
+
+
+def test_nothing_is_kept_of_what_waits_for_processes(monkeypatch, tmp_path):
+    monkeypatch.setattr(record_values, "PACKAGE", tmp_path)
+    lines = {}
+    tests = ["tests/test_batch.py::test_a", "tests/test_batch_stages.py::test_a"]
+    for module in ("m.py", "tools/batch/m.py"):
+        (tmp_path / module).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / module).write_text("def f():\n    return 1\n")
+        lines[module] = {"2": tests}
+    returned = {"m:f": summarise([1]), "tools/batch/m:f": summarise([1])}
+    kept = record_values.choose(dict.fromkeys(tests, (0.1, returned)), lines)
+    assert kept == {tests[1]: {"m:f": summarise([1])}}
