@@ -41,8 +41,12 @@ OTHER_KERNELS = {
 #: second (s): to note what functions return makes a test a fifth slower.
 TESTS_OF_A_LINE, LONGEST_S, QUICK_S = 2, 3.0, 0.5
 
-#: Modules and tests whose functions wait for other processes: how often they return varies.
-VARYING = ("pipeline/run/chunks", "pipeline/run/workers", "tools/batch/", "tools/view/server")
+#: Modules and tests whose functions wait for other processes: how often they return varies. Functions of the time that
+#: has gone by, and of where files lie.
+VARYING = (
+    *("pipeline/run/chunks", "pipeline/run/workers", "tools/batch/", "tools/view/server"),
+    *("cli/screen:Stage.seconds", "cli/screen:clock", "pipeline/run/runner:hash_values", "checks/report/page:_packed"),
+)
 VARYING_TESTS = tuple(f"tests/test_{name}.py::" for name in ("batch", "heal", "installed_colmap", "parts", "view"))
 
 #: So many places of a result are kept.

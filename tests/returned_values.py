@@ -42,6 +42,8 @@ _NUMBER = re.compile(r"-?\d+\.?\d*(?:e[-+]?\d+)?")
 _PATH = re.compile(r"(?:/[\w.@+-]+){2,}")
 #: A test's own folder, which pytest numbers.
 _FOLDER = re.compile(r"\btest_\w+\d\b")
+#: What commands begin with where the program is not on the PATH.
+_PROGRAM = str(Path(sys.executable).with_name("colmap-inertial"))
 
 
 @functools.cache
@@ -114,7 +116,8 @@ def _summary(some: list[Any]) -> list[Any]:
     numbers = [np.asarray(item).ravel() for item in some if not isinstance(item, str)]
     masked = ""
     for text in texts:
-        plain = _FOLDER.sub("test", _PATH.sub("/", text))
+        plain = text.replace(_PROGRAM, "colmap-inertial")
+        plain = _FOLDER.sub("test", _PATH.sub("/", plain))
         numbers.append(np.array([float(number) for number in _NUMBER.findall(plain)][:200]))
         masked += _NUMBER.sub("#", plain)[: 240 // len(texts)]
     every = np.concatenate(numbers) if numbers else np.zeros(0)
