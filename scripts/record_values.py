@@ -1,15 +1,15 @@
 """Write what the package's functions return in tests, for the tests to compare with (``tests/returned_values.py``).
 
-    python scripts/record_values.py renew
-    python scripts/record_values.py run FOLDER [--other-kernels] [PYTEST'S WORDS ...]
+    python scripts/record_values.py renew [FILE ...]
+    python scripts/record_values.py run FOLDER [--elsewhere] [PYTEST'S WORDS ...]
     python scripts/record_values.py choose --map MAP FOLDER FOLDER ...
 
-``renew`` is for a change that was meant to change values: the files of tests that values are kept of are run twice, and
-what functions return now is written. Look at what the tests said before. The other two are for values of new tests.
-``run`` runs tests and writes all that functions return in each into a new folder; ``--other-kernels`` has numpy,
-OpenBLAS and OpenCV calculate as an old processor would. ``choose`` takes what several runs agree in and keeps some of
-it: for each line that a test runs (``random_mutants.py map``), what its function returns in a quick test that runs the
-line, or in two.
+``renew`` is for a change that was meant to change values: the files of tests that values are kept of, or those given,
+are run twice, and what functions return now is written. Look at what the tests said before. The other two are for
+values of new tests. ``run`` runs tests and writes all that functions return in each into a new folder; ``--elsewhere``
+has numpy, OpenBLAS and OpenCV calculate as an old processor would, in another time zone, with nothing of ``.venv`` on
+the PATH. ``choose`` takes what several runs agree in and keeps some of it: for each line that a test runs
+(``random_mutants.py map``), what its function returns in a quick test that runs the line, or in two.
 """
 
 from __future__ import annotations
@@ -30,12 +30,14 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 from returned_values import KEPT, PACKAGE, read_kept, same, versions  # noqa: E402
 
-#: Kernels of a processor without AVX.
-OTHER_KERNELS = {
+#: Another machine: kernels of a processor without AVX, other surroundings.
+ELSEWHERE = {
     "OPENBLAS_CORETYPE": "Nehalem",
     "NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4 AVX512_ICL AVX512_SPR",
     "OPENCV_CPU_DISABLE": "AVX512_SKX,AVX2,FP16,FMA3",
     "OPENCV_IPP": "disabled",
+    "PATH": os.defpath,
+    "TZ": "Asia/Tokyo",
 }
 #: Tests of each line that values are kept of, how long such a test may take unless there is no other, and how long the
 #: second (s): to note what functions return makes a test a fifth slower.
@@ -56,13 +58,13 @@ PLACES = 10
 Seen = dict[str, tuple[float, dict[str, dict[str, Any]]]]
 
 
-def run(folder: Path, words: Sequence[str], *, other_kernels: bool = False) -> int:
+def run(folder: Path, words: Sequence[str], *, elsewhere: bool = False) -> int:
     """Run tests and write what functions return in each; returns pytest's exit code."""
     if folder.exists() and any(folder.iterdir()):
         raise SystemExit(f"{folder} is not empty")
     command = [sys.executable, "-m", "pytest", "-q", "--numprocesses", "auto", "--dist", "loadfile", *words]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    environment |= OTHER_KERNELS if other_kernels else {}
+    environment |= ELSEWHERE if elsewhere else {}
     return subprocess.run([*command, f"--write-returned={folder}"], cwd=ROOT, env=environment, check=False).returncode
 
 
@@ -173,14 +175,18 @@ def exists(test: str) -> bool:
     return (ROOT / file).is_file() and f"def {name}(" in (ROOT / file).read_text(encoding="utf-8")
 
 
-def renew() -> None:
-    """Write anew what is kept of tests."""
+def renew(only: Sequence[str]) -> None:
+    """Write anew what is kept of tests, or of those in some files."""
     before = read_kept()
     files = sorted({test.partition("::")[0] for test in before if exists(test)})
+    if only:
+        files = [file for file in files if file in only]
+    if unknown := sorted(set(only) - set(files)):
+        raise SystemExit(f"values are kept of no test in {', '.join(unknown)} (a path as tests/test_scale.py)")
     with tempfile.TemporaryDirectory() as folder:
         usual, other = Path(folder) / "usual", Path(folder) / "other"
         # another distribution over processes, too: what a test's helper keeps for the next ones shows
-        if run(usual, files) or run(other, [*files, "--dist", "load"], other_kernels=True):
+        if run(usual, files) or run(other, [*files, "--dist", "load"], elsewhere=True):
             raise SystemExit("tests fail: nothing was written")
         kept = renewed(before, [read(usual), read(other)])
     write(kept)
@@ -192,10 +198,11 @@ def renew() -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parts = parser.add_subparsers(dest="part", required=True)
-    parts.add_parser("renew")
+    renewing = parts.add_parser("renew")
+    renewing.add_argument("files", nargs="*", help="of tests (default: all that values are kept of)")
     running = parts.add_parser("run")
     running.add_argument("folder", type=Path)
-    running.add_argument("--other-kernels", action="store_true")
+    running.add_argument("--elsewhere", action="store_true")
     choosing = parts.add_parser("choose")
     choosing.add_argument("--map", type=Path, required=True)
     choosing.add_argument("folders", type=Path, nargs="+")
@@ -203,9 +210,9 @@ def main() -> None:
     if rest and given.part != "run":
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
     if given.part == "renew":
-        renew()
+        renew(given.files)
     elif given.part == "run":
-        sys.exit(run(given.folder.resolve(), rest, other_kernels=given.other_kernels))
+        sys.exit(run(given.folder.resolve(), rest, elsewhere=given.elsewhere))
     else:
         lines = json.loads(given.map.read_text())["lines"]
         write(choose(agreed([read(folder) for folder in given.folders]), lines))

@@ -24,10 +24,11 @@ mkdir "$types/examples"
 .venv/bin/python scripts/doc_examples.py "$types/examples"
 .venv/bin/mypy colmap_inertial "$types/examples" >"$types/found.txt" 2>&1 &
 checking=$!
-# A process for each core: one thread in each is enough. Tests of one file share what it sets up, and the slowest files
-# begin first (tests/slow.txt). Modules are compiled once, not in each of the processes that tests start.
+# A process more than there are cores, as tests also wait for programs that they start; one thread in each is enough.
+# Tests of one file share what it sets up, and the slowest files begin first (tests/slow.txt). Modules are compiled once,
+# not in each of the processes that tests start.
 unset PYTHONDONTWRITEBYTECODE
-OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 .venv/bin/python -m pytest --numprocesses auto --dist loadfile \
+OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 .venv/bin/python -m pytest --numprocesses $(($(nproc) + 1)) --dist loadfile \
   --no-loadscope-reorder "$@" && tested=0 || tested=$?
 wait "$checking" && typed=0 || typed=$?
 cat "$types/found.txt"
