@@ -42,6 +42,8 @@ _NUMBER = re.compile(r"-?\d+\.?\d*(?:e[-+]?\d+)?")
 _PATH = re.compile(r"(?:/[\w.@+-]+){2,}")
 #: A test's own folder, which pytest numbers.
 _FOLDER = re.compile(r"\btest_\w+\d\b")
+#: Functions whose results are kept between tests, as they take seconds.
+_SLOW_TO_MAKE = ("_renderer", "_plotly_library")
 #: What commands begin with where the program is not on the PATH.
 _PROGRAM = str(Path(sys.executable).with_name("colmap-inertial"))
 
@@ -138,10 +140,10 @@ def _rounded(value: float) -> float:
 
 
 class Recorder:
-    """Notes what functions of the package, or only the named ones, return in this thread while it is on."""
+    """Notes what functions of the package return in this thread while it is on, or what some hold at some places."""
 
-    def __init__(self, functions: Container[str] | None = None) -> None:
-        self._wanted = functions
+    def __init__(self, wanted: Mapping[str, Container[str]] | None = None) -> None:
+        self._wanted = wanted
         self._root = str(PACKAGE) + os.sep
         #: By code object: its function's name, or ``None`` of what is not noted; and how often it has returned.
         self._names: dict[CodeType, str | None] = {}
@@ -153,7 +155,7 @@ class Recorder:
     def __enter__(self) -> Recorder:
         for name, module in list(sys.modules.items()):
             for thing in vars(module).values() if name.startswith(PACKAGE.name) else ():
-                if isinstance(thing, functools._lru_cache_wrapper):
+                if isinstance(thing, functools._lru_cache_wrapper) and thing.__name__ not in _SLOW_TO_MAKE:
                     thing.cache_clear()
         self.seconds = time.perf_counter()
         sys.setprofile(self._note)
@@ -174,12 +176,14 @@ class Recorder:
             return
         self._calls[code] += 1
         into = self._leaves.setdefault(name, {})
+        places = None if self._wanted is None else self._wanted[name]
         try:
             if value is None:  # what it left in its arguments, or wrote
                 arguments = code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]
                 value = {argument: frame.f_locals[argument] for argument in arguments if argument in frame.f_locals}
             for place, leaf in _leaves(value, "", 0):
-                into.setdefault(place, []).append(leaf.copy() if isinstance(leaf, np.ndarray) else leaf)
+                if places is None or place in places:
+                    into.setdefault(place, []).append(leaf.copy() if isinstance(leaf, np.ndarray) else leaf)
         except Exception as error:  # not to be met by the function that returns
             self._error = self._error or error
 
