@@ -39,9 +39,9 @@ ELSEWHERE = {
     "PATH": os.defpath,
     "TZ": "Asia/Tokyo",
 }
-#: Tests of each line that values are kept of, how long such a test may take unless there is no other, and how long the
-#: second (s): to note what functions return makes a test a fifth slower.
-TESTS_OF_A_LINE, LONGEST_S, QUICK_S = 2, 3.0, 0.5
+#: Tests of each line that values are kept of, how long such a test may take unless the function runs in no other, and
+#: how long the second (s): to note what functions return makes a test a fifth slower.
+TESTS_OF_A_LINE, LONGEST_S, QUICK_S = 2, 0.8, 0.5
 
 #: Modules and tests whose functions wait for other processes: how often they return varies. Functions of the time that
 #: has gone by, and of where files lie.
@@ -127,13 +127,14 @@ def choose(seen: Seen, lines: dict[str, dict[str, list[str]]]) -> dict[str, dict
             if function.startswith(VARYING):
                 continue
             able = {test for test, (_, functions) in seen.items() if function in functions}
+            able = {test for test in able if seen[test][0] <= LONGEST_S} or able
             # what is chosen for another line or function already comes first
-            costs = {test: (seen[test][0] > LONGEST_S, test not in chosen, seen[test][0], test) for test in able}
+            costs = {test: (test not in chosen, seen[test][0], test) for test in able}
             tests: set[str] = set()
             for line in body:
                 of_line = able & set(contexts.get(str(line), ()))
                 ranked = sorted((test not in tests, *costs[test]) for test in of_line)
-                tests |= {rank[-1] for i, rank in enumerate(ranked[:TESTS_OF_A_LINE]) if i == 0 or rank[3] < QUICK_S}
+                tests |= {rank[-1] for i, rank in enumerate(ranked[:TESTS_OF_A_LINE]) if i == 0 or rank[2] < QUICK_S}
             for test in tests:
                 chosen[test].add(function)
     return {test: {name: seen[test][1][name] for name in functions} for test, functions in chosen.items()}
