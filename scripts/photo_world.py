@@ -6,6 +6,7 @@ ones.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -60,8 +61,11 @@ class Cover:
         room = -len(at[0]) % 1024
         x, y = (np.pad(a, (0, room)).reshape(shape) for a in at)
         found = cv2.remap(self.texels.astype("f4"), x, y, cv2.INTER_LINEAR).reshape(-1, 3)[: len(at[0])]
-        mean = self.texels.mean(axis=(0, 1))
-        return np.asarray(mean + self.contrast * (found - mean))
+        return np.asarray(self._mean + self.contrast * (found - self._mean))
+
+    @functools.cached_property
+    def _mean(self) -> Array:
+        return np.asarray(self.texels.mean(axis=(0, 1)))
 
 
 def _lively_share(photo: Path) -> float:

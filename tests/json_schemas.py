@@ -1,5 +1,6 @@
 """The documented schemas of JSON files."""
 
+import functools
 import json
 from pathlib import Path
 
@@ -8,6 +9,7 @@ from jsonschema import Draft202012Validator
 SCHEMAS = Path(__file__).parents[1] / "docs" / "schemas"
 
 
+@functools.cache
 def read_schema(name: str) -> Draft202012Validator:
     content = json.loads((SCHEMAS / f"{name}.schema.json").read_text())
     Draft202012Validator.check_schema(content)

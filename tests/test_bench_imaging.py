@@ -80,11 +80,14 @@ def test_deblurring_helps_and_the_gate_refuses_a_wrong_axis():
     assert row["kept"] >= 0.95
 
 
+drawn_walls = cache(scenes.drawn_walls)
+
+
 @pytest.mark.parametrize(("blur_px", "sky_px"), [(6.0, 330), (10.0, 420), (20.0, 420), (30.0, 420)])
 def test_blurred_frames_are_treated_though_most_of_them_is_sky(blur_px, sky_px):
     rng = np.random.default_rng(4)
     walls = []
-    for wall in scenes.drawn_walls(3, 8):
+    for wall in drawn_walls(3, 8):
         below = wall[300:900, :1000].copy()
         below[:sky_px] = 0.5 + 0.003 * rng.standard_normal((sky_px, 1000), dtype=np.float32)
         walls.append(below)

@@ -19,7 +19,7 @@ from colmap_inertial.imaging.exposure_pairs import better_alone, bring_together,
 from colmap_inertial.imaging.exposure_pairs._search import places
 from colmap_inertial.imaging.restoration import load_network, lsd2
 
-SEED, WIDTH = 3, 240
+SEED, WIDTH, WRONG_WIDTH = 3, 200, 240
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +62,7 @@ def test_a_shift_is_found_up_to_the_farthest_and_not_beyond():
 
 
 def test_pictures_of_two_scenes_are_never_blended(turnings):
-    for maker in pairs(turnings, [], 6, SEED, width=WIDTH, good=False):
+    for maker in pairs(turnings, [], 6, SEED, width=WRONG_WIDTH, good=False):
         pair = maker()
         assert not bring_together(pair.short, pair.long, gyro=pair.gyro).registered.alike, pair.kind
 

@@ -23,7 +23,7 @@ LENS = CameraModel(model="OPENCV", width=320, height=240, params=(250, 252, 161,
 FISHEYE = CameraModel(model="OPENCV_FISHEYE", width=320, height=240, params=(140, 140, 161, 119, 0.02, -0.01, 0, 0))
 
 
-def filmed(scene, model=LENS, *, rate_hz=15.0, readout_s=0.03, begin_s=0.3, end_s=5.5):
+def filmed(scene, model=LENS, *, rate_hz=15.0, readout_s=0.03, begin_s=0.3, end_s=3.7):
     """Frames and their timing."""
     t_s = np.arange(begin_s, end_s, 1 / rate_hz)
     names = tuple(f"{i:03}.png" for i in range(len(t_s)))

@@ -7,6 +7,7 @@ import os
 import shutil
 import sqlite3
 import subprocess
+from functools import cache
 
 import cv2
 import numpy as np
@@ -24,20 +25,22 @@ from colmap_inertial.reconstruction.drivers.capture import reconstruct
 from colmap_inertial.reconstruction.drivers.reference import reconstruct_by
 from colmap_inertial.tools.simulate.truth import read_truth, true_metres_per_unit
 
-FIRST = 16
+FIRST = 12
 FEATURES = 500
 #: The example scene's camera, as somebody else may know it.
 OPENCV = [260.0, 260.0, 160.0, 120.0, 0.08, -0.12, 0.0005, -0.0003]
 SIMPLE = [265.0, 160.0, 120.0, 0.0]
 
 
-def features_of(kind, picture):
-    """(K, 2) keypoints, and descriptors as OpenCV makes them."""
+@cache
+def features_of(kind, file):
+    """Height and width of a picture, (K, 2) keypoints, and descriptors as OpenCV makes them. ``file``: its bytes."""
+    picture = cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_GRAYSCALE)
     finder = cv2.xfeatures2d.AKAZE_create(threshold=1e-4) if kind == "akaze" else cv2.SIFT_create()
     points = sorted(finder.detect(picture), key=lambda point: -point.response)[:FEATURES]
     points, descriptors = finder.compute(picture, points)
     # COLMAP counts from the corner of the first pixel
-    return np.array([p.pt for p in points], np.float32) + 0.5, descriptors
+    return picture.shape, np.array([p.pt for p in points], np.float32) + 0.5, descriptors
 
 
 def stored(descriptors):
@@ -61,13 +64,11 @@ def write_database(path, frames, kind, *, raw=False, matched=(), params=OPENCV, 
         camera = None
         for file in sorted(frames.iterdir())[::-1]:  # other numbers than ours
             name = file.name if names is None else names[file.name]
-            picture = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-            height, width = picture.shape
+            (height, width), xy_px, descriptors = features_of(kind, file.read_bytes())
             if camera is None or camera_each:
                 camera = pycolmap.Camera(model=model, width=width, height=height, params=params)
                 camera.camera_id = database.write_camera(camera)
             number = database.write_image(pycolmap.Image(name=name, camera_id=camera.camera_id))
-            xy_px, descriptors = features_of(kind, picture)
             found[name] = number, descriptors
             database.write_keypoints(number, xy_px)
             if descriptors is not None and raw is not None:
@@ -97,8 +98,15 @@ def akaze(capture, names):
     return write_database(path, capture / "frames", "akaze", matched=itertools.combinations(names, 2))
 
 
-def run(capture, out, database, **more):
-    return reconstruct(capture, out, dataclasses.replace(QUICK, database=database, **more))
+def run(capture, out, database):
+    return reconstruct(capture, out, dataclasses.replace(QUICK, database=database))
+
+
+@pytest.fixture(scope="module")
+def matched(capture, akaze, tmp_path_factory):
+    """A run on binary features with matches, and the database's bytes before it. Tests must not change it."""
+    before = akaze.read_bytes()
+    return run(capture, tmp_path_factory.mktemp("matched") / "out", akaze), before
 
 
 def is_right(result, names):
@@ -116,23 +124,35 @@ def keypoints_of(database, name):
     return np.frombuffer(data, np.float32).reshape(-1, columns)
 
 
-def test_binary_features_with_matches_go_on_to_metres(capture, names, akaze, tmp_path):
-    before = akaze.read_bytes()
-    result = run(capture, tmp_path / "out", akaze)
+def test_binary_features_with_matches_go_on_to_metres(capture, names, akaze, matched, tmp_path):
+    result, before = matched
     is_right(result, names)
     assert result.matching.given == len(names) * (len(names) - 1) // 2 >= result.matching.matched
     assert akaze.read_bytes() == before and not akaze.with_name("akaze.db-wal").exists()
     own = result.workspace.colmap_database
     np.testing.assert_array_equal(keypoints_of(own, names[0]), keypoints_of(akaze, names[0]))
     # the same again does nothing, another database all
+    shutil.copytree(result.workspace.root, tmp_path / "out")
     assert run(capture, tmp_path / "out", akaze).unchanged
     other = tmp_path / "other.db"
     shutil.copyfile(akaze, other)
     os.utime(other, (1, 1))
-    assert not run(capture, tmp_path / "out", other).unchanged
+    begun = []
+
+    def stop(stage, done, total):
+        begun.append(stage)
+        if stage == "mapping":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(capture, tmp_path / "out", dataclasses.replace(QUICK, database=other), progress=stop)
+    assert "matches" in begun
 
 
-def test_sift_of_opencv_without_matches_is_matched_and_a_known_camera_goes_before_its_own(capture, names, tmp_path):
+def test_sift_of_opencv_without_matches_is_matched_and_a_known_camera_goes_before_its_own(tmp_path):
+    # of fewer frames, some models begin with the wrong one of a plane's two poses
+    capture = copy_scene(tmp_path / "capture", first=16)
+    names = [file.name for file in (capture / "frames").iterdir()]
     given = write_database(tmp_path / "x.db", capture / "frames", "sift", params=SIMPLE, camera_each=True)
     result = run(capture, tmp_path / "out", given)
     is_right(result, names)
@@ -143,7 +163,7 @@ def test_sift_of_opencv_without_matches_is_matched_and_a_known_camera_goes_befor
 
 
 def test_float_features_some_frames_and_a_camera_that_only_the_database_knows(capture, names, tmp_path):
-    taken = names[2:14]
+    taken = names[1:11]
     other = copy_scene(tmp_path / "capture", first=FIRST)
     text = (other / "capture.toml").read_text()
     (other / "capture.toml").write_text(text[: text.index("[camera]")] + text[text.index("[imu.gyro]") :])
@@ -171,7 +191,7 @@ def test_what_cannot_be_gone_on_with_is_refused_in_words(capture, names, akaze, 
     strange = {name: f"other_{name}" for name in names}
     refused(
         write_database(tmp_path / "names.db", capture / "frames", "sift", names=strange),
-        r"16 of its 16 images are not the capture's \(other_.*give a database of the capture's images",
+        rf"{FIRST} of its {FIRST} images are not the capture's \(other_.*give a database of the capture's images",
     )
     small = tmp_path / "small"
     small.mkdir()
@@ -244,7 +264,10 @@ class Shift(KeypointStage):
 
 
 @pytest.mark.parametrize("of", ["filmed", "rectified"])
-def test_keypoints_are_corrected_once(capture, names, akaze, tmp_path, of):
+def test_keypoints_are_corrected_once(names, tmp_path, of):
+    capture, names = copy_scene(tmp_path / "capture", first=6), names[:6]
+    pairs = itertools.combinations(names, 2)
+    akaze = write_database(tmp_path / "akaze.db", capture / "frames", "akaze", matched=pairs)
     stages = {"keypoint_stages": [Shift()], "frame_stages": []}
     options = dataclasses.replace(QUICK, database=akaze)
     with pytest.raises(InertialError, match="Say --database-images filmed"):
@@ -256,8 +279,8 @@ def test_keypoints_are_corrected_once(capture, names, akaze, tmp_path, of):
     assert result.keypoints.rectified() == set(names)
 
 
-def test_verified_pairs_are_kept_where_nothing_moves(capture, names, akaze, tmp_path, monkeypatch):
-    first = run(capture, tmp_path / "first", akaze)
+def test_verified_pairs_are_kept_where_nothing_moves(capture, names, matched, tmp_path, monkeypatch):
+    first, _ = matched
     verified = tmp_path / "verified.db"
     shutil.copyfile(first.workspace.colmap_database, verified)
     with contextlib.closing(sqlite3.connect(verified)) as database, database:
@@ -278,9 +301,9 @@ def test_verified_pairs_are_kept_where_nothing_moves(capture, names, akaze, tmp_
 
 
 @pytest.mark.skipif(shutil.which("colmap") is None, reason="no colmap is installed")
-def test_a_database_of_an_installed_colmap_goes_on(names, tmp_path):
+def test_a_database_of_an_installed_colmap_goes_on(tmp_path):
     # in half the size, one of its models in five begins with the wrong one of a plane's two poses
-    capture = copy_scene(tmp_path / "capture", first=FIRST, half=False)
+    capture = copy_scene(tmp_path / "capture", first=16, half=False)
     path, quiet = tmp_path / "installed.db", {**os.environ, "QT_QPA_PLATFORM": "offscreen"}
     for words in (
         f"feature_extractor --image_path {capture / 'frames'} --SiftExtraction.max_num_features 400 "
@@ -290,7 +313,7 @@ def test_a_database_of_an_installed_colmap_goes_on(names, tmp_path):
         subprocess.run(["colmap", *words.split(), "--database_path", path], env=quiet, check=True, capture_output=True)
     before = path.read_bytes()
     result = run(capture, tmp_path / "out", path)
-    is_right(result, names)
+    is_right(result, [file.name for file in (capture / "frames").iterdir()])
     assert path.read_bytes() == before
     assert result.matching.given > 60
 

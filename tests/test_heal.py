@@ -4,6 +4,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from batch_captures import tiny_capture
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
@@ -11,6 +12,9 @@ import study_heal
 
 
 @pytest.mark.slow
-def test_a_damaged_folder_heals_or_says_what_to_do(capsys):
-    arguments = ["--trials", "16", "--seed", "7", "--commands", "reconstruct", "project", "deblur", "export"]
+def test_a_damaged_folder_heals_or_says_what_to_do(capsys, monkeypatch):
+    # no board is looked for; from ten frames on, a model is refined
+    monkeypatch.setattr(study_heal, "FRAMES", 10)
+    monkeypatch.setattr(study_heal, "tiny_capture", lambda folder, *, frames, half: tiny_capture(folder, frames=frames))
+    arguments = ["--trials", "13", "--seed", "7", "--commands", "reconstruct", "project", "deblur", "export"]
     assert study_heal.main(arguments) == 0, capsys.readouterr().out

@@ -6,7 +6,8 @@ from functools import cache
 import cv2
 import numpy as np
 import pytest
-from test_imaging_psf import LENS, handheld, room, shutter_of
+from far_scene import FarScene
+from test_imaging_psf import LENS, handheld, shutter_of
 
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.gyro import GyroPath
@@ -18,6 +19,7 @@ from colmap_inertial.imaging.psf import blur_field, blur_path
 from colmap_inertial.imaging.rolling_shutter import project_by_lines, rays
 from colmap_inertial.imaging.transfer import srgb_from_linear
 from colmap_inertial.tools.simulate.render import ShutterCamera, colmap_camera
+from colmap_inertial.tools.simulate.textures import poster
 
 MODEL = replace(LENS, width=320, height=240, params=(300, 302, 161, 119, 0.12, -0.2, 0.001, -0.0005))
 #: When the hand of this seed turns in a bend.
@@ -40,9 +42,12 @@ def scene(direction="down", readout_s=0.02):
     """A blurred picture, the sharp one of the same shutter, and the path."""
     motion, gyro = handheld(vigour=2.0, seed=6)
     camera = ShutterCamera(model=MODEL, exposure_s=EXPOSURE_S, readout_s=readout_s, readout_direction=direction)
-    blurred = room().linear(camera, motion, BEGIN_S)
-    sharp = room().linear(replace(camera, exposure_s=0.0), motion, BEGIN_S + EXPOSURE_S / 2)
     lens, shutter = colmap_camera(MODEL), shutter_of(camera, BEGIN_S)
+    # as coarse as a sharp picture can show it
+    texture = cv2.GaussianBlur(poster(np.random.default_rng(5), 600, 600), (0, 0), 1)
+    wall = FarScene(texture=texture, motion=motion)
+    blurred = wall.linear(MODEL, shutter, samples=64)
+    sharp = wall.linear(MODEL, replace(shutter, exposure_s=0.0, t_s=BEGIN_S + EXPOSURE_S / 2))
     late = reversed_in_time(gyro, shutter.reference_s())
     return (
         blurred,

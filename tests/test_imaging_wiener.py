@@ -82,7 +82,7 @@ def test_a_long_filter_equals_the_wiener_filter_in_the_frequency_domain(subtests
     for vector_px in ((12.0, 0.0), (0.0, 12.0), (11.0, 4.0), (-5.0, 9.0), (8.0, 8.0)):
         with subtests.test(vector_px=vector_px):
             prior = Prior(alpha=0.1, eps=0.01)
-            light = gaussian_filter(texture()[:120, :160, 1], 1.5, mode="wrap")
+            light = gaussian_filter(texture()[128:176, :64, 1], 1.5, mode="wrap")
             extent = max(abs(vector_px[0]), abs(vector_px[1]))
             margin = int(8 * extent) + 2
             periodic = np.pad(light, margin, mode="wrap")
@@ -163,34 +163,35 @@ def test_the_major_axis_may_change_within_an_image():
 
 
 def test_every_instruction_set_gives_the_reference_s_light(subtests):
-    for name in INSTRUCTION_SETS:
-        for vector_px, rate in (((17, 4), 0.0), ((3, -9), 0.01), ((9, 9), 0.02), ((0, 0), 0.05)):
+    light = texture(height=100, width=150)[..., 1].astype(np.float32)
+    for vector_px, rate in (((17, 4), 0.0), ((3, -9), 0.01), ((9, 9), 0.02), ((0, 0), 0.05)):
+        cells = Cells.of(turning(100, 150, vector_px, rate))
+        table = wiener._table(cells, 0.01)
+        share = share_reference(np.zeros(light.shape, dtype=bool), cells)
+        expected = light + share * (filter_reference(light, cells, table) - light)
+        for name in INSTRUCTION_SETS:
             with subtests.test(name=name, vector_px=vector_px, rate=rate):
-                light = texture(height=100, width=150)[..., 1].astype(np.float32)
-                cells = Cells.of(turning(100, 150, vector_px, rate))
-                table = wiener._table(cells, 0.01)
                 result, _ = wiener._compiled(light[..., None], cells, table, instruction_set=name)
-                share = share_reference(np.zeros(light.shape, dtype=bool), cells)
-                expected = light + share * (filter_reference(light, cells, table) - light)
                 np.testing.assert_allclose(result[..., 0], expected, atol=2e-5)
 
 
 def test_every_instruction_set_gives_the_reference_s_codes(subtests):
-    for colour, dtype, name in itertools.product((False, True), (np.uint8, np.uint16), INSTRUCTION_SETS):
-        with subtests.test(colour=colour, dtype=dtype, name=name):
-            light = 1.05 * texture(height=130, width=170, brightest=1)  # some of it saturated
-            light[40:43, 60:66, 1] = light[90:92, 100:102] = 1  # and some by lamps
-            image = coded(light, dtype)
-            image = image if colour else image[..., 1].copy()
-            field = turning(130, 170, (9, 6), 0.08)  # both axes, and down to no blur
-            planes, cells, noise = wiener._prepare(image, field, DeblurOptions())
-            result, _ = wiener._compiled(planes, cells, wiener._table(cells, noise), instruction_set=name)
-            expected = deblur_reference(image, field)
-            difference = np.abs(result.reshape(image.shape).astype(int) - expected)
-            # an 8-bit level is 257 of the 16-bit ones
-            assert (difference <= 1).mean() > (0.999 if dtype is np.uint8 else 0.95)
-            assert difference.max() <= (1 if dtype is np.uint8 else 8)
-            assert (deblur(image, field) != image).any()
+    light = 1.05 * texture(height=130, width=170, brightest=1)  # some of it saturated
+    light[40:43, 60:66, 1] = light[90:92, 100:102] = 1  # and some by lamps
+    field = turning(130, 170, (9, 6), 0.08)  # both axes, and down to no blur
+    for colour, dtype in itertools.product((False, True), (np.uint8, np.uint16)):
+        image = coded(light, dtype)
+        image = image if colour else image[..., 1].copy()
+        planes, cells, noise = wiener._prepare(image, field, DeblurOptions())
+        expected = deblur_reference(image, field)
+        assert (deblur(image, field) != image).any()
+        for name in INSTRUCTION_SETS:
+            with subtests.test(colour=colour, dtype=dtype, name=name):
+                result, _ = wiener._compiled(planes, cells, wiener._table(cells, noise), instruction_set=name)
+                difference = np.abs(result.reshape(image.shape).astype(int) - expected)
+                # an 8-bit level is 257 of the 16-bit ones
+                assert (difference <= 1).mean() > (0.999 if dtype is np.uint8 else 0.95)
+                assert difference.max() <= (1 if dtype is np.uint8 else 8)
 
 
 def test_an_unknown_instruction_set_is_refused():
@@ -433,7 +434,7 @@ def test_wrong_images_and_options_are_refused():
 def test_photographs_come_closer_to_the_sharp_ones(shared_data, length_px):
     before, after = [], []
     for path in sorted((shared_data / "sharp_photos").glob("clic_*.jpg"))[::8]:
-        sharp = cv2.imread(str(path))[:500, :500]
+        sharp = cv2.imread(str(path))[:300, :300]
         vector_px = (length_px * 0.94, length_px * 0.34)
         rng = np.random.default_rng(9)
         blurred = srgb_from_linear(smeared(linear_from_srgb(sharp / 255), vector_px))

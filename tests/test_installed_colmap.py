@@ -103,14 +103,27 @@ def program(path, text):
     return path
 
 
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    return copy_scene(tmp_path_factory.mktemp("installed") / "capture", first=16, half=False)
+def capture_of(folder, **more):
+    """A capture, and the names of its frames."""
+    capture = copy_scene(folder / "capture", **more)
+    return capture, sorted(file.name for file in (capture / "frames").iterdir())
 
 
 @pytest.fixture(scope="module")
-def names(capture):
-    return sorted(file.name for file in (capture / "frames").iterdir())
+def filmed(tmp_path_factory):
+    """For a real COLMAP."""
+    return capture_of(tmp_path_factory.mktemp("filmed"), first=16, half=False)
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory):
+    """For programs that stand for one."""
+    return capture_of(tmp_path_factory.mktemp("short"), first=10)
+
+
+@pytest.fixture(scope="module")
+def capture(short):
+    return short[0]
 
 
 def run(capture, out, path, **more):
@@ -118,9 +131,9 @@ def run(capture, out, path, **more):
 
 
 @pytest.fixture(scope="module")
-def installed(capture, tmp_path_factory):
+def installed(filmed, tmp_path_factory):
     """A run by the COLMAP that is installed."""
-    return run(capture, tmp_path_factory.mktemp("installed") / "out", COLMAP)
+    return run(filmed[0], tmp_path_factory.mktemp("installed") / "out", COLMAP)
 
 
 def tables_of(path):
@@ -131,8 +144,8 @@ def tables_of(path):
 
 
 @needs_colmap
-def test_an_installed_colmap_finds_and_matches_features(capture, names, installed, tmp_path):
-    result, out = installed, installed.workspace.root
+def test_an_installed_colmap_finds_and_matches_features(filmed, installed, tmp_path):
+    (capture, names), result, out = filmed, installed, installed.workspace.root
     is_right(result, names)
     assert result.matching.given == 0 and result.matching.device == "cpu"
     assert "Processed file [16/16]" in (out / ".stages/feature_extractor.txt").read_text()
@@ -152,7 +165,9 @@ def test_an_installed_colmap_finds_and_matches_features(capture, names, installe
 
 
 @needs_colmap
-def test_its_keypoints_are_moved_before_its_matches_are_verified(capture, names, installed, tmp_path):
+def test_its_keypoints_are_moved_before_its_matches_are_verified(filmed, installed, tmp_path):
+    capture, names = filmed
+
     def shift(keypoints):
         return dataclasses.replace(keypoints, xy_px=keypoints.xy_px + np.array([3.0, -2.0]))
 
@@ -175,7 +190,13 @@ def test_frames_without_texture_give_no_model(tmp_path, capsys):
     assert "COLMAP found no model" in told and "Traceback" not in told
 
 
-def test_options_and_tables_of_todays_colmap_are_used(capture, names, tmp_path):
+def stop_before_mapping(stage, done, total):
+    if stage == "mapping":
+        raise KeyboardInterrupt
+
+
+def test_options_and_tables_of_todays_colmap_are_used(short, tmp_path):
+    capture, names = short
     newer = program(tmp_path / "colmap", NEWER)
     given = (
         "SiftExtraction.peak_threshold=0.004",
@@ -184,11 +205,14 @@ def test_options_and_tables_of_todays_colmap_are_used(capture, names, tmp_path):
     )
     result = run(capture, tmp_path / "out", newer, colmap=given)
     is_right(result, names)
-    own = reconstruct(capture, tmp_path / "own", dataclasses.replace(QUICK, deterministic=True, colmap=given))
-    assert tables_of(result.workspace.colmap_database) == tables_of(own.workspace.colmap_database)
+    own = dataclasses.replace(QUICK, deterministic=True, colmap=given)
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(capture, tmp_path / "own", own, progress=stop_before_mapping)
+    assert tables_of(result.workspace.colmap_database) == tables_of(tmp_path / "own/colmap/database.db")
 
 
-def test_a_database_of_others_is_matched_by_it(capture, names, tmp_path):
+def test_a_database_of_others_is_matched_by_it(short, tmp_path):
+    capture, names = short
     from test_given_database import write_database
 
     given = write_database(tmp_path / "x.db", capture / "frames", "sift", matched=[(names[0], names[1])])
@@ -338,7 +362,8 @@ def stop_in_matches(words, by, code, pid):
     pid.unlink()
 
 
-def test_it_ends_with_the_run_which_then_continues(capture, names, tmp_path):
+def test_it_ends_with_the_run_which_then_continues(short, tmp_path):
+    capture, names = short
     wait = f"import os, time\nif command == 'matches_importer' and not os.path.exists({str(tmp_path / 'go')!r}):\n"
     wait += f"    open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid()))\n    time.sleep(100)\nimport pycolmap\n"
     path = program(tmp_path / "colmap", NEWER.replace("import pycolmap\n", wait))

@@ -24,7 +24,7 @@ from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.imu import read_frame_log, read_imu
 from colmap_inertial.io.tables import text_of
 
-MUTATIONS = 200
+MUTATIONS = 100
 #: Sizes that a damaged box or entry may state.
 SIZES = (0, 1, 7, 8, 9, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF)
 
@@ -128,7 +128,7 @@ def test_packed_ros_recordings_are_read_as_others(
 def test_ros_recordings_that_unpack_to_much_more_are_refused(
     tmp_path: Path, imu: ImuRecording, kind: str, packed_by: str
 ) -> None:
-    path = write_packed(tmp_path, imu, kind, packed_by, bytes(200 << 20))
+    path = write_packed(tmp_path, imu, kind, packed_by, bytes(100 << 20))
     size = sum(file.stat().st_size for file in path.iterdir()) if path.is_dir() else path.stat().st_size
     assert size < 3e6
     tracemalloc.start()

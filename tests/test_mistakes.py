@@ -1,5 +1,6 @@
 """Mistakes that people make are named before the work, with advice that helps (scripts/study_mistakes.py)."""
 
+import shutil
 import sys
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
+import study_mistakes
 from study_mistakes import MISTAKES, try_mistake
 
 #: Of the study, what takes under a minute together.
@@ -22,6 +24,19 @@ QUICK = (
     "Python: world='zup'",
     "stamps of the gyroscope in ns",
 )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _fewer_pictures(tmp_path_factory):
+    """The first 25 pictures of the scene: to compare them is most of the work."""
+    desk = shutil.copytree(study_mistakes.DESK, tmp_path_factory.mktemp("short") / "desk")
+    lines = (desk / "frames.csv").read_text().splitlines()
+    (desk / "frames.csv").write_text("\n".join(lines[:26]) + "\n")
+    for line in lines[26:]:
+        (desk / "frames" / line.partition(",")[0]).unlink()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(study_mistakes, "DESK", desk)
+        yield
 
 
 @pytest.mark.parametrize("name", QUICK)

@@ -78,9 +78,9 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    """Ten seconds of the scene, reconstructed once: (capture, out, result). Tests must not change it."""
+    """Seven seconds of the scene, reconstructed once: (capture, out, result). Tests must not change it."""
     root = tmp_path_factory.mktemp("desk")
-    capture = copy_scene(root / "capture", first=30, target=True)
+    capture = copy_scene(root / "capture", first=20, target=True)
     before = contents(capture)
     steps = []
     result = reconstruct(capture, root / "out", FINE, progress=lambda *step: steps.append(step))
@@ -97,7 +97,7 @@ def finished(tmp_path_factory):
 def whole(tmp_path_factory):
     """The first frames, reconstructed undisturbed: (capture, out, result). Tests must not change it."""
     root = tmp_path_factory.mktemp("whole")
-    capture = copy_scene(root / "capture", first=16)
+    capture = copy_scene(root / "capture", first=10)
     return capture, root / "out", reconstruct(capture, root / "out", DETERMINISTIC)
 
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from box_project import HIGH, LOW, build, cast, off_the_walls, rays, shared_box
+from box_project import HIGH, LOW, build, cast, off_the_walls, rays, write_model
 from test_pipeline_existing import contents, run
 
 from colmap_inertial.colmap import dense as dense_stage, depth_maps
@@ -35,8 +35,11 @@ FLAGS = ["--dense", "--dense-options.max-image-size", "96", *SPARSE]
 
 @pytest.fixture(scope="module")
 def box(tmp_path_factory):
-    """Tests must not change it."""
-    return shared_box(tmp_path_factory)
+    """Of few points, which all steps read. Tests must not change it."""
+    box = build(tmp_path_factory.mktemp("box"), every=8)
+    shutil.rmtree(box.root / "sparse")
+    write_model(box, box.root / "sparse" / "0", box.names, points=500)
+    return box
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +135,7 @@ def test_depth_maps_that_come_later_become_points_and_a_mesh_in_metres(unfinishe
     cast_depth_maps(box, out)
     code, shown, err = run(capsys, "reconstruct", box.root, out, *flags)
     assert code == 0, err
-    assert "120 depth maps" in shown
+    assert f"{len(box.names)} depth maps" in shown
     log = (out / "log.txt").read_text()
     assert log.count("dense_0_undistorted: finished in an earlier run, kept") == 1
 
@@ -167,7 +170,7 @@ def test_depth_maps_that_come_later_become_points_and_a_mesh_in_metres(unfinishe
 
 def test_a_finished_project_is_gone_on_with_by_the_sweep(tmp_path, capsys):
     """Without CUDA: exit code 0, a cloud and a mesh in metres, and what was measured of them."""
-    box = build(tmp_path / "box", every=12)
+    box = build(tmp_path / "box", every=24)
     count = len(box.names)
     out, flags = tmp_path / "out", ["--imu", box.imu, "--frame-times", box.frame_times]
     code, _, err = run(capsys, "reconstruct", box.root, out, *flags, *SPARSE)
@@ -193,38 +196,35 @@ def test_a_finished_project_is_gone_on_with_by_the_sweep(tmp_path, capsys):
     away = off_the_walls(ratio * vertices(out / dense["mesh"]) @ rotation.T + shift)
     assert np.median(away) < 0.03, np.quantile(away, (0.25, 0.5, 0.75, 0.9))
     assert not list((out / ".stages").glob("sweep_*"))
-    # maps that somebody removed are made again; maps of the other maker are not mixed with them
+    # those of other options are replaced
     stereo = out / "dense" / "0" / "stereo"
     maps = sorted(path.name for path in (stereo / "depth_maps").iterdir())
+    small = [*flags, *FLAGS, "--dense-options.max-image-size", "64", "--dense-options.mesh", "none"]
+    code, _, err = run(capsys, "reconstruct", box.root, out, *small)
+    assert code == 0, err
+    assert read_map(stereo / "depth_maps" / maps[0]).shape == (48, 64)
+    # maps that somebody removed are made again; maps of the other maker are not mixed with them
     (stereo / "depth_maps" / maps[0]).rename(tmp_path / "kept.bin")
-    code, _, err = run(capsys, "reconstruct", box.root, out, *flags, *FLAGS)
+    code, _, err = run(capsys, "reconstruct", box.root, out, *small)
     assert code == 0, err
     assert (stereo / "depth_maps" / maps[0]).read_bytes() == (tmp_path / "kept.bin").read_bytes()
     (stereo / "depth_maps" / maps[0].replace("geometric", "photometric")).write_bytes(b"")
-    code, _, err = run(capsys, "reconstruct", box.root, out, *flags, *FLAGS)
+    code, _, err = run(capsys, "reconstruct", box.root, out, *small)
     assert code == 2
     assert "the plane sweep made them" in err
-    (stereo / "depth_maps" / maps[0].replace("geometric", "photometric")).unlink()
-    # those of other options are replaced
-    code, _, err = run(
-        capsys, "reconstruct", box.root, out, *flags, *FLAGS, "--dense-options.max-image-size", "64",
-        "--dense-options.mesh", "none",
-    )  # fmt: skip
-    assert code == 0, err
-    assert read_map(stereo / "depth_maps" / maps[0]).shape == (48, 64)
 
 
 def test_with_cuda_it_goes_through_in_one_run(box, tmp_path, monkeypatch):
-    out, calls = tmp_path / "out", []
+    out, calls, images = tmp_path / "out", [], len(box.names)
 
     def patch_match(workspace, max_image_size, settings, count):
         calls.append(max_image_size)
-        for there in (30, 150, 60, 300):  # of 240; those of an earlier attempt may have gone
+        for there in (15, 75, 30, 200):  # of 150; those of an earlier attempt may have gone
             count(there)
         # the result file is not there yet, but the scale is in the model
         estimate = json.loads((out / "sparse" / "0" / "transform.json").read_text())["scale"]
         (out / "result.json").write_text(json.dumps({"models": [{"metres_per_unit": estimate}]}))
-        cast_depth_maps(box, out, only=100)
+        cast_depth_maps(box, out, only=50)
         (out / "result.json").unlink()
 
     monkeypatch.setattr(pycolmap, "has_cuda", True)
@@ -237,12 +237,12 @@ def test_with_cuda_it_goes_through_in_one_run(box, tmp_path, monkeypatch):
     dense = result.models[0].dense
     assert calls == [96]
     assert result.exit_code() == 0
-    assert (dense.depth_maps, dense.images, dense.mesh, dense.waiting) == (100, 120, None, "")
+    assert (dense.depth_maps, dense.images, dense.mesh, dense.waiting) == (50, images, None, "")
     assert dense.points > 2000
     assert max(camera.width for camera in read_model(dense.folder / "sparse").cameras.values()) == 96
     # 1 for undistortion, 46 for depth maps, 11 for fusion: times on two recordings
-    depth = [120 + 46 * 120 * there // 240 for there in (30, 150, 240, 240)]
-    assert [done for stage, done, _ in seen if stage == "dense"] == [120, *depth, 58 * 120, 58 * 120]
+    depth = [images + 46 * images * there // (2 * images) for there in (15, 75, 150, 150)]
+    assert [done for stage, done, _ in seen if stage == "dense"] == [images, *depth, 58 * images, 58 * images]
     assert not [stage for stage, *_ in seen if stage == "mesh"]
     assert "no depth map of" in (out / "log.txt").read_text()
 
@@ -391,6 +391,7 @@ def test_a_mesh_maker_that_lacks_a_library_is_said_and_not_loaded(tmp_path, monk
     (tmp_path / "open3d.py").write_text("raise OSError('libusb-1.0.so.0: cannot open shared object file')")
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
     monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "open3d", raising=False)
     options = dataclasses.replace(QUICK, dense_options=DenseOptions(mesh="tsdf"))
     assert options.dense
     with pytest.raises(InertialError, match=r"libusb-1\.0\.so\.0: cannot open.*apt install libusb"):
@@ -426,7 +427,7 @@ def test_damaged_depth_maps_and_those_of_other_options_are_named(unfinished, box
 
 
 def test_images_that_are_not_the_model_s_are_named(box, tmp_path, capsys):
-    flags = ["--imu", box.imu, "--frame-times", box.frame_times, "--dense", "--images"]
+    flags = ["--imu", box.imu, "--frame-times", box.frame_times, *FLAGS, "--images"]
     some = shutil.copytree(box.root / "images", tmp_path / "some")
     (some / box.names[4]).unlink()
     code, _, err = run(capsys, "reconstruct", box.root, tmp_path / "out", *flags, some)

@@ -17,6 +17,8 @@ from colmap_inertial.cli import main
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), resource.RLIM_INFINITY))
 main(["reconstruct", *sys.argv[2:]])
 """
+#: Of fewer there is no scale.
+FRAMES = 9
 Usage = namedtuple("Usage", "total used free")
 
 
@@ -25,7 +27,7 @@ def contents(folder):
 
 
 def test_images_that_cannot_be_written_are_an_error(tmp_path):
-    capture = tiny_capture(tmp_path / "capture")
+    capture = tiny_capture(tmp_path / "capture", frames=FRAMES)
     before = contents(capture)
     args = [sys.executable, "-c", LIMITED, "5000", str(capture), str(tmp_path / "out")]
     done = subprocess.run(args, capture_output=True, text=True)
@@ -38,7 +40,7 @@ def test_images_that_cannot_be_written_are_an_error(tmp_path):
 
 @pytest.mark.parametrize("step", ["features", "matches"])
 def test_colmap_is_not_started_on_a_disk_that_is_nearly_full(tmp_path, monkeypatch, step):
-    capture = tiny_capture(tmp_path / "capture")
+    capture = tiny_capture(tmp_path / "capture", frames=FRAMES)
     room, at = shutil.disk_usage, []
     with monkeypatch.context() as patch:
         patch.setattr(shutil, "disk_usage", lambda path: Usage(1, 1, 0) if step in at else room(path))

@@ -1,7 +1,9 @@
 """``reconstruct`` on an existing COLMAP project: nothing is mapped, all becomes metric, the original is only read."""
 
+import contextlib
 import dataclasses
 import datetime
+import io
 import json
 import re
 import shutil
@@ -10,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from box_project import pictures, shared_box, with_exif, write_model, write_video
+from box_project import build, pictures, with_exif, write_model, write_video
 
 from colmap_inertial.cli import main
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError, TimingError
@@ -35,17 +37,32 @@ UNREFINED = ("--refine", "off")
 
 @pytest.fixture(scope="module")
 def box(tmp_path_factory):
-    """Tests must not change it."""
-    return shared_box(tmp_path_factory)
+    """Of few points, which all steps read. Tests must not change it."""
+    box = build(tmp_path_factory.mktemp("box"), every=10)
+    shutil.rmtree(box.root / "sparse")
+    write_model(box, box.root / "sparse" / "0", box.names, points=500)
+    return box
 
 
 @pytest.fixture(scope="module")
 def video(box):
-    """The recording's frames at another size, through a codec; its clock starts at 2 s."""
-    count = len(box.recording.trajectory)
-    stamps_ms = [2000 + round(1000 * i / 30) for i in range(count)]
-    frames = pictures(box.recording, range(count))
-    return write_video(box.root.parent / "clip.mp4", frames, stamps_ms=stamps_ms, size=(200, 150))
+    """Every other of the recording's frames at another size, through a codec; its clock starts at 2 s."""
+    frames = range(0, len(box.recording.trajectory), 2)
+    stamps_ms = [2000 + round(1000 * i / 30) for i in frames]
+    shown = pictures(box.recording, frames)
+    return write_video(box.root.parent / "clip.mp4", shown, stamps_ms=stamps_ms, size=(200, 150))
+
+
+@pytest.fixture(scope="module")
+def finished(box, tmp_path_factory):
+    """The command's words, what it made and what it printed. Tests must not change it."""
+    before, out, shown = contents(box.root), tmp_path_factory.mktemp("finished") / "out", io.StringIO()
+    words = "reconstruct", box.root, out, "--imu", box.imu, "--frame-times", box.frame_times, *UNREFINED
+    with contextlib.redirect_stdout(shown), pytest.raises(SystemExit) as stopped:
+        main([str(word) for word in words])
+    assert stopped.value.code == 0
+    assert contents(box.root) == before
+    return words, out, shown.getvalue()
 
 
 def run(capsys, *args):
@@ -76,14 +93,10 @@ def poses_only(box, folder, names):
     return folder
 
 
-def test_a_project_with_a_csv_becomes_metric_whole(box, tmp_path, capsys):
-    before, out = contents(box.root), tmp_path / "out"
-    words = "reconstruct", box.root, out, "--imu", box.imu, "--frame-times", box.frame_times, "--refine", "off"
-    code, shown, err = run(capsys, *words)
-    assert code == 0, err
-    assert contents(box.root) == before
+def test_a_project_with_a_csv_becomes_metric_whole(box, finished, tmp_path, capsys):
+    words, out, shown = finished
     model = assert_metric(box, out)
-    assert "120" in shown
+    assert f"Images       {len(box.names)} " in shown
     assert model["sparse"] == str(box.root / "sparse" / "0")
     assert not (out / "colmap").exists()
     assert "poses" in json.loads((out / "diagnosis.json").read_text())["checked"]
@@ -199,7 +212,7 @@ def test_exif_with_fractions_times_the_images_and_without_is_refused(box, tmp_pa
         assert not (tmp_path / f"out{digits}" / "result.json").exists()
     bare = exif_pictures(box, tmp_path / "bare")
     bare.joinpath(box.names[3]).write_bytes(cv2.imencode(".jpg", np.zeros((8, 8), np.uint8))[1].tobytes())
-    with pytest.raises(InertialError, match=r"00017\.jpg: has no EXIF"):
+    with pytest.raises(InertialError, match=rf"{box.names[3]}: has no EXIF"):
         stamps_of_exif(bare, box.names)
     shutil.copy(images / box.names[3], bare)
     with pytest.raises(TimingError, match="cannot be compared"):
@@ -411,7 +424,7 @@ def test_each_sub_model_has_its_own_scale(box, tmp_path):
     assert (out / "trajectory_1.tum").is_file()
 
 
-def test_an_interrupted_run_continues(box, tmp_path):
+def test_an_interrupted_run_continues(box, finished, tmp_path):
     source = ProjectOptions(imu=box.imu, frame_times=box.frame_times)
 
     class Stopped(Exception):
@@ -428,9 +441,9 @@ def test_an_interrupted_run_continues(box, tmp_path):
     assert not (out / "transform.json").exists() and not (out / "images").exists()
     first = reconstruct_project(box.root, out, source, NOT_REFINED)
     assert "times: finished in an earlier run, kept" in (out / "log.txt").read_text()
-    whole = reconstruct_project(box.root, tmp_path / "whole", source, NOT_REFINED)
-    assert first.models[0].scale.metres_per_unit == whole.models[0].scale.metres_per_unit
-    assert contents(out / "sparse") == contents(tmp_path / "whole" / "sparse")
+    (whole,) = json.loads((finished[1] / "result.json").read_text())["models"]
+    assert first.models[0].scale.metres_per_unit == whole["metres_per_unit"]
+    assert contents(out / "sparse") == contents(finished[1] / "sparse")
     assert not list(out.rglob("*partial*"))
 
 
@@ -457,7 +470,7 @@ def test_what_a_project_is(box, tmp_path):
 def test_euroc_keyframes_mapped_by_colmap(shared_data, tmp_path, capsys):
     data = shared_data / "euroc_v101"
     out = tmp_path / "out"
-    flags = ["--imu", data / "mav0" / "imu0", "--name-times", "ns", "--scale.max-offset-s", "1"]
+    flags = ["--imu", data / "mav0" / "imu0", "--name-times", "ns", "--scale.max-offset-s", "1", *UNREFINED]
     code, _, err = run(capsys, "reconstruct", data / "colmap_sparse", out, *flags)
     assert code == 0, err
     metric = read_model(out / "sparse" / "0")

@@ -43,7 +43,7 @@ print(json.dumps([usable_processors(), codes]))
 
 
 def test_commands_run_without_what_only_linux_has(project, tmp_path: Path) -> None:
-    scene = copy_scene(tmp_path / "scene", first=16, half=False)  # its target is validated
+    scene = copy_scene(tmp_path / "scene", first=9, half=False)  # its target is validated
     (tmp_path / "tiny.toml").write_text(config_as_toml(TINY))
     out, metric = tmp_path / "out", tmp_path / "metric"
     spec = tomllib.loads((SCENE / "capture.toml").read_text())["target"]["spec"]

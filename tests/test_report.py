@@ -99,21 +99,37 @@ def report_of(out):
 def full(tmp_path_factory):
     """A run with data for everything: (folder, content of result.json). Tests must not change it."""
     out = tmp_path_factory.mktemp("full") / "out"
-    return out, write_run(out)
+    result = write_run(out)
+    for path in (out / "validation" / "0").iterdir():  # each report makes them small again
+        cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), (480, 360), interpolation=cv2.INTER_AREA))
+    return out, result
 
 
-def copy_of(full, tmp_path):
+@pytest.fixture(scope="module")
+def full_report(full):
+    """Its report."""
+    return report_of(full[0])
+
+
+@pytest.fixture(scope="module")
+def refused(tmp_path_factory):
+    """A run whose scale was refused: (folder, content of result.json). Tests must not change it."""
+    out = tmp_path_factory.mktemp("refused") / "out"
+    return out, write_run(out, kind="constant_velocity", duration_s=10.0)
+
+
+def copy_of(run, tmp_path):
     out = tmp_path / "out"
-    shutil.copytree(full[0], out)
+    shutil.copytree(run[0], out)
     return out
 
 
 # What is said
 
 
-def test_the_numbers_are_those_of_the_result(full):
-    out, result = full
-    content, page = report_of(out)
+def test_the_numbers_are_those_of_the_result(full, full_report):
+    _, result = full
+    content, page = full_report
     (model,) = content["models"]
     for key, value in result["models"][0].items():
         if key not in ("drift", "validation", "cov"):
@@ -133,8 +149,8 @@ def test_the_numbers_are_those_of_the_result(full):
     assert "mapping" in page.text
 
 
-def test_every_section_that_has_data_is_there_and_every_figure_has_its_place(full):
-    _, page = report_of(full[0])
+def test_every_section_that_has_data_is_there_and_every_figure_has_its_place(full_report):
+    _, page = full_report
     assert page.anchors() == [
         "outcome",
         "findings",
@@ -179,8 +195,8 @@ class Drawing(html.parser.HTMLParser):
         return [np.array([corner.split() for corner in piece.split("L")], dtype=float) for piece in pieces]
 
 
-def test_every_plot_has_a_still_picture_that_shows_the_same(full):
-    _, page = report_of(full[0])
+def test_every_plot_has_a_still_picture_that_shows_the_same(full_report):
+    _, page = full_report
     stills = [attrs for tag, attrs in page.tags if tag == "svg" and attrs["class"] == "still"]
     places = [attrs for tag, attrs in page.tags if attrs.get("class") == "plot" and tag == "div"]
     assert [s["aria-label"] for s in stills][1:] == [
@@ -462,15 +478,15 @@ def test_the_picture_of_a_model_shows_near_over_far_and_up_upwards(full):
     assert seen == {(0, 0, 255, 255), (0, 255, 0, 255)}
 
 
-def test_figures_are_what_plotly_takes(full):
-    _, page = report_of(full[0])
+def test_figures_are_what_plotly_takes(full_report):
+    _, page = full_report
     for figure in page.figures().values():
         graph_objects.Figure(figure)  # raises on any name or value that plotly does not know
 
 
-def test_notes_stand_apart_from_reasons_and_earlier_results_have_none(tmp_path):
-    out = tmp_path / "out"
-    result = write_run(out, kind="constant_velocity")
+def test_notes_stand_apart_from_reasons_and_earlier_results_have_none(refused, tmp_path):
+    out = copy_of(refused, tmp_path)
+    result = json.loads((out / "result.json").read_text(encoding="utf-8"))
     (model,) = result["models"]
     write_json(out / "result.json", {**result, "models": [{**model, "notes": ["poses jump, which hardly counts"]}]})
     _, page = report_of(out)
@@ -481,9 +497,8 @@ def test_notes_stand_apart_from_reasons_and_earlier_results_have_none(tmp_path):
     assert content["models"][0]["notes"] == [] and "Notes" not in page.text
 
 
-def test_a_refused_scale_has_no_number_and_says_what_to_do(tmp_path):
-    out = tmp_path / "out"
-    result = write_run(out, kind="constant_velocity")
+def test_a_refused_scale_has_no_number_and_says_what_to_do(refused):
+    out, result = refused
     content, page = report_of(out)
     (model,) = content["models"]
     assert content["outcome"]["verdict"] == result["models"][0]["verdict"] == "refused"
@@ -533,9 +548,8 @@ def test_the_first_screen_says_how_large_how_sure_where_and_what_next(full, tmp_
     assert "rms, in which large residuals weigh more than in their mean, 0.40 px" in text
 
 
-def test_a_refused_report_does_not_say_that_nothing_was_wrong(tmp_path):
-    out = tmp_path / "out"
-    write_run(out, kind="constant_velocity")
+def test_a_refused_report_does_not_say_that_nothing_was_wrong(refused, tmp_path):
+    out = copy_of(refused, tmp_path)
     write_json(out / "diagnosis.json", {"version": 1, "worst": "info", "checked": ["gyroscope"], "findings": []})
     text = report_of(out)[1].text
     assert "Nothing was found wrong" not in text and "Nothing was found beforehand that explains this outcome" in text
@@ -695,8 +709,8 @@ def test_names_from_users_are_text_and_nothing_else(tmp_path):
         assert "<img" not in json.dumps(figure)
 
 
-def test_the_page_names_no_place_to_load_from(full):
-    _, page = report_of(full[0])
+def test_the_page_names_no_place_to_load_from(full_report):
+    _, page = full_report
     for tag, attrs in page.tags:
         for name in ("src", "href", "srcset", "action", "data", "poster"):
             target = attrs.get(name)
@@ -970,7 +984,7 @@ def test_grid_cells_are_round_lengths():
 
 
 def test_reconstruct_writes_it_and_a_continued_run_does_too(tmp_path):
-    capture = copy_scene(tmp_path / "capture", first=14)
+    capture = copy_scene(tmp_path / "capture", first=12)
     out = tmp_path / "out"
     result = reconstruct(capture, out, DETERMINISTIC)
     content, page = json.loads((out / "report.json").read_text()), Page(out / "report.html")
@@ -978,7 +992,7 @@ def test_reconstruct_writes_it_and_a_continued_run_does_too(tmp_path):
     assert content["models"][0]["metres_per_unit"] == written["models"][0]["metres_per_unit"]
     assert content["outcome"]["verdict"] == result.models[0].scale.verdict
     assert content["findings"]["checked"]
-    assert content["recording"]["frames"]["count"] == 14
+    assert content["recording"]["frames"]["count"] == 12
     assert content["models"][0]["scene"]["unit"] == ("m" if result.models[0].sparse_metric else "model")
     assert {"scene", "rotation", "acceleration"} <= set(page.anchors())
     assert result.workspace.report == out / "report.html"

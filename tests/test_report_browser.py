@@ -49,14 +49,13 @@ def browser():
 
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory):
-    """Reports by kind: everything there, with names that a page must not run; a refused scale; two; a stopped run."""
+    """Reports by kind: everything there, with names that a page must not run; two refused scales; a stopped run."""
     root = tmp_path_factory.mktemp("reports")
-    write_run(root / "full", name=HOSTILE)
-    write_run(root / "refused", kind="constant_velocity")
-    write_run(root / "both refused", kind="constant_velocity", models=2)
+    write_run(root / "full", name=HOSTILE, duration_s=8.0)
+    write_run(root / "both refused", kind="constant_velocity", duration_s=8.0, models=2)
     (root / "stopped").mkdir()
     stopped = root / "stopped"
-    page = {kind: write_report(root / kind) for kind in ("full", "refused", "both refused")}
+    page = {kind: write_report(root / kind) for kind in ("full", "both refused")}
     return page | {"stopped": write_report(stopped, stopped="the video was stabilised", capture="capture.toml")}
 
 
@@ -118,7 +117,7 @@ def drawn(browser, pages, kind, width, *, dark=False) -> Visit:
     assert seen.script("return document.querySelectorAll('.gl-container canvas').length") == len(
         seen.script("return [...document.querySelectorAll('section[id^=scene] .plot')]")
     )
-    least = {"full": 12, "refused": 5, "both refused": 10}[kind]
+    least = {"full": 12, "both refused": 10}[kind]
     assert seen.script("return document.querySelectorAll('.plot').length") >= least
     assert seen.script(
         """return [...document.querySelectorAll('img:not(.still)')].every(
@@ -132,9 +131,35 @@ def drawn(browser, pages, kind, width, *, dark=False) -> Visit:
 # Loading a page takes seconds: tests of one that stands on the screen follow each other.
 
 
-@pytest.mark.parametrize(("kind", "width"), [("both refused", "phone"), ("full", "desktop")])
-def test_every_plot_is_drawn_without_errors_or_requests(browser, pages, kind, width):
-    drawn(browser, pages, kind, width)
+#: Of the picture of the model on the first screen: where it lies, and how many pixels of its points are drawn.
+PICTURE = """
+    const done = arguments[arguments.length - 1];
+    const still = document.querySelector('#outcome .still'), box = still.getBoundingClientRect(), image = new Image();
+    image.src = still.querySelector('image').getAttribute('href');
+    image.decode().then(() => {
+        const canvas = Object.assign(document.createElement('canvas'), {width: image.width, height: image.height});
+        const brush = canvas.getContext('2d');
+        brush.drawImage(image, 0, 0);
+        const pixels = brush.getImageData(0, 0, image.width, image.height).data;
+        let drawn = 0;
+        for (let i = 3; i < pixels.length; i += 4) drawn += pixels[i] > 0;
+        done([box.top, box.bottom, box.left, box.right, drawn]);
+    });
+"""
+
+
+@pytest.mark.parametrize("width", ["phone", "desktop"])
+def test_the_first_screen_shows_the_model_beside_what_it_says(browser, pages, width):
+    seen = visit(browser, pages["full"], width)
+    top, bottom, left, right, points = browser.execute_async_script(PICTURE)
+    across, down, _ = WIDTHS[width]
+    assert 0 < top < bottom < down and 0 < left < right <= across
+    assert right - left > 0.3 * across and points > 1000
+    asked = (
+        "return [...document.querySelectorAll('.answers dt, .answers h2')].map(e => e.getBoundingClientRect().bottom)"
+    )
+    said = seen.script(asked)
+    assert len(said) == 4 and max(said) < down
 
 
 def test_names_are_shown_and_not_run(browser, pages):
@@ -199,21 +224,6 @@ BOXES = """JSON.stringify([...document.querySelectorAll('.plot')].map((plot) => 
         width: box.width, shapes: still.querySelectorAll('path, rect').length,
     };
 }))"""
-#: Of the picture of the model on the first screen: where it lies, and how many pixels of its points are drawn.
-PICTURE = """
-    const done = arguments[arguments.length - 1];
-    const still = document.querySelector('#outcome .still'), box = still.getBoundingClientRect(), image = new Image();
-    image.src = still.querySelector('image').getAttribute('href');
-    image.decode().then(() => {
-        const canvas = Object.assign(document.createElement('canvas'), {width: image.width, height: image.height});
-        const brush = canvas.getContext('2d');
-        brush.drawImage(image, 0, 0);
-        const pixels = brush.getImageData(0, 0, image.width, image.height).data;
-        let drawn = 0;
-        for (let i = 3; i < pixels.length; i += 4) drawn += pixels[i] > 0;
-        done([box.top, box.bottom, box.left, box.right, drawn]);
-    });
-"""
 
 #: Until eight frames are drawn.
 SETTLE = """
@@ -221,36 +231,6 @@ SETTLE = """
     const next = () => ++n > 8 ? arguments[0]() : requestAnimationFrame(next);
     next();
 """
-
-
-@pytest.mark.parametrize("width", ["phone", "desktop"])
-def test_the_first_screen_shows_the_model_beside_what_it_says(browser, pages, width):
-    seen = visit(browser, pages["full"], width)
-    top, bottom, left, right, points = browser.execute_async_script(PICTURE)
-    across, down, _ = WIDTHS[width]
-    assert 0 < top < bottom < down and 0 < left < right <= across
-    assert right - left > 0.3 * across and points > 1000
-    asked = (
-        "return [...document.querySelectorAll('.answers dt, .answers h2')].map(e => e.getBoundingClientRect().bottom)"
-    )
-    said = seen.script(asked)
-    assert len(said) == 4 and max(said) < down
-
-
-def test_without_waiting_a_page_prints_with_all_of_its_plots(browser, pages):
-    """Printed while plotly.js is still at work, and where it never works."""
-    browser.shown = None
-    source = {"source": "delete window.DecompressionStream"}
-    old = browser.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", source)
-    try:
-        visit(browser, pages["full"], "desktop")
-        boxes = json.loads(browser.execute_script(f"return {BOXES}"))
-        assert len(boxes) > 10
-        for box in boxes:
-            assert box["shown"] == "none" and box["width"] > 500 and box["height"] > 150 and box["shapes"] > 3
-    finally:
-        browser.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", {"identifier": old["identifier"]})
-        browser.shown = None
 
 
 def test_it_prints_on_a4_with_still_pictures_and_nothing_cut(browser, pages):
@@ -278,22 +258,52 @@ def test_it_prints_on_a4_with_still_pictures_and_nothing_cut(browser, pages):
     assert b"/MediaBox [0 0 594" in printed or b"/MediaBox [0 0 595" in printed
 
 
-def test_it_follows_a_dark_screen(browser, pages):
+def colours(seen: Visit) -> list[str]:
+    """Of the page, of a still picture's title, and of a plot's axis."""
     words = "getComputedStyle(document.querySelector('.still .title')).fill"
     colour = f"return getComputedStyle(document.body).backgroundColor + {words}"
-    tick = "return getComputedStyle(document.querySelector('#rotation .plot .xtick text')).fill"
-    light = visit(browser, pages["full"], "desktop")
-    bright = [light.script(colour), light.script(tick)]
-    dark = drawn(browser, pages, "refused", "desktop", dark=True)
-    dim = [dark.script(colour), dark.script(tick)]
-    assert all(a != b for a, b in zip(bright, dim, strict=True))
+    tick = "return getComputedStyle(document.querySelector('section[id^=rotation] .plot .xtick text')).fill"
+    return [seen.script(colour), seen.script(tick)]
+
+
+@pytest.fixture(scope="module")
+def bright(browser, pages):
+    return colours(visit(browser, pages["full"], "desktop"))
+
+
+@pytest.mark.parametrize(("kind", "width"), [("full", "desktop"), ("both refused", "phone")])
+def test_every_plot_is_drawn_without_errors_or_requests(browser, pages, bright, kind, width):
+    seen = drawn(browser, pages, kind, width, dark=kind != "full")
+    assert (colours(seen) == bright) == (kind == "full")
+
+
+def test_it_follows_a_dark_screen(browser, pages, bright):
+    dark = drawn(browser, pages, "both refused", "phone", dark=True)
+    assert all(a != b for a, b in zip(bright, colours(dark), strict=True))
     browser.execute_cdp_cmd(
         "Emulation.setEmulatedMedia", {"features": [{"name": "prefers-color-scheme", "value": "light"}]}
     )
+    browser.shown = None
     until = time.monotonic() + 20
-    while [dark.script(colour), dark.script(tick)] != bright:
+    while colours(dark) != bright:
         assert time.monotonic() < until, "the plots did not follow"
         time.sleep(0.1)
+
+
+def test_without_waiting_a_page_prints_with_all_of_its_plots(browser, pages):
+    """Printed while plotly.js is still at work, and where it never works."""
+    browser.shown = None
+    source = {"source": "delete window.DecompressionStream"}
+    old = browser.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", source)
+    try:
+        visit(browser, pages["full"], "desktop")
+        boxes = json.loads(browser.execute_script(f"return {BOXES}"))
+        assert len(boxes) > 10
+        for box in boxes:
+            assert box["shown"] == "none" and box["width"] > 500 and box["height"] > 150 and box["shapes"] > 3
+    finally:
+        browser.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", {"identifier": old["identifier"]})
+        browser.shown = None
 
 
 def test_a_run_that_stopped_has_a_page_without_plots(browser, pages):
@@ -307,7 +317,7 @@ def test_text_tables_and_plots_stand_without_scripts(browser, pages):
     browser.shown = None
     browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
     try:
-        browser.get(pages["refused"].as_uri())
+        browser.get(pages["both refused"].as_uri())
         text = browser.execute_cdp_cmd("Accessibility.getFullAXTree", {})
         names = " ".join(str(node.get("name", {}).get("value", "")) for node in text["nodes"])
     finally:
@@ -325,7 +335,7 @@ def test_a_browser_that_cannot_unpack_says_so(browser, pages):
         "Page.addScriptToEvaluateOnNewDocument", {"source": "delete window.DecompressionStream"}
     )
     try:
-        seen = visit(browser, pages["refused"], "desktop")
+        seen = visit(browser, pages["both refused"], "desktop")
         assert seen.script("return document.documentElement.dataset.plots") == "none"
         assert "newer browser" in seen.script("return document.getElementById('notice').innerText")
     finally:

@@ -36,7 +36,7 @@ DEEP = replace(QUICK, deblur="deepgyro")
 @pytest.fixture(scope="module")
 def blurred(tmp_path_factory):
     """Pictures without loss, so that every pixel can be compared; all that are looked at confirm the gyroscope."""
-    scene = CornerScene.make(exposure_s=0.03, readout_s=0.0, frames=12, vigour=0.8)
+    scene = CornerScene.make(exposure_s=0.03, readout_s=0.0, frames=8, vigour=0.8)
     return scene.write(tmp_path_factory.mktemp("blurred") / "capture", extra=CALIBRATED, suffix=".png")
 
 

@@ -32,7 +32,10 @@ CAMERA = (
     f'model = "SIMPLE_PINHOLE"\nwidth = {WIDTH}\nheight = {HEIGHT}\n'
     f'params = [{FOCAL}, {WIDTH / 2}, {HEIGHT / 2}]\npixel_origin = "corner"\n'
 )
-SPARE = ReconstructOptions(deterministic=True, mapping=MappingOptions(max_num_features=350, first_octave=0))
+SPARE = ReconstructOptions(
+    deterministic=True,
+    mapping=MappingOptions(max_num_features=350, first_octave=0, pairing="sequential", overlap=5),
+)
 
 
 @pytest.fixture(scope="module")

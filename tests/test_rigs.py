@@ -28,7 +28,7 @@ from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, SfmO
 
 #: Second camera against the first, in metres.
 TURN, SHIFT_M = pycolmap.Rotation3d(np.array([0.0, 0.06, 0.02])), np.array([-0.11, 0.004, 0.01])
-POINTS = 600
+POINTS = 400
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,7 +102,7 @@ def write_rig_model(recording, folder, *, skip=(), turn=TURN, shift_m=SHIFT_M):
 def rig(tmp_path_factory):
     """20 s by hand, 5 frames a second of both cameras; a frame without the first one's image. Tests change nothing."""
     root = tmp_path_factory.mktemp("rig")
-    sfm = SfmOptions(frame_rate_hz=10, position_white_m=0.0005, position_correlated_m=0.0005)
+    sfm = SfmOptions(frame_rate_hz=5, position_white_m=0.0005, position_correlated_m=0.0005)
     recording = simulate_recording(RecordingOptions(motion=MotionOptions(duration_s=20), sfm=sfm), seed=4)
     given = write_project(root / "given", recording)
     write_rig_model(recording, root / "project" / "sparse" / "0", skip={"cam0/f00007.jpg"})

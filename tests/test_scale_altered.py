@@ -1,6 +1,6 @@
 """Recordings with something wrong, through the command: an error that names the setting, a refusal, or a right scale.
 
-Nothing is ever trusted and wrong. The recordings are real (30 s of one of Mustaniemi et al., IROS 2017).
+Nothing is ever trusted and wrong. The recordings are real (18 s of one of Mustaniemi et al., IROS 2017).
 """
 
 import json
@@ -14,7 +14,7 @@ import pytest
 from colmap_inertial.cli import main
 from colmap_inertial.core.geometry import so3_exp
 
-NAME, SECONDS, OTHER = "D11", 30.0, "D5"
+NAME, SECONDS, OTHER = "D11", 18.0, "D5"
 GYRO, ACCEL, POSES = "gyroscope", "accelerometer", "poses"
 Tables = dict[str, np.ndarray]
 
@@ -65,30 +65,44 @@ def broken(tables: Tables) -> None:
 
 
 def weightless(tables: Tables) -> None:
-    from scipy.signal import butter, filtfilt
+    tables[ACCEL][:, 1:] -= filtered(filtered(tables[ACCEL][::-1, 1:], hz=0.3)[::-1], hz=0.3)
 
-    force = tables[ACCEL][:, 1:]
-    tables[ACCEL][:, 1:] = force - filtfilt(*butter(2, 0.3 / 50), force, axis=0)
+
+def filtered(force: np.ndarray, hz: float = 4.0) -> np.ndarray:
+    """A low-pass filter of the first order, at 100 readings a second."""
+    out, keep = force.copy(), np.exp(-2 * np.pi * hz / 100)
+    for i in range(1, len(out)):
+        out[i] = keep * out[i - 1] + (1 - keep) * out[i]
+    return out
+
+
+@pytest.fixture(scope="module")
+def source(shared_data):
+    """The recording's folder and its tables. Tests must not change them."""
+    folder = shared_data / "inertial_scale" / NAME
+    return folder, {kind: np.loadtxt(folder / f"{kind}.txt") for kind in (POSES, GYRO, ACCEL)}
 
 
 @pytest.fixture
-def attempt(shared_data, tmp_path, capsys):
+def attempt(source, tmp_path, capsys):
     """Runs the command on an altered copy; gives exit code, message and the JSON (None where there is none)."""
 
-    def run(alter: Callable[[Tables], None], *options: str, name: str = NAME, seconds: float = SECONDS):
-        source = shared_data / "inertial_scale" / name
-        tables = {kind: np.loadtxt(source / f"{kind}.txt") for kind in (POSES, GYRO, ACCEL)}
-        begin_ns = tables[POSES][0, 0]
-        tables[POSES] = tables[POSES][tables[POSES][:, 0] <= begin_ns + seconds * 1e9]
+    def run(alter: Callable[[Tables], None], *options: str, seconds: float = SECONDS):
+        original, recorded = source
+        tables = {kind: table.copy() for kind, table in recorded.items()}
+        tables[POSES] = tables[POSES][tables[POSES][:, 0] <= tables[POSES][0, 0] + seconds * 1e9]
         alter(tables)
-        folder = tmp_path / name
+        folder = tmp_path / NAME
         folder.mkdir(exist_ok=True)
         for kind, table in tables.items():
-            np.savetxt(folder / f"{kind}.txt", table, fmt=["%d"] + ["%.9g"] * (table.shape[1] - 1))
+            if np.array_equal(table, recorded[kind]):
+                shutil.copy(original / f"{kind}.txt", folder)
+            else:
+                np.savetxt(folder / f"{kind}.txt", table, fmt=["%d"] + ["%.9g"] * (table.shape[1] - 1))
         target = tmp_path / "scale.json"
         with pytest.raises(SystemExit) as stopped:
             main(["scale", str(folder), "--json", str(target), *options])
-        truth = float((source / "groundtruth.txt").read_text())
+        truth = float((original / "groundtruth.txt").read_text())
         estimate = json.loads(target.read_text()) if target.exists() else None
         if estimate is not None and estimate["verdict"] == "trusted":
             low, high = estimate["ci95"]
@@ -204,17 +218,8 @@ def test_clocks_that_part_are_both_suspected(attempt, shared_data, faster):
     ],
 )
 def test_a_badly_calibrated_imu_is_not_trusted(attempt, alter):
-    _, _, estimate = attempt(alter, seconds=45.0)
+    _, _, estimate = attempt(alter, seconds=20.0)
     assert estimate["verdict"] != "trusted" and estimate["reasons"]
-
-
-def filtered(force: np.ndarray) -> np.ndarray:
-    """A low-pass filter of the first order at 4 Hz, at 100 readings a second."""
-    from scipy.signal import lfilter, lfilter_zi
-
-    keep = np.exp(-2 * np.pi * 4 / 100)
-    start = lfilter_zi([1 - keep], [1, -keep])[:, None] * force[:1]
-    return lfilter([1 - keep], [1, -keep], force, axis=0, zi=start)[0]
 
 
 def late(force: np.ndarray) -> np.ndarray:
@@ -223,18 +228,22 @@ def late(force: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("alter", "said"),
+    ("alter", "seconds", "said"),
     [
-        pytest.param(values(ACCEL, filtered), "low-passed at about", id="low-pass-4-Hz"),
-        pytest.param(values(ACCEL, late), "axes are not read at the same time", id="axis-late"),
-        pytest.param(stamps((ACCEL,), lambda t: t[0] + 1.001 * (t - t[0])), "ppm off the gyroscope's", id="accel-rate"),
-        pytest.param(values(ACCEL, lambda x: 1.05 * x), "off in gain by", id="gain-5-%"),
-        pytest.param(values(ACCEL, lambda x: x * [1.05, 1, 1]), "off in gain by", id="gain-5-%-of-one-axis"),
-        pytest.param(values(ACCEL, lambda x: np.clip(x, -11, 11)), "stand at the end of its range", id="saturated"),
+        pytest.param(values(ACCEL, filtered), 30.0, "low-passed at about", id="low-pass-4-Hz"),
+        pytest.param(values(ACCEL, late), 60.0, "axes are not read at the same time", id="axis-late"),
+        pytest.param(
+            stamps((ACCEL,), lambda t: t[0] + 1.001 * (t - t[0])), 30.0, "ppm off the gyroscope's", id="accel-rate"
+        ),
+        pytest.param(values(ACCEL, lambda x: 1.05 * x), 40.0, "off in gain by", id="gain-5-%"),
+        pytest.param(values(ACCEL, lambda x: x * [1.05, 1, 1]), 30.0, "off in gain by", id="gain-5-%-of-one-axis"),
+        pytest.param(
+            values(ACCEL, lambda x: np.clip(x, -11, 11)), 30.0, "stand at the end of its range", id="saturated"
+        ),
     ],
 )
-def test_what_is_wrong_with_the_accelerometer_is_named_and_undone(attempt, shared_data, alter, said):
-    code, message, estimate = attempt(alter, "--force", seconds=60.0)
+def test_what_is_wrong_with_the_accelerometer_is_named_and_undone(attempt, shared_data, alter, seconds, said):
+    code, message, estimate = attempt(alter, "--force", seconds=seconds)
     assert code == 0, message
     assert estimate["verdict"] == "weak" and said in " ".join(estimate["reasons"])
     truth = float((shared_data / "inertial_scale" / NAME / "groundtruth.txt").read_text())

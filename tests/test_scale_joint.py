@@ -485,7 +485,7 @@ def test_roughness_is_the_density_of_white_noise_and_not_the_motion(subtests):
 def test_a_lever_arm_along_the_optical_axis_is_found_where_the_device_is_no_phone():
     """A rig has centimetres where a phone has millimetres: the prior gives way to the data, and the scale holds."""
     options = RecordingOptions(
-        motion=MotionOptions(kind="roam", duration_s=30.0),
+        motion=MotionOptions(kind="roam", duration_s=20.0),
         sfm=SfmOptions(position_drift_m_rts=0.0),
         imu=replace(IMU_PRESETS["phone"], lever_arm_m_sd=(0.0, 0.0, 0.05)),
     )
@@ -605,7 +605,7 @@ def test_a_break_of_the_path_does_no_harm_and_is_named(subtests, recording, cali
 
 @pytest.mark.parametrize("kind", ["static", "pure_rotation", "constant_velocity"])
 def test_motion_that_cannot_give_a_scale_is_refused(kind):
-    recording = simulate_recording(RecordingOptions(motion=MotionOptions(kind=kind, duration_s=30.0)), seed=1)
+    recording = simulate_recording(RecordingOptions(motion=MotionOptions(kind=kind, duration_s=10.0)), seed=1)
     truth = recording.truth.calibration
     cov = np.diag(np.array([0.01] * 3 + [0.002, 0.02] + [0.01] * 3 + [0.08] * 3 + [0.02]) ** 2)
     estimate = joint(recording.trajectory, recording.imu, replace(truth, cov=cov))
@@ -717,7 +717,7 @@ def test_what_residuals_lose_to_the_fit_is_the_trace_of_a_dense_inverse(recordin
 
 
 def test_a_wrong_gain_is_named():
-    recording = simulate_recording(RecordingOptions(motion=MotionOptions(kind="roam", duration_s=40.0)), seed=7)
+    recording = simulate_recording(RecordingOptions(motion=MotionOptions(kind="roam", duration_s=20.0)), seed=7)
     imu = replace(recording.imu, accel_m_s2=1.1 * recording.imu.accel_m_s2)
     estimate = joint(recording.trajectory, imu, align_camera_imu(recording.trajectory, imu))
     assert estimate.verdict != "trusted" and any("gain" in reason for reason in estimate.reasons)
@@ -773,10 +773,10 @@ def tablet(shared_data):
 
 
 @pytest.mark.slow
-def test_real_handheld_recordings_of_a_minute(tablet):
+def test_real_handheld_recordings_of_half_a_minute(tablet):
     errors, inside = [], []
     for trajectory, imu, truth in tablet.values():
-        estimate = estimate_scale(trajectory, imu)
+        estimate = estimate_scale(first_seconds(trajectory, 30.0), imu)
         errors.append(abs(estimate.metres_per_unit / truth - 1))
         inside.append(estimate.ci95[0] < truth < estimate.ci95[1])
     assert len(errors) == 8
@@ -840,16 +840,16 @@ def stretched(trajectory, growth):
 
 
 def test_a_drift_of_the_scale_is_found_and_measured():
-    recording = simulate_recording(RecordingOptions(motion=MotionOptions(duration_s=60.0, kind="roam")), seed=31)
+    recording = simulate_recording(RecordingOptions(motion=MotionOptions(duration_s=45.0, kind="roam")), seed=31)
     steady = estimate_scale(recording.trajectory, recording.imu)
     assert steady.verdict == "trusted" and steady.drift.p_value > 1e-3
     assert np.all(np.abs(steady.drift.log_ratio) < 4 * steady.drift.sigma_log)
     growing = estimate_scale(stretched(recording.trajectory, 0.12), recording.imu)
     assert growing.verdict == "weak" and any("not the same throughout" in reason for reason in growing.reasons)
     drift = growing.drift
-    assert drift.trend_log_per_s * 60 == pytest.approx(-0.12, abs=4 * 60 * drift.trend_sigma_log_per_s)
+    assert drift.trend_log_per_s * 45 == pytest.approx(-0.12, abs=4 * 45 * drift.trend_sigma_log_per_s)
     middle_s = 0.5 * (drift.begin_s + drift.end_s)
     # Scales of the model shrink where its lengths grow: metres per unit go the other way
     assert np.corrcoef(middle_s, drift.log_ratio)[0, 1] < -0.8
     parts = growing.as_json()["drift"]["parts"]
-    assert len(parts) == 6 and parts[0]["metres_per_unit"] > parts[-1]["metres_per_unit"]
+    assert len(parts) == 4 and parts[0]["metres_per_unit"] > parts[-1]["metres_per_unit"]

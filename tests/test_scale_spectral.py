@@ -178,7 +178,7 @@ def test_derivatives_of_the_magnitudes_are_right(handheld):
 @pytest.mark.parametrize("kind", ["static", "pure_rotation", "constant_velocity"])
 def test_motion_without_acceleration_gives_no_number(kind):
     for seed in range(4):
-        options = RecordingOptions(motion=MotionOptions(kind=kind, duration_s=20.0))
+        options = RecordingOptions(motion=MotionOptions(kind=kind, duration_s=10.0))
         simulated = simulate_recording(options, seed=seed)
         estimate = spectral(simulated.trajectory, simulated.imu, known(simulated))
         assert estimate.verdict == "refused"

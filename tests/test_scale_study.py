@@ -148,7 +148,13 @@ def test_short_recordings_are_covered_and_close_to_the_bound(scripts):
 
 def test_recordings_that_cannot_give_a_scale_are_refused(scripts):
     _, study = scripts
-    runs = [study.run(seed) for seed in study.seeds(0, (0, 0, 0, len(study.FUTILE)))]
+    seconds = {seed: study.drawn(seed)[0].motion.duration_s for seed in study.seeds(0, (0, 0, 0, 120))}
+    by_kind = {kind: list(seconds)[i :: len(study.FUTILE)] for i, kind in enumerate(study.FUTILE)}
+    # of each kind the shortest of twenty, but not of those that are too short anyway
+    runs = [
+        study.run(some[0] if kind == "too_short" else min(some, key=seconds.__getitem__))
+        for kind, some in by_kind.items()
+    ]
     assert {r.kind for r in runs} == set(study.FUTILE)
     assert [(r.seed, r.kind) for r in runs if r.verdict != "refused"] == []
     assert all(r.error is None and r.reasons for r in runs)

@@ -23,7 +23,7 @@ from colmap_inertial.tools.simulate.recording import RecordingOptions, simulate_
 
 @pytest.fixture(scope="module")
 def recording():
-    return simulate_recording(RecordingOptions(motion=MotionOptions(kind="roam", duration_s=40.0)), seed=7)
+    return simulate_recording(RecordingOptions(motion=MotionOptions(kind="roam", duration_s=20.0)), seed=7)
 
 
 def low_passed(imu, hz):
@@ -75,7 +75,7 @@ def test_a_fault_of_the_accelerometer_is_named_and_undone(recording, alter, said
 @pytest.mark.parametrize("width_s", [0.05, 0.12])
 @pytest.mark.parametrize("kind", ["roam", "walk"])
 def test_a_path_that_was_smoothed_gives_no_scale(kind, width_s):
-    recording = simulate_recording(RecordingOptions(motion=MotionOptions(kind=kind, duration_s=25.0)), seed=5)
+    recording = simulate_recording(RecordingOptions(motion=MotionOptions(kind=kind, duration_s=22.0)), seed=5)
     trajectory = recording.trajectory
     kernel = np.exp(-0.5 * (np.arange(-15, 16) * np.median(np.diff(trajectory.t_s)) / width_s) ** 2)
     padded = np.pad(trajectory.cam_in_world, ((15, 15), (0, 0)), mode="edge")
@@ -132,7 +132,7 @@ def test_a_stream_that_is_cut_off_throughout_is_refused_for_that(recording):
     imu = recording.imu
     ends = np.where(imu.accel_m_s2 > np.median(imu.accel_m_s2, axis=0), 1.0, -1.0) * [5.0, 6.0, 7.0]
     ends[::7, 0] = 0.1  # a third level; the other axes stand at an end
-    short = first_seconds(recording.trajectory, 15.0)
+    short = first_seconds(recording.trajectory, 8.0)
     estimate = estimate_scale(short, replace(imu, accel_m_s2=ends + np.array([0, 0, 4.0])))
     assert estimate.verdict == "refused"
     hard = np.clip(imu.accel_m_s2, -8.0, 8.0)

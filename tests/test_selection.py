@@ -96,7 +96,8 @@ def _followed_once():
 @pytest.fixture(scope="module")
 def orbiting(tmp_path_factory) -> BoxVideo:
     """Handheld around the middle of the box, looking at it, 16 ms of exposure."""
-    return film(tmp_path_factory.mktemp("orbit") / "a", MotionOptions(kind="orbit", duration_s=6.0))
+    motion = MotionOptions(kind="orbit", duration_s=5.0)
+    return film(tmp_path_factory.mktemp("orbit") / "a", motion, frame_rate_hz=24.0)
 
 
 @pytest.fixture(scope="module")
@@ -110,8 +111,9 @@ def turning(tmp_path_factory) -> BoxVideo:
     """About the optical centre alone."""
     return film(
         tmp_path_factory.mktemp("turn") / "a",
-        MotionOptions(kind="pure_rotation", duration_s=5.0, vigour=0.6),
+        MotionOptions(kind="pure_rotation", duration_s=4.5, vigour=0.6),
         exposure_s=0.025,
+        frame_rate_hz=24.0,
     )
 
 
@@ -172,8 +174,8 @@ def test_baseline_is_what_translation_moves(orbiting, of_orbiting, of_turning):
 
 
 def test_more_baseline_makes_more_frames(tmp_path):
-    slow = film(tmp_path / "slow", MotionOptions(kind="constant_velocity", duration_s=2.0, speed_m_s=0.1, vigour=0.0))
-    quick = film(tmp_path / "quick", MotionOptions(kind="constant_velocity", duration_s=2.0, speed_m_s=1.6, vigour=0.0))
+    slow = film(tmp_path / "slow", MotionOptions(kind="constant_velocity", duration_s=1.5, speed_m_s=0.1, vigour=0.0))
+    quick = film(tmp_path / "quick", MotionOptions(kind="constant_velocity", duration_s=1.5, speed_m_s=1.6, vigour=0.0))
     few, many = selected(slow, min_fps=2.0), selected(quick, min_fps=2.0)
     assert len(many.windows) > 1.5 * len(few.windows)
     assert Counter(window.closed_by for window in many.windows).most_common(1)[0][0] in ("baseline", "motion")
@@ -183,7 +185,7 @@ def test_more_baseline_makes_more_frames(tmp_path):
 
 
 def test_a_tripod_gives_few_frames(tmp_path):
-    video = film(tmp_path / "a", MotionOptions(kind="static", duration_s=3.0))
+    video = film(tmp_path / "a", MotionOptions(kind="static", duration_s=2.5))
     selection = selected(video)
     assert 3 <= len(selection.windows) <= 8
     assert Counter(window.closed_by for window in selection.windows)["still"] >= 2
@@ -410,8 +412,8 @@ def test_a_gyroscope_of_another_recording_does_not_rank(turning):
 
 
 def test_a_video_is_reconstructed_from_the_chosen_frames(orbiting, of_orbiting, tmp_path):
-    mapping = MappingOptions(max_num_features=600, first_octave=0, pairing="sequential", overlap=4)
-    options = ReconstructOptions(deblur="off", mapping=mapping)
+    mapping = MappingOptions(max_num_features=400, first_octave=0, pairing="sequential", overlap=3)
+    options = ReconstructOptions(deblur="off", refine="off", mapping=mapping)
     result = reconstruct(orbiting.folder, tmp_path / "out", options)
     stored = json.loads((tmp_path / "out" / "result.json").read_text())
     assert result.selection.names == of_orbiting.names

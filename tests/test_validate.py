@@ -44,6 +44,23 @@ SMALL = default_camera(480, 360)
 SMALL.params = [450.0, 451.0, 241.0, 179.0, -0.1, 0.02, 0.001, -0.0005]
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _searched_once():
+    """What OpenCV found of a board in a picture is kept: most of the time is its search, here often the same one."""
+    search, found = cv2.findChessboardCornersSB, {}
+
+    def known(image, size, flags):
+        key = image.shape, image.tobytes(), size, flags
+        if key not in found:
+            found[key] = search(image, size, flags=flags)
+        seen, corners = found[key]
+        return seen, None if corners is None else corners.copy()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cv2, "findChessboardCornersSB", known)
+        yield
+
+
 class Scene:
     def __init__(self, folder, poses, camera=CAMERA, texture=None, target=TARGET, seed=0, **how):
         self.poses, self.camera, self.target = poses, camera, target
@@ -59,8 +76,13 @@ class Scene:
 
 @pytest.fixture(scope="module")
 def sharp(tmp_path_factory) -> Scene:
-    """Eight sharp frames with lens distortion, taken at all angles of roll."""
-    return Scene(tmp_path_factory.mktemp("sharp"), orbit(np.random.default_rng(1), 8))
+    """Six sharp frames with lens distortion, taken at all angles of roll."""
+    return Scene(tmp_path_factory.mktemp("sharp"), orbit(np.random.default_rng(1), 6))
+
+
+@pytest.fixture(scope="module")
+def measured(sharp):
+    return sharp.validate()
 
 
 @pytest.fixture(scope="module")
@@ -68,13 +90,13 @@ def small(tmp_path_factory) -> Scene:
     return Scene(tmp_path_factory.mktemp("small"), orbit(np.random.default_rng(2), 5), SMALL, samples=1)
 
 
-def test_a_perfect_model_of_sharp_frames_has_the_right_size(sharp):
-    result = sharp.validate()
+def test_a_perfect_model_of_sharp_frames_has_the_right_size(measured):
+    result = measured
     assert abs(result.scale_error_pct) <= 0.05
     assert abs(result.scale_error_pct) <= 0.02  # what it reaches; the bound above is what is promised
     assert result.ci95_pct[0] <= result.scale_error_pct <= result.ci95_pct[1]
-    assert result.views_used == 8
-    assert result.corners_used == 8 * 54
+    assert result.views_used == 6
+    assert result.corners_used == 6 * 54
     assert result.rms_px < 0.1
     assert result.within_tolerance
 
@@ -118,14 +140,14 @@ def test_a_model_without_a_unit_gets_the_factor_that_makes_it_metric(sharp):
     assert max(abs(d.residual_m) for d in result.distances) < 2e-4  # metres after scaling by the control corners
 
 
-def test_the_json_has_the_agreed_fields_and_the_table_says_the_same(sharp):
-    result = sharp.validate(units_per_m=1.01)
+def test_the_json_has_the_agreed_fields_and_the_table_says_the_same(measured):
+    result = measured
     fields = json.loads(json.dumps(result.as_json()))
     agreed = "scale_error_pct ci95_pct metres_per_unit views_used corners_used rms_px distances reasons"
     assert set(agreed.split()) <= set(fields)
-    assert fields["views_used"] == 8
+    assert fields["views_used"] == 6
     assert {"pair", "known_m", "measured", "residual_m"} <= set(fields["distances"][0])
-    assert [view["name"] for view in fields["views"]] == [f"{i:03}.png" for i in range(8)]
+    assert [view["name"] for view in fields["views"]] == [f"{i:03}.png" for i in range(6)]
     console = Console(width=120, file=io.StringIO())
     console.print(validation_table(result))
     text = console.file.getvalue()
@@ -133,8 +155,8 @@ def test_the_json_has_the_agreed_fields_and_the_table_says_the_same(sharp):
     assert "within 2 %" in text
 
 
-def test_pictures_show_corners_on_frames_and_a_chart(sharp, tmp_path):
-    result = sharp.validate()
+def test_pictures_show_corners_on_frames_and_a_chart(sharp, measured, tmp_path):
+    result = measured
     files = write_overlays(result, sharp.images, tmp_path / "pictures", most_frames=3)
     chart = ET.parse(files[0]).getroot()
     circles = [e for e in chart.iter() if e.tag.endswith("circle")]
@@ -186,25 +208,28 @@ def test_a_wrong_board_size_is_not_found_and_the_right_one_is_suggested(small):
     assert caught.value.exit_code == 5
 
 
+@pytest.fixture(scope="module")
+def board(tmp_path_factory) -> Scene:
+    """Three views of a board with 8x6 inner corners."""
+    poses, target = orbit(np.random.default_rng(2), 3), parse_target("checkerboard:8x6:0.04")
+    return Scene(tmp_path_factory.mktemp("board"), poses, SMALL, target=target)
+
+
 @pytest.mark.parametrize(("stated", "visible"), [("8x7", "8x6"), ("9x7", "8x6")])
-def test_a_board_with_a_row_or_squares_too_many_is_refused_by_its_likely_size(tmp_path, stated, visible):
+def test_a_board_with_a_row_or_squares_too_many_is_refused_by_its_likely_size(board, stated, visible):
     """9x7 squares are 8x6 inner corners; patterns beside the board pass for the row that it does not have."""
-    scene = Scene(
-        tmp_path, orbit(np.random.default_rng(2), 5), SMALL, target=parse_target(f"checkerboard:{visible}:0.04")
-    )
     with pytest.raises(TargetNotFoundError, match=f"{visible} inner corners is") as caught:
-        validate_model(scene.model(), scene.images, parse_target(f"checkerboard:{stated}:0.04"))
+        validate_model(board.model(), board.images, parse_target(f"checkerboard:{stated}:0.04"))
     assert caught.value.exit_code == 5
 
 
 @pytest.mark.parametrize(
     ("stated", "words"), [("6x4", "is a part of a board with 8x6"), ("5x5", "with 8x6"), ("10x8", "8x6 inner corners")]
 )
-def test_a_board_of_quite_another_size_is_refused_by_its_likely_size(tmp_path, stated, words):
+def test_a_board_of_quite_another_size_is_refused_by_its_likely_size(board, stated, words):
     """A 6x4 board is found in an 8x6 one, now here and now there: two images that agree by chance gave a scale."""
-    scene = Scene(tmp_path, orbit(np.random.default_rng(2), 6), SMALL, target=parse_target("checkerboard:8x6:0.04"))
     with pytest.raises(TargetNotFoundError, match=words):
-        validate_model(scene.model(), scene.images, parse_target(f"checkerboard:{stated}:0.04"))
+        validate_model(board.model(), board.images, parse_target(f"checkerboard:{stated}:0.04"))
 
 
 def test_a_board_that_is_never_visible_is_not_found(tmp_path):
@@ -216,27 +241,28 @@ def test_a_board_that_is_never_visible_is_not_found(tmp_path):
 
 def test_one_view_gives_no_length(small, tmp_path):
     rng = np.random.default_rng(5)
-    for i in range(5):
+    for i in range(3):
         texture = checkerboard(TARGET) if i == 2 else ground
         cv2.imwrite(str(tmp_path / f"{i:03}.png"), render(SMALL, small.poses[i], texture, rng, samples=1))
     with pytest.raises(NotObservableError, match=r"one image only \(002.png\)") as caught:
-        validate_model(small.model(), tmp_path, TARGET)
+        validate_model(reconstruction(SMALL, small.poses[:3]), tmp_path, TARGET)
     assert caught.value.exit_code == 3
 
 
-def test_views_from_one_place_give_no_length(tmp_path):
+def test_views_from_one_place_give_no_length(tmp_path, monkeypatch):
+    monkeypatch.setattr(failures, "_count_boards", lambda *_: 0)  # of other sizes
     centre = np.array([0.1, 0.1, -0.6])
-    poses = [look_at(centre, (x, 0.0, 0.0), roll) for x, roll in ((0.0, 0.0), (0.03, 0.3), (-0.03, 1.0))]
+    poses = [look_at(centre, (x, 0.0, 0.0), roll) for x, roll in ((0.03, 0.3), (-0.03, 1.0))]
     with pytest.raises(NotObservableError, match="along the same line"):
         Scene(tmp_path, poses, SMALL, samples=1).validate()
 
 
 @pytest.mark.parametrize(("flip", "words"), [(1, "left to right"), (0, "top to bottom")])
 def test_mirrored_images_are_named_as_such(small, tmp_path, flip, words):
-    for path in sorted(small.images.iterdir())[:3]:
+    for path in sorted(small.images.iterdir())[:2]:
         cv2.imwrite(str(tmp_path / path.name), cv2.flip(cv2.imread(str(path)), flip))
     with pytest.raises(FormatError, match=f"mirrored {words}"):
-        validate_model(reconstruction(SMALL, small.poses[:3]), tmp_path, TARGET)
+        validate_model(reconstruction(SMALL, small.poses[:2]), tmp_path, TARGET)
 
 
 def test_mirrored_markers_are_named_as_such(tmp_path):

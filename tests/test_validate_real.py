@@ -49,12 +49,12 @@ def test_tag_corners_and_their_numbers_agree_with_another_programs(shared_data):
 @pytest.mark.slow
 def test_a_model_scaled_by_the_tags_has_the_stereo_baseline(shared_data, script):
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
-    result = script.measure(shared_data, pairs=26)
-    assert result.registered == 52
+    result = script.measure(shared_data, pairs=18)
+    assert result.registered == 36
     assert abs(result.error_pct) < 1.0  # 0.3 % is the aim; it has been between -0.11 and -0.27
     assert abs(result.baseline_m - result.true_m) < 4 * result.sigma_m
     validation = result.validation
-    assert validation.views_used >= 48
+    assert validation.views_used >= 34
     assert abs(validation.check_error_pct) < 0.1
     assert validation.rms_px < 0.5
     assert validation.scale_error_pct is None
