@@ -8,8 +8,9 @@
 are run twice, and what functions return now is written. Look at what the tests said before. The other two are for
 values of new tests. ``run`` runs tests and writes all that functions return in each into a new folder; ``--elsewhere``
 has numpy, OpenBLAS and OpenCV calculate as an old processor would, in another time zone, with nothing of ``.venv`` on
-the PATH. ``choose`` takes what several runs agree in and keeps some of it: for each line that a test runs
-(``random_mutants.py map``), what its function returns in a quick test that runs the line, or in two.
+the PATH. ``choose`` takes what several runs agree in and keeps some of it: for each line that a quick test runs
+(``random_mutants.py map``), what its function returns in such a test, or in two; of a function that runs in no quick
+test, in a slower one.
 """
 
 from __future__ import annotations
@@ -182,8 +183,10 @@ def renew(only: Sequence[str]) -> None:
     files = sorted({test.partition("::")[0] for test in before if exists(test)})
     if only:
         files = [file for file in files if file in only]
+    if only and json.loads(KEPT.read_text())["versions"] != versions():
+        raise SystemExit("libraries have other versions than the kept values: renew all of these, or install those")
     if unknown := sorted(set(only) - set(files)):
-        raise SystemExit(f"values are kept of no test in {', '.join(unknown)} (a path as tests/test_scale.py)")
+        raise SystemExit(f"values are kept of no test in {', '.join(unknown)} (give paths such as tests/test_scale.py)")
     with tempfile.TemporaryDirectory() as folder:
         usual, other = Path(folder) / "usual", Path(folder) / "other"
         # another distribution over processes, too: what a test's helper keeps for the next ones shows

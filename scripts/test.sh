@@ -28,7 +28,8 @@ checking=$!
 # Tests of one file share what it sets up, and the slowest files begin first (tests/slow.txt). Modules are compiled once,
 # not in each of the processes that tests start.
 unset PYTHONDONTWRITEBYTECODE
-OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 .venv/bin/python -m pytest --numprocesses $(($(nproc) + 1)) --dist loadfile \
+processes=$(($(env -u OMP_NUM_THREADS nproc) + 1))
+OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 .venv/bin/python -m pytest --numprocesses "$processes" --dist loadfile \
   --no-loadscope-reorder "$@" && tested=0 || tested=$?
 wait "$checking" && typed=0 || typed=$?
 cat "$types/found.txt"

@@ -24,7 +24,7 @@ from colmap_inertial.tools.simulate import (
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 130.0
 LOW, HIGH = np.array([-2.5, -2.0, -1.0]), np.array([2.5, 3.0, 2.0])
-FRAME_RATE_HZ, EVERY = 30, 5
+FRAME_RATE_HZ = 30
 _WAVES = np.random.default_rng(5).normal(0, 6, (6, 3)).astype("f4")
 _COLOURS = np.random.default_rng(6).uniform(-1.4, 1.4, (6, 3)).astype("f4")
 
@@ -93,18 +93,8 @@ def pictures(recording, frames):
         yield picture(matrix_from_quat(motion.world_from_cam_xyzw(t))[0], motion.cam_in_world_m(t)[0])
 
 
-_built: list[BoxProject] = []
-
-
-def shared_box(tmp_path_factory) -> BoxProject:
-    """One for all tests of a run, which must not change it."""
-    if not _built:
-        _built.append(build(tmp_path_factory.mktemp("box")))
-    return _built[0]
-
-
-def build(root: Path, *, every: int = EVERY) -> BoxProject:
-    """Write everything: 20 s of a hand's motion, an image of every so many frames: 120."""
+def build(root: Path, *, every: int) -> BoxProject:
+    """Write everything: 20 s of a hand's motion at 30 frames a second, an image of every so many of them."""
     options = RecordingOptions(
         motion=MotionOptions(duration_s=20),
         sfm=SfmOptions(

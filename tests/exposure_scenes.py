@@ -151,7 +151,7 @@ def coloured_wall(height, width, seed, *, lamps=6):
     return wall.astype(np.float32)
 
 
-def make_scene(seed, *, size=(480, 320), vigour=1.0, readout_s=READOUT_S, lamps=6) -> PairScene:
+def make_scene(seed, *, size=(480, 320), vigour=1.0, lamps=6) -> PairScene:
     """A pair at a moment of a handheld recording at which the long exposure is blurred."""
     width, height = size
     f = 0.78 * width
@@ -166,7 +166,7 @@ def make_scene(seed, *, size=(480, 320), vigour=1.0, readout_s=READOUT_S, lamps=
     t = np.arange(1.0, PairScene.motion_s - 1, 0.05)
     speed = np.linalg.norm(motion.rate_in_cam_rad_s(t + DELAY_S + LONG_S / 2), axis=1)
     start = float(t[np.argmin(np.abs(speed * LONG_S * f - 14))])
-    short = FrameShutter(width=width, height=height, t_s=start, exposure_s=SHORT_S, readout_s=readout_s)
+    short = FrameShutter(width=width, height=height, t_s=start, exposure_s=SHORT_S, readout_s=READOUT_S)
     long = replace(short, t_s=start + DELAY_S, exposure_s=LONG_S)
     middle = matrix_from_quat(motion.world_from_cam_xyzw(np.array([short.reference_s()])))[0]
     return PairScene(

@@ -140,7 +140,7 @@ def _rounded(value: float) -> float:
 
 
 class Recorder:
-    """Notes what functions of the package return in this thread while it is on, or what some hold at some places."""
+    """Notes what functions of the package return in this thread while it is on: all, or the wanted places of some."""
 
     def __init__(self, wanted: Mapping[str, Container[str]] | None = None) -> None:
         self._wanted = wanted

@@ -113,7 +113,7 @@ def test_a_manifest_s_stages_run_where_they_are_allowed(capsys, hooks, capture, 
     (again,) = run_batch(manifest, out, TINY, allow_stages=True).captures
     assert (again.state, again.attempts) == ("done", 1)
     (entry,) = read_manifest(manifest, TINY, allow_stages=True)
-    for other in (StageNames(), SEEN, SEEN):
+    for other in (StageNames(), SEEN, SEEN):  # a refusal changes nothing
         (end,) = run_batch([dataclasses.replace(entry, stages=other)], out).captures
         assert (end.state, end.exit_code) == ("failed", 2)
         assert f"{out / 'hall'} holds the result of another set of stages; remove it" in end.error

@@ -29,7 +29,7 @@ pytestmark = [
 def whole(tmp_path_factory):
     """Commands, what an undisturbed run of each takes, and what it makes."""
     root, found = tmp_path_factory.mktemp("faults"), {}
-    with pytest.MonkeyPatch.context() as patch:  # what other commands are given
+    with pytest.MonkeyPatch.context() as patch:  # inputs of the commands that are not tried here
         patch.setattr(batch_captures, "tiny_capture", lambda *_, **__: None)
         patch.setattr(exposure_scenes, "write_pair_capture", lambda *_: None)
         known = commands(root)
@@ -113,7 +113,7 @@ def test_what_runs_out_on_the_way_is_a_sentence_and_no_half_result(whole, tmp_pa
         if kind == "memory":
             break  # with less, libraries cannot be loaded, and some say so in words of their own
     assert failed
-    with pytest.raises(SystemExit, match="0"):
+    with pytest.raises(SystemExit, match=r"^0$"):
         main(line)
     assert command.made(out) == expected
 

@@ -13,7 +13,7 @@ import study_heal
 
 @pytest.mark.slow
 def test_a_damaged_folder_heals_or_says_what_to_do(capsys, monkeypatch):
-    # no board is looked for; from ten frames on, a model is refined
+    # no board is looked for; a model of ten frames is refined, one of nine is not
     monkeypatch.setattr(study_heal, "FRAMES", 10)
     monkeypatch.setattr(study_heal, "tiny_capture", lambda folder, *, frames, half: tiny_capture(folder, frames=frames))
     arguments = ["--trials", "13", "--seed", "7", "--commands", "reconstruct", "project", "deblur", "export"]

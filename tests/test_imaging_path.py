@@ -43,7 +43,7 @@ def scene(direction="down", readout_s=0.02):
     motion, gyro = handheld(vigour=2.0, seed=6)
     camera = ShutterCamera(model=MODEL, exposure_s=EXPOSURE_S, readout_s=readout_s, readout_direction=direction)
     lens, shutter = colmap_camera(MODEL), shutter_of(camera, BEGIN_S)
-    # as coarse as a sharp picture can show it
+    # no finer than a sharp picture can show
     texture = cv2.GaussianBlur(poster(np.random.default_rng(5), 600, 600), (0, 0), 1)
     wall = FarScene(texture=texture, motion=motion)
     blurred = wall.linear(MODEL, shutter, samples=64)

@@ -17,7 +17,7 @@ from colmap_inertial.cli import main
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), resource.RLIM_INFINITY))
 main(["reconstruct", *sys.argv[2:]])
 """
-#: Of fewer there is no scale.
+#: Of fewer than eight there is no scale.
 FRAMES = 9
 Usage = namedtuple("Usage", "total used free")
 

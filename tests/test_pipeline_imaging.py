@@ -136,7 +136,7 @@ def long(tmp_path_factory, scene):
 
 @pytest.fixture(scope="module")
 def blurred(tmp_path_factory, long):
-    """Of that the first ten frames, which most tests do with."""
+    """Its first ten frames, which are enough for most tests."""
     capture = tmp_path_factory.mktemp("blurred") / "capture"
     shutil.copytree(long, capture)
     header, *rows = (capture / "frames.csv").read_text().splitlines()
@@ -236,13 +236,12 @@ def alone(tmp_path_factory, blurred):
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="processors cannot be chosen here")
-def test_deblurring_on_one_processor_makes_the_same_images(alone, stopped):
+def test_deblurring_for_matching_on_one_processor_makes_what_colmap_saw_of_several(alone, stopped):
     assert contents(alone / "images") == contents(stopped / "colmap" / "images")
 
 
-def test_images_for_matching_are_those_that_colmap_sees(deblurred, stopped, alone):
+def test_images_for_matching_are_not_those_for_viewing(deblurred, alone):
     frames = json.loads((alone / "result.json").read_text())["frames"]
-    assert contents(alone / "images") == contents(stopped / "colmap" / "images")
     treated = [frame["name"] for frame in frames if frame["action"] == "deblurred"]
     assert len(treated) >= 8
     for name in treated:

@@ -1,6 +1,6 @@
 """Recordings with something wrong, through the command: an error that names the setting, a refusal, or a right scale.
 
-Nothing is ever trusted and wrong. The recordings are real (18 s of one of Mustaniemi et al., IROS 2017).
+Nothing is ever trusted and wrong. The recordings are real (18 to 60 s of one of Mustaniemi et al., IROS 2017).
 """
 
 import json

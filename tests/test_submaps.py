@@ -499,7 +499,7 @@ def test_places_that_settle_are_given_and_those_that_do_not_are_refused():
 
 @pytest.fixture(scope="module")
 def map_parts_once():
-    """``submaps.map_parts``, which maps a part with a seed once; each caller gets copies."""
+    """``submaps.map_parts``, which maps a part with a seed once, as all callers split the ring alike."""
     import pycolmap
 
     mapped, map_parts = {}, submaps.map_parts
