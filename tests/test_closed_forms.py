@@ -8,6 +8,7 @@ import numpy as np
 import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import norm
 
 from colmap_inertial.checks.diagnose import camera
 from colmap_inertial.checks.diagnose.frames import _readout
@@ -23,7 +24,7 @@ from colmap_inertial.checks.validate.views import load_views
 from colmap_inertial.checks.words import digits, fixed, half_width_pct, length, length_error
 from colmap_inertial.cli import process
 from colmap_inertial.cli.help import Option, _shorten
-from colmap_inertial.colmap import dense, tsdf
+from colmap_inertial.colmap import dense, rigs, tsdf
 from colmap_inertial.colmap.loops import key_frames
 from colmap_inertial.colmap.sparse import require_room_for_features
 from colmap_inertial.colmap.two_views import _count_matches
@@ -39,6 +40,7 @@ from colmap_inertial.core.geometry import (
     quat_rotate,
 )
 from colmap_inertial.core.options import MappingOptions
+from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.sampling import find_clipped, time_unit_factor
 from colmap_inertial.core.types import (
     IMU_CAL,
@@ -65,7 +67,7 @@ from colmap_inertial.inertial.scale import _shape
 from colmap_inertial.inertial.scale._fit import _excitation_m_s2, _gain_surprise
 from colmap_inertial.inertial.scale._shape import ShapeFault
 from colmap_inertial.inertial.scale.joint import estimate_joint, scale_of
-from colmap_inertial.io import video
+from colmap_inertial.io import imu_text, video
 from colmap_inertial.io.android import is_opencamera
 from colmap_inertial.io.gopro import _labels, _stabilisation
 from colmap_inertial.io.phyphox import _column
@@ -87,6 +89,7 @@ from colmap_inertial.reconstruction.drivers.paths import only_model
 from colmap_inertial.reconstruction.preparation import plan
 from colmap_inertial.reconstruction.preparation.plan import _most_turned_rad
 from colmap_inertial.reconstruction.preparation.selection import _slots
+from colmap_inertial.tools.export import transforms
 from colmap_inertial.tools.simulate import ImuOptions, RecordingOptions, simulate_recording
 from colmap_inertial.tools.simulate.motion import MotionOptions
 from colmap_inertial.tools.simulate.rests import RestOptions, _triangular, _Turn, simulate_rests
@@ -1078,3 +1081,34 @@ def test_less_memory_than_libraries_need_is_said(monkeypatch, fewer):
     else:
         with pytest.raises(InertialError, match="of memory are allowed to a process here"):
             process.require_limits(to_load=False)
+
+
+def test_what_is_not_one_for_each_is_refused():
+    with pytest.raises(ValueError, match="unique, one for each time"):
+        FrameTiming(names=("a", "b", "a"), t_s=np.arange(3.0))
+    known = {"latitude_deg": np.zeros(2), "longitude_deg": np.zeros(2), "names": ("a", "b")}
+    with pytest.raises(ValueError, match="height_m: must be"):
+        PositionFixes(**known, height_m=np.array([0.0, np.inf]), sigma_m=np.ones(2))
+
+
+def test_a_column_that_falls_once_holds_no_times():
+    t_s = np.arange(0.0, 1.0, 0.01)
+    assert imu_text._time(np.stack([t_s, np.sin(t_s)], axis=1)) == (0, "s")
+    t_s[50] -= 0.02
+    assert imu_text._time(np.stack([t_s, np.sin(t_s)], axis=1))[0] is None
+
+
+def test_ninety_five_per_cent_of_a_normal_distribution_lie_within():
+    assert norm.cdf(Z95) - norm.cdf(-Z95) == pytest.approx(0.95, abs=1e-12)
+
+
+def test_poses_of_a_rig_are_known_where_each_is_declared():
+    declared, not_declared = (SimpleNamespace(cam_from_reference=pose) for pose in (np.eye(4), None))
+    assert rigs.poses_are_known([declared, declared])
+    assert not rigs.poses_are_known([declared, not_declared])
+
+
+def test_a_box_of_cameras_alone_holds_them_all():
+    box = transforms._box(np.array([[0.0, 0.0, 0.0], [4.0, 2.0, 1.0]]), np.zeros((0, 3)))
+    assert np.allclose(np.array(box["offset"]) + box["scale"] * np.array([2.0, 1.0, 0.5]), 0.5)
+    assert 0 < box["scale"] * 4.0 <= box["aabb_scale"]
