@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -203,7 +204,7 @@ def test_a_finished_run_is_gone_on_with_where_the_options_ask_for_more(capture, 
 
 
 def test_a_calibration_given_later_maps_nothing_again(capture, bare, tmp_path):
-    out, first, _ = bare
+    first, out = bare[1], shutil.copytree(bare[0], tmp_path / "out")
     known = first.models[0].scale.calibration
     write_calibration(tmp_path / "device.json", dataclasses.replace(known, cov=known.cov / 100))
     before, log = contents(out), (out / "log.txt").read_text()
@@ -239,7 +240,7 @@ def test_a_run_reads_each_model_from_disk_twice_at_most(tmp_path, monkeypatch):
 
 def test_a_killed_change_of_a_finished_run_leaves_the_earlier_result(capture, bare, tmp_path):
     """While something is made again, the folder is what it was."""
-    out = bare[0]
+    out = shutil.copytree(bare[0], tmp_path / "out")
     earlier, seen = (out / "result.json").read_bytes(), []
 
     def stop(stage, done, total, /):
