@@ -93,7 +93,7 @@ def pictures(recording, frames):
         yield picture(matrix_from_quat(motion.world_from_cam_xyzw(t))[0], motion.cam_in_world_m(t)[0])
 
 
-def build(root: Path, *, every: int) -> BoxProject:
+def build(root: Path, *, every: int, points: int = 1200) -> BoxProject:
     """Write everything: 20 s of a hand's motion at 30 frames a second, an image of every so many of them."""
     options = RecordingOptions(
         motion=MotionOptions(duration_s=20),
@@ -111,7 +111,7 @@ def build(root: Path, *, every: int) -> BoxProject:
     (box.root / "images").mkdir(parents=True)
     for name, image in zip(box.names, pictures(recording, frames), strict=True):
         cv2.imwrite(str(box.root / "images" / name), image, [cv2.IMWRITE_JPEG_QUALITY, 92])
-    write_model(box, box.root / "sparse" / "0", box.names, points=1200)
+    write_model(box, box.root / "sparse" / "0", box.names, points=points)
     (box.root / "notes.txt").write_text("taken in March\n")
     return box
 

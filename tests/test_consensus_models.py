@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pycolmap
 import pytest
-from box_project import build, write_model
+from box_project import build
 from test_pipeline_parts import recording_of, session_in
 
 from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply
@@ -30,11 +30,8 @@ from colmap_inertial.reconstruction.drivers.sources import ScaleSource, align_so
 
 @pytest.fixture(scope="module")
 def box(tmp_path_factory):
-    """Of few points, which all steps read. Tests must not change it."""
-    box = build(tmp_path_factory.mktemp("box"), every=10)
-    shutil.rmtree(box.root / "sparse")
-    write_model(box, box.root / "sparse" / "0", box.names, points=700)
-    return box
+    """With few points, as every step reads them. Tests must not change it."""
+    return build(tmp_path_factory.mktemp("box"), every=10, points=700)
 
 
 def turned(model, names, deg, *, about=None):

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from box_project import HIGH, LOW, build, cast, off_the_walls, rays, write_model
+from box_project import HIGH, LOW, build, cast, off_the_walls, rays
 from test_pipeline_existing import contents, run
 
 from colmap_inertial.colmap import dense as dense_stage, depth_maps
@@ -35,11 +35,8 @@ FLAGS = ["--dense", "--dense-options.max-image-size", "96", *SPARSE]
 
 @pytest.fixture(scope="module")
 def box(tmp_path_factory):
-    """Of few points, which all steps read. Tests must not change it."""
-    box = build(tmp_path_factory.mktemp("box"), every=8)
-    shutil.rmtree(box.root / "sparse")
-    write_model(box, box.root / "sparse" / "0", box.names, points=500)
-    return box
+    """With few points, as every step reads them. Tests must not change it."""
+    return build(tmp_path_factory.mktemp("box"), every=8, points=500)
 
 
 @pytest.fixture(scope="module")

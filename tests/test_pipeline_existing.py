@@ -37,11 +37,8 @@ UNREFINED = ("--refine", "off")
 
 @pytest.fixture(scope="module")
 def box(tmp_path_factory):
-    """Of few points, which all steps read. Tests must not change it."""
-    box = build(tmp_path_factory.mktemp("box"), every=10)
-    shutil.rmtree(box.root / "sparse")
-    write_model(box, box.root / "sparse" / "0", box.names, points=500)
-    return box
+    """With few points, as every step reads them. Tests must not change it."""
+    return build(tmp_path_factory.mktemp("box"), every=10, points=500)
 
 
 @pytest.fixture(scope="module")
