@@ -18,6 +18,7 @@ from .core.errors import (
     TargetNotFoundError as TargetNotFoundError,
     TimingError as TimingError,
 )
+from .core.facts import Fact as Fact
 from .core.options import (
     BatchOptions as BatchOptions,
     MappingOptions as MappingOptions,
@@ -30,6 +31,7 @@ from .core.options import (
 )
 from .core.types import (
     AcceptedScale as AcceptedScale,
+    Action as Action,
     CameraImuCalibration as CameraImuCalibration,
     CameraModel as CameraModel,
     CameraTrajectory as CameraTrajectory,

@@ -10,6 +10,8 @@ import errno
 from pathlib import Path
 from typing import ClassVar
 
+from colmap_inertial.core.facts import Fact
+
 #: Libraries that open3d and pycolmap-cuda12 take from the system, and their packages on Debian.
 _SYSTEM_LIBRARIES = {
     "libusb-1.0": "libusb-1.0-0",
@@ -25,9 +27,28 @@ _SYSTEM_LIBRARIES = {
 
 
 class InertialError(Exception):
-    """Base class of all errors that the command line shows as one line."""
+    """Base class of all errors that the command line shows as one line.
+
+    Parameters
+    ----------
+    message
+        What is wrong and what to do: a fact, whose message is shown with its advice, or words.
+    code
+        Stable name of what is wrong; by default that of the fact, or the class's own.
+    """
 
     exit_code: ClassVar[int] = 2
+    default_code: ClassVar[str] = "error"
+
+    def __init__(self, message: Fact | str = "", *, code: str = "", shown: str = "") -> None:
+        self.fact = message if isinstance(message, Fact) else None
+        self.code = code or (self.default_code if self.fact is None else self.fact.code)
+        super().__init__(shown or in_words(message))
+
+
+def in_words(message: Fact | str) -> str:
+    """A fact's message with its advice; words as they are."""
+    return message.with_advice if isinstance(message, Fact) else message
 
 
 class FormatError(InertialError):
@@ -42,39 +63,35 @@ class FormatError(InertialError):
     line
         One-based line number, where the file has lines.
     code
-        Stable name of what is wrong, where it is one of the things that recordings often have.
+        As of :class:`InertialError`.
     """
 
-    def __init__(self, path: Path | str, reason: str, *, line: int | None = None, code: str = "unreadable") -> None:
+    default_code = "unreadable"
+
+    def __init__(self, path: Path | str, reason: Fact | str, *, line: int | None = None, code: str = "") -> None:
         self.path = Path(path)
-        self.reason = reason
+        self.reason = in_words(reason)
         self.line = line
-        self.code = code
-        super().__init__(f"{path}{'' if line is None else f', line {line}'}: {reason}")
+        place = f"{path}{'' if line is None else f', line {line}'}"
+        super().__init__(reason, code=code, shown=f"{place}: {self.reason}")
 
 
 class TimingError(InertialError):
-    """Time stamps are missing, out of order, or do not fit together.
+    """Time stamps are missing, out of order, or do not fit together."""
 
-    Parameters
-    ----------
-    message
-        Where, what is wrong and what to do.
-    code
-        Stable name of what is wrong, as of :class:`FormatError`.
-    """
-
-    def __init__(self, message: str, *, code: str = "untimed") -> None:
-        self.code = code
-        super().__init__(message)
+    default_code = "untimed"
 
 
 class OutputError(InertialError):
     """An output cannot be written where it was asked for."""
 
+    default_code = "not-writable"
+
 
 class OutputExistsError(OutputError):
     """Something that would be overwritten is already there."""
+
+    default_code = "exists"
 
 
 class MissingExtraError(InertialError):
@@ -87,6 +104,8 @@ class MissingExtraError(InertialError):
     what
         What needs it.
     """
+
+    default_code = "extra-missing"
 
     def __init__(self, extra: str, what: str) -> None:
         self.extra = extra
@@ -106,6 +125,8 @@ def _list_packages(extra: str) -> list[str]:
 class AlreadyMetricError(InertialError):
     """A model that already holds a metric scale would be scaled again."""
 
+    default_code = "already-metric"
+
 
 class NotObservableError(InertialError):
     """The data cannot give the quantity that was asked for.
@@ -121,25 +142,28 @@ class NotObservableError(InertialError):
     """
 
     exit_code = 3
+    default_code = "not-observable"
 
-    def __init__(self, quantity: str, hint: str, *, sigma: float | None = None) -> None:
+    def __init__(self, quantity: str, hint: Fact | str, *, sigma: float | None = None) -> None:
         self.quantity = quantity
-        self.hint = hint
+        self.hint = in_words(hint)
         self.sigma = sigma
         spread = "" if sigma is None else f" (standard deviation {100 * sigma:.1f} %)"
-        super().__init__(f"{quantity} is not observable{spread}: {hint}")
+        super().__init__(hint, shown=f"{quantity} is not observable{spread}: {self.hint}")
 
 
 class MappingError(InertialError):
     """COLMAP could not build a model from the images."""
 
     exit_code = 4
+    default_code = "not-mapped"
 
 
 class TargetNotFoundError(InertialError):
     """The calibration target was not found in the images."""
 
     exit_code = 5
+    default_code = "target-not-found"
 
 
 def describe_environment_fault(error: BaseException) -> str | None:

@@ -31,6 +31,7 @@ from colmap_inertial.core.errors import (
     OutputExistsError,
     describe_environment_fault,
 )
+from colmap_inertial.core.facts import DETAILS, Fact, with_sentences
 from colmap_inertial.core.options import ReadLimits
 from colmap_inertial.core.printing import printable
 
@@ -354,8 +355,11 @@ def _plain(value: object, where: str) -> object:
         return value
     if isinstance(value, Path):
         return str(value)
+    if isinstance(value, Fact):
+        return _plain(value.as_json(), where)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: _plain(getattr(value, f.name), f"{where}.{f.name}") for f in dataclasses.fields(value)}
+        fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+        return {name: _plain(item, f"{where}.{name}") for name, item in with_sentences(fields).items()}
     if isinstance(value, Mapping):
         if not all(isinstance(key, str) for key in value):
             raise ValueError(f"{where}: JSON keys must be text")
@@ -390,7 +394,24 @@ def read_record(path: Path, kind: type[T]) -> T:
 
 def structured(kind: type[T], values: Any) -> T:
     """A value of type ``kind`` from JSON types, by the annotations of its fields."""
-    return _converter().structure(values, kind)
+    return _converter().structure(_without_sentences(values), kind)
+
+
+def _without_sentences(values: Any) -> Any:
+    """JSON values with facts by their codes, where these stand beside sentences."""
+    if isinstance(values, list):
+        return [_without_sentences(item) for item in values]
+    if not isinstance(values, dict):
+        return values
+    coded = {name.removesuffix(DETAILS): item for name, item in values.items() if name.endswith(DETAILS)}
+    return {
+        name: coded.get(name, _without_sentences(item)) for name, item in values.items() if not name.endswith(DETAILS)
+    }
+
+
+def _structure_fact(value: Any, _: Any) -> Fact:
+    """A fact by its code and values; of an earlier version's record, its words."""
+    return Fact.stated(value) if isinstance(value, str) else Fact(value["code"], **value["values"])
 
 
 @functools.cache
@@ -400,6 +421,7 @@ def _converter() -> Converter:
     converter = cattrs.Converter()
     converter.register_structure_hook_func(_is_array, lambda value, kind: np.array(value, _dtype(kind)))
     converter.register_structure_hook(Path, lambda value, _: Path(value))
+    converter.register_structure_hook(Fact, _structure_fact)
     converter.register_structure_hook_func(lambda kind: kind is object or kind == int | float, lambda value, _: value)
     return converter
 

@@ -36,6 +36,7 @@ from colmap_inertial.core.types.imu import (
     ImuRecording,
 )
 from colmap_inertial.core.types.recorded import (
+    Action,
     Aperture,
     ApertureRig,
     CameraModel,
@@ -54,6 +55,7 @@ from colmap_inertial.core.types.recorded import (
 )
 
 __all__ = [
+    "Action",
     "CAL",
     "CALIBRATION_PARAMETERS",
     "DOWN_IN_WORLD",

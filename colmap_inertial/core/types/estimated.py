@@ -11,6 +11,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, check_field, check_fields, check_increasing, set_fields
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact, as_fact, sentences, with_sentences
 from colmap_inertial.core.geometry import matrix_from_quat, rotation_between, skew
 from colmap_inertial.core.options import WorldAxes
 from colmap_inertial.core.summary import prints_in_lines
@@ -156,7 +157,7 @@ class ScaleEstimate:
     ci95
         95 % interval of ``metres_per_unit``; ``None`` when refused.
     verdict, reasons
-        What to make of it, and what decided that, in words for the user.
+        What to make of it, and what decided that.
     notes
         What else the user should know: repairs, pauses, clocks; none of it decided the verdict.
     gravity_in_world_m_s2
@@ -193,7 +194,7 @@ class ScaleEstimate:
     ci95: tuple[float, float] | None
     verdict: Verdict
     method: str
-    reasons: tuple[str, ...] = ()
+    reasons: tuple[Fact, ...] = ()
     gravity_in_world_m_s2: Array | None = None
     accel_bias_m_s2: Array | None = None
     calibration: CameraImuCalibration | None = None
@@ -208,9 +209,10 @@ class ScaleEstimate:
     rotations: RotationConsensus | None = None
     jumped: tuple[str, ...] = ()
     runtime_s: float = 0.0
-    notes: tuple[str, ...] = ()
+    notes: tuple[Fact, ...] = ()
 
     def __post_init__(self) -> None:
+        set_fields(self, reasons=tuple(map(as_fact, self.reasons)), notes=tuple(map(as_fact, self.notes)))
         numbers = (self.metres_per_unit, self.sigma_log, self.ci95)
         if (self.verdict == "refused") != (self.metres_per_unit is None) or len({n is None for n in numbers}) > 1:
             raise ValueError("a refused scale has no number, and no other scale lacks one")
@@ -221,7 +223,7 @@ class ScaleEstimate:
         check_fields(self, gravity_in_world_m_s2=(3,), accel_bias_m_s2=(3,), cov=(7, 7))
 
     @classmethod
-    def refused(cls, method: str, *reasons: str, calibration: CameraImuCalibration | None = None) -> ScaleEstimate:
+    def refused(cls, method: str, *reasons: Fact, calibration: CameraImuCalibration | None = None) -> ScaleEstimate:
         """No scale, for these reasons."""
         return cls(
             metres_per_unit=None,
@@ -243,7 +245,7 @@ class ScaleEstimate:
             When it was refused.
         """
         if self.metres_per_unit is None or self.sigma_log is None or self.ci95 is None:
-            raise NotObservableError("scale", "; ".join(self.reasons))
+            raise NotObservableError("scale", "; ".join(sentences(self.reasons)))
         return AcceptedScale(metres_per_unit=self.metres_per_unit, sigma_log=self.sigma_log, ci95=self.ci95)
 
     def as_json(self) -> dict[str, object]:
@@ -257,8 +259,7 @@ class ScaleEstimate:
             "ci95": None if self.ci95 is None else list(self.ci95),
             "sigma_log": self.sigma_log,
             "verdict": self.verdict,
-            "reasons": list(self.reasons),
-            "notes": list(self.notes),
+            **with_sentences({"reasons": list(self.reasons), "notes": list(self.notes)}),
             "gravity_in_world_m_s2": plain(self.gravity_in_world_m_s2),
             "accel_bias_m_s2": plain(self.accel_bias_m_s2),
             # where camera and IMU could not be brought together, these are unknown
@@ -314,7 +315,7 @@ class Similarity:
             When the scale was refused.
         """
         if estimate.metres_per_unit is None or estimate.gravity_in_world_m_s2 is None:
-            raise NotObservableError("scale", "; ".join(estimate.reasons))
+            raise NotObservableError("scale", "; ".join(sentences(estimate.reasons)))
         down = DOWN_IN_WORLD[world]
         gravity = estimate.gravity_in_world_m_s2
         rotation = rotation_between(gravity, down)

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array, check_fields
+from colmap_inertial.core.arrays import Array, check_fields, set_fields
+from colmap_inertial.core.facts import Fact, as_fact
 from colmap_inertial.core.summary import prints_in_lines
 
 #: Order of the parameters in ``CameraImuCalibration.cov``. The rotation error is in the camera frame, on the left:
@@ -340,7 +341,7 @@ class ImuRecording:
     accel_t_s: Array
     accel_m_s2: Array
     epoch_ns: int = 0
-    repairs: tuple[str, ...] = ()
+    repairs: tuple[Fact, ...] = ()
     device: str = ""
     noise: ImuNoise | None = None
     calibration: ImuCalibration | None = None
@@ -348,6 +349,7 @@ class ImuRecording:
 
     def __post_init__(self) -> None:
         check_fields(self, gyro_t_s=("N",), accel_t_s=("M",), gyro_rad_s=("N", 3), accel_m_s2=("M", 3))
+        set_fields(self, repairs=tuple(map(as_fact, self.repairs)))
         if len(self.gyro_t_s) < 2 or len(self.accel_t_s) == 1:
             raise ValueError("an ImuRecording needs at least two samples of each sensor (or none of the accelerometer)")
         for name in ("gyro_t_s", "accel_t_s"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from typing import Literal, Protocol
 
 import numpy as np
@@ -18,6 +19,7 @@ from colmap_inertial.core.arrays import (
     check_fields,
     set_fields,
 )
+from colmap_inertial.core.facts import Fact, as_fact
 from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply
 from colmap_inertial.core.summary import prints_in_lines
 
@@ -51,6 +53,27 @@ class Projector(Protocol):
     def img_from_cam(self, cam_points: Array, /) -> Array: ...
 
 
+class Action(StrEnum):
+    """What became of a frame, its keypoints or a model."""
+
+    #: Nothing was changed.
+    NOTHING = ""
+    #: The original file or pixels.
+    PASSED = "passed"
+    #: Not shown to COLMAP.
+    DROPPED = "dropped"
+    #: Changed by a stage that has no other word here.
+    CHANGED = "changed"
+    DEBLURRED = "deblurred"
+    FUSED = "fused"
+    RECTIFIED = "rectified"
+    ADJUSTED = "adjusted"
+    LEFT_OUT = "left out"
+    REGISTERED_AGAIN = "registered again"
+    JOINED = "joined"
+    REFINED = "refined"
+
+
 @dataclass(frozen=True, kw_only=True)
 class Treatment:
     """Decision of a stage about a frame, its keypoints or a model, with the reason.
@@ -60,17 +83,32 @@ class Treatment:
     stage
         Which stage, in a word.
     reason
-        In words.
+        Why; words of a user's own stage become a fact with the code ``"stated"``.
     action
-        What became of it, in a word (``"deblurred"``); empty where nothing was changed.
+        What became of it.
     values
         Figures, in JSON types.
+
+    Raises
+    ------
+    ValueError
+        For an action that is none of :class:`Action`.
     """
 
     stage: str
-    reason: str
-    action: str = ""
+    reason: Fact
+    action: Action = Action.NOTHING
     values: Mapping[str, object] = field(default_factory=dict)
+
+    def __init__(
+        self,
+        *,
+        stage: str,
+        reason: Fact | str,
+        action: Action | str = Action.NOTHING,
+        values: Mapping[str, object] | None = None,
+    ) -> None:
+        set_fields(self, stage=stage, reason=as_fact(reason), action=Action(action), values=values or {})
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
