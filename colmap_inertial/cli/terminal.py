@@ -142,7 +142,7 @@ def _describe_remembered(kept: Path | None) -> list[Line]:
 
 def show_compared(calibration: ImuCalibration, out: Path, kept: Path | None) -> None:
     """Print what results with targets say of a device."""
-    lines: list[Line] = [("scale", calibration.describe_comparison()), ("written", str(out))]
+    lines: list[Line] = [("scale", str(calibration.comparison())), ("written", str(out))]
     results = f"{calibration.compared} result{'s' * (calibration.compared > 1)}"
     _print_panel(f"{results} with targets", [*lines, *_describe_remembered(kept)])
 

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types.imu import CameraImuCalibration, ImuRecording
 
 
@@ -58,12 +59,9 @@ class CameraTimedImu:
         def stretch(t_s: Array) -> Array:
             return np.asarray(fixed_s + (t_s - fixed_s) / (1 - rate))
 
-        note = (
-            f"the IMU's clock is {-1e6 * rate:+.0f} ppm off the camera's, and either may be wrong (suspect a nominal "
-            "frame rate first); the IMU's stamps were stretched to keep step"
-        )
+        repair = Fact("imu-clock-stretched", clock_rate=rate)
         stretched = replace(
-            imu, gyro_t_s=stretch(imu.gyro_t_s), accel_t_s=stretch(imu.accel_t_s), repairs=(*imu.repairs, note)
+            imu, gyro_t_s=stretch(imu.gyro_t_s), accel_t_s=stretch(imu.accel_t_s), repairs=(*imu.repairs, repair)
         )
         return replace(timed, imu=stretched)
 

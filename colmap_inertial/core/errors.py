@@ -45,6 +45,11 @@ class InertialError(Exception):
         self.code = code or (self.default_code if self.fact is None else self.fact.code)
         super().__init__(shown or in_words(message))
 
+    @property
+    def why(self) -> Fact:
+        """What is wrong as a fact, without the place or the quantity; of an error in words, these."""
+        return Fact.stated(str(self)) if self.fact is None else self.fact
+
 
 def in_words(message: Fact | str) -> str:
     """A fact's message with its advice; words as they are."""
@@ -74,6 +79,10 @@ class FormatError(InertialError):
         self.line = line
         place = f"{path}{'' if line is None else f', line {line}'}"
         super().__init__(reason, code=code, shown=f"{place}: {self.reason}")
+
+    @property
+    def why(self) -> Fact:
+        return Fact.stated(self.reason) if self.fact is None else self.fact
 
 
 class TimingError(InertialError):
@@ -150,6 +159,10 @@ class NotObservableError(InertialError):
         self.sigma = sigma
         spread = "" if sigma is None else f" (standard deviation {100 * sigma:.1f} %)"
         super().__init__(hint, shown=f"{quantity} is not observable{spread}: {self.hint}")
+
+    @property
+    def why(self) -> Fact:
+        return Fact.stated(self.hint) if self.fact is None else self.fact
 
 
 class MappingError(InertialError):

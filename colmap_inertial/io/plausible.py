@@ -19,6 +19,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, quat_multiply
 from colmap_inertial.core.sampling import Coverage, integral_at
 from colmap_inertial.core.types import ImuRecording
@@ -207,8 +208,6 @@ class PlausibleReadings:
 
 PLAUSIBLE = PlausibleReadings()
 
-_COUNTS = "for raw counts zero and counts_per_unit, by the sensor's data sheet, in capture.toml"
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RawImu:
@@ -276,12 +275,7 @@ def check_exchanged(imu: ImuRecording, path: Path) -> None:
     accel = float(np.median(np.linalg.norm(imu.accel_m_s2, axis=1)))
     low, high = PLAUSIBLE.smallest_gravity_m_s2, PLAUSIBLE.largest_gravity_m_s2
     if low < gyro < high and not low < accel < high and accel < PLAUSIBLE.largest_median_rate_rad_s:
-        raise FormatError(
-            path,
-            f"the gyroscope's median length is {gyro:.2f} and the accelerometer's {accel:.2f}: the two sensors are "
-            "exchanged; exchange the columns or files of [imu.gyro] and [imu.accel] in capture.toml",
-            code="sensors-exchanged",
-        )
+        raise FormatError(path, Fact("sensors-exchanged", gyro_median=gyro, accel_median=accel))
 
 
 def check_alive(values: Array, quantity: Quantity, path: Path) -> None:
@@ -297,19 +291,9 @@ def check_alive(values: Array, quantity: Quantity, path: Path) -> None:
         return
     name = SENSOR_NAMES[quantity]
     if len(dead) == 3:
-        raise FormatError(
-            path,
-            f"the {name} never changes (it reads {np.array2string(values[0], precision=4)} throughout): the sensor is "
-            f"dead or was not recorded; record again, or give another file in [imu.{quantity}]",
-            code="dead-sensor",
-        )
-    axes = " and ".join("xyz"[i] for i in dead)
-    raise FormatError(
-        path,
-        f"the {name}'s {axes} axis never changes (it reads {values[0, dead[0]]:.6g} throughout): the axis is dead or "
-        f"the wrong column; check columns of [imu.{quantity}] in capture.toml",
-        code="dead-axis",
-    )
+        raise FormatError(path, Fact("dead-sensor", sensor=name, table=quantity, reading=values[0]))
+    axes = ["xyz"[i] for i in dead]
+    raise FormatError(path, Fact("dead-axis", sensor=name, table=quantity, axes=axes, reading=values[0, dead[0]]))
 
 
 def check_gravity(lengths_m_s2: Array, path: Path) -> None:
@@ -324,40 +308,19 @@ def check_gravity(lengths_m_s2: Array, path: Path) -> None:
     median, few = (float(value) for value in np.percentile(lengths_m_s2, [50, 5]))
     if low <= median <= high:
         return
-    evidence = f"the accelerometer's median length is {median:.4g} where gravity gives about 9.8 m/s2"
     # Gravity keeps the length near its median; what is left without it comes near zero again and again.
     steady = few > PLAUSIBLE.steady_share * median
     if steady and low <= median * STANDARD_GRAVITY_M_S2 <= high:
-        raise FormatError(
-            path,
-            f'{evidence}: the numbers are in g; set unit = "g" under [imu.accel] in capture.toml',
-            code="accel-in-g",
-        )
-    if steady and low <= median / STANDARD_GRAVITY_M_S2 <= high:
-        raise FormatError(
-            path,
-            f'{evidence}: m/s2 were converted as if they were g; set unit = "m/s2" under [imu.accel] in capture.toml',
-            code="accel-not-in-g",
-        )
-    if steady and low <= 0.5 * median <= high:
-        raise FormatError(
-            path,
-            f"{evidence}: gravity was added twice, or the readings are doubled; give the accelerometer as it was "
-            "logged",
-            code="gravity-doubled",
-        )
-    if not steady:
-        raise FormatError(
-            path,
-            f"{evidence}: gravity was taken out (a phone's linear acceleration); give the accelerometer with gravity "
-            "in [imu.accel]",
-            code="gravity-removed",
-        )
-    raise FormatError(
-        path,
-        f"{evidence}: the unit is wrong, or these are raw counts; set unit under [imu.accel], and {_COUNTS}",
-        code="accel-unit",
-    )
+        code = "accel-in-g"
+    elif steady and low <= median / STANDARD_GRAVITY_M_S2 <= high:
+        code = "accel-not-in-g"
+    elif steady and low <= 0.5 * median <= high:
+        code = "gravity-doubled"
+    elif not steady:
+        code = "gravity-removed"
+    else:
+        code = "accel-unit"
+    raise FormatError(path, Fact(code, median_m_s2=median))
 
 
 def check_rates(gyro_rad_s: Array, path: Path) -> None:
@@ -366,21 +329,14 @@ def check_rates(gyro_rad_s: Array, path: Path) -> None:
     largest = float(np.abs(gyro_rad_s).max())
     if largest <= PLAUSIBLE.largest_rate_rad_s and median <= PLAUSIBLE.largest_median_rate_rad_s:
         return
-    evidence = (
-        f"the gyroscope reads up to {largest:.4g} rad/s, half of the time above {median:.3g} (a hand reaches about 5, "
-        f"a sensor ends at {PLAUSIBLE.largest_rate_rad_s:g})"
-    )
+    read = {
+        "largest_rad_s": largest,
+        "median_rad_s": median,
+        "sensor_ends_rad_s": PLAUSIBLE.largest_rate_rad_s,
+    }
     if pi / 180 * largest > PLAUSIBLE.largest_rate_rad_s or pi / 180 * median > PLAUSIBLE.largest_median_rate_rad_s:
-        raise FormatError(
-            path,
-            f"{evidence}, too much for deg/s, too: these are raw counts; set unit under [imu.gyro], and {_COUNTS}",
-            code="gyro-unit",
-        )
-    raise FormatError(
-        path,
-        f'{evidence}: the numbers are in deg/s; set unit = "deg/s" under [imu.gyro] in capture.toml',
-        code="gyro-in-deg",
-    )
+        raise FormatError(path, Fact("gyro-unit", **read))
+    raise FormatError(path, Fact("gyro-in-deg", seen_in="rates", **read))
 
 
 def check_consistent(raw: RawImu, *, confirmed: bool = False) -> None:
@@ -395,52 +351,35 @@ def check_consistent(raw: RawImu, *, confirmed: bool = False) -> None:
     if not readings:
         return
     best = readings[0]
-    evidence = "seen from the turning gyroscope gravity does not stand still, but would"
     if best.factor < 1:
-        raise FormatError(
-            path,
-            f"{evidence} if the gyroscope's numbers were in deg/s: "
-            'set unit = "deg/s" under [imu.gyro] in capture.toml',
-            code="gyro-in-deg",
-        )
+        raise FormatError(path, Fact("gyro-in-deg", seen_in="gravity"))
     if best.factor > 1:
-        raise FormatError(
-            path,
-            f'{evidence} at 57.3 times the rate: rad/s were converted as if they were deg/s; set unit = "rad/s" under '
-            "[imu.gyro] in capture.toml",
-            code="gyro-not-in-deg",
-        )
+        raise FormatError(path, Fact("gyro-not-in-deg", seen_in="gravity"))
     stated = {"gyro": raw.gyro_axes, "accel": raw.accel_axes}
 
-    def setting(quantity: Quantity, matrix: Array) -> str:
+    def setting(quantity: Quantity, matrix: Array) -> tuple[str, bool]:
         before = stated[quantity]
-        axes = Axes(matrix=matrix if before is None else matrix @ before.matrix)
-        return f'axes = "{axes}"{" and mirrored = true" if axes.is_mirrored else ""} under [imu.{quantity}]'
+        return Axes(matrix=matrix if before is None else matrix @ before.matrix).setting()
 
-    what = "mirrored" if np.linalg.det(best.matrix) < 0 else "turned against the accelerometer's"
-    hint = f"set {setting('gyro', best.matrix)} in capture.toml"
-    if what != "mirrored":
+    def settings(reading: Reading) -> tuple[tuple[str, bool], ...]:
+        gyro = setting("gyro", reading.matrix)
+        if np.linalg.det(reading.matrix) < 0:
+            return (gyro,)
         # A mirrored accelerometer looks like a rotated gyroscope from here: a' = P a needs the rate det(P) P w. Only
         # the user can tell which; the wrong choice leaves both sensors mirrored against the camera.
-        accel = -best.matrix.T
-        hint += f", or, if {_mirroring(accel)}, set instead {setting('accel', accel)}"
-    for other in readings[1:3]:
-        hint += f"; hardly less likely: {setting('gyro', other.matrix)}"
-        if np.linalg.det(other.matrix) > 0:
-            hint += f", or {setting('accel', -other.matrix.T)}"
-    raise FormatError(
-        path,
-        f"{evidence} if the gyroscope's axes are {what}: {hint}",
-        code="axes-mirrored" if what == "mirrored" else "axes-turned",
-    )
+        return gyro, setting("accel", -reading.matrix.T)
+
+    gyro, *accel = settings(best)
+    others = tuple(settings(other) for other in readings[1:3])
+    if not accel:
+        raise FormatError(path, Fact("axes-mirrored", gyro=gyro, others=others))
+    mirroring = _find_mirrored_axes(-best.matrix.T)
+    raise FormatError(path, Fact("axes-turned", gyro=gyro, accel=accel[0], accel_mirroring=mirroring, others=others))
 
 
-def _mirroring(matrix: Array) -> str:
-    """The mirroring of an accelerometer that a signed permutation undoes."""
+def _find_mirrored_axes(matrix: Array) -> str:
+    """The axis of an accelerometer that a signed permutation mirrors back, or the two that it exchanges; else none."""
     kept = np.diag(matrix)
     if np.abs(kept).all() and (kept < 0).sum() == 1:
-        return f"it is the accelerometer's {'xyz'[int(np.argmin(kept))]} axis that is mirrored"
-    if (matrix >= 0).all():
-        first, second = ("xyz"[i] for i in np.flatnonzero(kept == 0))
-        return f"it is the accelerometer's {first} and {second} columns that are exchanged"
-    return "it is the accelerometer's axes that are mirrored"
+        return "xyz"[int(np.argmin(kept))]
+    return "".join("xyz"[i] for i in np.flatnonzero(kept == 0)) if (matrix >= 0).all() else ""

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from colmap_inertial.core.geometry import quat_conjugate, quat_rotate
+from colmap_inertial.core.messages.findings import describe_convention
 from colmap_inertial.core.types import CameraTrajectory
 
 
@@ -30,8 +31,7 @@ class PoseConvention:
     position: Literal["centre", "translation"] = "centre"
 
     def __str__(self) -> str:
-        position = "camera centre" if self.position == "centre" else "translation of camera_from_world"
-        return f"{self.rotation} quaternion in the order {' '.join(self.order)}, {position}"
+        return describe_convention(self.rotation, self.order, self.position)
 
     def others(self) -> tuple[PoseConvention, ...]:
         """The other seven."""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from colmap_inertial.core.arrays import Array, IndexArray, Int64Array
 from colmap_inertial.core.errors import FormatError, TimingError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.units import SENSOR_NAMES, Quantity, convert_to_si
 
 
@@ -35,17 +36,6 @@ class SampleLimits:
 LIMITS = SampleLimits()
 
 
-class Repair(str):
-    """A sentence on what was repaired, with a stable name of it."""
-
-    code: str
-
-    def __new__(cls, text: str, code: str = "repaired") -> Repair:
-        self = super().__new__(cls, text)
-        self.code = code
-        return self
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Samples:
     """Samples of one sensor, in order.
@@ -62,7 +52,7 @@ class Samples:
 
     t_ns: Int64Array
     values: Array
-    repairs: tuple[str, ...]
+    repairs: tuple[Fact, ...]
 
 
 def order_samples(
@@ -113,15 +103,26 @@ class _Rows:
     numbers: Int64Array
     t_ns: Int64Array
     values: Array
-    repairs: tuple[Repair, ...] = ()
+    repairs: tuple[Fact, ...] = ()
 
-    def taken(self, chosen: NDArray[np.bool_ | np.intp], text: str, *, code: str) -> _Rows:
-        """Some of the rows, or all in another order, and the sentence that says so."""
-        taken = replace(self, numbers=self.numbers[chosen], t_ns=self.t_ns[chosen], values=self.values[chosen])
-        return taken.repaired(text, code=code)
+    def taken(self, chosen: NDArray[np.bool_ | np.intp]) -> _Rows:
+        """Some of the rows, or all in another order."""
+        return replace(self, numbers=self.numbers[chosen], t_ns=self.t_ns[chosen], values=self.values[chosen])
 
-    def repaired(self, text: str, *, code: str) -> _Rows:
-        return replace(self, repairs=(*self.repairs, Repair(f"{self.path.name}: {text}", code)))
+    def repaired(self, code: str, **values: object) -> _Rows:
+        """The rows with a repair of theirs, whose other values are the file and the sensor."""
+        repair = Fact(code, file=self.path.name, sensor=self.what, **values)
+        return replace(self, repairs=(*self.repairs, repair))
+
+    def refused(self, code: str, at: int | None = None, **values: object) -> TimingError:
+        """The error for stamps that cannot be repaired, at a row where there is one to look at."""
+        place = {} if at is None else {"counted": self.counted, "number": self.numbers[at]}
+        return refuse_stamps(Fact(code, path=str(self.path), sensor=self.what, **place, **values))
+
+
+def refuse_stamps(fact: Fact) -> TimingError:
+    """The error for stamps, whose sentence says by itself what to do."""
+    return TimingError(fact, shown=str(fact))
 
 
 def _drop_incomplete(rows: _Rows) -> _Rows:
@@ -129,16 +130,14 @@ def _drop_incomplete(rows: _Rows) -> _Rows:
     # Loggers that write sensors of different rates to one table leave the cells of the others empty.
     absent = np.asarray(np.isnan(rows.values).all(axis=1))
     if absent.any():
-        text = f"{int(absent.sum())} of {len(absent)} rows hold no {rows.what} sample"
-        rows = rows.taken(~absent, text, code="empty-cells")
+        rows = rows.taken(~absent).repaired("rows-without-sample", count=absent.sum(), rows=len(absent))
     finite = np.asarray((np.abs(rows.values) < LIMITS.largest_reading).all(axis=1))
     if not finite.all():
         missing, first = int((~finite).sum()), int(rows.numbers[np.argmin(finite)])
         if missing > LIMITS.harmless_share * len(finite):
             lacking = f"{missing} of {len(finite)} {rows.what} rows lack a value (NaN or empty)"
             raise FormatError(rows.path, lacking, line=first if rows.counted == "line" else None)
-        text = f"dropped {missing} {rows.what} rows without a value (first: {rows.counted} {first})"
-        rows = rows.taken(finite, text, code="samples-missing")
+        rows = rows.taken(finite).repaired("rows-without-value", count=missing, counted=rows.counted, first=first)
     if len(rows.t_ns) < 2:
         raise FormatError(rows.path, f"holds {len(rows.t_ns)} {rows.what} samples; at least two are needed")
     return rows
@@ -150,20 +149,11 @@ def _sort(rows: _Rows) -> _Rows:
     if not late_ns.any():
         return rows
     if (np.diff(rows.t_ns) < 0).mean() > 0.5:
-        raise TimingError(
-            f"{rows.path}: {rows.what} stamps run backwards; is the file written in reverse order?",
-            code="stamps-reversed",
-        )
+        raise rows.refused("stamps-reversed")
     if late_ns.max() > LIMITS.latest_arrival_ns:
         first = int(np.argmax(late_ns > LIMITS.latest_arrival_ns))
-        where = f"{rows.path}, {rows.counted} {rows.numbers[first]}"
-        raise TimingError(
-            f"{where}: the {rows.what} stamp is {late_ns[first] * 1e-9:.3f} s behind one before it; the clock was set "
-            "back or a stamp is damaged: split or correct the file there",
-            code="stamps-jump-back",
-        )
-    text = f"sorted {int((late_ns > 0).sum())} {rows.what} rows that came late"
-    return rows.taken(np.argsort(rows.t_ns, kind="stable"), text, code="stamps-reordered")
+        raise rows.refused("stamps-jump-back", first, behind_s=late_ns[first] * 1e-9)
+    return rows.taken(np.argsort(rows.t_ns, kind="stable")).repaired("rows-sorted", count=np.sum(late_ns > 0))
 
 
 def _merge(rows: _Rows) -> _Rows:
@@ -174,12 +164,8 @@ def _merge(rows: _Rows) -> _Rows:
     differs = same & (rows.values[1:] != rows.values[:-1]).any(axis=1)
     n_equal, n_different = int((same & ~differs).sum()), int(differs.sum())
     if n_different > LIMITS.harmless_share * len(rows.t_ns):
-        raise TimingError(
-            f"{rows.path}, {rows.counted} {rows.numbers[1 + np.argmax(differs)]}: {n_different} of {len(rows.t_ns)} "
-            f"{rows.what} samples repeat the stamp before them with other values; the stamps are too coarse, or this "
-            "is not the time column",
-            code="stamps-too-coarse",
-        )
+        first_off = 1 + int(np.argmax(differs))
+        raise rows.refused("stamps-too-coarse", first_off, repeated=n_different, samples=len(rows.t_ns))
     group = np.concatenate([[0], np.cumsum(~same)])
     first = np.concatenate([[0], np.flatnonzero(~same) + 1])
     if len(first) < 2:
@@ -191,12 +177,9 @@ def _merge(rows: _Rows) -> _Rows:
         np.add.at(sums, group, rows.values)
         values[mixed] = sums[mixed] / np.bincount(group)[mixed, None]
     rows = replace(rows, numbers=rows.numbers[first], t_ns=rows.t_ns[first], values=values)
-    for count, text in (
-        (n_equal, f"merged {n_equal} repeated {rows.what} rows"),
-        (n_different, f"averaged {n_different} {rows.what} rows that repeat a stamp with other values"),
-    ):
+    for code, count in (("rows-merged", n_equal), ("rows-averaged", n_different)):
         if count:
-            rows = rows.repaired(text, code="stamps-repeated")
+            rows = rows.repaired(code, count=count)
     return rows
 
 
@@ -217,16 +200,10 @@ def check_rate(path: Path, what: str, t_ns: Int64Array) -> None:
     steps = np.diff(t_ns)
     median_s = float(np.median(steps)) * 1e-9
     if not 1 / LIMITS.highest_rate_hz <= median_s <= 1 / LIMITS.lowest_rate_hz:
-        direction = "smaller" if median_s > 1 / LIMITS.lowest_rate_hz else "larger"
-        raise TimingError(
-            f"{path}: {what} samples lie {median_s:.3g} s apart, which no IMU does; the stamps are probably in a "
-            f"{direction} unit: set time_unit in capture.toml",
-            code="time-unit",
-        )
+        slowest_s = 1 / LIMITS.lowest_rate_hz
+        raise refuse_stamps(Fact("time-unit", path=str(path), sensor=what, step_s=median_s, slowest_s=slowest_s))
     longest = int(np.argmax(steps))
     if steps[longest] > LIMITS.longest_gap_ns:
-        raise TimingError(
-            f"{path}: the {what} pauses for {steps[longest] * 1e-9:.0f} s after {(t_ns[longest] - t_ns[0]) * 1e-9:.3f} "
-            "s; a stamp is damaged, or this is more than one recording",
-            code="stamps-damaged",
-        )
+        after_s = (t_ns[longest] - t_ns[0]) * 1e-9
+        pause_s = steps[longest] * 1e-9
+        raise refuse_stamps(Fact("stamps-damaged", path=str(path), sensor=what, pause_s=pause_s, after_s=after_s))

@@ -17,6 +17,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.files import first_line, read_limits, read_text, reading
 from colmap_inertial.io.units import SENSOR_UNITS, TIME_UNITS_NS, Quantity, stamps_ns, unit_of
 
@@ -50,7 +51,7 @@ class Table:
     line_numbers: Int64Array
     delimiter: str | None
     width: int
-    repairs: tuple[str, ...] = ()
+    repairs: tuple[Fact, ...] = ()
 
     def __len__(self) -> int:
         return len(self.lines)
@@ -165,7 +166,7 @@ def parse_table(path: Path, text: str) -> Table:
         reason = f"{width} cells under a header of {cells}: {candidates[0][:200]}"
         raise FormatError(path, reason, line=int(numbers[0]))
     if not text.endswith("\n") and len(lines) > 1 and _is_cut_off(lines[-1], lines[-2], delimiter, width):
-        repairs.append(f"{path.name}: dropped the last line ({numbers[-1]}), which is cut off")
+        repairs.append(Fact("last-line-cut-off", file=path.name, line=numbers[-1]))
         lines, numbers = lines[:-1], numbers[:-1]
     _require_one_width(path, lines, numbers, delimiter, width)
     return Table(
@@ -180,7 +181,7 @@ def parse_table(path: Path, text: str) -> Table:
     )
 
 
-def _split_lines(path: Path, body: str) -> tuple[list[str], Int64Array, list[str], list[str]]:
+def _split_lines(path: Path, body: str) -> tuple[list[str], Int64Array, list[str], list[Fact]]:
     """Lines that hold cells, their numbers in the file, the comments before them, and what was passed over."""
     raw = body.split("\n")
     first = next((i for i, line in enumerate(raw) if line.strip() and not _is_comment(line)), None)
@@ -188,12 +189,12 @@ def _split_lines(path: Path, body: str) -> tuple[list[str], Int64Array, list[str
         raise FormatError(path, "holds no rows of numbers")
     comments = [line for line in raw[:first] if _is_comment(line)]
     lines, numbers = raw[first:], np.arange(first + 1, len(raw) + 1)
-    repairs = []
+    repairs = list[Fact]()
     if _BLANK_OR_COMMENT.search(body):
         keep = [bool(line.strip()) and not _is_comment(line) for line in lines]
         inside = sum(map(_is_comment, lines))
         if inside:
-            repairs.append(f"{path.name}: passed over {inside} lines inside the data that start with #")
+            repairs.append(Fact("comments-passed-over", file=path.name, count=inside))
         lines, numbers = [line for line, kept in zip(lines, keep, strict=True) if kept], numbers[keep]
     return lines, numbers, comments, repairs
 

@@ -108,6 +108,10 @@ class Axes:
         """Whether the mapping turns a right-handed frame into a left-handed one."""
         return bool(np.linalg.det(self.matrix) < 0)
 
+    def setting(self) -> tuple[str, bool]:
+        """As capture.toml has it: the axes, and whether they are mirrored."""
+        return str(self), self.is_mirrored
+
     def apply(self, values: Array) -> Array:
         """(N, 3) samples in the IMU frame from (N, 3) samples in the file's order."""
         # a missing or damaged value stays one: 0 * inf is no news

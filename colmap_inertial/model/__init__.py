@@ -16,6 +16,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import AlreadyMetricError, FormatError, OutputExistsError, TimingError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.types import (
     CameraModel,
@@ -86,7 +87,7 @@ class Model:
     colmap_index: int
     timing: FrameTiming
     rectified: bool = False
-    doubts: tuple[str, ...] = ()
+    doubts: tuple[Fact, ...] = ()
     rotations: RotationConsensus | None = None
     torn_off: tuple[tuple[str, ...], ...] = ()
     scale: ScaleEstimate | None = None
@@ -119,7 +120,7 @@ class Model:
         )
 
 
-def downgraded(estimate: ScaleEstimate, doubts: Sequence[str]) -> ScaleEstimate:
+def downgraded(estimate: ScaleEstimate, doubts: Sequence[Fact]) -> ScaleEstimate:
     """An estimate from a recording with doubts: they are among its reasons, and it is not trusted."""
     if not doubts:
         return estimate

@@ -15,6 +15,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, Float32Array, IndexArray, UInt8Array, UInt16Array
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import (
     cross,
     quat_conjugate,
@@ -156,11 +157,7 @@ class VisualRotation:
         longest = runs[np.argmax(runs[:, 1] - runs[:, 0])] if len(runs) else np.zeros(2, dtype=np.intp)
         begin, end = int(longest[0]), int(longest[1])
         if end - begin < 4:
-            raise NotObservableError(
-                "camera rotation",
-                "consecutive frames share too few corners to follow the camera's rotation: film at a higher frame "
-                "rate, or where there is more texture",
-            )
+            raise NotObservableError("camera rotation", Fact("too-few-corners-shared"))
         first_from_cam = quat_cumulative(quat_exp(self.turn_rad[begin:end]))
         return CameraTrajectory(
             names=self.names[begin : end + 1],
@@ -225,12 +222,12 @@ class Stabilisation:
     stabilised
         ``None`` where that cannot be told.
     reason
-        In words.
+        Why.
     """
 
     share: float | None = None
     stabilised: bool | None = None
-    reason: str
+    reason: Fact
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -248,13 +245,13 @@ class MotionCheck:
     agrees
         ``None`` where that cannot be told.
     reason
-        In words.
+        Why.
     """
 
     explained: float | None = None
     gain: tuple[float, float, float] = (float("nan"), float("nan"), float("nan"))
     agrees: bool | None = None
-    reason: str
+    reason: Fact
 
 
 def check_motion(rotation: VisualRotation, motion: GyroCamera) -> MotionCheck:
@@ -272,12 +269,12 @@ def check_motion(rotation: VisualRotation, motion: GyroCamera) -> MotionCheck:
     """
     known = np.isfinite(rotation.turn_rad).all(axis=1) & motion.covers(rotation.t_s[:-1], rotation.t_s[1:])
     if known.sum() < 3:
-        return MotionCheck(reason="too few pairs of frames to compare with the gyroscope")
+        return MotionCheck(reason=Fact("too-few-pairs-of-frames"))
     inertial = motion.turn_rad(rotation.t_s)[known]
     visual, sigma = rotation.turn_rad[known], float(np.median(rotation.sigma_rad[known]))
     size = np.sqrt(np.mean(visual**2))
     if size < _LIMITS.rotated_sigmas * sigma:
-        return MotionCheck(reason="the camera hardly turned between frames")
+        return MotionCheck(reason=Fact("camera-hardly-turned"))
     # the median copes with pairs that were measured wrongly
     left, all_of_it = (float(np.median(np.sum(v**2, axis=1))) for v in (visual - inertial, visual))
     explained = 1 - left / max(all_of_it, 1e-12)
@@ -286,9 +283,7 @@ def check_motion(rotation: VisualRotation, motion: GyroCamera) -> MotionCheck:
         x, y = inertial[:, axis], visual[:, axis]
         gain.append(fit_robust_slope(x, y) if np.sqrt(np.mean(x**2)) > _LIMITS.rotated_sigmas * sigma else float("nan"))
     flipped = ["xyz"[axis] for axis in range(3) if gain[axis] < -0.3]
-    reason = f"the gyroscope explains {100 * max(explained, 0):.0f} % of the rotation between frames"
-    if flipped:
-        reason += f"; the camera's {' and '.join(flipped)} axis turns the other way: check the axes"
+    reason = Fact("rotation-explained", explained=explained, flipped=flipped)
     agrees = explained >= _LIMITS.least_explained and not flipped
     return MotionCheck(explained=explained, gain=(gain[0], gain[1], gain[2]), agrees=agrees, reason=reason)
 
@@ -313,7 +308,7 @@ def find_stabilisation(rotation: VisualRotation, imu: ImuRecording, *, offset_s:
     dt_s = np.diff(rotation.t_s)
     step_s = float(np.median(dt_s)) if len(dt_s) else np.inf
     if known.sum() < 20 or step_s > _LIMITS.quick_s / 3:
-        return Stabilisation(reason="too few frames close in time to tell stabilisation")
+        return Stabilisation(reason=Fact("frames-too-sparse"))
     path = GyroPath(imu.gyro_t_s, imu.gyro_rad_s, np.median(imu.gyro_rad_s, axis=0))
     if offset_s is None:
         begin_s = np.arange(imu.gyro_t_s[0], imu.gyro_t_s[-1] - step_s, step_s)
@@ -322,22 +317,17 @@ def find_stabilisation(rotation: VisualRotation, imu: ImuRecording, *, offset_s:
         begin_s, end_s = rotation.t_s[:-1][known] - offset_s, rotation.t_s[1:][known] - offset_s
     inside = path.covers(begin_s, end_s)
     if inside.sum() < 20:
-        return Stabilisation(reason="the gyroscope does not run along with the frames")
+        return Stabilisation(reason=Fact("gyroscope-elsewhere"))
     inertial = path.turn_rad(begin_s[inside], end_s[inside]) / (end_s - begin_s)[inside, None]
     visual = rotation.turn_rad[known] / dt_s[known, None]
     noise = float(np.median(rotation.sigma_rad[known])) / step_s
     width = max(3, round(_LIMITS.quick_s / step_s))
     quick_inertial, quick_visual = _measure_quick_rotation(inertial, width), _measure_quick_rotation(visual, width)
     if quick_inertial < _LIMITS.clear_sigmas * noise or quick_inertial < 0.02:
-        return Stabilisation(reason="the camera was held too still to tell whether the video is stabilised")
+        return Stabilisation(reason=Fact("camera-held-still"))
     share = quick_visual / quick_inertial
     stabilised = share < _LIMITS.stabilised_share
-    reason = f"the pictures show {100 * share:.0f} % of the quick rotation that the gyroscope measured"
-    if stabilised:
-        reason += (
-            ": the video was stabilised in the camera, so its gyroscope does not belong to its pixels; switch "
-            "stabilisation off and record again"
-        )
+    reason = Fact("pictures-stabilised" if stabilised else "quick-rotation-shown", share=share)
     return Stabilisation(share=share, stabilised=stabilised, reason=reason)
 
 

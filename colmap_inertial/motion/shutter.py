@@ -16,6 +16,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, IndexArray
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import cross
 from colmap_inertial.core.types import ReadoutDirection
 from colmap_inertial.imaging.gyro_camera import GyroCamera
@@ -127,16 +128,9 @@ def estimate_readout(rotation: VisualRotation, motion: GyroCamera) -> ReadoutEst
         # of a shutter that is not seen nobody knows how its lines run
         readout_s, sigma_s, along, beside = 0.0, float(sigma.max()), 0, 1
     if not sigma_s < _LIMITS.most_sigma_s:
-        raise NotObservableError(
-            "readout",
-            f"the pictures tell the readout to +-{1e3 * sigma_s:.1f} ms only: turn the camera quickly to and fro for "
-            "some seconds",
-        )
+        raise NotObservableError("readout", Fact("readout-too-loose", readout_sigma_s=sigma_s))
     if abs(params[beside]) > max(_LIMITS.clear_sigmas * sigma[beside], _LIMITS.beside_share * abs(readout_s)):
-        raise NotObservableError(
-            "readout",
-            "what bends the pictures runs neither along nor across their lines: they were warped, turned or stabilised",
-        )
+        raise NotObservableError("readout", Fact("readout-not-of-lines"))
     directions: tuple[tuple[ReadoutDirection, ReadoutDirection], ...] = (("down", "up"), ("right", "left"))
     return ReadoutEstimate(
         readout_s=abs(readout_s),
@@ -186,10 +180,7 @@ def _collect_corners(rotation: VisualRotation, motion: GyroCamera) -> _Corners:
     used = used[first : first + _LIMITS.most_pairs]
     counts = [len(rotation.tracks[i].rays) for i in used]
     if len(used) < _LIMITS.least_pairs or sum(counts) < _LIMITS.least_corners:
-        raise NotObservableError(
-            "readout",
-            f"{sum(counts)} corners in {len(used)} pairs of frames are too few: film two seconds or more of texture",
-        )
+        raise NotObservableError("readout", Fact("readout-of-few-corners", corners=sum(counts), pairs=len(used)))
     pair = np.repeat(np.arange(len(used)), counts)
     ends_s = np.column_stack([rotation.t_s[:-1][used], rotation.t_s[1:][used]])
     return _Corners(
@@ -208,11 +199,7 @@ def _require_change(seen: _Corners, motion: GyroCamera) -> None:
     change = float(np.sqrt(np.mean(np.sum((ends[1] - ends[0]) ** 2, axis=1))))
     noise = motion.path.noise_rad_s_rthz / float(np.sqrt(np.median(np.diff(motion.path.t_s))))
     if change < max(_LIMITS.least_change_rad_s, _LIMITS.change_by_noise * noise):
-        raise NotObservableError(
-            "readout",
-            f"the camera's rate changes by {change:.2g} rad/s from frame to frame, which is too little to tell it: "
-            "turn the camera quickly to and fro for some seconds",
-        )
+        raise NotObservableError("readout", Fact("readout-of-even-rotation", change_rad_s=change))
 
 
 def _fit_readout(seen: _Corners, motion: GyroCamera) -> tuple[Array, Array]:

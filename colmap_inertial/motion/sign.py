@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.motion.flow import VisualRotation
 
@@ -38,12 +39,12 @@ class SignCheck:
     log_ratio
         Natural logarithm of the likelihood of the gyroscope over that of its negative.
     reason
-        In words.
+        Why.
     """
 
     right: bool | None
     log_ratio: float
-    reason: str
+    reason: Fact
 
 
 def check_sign(rotation: VisualRotation, motion: GyroCamera) -> SignCheck:
@@ -71,16 +72,10 @@ def compare_signs(visual_rad: Array, inertial_rad: Array, sigma_rad: Array) -> S
     scatter = np.maximum(np.hypot(sigma_rad, SIGN_LIMITS.least_scatter * size), nearer)
     log_ratio = float(np.sum(np.log1p((residuals[1] / scatter) ** 2) - np.log1p((residuals[0] / scatter) ** 2)))
     if abs(log_ratio) < SIGN_LIMITS.log_ratio:
-        reason = f"{len(size)} pairs of frames do not tell whether the gyroscope has the right sign"
-        return SignCheck(right=None, log_ratio=log_ratio, reason=reason)
+        return SignCheck(right=None, log_ratio=log_ratio, reason=Fact("sign-open", pairs=len(size)))
     explained = 1 - float(np.median(residuals[0 if log_ratio > 0 else 1] ** 2) / np.median(size**2))
     if explained < (0 if log_ratio > 0 else SIGN_LIMITS.least_explained):
-        reason = "the pictures turn neither as the gyroscope does nor the other way"
-        return SignCheck(right=None, log_ratio=log_ratio, reason=reason)
+        return SignCheck(right=None, log_ratio=log_ratio, reason=Fact("neither-sign"))
     if log_ratio > 0:
-        return SignCheck(right=True, log_ratio=log_ratio, reason="the pictures turn as the gyroscope does")
-    reason = (
-        "the pictures turn the other way than the gyroscope: its axes have the wrong sign; check axes and rotation of "
-        "[calibration] in capture.toml"
-    )
-    return SignCheck(right=False, log_ratio=log_ratio, reason=reason)
+        return SignCheck(right=True, log_ratio=log_ratio, reason=Fact("sign-right"))
+    return SignCheck(right=False, log_ratio=log_ratio, reason=Fact("sign-wrong"))

@@ -10,7 +10,8 @@ from collections.abc import Callable, Iterable
 
 from colmap_inertial.checks.diagnose import camera, clocks, frames, imu
 from colmap_inertial.checks.diagnose.findings import SEVERITIES, Diagnosis, Finding, FramesInVideo, Recorded, Severity
-from colmap_inertial.core.errors import FormatError, InertialError, TimingError
+from colmap_inertial.core.errors import InertialError, TimingError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.threads import one_blas_thread
 
 Check = Callable[[Recorded], Iterable[Finding]]
@@ -74,14 +75,18 @@ def diagnose(recorded: Recorded) -> Diagnosis:
     return Diagnosis(findings=tuple(findings), checked=tuple(name for name, there in parts.items() if there))
 
 
+#: What a reader refuses stamps for, whose facts name the file.
+_FAULTS_OF_STAMPS = frozenset(
+    {"time-unit", "stamps-reversed", "stamps-jump-back", "stamps-damaged", "stamps-too-coarse"}
+)
+
+
 def unreadable(error: InertialError) -> Finding:
     """A reader's error as a finding."""
-    code = error.code if isinstance(error, FormatError | TimingError) else "unreadable"
-    return Finding(
-        code=code,
-        severity="error",
-        evidence=str(error),
-    )
+    if error.fact is not None and error.code in _FAULTS_OF_STAMPS:
+        return Finding(fact=error.fact, severity="error")
+    code = "untimed" if isinstance(error, TimingError) else "unreadable"
+    return Finding(fact=Fact(code, detail=str(error)), severity="error")
 
 
 __all__ = [

@@ -15,6 +15,7 @@ from colmap_inertial.checks.diagnose.clocks import (
 )
 from colmap_inertial.checks.diagnose.findings import UNIT_FACTORS, Finding, Recorded
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact, as_fact
 from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply
 from colmap_inertial.core.sampling import subtract_running_mean
 from colmap_inertial.core.types import CameraTrajectory, ImuRecording, RotationConsensus
@@ -75,23 +76,18 @@ _LIMITS = CameraCheckLimits()
 
 #: What is wrong with a gyroscope's own numbers keeps it from fitting the camera: it is named once.
 _OF_THE_GYROSCOPE = frozenset({*UNIT_FACTORS, "gyro-unit", "sensors-exchanged", "dead-sensor", "dead-axis"})
+#: Why camera and gyroscope cannot be aligned at any offset of their clocks.
+_TOO_LITTLE_ROTATION = frozenset({"camera-hardly-rotates", "rotation-axis-open"})
 
 
 def _find_mirroring(recorded: Recorded, imu: ImuRecording) -> Finding:
     """A mirrored gyroscope; where the accelerometer tells that it is the only one, with its right axes."""
-    evidence = "the gyroscope fits the camera's rotation better when it is mirrored"
     reading = best_mirrored_reading(imu) if imu.has_accel else None
     if reading is None or np.array_equal(reading.matrix, -np.eye(3)):
-        return Finding(code="gyro-mirrored", severity="error", evidence=evidence)
+        return Finding(fact=Fact("gyro-mirrored"), severity="error")
     before = np.eye(3) if recorded.gyro_axes is None else recorded.gyro_axes.matrix
     axes = Axes(matrix=reading.matrix @ before)
-    return Finding(
-        code="gyro-mirrored",
-        severity="error",
-        evidence=evidence,
-        advice=f'set axes = "{axes}"{" and mirrored = true" if axes.is_mirrored else ""} under [imu.gyro] in '
-        "capture.toml; the accelerometer is right as it is",
-    )
+    return Finding(fact=Fact("gyro-mirrored", gyro=axes.setting()), severity="error")
 
 
 def check_belonging(recorded: Recorded) -> Iterator[Finding]:
@@ -111,8 +107,8 @@ def check_belonging(recorded: Recorded) -> Iterator[Finding]:
     if recorded.wrong_unit is not None:
         yield _unit_finding(recorded.wrong_unit)
         return
-    if failed.quantity != "time offset":
-        yield Finding(code="rotation-too-little", severity="error", evidence=failed.hint.split(":")[0])
+    if failed.code in _TOO_LITTLE_ROTATION:
+        yield Finding(fact=Fact("rotation-too-little", why=failed.why), severity="error")
         return
     otherwise = _find_better_fit(recorded, imu)
     if otherwise is not None:
@@ -130,14 +126,13 @@ def _check_turned(turning: CameraTrajectory, aligned: Alignment) -> Iterator[Fin
     rate = np.linalg.norm(each_s.turn_rad(), axis=1) / np.diff(each_s.t_s)
     usual = float(np.median(rate))
     if len(rate) >= _LIMITS.fewest_seconds and usual < _LIMITS.still_rad_s:
-        yield Finding(
-            code="rotation-too-little",
-            severity="error",
-            evidence=f"the camera hardly rotates: half of the time by less than {usual:.3f} rad/s, most at "
-            f"{each_s.t_s[int(np.argmax(rate))] - turning.t_s[0]:.0f} s; how it is turned against the gyroscope is "
-            f"open by {np.degrees(sigma_rad):.0f} deg",
-            numbers={"median_rad_s": usual, "rotation_sigma_rad": sigma_rad},
+        fact = Fact(
+            "rotation-too-little",
+            median_rad_s=usual,
+            fastest_s=each_s.t_s[int(np.argmax(rate))] - turning.t_s[0],
+            rotation_sigma_rad=sigma_rad,
         )
+        yield Finding(fact=fact, severity="error")
 
 
 def _is_explained(recorded: Recorded) -> bool:
@@ -153,47 +148,29 @@ def check_cameras(recorded: Recorded) -> Iterator[Finding]:
     """Whether cameras of a reconstruction contradict the gyroscope."""
     consensus = recorded.consensus
     if isinstance(consensus, NotObservableError) and recorded.lacks_majority:
-        yield Finding(code="cameras-turned", severity="error", evidence=consensus.hint)
+        yield Finding(fact=Fact("cameras-turned", why=(consensus.why,)), severity="error")
     if isinstance(consensus, RotationConsensus) and not consensus.kept.all():
-        yield Finding(
-            code="cameras-turned",
-            severity="warning",
-            evidence="; ".join(describe_consensus(consensus)),
-            numbers={
-                "wrong": float(len(consensus.wrong)),
-                "seams": float(len(consensus.seams)),
-                "left_out": float(np.sum(~consensus.kept)),
-                "judged": float(np.sum(consensus.judged)),
-                "median_deg": float(np.median(consensus.deviation_deg[consensus.judged & consensus.kept])),
-            },
-            deviations_deg=consensus.deviations_deg,
+        fact = Fact(
+            "cameras-turned",
+            why=tuple(map(as_fact, describe_consensus(consensus))),
+            wrong=len(consensus.wrong),
+            seams=len(consensus.seams),
+            left_out=np.sum(~consensus.kept),
+            judged=np.sum(consensus.judged),
+            median_deg=np.median(consensus.deviation_deg[consensus.judged & consensus.kept]),
         )
+        yield Finding(fact=fact, severity="warning", deviations_deg=consensus.deviations_deg)
 
 
 def _never_fits(recorded: Recorded, turning: CameraTrajectory, failed: NotObservableError) -> Finding:
     """A gyroscope that fits the camera at no offset: it belongs to something else, where there is enough to tell."""
     span_s = float(np.ptp(turning.t_s))
     if span_s < _LIMITS.enough_s:
-        return Finding(
-            code="offset-undecided",
-            severity="warning",
-            evidence=f"no time offset between camera and gyroscope fits clearly better than others in {span_s:.1f} s",
-            numbers={"seconds": span_s},
-        )
+        return Finding(fact=Fact("offset-undecided", seconds=span_s), severity="warning")
     if recorded.trajectory is None and not recorded.is_dense and len(turning) <= _LIMITS.enough_pairs:
-        return Finding(
-            code="pictures-too-few",
-            severity="info",
-            evidence=f"only {len(turning) - 1} pairs of consecutive pictures overlap enough to be compared with the "
-            "gyroscope, and no time offset fits them",
-            numbers={"pairs": len(turning) - 1.0},
-        )
-    return Finding(
-        code="imu-does-not-fit",
-        severity="error",
-        evidence=f"{failed.hint.split(':')[0]}; {recorded.clocks}",
-        numbers={"seconds": span_s},
-    )
+        return Finding(fact=Fact("pictures-too-few", pairs=len(turning) - 1), severity="info")
+    clocks = None if recorded.clocks is None else recorded.clocks.fact
+    return Finding(fact=Fact("imu-does-not-fit", seconds=span_s, why=failed.why, clocks=clocks), severity="error")
 
 
 def _find_better_fit(recorded: Recorded, imu: ImuRecording) -> Finding | None:
@@ -221,14 +198,7 @@ def check_gyro_gain(recorded: Recorded) -> Iterator[Finding]:
         return
     least, most = bounds
     if least > _LIMITS.gyro_gain[1] or most < _LIMITS.gyro_gain[0]:
-        gain = (least * most) ** 0.5
-        yield Finding(
-            code="gyro-gain",
-            severity="error",
-            evidence=f"the gyroscope measures {gain:.2f} times the rotation that the images show; sensors are right to "
-            "a few per cent",
-            numbers={"gain": gain},
-        )
+        yield Finding(fact=Fact("gyro-gain", gain=(least * most) ** 0.5), severity="error")
 
 
 def _bound_gain(recorded: Recorded) -> tuple[float, float] | None:
@@ -262,35 +232,14 @@ def _bound_gain(recorded: Recorded) -> tuple[float, float] | None:
 
 
 def _unit_finding(code: str) -> Finding:
-    factor = UNIT_FACTORS[code]
-    if factor < 1:
-        evidence = "the gyroscope turns as the camera does, but 57.3 times as far: its numbers are in deg/s"
-        unit = "deg/s"
-    else:
-        evidence = (
-            "the gyroscope turns as the camera does, but a 57.3th as far: rad/s were converted as if they were deg/s"
-        )
-        unit = "rad/s"
-    return Finding(
-        code=code,
-        severity="error",
-        evidence=evidence,
-        advice=f'set unit = "{unit}" under [imu.gyro] in capture.toml',
-        numbers={"gain": 1 / factor},
-    )
+    return Finding(fact=Fact(code, seen_in="camera", gain=1 / UNIT_FACTORS[code]), severity="error")
 
 
 def check_pose_convention(recorded: Recorded) -> Iterator[Finding]:
     """Poses that fit the IMU if their table was written by another convention than it was read by."""
     likely = recorded.likely_convention
     if likely is not None:
-        yield Finding(
-            code="pose-convention",
-            severity="error",
-            evidence=likely.found,
-            advice=likely.advice,
-            numbers={"log_likelihood": likely.log_likelihood} if np.isfinite(likely.log_likelihood) else {},
-        )
+        yield Finding(fact=likely.fact, severity="error")
 
 
 def _is_mirrored(turning: CameraTrajectory, imu: ImuRecording, aligned: Alignment) -> bool:
@@ -311,12 +260,8 @@ def _is_mirrored(turning: CameraTrajectory, imu: ImuRecording, aligned: Alignmen
 def check_stabilisation(recorded: Recorded) -> Iterator[Finding]:
     """A picture that was turned against its lens no longer belongs to the gyroscope."""
     if recorded.log is not None and recorded.log.stabilised:
-        description = recorded.log.stabilisation or "stabilisation was on"
-        yield Finding(
-            code="stabilised",
-            severity="error",
-            evidence=f"the recorder says that the video was stabilised in the camera ({description})",
-        )
+        noted = recorded.log.stabilisation or "stabilisation was on"
+        yield Finding(fact=Fact("stabilised", recorder_notes=noted), severity="error")
         return
     stabilisation = recorded.stabilisation
     # numbers in another unit look like it
@@ -326,13 +271,7 @@ def check_stabilisation(recorded: Recorded) -> Iterator[Finding]:
         and stabilisation.share is not None
         and recorded.wrong_unit is None
     ):
-        yield Finding(
-            code="stabilised",
-            severity="error",
-            evidence=f"the pictures hold {100 * stabilisation.share:.0f} % of the quick rotation that the gyroscope "
-            "measured: the video was stabilised in the camera",
-            numbers={"share": stabilisation.share},
-        )
+        yield Finding(fact=Fact("stabilised", share=stabilisation.share), severity="error")
 
 
 def check_declared_rotation(recorded: Recorded) -> Iterator[Finding]:
@@ -346,12 +285,7 @@ def check_declared_rotation(recorded: Recorded) -> Iterator[Finding]:
     turn = quat_multiply(aligned.calibration.cam_from_imu_xyzw, quat_conjugate(prior.cam_from_imu_xyzw))
     angle = float(np.linalg.norm(quat_log(turn)))
     if angle > _LIMITS.other_rotation_rad + 3 * max(sigmas):
-        yield Finding(
-            code="declared-rotation",
-            severity="error",
-            evidence=f"camera and IMU are turned by {np.degrees(angle):.0f} deg against what is declared",
-            numbers={"angle_deg": float(np.degrees(angle))},
-        )
+        yield Finding(fact=Fact("declared-rotation", angle_deg=np.degrees(angle)), severity="error")
 
 
 def check_focal_length(recorded: Recorded) -> Iterator[Finding]:
@@ -377,13 +311,8 @@ def check_focal_length(recorded: Recorded) -> Iterator[Finding]:
     rest = quick_visual - gain * quick_inertial
     sigma = float(np.sqrt(np.mean(rest**2) * width / energy))
     if sigma < _LIMITS.gain_sigma and not _LIMITS.usual_gain[0] - sigma < gain < _LIMITS.usual_gain[1] + sigma:
-        yield Finding(
-            code="focal-length",
-            severity="error",
-            evidence=f"the pictures turn {gain:.2f} times as far as the gyroscope measured: with the declared focal "
-            f"length of {camera.params[0]:.0f} px, about {camera.params[0] * gain:.0f} px would fit",
-            numbers={"gain": gain, "gain_sigma": sigma},
-        )
+        fact = Fact("focal-length", gain=gain, gain_sigma=sigma, focal_px=camera.params[0])
+        yield Finding(fact=fact, severity="error")
 
 
 def check_accelerometer_sign(recorded: Recorded) -> Iterator[Finding]:
@@ -395,13 +324,7 @@ def check_accelerometer_sign(recorded: Recorded) -> Iterator[Finding]:
         return
     correlation = acceleration_correlation(poses, imu, aligned)
     if correlation is not None and correlation < _LIMITS.opposite:
-        yield Finding(
-            code="accel-flipped",
-            severity="error",
-            evidence="the accelerometer measures the opposite of the camera's acceleration (correlation "
-            f"{correlation:.2f}): its sign is flipped",
-            numbers={"correlation": correlation},
-        )
+        yield Finding(fact=Fact("accel-flipped", correlation=correlation), severity="error")
 
 
 def acceleration_correlation(poses: CameraTrajectory, imu: ImuRecording, aligned: Alignment) -> float | None:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from colmap_inertial.checks.diagnose.findings import Finding, Recorded, Severity
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import CameraTrajectory
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.motion.align import Alignment
@@ -37,17 +38,9 @@ _LIMITS = ClockCheckLimits()
 
 def offset_finding(recorded: Recorded, offset_s: float) -> Finding:
     """Clocks that are further apart than was stated."""
-    if recorded.max_offset_s is not None:
-        stated = f"which one clock (up to {recorded.max_offset_s:g} s apart) does not allow"
-    else:
-        stated = "which the time offset that was given excludes"
-    return Finding(
-        code="clock-offset",
-        severity="error",
-        evidence=f"camera and gyroscope fit where their stamps are {offset_s:+.3f} s apart, {stated}; "
-        f"{recorded.clocks}",
-        numbers={"offset_s": offset_s},
-    )
+    clocks = None if recorded.clocks is None else recorded.clocks.fact
+    fact = Fact("clock-offset", offset_s=offset_s, max_offset_s=recorded.max_offset_s, clocks=clocks)
+    return Finding(fact=fact, severity="error")
 
 
 def check_time_unit(recorded: Recorded) -> Iterator[Finding]:
@@ -56,17 +49,7 @@ def check_time_unit(recorded: Recorded) -> Iterator[Finding]:
     if clocks is None or not wrong_time_unit(recorded):
         return
     assert clocks.unit_factor is not None
-    factor = clocks.unit_factor
-    yield Finding(
-        code="time-unit",
-        severity="error",
-        evidence=f"{clocks}: the frames' times are {factor:g} times too {'long' if factor > 1 else 'short'}, and are "
-        f"in {_TIME_UNITS.get(factor, 'another unit')} where seconds were read",
-        numbers={"frames_s": clocks.frames_s, "imu_s": clocks.imu_s, "factor": factor},
-    )
-
-
-_TIME_UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
+    yield Finding(fact=Fact("time-unit", **asdict(clocks), factor=clocks.unit_factor), severity="error")
 
 
 def wrong_time_unit(recorded: Recorded) -> bool:
@@ -84,24 +67,12 @@ def check_clock_rate(recorded: Recorded) -> Iterator[Finding]:
 
 def rate_finding(rate: float) -> Finding:
     severity: Severity = "error" if abs(rate) > _LIMITS.wrong_rate else "warning"
-    return Finding(
-        code="clock-rate",
-        severity=severity,
-        evidence=f"the camera's clock runs {100 * rate:+.2f} % faster than the IMU's, and either may be wrong: lengths "
-        "go with the square of time",
-        numbers={"rate": rate},
-    )
+    return Finding(fact=Fact("clock-rate", rate=rate), severity=severity)
 
 
 def frame_rate_finding(rate: float) -> Finding:
     """Frame times by a wrong frame rate; ``rate`` is how many seconds of frames the IMU's second is."""
-    return Finding(
-        code="frame-rate",
-        severity="error",
-        evidence=f"the frames fit the gyroscope if {rate:.3g} times as many come in a second as are stated: they were "
-        "timed by another frame rate than they were filmed with",
-        numbers={"rate": rate},
-    )
+    return Finding(fact=Fact("frame-rate", rate=rate), severity="error")
 
 
 def check_coverage(recorded: Recorded) -> Iterator[Finding]:
@@ -124,10 +95,8 @@ def check_coverage(recorded: Recorded) -> Iterator[Finding]:
         return
     share = float(np.clip(1 - missed_s / span_s, 0, 1))
     yield Finding(
-        code="imu-too-short",
+        fact=Fact("imu-too-short", share=share, frames_s=span_s, imu_s=end_s - begin_s),
         severity="error" if share < _LIMITS.least_covered else "warning",
-        evidence=f"the IMU runs along with {100 * share:.0f} % of {span_s:.1f} s of frames",
-        numbers={"share": share, "frames_s": span_s, "imu_s": float(end_s - begin_s)},
     )
 
 
@@ -155,13 +124,8 @@ def check_even_times(recorded: Recorded) -> Iterator[Finding]:
     off -= np.median(off)
     worst = int(np.argmax(np.abs(off)))
     if abs(off[worst]) > _LIMITS.uneven_s:
-        yield Finding(
-            code="frame-times-uneven",
-            severity="error",
-            evidence=f"against the gyroscope, frame times wander by {1e3 * np.ptp(off):.0f} ms; worst "
-            f"{middles[worst] - turning.t_s[0]:.0f} s after the first frame",
-            numbers={"wander_s": float(np.ptp(off)), "parts": float(len(off))},
-        )
+        fact = Fact("frame-times-uneven", wander_s=np.ptp(off), worst_s=middles[worst] - turning.t_s[0], parts=len(off))
+        yield Finding(fact=fact, severity="error")
 
 
 def _part_offset_s(part: CameraTrajectory, motion: GyroCamera, drift_s: float) -> float | None:

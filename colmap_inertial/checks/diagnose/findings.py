@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from colmap_inertial.checks.diagnose.advice import ADVICE
 from colmap_inertial.core.arrays import Int64Array
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError
+from colmap_inertial.core.facts import Fact, with_sentences
 from colmap_inertial.core.sampling import time_unit_factor
 from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.types import (
@@ -30,7 +30,7 @@ from colmap_inertial.io.plausible import RawImu
 from colmap_inertial.io.pose_convention import ARRAYS, PoseConvention
 from colmap_inertial.io.units import Axes
 from colmap_inertial.motion.align import Alignment, AlignOptions, align_clocks
-from colmap_inertial.motion.align.consensus import align_by_consensus
+from colmap_inertial.motion.align.consensus import NO_MAJORITY, align_by_consensus
 from colmap_inertial.motion.align.conventions import LikelyConvention, likely_convention
 from colmap_inertial.motion.flow import Stabilisation, VisualRotation, find_stabilisation
 
@@ -44,43 +44,59 @@ class Finding:
 
     Attributes
     ----------
-    code
-        Stable name of what was found.
+    fact
+        What was seen, and what to do.
     severity
         ``"error"`` makes a scale wrong or impossible, ``"warning"`` makes it worse, ``"info"`` is worth knowing.
-    evidence
-        What was seen, in a sentence.
-    numbers
-        The same in numbers; units are in the names.
-    advice
-        What to do; of the table in ``checks/diagnose/advice.py`` where nothing is given.
     deviations_deg
         By image, how far its camera is turned against those around it; empty in findings about anything else.
     """
 
-    code: str
+    fact: Fact
     severity: Severity
-    evidence: str
-    advice: str = ""
-    numbers: Mapping[str, float] = field(default_factory=dict)
     deviations_deg: Mapping[str, float] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        if not self.advice:
-            object.__setattr__(self, "advice", ADVICE.get(self.code, ADVICE["unreadable"]))
+    @property
+    def code(self) -> str:
+        """Stable name of what was found."""
+        return self.fact.code
+
+    @property
+    def evidence(self) -> str:
+        """What was seen, in a sentence."""
+        return str(self.fact)
+
+    @property
+    def advice(self) -> str:
+        """What to do."""
+        return self.fact.advice
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """The numbers of what was seen; units are in the names."""
+        return {
+            name: value
+            for name, value in self.fact.values.items()
+            if isinstance(value, int | float) and not isinstance(value, bool)
+        }
+
+    @property
+    def reason(self) -> Fact:
+        """The finding as a reason not to trust a scale: message, advice and code."""
+        return Fact("found-beforehand", finding=self.fact)
 
     @property
     def sentence(self) -> str:
         """Message, advice and code."""
-        return f"{self.evidence}; {self.advice} ({self.code})"
+        return str(self.reason)
 
     def as_json(self) -> dict[str, object]:
         deviations = {"deviations_deg": dict(self.deviations_deg)} if self.deviations_deg else {}
         return {
             "code": self.code,
             "severity": self.severity,
-            "evidence": self.evidence,
-            "numbers": dict(self.numbers),
+            **with_sentences({"evidence": self.fact}),
+            "numbers": self.numbers,
             "advice": self.advice,
             **deviations,
         }
@@ -160,11 +176,13 @@ class Clocks:
     imu_s: float
     imu_hz: float
 
+    @property
+    def fact(self) -> Fact:
+        """Spans and rates, as a message has them."""
+        return Fact("spans-and-rates", **asdict(self))
+
     def __str__(self) -> str:
-        return (
-            f"the frames span {self.frames_s:.4g} s at {self.frame_hz:.3g} Hz, "
-            f"the gyroscope {self.imu_s:.4g} s at {self.imu_hz:.3g} Hz"
-        )
+        return str(self.fact)
 
     @property
     def unit_factor(self) -> float | None:
@@ -242,7 +260,7 @@ class Recorded:
     @property
     def lacks_majority(self) -> bool:
         """Whether it is open which cameras of a reconstruction are right."""
-        return isinstance(self.consensus, NotObservableError) and self.consensus.quantity == "camera rotation"
+        return isinstance(self.consensus, NotObservableError) and self.consensus.code in NO_MAJORITY
 
     @cached_property
     def turning(self) -> CameraTrajectory | None:
@@ -322,7 +340,7 @@ class Recorded:
             return None
         if self.clocks is not None and (self.clocks.unit_factor or 0) > 1:
             # hours of offsets to search, for frames that mostly have no gyroscope beside them
-            return NotObservableError("time offset", str(self.clocks))
+            return NotObservableError("time offset", self.clocks.fact)
         prior = self.calibration
         if any_offset and prior is not None:
             prior = reset_for_recording(prior)

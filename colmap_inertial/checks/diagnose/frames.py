@@ -10,6 +10,7 @@ import numpy as np
 from colmap_inertial.checks.diagnose.findings import Finding, Recorded, Severity
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.motion.align import Alignment
 from colmap_inertial.motion.shutter import ReadoutEstimate, estimate_readout
@@ -53,13 +54,8 @@ def check_dropped(recorded: Recorded) -> Iterator[Finding]:
         return
     lost = int(np.sum(np.round(step_s / usual_s) - 1))
     if lost > max(_LIMITS.dropped, _LIMITS.dropped_share * len(step_s)):
-        yield Finding(
-            code="frames-dropped",
-            severity="warning",
-            evidence=f"{lost} frames are missing between {len(frames.t_s)} that come every {1e3 * usual_s:.1f} ms; "
-            f"the longest pause is {step_s.max():.2f} s",
-            numbers={"lost": float(lost), "longest_s": float(step_s.max())},
-        )
+        fact = Fact("frames-dropped", lost=lost, frames=len(frames.t_s), step_s=usual_s, longest_s=step_s.max())
+        yield Finding(fact=fact, severity="warning")
 
 
 def check_repeated(recorded: Recorded) -> Iterator[Finding]:
@@ -76,12 +72,7 @@ def check_repeated(recorded: Recorded) -> Iterator[Finding]:
     count = int(np.sum(same))
     if count > _LIMITS.repeated:
         severity: Severity = "error" if count > _LIMITS.repeated_share * len(same) else "warning"
-        yield Finding(
-            code="frames-repeated",
-            severity=severity,
-            evidence=f"{count} of {len(same)} frames repeat the one before them",
-            numbers={"repeated": float(count), "looked_at": float(len(same))},
-        )
+        yield Finding(fact=Fact("frames-repeated", repeated=count, looked_at=len(same)), severity=severity)
 
 
 def check_exposure(recorded: Recorded) -> Iterator[Finding]:
@@ -105,52 +96,44 @@ def check_exposure(recorded: Recorded) -> Iterator[Finding]:
     blur = focal * turning * timing.exposure_s * (2 / 3) ** 0.5
     share = float(np.mean(blur > _LIMITS.blur_share))
     if share > _LIMITS.blurred_frames:
-        yield Finding(
-            code="exposure-too-long",
-            severity="warning",
-            evidence=f"{100 * share:.0f} % of the frames are blurred by more than {100 * _LIMITS.blur_share:g} % of "
-            f"the picture's long side (median {100 * np.median(blur):.2f} %, exposure "
-            f"{1e3 * np.median(timing.exposure_s):.1f} ms)",
-            numbers={"share": share, "median_blur_of_long_side": float(np.median(blur))},
+        fact = Fact(
+            "exposure-too-long",
+            share=share,
+            blur_limit_of_long_side=_LIMITS.blur_share,
+            median_blur_of_long_side=np.median(blur),
+            exposure_s=np.median(timing.exposure_s),
         )
+        yield Finding(fact=fact, severity="warning")
 
 
 def check_readout(recorded: Recorded) -> Iterator[Finding]:
     """A capture that does not say how its shutter runs; where the pictures show it, how long it takes."""
     if not recorded.is_capture or recorded.timing is None or recorded.timing.readout_s is not None:
         return
-    evidence = "nothing says whether the camera has a rolling shutter, as nearly all phones do"
     try:
         readout = _readout(recorded)
     except NotObservableError as error:
-        yield Finding(
-            code="readout-unknown",
-            severity="warning",
-            evidence=f"{evidence}; {error.hint.split(':')[0]}",
-        )
+        yield Finding(fact=Fact("readout-unknown", why=error.why), severity="warning")
         return
-    lines = f"readout_s = {readout.readout_s:.4f}"
-    if readout.direction != "down":
-        lines += f' and readout_direction = "{readout.direction}"'
-    yield Finding(
-        code="readout-unknown",
-        severity="warning",
-        evidence=f"{evidence}; by the pictures and the gyroscope, reading a frame takes {readout}"
-        + ("" if readout.readout_s else ", as a global shutter"),
-        advice=f"write {lines} under [timing] in capture.toml, so that it is undone",
-        numbers={"readout_s": readout.readout_s, "readout_sigma_s": readout.sigma_s, "pairs": float(readout.pairs)},
+    fact = Fact(
+        "readout-unknown",
+        readout_s=readout.readout_s,
+        readout_sigma_s=readout.sigma_s,
+        direction=readout.direction,
+        pairs=readout.pairs,
     )
+    yield Finding(fact=fact, severity="warning")
 
 
 def _readout(recorded: Recorded) -> ReadoutEstimate:
     """Estimate the readout from tracked corners and the aligned gyroscope."""
     rotation, aligned, imu = recorded.rotation, recorded.aligned, recorded.imu
     if rotation is not None and not recorded.is_dense:
-        raise NotObservableError("readout", "pictures that are this far apart in time do not tell it; a video does")
+        raise NotObservableError("readout", Fact("readout-of-sparse-pictures"))
     if rotation is None or imu is None or not isinstance(aligned, Alignment):
-        raise NotObservableError("readout", "a video and its gyroscope would tell, where they fit each other")
+        raise NotObservableError("readout", Fact("readout-without-gyroscope"))
     if recorded.stabilisation is not None and recorded.stabilisation.stabilised:
-        raise NotObservableError("readout", "a stabilised video tells nothing of it")
+        raise NotObservableError("readout", Fact("readout-of-stabilised-video"))
     timed = CameraTimedImu.from_recording(imu, aligned.settled(), rotation.epoch_ns)
     return estimate_readout(rotation, GyroCamera.from_timed(timed))
 
@@ -161,28 +144,15 @@ def check_cut_from_video(recorded: Recorded) -> Iterator[Finding]:
     if cut is None:
         return
     if cut.doubtful:
-        yield Finding(
-            code="frames-not-in-video",
-            severity="info",
-            evidence=f"{cut.doubtful} of {cut.doubtful + len(cut.found_ns)} pictures look like no frame of the video, "
-            "or like several",
-            numbers={"pictures": float(cut.doubtful)},
-        )
+        looked_for = cut.doubtful + len(cut.found_ns)
+        yield Finding(fact=Fact("frames-not-in-video", pictures=cut.doubtful, looked_for=looked_for), severity="info")
     if cut.quarter_turns:
         yield Finding(
-            code="frames-turned",
+            fact=Fact("frames-turned", angle_deg=90 * cut.quarter_turns),
             severity="error" if _refers_to_rows(recorded) else "info",
-            evidence=f"the pictures are turned by {90 * cut.quarter_turns} deg against the sensor's rows",
-            numbers={"angle_deg": 90.0 * cut.quarter_turns},
         )
     elif cut.container_turn_deg % 360:
-        yield Finding(
-            code="rotation-ignored",
-            severity="info",
-            evidence=f"the video asks players to turn it by {cut.container_turn_deg} deg; the pictures are as the "
-            "sensor saw them",
-            numbers={"angle_deg": float(cut.container_turn_deg)},
-        )
+        yield Finding(fact=Fact("rotation-ignored", angle_deg=cut.container_turn_deg), severity="info")
     if len(cut.found_ns) < 3:
         return
     off_s = (cut.stated_ns - cut.found_ns) * 1e-9
@@ -190,20 +160,9 @@ def check_cut_from_video(recorded: Recorded) -> Iterator[Finding]:
     wander_s = float(np.ptp(off_s))
     start_s = cut.video_start_ns * 1e-9
     if wander_s > _LIMITS.wander_s:
-        yield Finding(
-            code="frame-times-counted",
-            severity="error",
-            evidence=f"the pictures' times wander by {1e3 * wander_s:.0f} ms against the presentation stamps of the "
-            "video's frames that they are, as times counted from a frame rate do",
-            numbers={"wander_s": wander_s},
-        )
+        yield Finding(fact=Fact("frame-times-counted", wander_s=wander_s), severity="error")
     elif abs(start_s) > _LIMITS.start_s and abs(middle_s + start_s) < _LIMITS.start_s:
-        yield Finding(
-            code="container-start-ignored",
-            severity="error",
-            evidence=f"the pictures' times lack the {1e3 * start_s:+.0f} ms at which the video's container starts",
-            numbers={"start_s": start_s},
-        )
+        yield Finding(fact=Fact("container-start-ignored", start_s=start_s), severity="error")
 
 
 def _refers_to_rows(recorded: Recorded) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 from colmap_inertial.checks.diagnose.findings import Finding, Recorded, Severity
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import matrix_from_quat, skew
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.sampling import MUCH_CUT, PAUSE_STEPS, find_clipped, integral_at, is_gap
@@ -51,17 +52,15 @@ def check_motion_content(recorded: Recorded) -> Iterator[Finding]:
     rotated = float(np.sqrt(np.mean(np.sum(rate**2, axis=1))))
     if accel is None or accel > _MOTION_LIMITS.least_accel_m_s2 + _MOTION_LIMITS.accel_per_turn_m_s * rotated:
         return
-    numbers = {"acceleration_rms_m_s2": accel, "turning_rms_rad_s": rotated}
-    evidence = f"the camera's acceleration is {accel:.3f} m/s2 (rms) once gravity is out"
     if recorded.trajectory is not None and _glides(recorded.trajectory):
-        code, what = "constant-velocity", "it glides at constant speed"
+        code = "constant-velocity"
     elif rotated < _MOTION_LIMITS.rotated_rad_s:
-        code, what = "no-motion", f"it turns by {rotated:.3f} rad/s: it stood on a tripod or table"
+        code = "no-motion"
     elif recorded.trajectory is not None:
-        code, what = "pure-rotation", f"it only turns, by {rotated:.2f} rad/s"
+        code = "pure-rotation"
     else:
-        code, what = "no-acceleration", f"it turns by {rotated:.2f} rad/s, but stays in place or glides"
-    yield Finding(code=code, severity="error", evidence=f"{evidence}; {what}", numbers=numbers)
+        code = "no-acceleration"
+    yield Finding(fact=Fact(code, acceleration_rms_m_s2=accel, turning_rms_rad_s=rotated), severity="error")
 
 
 def acceleration_rms_m_s2(imu: ImuRecording) -> float | None:
@@ -148,13 +147,11 @@ _SCATTER = {"gyroscope": 0.0004, "accelerometer": 0.005}
 #: Motion that leaves no doubt that readings without scatter are smoothed ones.
 _MOVING = {"gyroscope": 0.1, "accelerometer": 0.2}
 
-_UNITS = {"gyroscope": "rad/s", "accelerometer": "m/s2"}
-
 
 def check_plausibility(recorded: Recorded) -> Iterator[Finding]:
     """Units, gravity, dead axes, exchanged sensors, axes that do not match: what a reader would refuse first."""
     for problem in recorded.implausible:
-        yield refusal(problem)
+        yield Finding(fact=problem.why, severity="error")
 
 
 def check_axes(recorded: Recorded) -> Iterator[Finding]:
@@ -166,38 +163,36 @@ def check_axes(recorded: Recorded) -> Iterator[Finding]:
     try:
         check_consistent(raw, confirmed=True)
     except FormatError as error:
-        yield refusal(error)
-
-
-def refusal(error: FormatError) -> Finding:
-    """A reader's refusal, whose sentence gives what was found, then what to do."""
-    evidence, _, advice = error.reason.rpartition("; " if "; " in error.reason else ": ")
-    return Finding(code=error.code, severity="error", evidence=evidence or advice, advice=advice if evidence else "")
+        yield Finding(fact=error.why, severity="error")
 
 
 def check_accelerometer(recorded: Recorded) -> Iterator[Finding]:
     """Report a missing accelerometer: there is no scale without one."""
     if recorded.imu is not None and not recorded.imu.has_accel:
-        yield Finding(
-            code="no-accelerometer",
-            severity="error",
-            evidence="the recording holds a gyroscope alone",
-        )
+        yield Finding(fact=Fact("no-accelerometer"), severity="error")
+
+
+#: The finding that a reader's repair belongs to; the others are ``"repaired"``.
+_FINDING_OF_REPAIR = {
+    "rows-without-sample": "empty-cells",
+    "rows-without-value": "samples-missing",
+    "rows-sorted": "stamps-reordered",
+    "rows-merged": "stamps-repeated",
+    "rows-averaged": "stamps-repeated",
+}
 
 
 def check_repairs(recorded: Recorded) -> Iterator[Finding]:
     """Report samples that the reader sorted, merged or dropped."""
     if recorded.imu is None:
         return
-    by_code: dict[str, list[str]] = {}
+    by_code: dict[str, list[Fact]] = {}
     for repair in recorded.imu.repairs:
-        by_code.setdefault(getattr(repair, "code", "repaired"), []).append(str(repair))
-    for code, sentences in by_code.items():
+        by_code.setdefault(_FINDING_OF_REPAIR.get(repair.code, "repaired"), []).append(repair)
+    for code, repairs in by_code.items():
         yield Finding(
-            code=code,
+            fact=Fact(code, repairs=len(repairs), each=repairs),
             severity="info" if code in ("empty-cells", "repaired") else "warning",
-            evidence="; ".join(sentences),
-            numbers={"repairs": len(sentences)},
         )
 
 
@@ -214,13 +209,16 @@ def check_pauses(recorded: Recorded) -> Iterator[Finding]:
         ):
             if len(some) == 0:
                 continue
-            yield Finding(
-                code=code,
-                severity="error" if share > _LIMITS.most_paused else "warning",
-                evidence=f"the {sensor} pauses {len(some)} times, {some.max():.3f} s at the longest, "
-                f"{some.sum():.2f} s in all; it samples every {1e3 * usual_s:.1f} ms",
-                numbers={"pauses": len(some), "longest_s": float(some.max()), "share": share},
+            fact = Fact(
+                code,
+                sensor=sensor,
+                pauses=len(some),
+                longest_s=some.max(),
+                total_s=some.sum(),
+                step_s=usual_s,
+                share=share,
             )
+            yield Finding(fact=fact, severity="error" if share > _LIMITS.most_paused else "warning")
 
 
 def check_rate(recorded: Recorded) -> Iterator[Finding]:
@@ -229,10 +227,8 @@ def check_rate(recorded: Recorded) -> Iterator[Finding]:
         rate_hz = 1 / float(np.median(np.diff(t_s)))
         if rate_hz < _LIMITS.slow_hz:
             yield Finding(
-                code="rate-too-low",
+                fact=Fact("rate-too-low", sensor=sensor, rate_hz=rate_hz),
                 severity="error" if rate_hz < _LIMITS.too_slow_hz else "warning",
-                evidence=f"the {sensor} reads {rate_hz:.3g} times a second; a hand shakes ten times a second",
-                numbers={"rate_hz": rate_hz},
             )
 
 
@@ -246,37 +242,19 @@ def check_scatter(recorded: Recorded) -> Iterator[Finding]:
     # the camera tells units better, where there is one
     alone = not isinstance(recorded.aligned, Alignment)
     if alone and usual > _LIMITS.whirling_rad_s:
-        yield Finding(
-            code="gyro-in-deg",
-            severity="warning",
-            evidence=f"half of the time the gyroscope turns faster than {usual:.2g} rad/s, as nobody films: the "
-            "numbers are probably in deg/s",
-            advice='set unit = "deg/s" under [imu.gyro] in capture.toml, if they are',
-            numbers={"median_rad_s": usual},
-        )
+        yield Finding(fact=Fact("gyro-in-deg", seen_in="usual", median_rad_s=usual), severity="warning")
     for sensor, _, values in _sensors(imu):
         scatter = scatter_of(values)
         if not 0 < scatter < _SCATTER[sensor]:
             continue
         if alone and sensor == "gyroscope" and turning < _LIMITS.hardly_rad_s and scatter < _LIMITS.silent_rad_s:
-            yield Finding(
-                code="gyro-not-in-deg",
-                severity="warning",
-                evidence=f"the gyroscope turns by {turning:.2g} rad/s and scatters by {scatter:.1g} rad/s from sample "
-                "to sample, less than sensors do: rad/s were probably converted as if they were deg/s",
-                advice='set unit = "rad/s" under [imu.gyro] in capture.toml, if the camera was in a hand',
-                numbers={"turning_rad_s": turning, "scatter_rad_s": scatter},
-            )
+            fact = Fact("gyro-not-in-deg", seen_in="scatter", turning_rad_s=turning, scatter_rad_s=scatter)
+            yield Finding(fact=fact, severity="warning")
             continue
         moving = turning if sensor == "gyroscope" else acceleration_rms_m_s2(imu) or 0.0
         if moving > _MOVING[sensor]:
-            yield Finding(
-                code="low-passed",
-                severity="warning",
-                evidence=f"the {sensor} hardly scatters from sample to sample ({scatter:.1g} {_UNITS[sensor]}), though "
-                "the device moves: its readings were smoothed",
-                numbers={"scatter": scatter, "moving": moving},
-            )
+            fact = Fact("low-passed", sensor=sensor, scatter=scatter, moving=moving)
+            yield Finding(fact=fact, severity="warning")
 
 
 def scatter_of(values: Array) -> float:
@@ -293,12 +271,7 @@ def check_together(recorded: Recorded) -> Iterator[Finding]:
     both_s = min(imu.gyro_t_s[-1], imu.accel_t_s[-1]) - max(imu.gyro_t_s[0], imu.accel_t_s[0])
     shorter_s = min(np.ptp(imu.gyro_t_s), np.ptp(imu.accel_t_s))
     if both_s < _LIMITS.together * shorter_s:
-        yield Finding(
-            code="sensors-apart",
-            severity="error",
-            evidence=f"gyroscope and accelerometer run together for {max(both_s, 0):.1f} s of {shorter_s:.1f} s",
-            numbers={"together_s": float(both_s), "shorter_s": float(shorter_s)},
-        )
+        yield Finding(fact=Fact("sensors-apart", together_s=both_s, shorter_s=shorter_s), severity="error")
 
 
 def check_cut_off(recorded: Recorded) -> Iterator[Finding]:
@@ -308,13 +281,16 @@ def check_cut_off(recorded: Recorded) -> Iterator[Finding]:
         cut = {axis: count for axis, count in counts.items() if count}
         if cut:
             share = sum(cut.values()) / len(values)
-            yield Finding(
-                code="saturated",
-                severity="error" if share > MUCH_CUT else "warning",
-                evidence=f"{sum(cut.values())} of {len(values)} {sensor} samples stand at the end of the range "
-                f"({', '.join(f'{axis}: {count}' for axis, count in cut.items())})",
-                numbers={"samples": float(sum(cut.values())), "share": share},
+            fact = Fact(
+                "saturated",
+                sensor=sensor,
+                samples=sum(cut.values()),
+                of=len(values),
+                axes="".join(cut),
+                counts=tuple(cut.values()),
+                share=share,
             )
+            yield Finding(fact=fact, severity="error" if share > MUCH_CUT else "warning")
 
 
 def check_resolution(recorded: Recorded) -> Iterator[Finding]:
@@ -326,13 +302,14 @@ def check_resolution(recorded: Recorded) -> Iterator[Finding]:
         changing = values - np.median(values, axis=0)
         share = float(step / 12**0.5 / max(np.sqrt(np.mean(changing**2)), 1e-12))
         severity: Severity = "error" if share > _LIMITS.rounding_share else "warning"
-        yield Finding(
-            code="coarse-resolution",
-            severity=severity,
-            evidence=f"the {sensor} reads in steps of {step:.3g} {_UNITS[sensor]} "
-            f"({len(np.unique(values[:, 0]))} different values on x)",
-            numbers={"step": step, "rounding_share_of_signal": share},
+        fact = Fact(
+            "coarse-resolution",
+            sensor=sensor,
+            step=step,
+            different_on_x=len(np.unique(values[:, 0])),
+            rounding_share_of_signal=share,
         )
+        yield Finding(fact=fact, severity=severity)
 
 
 def _resolution(values: Array) -> float:
@@ -350,13 +327,7 @@ def check_delay(recorded: Recorded) -> Iterator[Finding]:
         return
     delay_s, correlation = accel_delay_s(imu)
     if abs(delay_s) > _LIMITS.delay_s and correlation > _LIMITS.delay_correlation:
-        yield Finding(
-            code="sensors-offset",
-            severity="error",
-            evidence=f"the accelerometer's stamps are {1e3 * delay_s:+.0f} ms off the gyroscope's: there, gravity "
-            f"turns against the gyroscope with a correlation of {correlation:.2f}",
-            numbers={"delay_s": delay_s, "correlation": correlation},
-        )
+        yield Finding(fact=Fact("sensors-offset", delay_s=delay_s, correlation=correlation), severity="error")
 
 
 def accel_delay_s(imu: ImuRecording) -> tuple[float, float]:

@@ -31,12 +31,15 @@ class Message:
         The sentence by the fact's values.
     advice
         What to do about it, in words or by the values; empty where there is nothing to do.
+    joint
+        What stands between both where they are one sentence.
     example
         Values to show it with.
     """
 
     text: Callable[..., str]
     advice: Callable[..., str] | str = ""
+    joint: Callable[..., str] | str = "; "
     example: Mapping[str, Any] = field(default_factory=dict)
 
     @functools.cached_property
@@ -50,7 +53,11 @@ Text = TypeVar("Text", bound=Callable[..., str])
 
 
 def message(
-    *, advice: Callable[..., str] | str = "", example: Mapping[str, Any] | None = None, code: str = ""
+    *,
+    advice: Callable[..., str] | str = "",
+    joint: Callable[..., str] | str = "; ",
+    example: Mapping[str, Any] | None = None,
+    code: str = "",
 ) -> Callable[[Text], Text]:
     """Register a function as the message of a code, by default that of its name with dashes."""
 
@@ -58,15 +65,15 @@ def message(
         name = code or text.__name__.replace("_", "-")
         if name in _MESSAGES:
             raise ValueError(f"two messages have the code {name}")
-        _MESSAGES[name] = Message(text=text, advice=advice, example=example or {})
+        _MESSAGES[name] = Message(text=text, advice=advice, joint=joint, example=example or {})
         return text
 
     return register
 
 
-def state(code: str, text: str, *, advice: str = "") -> None:
+def state(code: str, text: str, *, advice: str = "", joint: str = "; ") -> None:
     """Register a sentence that has no values."""
-    message(code=code, advice=advice)(lambda: text)
+    message(code=code, advice=advice, joint=joint)(lambda: text)
 
 
 def render(code: str, values: Mapping[str, Any]) -> str:
@@ -78,6 +85,12 @@ def advise(code: str, values: Mapping[str, Any]) -> str:
     """What to do about a fact."""
     advice = _of(code).advice
     return advice if isinstance(advice, str) else advice(**values)
+
+
+def join(code: str, values: Mapping[str, Any]) -> str:
+    """What stands between a fact's sentence and what to do about it."""
+    joint = _of(code).joint
+    return joint if isinstance(joint, str) else joint(**values)
 
 
 def check(code: str, values: Mapping[str, Any]) -> None:

@@ -282,10 +282,9 @@ class ImuCalibration:
         """
         if imu.calibration is not None:
             raise ValueError("the recording was corrected by a calibration before")
-        attitudes = f" in {self.attitudes} attitudes" if self.attitudes else ""
-        repair = f"the IMU's readings were corrected by its calibration{attitudes}"
+        repair = Fact("imu-corrected", attitudes=self.attitudes)
         if self.accel_factor is not None:
-            repair = self.describe_comparison()
+            repair = self.comparison()
         return replace(
             imu,
             gyro_rad_s=imu.gyro_rad_s @ (np.eye(3) + self.gyro_gain).T - self.gyro_bias_rad_s,
@@ -294,12 +293,9 @@ class ImuCalibration:
             repairs=(*imu.repairs, repair),
         )
 
-    def describe_comparison(self) -> str:
-        """What results that were compared with targets say, in words."""
-        return (
-            f"the accelerometer's part of the scale's interval is {self.accel_factor:.2f} of that of unknown devices, "
-            f"by targets (results of this device: {self.compared})"
-        )
+    def comparison(self) -> Fact:
+        """What results that were compared with targets say."""
+        return Fact("imu-compared", accel_factor=self.accel_factor, compared=self.compared)
 
     def uncorrected(self, gyro_rad_s: Array, accel_m_s2: Array) -> tuple[Array, Array]:
         """(N, 3), (M, 3) what the sensors read where these are the true values."""
@@ -325,7 +321,7 @@ class ImuRecording:
     epoch_ns
         The clock's reading, in nanoseconds, where both time bases are zero.
     repairs
-        What the reader had to sort, merge or drop, in words.
+        What the reader had to sort, merge or drop, and what was corrected since.
     device
         What recorded it, where known.
     noise

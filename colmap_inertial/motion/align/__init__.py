@@ -16,6 +16,7 @@ import numpy as np
 from colmap_inertial.core.camera_clock import epoch_shift_s
 from colmap_inertial.core.choices import CheckedOptions
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording
@@ -172,11 +173,10 @@ def _search(
     options = options or AlignOptions()
     prior = prior or calibration_prior()
     if len(trajectory) < 5:
-        raise NotObservableError("time offset", f"{len(trajectory)} poses are too few to compare with the gyroscope")
+        raise NotObservableError("time offset", Fact("poses-too-few", poses=len(trajectory)))
     span_s = float(trajectory.t_s[-1] - trajectory.t_s[0])
     if span_s < _SHORTEST_S:
-        hint = f"{span_s:.2f} s of poses are too short to compare with the gyroscope: record ten seconds or more"
-        raise NotObservableError("time offset", hint)
+        raise NotObservableError("time offset", Fact("poses-too-short", span_s=span_s))
     return _Search(
         path=GyroPath(imu.gyro_t_s, imu.gyro_rad_s, np.zeros(3)),
         offsets_s=_range(trajectory, imu, prior, options),
@@ -224,11 +224,7 @@ class _Search:
                 share=share,
             )
             if not fits:
-                return NotObservableError(
-                    "time offset",
-                    "camera and IMU do not overlap at any offset that is allowed: check that the recordings belong "
-                    "together and that their clocks are what was declared",
-                )
+                return NotObservableError("time offset", Fact("no-overlap"))
             best = fits[0]
             rival = max([0.0, *(fit.log_likelihood for fit in fits[1:])])
             explained = measure_explained_share(spaced, self.path, best.offset_s, held, share)
@@ -236,18 +232,10 @@ class _Search:
                 return best
         seconds = intervals_of(trajectory, _SHORTEST_S)
         if np.sqrt(np.mean(np.sum(seconds.turn_rad**2, axis=1) / seconds.dt_s)) < _STILL_RAD_RTS:
-            hint = "the camera hardly rotates: turn it about all three axes while recording"
-            return NotObservableError("camera-IMU rotation", hint)
-        hint = "the rotations fit almost as well at another offset"
-        hint += ": record longer, with rotation that does not repeat itself"
+            return NotObservableError("camera-IMU rotation", Fact("camera-hardly-rotates"))
         if explained < options.min_explained:
-            hint = (
-                "no time offset fits gyroscope and camera rotations clearly better than the others (the gyroscope "
-                f"explains {100 * max(explained, 0):.0f} % of them): check that this IMU recording belongs to these "
-                "images and that the gyroscope's columns, axes and unit are right, or record longer with rotation "
-                "about all three axes"
-            )
-        return NotObservableError("time offset", hint)
+            return NotObservableError("time offset", Fact("no-offset-fits", explained=explained))
+        return NotObservableError("time offset", Fact("offset-ambiguous"))
 
     def parts(self, trajectory: CameraTrajectory) -> tuple[ClockFit, float] | None:
         """Offset in the middle and clock rate from short parts, if at least two of them agree on a steady drift."""

@@ -10,6 +10,7 @@ from colmap_inertial._kernels import _inertial
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.camera_clock import epoch_shift_s
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import (
     matrix_from_quat,
     quat_conjugate,
@@ -142,7 +143,7 @@ def refine_alignment(
             path, path_bias = GyroPath(imu.gyro_t_s, imu.gyro_rad_s, state.bias), state.bias
         residual, jacobian, dt_s = _residuals(trajectory, path, state, state.bias - path_bias, middle_s)
         if len(residual) < 4:
-            raise NotObservableError("time offset", "fewer than four frame intervals lie inside the IMU recording")
+            raise NotObservableError("time offset", Fact("too-few-intervals"))
         if noise is None:
             spread = float(np.median(np.sum(residual**2, axis=1))) / 2.366 + 1e-14  # median of chi2 with 3 dof
             noise = (0.25 * spread, 0.5 * spread / float(np.median(dt_s)))
@@ -180,14 +181,9 @@ def _require_observable(cov: Array, offset_change_s: float) -> None:
     """Refuse rotations that leave an axis or the offset open."""
     axis_sigma = float(np.sqrt(np.linalg.eigvalsh(cov[_TURN, _TURN])[-1]))
     if axis_sigma > _OPEN_ROTATION_RAD:
-        hint = (
-            f"known to no better than {np.degrees(axis_sigma):.0f} deg about one axis: turn the camera about at least "
-            "two axes while recording"
-        )
-        raise NotObservableError("camera-IMU rotation", hint)
+        raise NotObservableError("camera-IMU rotation", Fact("rotation-axis-open", axis_sigma_rad=axis_sigma))
     if cov[_OFFSET, _OFFSET] > _OPEN_OFFSET_S**2 or abs(offset_change_s) > 0.5:
-        hint = "the rotation is too slow to place the clocks to a tenth of a second: turn the camera more briskly"
-        raise NotObservableError("time offset", hint)
+        raise NotObservableError("time offset", Fact("rotation-too-slow"))
 
 
 def middle_of_overlap(trajectory: CameraTrajectory, imu_t_s: Array, offset_s: float) -> float:

@@ -19,6 +19,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array, IndexArray
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply, quat_normalize
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.threads import one_blas_thread
@@ -54,6 +55,8 @@ class ConsensusLimits:
 
 
 LIMITS = ConsensusLimits()
+#: Codes of refusals where it is open which cameras are right.
+NO_MAJORITY = frozenset({"too-few-cameras-judged", "no-majority-of-cameras"})
 
 
 @one_blas_thread()
@@ -120,15 +123,9 @@ def _require_majority(consensus: RotationConsensus) -> None:
     part = consensus.part[consensus.judged]
     count, placed, largest = len(part), int(np.sum(part >= 0)), int(np.sum(part == 0))
     if count < LIMITS.fewest_judged:
-        hint = f"cameras contradict the gyroscope, and {count} are too few to tell which: record longer"
-    elif 2 * placed <= count or 2 * largest <= placed:
-        hint = (
-            f"the gyroscope agrees with {largest} of {count} cameras at most: check that the IMU recording belongs to "
-            "these images, and that the images are of one place"
-        )
-    else:
-        return
-    raise NotObservableError("camera rotation", hint)
+        raise NotObservableError("camera rotation", Fact("too-few-cameras-judged", judged=count))
+    if 2 * placed <= count or 2 * largest <= placed:
+        raise NotObservableError("camera rotation", Fact("no-majority-of-cameras", largest=largest, judged=count))
 
 
 def describe_consensus(consensus: RotationConsensus) -> tuple[str, ...]:

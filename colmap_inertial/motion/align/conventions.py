@@ -10,12 +10,13 @@ convention is named only where it beats the one that was read as clearly as an a
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.camera_clock import CameraTimedImu, epoch_shift_s
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_multiply, quat_rotate
 from colmap_inertial.core.sampling import subtract_running_mean
 from colmap_inertial.core.threads import one_blas_thread
@@ -125,38 +126,21 @@ class LikelyConvention:
     log_likelihood: float
 
     @property
-    def found(self) -> str:
-        """The convention that fits."""
-        fits = "the IMU fits the camera's motion if"
-        if len(self.written_as) > 1:
-            fits = "the gyroscope fits the camera's rotations if"
-        return f"{fits} {', or '.join(_difference(self.read_as, convention) for convention in self.written_as)}"
+    def fact(self) -> Fact:
+        """The convention that fits, and what to do about it."""
+        ahead = {"log_likelihood": self.log_likelihood} if np.isfinite(self.log_likelihood) else {}
+        written_as = tuple(astuple(convention) for convention in self.written_as)
+        return Fact("pose-convention", read_as=astuple(self.read_as), written_as=written_as, **ahead)
 
     @property
-    def advice(self) -> str:
-        """Advice to the user."""
-        return f"write each pose as {self.read_as}"
+    def reason(self) -> Fact:
+        """The same as a reason against a scale, whose sentence has the advice in it."""
+        return Fact("poses-of-another-convention", found=self.fact)
 
     @property
     def sentence(self) -> str:
         """The convention that fits, and the advice."""
-        return f"{self.found}: {self.advice}"
-
-
-def _difference(read_as: PoseConvention, written_as: PoseConvention) -> str:
-    """Difference between the table and the reading."""
-    differences = []
-    if written_as.rotation != read_as.rotation:
-        differences.append(f"the quaternions are inverted ({written_as.rotation}, not {read_as.rotation})")
-    if written_as.order != read_as.order:
-        differences.append(
-            f"the quaternions are in the order {' '.join(written_as.order)}, not {' '.join(read_as.order)}"
-        )
-    if written_as.position != read_as.position:
-        centre, translation = "the camera's centre", "the translation of camera_from_world"
-        what = (translation, centre) if written_as.position == "translation" else (centre, translation)
-        differences.append(f"the positions are {what[0]}, not {what[1]} (centre = -R' translation)")
-    return " and ".join(differences)
+        return self.fact.with_advice
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from colmap_inertial.core.errors import InertialError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.core.types import CameraImuCalibration, FrameTiming, ImuRecording
 from colmap_inertial.io.calibration import CalibrationFiles, largest_offset_s, read_calibrations, read_for_recording
@@ -50,7 +51,7 @@ class Recording:
     imu: ImuRecording
     timing: FrameTiming
     prior: CameraImuCalibration
-    doubts: tuple[str, ...] = ()
+    doubts: tuple[Fact, ...] = ()
     every: FrameTiming
     max_offset_s: float | None = None
 

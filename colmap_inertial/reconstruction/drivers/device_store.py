@@ -16,6 +16,7 @@ from colmap_inertial.checks.report import require_plotly
 from colmap_inertial.checks.report.imu_calibration import calibration_page
 from colmap_inertial.checks.validate import parse_target
 from colmap_inertial.core.errors import FormatError, InertialError, OutputError, OutputExistsError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import GravityOptions
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import ImuCalibration
@@ -180,7 +181,7 @@ def _read_comparison(path: Path, models: Sequence[Mapping[str, Any]]) -> TargetC
     if model["imu_calibration"] is not None:
         raise FormatError(path, "a calibration of the IMU went into its scale; run it without one (--no-remembered)")
     if doubts := check.get("doubts", () if check["within_tolerance"] else check["reasons"]):  # earlier versions
-        raise FormatError(path, f"its target may not be the stated one: {'; '.join(doubts)}")
+        raise FormatError(path, Fact("target-doubtful", doubts=doubts))
     target = parse_target(check["target"])
     if target.sigma_m is None:
         raise FormatError(

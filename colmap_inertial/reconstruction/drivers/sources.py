@@ -9,6 +9,7 @@ from pathlib import Path
 
 from colmap_inertial.checks.diagnose import diagnose
 from colmap_inertial.core.errors import FormatError, NotObservableError
+from colmap_inertial.core.facts import Fact, as_fact
 from colmap_inertial.core.options import ScaleOptions
 from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate
 from colmap_inertial.inertial.scale import estimate_scale, first_seconds, learn_lever_arm
@@ -82,7 +83,7 @@ class TimedPoses:
     checked: CheckInputs
     shared_clock: bool
     start_s: float | None = None
-    notes: Sequence[str] = ()
+    notes: Sequence[Fact] = ()
 
     @property
     def calibration(self) -> CameraImuCalibration | None:
@@ -131,7 +132,7 @@ def load_source(source: ScaleSource) -> TimedPoses:
     )
 
 
-def read_source(source: ScaleSource) -> tuple[CheckInputs, Sequence[str]]:
+def read_source(source: ScaleSource) -> tuple[CheckInputs, Sequence[Fact]]:
     """Read what there is of poses and the IMU recorded along, with notes; what cannot be read is among the refused.
 
     Raises
@@ -141,7 +142,7 @@ def read_source(source: ScaleSource) -> tuple[CheckInputs, Sequence[str]]:
     """
     path, reader = source.source, TolerantReader()
     trajectory = timing = capture = None
-    notes: Sequence[str] = ()
+    notes: Sequence[Fact] = ()
     if brings_imu(source):
         read_as = INERTIAL_SCALE
         trajectory = reader.attempt(lambda: read_inertial_scale_poses(path))
@@ -156,9 +157,10 @@ def read_source(source: ScaleSource) -> tuple[CheckInputs, Sequence[str]]:
         timing = reader.attempt(lambda: read_frame_times(times, rigs))
         if model is not None and timing is not None:
             placed, known = model, timing
-            trajectory, notes = reader.attempt(lambda: trajectory_from_model(placed, known)) or (None, ())
+            trajectory, left_out = reader.attempt(lambda: trajectory_from_model(placed, known)) or (None, ())
+            notes = tuple(map(as_fact, left_out))
         if is_metric(folder):
-            notes = (*notes, "this model is metric already: a scale of 1 says that it is right")
+            notes = (*notes, Fact("model-metric-already"))
     else:
         read_as = TUM
         trajectory = reader.attempt(lambda: read_tum(path))
@@ -256,7 +258,7 @@ def _refuse_another_convention(recording: TimedPoses, options: AlignOptions, qua
         options=options,
     )
     if likely is not None:
-        raise NotObservableError(quantity, likely.sentence)
+        raise NotObservableError(quantity, likely.reason)
 
 
 def scale_source(
@@ -292,7 +294,7 @@ def scale_source(
     options = dataclasses.replace(options, max_offset_s=limit_s)
     checked = dataclasses.replace(recording.checked, trajectory=trajectory, max_offset_s=limit_s)
     diagnosis = diagnose(measure_recording(checked, silent))
-    doubts = tuple(finding.sentence for finding in diagnosis.stopping)
+    doubts = tuple(finding.reason for finding in diagnosis.stopping)
     if doubts and not force:
         estimate = ScaleEstimate.refused("none", *doubts)
     else:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 import logging
-import math
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,6 +20,7 @@ import numpy as np
 from colmap_inertial.colmap.mapping import map_images
 from colmap_inertial.colmap.sparse import extract_features, image_pairs, match_pairs, verify_again
 from colmap_inertial.core.errors import FormatError, MappingError, NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.core.types import (
     CameraImuCalibration,
@@ -172,7 +172,7 @@ def _check_declared_sign(
     sign = check_sign(rotation, view.motion())
     if sign.right is False:
         raise NotObservableError("the pixels' motion", sign.reason)
-    return view if sign.right else replace(view, sign_doubt=sign.reason)
+    return view if sign.right else replace(view, sign_doubt=str(sign.reason))
 
 
 def survey_parts(timing: FrameTiming) -> list[list[str]]:
@@ -229,7 +229,10 @@ def _calibrate_by_pixels(
     try:
         view = _aligned(rotation.trajectory(), recording, camera, "pixels")
     except NotObservableError as error:
-        return NotObservableError(error.quantity, f"{error.hint} (nor by a small model: {instead_of})")
+        why = Fact(
+            "neither-by-pixels-nor-model", by_pixels=error.why, quantity=instead_of.quantity, by_model=instead_of.why
+        )
+        return NotObservableError(error.quantity, why)
     # what translation does to pixels looks like a bias of the gyroscope
     return replace(view, calibration=replace(view.calibration, gyro_bias_rad_s=recording.prior.gyro_bias_rad_s))
 
@@ -244,8 +247,7 @@ def _aligned(trajectory: CameraTrajectory, recording: Recording, camera: CameraM
     if rotation_rad > _LIMITS.usable_rotation_rad or offset_s > _LIMITS.usable_offset_s:
         raise NotObservableError(
             "camera-IMU calibration",
-            f"before the reconstruction it is known to {math.degrees(rotation_rad):.1f} deg and "
-            f"{1e3 * offset_s:.0f} ms, which is too little: give [calibration] in capture.toml",
+            Fact("calibration-too-loose", rotation_sigma_rad=rotation_rad, offset_sigma_s=offset_s),
         )
     return GyroView(
         imu=recording.imu, timing=recording.timing, calibration=alignment.settled(), camera=camera, source=source

@@ -11,6 +11,7 @@ import numpy as np
 
 from colmap_inertial.checks.diagnose import Diagnosis, FramesInVideo, Recorded, diagnose
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError, TimingError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, FrameTiming
 from colmap_inertial.io.capture import Capture
@@ -75,7 +76,9 @@ def check_imu(raw: RawImu, *, force: bool) -> RawImu:
         if error.code != "gravity-removed":
             raise
         if not force:
-            raise NotObservableError("scale", f"{error} (--force goes on)") from None
+            raise NotObservableError(
+                "scale", Fact("stopped-by-file", path=str(error.path), finding=error.why)
+            ) from None
     return raw
 
 
@@ -165,7 +168,7 @@ def run_preflight(
     *,
     force: bool,
     model: CameraTrajectory | Literal["untimed"] | None = None,
-) -> tuple[str, ...]:
+) -> tuple[Fact, ...]:
     """The checks, written down and told to ``findings``; the doubts of a run that is forced to go on.
 
     Of a ``model``, its poses are checked in place of the images.
@@ -194,22 +197,22 @@ def run_preflight(
     return stop_or_doubt(diagnosis, force=force)
 
 
-def stop_or_doubt(diagnosis: Diagnosis, *, force: bool) -> tuple[str, ...]:
+def stop_or_doubt(diagnosis: Diagnosis, *, force: bool) -> tuple[Fact, ...]:
     """Stop where the recording cannot give metres; when forced to go on, the reasons not to trust them.
 
     Raises
     ------
     NotObservableError
-        With the finding's words.
+        With the finding.
     """
     for finding in diagnosis.findings:
         log.info("%s: %s: %s", finding.severity, finding.code, finding.evidence)
     stopping = diagnosis.stopping
     if stopping and not force:
-        raise NotObservableError("scale", f"{stopping[0].sentence} (--force goes on)")
+        raise NotObservableError("scale", Fact("stopped-by-finding", finding=stopping[0].fact))
     for finding in stopping:
         log.warning("forced to go on: %s", finding.evidence)
-    return tuple(f"{finding.evidence}; forced to go on" for finding in stopping)
+    return tuple(Fact("forced-to-go-on", finding=finding.fact) for finding in stopping)
 
 
 def measure_images(capture: Capture, timing: FrameTiming, progress: Progress) -> VisualRotation | None:

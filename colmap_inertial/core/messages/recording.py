@@ -1,0 +1,296 @@
+"""Words on recordings: repairs of samples and clocks, camera against gyroscope, and why a run stops or is doubted."""
+
+from __future__ import annotations
+
+from math import degrees
+from typing import TYPE_CHECKING
+
+from colmap_inertial.core.messages import message, state
+
+if TYPE_CHECKING:
+    from colmap_inertial.core.facts import Fact
+
+# samples, as they were read
+
+
+@message(example={"file": "imu.csv", "sensor": "gyroscope", "count": 20, "rows": 60})
+def rows_without_sample(file: str, sensor: str, count: int, rows: int) -> str:
+    return f"{file}: {count} of {rows} rows hold no {sensor} sample"
+
+
+@message(example={"file": "imu.csv", "sensor": "gyroscope", "count": 2, "counted": "line", "first": 9})
+def rows_without_value(file: str, sensor: str, count: int, counted: str, first: int) -> str:
+    return f"{file}: dropped {count} {sensor} rows without a value (first: {counted} {first})"
+
+
+@message(example={"file": "imu.csv", "sensor": "gyroscope", "count": 4})
+def rows_sorted(file: str, sensor: str, count: int) -> str:
+    return f"{file}: sorted {count} {sensor} rows that came late"
+
+
+@message(example={"file": "imu.csv", "sensor": "gyroscope", "count": 1})
+def rows_merged(file: str, sensor: str, count: int) -> str:
+    return f"{file}: merged {count} repeated {sensor} rows"
+
+
+@message(example={"file": "imu.csv", "sensor": "gyroscope", "count": 4})
+def rows_averaged(file: str, sensor: str, count: int) -> str:
+    return f"{file}: averaged {count} {sensor} rows that repeat a stamp with other values"
+
+
+@message(example={"file": "imu.csv", "line": 400})
+def last_line_cut_off(file: str, line: int) -> str:
+    return f"{file}: dropped the last line ({line}), which is cut off"
+
+
+@message(example={"file": "imu.csv", "count": 2})
+def comments_passed_over(file: str, count: int) -> str:
+    return f"{file}: passed over {count} lines inside the data that start with #"
+
+
+@message(example={"attitudes": 12})
+def imu_corrected(attitudes: int) -> str:
+    return "the IMU's readings were corrected by its calibration" + (f" in {attitudes} attitudes" if attitudes else "")
+
+
+@message(example={"accel_factor": 0.5, "compared": 4})
+def imu_compared(accel_factor: float, compared: int) -> str:
+    return (
+        f"the accelerometer's part of the scale's interval is {accel_factor:.2f} of that of unknown devices, "
+        f"by targets (results of this device: {compared})"
+    )
+
+
+@message(example={"clock_rate": 2.5e-4})
+def imu_clock_stretched(clock_rate: float) -> str:
+    return (
+        f"the IMU's clock is {-1e6 * clock_rate:+.0f} ppm off the camera's, and either may be wrong (suspect a nominal "
+        "frame rate first); the IMU's stamps were stretched to keep step"
+    )
+
+
+state("model-metric-already", "this model is metric already: a scale of 1 says that it is right")
+
+# camera against gyroscope
+
+
+@message(example={"frames_s": 20.0, "frame_hz": 30.0, "imu_s": 22.0, "imu_hz": 200.0})
+def spans_and_rates(frames_s: float, frame_hz: float, imu_s: float, imu_hz: float) -> str:
+    return f"the frames span {frames_s:.4g} s at {frame_hz:.3g} Hz, the gyroscope {imu_s:.4g} s at {imu_hz:.3g} Hz"
+
+
+@message(example={"poses": 4})
+def poses_too_few(poses: int) -> str:
+    return f"{poses} poses are too few to compare with the gyroscope"
+
+
+@message(advice="record ten seconds or more", joint=": ", example={"span_s": 0.5})
+def poses_too_short(span_s: float) -> str:
+    return f"{span_s:.2f} s of poses are too short to compare with the gyroscope"
+
+
+state("too-few-intervals", "fewer than four frame intervals lie inside the IMU recording")
+state(
+    "no-overlap",
+    "camera and IMU do not overlap at any offset that is allowed",
+    advice="check that the recordings belong together and that their clocks are what was declared",
+    joint=": ",
+)
+state(
+    "camera-hardly-rotates",
+    "the camera hardly rotates",
+    advice="turn it about all three axes while recording",
+    joint=": ",
+)
+state(
+    "offset-ambiguous",
+    "the rotations fit almost as well at another offset",
+    advice="record longer, with rotation that does not repeat itself",
+    joint=": ",
+)
+
+
+@message(
+    advice="check that this IMU recording belongs to these images and that the gyroscope's columns, axes and unit are "
+    "right, or record longer with rotation about all three axes",
+    joint=": ",
+    example={"explained": 0.2},
+)
+def no_offset_fits(explained: float) -> str:
+    return (
+        "no time offset fits gyroscope and camera rotations clearly better than the others (the gyroscope explains "
+        f"{100 * max(explained, 0):.0f} % of them)"
+    )
+
+
+@message(advice="turn the camera about at least two axes while recording", joint=": ", example={"axis_sigma_rad": 0.5})
+def rotation_axis_open(axis_sigma_rad: float) -> str:
+    return f"known to no better than {degrees(axis_sigma_rad):.0f} deg about one axis"
+
+
+state(
+    "rotation-too-slow",
+    "the rotation is too slow to place the clocks to a tenth of a second",
+    advice="turn the camera more briskly",
+    joint=": ",
+)
+
+
+@message(advice="record longer", joint=": ", example={"judged": 5})
+def too_few_cameras_judged(judged: int) -> str:
+    return f"cameras contradict the gyroscope, and {judged} are too few to tell which"
+
+
+@message(
+    advice="check that the IMU recording belongs to these images, and that the images are of one place",
+    joint=": ",
+    example={"largest": 20, "judged": 60},
+)
+def no_majority_of_cameras(largest: int, judged: int) -> str:
+    return f"the gyroscope agrees with {largest} of {judged} cameras at most"
+
+
+# the pixels' motion
+
+state(
+    "too-few-corners-shared",
+    "consecutive frames share too few corners to follow the camera's rotation",
+    advice="film at a higher frame rate, or where there is more texture",
+    joint=": ",
+)
+state("too-few-pairs-of-frames", "too few pairs of frames to compare with the gyroscope")
+state("camera-hardly-turned", "the camera hardly turned between frames")
+
+
+@message(example={"explained": 0.4, "flipped": ("x",)})
+def rotation_explained(explained: float, flipped: tuple[str, ...] = ()) -> str:
+    said = f"the gyroscope explains {100 * max(explained, 0):.0f} % of the rotation between frames"
+    if flipped:
+        said += f"; the camera's {' and '.join(flipped)} axis turns the other way: check the axes"
+    return said
+
+
+state("frames-too-sparse", "too few frames close in time to tell stabilisation")
+state("gyroscope-elsewhere", "the gyroscope does not run along with the frames")
+state("camera-held-still", "the camera was held too still to tell whether the video is stabilised")
+
+
+@message(example={"share": 0.95})
+def quick_rotation_shown(share: float) -> str:
+    return f"the pictures show {100 * share:.0f} % of the quick rotation that the gyroscope measured"
+
+
+@message(advice="switch stabilisation off and record again", example={"share": 0.2})
+def pictures_stabilised(share: float) -> str:
+    return (
+        f"{quick_rotation_shown(share)}: the video was stabilised in the camera, so its gyroscope does not belong to "
+        "its pixels"
+    )
+
+
+@message(example={"pairs": 12})
+def sign_open(pairs: int) -> str:
+    return f"{pairs} pairs of frames do not tell whether the gyroscope has the right sign"
+
+
+state("neither-sign", "the pictures turn neither as the gyroscope does nor the other way")
+state("sign-right", "the pictures turn as the gyroscope does")
+state(
+    "sign-wrong",
+    "the pictures turn the other way than the gyroscope: its axes have the wrong sign",
+    advice="check axes and rotation of [calibration] in capture.toml",
+)
+
+
+@message(
+    advice="give [calibration] in capture.toml", joint=": ", example={"rotation_sigma_rad": 0.2, "offset_sigma_s": 0.05}
+)
+def calibration_too_loose(rotation_sigma_rad: float, offset_sigma_s: float) -> str:
+    return (
+        f"before the reconstruction it is known to {degrees(rotation_sigma_rad):.1f} deg and "
+        f"{1e3 * offset_sigma_s:.0f} ms, which is too little"
+    )
+
+
+@message(
+    example={
+        "by_pixels": {"code": "camera-hardly-rotates", "values": {}},
+        "quantity": "time offset",
+        "by_model": {"code": "poses-too-few", "values": {"poses": 3}},
+    }
+)
+def neither_by_pixels_nor_model(by_pixels: Fact, quantity: str, by_model: Fact) -> str:
+    return f"{by_pixels.with_advice} (nor by a small model: {quantity} is not observable: {by_model.with_advice})"
+
+
+# the readout
+
+
+@message(advice="turn the camera quickly to and fro for some seconds", joint=": ", example={"readout_sigma_s": 0.004})
+def readout_too_loose(readout_sigma_s: float) -> str:
+    return f"the pictures tell the readout to +-{1e3 * readout_sigma_s:.1f} ms only"
+
+
+state(
+    "readout-not-of-lines",
+    "what bends the pictures runs neither along nor across their lines: they were warped, turned or stabilised",
+)
+
+
+@message(advice="film two seconds or more of texture", joint=": ", example={"corners": 300, "pairs": 10})
+def readout_of_few_corners(corners: int, pairs: int) -> str:
+    return f"{corners} corners in {pairs} pairs of frames are too few"
+
+
+@message(advice="turn the camera quickly to and fro for some seconds", joint=": ", example={"change_rad_s": 0.01})
+def readout_of_even_rotation(change_rad_s: float) -> str:
+    return f"the camera's rate changes by {change_rad_s:.2g} rad/s from frame to frame, which is too little to tell it"
+
+
+state("readout-of-sparse-pictures", "pictures that are this far apart in time do not tell it; a video does")
+state("readout-without-gyroscope", "a video and its gyroscope would tell, where they fit each other")
+state("readout-of-stabilised-video", "a stabilised video tells nothing of it")
+
+# stops and doubts
+
+
+_POSES = {
+    "code": "pose-convention",
+    "values": {
+        "read_as": ("world_from_camera", "xyzw", "centre"),
+        "written_as": (("camera_from_world", "xyzw", "centre"),),
+    },
+}
+
+
+@message(example={"found": _POSES})
+def poses_of_another_convention(found: Fact) -> str:
+    return found.with_advice
+
+
+_FOUND = {"code": "gyro-gain", "values": {"gain": 1.3}}
+
+
+@message(example={"finding": _FOUND})
+def found_beforehand(finding: Fact) -> str:
+    return f"{finding}; {finding.advice} ({finding.code})"
+
+
+@message(example={"finding": _FOUND})
+def stopped_by_finding(finding: Fact) -> str:
+    return f"{finding}; {finding.advice} ({finding.code}) (--force goes on)"
+
+
+@message(example={"path": "accel.csv", "finding": {"code": "gravity-removed", "values": {"median_m_s2": 0.5}}})
+def stopped_by_file(path: str, finding: Fact) -> str:
+    return f"{path}: {finding.with_advice} (--force goes on)"
+
+
+@message(example={"finding": _FOUND})
+def forced_to_go_on(finding: Fact) -> str:
+    return f"{finding}; forced to go on"
+
+
+@message(example={"doubts": ("its squares measure 3 % off",)})
+def target_doubtful(doubts: tuple[str, ...]) -> str:
+    return f"its target may not be the stated one: {'; '.join(doubts)}"
