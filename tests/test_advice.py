@@ -11,9 +11,11 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
 from study_diagnose import LENS, pictures, simulated
 
-from colmap_inertial.checks.diagnose import Finding, Recorded, diagnose
-from colmap_inertial.checks.diagnose.advice import ADVICE
+from colmap_inertial.checks.diagnose import Finding, Recorded, diagnose, unreadable
 from colmap_inertial.checks.words import not_checked, outcome_of_model
+from colmap_inertial.core.errors import FormatError, TimingError
+from colmap_inertial.core.facts import Fact
+from colmap_inertial.core.messages import all_messages
 from colmap_inertial.core.types import ImuRecording
 from colmap_inertial.motion.flow import VisualRotation
 
@@ -32,23 +34,51 @@ REFUSED = {
 def test_every_finding_of_the_documentation_has_advice_and_the_other_way_round():
     text = (ROOT / "docs/troubleshooting.md").read_text(encoding="utf-8").split("## Findings of diagnose")[1]
     told = {code for row in re.findall(r"^\| (`.*?) \|", text, re.M) for code in re.findall(r"`([a-z-]+)`", row)}
-    assert set(ADVICE) == told
-    assert all(isinstance(text, str) and text for text in ADVICE.values())
+    known = all_messages()
+    assert {code for code in told if not Fact(code, **known[code].example).advice} == set()
+    assert {code for code, of in known.items() if of.text.__module__.endswith(".findings")} <= told
 
 
-def test_a_finding_without_words_of_its_own_takes_its_advice_from_the_table():
-    finding = Finding(code="clock-offset", severity="error", evidence="apart")
-    assert finding.advice == ADVICE["clock-offset"] == finding.as_json()["advice"]
-    assert finding.sentence == f"apart; {finding.advice} (clock-offset)"
-    assert Finding(code="clock-offset", severity="error", evidence="apart", advice="this").advice == "this"
-    assert Finding(code="of-a-reader", severity="error", evidence="x").advice == ADVICE["unreadable"]
+def test_a_finding_has_code_words_numbers_and_advice_of_its_fact():
+    fact = Fact("clock-offset", offset_s=2.5, max_offset_s=1.0, clocks=None)
+    finding = Finding(fact=fact, severity="error")
+    assert (finding.code, finding.evidence, finding.advice) == ("clock-offset", str(fact), fact.advice)
+    assert finding.sentence == f"{fact}; {fact.advice} (clock-offset)" == str(finding.reason)
+    assert finding.numbers == {"offset_s": 2.5, "max_offset_s": 1.0}
+    written = finding.as_json()
+    assert written["evidence_details"] == fact.as_json()
+    assert {name: written[name] for name in ("code", "severity", "evidence", "advice")} == {
+        "code": "clock-offset",
+        "severity": "error",
+        "evidence": str(fact),
+        "advice": fact.advice,
+    }
+
+
+def test_advice_goes_by_the_values_of_what_was_found():
+    both, alone = Fact("gyro-mirrored"), Fact("gyro-mirrored", gyro=("-x,y,z", True))
+    assert "both sensors" in both.advice
+    assert alone.advice.startswith('set axes = "-x,y,z" and mirrored = true under [imu.gyro]')
+    assert "a global shutter" in Fact("readout-unknown", why=Fact("readout-without-gyroscope")).advice
+    measured = Fact("readout-unknown", readout_s=0.02, readout_sigma_s=0.001, direction="up", pairs=40)
+    assert 'readout_s = 0.0200 and readout_direction = "up"' in measured.advice
+
+
+def test_what_cannot_be_read_is_a_finding_with_the_words_of_its_error():
+    told = unreadable(FormatError("imu.csv", "holds no rows", line=3))
+    assert (told.code, told.evidence) == ("unreadable", "imu.csv, line 3: holds no rows")
+    assert unreadable(TimingError("frames.csv has no header")).code == "untimed"
+    fact = Fact("stamps-reversed", path="imu.csv", sensor="gyroscope")
+    stamps = TimingError(fact, shown=str(fact))
+    assert unreadable(stamps).fact == fact and str(stamps) == str(fact)
 
 
 def test_a_refusal_repeats_what_was_found_and_never_says_to_film_again_where_the_recording_was_fine():
-    finding = Finding(code="gyro-mirrored", severity="error", evidence="it is mirrored").as_json()
+    mirrored = Fact("gyro-mirrored")
+    finding = Finding(fact=mirrored, severity="error").as_json()
     told = outcome_of_model({**REFUSED, "signals": {"alignment": "failed"}, "findings": [finding]})
-    assert any("gyro-mirrored" in text and "it is mirrored" in text for text in told["summary"])
-    assert told["todo"][0].lower().startswith(ADVICE["gyro-mirrored"])
+    assert any("gyro-mirrored" in text and str(mirrored) in text for text in told["summary"])
+    assert told["todo"][0].lower().startswith(mirrored.advice.lower())
     assert not any("Film again" in text or "Record the raw" in text for text in told["todo"])
     lively = {"alignment": "done", "acceleration": {"rms_accelerometer_m_s2": 1.4}}
     assert not any("Film again" in text for text in outcome_of_model({**REFUSED, "signals": lively})["todo"])

@@ -12,6 +12,7 @@ import pytest
 
 from colmap_inertial import calibrate_imu, estimate_scale, gravity_at_latitude_m_s2
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import IMU_CAL, IMU_CALIBRATION_PARAMETERS, ImuCalibration, ImuRecording
 from colmap_inertial.inertial.static_calibration import _judged, _residual
 from colmap_inertial.inertial.static_calibration._rests import _means, candidate_rests
@@ -91,7 +92,7 @@ def test_a_phone_is_found_out_and_its_readings_become_true():
     np.testing.assert_allclose(calibration.gyro_gain, truth.gyro_gain, atol=2e-3)
     corrected = calibration.corrected(truth.recording)
     assert corrected.calibration is calibration
-    assert "12 attitudes" in corrected.repairs[-1]
+    assert corrected.repairs[-1] == Fact("imu-corrected", attitudes=12)
     for rest, up in zip(range(12), truth.up_in_imu, strict=True):
         inside = slice(*np.searchsorted(corrected.accel_t_s, [found.rests.begin_s[rest], found.rests.end_s[rest]]))
         np.testing.assert_allclose(corrected.accel_m_s2[inside].mean(axis=0), 9.81 * up, atol=0.01)

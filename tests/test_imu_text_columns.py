@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from colmap_inertial.core.errors import FormatError, TimingError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.io import imu_text
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.io.tables import parse_table
@@ -65,7 +66,8 @@ def test_a_table_has_its_header_numbers_and_lines(subtests):
             assert table.numbers([0, 2]).tolist() == [[1, 3], [4, 6], [7, 9]]
             # a comment, and a last line that was cut off
             passed, cut = table.repairs
-            assert "passed over 1 lines" in passed and "last line (7)" in cut
+            assert passed == Fact("comments-passed-over", file="a.csv", count=1)
+            assert cut == Fact("last-line-cut-off", file="a.csv", line=7)
             assert (table.column(1), table.column(3), table.column("y")) == (0, 2, 2)
             for name, said in (
                 (0, "no column 0: columns count from 1 to 3"),

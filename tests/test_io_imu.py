@@ -8,6 +8,7 @@ import pytest
 from cases import loop_over
 
 from colmap_inertial.core.errors import FormatError, TimingError
+from colmap_inertial.core.facts import Fact, sentences
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.io.units import stamps_ns as stamps_of_text
 
@@ -121,7 +122,7 @@ def test_sensors_of_two_rates_in_one_table_keep_their_own_times(tmp_path: Path) 
     imu = read_imu(write_csv(tmp_path / "mixed.csv", lines))
     assert (len(imu.gyro_t_s), len(imu.accel_t_s)) == (40, 20)
     np.testing.assert_array_equal(imu.accel_m_s2, accel[::3])
-    assert imu.repairs == (
+    assert sentences(imu.repairs) == (
         "mixed.csv: 20 of 60 rows hold no gyroscope sample",
         "mixed.csv: 40 of 60 rows hold no accelerometer sample",
     )
@@ -176,7 +177,7 @@ def test_a_cut_off_last_line_is_dropped_and_listed(clean: tuple[Path, list[str]]
         path.write_text(text.rstrip()[:-cut])
         imu = read_imu(path)
         assert len(imu.gyro_t_s) == 399
-        assert any("cut off" in repair for repair in imu.repairs)
+        assert [repair.code for repair in imu.repairs] == ["last-line-cut-off"]
 
 
 def test_small_disorder_is_sorted_and_listed(clean: tuple[Path, list[str]]) -> None:
@@ -184,14 +185,14 @@ def test_small_disorder_is_sorted_and_listed(clean: tuple[Path, list[str]]) -> N
     lines[100:104] = lines[100:104][::-1]
     imu = read_imu(write_csv(path, lines))
     np.testing.assert_array_equal(imu.gyro_rad_s, handheld()[1])
-    assert any("sorted" in repair for repair in imu.repairs)
+    assert {repair.code for repair in imu.repairs} == {"rows-sorted"}
 
 
 def test_repeated_rows_are_merged_and_listed(clean: tuple[Path, list[str]]) -> None:
     path, lines = clean
     imu = read_imu(write_csv(path, lines[:50] + lines[49:52] + lines[50:]))
     np.testing.assert_array_equal(imu.gyro_rad_s, handheld()[1])
-    assert any("repeated" in repair for repair in imu.repairs)
+    assert {repair.code for repair in imu.repairs} == {"rows-merged"}
 
 
 def test_rows_of_one_stamp_become_their_average(tmp_path: Path) -> None:
@@ -214,8 +215,8 @@ def test_rows_of_one_stamp_become_their_average(tmp_path: Path) -> None:
     assert imu.accel_m_s2[200, 0] == pytest.approx(1.0)
     others = np.setdiff1d(np.arange(400), list(same))
     np.testing.assert_array_equal(imu.gyro_rad_s[others], handheld()[1][others])
-    assert "imu.csv: averaged 4 gyroscope rows that repeat a stamp with other values" in imu.repairs
-    assert "imu.csv: merged 1 repeated gyroscope rows" in imu.repairs
+    assert Fact("rows-averaged", file="imu.csv", sensor="gyroscope", count=4) in imu.repairs
+    assert Fact("rows-merged", file="imu.csv", sensor="gyroscope", count=1) in imu.repairs
 
 
 def test_rows_without_a_value_are_dropped_and_listed(clean: tuple[Path, list[str]]) -> None:
@@ -224,7 +225,7 @@ def test_rows_without_a_value_are_dropped_and_listed(clean: tuple[Path, list[str
     lines[7] = ",".join([*cells[:2], "nan", *cells[3:]])
     imu = read_imu(write_csv(path, lines))
     assert (len(imu.gyro_t_s), len(imu.accel_t_s)) == (399, 400)
-    assert any("line 9" in repair for repair in imu.repairs)
+    assert [(repair.code, repair.values["first"]) for repair in imu.repairs] == [("rows-without-value", 9)]
 
 
 @loop_over(

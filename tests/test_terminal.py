@@ -15,17 +15,19 @@ from colmap_inertial.checks.diagnose import Diagnosis, Finding
 from colmap_inertial.cli import main
 from colmap_inertial.cli.screen import Screen, Stage
 from colmap_inertial.cli.terminal import show_scale
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import ScaleEstimate
 from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, simulate_recording
 
 GLIDES = Finding(
-    code="no-acceleration",
+    fact=Fact("no-acceleration", acceleration_rms_m_s2=0.02, turning_rms_rad_s=0.5),
     severity="error",
-    evidence="it turns by 0.50 rad/s, but stays in place or glides [at 3 s]",
-    advice="swing it back and forth by 20 cm or more while it sees texture",
 )
-CUT = Finding(code="saturated", severity="warning", evidence="2 % of readings are cut", advice="use a wider range")
-TOLD = Finding(code="device", severity="info", evidence="a phone", advice="nothing")
+CUT = Finding(
+    fact=Fact("saturated", sensor="gyroscope", samples=80, of=4000, axes="x", counts=(80,), share=0.02),
+    severity="warning",
+)
+TOLD = Finding(fact=Fact("pictures-too-few", pairs=3), severity="info")
 
 
 def run(capsys, *args):
@@ -59,7 +61,7 @@ def test_errors_and_warnings_of_the_check_beforehand_stand_there_whole(width):
     said = " ".join(text.split())
     for finding in (GLIDES, CUT):
         assert f"{finding.severity}: {finding.evidence}; {finding.advice} ({finding.code})" in said
-    assert "a phone" not in said and "Ctrl-C ends the run" in said
+    assert "only 3 pairs" not in said and "Ctrl-C ends the run" in said
     assert len(lines) == 3 if width is None else max(map(len, lines)) <= width
 
 
@@ -79,19 +81,14 @@ def test_what_the_check_beforehand_finds_is_said_before_the_work(still, tmp_path
 
 @pytest.mark.parametrize("width", [80, 140, None], ids=["80", "140", "piped"])
 def test_a_finding_that_stops_the_run_is_left_to_the_error(width):
-    stops = Finding(
-        code="stabilised",
-        severity="error",
-        evidence="the video is stabilised",
-        advice="film without it",
-    )
+    stops = Finding(fact=Fact("stabilised", share=0.2), severity="error")
     screen, file = screen_of(width)
     screen.findings(Diagnosis(findings=(stops, CUT)), stops=True)
     said = " ".join(file.getvalue().split())
     assert "saturated" in said and "stabilised" not in said and "Ctrl-C" not in said
     screen, file = screen_of(width)
     screen.findings(Diagnosis(findings=(stops, CUT)))
-    assert "the video is stabilised" in " ".join(file.getvalue().split())
+    assert stops.evidence in " ".join(file.getvalue().split())
 
 
 def test_a_pipe_has_a_line_for_each_stage_and_few_of_how_far_it_is():
