@@ -10,7 +10,7 @@ import errno
 from pathlib import Path
 from typing import ClassVar
 
-from colmap_inertial.core.facts import Fact
+from colmap_inertial.core.facts import Fact, as_fact
 
 #: Libraries that open3d and pycolmap-cuda12 take from the system, and their packages on Debian.
 _SYSTEM_LIBRARIES = {
@@ -44,6 +44,13 @@ class InertialError(Exception):
         self.fact = message if isinstance(message, Fact) else None
         self.code = code or (self.default_code if self.fact is None else self.fact.code)
         super().__init__(shown or in_words(message))
+
+
+def fact_of(error: InertialError) -> Fact:
+    """An error as a fact, whose message is that of the error."""
+    if isinstance(error, NotObservableError):
+        return Fact("not-observable", quantity=error.quantity, why=error.why, sigma=error.sigma)
+    return as_fact(error.fact if error.fact is not None and str(error) == str(error.fact) else str(error))
 
 
 def in_words(message: Fact | str) -> str:
@@ -146,6 +153,7 @@ class NotObservableError(InertialError):
 
     def __init__(self, quantity: str, hint: Fact | str, *, sigma: float | None = None) -> None:
         self.quantity = quantity
+        self.why = as_fact(hint)
         self.hint = in_words(hint)
         self.sigma = sigma
         spread = "" if sigma is None else f" (standard deviation {100 * sigma:.1f} %)"

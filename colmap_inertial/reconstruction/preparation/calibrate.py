@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 import logging
-import math
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +19,8 @@ import numpy as np
 
 from colmap_inertial.colmap.mapping import map_images
 from colmap_inertial.colmap.sparse import extract_features, image_pairs, match_pairs, verify_again
-from colmap_inertial.core.errors import FormatError, MappingError, NotObservableError
+from colmap_inertial.core.errors import FormatError, MappingError, NotObservableError, fact_of
+from colmap_inertial.core.facts import Fact, as_fact
 from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.core.types import (
     CameraImuCalibration,
@@ -131,7 +131,7 @@ def estimate_preliminary_calibration(recording: Recording, context: RunContext) 
     view: GyroView | NotObservableError
     models: tuple[pycolmap.Reconstruction, ...] = ()
     if declared:
-        notes = () if capture.camera is not None else (f"the focal length was guessed: {camera.params[0]:.0f} px",)
+        notes = () if capture.camera is not None else (Fact("focal-length-guessed", focal_px=camera.params[0]),)
         view = GyroView(
             imu=recording.imu, timing=timing, calibration=recording.prior, camera=camera, source="capture", notes=notes
         )
@@ -172,7 +172,7 @@ def _check_declared_sign(
     sign = check_sign(rotation, view.motion())
     if sign.right is False:
         raise NotObservableError("the pixels' motion", sign.reason)
-    return view if sign.right else replace(view, sign_doubt=sign.reason)
+    return view if sign.right else replace(view, sign_doubt=as_fact(sign.reason))
 
 
 def survey_parts(timing: FrameTiming) -> list[list[str]]:
@@ -229,7 +229,7 @@ def _calibrate_by_pixels(
     try:
         view = _aligned(rotation.trajectory(), recording, camera, "pixels")
     except NotObservableError as error:
-        return NotObservableError(error.quantity, f"{error.hint} (nor by a small model: {instead_of})")
+        return NotObservableError(error.quantity, Fact("nor-by-small-model", why=error.why, model=fact_of(instead_of)))
     # what translation does to pixels looks like a bias of the gyroscope
     return replace(view, calibration=replace(view.calibration, gyro_bias_rad_s=recording.prior.gyro_bias_rad_s))
 
@@ -244,8 +244,7 @@ def _aligned(trajectory: CameraTrajectory, recording: Recording, camera: CameraM
     if rotation_rad > _LIMITS.usable_rotation_rad or offset_s > _LIMITS.usable_offset_s:
         raise NotObservableError(
             "camera-IMU calibration",
-            f"before the reconstruction it is known to {math.degrees(rotation_rad):.1f} deg and "
-            f"{1e3 * offset_s:.0f} ms, which is too little: give [calibration] in capture.toml",
+            Fact("preliminary-calibration-unsure", rotation_rad=rotation_rad, offset_s=offset_s),
         )
     return GyroView(
         imu=recording.imu, timing=recording.timing, calibration=alignment.settled(), camera=camera, source=source
@@ -281,7 +280,7 @@ def _calibrate_by_model(
                 trajectory, _ = trajectory_from_model(models[0], timing, covariances=False)
                 view = _aligned(trajectory, recording, _camera_of(models[0]), "model")
         except (MappingError, FormatError) as error:
-            return view or NotObservableError("camera-IMU calibration", str(error)), ()
+            return view or NotObservableError("camera-IMU calibration", fact_of(error)), ()
         except NotObservableError as error:
             return view or error, ()
     assert view is not None
