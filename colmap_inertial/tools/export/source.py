@@ -12,6 +12,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, UInt8Array
 from colmap_inertial.core.errors import FormatError, NotObservableError
+from colmap_inertial.core.facts import Fact, sentences
 from colmap_inertial.core.options import ExportImages
 from colmap_inertial.core.types import DOWN_IN_WORLD, Action, CameraMotion, CameraTrajectory
 from colmap_inertial.inertial.georeference import Georeference
@@ -189,7 +190,7 @@ def read_source(
     with explaining_losses(Workspace(out)):
         source = find_source(out, model, images=image_folder)
         if source.scale.unit != "m" and not unscaled:
-            why = "; ".join(source.scale.reasons) or "this model was never given one"
+            why = "; ".join(sentences(source.scale.reasons or (Fact("never-scaled"),)))
             raise NotObservableError("scale", f"{why}; --unscaled exports it in its own units")
         reconstruction = read_model(source.folder)
         down, motion = source.down_in_world, None
@@ -350,7 +351,7 @@ class ExportContent:
     rgb: UInt8Array
     on_map: Georeference | None = None
     pictures: Mapping[str, Picture] = field(default_factory=dict)
-    notes: list[str]
+    notes: list[Fact]
 
     @classmethod
     def of(cls, source: ExportSource, on_map: Georeference | None, *, square: bool) -> ExportContent:
@@ -390,7 +391,7 @@ class ExportContent:
         return _Z_UP if self.source.up_in_world is None else self.source.up_in_world
 
 
-def _notes_on_model(source: ExportSource) -> list[str]:
+def _notes_on_model(source: ExportSource) -> list[Fact]:
     """Notes for the user on the model."""
     notes = []
     if source.found.scale.unit != "m":
@@ -398,5 +399,5 @@ def _notes_on_model(source: ExportSource) -> list[str]:
     if source.up_in_world is None:
         notes.append(NO_UP)
     elif float(source.up_in_world @ _Z_UP) < 0.9:
-        notes.append("up is not z in this model (up_in_world says what it is), while most trainers' viewers take z")
+        notes.append(Fact("up-is-not-z"))
     return notes

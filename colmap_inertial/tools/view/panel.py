@@ -47,7 +47,7 @@ def scale_text(scene: Scene) -> str:
         lines.append("**Metres**, as the user gave the scale; its uncertainty is not known.")
     if scale.unit == "m" and scale.metres_per_unit is not None:
         lines.append(f"{scale.metres_per_unit:.5g} m per unit of the original model")
-    lines += [f"- {_plain(reason)}" for reason in scale.reasons]
+    lines += [f"- {_plain(str(reason))}" for reason in scale.reasons]
     if not scene.gravity_known:
         lines.append("Gravity is not known: up is where the images' upper edges point on average.")
     return "\n\n".join(lines)
@@ -65,8 +65,8 @@ def contents_text(scene: Scene) -> str:
     if scene.path_percent is not None:
         most = float(np.abs(scene.path_percent).max(initial=0.0))
         lines.append(f"Along the path, red was stretched by the refinement and blue shortened, by up to {most:.2g} %.")
-    if scene.mesh_note:
-        lines.append(_plain(scene.mesh_note))
+    if scene.mesh_note is not None:
+        lines.append(_plain(str(scene.mesh_note)))
     return "\n\n".join(lines)
 
 
