@@ -49,7 +49,7 @@ class InertialError(Exception):
 def fact_of(error: InertialError) -> Fact:
     """An error as a fact, whose message is that of the error."""
     if isinstance(error, NotObservableError):
-        return Fact("not-observable", quantity=error.quantity, why=error.why, sigma=error.sigma)
+        return Fact("quantity-not-observable", quantity=error.quantity, why=error.why, sigma=error.sigma)
     return as_fact(error.fact if error.fact is not None and str(error) == str(error.fact) else str(error))
 
 
@@ -146,6 +146,11 @@ class NotObservableError(InertialError):
         Why, and what to record instead.
     sigma
         Relative standard deviation, where one was computed.
+
+    Attributes
+    ----------
+    why
+        The hint as a fact.
     """
 
     exit_code = 3

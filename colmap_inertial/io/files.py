@@ -409,17 +409,6 @@ def without_sentences(values: Any) -> Any:
     }
 
 
-def read_facts(fields: Mapping[str, Any], key: str) -> tuple[Fact, ...]:
-    """The facts of a JSON object under a key, by their codes; of an earlier version's, their words.
-
-    Raises
-    ------
-    LookupError, TypeError
-        Where they are none.
-    """
-    return tuple(_structure_fact(item, None) for item in fields.get(key + DETAILS, fields.get(key, ())))
-
-
 def _structure_fact(value: Any, _: Any) -> Fact:
     """A fact by its code and values; of an earlier version's record, its words."""
     return Fact.stated(value) if isinstance(value, str) else Fact(value["code"], **value["values"])

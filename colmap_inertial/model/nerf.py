@@ -13,11 +13,10 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.core.facts import Fact, with_sentences
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import DOWN_IN_WORLD, UNDOES, Similarity
-from colmap_inertial.io.files import read_facts, read_json
+from colmap_inertial.io.files import read_json
 from colmap_inertial.model.database import PlacedModel
 
 _MATRICES = ("transform_matrix", "transform_matrix_start", "transform_matrix_end")
@@ -26,12 +25,10 @@ EXPORT_FORMAT = "colmap-inertial export"
 _METRES = re.compile(r"(?:(\d\S*) )?m")
 #: What it says where there is no scale, and no gravity, until a similarity brings them.
 NOT_METRES = "unknown: not metres"
-NO_SCALE = Fact("units-not-metres")
-NO_UP = Fact("up-taken-for-z")
+NO_SCALE = "the scale was refused: units are not metres, and nothing here says how large anything is"
+NO_UP = "the direction of gravity is not known: up is only taken for z"
 #: What it said before a similarity made it metres, and in that the provenance of this one.
 _BEFORE, _BY = "before_apply", "provenance"
-#: What is said anew.
-_REPLACED = ("unit", "up_in_world", "scale", "notes", "notes_details")
 _DIRECTIONS = ("up_in_world", "gravity_in_world_m_s2")
 
 
@@ -152,7 +149,7 @@ def transform_export(source: Path, target: Path, similarity: Similarity) -> tupl
         values |= {name: value for name, value in before_apply.items() if name != _BY}
         changed.append("unit")
     elif values.get("unit") == NOT_METRES and not similarity.provenance.startswith(UNDOES):
-        values |= _describe_metres(source, values, similarity)
+        values |= _describe_metres(values, similarity)
         changed.append("unit")
     elif metres is not None and similarity.scale != 1:
         try:
@@ -165,17 +162,13 @@ def transform_export(source: Path, target: Path, similarity: Similarity) -> tupl
     return tuple(dict.fromkeys(changed))
 
 
-def _describe_metres(source: Path, values: Mapping[str, Any], similarity: Similarity) -> dict[str, Any]:
+def _describe_metres(values: Mapping[str, Any], similarity: Similarity) -> dict[str, Any]:
     """Unit of an export that a similarity made metric, in words."""
     up = values.get("up_in_world")
     up = _up(similarity) if up is None else up
     sigma = math.sqrt(similarity.cov[0, 0])
     factor = math.exp(Z95 * sigma)
-    solved = {NO_SCALE} if up is None else {NO_SCALE, NO_UP}
-    try:
-        notes = [note for note in read_facts(values, "notes") if note not in solved]
-    except (LookupError, TypeError):
-        raise FormatError(source, "holds notes that no export of ours writes; leave it out with --keep") from None
+    notes = [note for note in values.get("notes", []) if note != NO_SCALE and (up is None or note != NO_UP)]
     return {
         "unit": "m",
         "up_in_world": up,
@@ -185,15 +178,10 @@ def _describe_metres(source: Path, values: Mapping[str, Any], similarity: Simila
             "metres_per_unit": similarity.scale,
             "relative_ci95": [1 / factor, factor] if sigma > 0 else None,
         },
-        **({"notes_details": []} if "notes_details" in values else {}),
-        **with_sentences({"notes": notes}),
+        "notes": notes,
         _BEFORE: {
             _BY: similarity.provenance,
-            **{
-                name: values[name]
-                for name in ("unit", "up_in_world", "scale", "notes", "notes_details")
-                if name in values
-            },
+            **{name: values[name] for name in ("unit", "up_in_world", "scale", "notes") if name in values},
         },
     }
 

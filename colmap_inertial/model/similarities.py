@@ -10,14 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from colmap_inertial.core.arrays import set_fields
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError
-from colmap_inertial.core.facts import Fact, as_fact, with_sentences
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_from_matrix
 from colmap_inertial.core.options import WorldAxes
 from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.types import UNDOES, ScaleEstimate, Similarity
-from colmap_inertial.io.files import StrPath, read_facts, read_json, reader, reading
+from colmap_inertial.io.files import StrPath, read_json, reader, reading
 from colmap_inertial.model import similarity_as_json
 
 
@@ -40,20 +38,16 @@ class ModelScale:
 
     similarity: Similarity | None
     verdict: str | None = None
-    reasons: tuple[Fact, ...] = ()
+    reasons: tuple[str, ...] = ()
     joined_of: tuple[int, ...] = ()
     left_out: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        set_fields(self, reasons=tuple(map(as_fact, self.reasons)))
 
     def as_json(self) -> dict[str, object]:
         """The fields in JSON types."""
         similarity = None if self.similarity is None else similarity_as_json(self.similarity)
         joined = {"joined_of": list(self.joined_of)} if self.joined_of else {}
         left_out = {"left_out": list(self.left_out)} if self.left_out else {}
-        judged = with_sentences({"verdict": self.verdict, "reasons": list(self.reasons)})
-        return {**judged, "similarity": similarity, **joined, **left_out}
+        return {"verdict": self.verdict, "reasons": list(self.reasons), "similarity": similarity, **joined, **left_out}
 
 
 def similarity_from_json(path: Path, fields: Mapping[str, Any]) -> Similarity:
@@ -245,11 +239,11 @@ def _model_scale(path: Path, fields: Any, world: WorldAxes) -> ModelScale:
             ci95=None if fields.get("ci95") is None else tuple(fields["ci95"]),
             verdict=fields["verdict"],
             method=str(fields.get("method", "unknown")),
-            reasons=read_facts(fields, "reasons"),
+            reasons=tuple(reasons),
             gravity_in_world_m_s2=fields.get("gravity_in_world_m_s2"),
             cov=fields.get("cov"),
         )
-    except (ValueError, TypeError, LookupError) as error:
+    except (ValueError, TypeError) as error:
         raise FormatError(path, f"not a valid scale estimate: {error}") from None
     similarity = None
     if estimate.verdict != "refused":

@@ -18,10 +18,7 @@ import inspect
 import pkgutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeVar
-
-if TYPE_CHECKING:
-    from colmap_inertial.core.facts import Fact
+from typing import Any, TypeVar
 
 
 @dataclass(frozen=True)
@@ -108,12 +105,6 @@ def _of(code: str) -> Message:
 def _load() -> None:
     for module in pkgutil.iter_modules(__path__):
         importlib.import_module(f"{__name__}.{module.name}")
-
-
-@message(example={"quantity": "scale", "why": "the camera hardly moves", "sigma": 0.2})
-def not_observable(quantity: str, why: Fact, sigma: float | None) -> str:
-    spread = "" if sigma is None else f" (standard deviation {100 * sigma:.1f} %)"
-    return f"{quantity} is not observable{spread}: {why.with_advice}"
 
 
 @message(example={"text": "words of a user's own stage"})

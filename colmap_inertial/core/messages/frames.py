@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from math import degrees
 from typing import TYPE_CHECKING
 
 from colmap_inertial.core.messages import message, state
@@ -221,7 +220,7 @@ state(
 )
 state("rig-not-rectified", "keypoints of a rig's cameras are not rectified")
 state(
-    "readout-unknown",
+    "rectifying-without-readout",
     "the readout is unknown: give readout_s under [timing] in capture.toml (docs/devices says where to find it)",
 )
 state("global-shutter", "global shutter")
@@ -289,17 +288,10 @@ def focal_length_guessed(focal_px: float) -> str:
     return f"the focal length was guessed: {focal_px:.0f} px"
 
 
-@message(example={"why": "the camera hardly turns", "model": "COLMAP made no model"})
-def nor_by_small_model(why: Fact, model: Fact) -> str:
-    return f"{why.with_advice} (nor by a small model: {model})"
-
-
-@message(example={"rotation_rad": 0.2, "offset_s": 0.02})
-def preliminary_calibration_unsure(rotation_rad: float, offset_s: float) -> str:
-    return (
-        f"before the reconstruction it is known to {degrees(rotation_rad):.1f} deg and "
-        f"{1e3 * offset_s:.0f} ms, which is too little: give [calibration] in capture.toml"
-    )
+@message(example={"quantity": "clock offset", "why": "the camera hardly turns", "sigma": None})
+def quantity_not_observable(quantity: str, why: Fact | str, sigma: float | None) -> str:
+    spread = "" if sigma is None else f" (standard deviation {100 * sigma:.1f} %)"
+    return f"{quantity} is not observable{spread}: {why if isinstance(why, str) else why.with_advice}"
 
 
 # the frames that are used

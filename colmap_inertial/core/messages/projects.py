@@ -24,7 +24,7 @@ state("looks-like-several-frames", "looks like several frames of the video")
 
 
 @message(example={"count": 3, "images": 120, "why": "is no frame of the video", "first": "0001.jpg"})
-def images_without_time(count: int, images: int, why: Fact, first: str) -> str:
+def images_untimed_by_video(count: int, images: int, why: Fact, first: str) -> str:
     return f"{count} of {images} images have no time: each {why} (first: {first})"
 
 
@@ -281,8 +281,6 @@ def other_board_likelier(spec: str, used: int, searched: int, columns: int, rows
 
 # exports
 
-state("units-not-metres", "the scale was refused: units are not metres, and nothing here says how large anything is")
-state("up-taken-for-z", "the direction of gravity is not known: up is only taken for z")
 state("up-is-not-z", "up is not z in this model (up_in_world says what it is), while most trainers' viewers take z")
 state("never-scaled", "this model was never given one")
 state("blur-not-modelled", "exposure times are not known and count as 0: blur is not modelled")

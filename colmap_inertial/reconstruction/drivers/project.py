@@ -461,7 +461,7 @@ def _video_times(
     notes = []
     for why in sorted(set(match.doubtful.values()), key=str):
         those = [name for name, reason in match.doubtful.items() if reason == why]
-        notes.append(Fact("images-without-time", count=len(those), images=len(names), why=why, first=those[0]))
+        notes.append(Fact("images-untimed-by-video", count=len(those), images=len(names), why=why, first=those[0]))
     return timing, tuple(notes)
 
 

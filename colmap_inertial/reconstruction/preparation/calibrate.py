@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+import math
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -229,7 +230,7 @@ def _calibrate_by_pixels(
     try:
         view = _aligned(rotation.trajectory(), recording, camera, "pixels")
     except NotObservableError as error:
-        return NotObservableError(error.quantity, Fact("nor-by-small-model", why=error.why, model=fact_of(instead_of)))
+        return NotObservableError(error.quantity, f"{error.hint} (nor by a small model: {instead_of})")
     # what translation does to pixels looks like a bias of the gyroscope
     return replace(view, calibration=replace(view.calibration, gyro_bias_rad_s=recording.prior.gyro_bias_rad_s))
 
@@ -244,7 +245,8 @@ def _aligned(trajectory: CameraTrajectory, recording: Recording, camera: CameraM
     if rotation_rad > _LIMITS.usable_rotation_rad or offset_s > _LIMITS.usable_offset_s:
         raise NotObservableError(
             "camera-IMU calibration",
-            Fact("preliminary-calibration-unsure", rotation_rad=rotation_rad, offset_s=offset_s),
+            f"before the reconstruction it is known to {math.degrees(rotation_rad):.1f} deg and "
+            f"{1e3 * offset_s:.0f} ms, which is too little: give [calibration] in capture.toml",
         )
     return GyroView(
         imu=recording.imu, timing=recording.timing, calibration=alignment.settled(), camera=camera, source=source

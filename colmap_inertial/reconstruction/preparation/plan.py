@@ -217,7 +217,7 @@ def _no_rectifying(recording: Recording, asked: Treatments) -> Fact | None:
     if recording.capture.rig:
         return Fact("rig-not-rectified")
     if timing.readout_s is None:
-        return Fact("readout-unknown")
+        return Fact("rectifying-without-readout")
     return None if timing.readout_s else Fact("global-shutter")
 
 

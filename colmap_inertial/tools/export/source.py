@@ -12,7 +12,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, UInt8Array
 from colmap_inertial.core.errors import FormatError, NotObservableError
-from colmap_inertial.core.facts import Fact, sentences
+from colmap_inertial.core.facts import Fact, as_fact
 from colmap_inertial.core.options import ExportImages
 from colmap_inertial.core.types import DOWN_IN_WORLD, Action, CameraMotion, CameraTrajectory
 from colmap_inertial.inertial.georeference import Georeference
@@ -190,7 +190,7 @@ def read_source(
     with explaining_losses(Workspace(out)):
         source = find_source(out, model, images=image_folder)
         if source.scale.unit != "m" and not unscaled:
-            why = "; ".join(sentences(source.scale.reasons or (Fact("never-scaled"),)))
+            why = "; ".join(map(str, source.scale.reasons or (Fact("never-scaled"),)))
             raise NotObservableError("scale", f"{why}; --unscaled exports it in its own units")
         reconstruction = read_model(source.folder)
         down, motion = source.down_in_world, None
@@ -395,9 +395,9 @@ def _notes_on_model(source: ExportSource) -> list[Fact]:
     """Notes for the user on the model."""
     notes = []
     if source.found.scale.unit != "m":
-        notes.append(NO_SCALE)
+        notes.append(as_fact(NO_SCALE))
     if source.up_in_world is None:
-        notes.append(NO_UP)
+        notes.append(as_fact(NO_UP))
     elif float(source.up_in_world @ _Z_UP) < 0.9:
         notes.append(Fact("up-is-not-z"))
     return notes

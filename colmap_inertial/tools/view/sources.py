@@ -11,11 +11,10 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import quat_rotate
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import LengthUnit
-from colmap_inertial.io.files import path_in, read_facts, read_json, reader
+from colmap_inertial.io.files import path_in, read_json, reader
 from colmap_inertial.model import TRANSFORM_FILE, find_models, is_metric, model_format
 from colmap_inertial.model.similarities import similarity_from_json
 from colmap_inertial.pipeline.run.workspace import Workspace, a_record_of_ours, places_of, refuse_links
@@ -39,7 +38,7 @@ class ScaleFacts:
 
     unit: LengthUnit
     verdict: str | None = None
-    reasons: tuple[Fact, ...] = ()
+    reasons: tuple[str, ...] = ()
     metres_per_unit: float | None = None
     relative_ci95: tuple[float, float] | None = None
 
@@ -277,7 +276,7 @@ def _estimated(fields: Mapping[str, Any], unit: LengthUnit) -> ScaleFacts:
     return ScaleFacts(
         unit=unit,
         verdict=str(fields["verdict"]),
-        reasons=read_facts(fields, "reasons"),
+        reasons=tuple(map(str, fields["reasons"])),
         metres_per_unit=scale,
         relative_ci95=relative,
     )
@@ -291,7 +290,7 @@ def _read_verdict_of_apply(out: Path, folder: Path) -> dict[str, Any]:
     with a_record_of_ours(path):
         for model in read_json(path).get("models", []):
             if out / model["folder"] == folder:
-                return {"verdict": model["verdict"], "reasons": read_facts(model, "reasons")}
+                return {"verdict": model["verdict"], "reasons": tuple(map(str, model["reasons"]))}
     return {}
 
 
