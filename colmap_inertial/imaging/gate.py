@@ -16,8 +16,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.core.arrays import Array, BoolArray, Float32Array
-from colmap_inertial.core.facts import Fact
+from colmap_inertial.core.arrays import Array, BoolArray, Float32Array, set_fields
+from colmap_inertial.core.facts import Fact, as_fact
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence, measure_blur_share
@@ -93,6 +93,9 @@ class FrameDecision:
     blur_px: float | None
     action: Decision
     reason: Fact
+
+    def __post_init__(self) -> None:
+        set_fields(self, action=Decision(self.action), reason=as_fact(self.reason))
 
 
 def decide(
@@ -223,6 +226,9 @@ class RecordingVerdict:
     extent_factor: float
     frames: int
     reason: Fact
+
+    def __post_init__(self) -> None:
+        set_fields(self, reason=as_fact(self.reason))
 
 
 def judge_recording(evidence: Iterable[BlurEvidence], options: GateOptions | None = None) -> RecordingVerdict:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from colmap_inertial.core.arrays import AnyArray
+from colmap_inertial.core.arrays import AnyArray, set_fields
 from colmap_inertial.core.errors import FormatError, InertialError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.summary import prints_in_lines
@@ -57,6 +57,9 @@ class FrameRecord:
     treatments: tuple[Treatment, ...] = ()
     sharpened: bool = False
     rectified: bool | None = None
+
+    def __post_init__(self) -> None:
+        set_fields(self, action=Action(self.action))
 
     @property
     def used(self) -> bool:
