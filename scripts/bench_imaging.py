@@ -204,7 +204,7 @@ def quality(
         "pairs": len(pairs),
         "median_blur_px": float(np.median([np.median(b.extent_px()) for two in blurs for b in two])),
         "deblurred_frames": deblurred,
-        "verdict": verdict.reason,
+        "verdict": str(verdict.reason),
         "kept_share": float(np.mean(kept)) if kept else 1.0,
         **out,
         "ratio": ratio,

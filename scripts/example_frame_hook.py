@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from colmap_inertial import Frame, ReconstructOptions, read_config, reconstruct
+from colmap_inertial import Action, Frame, ReconstructOptions, read_config, reconstruct
 
 
 # A frozen dataclass rather than a function: its fields then belong to what decides whether an interrupted run may keep
@@ -52,7 +52,7 @@ def main() -> None:
     options = ReconstructOptions() if args.config is None else read_config(args.config, ReconstructOptions)
     # The dots stand for the default frame stages (deblurring): theirs first, then ours.
     result = reconstruct(args.capture, args.out, options, frame_stages=[..., LocalContrast(below=args.below)])
-    print(f"{sum(frame.action == 'changed' for frame in result.frames)} of {len(result.frames)} frames changed")
+    print(f"{sum(frame.action is Action.CHANGED for frame in result.frames)} of {len(result.frames)} frames changed")
     for model in result.models:
         print(f"model {model.index}: {model.scale.verdict}, {model.scale.metres_per_unit} metres per unit")
 

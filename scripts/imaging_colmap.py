@@ -153,8 +153,8 @@ def _run(
         # of the largest distance between two cameras
         "centre_error_pct": float(100 * np.sqrt(np.mean(np.sum((centres - true) ** 2, axis=1))) / extent),
         "rotation_deg": float(np.median(angle)),
-        "deblurring": result.imaging.deblur_note,
-        "deblurred": sum(frame.action == "deblurred" for frame in result.frames),
+        "deblurring": str(result.imaging.deblur_note or ""),
+        "deblurred": sum(frame.sharpened for frame in result.frames),
         "scale_verdict": estimate.verdict,
         "scale_error_pct": None if ends is None else 100 * (1 / scale - 1),
         "scale_ci95_pct": None if ends is None else [float(round(100 * (end - 1), 2)) for end in ends],

@@ -1055,8 +1055,8 @@ MUTANTS = (
     ),
     Mutant(
         "pipeline/stages/frame_folder.py",
-        'return frame, "dropped" if frame.dropped else _write(',
-        'return frame, "dropped" if frame.image is None else _write(',
+        "return frame, Action.DROPPED if frame.dropped else _write(",
+        "return frame, Action.DROPPED if frame.image is None else _write(",
         "dropped frames are written for COLMAP",
         ("run_steps",),
     ),
@@ -1349,8 +1349,8 @@ MUTANTS = (
     ),
     Mutant(
         "reconstruction/preparation/plan.py",
-        'if d.action == "drop" and not first < i < last',
-        'if d.action == "drop" and first < i < last',
+        "if d.action is Decision.DROP and not first < i < last",
+        "if d.action is Decision.DROP and first < i < last",
         "frames are dropped at the ends, where nothing bridges the gap",
         ("run_steps::test_no_frame_is_dropped_where_nothing_bridges_the_gap",),
     ),

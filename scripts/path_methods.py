@@ -109,7 +109,7 @@ def gate(takes: Sequence[Take], binned: Callable[[float], str], *, console: Cons
         known = [pair.known(i, "exact") for pair, i in blurred]
         fields = [_field(one) for one in known]
         trusted = verdict_on([pair.frame(i) for pair, i in blurred], known)
-        row: dict[str, Any] = {"verdict": trusted.reason, "trusted": trusted.trusted, "treated": {}}
+        row: dict[str, Any] = {"verdict": str(trusted.reason), "trusted": trusted.trusted, "treated": {}}
         of_each = list(zip(blurred, fields, known, strict=True))
         for (pair, i), field, motion in track(of_each, f"gate, {label}", console=console):
             factor, _ = judge_frame(pair.frame(i), field, trusted, GateOptions(), blur_path(*motion))

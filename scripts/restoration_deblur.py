@@ -76,7 +76,7 @@ def quality(pairs: Sequence[Pair], ways: Ways, *, label: str, console: Console) 
                 rows.setdefault(f"{name} gated", []).append(figures)
                 deblurred[name] += sum(g.deblurred for g in gated)
         out[kind] = {
-            "verdict": verdict.reason,
+            "verdict": str(verdict.reason),
             "deblurred_frames": deblurred,
             "rows": {name: summed(found) for name, found in rows.items()},
             "correct_of_each_scene": {name: [int(row["correct"]) for row in found] for name, found in rows.items()},

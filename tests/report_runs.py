@@ -99,6 +99,7 @@ def write_run(
             {
                 "name": names[i],
                 "action": actions[i],
+                "sharpened": actions[i] == "deblurred",
                 "reason": f"because of {name}",
                 "blur_px": float(blur_px[i]),
                 "kept_share": 0.5,

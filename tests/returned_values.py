@@ -25,6 +25,7 @@ from scipy import sparse
 from scipy.spatial.transform import Rotation
 
 import colmap_inertial
+from colmap_inertial.core.facts import Fact
 
 PACKAGE = Path(colmap_inertial.__file__).parent
 KEPT = Path(__file__).parent / "references" / "returned_values.json"
@@ -70,8 +71,8 @@ def _leaves(value: Any, path: str, depth: int) -> Iterator[tuple[str, Any]]:
         elif values.dtype.names:
             for name in values.dtype.names:
                 yield from _leaves(values[name], f"{path}.{name}", depth)
-    elif isinstance(value, str):
-        yield path, value
+    elif isinstance(value, str | Fact):
+        yield path, str(value)
     elif isinstance(value, bytes):
         yield path, np.frombuffer(value, np.uint8)
     elif isinstance(value, Path):

@@ -35,7 +35,7 @@ class Skip:
 
     def __call__(self, frames, /):
         for i, frame in enumerate(frames):
-            because = Treatment(stage="skip", reason="one of the first", action="skipped")
+            because = Treatment(stage="skip", reason="one of the first", action="changed")
             yield replace(frame, dropped=True, treatments=(because,)) if i < self.first else frame
 
 

@@ -6,15 +6,18 @@ import numpy as np
 import pytest
 
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import Frame
 from colmap_inertial.imaging.blur_field import BlurField
-from colmap_inertial.imaging.gate import GATE_LIMITS, FrameDecision, GateOptions, RecordingVerdict
+from colmap_inertial.imaging.gate import GATE_LIMITS, Decision, FrameDecision, GateOptions, RecordingVerdict
 from colmap_inertial.pipeline.stages import deblur
 from colmap_inertial.pipeline.stages.deblur import DeblurStage
 
 
 def verdict_of(trusted):
-    return RecordingVerdict(trusted=trusted, support=3.0, extent_factor=1.0, frames=5, reason="by five frames")
+    return RecordingVerdict(
+        trusted=trusted, support=3.0, extent_factor=1.0, frames=5, reason=Fact.stated("by five frames")
+    )
 
 
 @pytest.fixture
@@ -42,10 +45,10 @@ def treat(monkeypatch):
         monkeypatch.setattr(deblur, "blur_field", blur_field)
         monkeypatch.setattr(deblur, "blur_path", blur_path)
         monkeypatch.setattr(deblur, "keep_sharp", keep_sharp)
-        monkeypatch.setattr(deblur, "judge_frame", lambda *_: (factor, "judged"))
-        decision = FrameDecision(name="a.jpg", action=action, reason="decided", blur_px=length)
+        monkeypatch.setattr(deblur, "judge_frame", lambda *_: (factor, Fact.stated("judged")))
+        decision = FrameDecision(name="a.jpg", action=Decision(action), reason=Fact.stated("decided"), blur_px=length)
         stage = DeblurStage(
-            view=SimpleNamespace(sign_doubt=doubt),
+            view=SimpleNamespace(sign_doubt=Fact.stated(doubt) if doubt else None),
             decisions=(decision,),
             verdict=verdict_of(trusted),
             parallaxes={"a.jpg": "slid"},
@@ -56,7 +59,12 @@ def treat(monkeypatch):
         (told,) = made.treatments
         assert told.stage == "deblur" and told.values["blur_px"] == length
         return SimpleNamespace(
-            frame=made, said=told.reason, values=told.values, done=told.action, changed=made.image[0, 0] == 8, seen=seen
+            frame=made,
+            said=str(told.reason),
+            values=told.values,
+            done=told.action,
+            changed=made.image[0, 0] == 8,
+            seen=seen,
         )
 
     return treated

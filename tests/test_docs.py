@@ -28,8 +28,9 @@ from colmap_inertial.checks.report import write_report
 from colmap_inertial.cli import main, parse
 from colmap_inertial.colmap.depth_maps import DenseResult
 from colmap_inertial.core.errors import InertialError, MappingError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ReconstructOptions
-from colmap_inertial.core.types import CameraModel, FrameTiming, Treatment
+from colmap_inertial.core.types import Action, CameraModel, FrameTiming, Treatment
 from colmap_inertial.imaging.gate import RecordingVerdict
 from colmap_inertial.imaging.parallax import Parallax
 from colmap_inertial.imaging.selection import Chosen
@@ -468,7 +469,7 @@ def examples(tmp_path_factory, project):
 def test_the_examples_in_python_run(examples):
     folder, values = examples
     result = values["result"]
-    assert {frame.action for frame in result.frames} == {"brightened"}
+    assert {frame.action for frame in result.frames} == {Action.CHANGED}
     assert [treatment.stage for model in result.models for treatment in model.treatments] == ["refine", "well_seen"]
     assert values["estimate"].verdict == "trusted"
     assert (folder / "metric_model" / "transform.json").is_file()
@@ -560,11 +561,13 @@ def test_what_is_done_to_frames_has_the_form_that_the_schema_describes(imu, tmp_
     window = Chosen(
         place=3, closed_by="start", ranked_by="blur", blur=np.nan, first=0, last=5, baseline=0.1, motion=np.nan
     )
-    selection = Selection(names=("b.jpg",), frames=9, note="so", windows=(window,), offset_s=0.1, offset_from="pixels")
+    selection = Selection(
+        names=("b.jpg",), frames=9, note=Fact.stated("so"), windows=(window,), offset_s=0.1, offset_from="pixels"
+    )
     dense = DenseResult(folder=tmp_path / "dense" / "0", images=4, depth_maps=0, maps="plane sweep", waiting="none")
     values = {"blur_px": 4.0, "kept_share": 0.2, "extent_factor": 1.1}
     treated = Treatment(stage="deblur", reason="so", action="deblurred", values=values)
-    record = FrameRecord(name="a.jpg", action="deblurred", camera=camera, treatments=(treated,))
+    record = FrameRecord(name="a.jpg", action="deblurred", sharpened=True, camera=camera, treatments=(treated,))
     write_json(
         tmp_path / "parts.json",
         {

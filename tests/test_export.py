@@ -41,7 +41,7 @@ from colmap_inertial.model.nerf import EXPORT_FORMAT, NOT_METRES, transform_expo
 from colmap_inertial.model.project import apply_to_project, undo_project
 from colmap_inertial.model.similarities import plain_factor, undoing
 from colmap_inertial.tools.export.formats import write_las
-from colmap_inertial.tools.export.source import ExportSource, Picture, flat_names
+from colmap_inertial.tools.export.source import ExportSource, Picture, TreatedFrame, flat_names
 from colmap_inertial.tools.export.targets import TARGETS
 from colmap_inertial.tools.export.transforms import Exposure, add_velocities
 from colmap_inertial.tools.export.undistort import Undistortion, list_needed_cameras, pinhole_model
@@ -288,7 +288,7 @@ def test_what_an_export_says_of_itself_holds_after_apply_and_comes_back(exported
     turn = np.array([np.sqrt(0.5), 0, 0, np.sqrt(0.5)])  # about x: z becomes -y
     similarity = dataclasses.replace(plain_factor(2.5), rotation_xyzw=turn)
     applied = apply_to_project(tmp_path / "export", tmp_path / "made", similarity)
-    assert any("1 georeference.json" in note for note in applied.notes)
+    assert any("1 georeference.json" in str(note) for note in applied.notes)
     moved = json.loads((tmp_path / "made" / "export.json").read_text())
     assert moved["unit"] == "0.4 m"  # a length of 1 there
     for name in ("up_in_world", "gravity_in_world_m_s2"):
@@ -491,7 +491,7 @@ def test_pictures_that_say_how_to_turn_them_are_written_anew(tmp_path):
 def test_rectified_pictures_in_place_of_filmed_ones_are_told():
     pictures = {"a.png": Picture(path=Path("a.png"), rectified=True), "b.png": Picture(path=Path("b.png"))}
     (note,) = _notes_on(pictures, "original")
-    assert note.startswith("1 pictures are rectified")
+    assert note.code == "pictures-rectified" and note.values["count"] == 1
     assert _notes_on(pictures, "rectified") == []
 
 
@@ -522,7 +522,7 @@ def test_a_run_s_rectified_pictures_are_known_by_any_path(tmp_path, monkeypatch)
     found = ViewSource(folder=Path("out/sparse/0"), index=0, others=(0,), scale=ScaleFacts(unit="m"), images=(images,))
     source = ExportSource(
         found=found, model=None, up_in_world=None, gravity_in_world_m_s2=None, motion=None,
-        treated={"a.png": ("passed", True)},
+        treated={"a.png": TreatedFrame(rectified=True)},
     )  # fmt: skip
     assert source.pictures(Path("out"), ["a.png"], "rectified")["a.png"].rectified
 
@@ -532,7 +532,7 @@ def test_instant_ngp_needs_no_velocities(known, tmp_path):
     made = export_model(known.out, tmp_path / "made", "instant-ngp")
     meta = json.loads((tmp_path / "made" / "transforms.json").read_text())
     assert len(meta["frames"]) == made.images and "transform_matrix_start" not in meta["frames"][0]
-    assert any("no velocities" in note for note in made.notes)
+    assert any("no velocities" in str(note) for note in made.notes)
 
 
 def test_the_page_has_the_command_lines_that_are_printed():
@@ -606,7 +606,7 @@ def test_velocities_for_deblurring_are_those_of_the_hand(rolling, filmed):
         assert np.median(error) < most, found
     assert seen.extra["exposure_s"] == pytest.approx(0.004)
     assert seen.extra["readout_s"] == pytest.approx(0.03, rel=0.01)
-    assert any("rolling shutter" in note for note in filmed[1].notes)
+    assert any("rolling shutter" in str(note) for note in filmed[1].notes)
 
 
 def test_rectified_pictures_have_no_readout_and_agree_with_the_model(rolling, tmp_path):
@@ -625,7 +625,7 @@ def test_what_was_deblurred_is_taken_out_of_the_capture_where_it_is_named(rollin
     shutil.copytree(out, copy)
     result = json.loads((copy / "result.json").read_text())
     for frame in result["frames"][:3]:
-        frame["action"] = "deblurred"
+        frame |= {"action": "deblurred", "sharpened": True}
     (copy / "result.json").write_text(json.dumps(result))
     blurred = [frame["name"] for frame in result["frames"][:3]]
     for folder in copy.rglob("images"):
@@ -636,10 +636,10 @@ def test_what_was_deblurred_is_taken_out_of_the_capture_where_it_is_named(rollin
     for step in ("frames", "images"):
         (copy / ".stages" / f"{step}.json").unlink()
     made = export_model(copy, tmp_path / "kept", "3dgs-deblur", images="original")
-    assert any("3 pictures are deblurred" in note for note in made.notes)
+    assert any("3 pictures are deblurred" in str(note) for note in made.notes)
     assert cv2.imread(str(tmp_path / "kept" / "images" / blurred[0])).max() == 0
     made = export_model(copy, tmp_path / "filmed", images="original", capture=out.parent / "capture")
-    assert not any("deblurred" in note for note in made.notes)
+    assert not any("deblurred" in str(note) for note in made.notes)
     # a pinhole camera, its principal point in the middle: only the recoding of the picture is left
     before, after = (
         cv2.imread(str(f / blurred[0])) for f in (out.parent / "capture/frames", tmp_path / "filmed/images")

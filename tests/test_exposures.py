@@ -218,7 +218,7 @@ def test_pixels_alone_bring_pairs_together(scene, pair):
     assert together.registered.by_pixels and not together.registered.by_gyro and together.blur is None
     # half the blur's unevenness through time: its centre is not mid-exposure
     assert np.median(errors_px(scene, together.registered.shift_px)) < 1.0
-    assert together.gyro_note == "no gyroscope"
+    assert together.gyro_note.code == "no-gyroscope"
 
 
 def test_a_gyroscope_of_another_recording_is_left_out(scene, pair, stranger):
@@ -226,14 +226,14 @@ def test_a_gyroscope_of_another_recording_is_left_out(scene, pair, stranger):
     wrong = PairGyro(motion=other.motion, camera=other.camera, short=scene.short, long=scene.long)
     together = bring_together(*pair, gyro=wrong)
     assert not together.registered.by_gyro and together.blur is None
-    assert "do not confirm" in together.gyro_note
+    assert together.gyro_note.code == "pair-rotation-not-confirmed"
     assert np.median(errors_px(scene, together.registered.shift_px)) < 1.0
 
 
 def test_an_unrecorded_exposure_leaves_the_pixels(scene, pair):
     gone = replace(gyro_of(scene), long=replace(scene.long, t_s=scene.motion_s + 5))
     together = bring_together(*pair, gyro=gone)
-    assert "does not cover" in together.gyro_note and together.registered.by_pixels and together.blur is None
+    assert together.gyro_note.code == "pair-not-covered" and together.registered.by_pixels and together.blur is None
 
 
 def test_the_aligned_long_exposure_agrees_with_its_true_picture(scene, pair, together):

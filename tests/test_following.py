@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from test_imaging_psf import CAM_FROM_IMU, PINHOLE
 
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import matrix_from_quat, so3_exp, so3_log
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.types import CameraModel, FrameTiming
@@ -115,7 +116,7 @@ def test_the_baseline_is_what_rotation_leaves_of_the_motion(subtests):
 def test_a_clock_counts_up_to_the_limit_that_its_offset_may_err_by():
     limit_s = choosing._LIMITS.offset_s
     t_s = np.array([0.0, 61.0, 100.0, 139.0, 200.0])
-    clocks = _Clocks(motion=None, oriented=False, camera=PINHOLE, note="")
+    clocks = _Clocks(motion=None, oriented=False, camera=PINHOLE, note=Fact("one-clock"))
     assert clocks.usable(t_s).all() and replace(clocks, offset_sigma_s=limit_s).usable(t_s).all()
     assert not replace(clocks, offset_sigma_s=1.01 * limit_s).usable(t_s).any()
     # three and four make five, forty seconds from the middle
@@ -135,7 +136,7 @@ def spinning(span_s=4.0):
 
 
 def clocks_of(motion, **changed):
-    return _Clocks(motion=motion, oriented=False, camera=PINHOLE, note="", **changed)
+    return _Clocks(motion=motion, oriented=False, camera=PINHOLE, note=Fact("one-clock"), **changed)
 
 
 def test_without_exposures_frames_rank_by_the_mean_speed_of_a_sixtieth_or_half_the_interval():

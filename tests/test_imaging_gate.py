@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from far_scene import FarScene
 
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.types import CameraModel
@@ -167,30 +168,30 @@ def test_a_sharp_frame_stays_as_it_is(subtests):
                 shutter, image = shot(pair[0], 0.2)
                 field = scaled(predicted(shutter, "none"), blur_px / 0.2)
                 gated = deblur_gated(image, field)
-                assert gated.image is image and not gated.deblurred and "does not show the blur" in gated.reason
+                assert gated.image is image and not gated.deblurred and "does not show the blur" in str(gated.reason)
 
 
 @pytest.mark.parametrize("blur_px", [6, 10, 20])
 def test_a_sharp_frame_stays_as_it_is_among_blurred_ones(blur_px):
-    trusted = RecordingVerdict(trusted=True, support=9.0, extent_factor=1.0, frames=9, reason="others do")
+    trusted = RecordingVerdict(trusted=True, support=9.0, extent_factor=1.0, frames=9, reason=Fact.stated("others do"))
     for pair in PAIRS.values():
         shutter, image = shot(pair[0], 0.2)
         field = scaled(predicted(shutter, "none"), blur_px / 0.2)
         gated = deblur_gated(image, field, recording=trusted)
-        assert gated.image is image and not gated.deblurred and "as much detail along" in gated.reason
+        assert gated.image is image and not gated.deblurred and gated.reason.code == "frame-sharp-along-blur"
         shutter, image = shot(pair[0], blur_px)
         assert deblur_gated(image, predicted(shutter, "none"), recording=trusted).deblurred
 
 
 def test_a_sharp_frame_of_white_texture_stays_as_it_is_among_blurred_ones():
     """Gravel or grain has as much beyond all frequencies that blur takes: no fall is expected of it."""
-    trusted = RecordingVerdict(trusted=True, support=9.0, extent_factor=1.0, frames=9, reason="others do")
+    trusted = RecordingVerdict(trusted=True, support=9.0, extent_factor=1.0, frames=9, reason=Fact.stated("others do"))
     image = np.clip(128 + 40 * np.random.default_rng(0).standard_normal((720, 1280)), 0, 255).astype(np.uint8)
     vectors = np.broadcast_to(np.float32([12.0, 0.0]), (*BlurField.nodes(1280, 720, 16), 2))
     flat = BlurField(width=1280, height=720, vector_px=vectors)
     assert measure_blur_share(image, flat) is None
     gated = deblur_gated(image, flat, recording=trusted)
-    assert gated.image is image and "does not show the blur" in gated.reason
+    assert gated.image is image and "does not show the blur" in str(gated.reason)
 
 
 def test_the_image_tells_extent_and_direction(subtests):
@@ -295,7 +296,7 @@ def test_curved_blur_is_compared_with_the_curve():
     assert measure_blur_share(image, path) > 0.5 > measure_blur_share(image, chord)
     curved, line = blur_evidence(image, path), blur_evidence(image, chord)
     assert curved.support > 6 and curved.extent_is_plausible and line.support < 2
-    trusted = RecordingVerdict(trusted=True, support=9.0, extent_factor=1.0, frames=9, reason="others do")
+    trusted = RecordingVerdict(trusted=True, support=9.0, extent_factor=1.0, frames=9, reason=Fact.stated("others do"))
     assert judge_frame(image, chord, trusted, GateOptions(), path)[0] == 1.0
     assert judge_frame(image, chord, None, GateOptions(), path)[0] is not None
     assert judge_frame(image, chord, None, GateOptions())[0] is None
@@ -352,11 +353,11 @@ def test_a_recording_is_judged_by_its_median_frame():
     assert judge_recording([right, right]).trusted is None
     assert judge_recording([right, wrong, right, BlurEvidence.nothing()]).trusted is True
     verdict = judge_recording([wrong, right, wrong])
-    assert verdict.trusted is False and verdict.frames == 3 and "check its axes" in verdict.reason
+    assert verdict.trusted is False and verdict.frames == 3 and verdict.reason.code == "blur-not-shown"
     assert not deblur_gated(image, predicted(shutter, "none"), recording=verdict).deblurred
     long = blur_evidence(image, scaled(predicted(shutter, "none"), 1.25))
     verdict = judge_recording([long, long, long])
-    assert verdict.trusted and verdict.extent_factor == pytest.approx(0.8, rel=0.05) and "0.8" in verdict.reason
+    assert verdict.trusted and verdict.extent_factor == pytest.approx(0.8, rel=0.05) and "0.8" in str(verdict.reason)
 
 
 def test_deepgyro_s_frames_show_a_fifth_more_blur_than_turning_explains(shared_data):
@@ -425,17 +426,17 @@ def test_blocks_of_a_sharp_edge_keep_their_pixels_and_fade_into_the_next(subtest
 
 def blur_of(px, reasons=None):
     names = tuple(f"{i}.jpg" for i in range(len(px)))
-    return PredictedBlur(names=names, px=np.array(px, dtype=float), reasons=tuple(reasons or [""] * len(px)))
+    return PredictedBlur(names=names, px=np.array(px, dtype=float), reasons=tuple(reasons or [None] * len(px)))
 
 
 def test_every_frame_has_a_decision_with_a_reason():
     px = [1.0, 10.0, 60.0, 10.0, np.nan]
     decisions = decide(
-        blur_of(px, ["", "", "", "", "the exposure time is unknown"]), np.arange(5) / 30, width=1920, height=1080
+        blur_of(px, [None, None, None, None, Fact("exposure-unknown")]), np.arange(5) / 30, width=1920, height=1080
     )
     assert [d.action for d in decisions] == ["keep", "deblur", "drop", "deblur", "keep"]
-    assert "too few to matter" in decisions[0].reason and "10.0 px" in decisions[1].reason
-    assert "too many" in decisions[2].reason and decisions[4].reason == "the exposure time is unknown"
+    assert decisions[0].reason.code == "blur-too-short" and str(decisions[1].reason) == "10.0 px of blur"
+    assert decisions[2].reason.code == "blur-too-long" and decisions[4].reason.code == "exposure-unknown"
     assert decisions[4].blur_px is None and decisions[2].blur_px == 60
     small = decide(blur_of(px[:4]), np.arange(4) / 30, width=640, height=360)
     assert [d.action for d in small] == ["keep", "deblur", "drop", "deblur"]
@@ -466,7 +467,7 @@ def test_frames_that_bridge_a_gap_stay_the_least_blurred_first():
     decisions = decide(blur_of(px), t_s, width=1920, height=1080)
     kept = [i for i, d in enumerate(decisions) if d.action != "drop"]
     assert kept[0] == 0 and kept[-1] == 7 and max(np.diff(t_s[kept])) < 0.5 + 1e-9
-    assert 3 in kept and 5 not in kept and "bridges a gap" in decisions[3].reason
+    assert 3 in kept and 5 not in kept and decisions[3].reason.code == "blur-bridges-gap"
     none = decide(blur_of(px), t_s, width=1920, height=1080, options=GateOptions(bridge_s=10.0))
     assert [d.action for d in none].count("drop") == 6
     turning = decide(

@@ -99,8 +99,8 @@ def test_no_small_model_is_made_where_sliding_blurs_nothing(tmp_path, monkeypatc
     monkeypatch.setattr(imaging, "survey", never)
     capture = sliding(exposure_s=exposure_s, reach_m=reach_m, frames=8).write(tmp_path / "capture", extra=CALIBRATED)
     plan = planned(capture, tmp_path)
-    assert not plan.parallaxes and "no frame has more than" in plan.deblur_note
-    assert bool(seen) == followed == ("pixels move" in plan.deblur_note)
+    assert not plan.parallaxes and plan.deblur_note.code == "blur-nowhere"
+    assert bool(seen) == followed == plan.deblur_note.values["by_sliding"]
 
 
 @pytest.mark.parametrize("rate_rad_s", [(0.0, 0.0, 0.0), (-0.1, 0.3, 0.2)], ids=["still", "turning"])

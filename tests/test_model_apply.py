@@ -265,7 +265,7 @@ def test_priors_in_a_frame_of_their_own_stay_and_are_mentioned(project, tmp_path
         database.execute("UPDATE pose_priors SET position = ?", (far,))
     database.close()
     applied = apply_to_project(project, tmp_path / "metric", SIMILARITY)
-    assert any("5 pose priors are not in a model's frame" in note for note in applied.notes)
+    assert any("5 pose priors are not in a model's frame" in str(note) for note in applied.notes)
     assert all(np.array_equal(row[0], [100, 200, 3]) for row in prior_rows(tmp_path / "metric" / "database.db"))
 
 

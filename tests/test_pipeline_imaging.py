@@ -119,7 +119,7 @@ def test_the_result_shows_the_calibration_from_before_and_after(rolling):
     assert abs(stored["models"][0]["calibration_change"]["gyro_time_offset_s"]) < 2e-3
     assert all(frame["rectified"] and frame["action"] == "passed" for frame in stored["frames"])
     assert "readout 30.0 ms" in stored["imaging"]["rolling_shutter"]
-    assert off.imaging.view is None and off.imaging.deblur_note == "not asked for"
+    assert off.imaging.view is None and off.imaging.deblur_note.code == "not-asked-for"
     assert contents(root / "off" / "images") == contents(root / "off" / "colmap" / "images")
 
 
@@ -179,7 +179,7 @@ def test_deblurred_images_see_more_of_the_scene(tmp_path, scene, blurred, stoppe
     # COLMAP saw the deblurred frames smoothed; who goes on from the model does not
     for record in on.frames:
         seen, made = (tmp_path / "on" / folder / record.name for folder in ("colmap/images", "images"))
-        if record.action == "deblurred":
+        if record.sharpened:
             sharper = edges(cv2.imread(str(made))) / edges(cv2.imread(str(seen)))
             # of short blur, hardly
             assert sharper > (1.1 if record.value("blur_px") > 12 else 1)
@@ -242,7 +242,7 @@ def test_deblurring_for_matching_on_one_processor_makes_what_colmap_saw_of_sever
 
 def test_images_for_matching_are_not_those_for_viewing(deblurred, alone):
     frames = json.loads((alone / "result.json").read_text())["frames"]
-    treated = [frame["name"] for frame in frames if frame["action"] == "deblurred"]
+    treated = [frame["name"] for frame in frames if frame["sharpened"]]
     assert len(treated) >= 8
     for name in treated:
         assert (alone / "images" / name).read_bytes() != (deblurred.workspace.images / name).read_bytes()
@@ -302,7 +302,7 @@ def blur_errors(scene, plan):
 
 
 def test_blur_by_translation_is_known_to_a_fraction_of_a_pixel(scene, plan):
-    assert set(plan.parallaxes) == set(plan.view.timing.names) and "translation is counted in" in plan.deblur_note
+    assert set(plan.parallaxes) == set(plan.view.timing.names) and plan.deblur_note.values["with_translation"]
     turning, both = blur_errors(scene, plan)
     assert both < 0.4 and both < 0.15 * turning
 
@@ -365,7 +365,7 @@ def test_exposure_times_that_are_wrong_by_a_common_factor_are_corrected_and_said
     assert plan.deblur is not None
     verdict = plan.deblur[1]
     assert verdict.trusted is True and verdict.extent_factor == pytest.approx(0.03 / said_s, rel=0.15)
-    assert "exposure times are wrong" in plan.deblur_note
+    assert plan.deblur_note.values["verdict"].code == "exposures-off-by-factor"
 
 
 def test_unknown_exposure_leaves_every_frame_and_says_why(tmp_path, blurred):
@@ -414,7 +414,7 @@ def test_a_stabilised_video_is_refused_where_asked_and_left_alone_otherwise(tmp_
     plan = planned(recording, tmp_path)
     assert plan.view is plan.deblur is None and not plan.rectify
     assert DeblurStage.of_plan(plan) is None
-    assert "stabilised" in plan.deblur_note and "stabilised" in plan.rolling_shutter_note
+    assert "stabilised" in str(plan.deblur_note) and "stabilised" in str(plan.rolling_shutter_note)
     # where a few frames were chosen from the video, all of them are followed
     few = recording.using(part_of(recording.timing, recording.timing.names[::7]))
     with pytest.raises(NotObservableError, match="stabilised"):

@@ -16,6 +16,7 @@ from test_validate_lengths import validated
 from colmap_inertial.checks.validate.result import LengthCheck
 from colmap_inertial.cli.terminal import show_reference
 from colmap_inertial.core.errors import InertialError, NotObservableError, TargetNotFoundError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ReferenceOptions
 from colmap_inertial.pipeline.run.chunks import Processes
 from colmap_inertial.reconstruction.drivers import reference as rooms
@@ -72,7 +73,7 @@ def test_markers_and_targets_give_their_scale(bare, tmp_path, monkeypatch):
     with pytest.raises(NotObservableError, match="only 2 of 5 images agree on the target, which proves no size"):
         scale_project_by(bare, tmp_path / "no", ReferenceOptions(scale_from="target", target="aruco:DICT_4X4_50:0.1"))
     found = scale_project_by(bare, tmp_path / "doubted", known)
-    assert any("only 2 of 5 images agree" in note for note in found.notes)
+    assert any("only 2 of 5 images agree" in str(note) for note in found.notes)
     with pytest.raises(NotObservableError, match="marker 9 was not measured in the model; measured: 0, 1, 2, 3, 7"):
         scale_project_by(bare, tmp_path / "no", ReferenceOptions(**markers, between=("0", "9"), distance="2.1+-0.001"))
     assert not (tmp_path / "no").exists()
@@ -248,7 +249,7 @@ def test_a_small_target_vouches_for_no_more_than_its_own_place(capsys):
             diagonal_m=6.0,
             longest_share=share,
             directions=2,
-            proves="",
+            proves=Fact("views-disagree"),
         )
         validation = dataclasses.replace(validated(0.5, unscaled=True), lengths=lengths)
         show_reference(

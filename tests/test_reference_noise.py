@@ -68,7 +68,7 @@ def test_the_interval_that_is_written_has_that_width(tmp_path, monkeypatch, chec
     found = reference.scale_project_by(tmp_path, tmp_path / "out", options)
     low, high = found.ci95
     assert low < 0.5 < high and low * high == pytest.approx(0.25) and high / low == pytest.approx(0.52 / 0.48)
-    assert any("+1.2 % off" in note for note in found.notes) == told
+    assert any("+1.2 % off" in str(note) for note in found.notes) == told
 
 
 def test_a_target_needs_the_project_s_pictures(tmp_path, monkeypatch):

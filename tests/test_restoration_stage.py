@@ -95,7 +95,7 @@ def test_the_network_treats_the_frames_that_the_filter_would_and_the_result_says
         assert (new["name"], new["action"]) == (old["name"], old["action"])
         assert new["blur_px"] == pytest.approx(old["blur_px"], rel=0.02)
     filmed, filtered, made = map(pictures, (blurred / "frames", by_filter.workspace.images, root / "out" / "images"))
-    deblurred = {frame["name"] for frame in stored["frames"] if frame["action"] == "deblurred"}
+    deblurred = {frame["name"] for frame in stored["frames"] if frame["sharpened"]}
     assert len(deblurred) >= 6
     for name in filmed:
         if name in deblurred:
@@ -133,7 +133,7 @@ def test_a_resumed_run_does_not_mix_methods_or_networks(tmp_path, blurred, weigh
     assert images(DEEP) == deep and log().count("frames: finished in an earlier run") == 1
     small.write_weights(weights, deepgyro=small.mixing(0.9))
     trained = images(DEEP)
-    treated = {record.name for record in read_frame_records(out / "frames.json") if record.action == "deblurred"}
+    treated = {record.name for record in read_frame_records(out / "frames.json") if record.sharpened}
     assert len(treated) >= 6 and {name for name in deep if deep[name] != trained[name]} == treated
     by_filter = images(QUICK)
     assert {name for name in deep if trained[name] != by_filter[name]} >= treated

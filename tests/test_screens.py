@@ -10,8 +10,9 @@ import pytest
 from colmap_inertial.cli import terminal
 from colmap_inertial.cli.captures import Reconstruct
 from colmap_inertial.cli.models import Apply, CalibrateImu, Export, Scale, Validate, View
-from colmap_inertial.core.types import CAL
+from colmap_inertial.core.types import CAL, Action
 from colmap_inertial.io.calibration import Declared, calibration_prior
+from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
 from colmap_inertial.reconstruction.drivers import result as results
 
 
@@ -146,12 +147,13 @@ def test_deblurring_is_counted_by_what_was_done(monkeypatch):
 
     def lines(*actions, view=None):
         plan = SimpleNamespace(view=view, deblur_note="by the gyroscope")
-        return dict(terminal.imaging_lines([SimpleNamespace(action=action) for action in actions], plan, ()))
+        frames = [FrameRecord(name="a", action=Action(action), sharpened=action == "deblurred") for action in actions]
+        return dict(terminal.imaging_lines(frames, plan, ()))
 
-    found = lines("deblurred", "dropped", "deblurred", "kept")
+    found = lines("deblurred", "dropped", "deblurred", "passed")
     assert found == {"deblurring": "2 deblurred, 1 dropped of 4 frames: by the gyroscope", "shutter": "global"}
-    assert lines("kept")["deblurring"] == "by the gyroscope"
-    assert lines("kept", view=SimpleNamespace(notes=("a note",)))[""] == "a note"
+    assert lines("passed")["deblurring"] == "by the gyroscope"
+    assert lines("passed", view=SimpleNamespace(notes=("a note",)))[""] == "a note"
 
 
 def test_an_export_says_unit_model_and_command(told):

@@ -210,14 +210,15 @@ def imaging_lines(frames: Sequence[FrameRecord], plan: ImagingPlan, rectified: C
     """Treatment of the frames, as labelled lines."""
     from colmap_inertial.reconstruction.drivers.result import shutter_note
 
-    counts = {action: sum(frame.action == action for frame in frames) for action in ("deblurred", "dropped")}
-    done = ", ".join(f"{count} {action}" for action, count in counts.items() if count)
+    counts = {"deblurred": sum(f.sharpened for f in frames), "dropped": sum(not f.used for f in frames)}
+    done = ", ".join(f"{count} {word}" for word, count in counts.items() if count)
     view = plan.view
+    note, shutter = str(plan.deblur_note or ""), str(shutter_note(plan, rectified) or "")
     lines: list[Line] = [
-        ("deblurring", f"{done} of {len(frames)} frames: {plan.deblur_note}" if done else plan.deblur_note),
-        ("shutter", shutter_note(plan, rectified)),
+        ("deblurring", f"{done} of {len(frames)} frames: {note}" if done else note),
+        ("shutter", shutter),
     ]
-    return [*lines, *(("", note) for note in (() if view is None else view.notes))]
+    return [*lines, *(("", str(note)) for note in (() if view is None else view.notes))]
 
 
 def show_nothing_to_do(workspace: Workspace) -> None:

@@ -10,7 +10,7 @@ import errno
 from pathlib import Path
 from typing import ClassVar
 
-from colmap_inertial.core.facts import Fact
+from colmap_inertial.core.facts import Fact, as_fact
 
 #: Libraries that open3d and pycolmap-cuda12 take from the system, and their packages on Debian.
 _SYSTEM_LIBRARIES = {
@@ -49,6 +49,13 @@ class InertialError(Exception):
     def why(self) -> Fact:
         """What is wrong as a fact, without the place or the quantity; of an error in words, these."""
         return Fact.stated(str(self)) if self.fact is None else self.fact
+
+
+def fact_of(error: InertialError) -> Fact:
+    """An error as a fact, whose message is that of the error."""
+    if isinstance(error, NotObservableError):
+        return Fact("quantity-not-observable", quantity=error.quantity, why=error.why, sigma=error.sigma)
+    return as_fact(error.fact if error.fact is not None and str(error) == str(error.fact) else str(error))
 
 
 def in_words(message: Fact | str) -> str:
@@ -148,6 +155,11 @@ class NotObservableError(InertialError):
         Why, and what to record instead.
     sigma
         Relative standard deviation, where one was computed.
+
+    Attributes
+    ----------
+    why
+        The hint as a fact.
     """
 
     exit_code = 3
@@ -155,6 +167,7 @@ class NotObservableError(InertialError):
 
     def __init__(self, quantity: str, hint: Fact | str, *, sigma: float | None = None) -> None:
         self.quantity = quantity
+        self.why = as_fact(hint)
         self.hint = in_words(hint)
         self.sigma = sigma
         spread = "" if sigma is None else f" (standard deviation {100 * sigma:.1f} %)"

@@ -98,24 +98,41 @@ def with_sentences(fields: Mapping[str, object]) -> dict[str, object]:
     return out
 
 
+def read_facts(fields: Mapping[str, Any], name: str) -> tuple[Fact, ...]:
+    """Facts that :func:`with_sentences` wrote; where it wrote no codes, or none that are known here, their sentences.
+
+    Parameters
+    ----------
+    fields, name
+        The JSON object, and which of its fields.
+    """
+    texts, coded = fields.get(name) or (), fields.get(name + DETAILS)
+    if isinstance(coded, list) and len(coded) == len(texts):
+        try:
+            return tuple(Fact(one["code"], **one["values"]) for one in coded)
+        except (KeyError, TypeError, LookupError):
+            pass
+    return tuple(Fact.stated(str(text)) for text in texts)
+
+
 def details(facts: Iterable[Fact]) -> list[dict[str, object]]:
     """Code and values of each fact, as JSON has them beside the sentences."""
     return [fact.as_json() for fact in facts]
 
 
 def _frozen(value: Any) -> Any:
-    """Plain values, with tuples for sequences, numbers for those of arrays, and facts for what :func:`_plain` made."""
+    """Plain values, with tuples for sequences, numbers for those of arrays, and facts for what JSON has of them."""
     if hasattr(value, "tolist"):
         value = value.tolist()
-    if isinstance(value, list | tuple):
-        return tuple(_frozen(item) for item in value)
     if isinstance(value, Mapping) and value.keys() == {"code", "values"}:
         return Fact(value["code"], **value["values"])
+    if isinstance(value, list | tuple):
+        return tuple(_frozen(item) for item in value)
     return value
 
 
 def _plain(value: Any) -> Any:
-    """A value with facts in it as JSON has them."""
+    """JSON types: facts by code and values."""
     if isinstance(value, tuple):
-        return tuple(_plain(item) for item in value)
+        return [_plain(item) for item in value]
     return value.as_json() if isinstance(value, Fact) else value

@@ -10,12 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeVar
+from enum import StrEnum
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.core.arrays import Array, BoolArray, Float32Array
+from colmap_inertial.core.arrays import Array, BoolArray, Float32Array, set_fields
+from colmap_inertial.core.facts import Fact, as_fact
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence, measure_blur_share
@@ -24,7 +26,15 @@ from colmap_inertial.imaging.psf import PredictedBlur
 from colmap_inertial.imaging.tracking import convert_to_grey
 
 Code = TypeVar("Code", np.uint8, np.uint16)
-Action = Literal["keep", "deblur", "drop"]
+
+
+class Decision(StrEnum):
+    """What to do with a frame, by the gyroscope alone."""
+
+    #: As filmed.
+    KEEP = "keep"
+    DEBLUR = "deblur"
+    DROP = "drop"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,15 +84,18 @@ class FrameDecision:
     blur_px
         Predicted, px of the image as it is; ``None`` where unknown.
     action
-        keep: as filmed.
+        What to do with it.
     reason
-        In words.
+        Why.
     """
 
     name: str
     blur_px: float | None
-    action: Action
-    reason: str
+    action: Decision
+    reason: Fact
+
+    def __post_init__(self) -> None:
+        set_fields(self, action=Decision(self.action), reason=as_fact(self.reason))
 
 
 def decide(
@@ -116,17 +129,18 @@ def decide(
     out = []
     for name, blur, reason, drop in zip(predicted.names, px, predicted.reasons, dropped, strict=True):
         if not np.isfinite(blur):
-            out.append(FrameDecision(name=name, blur_px=None, action="keep", reason=reason))
+            why = reason or Fact("blur-unknown")
+            out.append(FrameDecision(name=name, blur_px=None, action=Decision.KEEP, reason=why))
             continue
-        action: Action = "deblur"
-        why = f"{blur:.1f} px of blur"
+        action, code = Decision.DEBLUR, "blur-px"
         if blur < max(options.skip_below_px * scale, options.skip_below_own_px):
-            action, why = "keep", f"{blur:.1f} px of blur are too few to matter"
+            action, code = Decision.KEEP, "blur-too-short"
         elif drop:
-            action, why = "drop", f"{blur:.0f} px of blur are too many, and the frames around it are better"
+            action, code = Decision.DROP, "blur-too-long"
         elif blur > options.drop_above_px * scale:
-            why = f"{blur:.0f} px of blur are too many, but the frame bridges a gap"
-        out.append(FrameDecision(name=name, blur_px=float(blur), action=action, reason=why))
+            code = "blur-bridges-gap"
+        blur_px = float(blur)
+        out.append(FrameDecision(name=name, blur_px=blur_px, action=action, reason=Fact(code, blur_px=blur_px)))
     return tuple(out)
 
 
@@ -204,14 +218,17 @@ class RecordingVerdict:
     frames
         How many can tell.
     reason
-        In words.
+        Why.
     """
 
     trusted: bool | None
     support: float
     extent_factor: float
     frames: int
-    reason: str
+    reason: Fact
+
+    def __post_init__(self) -> None:
+        set_fields(self, reason=as_fact(self.reason))
 
 
 def judge_recording(evidence: Iterable[BlurEvidence], options: GateOptions | None = None) -> RecordingVerdict:
@@ -247,19 +264,13 @@ def _judge_evidence(evidence: Sequence[BlurEvidence], options: GateOptions) -> R
     together = sum(telling, BlurEvidence.nothing())
     factor = _correct_extent(together)
     if len(telling) < GATE_LIMITS.fewest_frames:
-        trusted, reason = None, f"{len(telling)} frames are too few to check the gyroscope against the images"
+        trusted, reason = None, Fact("too-few-blurred-frames", count=len(telling))
     elif median < options.min_recording_support and not _is_clear_together(telling, together):
         trusted = False
-        reason = (
-            f"the images do not show the blur that the gyroscope predicts ({median:.1f} standard deviations in the "
-            f"median of {len(telling)} frames): check its axes, the clock offset, the exposure times, and that the "
-            "video was not stabilised"
-        )
+        reason = Fact("blur-not-shown", support_sigmas=median, count=len(telling))
     else:
         sigmas = max(median, together.support)
-        trusted, reason = True, f"the images confirm the gyroscope's blur ({sigmas:.0f} standard deviations)"
-        if factor != 1.0:
-            reason += f", but for its extent, which is multiplied by {factor:.2f}"
+        trusted, reason = True, Fact("blur-confirmed", support_sigmas=sigmas, extent_factor=factor)
     return RecordingVerdict(trusted=trusted, support=median, extent_factor=factor, frames=len(telling), reason=reason)
 
 
@@ -298,7 +309,7 @@ def judge_frame(
     recording: RecordingVerdict | None,
     options: GateOptions,
     path: BlurPath | None = None,
-) -> tuple[float | None, str]:
+) -> tuple[float | None, Fact]:
     """Whether an image confirms its blur.
 
     Parameters
@@ -323,29 +334,23 @@ def judge_frame(
         return None, recording.reason
     unsure = blur.unsure_share()
     if unsure > GATE_LIMITS.most_unsure:
-        return None, f"noise and calibration of the gyroscope leave {unsure:.0%} of the blur's length uncertain"
+        return None, Fact("blur-uncertain", unsure_share=float(unsure))
     curve = BlurPath.straight(blur) if path is None else path
     if recording is not None and recording.trusted:
         share = measure_blur_share(image, curve.times(recording.extent_factor))
         if share is not None and share < GATE_LIMITS.least_share:
-            return (
-                None,
-                "the image has as much detail along the predicted blur as across it, though other frames lack it",
-            )
+            return None, Fact("frame-sharp-along-blur")
         # a flat spectrum predicts no fall, and so tells none
         if (share is None or share < GATE_LIMITS.clear_share) and _lacks_dip(image, curve, options):
-            return None, "the image does not show the blur that the gyroscope predicts, though other frames do"
+            return None, Fact("frame-without-blur")
         return recording.extent_factor, recording.reason
     evidence = blur_evidence(image, curve)
     own = _plausible_support(evidence) if evidence.enough else 0.0
     if not evidence.enough:
-        return None, "too little texture or blur to check the gyroscope's prediction against"
+        return None, Fact("frame-not-telling")
     if own < options.min_support:
-        return None, (
-            f"the image does not show the blur that the gyroscope predicts ({own:.1f} standard deviations where "
-            f"{options.min_support:g} are wanted)"
-        )
-    return _correct_extent(evidence), f"the image confirms the gyroscope's blur ({own:.0f} standard deviations)"
+        return None, Fact("frame-blur-not-shown", support_sigmas=own, wanted_sigmas=options.min_support)
+    return _correct_extent(evidence), Fact("frame-blur-confirmed", support_sigmas=own)
 
 
 def _lacks_dip(image: NDArray[Code], curve: BlurPath, options: GateOptions) -> bool:

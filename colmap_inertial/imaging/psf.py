@@ -11,6 +11,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import CameraImuCalibration, FrameTiming, ImuRecording, Projector
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath, middles, samples_for
@@ -200,12 +201,12 @@ class PredictedBlur:
     px
         (F,) 90th percentile of the blur's length over the image, px of the image as it is; NaN where unknown.
     reasons
-        (F,) why it is unknown; empty where it is known.
+        (F,) why it is unknown; ``None`` where it is known.
     """
 
     names: tuple[str, ...]
     px: Array
-    reasons: tuple[str, ...]
+    reasons: tuple[Fact | None, ...]
 
 
 def predict_blur_px(
@@ -234,11 +235,12 @@ def predict_blur_px(
     """
     parallaxes = parallaxes or {}
     count = len(timing.t_s)
-    px, reasons = np.full(count, np.nan), [_NO_EXPOSURE] * count
+    px = np.full(count, np.nan)
+    reasons: list[Fact | None] = [_NO_EXPOSURE] * count
     if timing.exposure_s is not None:
         readout_s = timing.readout_s or 0.0
         covered = motion.covers(timing.t_s, timing.t_s + timing.exposure_s + readout_s)
-        reasons = ["" if inside else _NOT_COVERED for inside in covered]
+        reasons = [None if inside else _NOT_COVERED for inside in covered]
         x = (np.arange(_LIMITS.predicted_columns) + 0.5) * width / _LIMITS.predicted_columns
         y = (np.arange(_LIMITS.predicted_rows) + 0.5) * height / _LIMITS.predicted_rows
         known = np.flatnonzero(covered)
@@ -256,11 +258,8 @@ def predict_blur_px(
     return PredictedBlur(names=timing.names, px=px, reasons=tuple(reasons))
 
 
-_NO_EXPOSURE = (
-    "the exposure time is unknown (the images carry none); give exposure_s under [timing] in capture.toml, or a column "
-    "of it in the frame times"
-)
-_NOT_COVERED = "the gyroscope does not cover the exposure of this frame, or pauses in it"
+_NO_EXPOSURE = Fact("exposure-unknown")
+_NOT_COVERED = Fact("exposure-not-covered")
 
 
 @dataclass(frozen=True, eq=False)

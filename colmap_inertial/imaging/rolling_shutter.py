@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from colmap_inertial.core.arrays import Array, BoolArray, Float32Array
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import colmap_px_from_opencv
 from colmap_inertial.core.types import Projector
 from colmap_inertial.imaging.blur_field import BlurField
@@ -119,9 +120,7 @@ def rectify_image(
 
 def _check_covered(motion: GyroCamera, shutter: FrameShutter) -> None:
     if not shutter.covered_by(motion, reference=True):
-        raise NotObservableError(
-            "rolling shutter", "the gyroscope does not cover the readout of this frame, or pauses in it"
-        )
+        raise NotObservableError("rolling shutter", Fact("frame-readout-not-covered"))
 
 
 def rays(camera: Projector, points: Array) -> Array:

@@ -394,18 +394,18 @@ def read_record(path: Path, kind: type[T]) -> T:
 
 def structured(kind: type[T], values: Any) -> T:
     """A value of type ``kind`` from JSON types, by the annotations of its fields."""
-    return _converter().structure(_without_sentences(values), kind)
+    return _converter().structure(without_sentences(values), kind)
 
 
-def _without_sentences(values: Any) -> Any:
+def without_sentences(values: Any) -> Any:
     """JSON values with facts by their codes, where these stand beside sentences."""
     if isinstance(values, list):
-        return [_without_sentences(item) for item in values]
+        return [without_sentences(item) for item in values]
     if not isinstance(values, dict):
         return values
     coded = {name.removesuffix(DETAILS): item for name, item in values.items() if name.endswith(DETAILS)}
     return {
-        name: coded.get(name, _without_sentences(item)) for name, item in values.items() if not name.endswith(DETAILS)
+        name: coded.get(name, without_sentences(item)) for name, item in values.items() if not name.endswith(DETAILS)
     }
 
 

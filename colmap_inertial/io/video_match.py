@@ -13,6 +13,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Float32Array, UInt8Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.files import path_in
 from colmap_inertial.io.images import grey_8bit, read_image
 from colmap_inertial.io.video import decode_grey
@@ -57,7 +58,7 @@ class VideoMatch:
     """
 
     t_ns: Mapping[str, int]
-    doubtful: Mapping[str, str]
+    doubtful: Mapping[str, Fact]
     quarter_turns: int
 
 
@@ -142,20 +143,20 @@ def match_to_video(
     return VideoMatch(t_ns=time_of, doubtful=doubtful, quarter_turns=turn)
 
 
-def _decide(candidates: _Candidates, names: Sequence[str]) -> tuple[dict[str, int], dict[str, str]]:
+def _decide(candidates: _Candidates, names: Sequence[str]) -> tuple[dict[str, int], dict[str, Fact]]:
     time_of: dict[str, int] = {}
-    doubtful: dict[str, str] = {}
+    doubtful: dict[str, Fact] = {}
     for i, name in enumerate(names):
         if candidates.distance[i, 0] > np.sqrt(1 - _LIMITS.same_correlation):
-            doubtful[name] = "is no frame of the video"
+            doubtful[name] = Fact("not-of-video")
         elif candidates.fraction_to_next(i) > _LIMITS.largest_fraction:
-            doubtful[name] = "looks like several frames of the video"
+            doubtful[name] = Fact("looks-like-several-frames")
         else:
             time_of[name] = int(candidates.t_ns[i, 0])
     several = {t_ns for t_ns, count in Counter(time_of.values()).items() if count > 1}
     for name in [name for name, t_ns in time_of.items() if t_ns in several]:
         del time_of[name]
-        doubtful[name] = "is the same frame as another picture"
+        doubtful[name] = Fact("same-frame-as-another")
     return time_of, doubtful
 
 

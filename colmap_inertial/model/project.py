@@ -16,6 +16,7 @@ from typing import Any
 
 from colmap_inertial import __version__
 from colmap_inertial.core.errors import AlreadyMetricError, FormatError, InertialError, NotObservableError, OutputError
+from colmap_inertial.core.facts import Fact, with_sentences
 from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.threads import one_blas_thread, usable_processors
 from colmap_inertial.core.types import Similarity
@@ -70,7 +71,7 @@ class Applied:
     models: Mapping[int, tuple[str, ModelScale]]
     changes: tuple[Change, ...]
     unchanged: Mapping[str, int]
-    notes: tuple[str, ...]
+    notes: tuple[Fact, ...]
 
 
 def apply_to_project(
@@ -194,7 +195,9 @@ def _assign_scales(
             )
         scales = {next(iter(layout.submodels)): scales[None]}
     if all(scale.similarity is None for scale in scales.values()):
-        raise NotObservableError("scale", "; ".join(reason for scale in scales.values() for reason in scale.reasons))
+        raise NotObservableError(
+            "scale", "; ".join(str(reason) for scale in scales.values() for reason in scale.reasons)
+        )
     missing = [index for index in layout.submodels if index not in scales]
     if missing or len(scales) > len(layout.submodels):
         given = ", ".join(str(i) for i in scales)
@@ -256,7 +259,7 @@ class _Work:
         )
         self._changes: list[Change] = []
         self._databases: dict[str, dict[str, Any]] = {}
-        self._notes: list[str] = []
+        self._notes: list[Fact] = []
         self._foreign: Counter[str] = Counter()
 
     def is_kept(self, path: Path) -> bool:
@@ -276,7 +279,7 @@ class _Work:
 
         self.folders, self._files, self._links = map(staying, (self.folders, self._files, self._links))
         for index in indices:
-            self._notes.append(f"{layout.submodels[index]} and what was made from it is left out: its scale is refused")
+            self._notes.append(Fact("model-left-out", folder=str(layout.submodels[index])))
 
     @one_blas_thread()
     def run(self, plan: _Plan, progress: Callable[[int, int], object]) -> Applied:
@@ -307,15 +310,13 @@ class _Work:
             for folder in reversed(self.folders):
                 shutil.copymode(self._project / folder, partial / folder)
             if self._foreign:
-                counted = ", ".join(f"{count} {suffix}" for suffix, count in sorted(self._foreign.items()))
-                self._notes.append(f"copied in their old units, as their formats are not transformed: {counted}")
+                counts = tuple((count, suffix) for suffix, count in sorted(self._foreign.items()))
+                self._notes.append(Fact("formats-not-transformed", counts=counts))
             submodels = plan.layout.submodels
             for index, scale in plan.by_model.items():
                 if scale.left_out and scale.similarity is not None:
-                    self._notes.append(
-                        f"{submodels[index]}: {len(scale.left_out)} images contradict the gyroscope and were left out: "
-                        f"{', '.join(scale.left_out[:5])}{' ...' if len(scale.left_out) > 5 else ''}"
-                    )
+                    folder = str(submodels[index])
+                    self._notes.append(Fact("contradicting-images-left-out", folder=folder, names=scale.left_out))
             applied = Applied(
                 out=self._out,
                 models={i: (str(submodels[i]), s) for i, s in plan.by_model.items() if i not in plan.left_out},
@@ -360,7 +361,7 @@ class _Work:
         """Whether a NeRF trainer's cameras are those of a model here; the user is told where they are not."""
         if cameras_are_those_of(self._project / path, layout.placed):
             return True
-        self._notes.append(f"{path}: copied as it is, as its cameras do not stand where those of a model do")
+        self._notes.append(Fact("cameras-elsewhere", file=str(path)))
         return False
 
     def _owner(self, layout: Layout, path: Path) -> int:
@@ -433,7 +434,7 @@ class _Work:
             if moved:
                 changed.append(f"{moved} {what}")
             if kept:
-                self._notes.append(f"{path}: {kept} {what} are not in a model's frame and stay as they are")
+                self._notes.append(Fact("not-in-model-frame", file=str(path), count=kept, kind=what))
         (shutil.copymode if changed else shutil.copystat)(self._project / path, partial / path)
         if changed:
             self._changes.append(Change(path=str(path), kind="database", changed=tuple(changed), model=None))
@@ -457,7 +458,7 @@ class _Work:
             "databases": self._databases,
             "files": [asdict(change) for change in applied.changes],
             "unchanged": applied.unchanged,
-            "notes": list(applied.notes),
+            **with_sentences({"notes": list(applied.notes)}),
         }
 
 

@@ -19,6 +19,7 @@ from colmap_inertial.checks.words import (
     outcome_of_stop,
     parts_mapped_in_words,
 )
+from colmap_inertial.core.types import Action
 from colmap_inertial.io.files import read_json, read_text
 from colmap_inertial.io.toml_section import parse_toml
 
@@ -227,7 +228,7 @@ def _crops(out: Path, done: Content) -> Content:
     file = out / DATA_FOLDER / CROPS_FOLDER / "crops.json"
     crops = read_json(file)["crops"] if file.is_file() else []
     if not crops:
-        if any(frame["action"] == "deblurred" for frame in done["frames"]):
+        if any(frame.get("sharpened", frame["action"] == Action.DEBLURRED) for frame in done["frames"]):
             return _mark_missing("None of the frames that were compared differs before and after.")
         return _mark_missing("No frame was deblurred, so there is nothing to show before and after.")
     reason = {frame["name"]: frame["reason"] for frame in done["frames"]}

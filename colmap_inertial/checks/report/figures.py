@@ -12,6 +12,7 @@ import numpy as np
 from colmap_inertial.checks.report.series import SIZES
 from colmap_inertial.checks.words import digits
 from colmap_inertial.core.quantiles import Z95
+from colmap_inertial.core.types import Action
 from colmap_inertial.inertial.scale.verdict import WEAK_HALF_WIDTH, half_width
 
 Figure = dict[str, Any]
@@ -20,10 +21,10 @@ Lines = Sequence[dict[str, list[float | None]]]
 CAMERA, IMU, OTHER, GOOD, BAD, QUIET = "#e07b1a", "#3f87cf", "#8a63c7", "#2f9e6e", "#d64550", "#8b93a1"
 _TIME = "time since the first frame (s)"
 _ACTIONS = {
-    "passed": ("as filmed", QUIET),
-    "deblurred": ("deblurred", IMU),
-    "changed": ("changed", OTHER),
-    "dropped": ("left out", BAD),
+    Action.PASSED: ("as filmed", QUIET),
+    Action.DEBLURRED: ("deblurred", IMU),
+    Action.CHANGED: ("changed", OTHER),
+    Action.DROPPED: ("left out", BAD),
 }
 _SETS = {"control": IMU, "check": CAMERA, "mixed": QUIET}
 

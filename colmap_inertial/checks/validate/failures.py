@@ -15,6 +15,7 @@ from colmap_inertial.checks.validate.targets import Target, parse_target
 from colmap_inertial.checks.validate.views import sight
 from colmap_inertial.core.arrays import Array, UInt8Array
 from colmap_inertial.core.errors import FormatError, NotObservableError, TargetNotFoundError
+from colmap_inertial.core.facts import Fact
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,39 +35,37 @@ def explain_failure(search: Search, images: Path) -> Exception:
     seen = sorted({s.view for s in search.sightings})
     mirrored = _find_mirroring(search)
     if mirrored is not None:
-        return FormatError(images, f"the images are mirrored {mirrored} against the model: give those it was made from")
+        return FormatError(images, Fact("images-mirrored", along=mirrored))
     if not seen:
         return TargetNotFoundError(
-            f"{target.spec} was not found in any of the {len(search.searched)} images that were searched; "
-            + _hint_at_absence(search)
+            Fact("target-not-found", spec=target.spec, images=len(search.searched), hint=_hint_at_absence(search))
         )
     if len(seen) == 1:
-        return NotObservableError(
-            "scale",
-            f"the target was found in one image only ({views[seen[0]].name}): a length needs it in two images or more, "
-            "taken from different places",
-        )
+        return NotObservableError("scale", Fact("target-in-one-image", name=views[seen[0]].name))
     if search.one_line is not None:
         return search.one_line
     return TargetNotFoundError(
-        f"{target.spec} was found in {len(seen)} images, but no two of them agree on where it is in the model "
-        f"(to {search.options.max_residual_px:g} px): false detections, wrong poses, a target that moved between the "
-        "images, or images that do not belong to this model"
+        Fact(
+            "target-nowhere-alike",
+            spec=target.spec,
+            images=len(seen),
+            residual_px=search.options.max_residual_px,
+        )
     )
 
 
 def _find_mirroring(search: Search) -> str | None:
-    """The mirroring of the images against the model that explains the detections, if there is one."""
-    for flip, words in ((1, "left to right"), (0, "top to bottom")):
+    """Along which direction the images are mirrored against the model, if that explains the detections."""
+    for flip, along in ((1, "horizontal"), (0, "vertical")):
         again = Search(search.views, search.target, search.options, None)
         for v in search.searched[: _LIMITS.mirror_views]:
             image = search.views[v].read(flip=flip)
-            if isinstance(image, str):
+            if isinstance(image, Fact):
                 continue
             sightings = [sight(v, search.views[v].camera, d) for d in detect(image, search.target)]
             again.sightings += [s for s in sightings if len(s.corner) >= DETECTION.least_corners]
         if again.place():
-            return words
+            return along
     return None
 
 
@@ -86,10 +85,7 @@ def require_no_larger_board(search: Search) -> None:
     larger = {size: votes for size, votes in _vote_on_sizes(images, centre).items() if size[0] * size[1] > area}
     size = max(larger, key=larger.__getitem__, default=None)
     if size is not None and larger[size] > 1 and _count_boards(images, size, search.target) >= 0.5 * len(images):
-        raise TargetNotFoundError(
-            f"{search.target.spec} is a part of a board with {size[0]}x{size[1]} inner corners: give the size of the "
-            "whole board"
-        )
+        raise TargetNotFoundError(Fact("part-of-larger-board", spec=search.target.spec, columns=size[0], rows=size[1]))
 
 
 def require_no_likelier_board(search: Search, used: int) -> None:
@@ -112,9 +108,14 @@ def require_no_likelier_board(search: Search, used: int) -> None:
     likely = next(iter(_largest_of(counts)), None)
     if likely is not None and counts[likely] > max(stated + 1, len(images) // 4):
         raise TargetNotFoundError(
-            f"{search.target.spec} agrees in {used} of {len(search.searched)} images, and a board with "
-            f"{likely[0]}x{likely[1]} inner corners is in more of them: COLSxROWS counts inner corners, one less than "
-            "squares"
+            Fact(
+                "other-board-likelier",
+                spec=search.target.spec,
+                used=used,
+                searched=len(search.searched),
+                columns=likely[0],
+                rows=likely[1],
+            )
         )
 
 
@@ -122,7 +123,7 @@ def _images_of_hints(search: Search) -> dict[int, UInt8Array]:
     """Some of the searched images, by view."""
     picked = np.unique(np.linspace(0, len(search.searched) - 1, _LIMITS.size_views).astype(np.intp))
     images = {search.searched[i]: search.views[search.searched[i]].read() for i in picked.tolist()}
-    return {v: image for v, image in images.items() if not isinstance(image, str)}
+    return {v: image for v, image in images.items() if not isinstance(image, Fact)}
 
 
 def _vote_on_sizes(images: Mapping[int, UInt8Array], centre: Mapping[int, Array]) -> Counter[tuple[int, int]]:
@@ -156,11 +157,11 @@ def _count_boards(images: Mapping[int, UInt8Array], size: tuple[int, int], targe
     return sum(bool(detect(image, other)) for image in images.values())
 
 
-def _hint_at_absence(search: Search) -> str:
+def _hint_at_absence(search: Search) -> Fact:
     if search.target.kind != "checkerboard":
-        return "is the description right, and is the target large and sharp enough in the images?"
+        return Fact("target-description-in-doubt")
     votes = _vote_on_sizes(_images_of_hints(search), {})
     for size in _largest_of(votes):
         if size != tuple(sorted((search.target.columns, search.target.rows), reverse=True)):
-            return f"a board with {size[0]}x{size[1]} inner corners is visible: is the size in the description right?"
-    return "COLSxROWS counts inner corners, one less than squares; the whole board must be in view, with a white rim"
+            return Fact("other-board-visible", columns=size[0], rows=size[1])
+    return Fact("inner-corners")

@@ -40,6 +40,7 @@ from colmap_inertial.checks.validate.targets import Target
 from colmap_inertial.checks.validate.views import Sighting, load_views
 from colmap_inertial.core.arrays import Array, BoolArray
 from colmap_inertial.core.errors import NotObservableError, TargetNotFoundError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ValidateOptions
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.threads import one_blas_thread
@@ -48,9 +49,6 @@ from colmap_inertial.model import read_model
 
 if TYPE_CHECKING:
     import pycolmap
-
-_NOT_FOUND = "target not found"
-_DISAGREES = "does not agree with the other views: a false detection, another target, or a wrong pose"
 
 
 @one_blas_thread()
@@ -130,13 +128,11 @@ def _require_agreement(search: Search, placed: dict[int, PartPlacement]) -> None
     seen = {s.view for s in search.sightings}
     if len(used) < PLACEMENT.smallest_agreement * len(seen):
         raise TargetNotFoundError(
-            f"something like {search.target.spec} was found in {len(seen)} images, but only {len(used)} of them agree "
-            "on where it is in the model: check the number of columns and rows (inner corners of a checkerboard), and "
-            "that the target did not move"
+            Fact("target-seldom-agrees", spec=search.target.spec, found=len(seen), agreeing=len(used))
         )
 
 
-def _reject_outliers(search: Search, placed: dict[int, PartPlacement]) -> tuple[dict[int, PartPlacement], list[str]]:
+def _reject_outliers(search: Search, placed: dict[int, PartPlacement]) -> tuple[dict[int, PartPlacement], list[Fact]]:
     """Single markers whose size differs from the others' by more than 5 % are not what the description says."""
     logs = {p: part.placement.log_scale for p, part in placed.items()}
     order = sorted(logs, key=lambda p: logs[p])
@@ -144,8 +140,7 @@ def _reject_outliers(search: Search, placed: dict[int, PartPlacement]) -> tuple[
     middle = logs[order[int(np.searchsorted(running, 0.5 * running[-1]))]]
     outlying = [p for p in placed if abs(logs[p] - middle) > FIT.outlying_marker_log]
     reasons = [
-        f"{search.target.part_name(p)} is left out: {100 * (np.exp(logs[p] - middle) - 1):+.1f} % against the others; "
-        "does it have another size?"
+        Fact("marker-of-other-size", part=search.target.part_name(p), difference=float(np.exp(logs[p] - middle) - 1))
         for p in outlying
     ]
     return {p: part for p, part in placed.items() if p not in outlying}, reasons
@@ -157,7 +152,7 @@ def _measure_diagonal(model: Path | pycolmap.Reconstruction) -> float | None:
 
 
 def _measure(
-    search: Search, placed: dict[int, PartPlacement], missing: dict[str, str], diagonal: float | None
+    search: Search, placed: dict[int, PartPlacement], missing: dict[str, Fact], diagonal: float | None
 ) -> Validation:
     """The size of a target that was placed; ``missing``: why images of the model are not there, by name."""
     target, options = search.target, search.options
@@ -178,7 +173,7 @@ def _measure(
     control, check = (_make_set_scale(markers, of_target) for markers in sets)
     check_error, check_ci = _compare_sets(*sets)
     if check_error is None:
-        reasons.append("too few corners to keep a control and a check set apart")
+        reasons.append(Fact("target-without-check-set"))
     to_metres = 1.0
     if options.unscaled:
         to_metres = float(np.exp(-log_scale)) if control is None else control.metres_per_unit
@@ -227,8 +222,7 @@ def _require_narrow(obs: Observations, fit: ScaleFit) -> float:
     if not half < np.log(FIT.widest_factor):
         raise NotObservableError(
             "scale",
-            f"{len(np.unique(obs.view))} views of the target lie too close together or agree too badly; "
-            "more views from different sides are needed",
+            Fact("target-views-too-close", views=len(np.unique(obs.view))),
             sigma=min(fit.sigma_log, 9.99),
         )
     return half
@@ -273,9 +267,9 @@ def _rms(vectors: Array) -> float:
     return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
 
 
-def fit_without_outliers(obs: Observations, start: Placement) -> tuple[Observations, ScaleFit, dict[int, str]]:
+def fit_without_outliers(obs: Observations, start: Placement) -> tuple[Observations, ScaleFit, dict[int, Fact]]:
     """Fit, leave out views and corners that do not belong, and fit again until none is left."""
-    dropped: dict[int, str] = {}
+    dropped: dict[int, Fact] = {}
     while True:
         fit = fit_scale(obs, start)
         start = fit.placement
@@ -290,18 +284,18 @@ def fit_without_outliers(obs: Observations, start: Placement) -> tuple[Observati
             keep[mine] = np.linalg.norm(fit.corner_residual_px[mine], axis=1) < FIT.outlier_sigma * sigma
             if keep[mine].sum() < DETECTION.least_corners:
                 keep[mine] = False
-                dropped[int(v)] = "fewer than four of its corners agree with the other views"
+                dropped[int(v)] = Fact("view-corners-disagree")
         if keep.all():  # corners first: a few wrong ones can make a good view look bad
             limit = FIT.outlier_view_ratio * float(np.median(list(rms.values())))
             for v, value in rms.items():
                 if value > limit and len(rms) > 2:
                     keep[obs.view == v] = False
-                    dropped[v] = "its corners are more than four times as far off as those of the other views"
+                    dropped[v] = Fact("view-corners-far-off")
         if keep.all():
             return obs, fit, dropped
         obs = obs.select(keep)
         if len(np.unique(obs.view)) < 2:
-            raise TargetNotFoundError("the views of the target do not agree with each other in the model")
+            raise TargetNotFoundError(Fact("views-disagree"))
         obs, start = _compact(obs, start)
 
 
@@ -403,8 +397,8 @@ def _collect_rejected(
     search: Search,
     placed: dict[int, PartPlacement],
     obs: Observations,
-    dropped: dict[int, str],
-    missing: dict[str, str],
+    dropped: dict[int, Fact],
+    missing: dict[str, Fact],
 ) -> tuple[RejectedView, ...]:
     used = set(obs.view.tolist())
     reason = dict(missing)
@@ -419,41 +413,36 @@ def _collect_rejected(
         elif v in dropped:
             reason[name] = dropped[v]
         elif not mine:
-            reason[name] = _NOT_FOUND
+            reason[name] = Fact("view-target-not-found")
         else:
             off = [
                 median_residual_px(s, placed[s.part].placement, search.target, search.views)
                 for s in mine
                 if s.part in placed
             ]
-            reason[name] = _DISAGREES if off else "shows only markers that no other view confirms"
+            reason[name] = Fact("view-disagrees" if off else "view-markers-unconfirmed")
             residual_px[name] = min(off, default=None)
     return tuple(
         RejectedView(name=name, reason=reason[name], residual_px=residual_px.get(name)) for name in sorted(reason)
     )
 
 
-def _list_remarks(search: Search, obs: Observations, fit: ScaleFit, views: tuple[ViewResiduals, ...]) -> list[str]:
+def _list_remarks(search: Search, obs: Observations, fit: ScaleFit, views: tuple[ViewResiduals, ...]) -> list[Fact]:
     out = []
     if len(views) < 5:
-        out.append(
-            f"only {len(views)} views: the interval is wide because pose errors are hard to estimate from so few"
-        )
+        out.append(Fact("target-in-few-views", views=len(views)))
     copies = Counter((s.view, s.part) for s in search.sightings)
     several = len({view for (view, _), count in copies.items() if count > 1})
     if several:
-        out.append(f"{several} images show more than one such target; the one that most views agree on was measured")
+        out.append(Fact("several-targets", images=several))
     if fit.noise.pose_ratio.any():
         shared = _rms(fit.residual_px - fit.corner_residual_px)
-        out.append(f"errors of the model's poses move the target by {shared:.2f} px; the interval allows for them")
+        out.append(Fact("target-moved-by-poses", shift_px=shared))
     sigma_m, length_m = search.target.sigma_m, search.target.length_m
     if sigma_m is None:
-        out.append(
-            "the interval does not include errors of the target itself: measure the print and state its standard "
-            "deviation (+- in the description)"
-        )
+        out.append(Fact("target-sigma-unknown"))
     else:
-        out.append(f"the interval includes the target's own standard deviation of {100 * sigma_m / length_m:.2g} %")
+        out.append(Fact("target-sigma-included", sigma_share=sigma_m / length_m))
     if len(search.searched) < len(search.views):
-        out.append(f"{len(search.views) - len(search.searched)} images were not searched: enough views were found")
+        out.append(Fact("images-not-searched", images=len(search.views) - len(search.searched)))
     return out

@@ -23,6 +23,7 @@ from colmap_inertial.checks.validate.targets import Target
 from colmap_inertial.checks.validate.views import Sighting, View, sight
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ValidateOptions
 
 
@@ -179,8 +180,7 @@ def _choose_pairs(sightings: list[Sighting], views: list[View], seed: int) -> li
     if not apart.any():
         raise NotObservableError(
             "scale",
-            f"all views see the target along the same line (within {np.rad2deg(angle.max()):.2f} degrees): a length "
-            "needs views from different places",
+            Fact("target-along-one-line", largest_angle_rad=angle.max()),
         )
     first, second, angle = first[apart], second[apart], angle[apart]
     if len(first) > PLACEMENT.most_pairs:
@@ -306,7 +306,7 @@ class Search:
         self.views, self.target, self.options = views, target, options
         self.sightings: list[Sighting] = []
         self.searched: list[int] = []
-        self.unreadable: dict[int, str] = {}
+        self.unreadable: dict[int, Fact] = {}
         self.parts: dict[int, list[Sighting]] = {}
         self.one_line: NotObservableError | None = None
         self._progress = progress
@@ -334,7 +334,7 @@ class Search:
 
     def _search_view(self, v: int, *, thorough: bool) -> bool:
         image = self.views[v].read()
-        if isinstance(image, str):
+        if isinstance(image, Fact):
             self.unreadable[v] = image
             return False
         sightings = [sight(v, self.views[v].camera, d) for d in detect(image, self.target, thorough=thorough)]

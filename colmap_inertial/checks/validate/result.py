@@ -18,6 +18,7 @@ from colmap_inertial.checks.validate.fit import FIT
 from colmap_inertial.checks.validate.targets import Target
 from colmap_inertial.checks.words import target_facts
 from colmap_inertial.core.arrays import Array, IndexArray
+from colmap_inertial.core.facts import Fact, with_sentences
 from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.io.files import convert_to_plain
 
@@ -87,7 +88,7 @@ class LengthCheck:
     directions
         In how many independent directions there are lengths: 1, 2 or 3.
     proves
-        What the check proves, and what it does not, in one sentence.
+        What the check proves, and what it does not.
     """
 
     count: int
@@ -97,7 +98,7 @@ class LengthCheck:
     diagonal_m: float | None
     longest_share: float | None
     directions: int
-    proves: str
+    proves: Fact
 
     @property
     def is_short(self) -> bool:
@@ -163,17 +164,17 @@ def _count_directions(ends: Array) -> int:
     return int((spread > FIT.own_direction * spread[-1]).sum())
 
 
-def _describe_proof(longest_m: float, diagonal_m: float | None, share: float | None, directions: int) -> str:
-    checked = f"lengths up to {longest_m:.3g} m agree within the errors given here"
-    if share is None or diagonal_m is None:
-        return checked
-    checked += f", in {'one direction' if directions == 1 else f'{directions} directions'}"
-    if share >= FIT.long_share:
-        return f"{checked} and over {100 * share:.0f} % of the model's diagonal of {diagonal_m:.3g} m"
-    amount = "nothing" if share < FIT.short_share else "little"
-    return (
-        f"{checked}; they span {100 * share:.2g} % of the model's diagonal of {diagonal_m:.3g} m and show {amount} "
-        "of a bend or drift elsewhere"
+def _describe_proof(longest_m: float, diagonal_m: float | None, share: float | None, directions: int) -> Fact:
+    elsewhere = None
+    if share is not None and share < FIT.long_share:
+        elsewhere = "nothing" if share < FIT.short_share else "little"
+    return Fact(
+        "lengths-agree",
+        longest_m=longest_m,
+        diagonal_m=diagonal_m,
+        longest_share=share,
+        directions=directions,
+        shows_elsewhere=elsewhere,
     )
 
 
@@ -216,7 +217,7 @@ class RejectedView:
     """
 
     name: str
-    reason: str
+    reason: Fact
     residual_px: float | None = None
 
 
@@ -351,7 +352,7 @@ class Validation:
     check_error_pct, check_ci95_pct
         Scale error that the check corners show after scaling by the control corners.
     reasons
-        What limits the result, in words.
+        What limits the result.
     lengths
         Errors of the known distances, how long they are and what they prove.
     bars, check_points, apart
@@ -380,7 +381,7 @@ class Validation:
     corners: tuple[Corner, ...]
     views: tuple[ViewResiduals, ...]
     views_rejected: tuple[RejectedView, ...]
-    reasons: tuple[str, ...]
+    reasons: tuple[Fact, ...]
     lengths: LengthCheck | None = None
     bars: tuple[ScaleBar, ...] = ()
     check_points: CheckPoints | None = None
@@ -395,20 +396,20 @@ class Validation:
         return not off and not self.doubts
 
     @property
-    def doubts(self) -> tuple[str, ...]:
+    def doubts(self) -> tuple[Fact, ...]:
         """Why the target may not be the stated one: few images agree, or its lengths do not."""
         doubts = []
         if self.views_used < FIT.enough_views:
-            doubts.append(
-                f"only {self.views_used} of {self.views_searched} images agree on the target, which proves no size: "
-                "check its columns and rows, or take it from more sides"
-            )
+            doubts.append(Fact("target-size-not-proved", used=self.views_used, searched=self.views_searched))
         lengths = self.lengths
         if lengths is not None and abs(lengths.largest_m) > self.tolerance_pct / 100 * lengths.longest_m:
             doubts.append(
-                f"its lengths do not agree: one is off by {1000 * lengths.largest_m:+.3g} mm, more than "
-                f"{self.tolerance_pct:g} % of the longest, {1000 * lengths.longest_m:.4g} mm: check its columns, rows "
-                "and that it is flat"
+                Fact(
+                    "target-lengths-disagree",
+                    largest_m=lengths.largest_m,
+                    tolerance_share=self.tolerance_pct / 100,
+                    longest_m=lengths.longest_m,
+                )
             )
         return tuple(doubts)
 
@@ -424,7 +425,7 @@ class Validation:
         values["reasons"] = (*self.doubts, *self.reasons)
         values["doubts"] = self.doubts
         values["views"] = [{"name": v.name, "corners": len(v.corner), "rms_px": v.rms_px} for v in self.views]
-        json: dict[str, Any] = convert_to_plain(values)
+        json: dict[str, Any] = convert_to_plain(with_sentences(values))
         return json
 
 
@@ -449,7 +450,7 @@ def validation_table(result: Validation) -> Group:
         rejected.add_column("images", justify="right")
         rejected.add_column("reason")
         for reason, count in Counter(view.reason for view in result.views_rejected).most_common():
-            rejected.add_row(str(count), reason)
+            rejected.add_row(str(count), str(reason))
         parts.append(rejected)
     proved = [] if result.lengths is None else [f"the check proves that {result.lengths.proves}"]
     parts += [Text(f"not proved: {text}", "bold red") for text in result.doubts]

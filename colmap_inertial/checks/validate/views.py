@@ -11,6 +11,7 @@ import numpy as np
 from colmap_inertial.checks.validate.detect import DETECTION, Detection
 from colmap_inertial.core.arrays import Array, IndexArray, UInt8Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.files import path_in, read_bytes
 from colmap_inertial.io.images import require_modest
 from colmap_inertial.model import model_format, read_model
@@ -46,7 +47,7 @@ class View:
     cam_from_world_t: Array
     origin_in_model: Array = field(default_factory=lambda: np.zeros(3))
 
-    def read(self, *, flip: int | None = None) -> UInt8Array | str:
+    def read(self, *, flip: int | None = None) -> UInt8Array | Fact:
         """The image (H, W) in grey as COLMAP sees it (orientation tags ignored), or why it cannot be used.
 
         Parameters
@@ -60,16 +61,19 @@ class View:
             data = read_bytes(self.path, what="picture")
             require_modest(self.path, data)
         except FormatError as error:
-            return error.reason
+            return error.fact or Fact.stated(error.reason)
         flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
         if image is None:
-            return "the image cannot be read"
+            return Fact("view-unreadable")
         height, width = image.shape
         if (width, height) != (self.camera.width, self.camera.height):
-            return (
-                f"the image is {width}x{height} and its camera in the model {self.camera.width}x{self.camera.height}: "
-                "give the images that the model was made from"
+            return Fact(
+                "view-of-other-size",
+                width=width,
+                height=height,
+                camera_width=self.camera.width,
+                camera_height=self.camera.height,
             )
         return np.asarray(image if flip is None else cv2.flip(image, flip), dtype=np.uint8)
 
@@ -102,7 +106,7 @@ class Sighting:
     px_from_tangent: Array
 
 
-def load_views(model: Path | pycolmap.Reconstruction, images: Path) -> tuple[list[View], dict[str, str]]:
+def load_views(model: Path | pycolmap.Reconstruction, images: Path) -> tuple[list[View], dict[str, Fact]]:
     """The posed images of a model whose files are there.
 
     Parameters
@@ -137,11 +141,11 @@ def load_views(model: Path | pycolmap.Reconstruction, images: Path) -> tuple[lis
     if not posed:
         raise FormatError(model if isinstance(model, Path) else "model", "holds no image with a pose")
     middle = np.median([image.projection_center() for image in posed], axis=0)
-    views, missing = [], {}
+    views, missing = [], dict[str, Fact]()
     for image in posed:
         path = path_in(images, image.name, model if isinstance(model, Path) else None)
         if not path.is_file():
-            missing[image.name] = "no such file in the image folder"
+            missing[image.name] = Fact("view-without-file")
             continue
         pose = image.cam_from_world()
         rotation = np.asarray(pose.rotation.matrix(), dtype=np.float64)

@@ -14,6 +14,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import AnyArray, Array, BoolArray, Float32Array
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import colmap_px_from_opencv
 from colmap_inertial.core.types import Projector
 from colmap_inertial.imaging._bilinear import interpolate_nodes
@@ -118,11 +119,7 @@ def match_brightness(short: AnyArray, long: AnyArray, *, stated: float | None = 
     measured = None if middle is None else float(np.exp(middle))
     gain = _choose_gain(stated, measured, BRIGHTNESS_LIMITS.agree_factor)
     if gain is None:
-        raise NotObservableError(
-            "the gain between short and long exposure",
-            "too little of the pictures is neither black in the short nor clipped in the long one; give the exposure "
-            "times and sensitivities",
-        )
+        raise NotObservableError("the gain between short and long exposure", Fact("pair-gain-unknown"))
     limit = np.log(BRIGHTNESS_LIMITS.most_colour)
     colours = [0.0 if g is None or middle is None else np.clip(np.log(g) - middle, -limit, limit) for g in gains]
     return Brightness(
@@ -183,14 +180,11 @@ def gyro_shift(
         Where an exposure time is unknown or the gyroscope did not record all from the first to the last line.
     """
     if short.exposure_s is None or long.exposure_s is None:
-        raise NotObservableError("the rotation between short and long exposure", "an exposure time is unknown")
+        raise NotObservableError("the rotation between short and long exposure", Fact("pair-exposure-unknown"))
     ends = [(s.t_s, s.t_s + (s.exposure_s or 0.0) + s.readout_s) for s in (short, long)]
     begin_s, end_s = min(e[0] for e in ends), max(e[1] for e in ends)
     if not motion.covers(np.array([begin_s]), np.array([end_s]))[0]:
-        raise NotObservableError(
-            "the rotation between short and long exposure",
-            "the gyroscope does not cover the time from the one to the other, or pauses in it",
-        )
+        raise NotObservableError("the rotation between short and long exposure", Fact("pair-not-covered"))
     nodes = step_px * grid_nodes(*BlurField.nodes(short.width, short.height, step_px))
     source = colmap_px_from_opencv(nodes.reshape(-1, 2))
     directions = np.einsum("nij,nj->ni", motion.start_from_cam(short.middle_s(source)), rays(camera, source))
@@ -257,7 +251,7 @@ class ExposurePair:
     registered
         How the geometry was.
     gyro_note
-        Why the gyroscope had no part in it; empty where it had.
+        Why the gyroscope had no part in it; ``None`` where it had.
     """
 
     short: Float32Array
@@ -267,7 +261,7 @@ class ExposurePair:
     blur: BlurField | None
     brightness: Brightness
     registered: Registered
-    gyro_note: str = ""
+    gyro_note: Fact | None = None
 
 
 def bring_together(
@@ -296,14 +290,15 @@ def bring_together(
     import cv2
 
     brightness = first_brightness(short, long, stated=stated_gain)
-    shift, note = None, ""
+    shift = None
+    note: Fact | None = None
     if gyro is None:
-        note = "no gyroscope"
+        note = Fact("no-gyroscope")
     else:
         try:
             shift = gyro_shift(gyro.motion, gyro.camera, gyro.short, gyro.long)
         except NotObservableError as error:
-            note = error.hint
+            note = error.why
     height, width = short.shape[:2]
     top = np.iinfo(long.dtype).max
     clipped = long >= np.ceil(BRIGHTNESS_LIMITS.clipped * top)
@@ -322,7 +317,7 @@ def bring_together(
             # the exposure is known and recorded: else there were no shift
             blur = blur_seen_from_short(blur_field(gyro.motion, gyro.camera, gyro.long), registered.shift_px)
         else:
-            note = "the pictures do not confirm the gyroscope's rotation"
+            note = Fact("pair-rotation-not-confirmed")
     map_x, map_y = sampling_maps(registered.shift_px, width, height, _STEP_PX)
     covered = (map_x >= 0) & (map_x <= width - 1) & (map_y >= 0) & (map_y <= height - 1)
     seen = cv2.remap(long, map_x, map_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)

@@ -10,6 +10,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import AnyArray
 from colmap_inertial.core.errors import FormatError, InertialError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ApertureOptions
 from colmap_inertial.core.types import Frame, Treatment
 from colmap_inertial.imaging.multi_aperture import (
@@ -66,7 +67,8 @@ class ApertureStage:
             fused = self.fused(frame.name, frame.image)
             if self.keep is not None:
                 write_maps(self.keep / "disparity", self.keep / "depth", frame.name, fused)
-            done = Treatment(stage="apertures", reason=f"fused of {len(self.pictures.rig.apertures)} sub-images")
+            count = len(self.pictures.rig.apertures)
+            done = Treatment(stage="apertures", reason=Fact("apertures-fused", count=count))
             yield replace(
                 frame,
                 image=fused.image,

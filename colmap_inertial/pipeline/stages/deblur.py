@@ -9,16 +9,14 @@ from typing import Any, get_args
 import numpy as np
 
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import BlurRemover, DeblurMethod
 from colmap_inertial.core.threads import frames_at_once, map_in_order, one_blas_thread, threads_beside
-from colmap_inertial.core.types import (
-    Frame,
-    Projector,
-    Treatment,
-)
+from colmap_inertial.core.types import Action, Frame, Projector, Treatment
 from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.gate import (
     GATE_LIMITS,
+    Decision,
     FrameDecision,
     GateOptions,
     RecordingVerdict,
@@ -202,28 +200,30 @@ class DeblurStage:
     ) -> Frame:
         """The frame to continue with, and what was decided about it."""
 
-        def said(reason: str, kept_share: float = 1.0, extent_factor: float = 1.0, action: str = "") -> Frame:
+        def said(
+            reason: Fact, kept_share: float = 1.0, extent_factor: float = 1.0, action: Action = Action.NOTHING
+        ) -> Frame:
             values = {"blur_px": decision.blur_px, "kept_share": kept_share, "extent_factor": extent_factor}
             done = Treatment(stage="deblur", reason=reason, action=action, values=values)
             return replace(frame, treatments=(*frame.treatments, done))
 
-        if decision.action == "keep":
+        if decision.action is Decision.KEEP:
             return said(decision.reason)
         if self.verdict.trusted is False:
             return said(self.verdict.reason)
-        if decision.action == "drop" and self.drop:
+        if decision.action is Decision.DROP and self.drop:
             return replace(said(decision.reason), dropped=bool(self.verdict.trusted))
         parallax = self.parallaxes.get(frame.name)
         try:
             blur = blur_field(motion, camera, shutter, parallax=parallax)
         except NotObservableError as error:
-            return said(error.hint)
+            return said(error.why)
         if float(np.abs(blur.vector_px).max()) * 1.5 > LONGEST_PX:
-            return said(f"{decision.blur_px:.0f} px of blur are too long to be undone")
+            return said(Fact("blur-not-undone", blur_px=decision.blur_px))
         image: Any = frame.image  # either of two types of pixel, which the checker would keep apart
         path = blur_path(motion, camera, shutter, parallax=parallax)
-        if self.view.sign_doubt and path.departure_px() > GATE_LIMITS.straight_px:
-            return said(f"{self.view.sign_doubt}, and with the other one the blur would be curved the other way")
+        if self.view.sign_doubt is not None and path.departure_px() > GATE_LIMITS.straight_px:
+            return said(Fact("curved-blur-in-doubt", doubt=self.view.sign_doubt))
         factor, reason = judge_frame(image, blur, self.verdict, self.gate, path)
         if factor is None:
             return said(reason)
@@ -233,4 +233,4 @@ class DeblurStage:
         out, kept = keep_sharp(image, remove(image, path), blur)
         width_px = smoothing_for(factor * (decision.blur_px or 0.0), self.smoothing, self.most_smoothing_px)
         smoothing_px = width_px if kept < SMOOTHING.kept_share else 0.0
-        return replace(said(reason, kept, factor, "deblurred"), image=out, smoothing_px=smoothing_px)
+        return replace(said(reason, kept, factor, Action.DEBLURRED), image=out, smoothing_px=smoothing_px)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -12,6 +12,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import AnyArray, Float32Array
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError
+from colmap_inertial.core.facts import Fact, with_sentences
 from colmap_inertial.core.options import ExposureOptions
 from colmap_inertial.core.threads import frames_at_once, map_in_order
 from colmap_inertial.core.types import Frame, Projector, Treatment
@@ -71,7 +72,7 @@ class FusedPair:
     used
         ``both``, or the better one of the two: the short one, brightened, or the long one as it is.
     reason
-        In words.
+        Why.
     gain, colours
         By what the short one's light was multiplied, and what each channel's gain is of it.
     gain_measured, gain_stated
@@ -92,7 +93,7 @@ class FusedPair:
     long: str
     fused: bool
     used: Literal["both", "short", "long"]
-    reason: str
+    reason: Fact
     gain: float | None = None
     colours: tuple[float, ...] | None = None
     gain_measured: float | None = None
@@ -190,7 +191,7 @@ class ExposureStage:
             if done is None:
                 yield frame
                 continue
-            treatment = Treatment(stage="exposures", reason=done.reason, values={"pair": asdict(done)})
+            treatment = Treatment(stage="exposures", reason=done.reason, values={"pair": with_sentences(vars(done))})
             yield replace(frame, treatments=(*frame.treatments, treatment))
 
     def _gyro(self) -> Callable[[str], PairGyro | None]:
@@ -228,34 +229,37 @@ class ExposureStage:
             short_exposure_s=frame.exposure_s,
             long_exposure_s=long_exposures_s.get(frame.name),
         )
-        done = FusedPair(name=frame.name, long=str(path), fused=False, used="short", reason="")
         try:
             pair = bring_together(frame.image, long, gyro=times, stated_gain=stated)
         except NotObservableError as error:
-            return _alone(frame, long, None, done, error.hint)
-        done = _described(done, pair)
+            return _alone(frame, long, None, path, error.why)
+        measured = _measured(pair)
         if not pair.registered.alike:
-            why = f"{path.name} does not show the same (correlation {done.agreement:.2f})"
-            return _alone(frame, long, pair.brightness, done, why)
+            why = Fact("pair-not-alike", long=path.name, correlation=pair.registered.agreement)
+            return _alone(frame, long, pair.brightness, path, why, measured)
         light = self.fuser.fuse(pair.short, pair.long, pair.blur)
         if self.fusion == "mertens":
             dark = brightened(frame.image, replace(pair.brightness, gain=1.0))
             light = fuse_mertens([darken_fused(light, dark, pair.clipped, pair.brightness.gain), light])
-        done = replace(done, fused=True, used="both", reason=_describe_pair(pair, path))
+        reason = _describe_pair(pair, path)
+        done = FusedPair(name=frame.name, long=str(path), fused=True, used="both", reason=reason, **measured)
         return _replace_light(frame, light), done
 
 
 def _alone(
-    frame: Frame, long: AnyArray, brightness: Brightness | None, done: FusedPair, why: str
+    frame: Frame,
+    long: AnyArray,
+    brightness: Brightness | None,
+    path: Path,
+    why: Fact,
+    measured: Mapping[str, Any] | None = None,
 ) -> tuple[Frame, FusedPair]:
     """The better one of the two, never a dark one."""
     alone = better_alone(frame.image, long, brightness)
-    what = (
-        "the long exposure as it is"
-        if alone.used == "long"
-        else f"the short exposure, {alone.gain:.3g} times as bright"
+    reason = Fact("exposures-not-fused", used=alone.used, gain=alone.gain, why=why)
+    treated = FusedPair(
+        name=frame.name, long=str(path), fused=False, used=alone.used, reason=reason, **(measured or {})
     )
-    treated = replace(done, used=alone.used, reason=f"is {what}, and not fused: {why}")
     if alone.used == "short":
         treated = replace(treated, gain=alone.gain)
     return _replace_light(frame, alone.image), treated
@@ -294,10 +298,10 @@ def _require_size(path: Path, frame: Frame, shutter: FrameShutter) -> None:
         )
 
 
-def _described(done: FusedPair, pair: ExposurePair) -> FusedPair:
+def _measured(pair: ExposurePair) -> dict[str, Any]:
+    """The figures of a pair that was brought together."""
     bright, registered = pair.brightness, pair.registered
-    return replace(
-        done,
+    return dict(
         gain=bright.gain,
         colours=bright.colours,
         gain_measured=bright.measured,
@@ -313,18 +317,15 @@ def _described(done: FusedPair, pair: ExposurePair) -> FusedPair:
     )
 
 
-def _describe_pair(pair: ExposurePair, path: Path) -> str:
-    by = [
-        name
-        for name, used in (("the gyroscope", pair.registered.by_gyro), ("the pixels", pair.registered.by_pixels))
-        if used
-    ]
-    aligned = f"aligned by {' and '.join(by)}" if by else "not aligned: no shift makes them agree better"
-    description = f"fused with {path.name}, which has {pair.brightness.gain:.3g} times the light; {aligned}"
-    if pair.gyro_note and pair.gyro_note != "no gyroscope":
-        description += f" ({pair.gyro_note})"
-    if pair.brightness.contradicts:
-        description += (
-            f"; exposure times and sensitivities say {pair.brightness.stated:.3g} times, which the pixels do not"
-        )
-    return description
+def _describe_pair(pair: ExposurePair, path: Path) -> Fact:
+    note, bright = pair.gyro_note, pair.brightness
+    return Fact(
+        "exposures-fused",
+        long=path.name,
+        gain=bright.gain,
+        by_gyro=pair.registered.by_gyro,
+        by_pixels=pair.registered.by_pixels,
+        # that there is none is said for the whole recording
+        no_gyro=None if note is None or note.code == "no-gyroscope" else note,
+        contradicted_gain=bright.stated if bright.contradicts else None,
+    )

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from colmap_inertial.core.arrays import AnyArray
+from colmap_inertial.core.arrays import AnyArray, set_fields
 from colmap_inertial.core.errors import FormatError, InertialError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.threads import frames_at_once, map_in_order
-from colmap_inertial.core.types import CameraModel, Frame, Treatment
+from colmap_inertial.core.types import Action, CameraModel, Frame, Treatment
 from colmap_inertial.imaging.path_filters import smoothed
 from colmap_inertial.io.exif import carry_metadata
 from colmap_inertial.io.files import path_in, read_record, write_record
@@ -37,27 +38,37 @@ class FrameRecord:
     name
         Image name.
     action
-        ``"passed"``: the original file or pixels; ``"dropped"``: by a frame stage; ``"changed"``: by a frame stage, or
-        the word that the stage itself has for it, such as ``"deblurred"``.
+        What the last frame stage that changed it says; ``Action.PASSED`` for the original file or pixels,
+        ``Action.DROPPED`` for a frame that a stage left out.
     camera
         Intrinsics that COLMAP starts from; ``None`` where COLMAP guesses.
     treatments
         What the stages said.
+    sharpened
+        Whether the picture that COLMAP sees had its blur undone.
+    rectified
+        Whether the rolling shutter of its keypoints was undone; ``None`` before there are keypoints, as in
+        ``frames.json``.
     """
 
     name: str
-    action: str
+    action: Action
     camera: CameraModel | None = None
     treatments: tuple[Treatment, ...] = ()
+    sharpened: bool = False
+    rectified: bool | None = None
+
+    def __post_init__(self) -> None:
+        set_fields(self, action=Action(self.action))
 
     @property
     def used(self) -> bool:
         """Whether COLMAP sees it."""
-        return self.action != "dropped"
+        return self.action is not Action.DROPPED
 
     @property
-    def reason(self) -> str | None:
-        """Why, in the words of the last stage that said something; ``None`` where none did."""
+    def reason(self) -> Fact | None:
+        """Why, by the last stage that said something; ``None`` where none did."""
         return self.treatments[-1].reason if self.treatments else None
 
     def value(self, key: str) -> Any:
@@ -173,9 +184,9 @@ def write_frames(
             came.add(frame.name)
             yield frame, originals.pop_through(frame.name)
 
-    def write(item: tuple[Frame, AnyArray | None]) -> tuple[Frame, str]:
+    def write(item: tuple[Frame, AnyArray | None]) -> tuple[Frame, Action]:
         frame, original = item
-        return frame, "dropped" if frame.dropped else _write(frame, original, paths)
+        return frame, Action.DROPPED if frame.dropped else _write(frame, original, paths)
 
     for frame, action in map_in_order(write, with_original(), workers=frames_at_once()):
         seen[frame.name] = FrameRecord(
@@ -183,14 +194,15 @@ def write_frames(
             action=action,
             camera=None if frame.dropped else frame.camera,
             treatments=frame.treatments,
+            sharpened=_is_sharpened(frame, action),
         )
         progress("frames", len(seen), len(names))
     require_frames(sum(record.used for record in seen.values()), of=len(names), least=least)
-    every = tuple(seen.get(name) or FrameRecord(name=name, action="dropped") for name in names)
+    every = tuple(seen.get(name) or FrameRecord(name=name, action=Action.DROPPED) for name in names)
     write_record(paths.records, FrameRecords(frames=every))
 
 
-def _write(frame: Frame, original: AnyArray | None, paths: FramePaths) -> str:
+def _write(frame: Frame, original: AnyArray | None, paths: FramePaths) -> Action:
     """Write the picture of a frame; returns what happened to it."""
     source = paths.original(frame.name)
     target = path_in(paths.images, frame.name)
@@ -207,7 +219,12 @@ def _write(frame: Frame, original: AnyArray | None, paths: FramePaths) -> str:
     else:
         encode_image(target, frame.image, source)
     actions = [treatment.action for treatment in frame.treatments if treatment.action]
-    return "passed" if passed else (actions or ["changed"])[-1]
+    return Action.PASSED if passed else (actions or [Action.CHANGED])[-1]
+
+
+def _is_sharpened(frame: Frame, action: Action) -> bool:
+    changed = action not in (Action.PASSED, Action.DROPPED)
+    return changed and any(treatment.action is Action.DEBLURRED for treatment in frame.treatments)
 
 
 def smooth_for_colmap(frame: Frame) -> AnyArray:
@@ -267,6 +284,11 @@ def _jpeg_options(original: bytes | None) -> list[int]:
 def read_frame_records(path: Path) -> tuple[FrameRecord, ...]:
     """The records that :func:`write_frames` wrote."""
     return read_record(path, FrameRecords).frames
+
+
+def note_rectified(records: Iterable[FrameRecord], rectified: Collection[str]) -> tuple[FrameRecord, ...]:
+    """The records with the frames marked whose keypoints were rectified."""
+    return tuple(replace(record, rectified=record.name in rectified) for record in records)
 
 
 #: Moves the pixels of a named image as a keypoint stage moves its keypoints.

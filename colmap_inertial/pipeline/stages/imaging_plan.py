@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from colmap_inertial.core.camera_clock import CameraTimedImu
+from colmap_inertial.core.facts import Fact, with_sentences
 from colmap_inertial.core.options import BlurRemover
 from colmap_inertial.core.types import CameraImuCalibration, CameraModel, FrameTiming, ImuRecording
 from colmap_inertial.imaging.gate import FrameDecision, RecordingVerdict
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.parallax import Parallax
-from colmap_inertial.io.files import read_json, write_json
+from colmap_inertial.io.files import read_json, structured, without_sentences, write_json
 from colmap_inertial.pipeline.run.workspace import a_record_of_ours
 
 
@@ -34,9 +35,9 @@ class GyroView:
     source
         Where the calibration comes from: ``"capture"``, ``"model"`` (a small one, made beforehand) or ``"pixels"``.
     notes
-        What there is to say about it, in words.
+        What there is to say about it.
     sign_doubt
-        Why the pixels do not show that the gyroscope has the right sign; empty where they do.
+        Why the pixels do not show that the gyroscope has the right sign; ``None`` where they do.
     """
 
     imu: ImuRecording
@@ -44,8 +45,8 @@ class GyroView:
     calibration: CameraImuCalibration
     camera: CameraModel
     source: str
-    notes: tuple[str, ...] = ()
-    sign_doubt: str = ""
+    notes: tuple[Fact, ...] = ()
+    sign_doubt: Fact | None = None
 
     def timed(self) -> CameraTimedImu:
         """The recording on the camera's clock."""
@@ -81,7 +82,7 @@ class ImagingPlan:
     rectify
         Whether the rolling shutter is undone.
     deblur_note, rolling_shutter_note
-        What is done, or why not, in words.
+        What is done, or why not; ``None`` where nothing was planned.
     """
 
     view: GyroView | None = None
@@ -89,30 +90,35 @@ class ImagingPlan:
     method: BlurRemover = "wiener"
     parallaxes: Mapping[str, Parallax] = field(default_factory=dict)
     rectify: bool = False
-    deblur_note: str = ""
-    rolling_shutter_note: str = ""
+    deblur_note: Fact | None = None
+    rolling_shutter_note: Fact | None = None
 
     def as_json(self) -> dict[str, object]:
         """As JSON types, without the recording."""
         view = self.view
         return {
-            "deblur": self.deblur_note,
+            **note_as_json("deblur", self.deblur_note),
             "deblur_method": None if self.deblur is None else self.method,
-            "rolling_shutter": self.rolling_shutter_note,
+            **note_as_json("rolling_shutter", self.rolling_shutter_note),
             "rectify": self.rectify,
             "calibration": None
             if view is None
             else {
                 **asdict(view.calibration),
                 "source": view.source,
-                "notes": list(view.notes),
+                **with_sentences({"notes": list(view.notes)}),
             },
-            "sign_doubt": None if view is None else view.sign_doubt,
+            **with_sentences({"sign_doubt": None if view is None else view.sign_doubt}),
             "camera": None if view is None else asdict(view.camera),
-            "verdict": None if self.deblur is None else asdict(self.deblur[1]),
-            "decisions": None if self.deblur is None else [asdict(decision) for decision in self.deblur[0]],
+            "verdict": None if self.deblur is None else with_sentences(vars(self.deblur[1])),
+            "decisions": None if self.deblur is None else [with_sentences(vars(d)) for d in self.deblur[0]],
             "parallaxes": {name: parallax.as_json() for name, parallax in self.parallaxes.items()},
         }
+
+
+def note_as_json(key: str, note: Fact | None) -> dict[str, object]:
+    """A note under its key, with its code and values beside it; empty where there is none."""
+    return with_sentences({key: "" if note is None else note})
 
 
 def write_plan(path: Path, plan: ImagingPlan) -> None:
@@ -122,7 +128,7 @@ def write_plan(path: Path, plan: ImagingPlan) -> None:
 
 def read_plan(path: Path, imu: ImuRecording, timing: FrameTiming) -> ImagingPlan:
     """The plan that :func:`write_plan` wrote for the same recording."""
-    values: dict[str, Any] = read_json(path)
+    values: dict[str, Any] = without_sentences(read_json(path))
     with a_record_of_ours(path):
         view = None
         if values["calibration"] is not None:
@@ -132,21 +138,25 @@ def read_plan(path: Path, imu: ImuRecording, timing: FrameTiming) -> ImagingPlan
                 imu=imu,
                 timing=timing,
                 source=calibration.pop("source"),
-                notes=tuple(calibration.pop("notes")),
-                sign_doubt=values["sign_doubt"],
+                notes=structured(tuple[Fact, ...], calibration.pop("notes")),
+                sign_doubt=_read_note(values["sign_doubt"]),
                 calibration=CameraImuCalibration(**calibration),
                 camera=CameraModel(**{**camera, "params": tuple(camera["params"])}),
             )
         deblur = None
         if values["decisions"] is not None:
-            decisions = tuple(FrameDecision(**decision) for decision in values["decisions"])
-            deblur = decisions, RecordingVerdict(**values["verdict"])
+            decisions = structured(tuple[FrameDecision, ...], values["decisions"])
+            deblur = decisions, structured(RecordingVerdict, values["verdict"])
         return ImagingPlan(
             view=view,
             deblur=deblur,
             method=values["deblur_method"] or "wiener",
             parallaxes={name: Parallax.from_json(parallax) for name, parallax in values["parallaxes"].items()},
             rectify=values["rectify"],
-            deblur_note=values["deblur"],
-            rolling_shutter_note=values["rolling_shutter"],
+            deblur_note=_read_note(values["deblur"]),
+            rolling_shutter_note=_read_note(values["rolling_shutter"]),
         )
+
+
+def _read_note(value: Any) -> Fact | None:
+    return structured(Fact, value) if value else None

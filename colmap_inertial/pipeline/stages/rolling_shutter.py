@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
-from colmap_inertial.core.types import CameraImuCalibration, CameraModel, Keypoints, Projector, Treatment
+from colmap_inertial.core.facts import Fact
+from colmap_inertial.core.types import Action, CameraImuCalibration, CameraModel, Keypoints, Projector, Treatment
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.imaging.rolling_shutter import project_by_lines, rays, rectify_image, rectify_keypoints
 from colmap_inertial.model import colmap_camera
@@ -44,9 +45,9 @@ class RollingShutterStage:
         """Move the keypoints of one image."""
         name = keypoints.name
         if not self.covers(name):
-            treatment = Treatment(stage="rolling_shutter", reason="the gyroscope does not cover the whole readout")
+            treatment = Treatment(stage="rolling_shutter", reason=Fact("readout-not-covered"))
             return replace(keypoints, treatments=(*keypoints.treatments, treatment))
-        treatment = Treatment(stage="rolling_shutter", reason="undone by the gyroscope", action="rectified")
+        treatment = Treatment(stage="rolling_shutter", reason=Fact("shutter-undone"), action=Action.RECTIFIED)
         return replace(
             keypoints,
             xy_px=self.moved(name, keypoints.xy_px),

@@ -42,7 +42,7 @@ from colmap_inertial.pipeline.stages.defaults import (
     default_model_stages,
 )
 from colmap_inertial.pipeline.stages.exposures import fuses_pairs
-from colmap_inertial.pipeline.stages.frame_folder import require_frames
+from colmap_inertial.pipeline.stages.frame_folder import note_rectified, require_frames
 from colmap_inertial.pipeline.stages.inputs import Fuser, StageInputs, lsd2_fuser
 from colmap_inertial.pipeline.stages.protocols import (
     FrameStage,
@@ -318,7 +318,7 @@ def _run(session: Session, given: _Given, options: ReconstructOptions, stages: S
         models=models,
         fragments=fragments,
         gaps=gaps,
-        frames=records,
+        frames=note_rectified(records, rectified),
         keypoints=keypoints,
         matching=matching,
         mapping=mapping,

@@ -13,6 +13,7 @@ from colmap_inertial.core.arrays import AnyArray, UInt8Array
 from colmap_inertial.core.errors import OutputError
 from colmap_inertial.core.types import CameraModel, Frame
 from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.gate import Decision
 from colmap_inertial.imaging.psf import blur_field
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import path_in, write_json
@@ -133,7 +134,9 @@ class CropKeeper:
     def of(cls, plan: ImagingPlan) -> CropKeeper:
         """The sheet of a plan: frames to deblur, evenly from the most to the least blurred."""
         blurred = () if plan.deblur is None else plan.deblur[0]
-        by_blur = sorted((d for d in blurred if d.action == "deblur"), key=lambda d: (-(d.blur_px or 0.0), d.name))
+        by_blur = sorted(
+            (d for d in blurred if d.action is Decision.DEBLUR), key=lambda d: (-(d.blur_px or 0.0), d.name)
+        )
         some = by_blur[:: -(-len(by_blur) // _LIMITS.candidates) or 1]
         return cls(blur_px={decision.name: decision.blur_px or 0.0 for decision in some})
 

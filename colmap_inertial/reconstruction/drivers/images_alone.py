@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 from colmap_inertial import __version__
 from colmap_inertial.colmap.sparse import check_pair_names
 from colmap_inertial.core.errors import FormatError, InertialError, OutputError, OutputExistsError
+from colmap_inertial.core.facts import Fact, with_sentences
 from colmap_inertial.core.options import (
     BlurRemover,
     DeblurPurpose,
@@ -40,11 +41,12 @@ from colmap_inertial.pipeline.stages.frame_folder import (
     FramePaths,
     FrameRecord,
     encode_image,
+    note_rectified,
     read_frame_records,
     rectifiable,
     write_frames,
 )
-from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan
+from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan, note_as_json
 from colmap_inertial.pipeline.stages.inputs import Fuser, StageInputs, lsd2_fuser
 from colmap_inertial.pipeline.stages.protocols import FrameStage
 from colmap_inertial.reconstruction.drivers.frames import run_frames, run_images, write_contact_sheet
@@ -191,7 +193,7 @@ def deblur_capture(
         unchanged = _finish(session, loaded, content)
         made = DeblurResult(
             workspace=workspace,
-            frames=records,
+            frames=note_rectified(records, rectified),
             imaging=plan,
             sheet=sheet if sheet is not None and shown else None,
             unchanged=unchanged,
@@ -216,7 +218,7 @@ def _require_free_sheet(sheet: Path, out: Path) -> None:
 
 def _shown(records: Sequence[FrameRecord]) -> list[str]:
     """Names of the deblurred frames, the most blurred first."""
-    deblurred = [record for record in records if record.action == "deblurred"]
+    deblurred = [record for record in records if record.sharpened]
     return [record.name for record in sorted(deblurred, key=lambda record: -(record.value("blur_px") or 0.0))]
 
 
@@ -343,17 +345,15 @@ def fuse_exposures_captured(
     if loaded.frames.times is not None:
         timing = add_stated_exposures(loaded, read_frame_timing(loaded))
         names = list(timing.names)
-    note = "short and long exposures are fused, aligned by the pixels alone: no gyroscope"
+    no_gyro = Fact("frames-without-times" if timing is None else "no-gyroscope")
     recording = None
-    if timing is None:
-        note = note.replace("no gyroscope", "the frames have no times")
-    elif loaded.imu is not None:
+    if timing is not None and loaded.imu is not None:
         imu = correct_imu(loaded, read_capture_imu(loaded), calibration)
         recording = Recording.of(loaded, imu, timing, prior)
     inputs = [fingerprint(path) for path in (*(path_in(folder, name) for name in names), *long)]
     decides = loaded, timing, prior, inputs, fuser.identity
     with _open_session(out, loaded, options, progress, "fuse-exposures", decides) as session:
-        plan = ImagingPlan(deblur_note=note)
+        plan = ImagingPlan(deblur_note=Fact("exposures-aligned", no_gyro=no_gyro))
         if recording is not None:
             plan = run_plan(session, recording, Treatments(deblur="off", rolling_shutter="off", pairs=True))
         stage = ExposureStage.of_capture(
@@ -373,10 +373,10 @@ def fuse_exposures_captured(
         records = _run_fusion(session, folder, frames, names, lambda _: stage, depends)
         pairs = tuple(structured(FusedPair, record.value("pair")) for record in records)
         content = {
-            "note": plan.deblur_note,
+            **note_as_json("note", plan.deblur_note),
             "fuser": fuser.identity,
             "fusion": options.fusion,
-            "frames": [asdict(pair) for pair in pairs],
+            "frames": [with_sentences(vars(pair)) for pair in pairs],
         }
         _finish(session, loaded, content)
         return pairs

@@ -16,6 +16,7 @@ from colmap_inertial.checks.validate import parse_target
 from colmap_inertial.colmap.tsdf import require_mesh_maker
 from colmap_inertial.core.choices import check_kind
 from colmap_inertial.core.errors import FormatError, InertialError, TimingError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.core.types import (
     CameraImuCalibration,
@@ -199,7 +200,7 @@ def _reconstruct(
         results, fragments, gaps = run_models(session, recording, stages, submodels, fragments=options.fragments)
         read.cache_clear()
         if target is not None and images is None:
-            notes = (*notes, "the target was not measured: the project has no images/; give --images DIR")
+            notes = (*notes, Fact("target-without-images"))
         results = tuple(_noted(result, notes) for result in results)
         results = run_validation(session, results, target, images)
         results = run_georeference(session, results, fixes, timing, options.world)
@@ -357,7 +358,7 @@ class _Times:
     """Times of the images, with notes for the user."""
 
     timing: FrameTiming
-    notes: tuple[str, ...]
+    notes: tuple[Fact, ...]
 
 
 def _run_times(
@@ -366,7 +367,7 @@ def _run_times(
     models: dict[int, Path],
     images: Path | None,
     read: Callable[[Path], pycolmap.Reconstruction],
-) -> tuple[FrameTiming, tuple[str, ...]]:
+) -> tuple[FrameTiming, tuple[Fact, ...]]:
     """Read the times of the images, with notes for the user."""
 
     def work(partial: Sequence[Path]) -> None:
@@ -396,9 +397,9 @@ def _registered(models: dict[int, Path], read: Callable[[Path], pycolmap.Reconst
 
 def _times(
     given: _Given, names: Sequence[str], first_of: Mapping[str, str], images: Path | None, progress: Progress
-) -> tuple[FrameTiming, tuple[str, ...]]:
+) -> tuple[FrameTiming, tuple[Fact, ...]]:
     source, capture = given.source, given.capture
-    notes: tuple[str, ...] = ()
+    notes: tuple[Fact, ...] = ()
     if source.video is not None:
         assert images is not None
         timing, notes = _video_times(capture, source.video, images, names, progress)
@@ -407,7 +408,7 @@ def _times(
         stamps, digits = stamps_of_exif(images, names)
         timing = _timing(capture, stamps.one_per_frame(first_of))
         if digits < _FINE_DIGITS:
-            notes = (f"EXIF gives the frames' times to 1/{10**digits} s only",)
+            notes = (Fact("exif-times-coarse", digits=digits),)
     elif source.name_times is not None:
         timing = _timing(capture, stamps_of_pattern(images or Path(), names, source.name_times).one_per_frame(first_of))
     elif source.frame_times is not None:
@@ -433,15 +434,15 @@ def _timing(capture: Capture, stamps: FrameStamps) -> FrameTiming:
 
 def _video_times(
     capture: Capture, video: Path, images: Path, names: Sequence[str], progress: Progress
-) -> tuple[FrameTiming, tuple[str, ...]]:
+) -> tuple[FrameTiming, tuple[Fact, ...]]:
     stamps_ns = video_stamps_ns(video)
     every = read_frame_timing(capture)
     match = match_to_video(video, images, names, progress=lambda done: progress("video", done, len(stamps_ns)))
     if len(match.t_ns) < max(2, _LEAST_SHARE * len(names)):
-        example = next(iter(match.doubtful.items()), ("", ""))
+        name, why = next(iter(match.doubtful.items()), ("", None))
+        found, images_ = len(match.t_ns), len(names)
         raise TimingError(
-            f"{video}: {len(match.t_ns)} of {len(names)} images are one of its frames beyond doubt ({example[0]} "
-            f"{example[1]}): give the video that the images were taken from, or --frame-times"
+            Fact("video-of-other-images", video=str(video), found=found, images=images_, name=name, why=why)
         )
     name_of = {t_ns: name for name, t_ns in match.t_ns.items()}
     kept = [i for i, t_ns in enumerate(stamps_ns.tolist()) if t_ns in name_of]
@@ -458,23 +459,24 @@ def _video_times(
         epoch_ns=every.epoch_ns,
     )
     notes = []
-    for why in sorted(set(match.doubtful.values())):
+    for why in sorted(set(match.doubtful.values()), key=str):
         those = [name for name, reason in match.doubtful.items() if reason == why]
-        notes.append(f"{len(those)} of {len(names)} images have no time: each {why} (first: {those[0]})")
+        notes.append(Fact("images-untimed-by-video", count=len(those), images=len(names), why=why, first=those[0]))
     return timing, tuple(notes)
 
 
-def _noted(result: ModelResult, notes: Sequence[str]) -> ModelResult:
+def _noted(result: ModelResult, notes: Sequence[Fact]) -> ModelResult:
     scale = result.scale
     return dataclasses.replace(result, scale=dataclasses.replace(scale, notes=(*scale.notes, *notes)))
 
 
 def _scales(results: Sequence[ModelResult], fragments: Sequence[Fragment]) -> dict[int | None, ModelScale]:
     """Similarity of each sub-model of the project, by COLMAP's number."""
-    small = "a fragment of {} images: too small to be made metric (--fragments does it all the same)"
     scales: dict[int | None, ModelScale] = {
         fragment.colmap_index: ModelScale(
-            similarity=None, verdict="refused", reasons=(small.format(fragment.registered_images),)
+            similarity=None,
+            verdict="refused",
+            reasons=(Fact("fragment-too-small", images=fragment.registered_images),),
         )
         for fragment in fragments
     }

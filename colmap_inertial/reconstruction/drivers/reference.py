@@ -24,6 +24,7 @@ from colmap_inertial.colmap.sparse import (
 )
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError, OutputExistsError
+from colmap_inertial.core.facts import Fact, sentences, with_sentences
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, ReferenceOptions, ValidateOptions
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.io.calibration import calibration_prior
@@ -81,13 +82,13 @@ class Reference:
     metres_per_unit: float
     ci95: tuple[float, float]
     made_of: str
-    notes: tuple[str, ...]
+    notes: tuple[Fact, ...]
     validation: Validation | None = None
 
     def as_json(self) -> dict[str, object]:
         """The content of ``scale.json``."""
         kept = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in ("validation", "out")}
-        return {**kept, "validation": self.validation and self.validation.as_json()}
+        return {**with_sentences(kept), "validation": self.validation and self.validation.as_json()}
 
 
 def scale_project_by(
@@ -134,17 +135,17 @@ def scale_project_by(
             progress=lambda done, total: progress("validation", done, total),
         )
         if validation.doubts and reference.scale_from == "target":
-            raise NotObservableError("scale", "; ".join(validation.doubts))
+            raise NotObservableError("scale", "; ".join(sentences(validation.doubts)))
     if reference.scale_from == "distance":
         scale, sigma_log, made_of = _scale_by_distance(reference, validation)
     else:
         scale, sigma_log, made_of = _scale_by_target(validation)
     half = Z95 * sigma_log
-    notes = ["which way is up is not known: no IMU was used"]
+    notes = [Fact("up-unknown-without-imu")]
     if validation is not None:
-        notes += [] if validation.lengths is None else [f"this proves that {validation.lengths.proves}"]
+        notes += [] if validation.lengths is None else [Fact("target-proves", proof=validation.lengths.proves)]
         if validation.check_error_pct is not None:
-            notes.append(f"corners that the scale does not rest on are {validation.check_error_pct:+.2g} % off")
+            notes.append(Fact("check-corners-off", error=validation.check_error_pct / 100))
         notes += (*validation.doubts, *validation.reasons)
     by_reference = Reference(
         out=out,
@@ -319,12 +320,9 @@ def reconstruct_by(
     scaled = scale_project_by(
         out / "colmap", metric, reference, ProjectOptions(link=True, keep=(_MADE_FROM,)), progress=progress
     )
-    notes = (*scaled.notes, "no IMU was used: frames are as they were filmed, with any blur and rolling shutter")
+    notes = (*scaled.notes, Fact("treatment-without-imu"))
     if left_out:
-        notes = (
-            *notes,
-            f"COLMAP made {len(left_out)} more models, of {', '.join(map(str, left_out))} images: left out",
-        )
+        notes = (*notes, Fact("more-models-left-out", images=left_out))
     scaled = dataclasses.replace(scaled, out=out, notes=notes)
     (metric / _MADE_FROM).unlink()
     write_json(metric / "scale.json", scaled.as_json())

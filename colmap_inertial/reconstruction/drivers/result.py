@@ -15,16 +15,17 @@ from colmap_inertial.colmap.depth_maps import DenseResult
 from colmap_inertial.colmap.mapping import MapRecord
 from colmap_inertial.colmap.sparse import KeypointRecords, MatchRecord
 from colmap_inertial.core.errors import InertialError, NotObservableError
+from colmap_inertial.core.facts import DETAILS, Fact
 from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply
 from colmap_inertial.core.summary import prints_in_lines
-from colmap_inertial.core.types import CameraImuCalibration, Gap, JoinedPart, ScaleEstimate, Treatment
+from colmap_inertial.core.types import Action, CameraImuCalibration, Gap, JoinedPart, ScaleEstimate, Treatment
 from colmap_inertial.inertial.georeference import Georeference
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.model import similarity_as_json
 from colmap_inertial.model.rigs import RigSensor
 from colmap_inertial.pipeline.run.workspace import Workspace
 from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
-from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan
+from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan, note_as_json
 from colmap_inertial.reconstruction.preparation.selection import Selection
 
 
@@ -228,28 +229,35 @@ class DeblurResult:
 def imaging_as_json(plan: ImagingPlan, rectified: Collection[str]) -> dict[str, object]:
     """Treatment of frames and its reasons, without single frames; and whether any was rectified."""
     values = {
-        key: value for key, value in plan.as_json().items() if key not in ("decisions", "parallaxes", "sign_doubt")
+        key: value
+        for key, value in plan.as_json().items()
+        if key.removesuffix(DETAILS) not in ("decisions", "parallaxes", "sign_doubt", "rolling_shutter")
     }
-    values |= {"rectify": bool(rectified), "rolling_shutter": shutter_note(plan, rectified)}
+    values |= {"rectify": bool(rectified), **note_as_json("rolling_shutter", shutter_note(plan, rectified))}
     return {**values, "frames_with_translation": len(plan.parallaxes)}
 
 
-def shutter_note(plan: ImagingPlan, rectified: Collection[str]) -> str:
+def shutter_note(plan: ImagingPlan, rectified: Collection[str]) -> Fact | None:
     """Describe the treatment of a rolling shutter, from the images whose keypoints were rectified."""
     if rectified and not plan.rectify:
-        return f"{plan.rolling_shutter_note}, which rectified keypoints of {len(rectified)} images"
+        return Fact("keypoints-rectified-by-stages", planned=plan.rolling_shutter_note, count=len(rectified))
     if plan.rectify and not rectified:
-        return "no keypoints are rectified: the gyroscope covers the whole readout of no image"
+        return Fact("keypoints-not-covered")
     return plan.rolling_shutter_note
 
 
 def frame_as_json(record: FrameRecord, plan: ImagingPlan, rectified: Collection[str]) -> dict[str, object]:
     """Treatment of one frame."""
+    reason = record.reason
+    if reason is None:
+        passed = record.action is Action.PASSED
+        reason = plan.deblur_note if passed else Fact("by-a-stage", action=record.action.value)
     return {
         "name": record.name,
         "action": record.action,
-        "reason": record.reason or (plan.deblur_note if record.action == "passed" else f"{record.action} by a stage"),
+        **note_as_json("reason", reason),
         **{key: record.value(key) for key in ("blur_px", "kept_share", "extent_factor")},
+        "sharpened": record.sharpened,
         "rectified": record.name in rectified,
     }
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from colmap_inertial.colmap.mapping import map_images
 from colmap_inertial.colmap.sparse import extract_features, image_pairs, match_pairs, verify_again
-from colmap_inertial.core.errors import FormatError, MappingError, NotObservableError
+from colmap_inertial.core.errors import FormatError, MappingError, NotObservableError, fact_of
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.core.types import (
@@ -131,7 +131,7 @@ def estimate_preliminary_calibration(recording: Recording, context: RunContext) 
     view: GyroView | NotObservableError
     models: tuple[pycolmap.Reconstruction, ...] = ()
     if declared:
-        notes = () if capture.camera is not None else (f"the focal length was guessed: {camera.params[0]:.0f} px",)
+        notes = () if capture.camera is not None else (Fact("focal-length-guessed", focal_px=camera.params[0]),)
         view = GyroView(
             imu=recording.imu, timing=timing, calibration=recording.prior, camera=camera, source="capture", notes=notes
         )
@@ -172,7 +172,7 @@ def _check_declared_sign(
     sign = check_sign(rotation, view.motion())
     if sign.right is False:
         raise NotObservableError("the pixels' motion", sign.reason)
-    return view if sign.right else replace(view, sign_doubt=str(sign.reason))
+    return view if sign.right else replace(view, sign_doubt=sign.reason)
 
 
 def survey_parts(timing: FrameTiming) -> list[list[str]]:
@@ -283,7 +283,7 @@ def _calibrate_by_model(
                 trajectory, _ = trajectory_from_model(models[0], timing, covariances=False)
                 view = _aligned(trajectory, recording, _camera_of(models[0]), "model")
         except (MappingError, FormatError) as error:
-            return view or NotObservableError("camera-IMU calibration", str(error)), ()
+            return view or NotObservableError("camera-IMU calibration", fact_of(error)), ()
         except NotObservableError as error:
             return view or error, ()
     assert view is not None

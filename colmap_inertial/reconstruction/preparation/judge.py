@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence, measure_blur_shares
 from colmap_inertial.imaging.gate import (
     GATE_LIMITS,
@@ -167,10 +168,7 @@ def _correct_exposures(
         corrected, support = judged(others), _together(evidence)
         if corrected.trusted is True and support >= _LIMITS.exposure_support and support > deepest:
             whole = factor * corrected.extent_factor
-            reason = (
-                f"the images confirm the gyroscope's blur ({support:.0f} standard deviations), but for its extent, "
-                f"which is multiplied by {whole:.2f}: the exposure times are wrong by this factor"
-            )
+            reason = Fact("exposures-off-by-factor", support_sigmas=support, factor=whole)
             best, deepest = replace(corrected, extent_factor=whole, reason=reason), support
     return best
 
@@ -193,7 +191,7 @@ def judge_sky(verdict: RecordingVerdict, looked: Sequence[Looked]) -> RecordingV
     sigmas = float(gains.mean() / max(gains.std(ddof=1) / np.sqrt(len(gains)), 1e-9))
     if shown < _LIMITS.sky_share * len(gains) or sigmas < _LIMITS.sky_sigmas:
         return verdict
-    reason = f"the images below the sky confirm the gyroscope's blur ({sigmas:.0f} standard deviations)"
+    reason = Fact("blur-confirmed-below-sky", support_sigmas=sigmas)
     return replace(verdict, trusted=True, support=sigmas, extent_factor=1.0, reason=reason)
 
 
@@ -209,8 +207,5 @@ def judge_each_frame(verdict: RecordingVerdict, looked: Sequence[Looked]) -> Rec
     most = _LIMITS.trusted_share_of_skies if skies else _LIMITS.trusted_share
     if verdict.trusted is not True or shown >= most * len(telling):
         return verdict
-    reason = (
-        f"{shown} of {len(telling)} frames that were looked at confirm the gyroscope's blur, so each frame must do so "
-        "by itself (close to objects, the camera's translation blurs, too)"
-    )
+    reason = Fact("blur-confirmed-by-some", confirming=shown, count=len(telling))
     return replace(verdict, trusted=None, reason=reason)

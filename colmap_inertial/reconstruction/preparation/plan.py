@@ -13,14 +13,11 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.camera_clock import CameraTimedImu
-from colmap_inertial.core.errors import InertialError, NotObservableError
+from colmap_inertial.core.errors import InertialError, NotObservableError, fact_of
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import BlurRemover, DeblurMethod, ReconstructOptions, RollingShutterMethod
 from colmap_inertial.core.types import CameraModel, FrameTiming
-from colmap_inertial.imaging.gate import (
-    FrameDecision,
-    GateOptions,
-    decide,
-)
+from colmap_inertial.imaging.gate import Decision, FrameDecision, GateOptions, decide
 from colmap_inertial.imaging.parallax import Parallax
 from colmap_inertial.imaging.psf import predict_blur_px
 from colmap_inertial.imaging.restoration.shipped import checksum
@@ -67,10 +64,6 @@ class PlanLimits:
 
 
 _LIMITS = PlanLimits()
-
-
-#: What the note says of methods other than the default.
-_SAID_OF = {"deepgyro": "; the network DeepGyro undoes it", "path": "; the half-quadratic filter undoes it"}
 
 
 def add_stated_exposures(capture: Capture, timing: FrameTiming) -> FrameTiming:
@@ -173,29 +166,30 @@ def plan_imaging(recording: Recording, context: RunContext, asked: Treatments) -
     no_rectifying = _no_rectifying(recording, asked)
     plan = ImagingPlan(
         method="wiener" if asked.deblur is None or asked.deblur == "off" else asked.deblur,
-        rectify=not no_rectifying,
+        rectify=no_rectifying is None,
         deblur_note=why_not,
         rolling_shutter_note=no_rectifying or _describe_rectification(capture, timing),
     )
-    if why_not and not plan.rectify and not asked.pairs:
+    if why_not is not None and not plan.rectify and not asked.pairs:
         return plan
-    no_gyro = _no_gyro_for_pairs(recording) if asked.pairs else ""
-    if not plan.rectify and no_gyro:
-        return replace(plan, deblur_note=_describe_fusion(no_gyro))
+    no_gyro = _no_gyro_for_pairs(recording) if asked.pairs else None
+    if not plan.rectify and no_gyro is not None:
+        return replace(plan, deblur_note=Fact("exposures-aligned", no_gyro=no_gyro))
     try:
         calibration = estimate_preliminary_calibration(recording, context)
     except NotObservableError as error:
-        if asked.by_name(deblur=not why_not, rectify=plan.rectify):
+        if asked.by_name(deblur=why_not is None, rectify=plan.rectify):
             raise
-        untreated = f"frames stay as they were filmed: {error}"
+        why = fact_of(error)
+        untreated = Fact("frames-untreated", why=why)
         return ImagingPlan(
-            deblur_note=_describe_fusion(str(error)) if asked.pairs else why_not or untreated,
+            deblur_note=Fact("exposures-aligned", no_gyro=why) if asked.pairs else why_not or untreated,
             rolling_shutter_note=untreated if plan.rectify else plan.rolling_shutter_note,
         )
     plan = replace(plan, view=calibration.view)
     if asked.pairs:
-        return replace(plan, deblur_note=_describe_fusion(no_gyro))
-    if why_not:
+        return replace(plan, deblur_note=Fact("exposures-aligned", no_gyro=no_gyro))
+    if why_not is not None:
         return plan
 
     def models(names: Sequence[str], plan: ImagingPlan | None) -> tuple[pycolmap.Reconstruction, ...]:
@@ -213,25 +207,22 @@ def plan_imaging(recording: Recording, context: RunContext, asked: Treatments) -
     return _deblurring(plan, calibration.view, capture, models, sliding, context.progress)
 
 
-def _no_rectifying(recording: Recording, asked: Treatments) -> str:
-    """Why keypoints are not rectified; empty where they are."""
+def _no_rectifying(recording: Recording, asked: Treatments) -> Fact | None:
+    """Why keypoints are not rectified; ``None`` where they are."""
     timing = recording.timing
     if asked.keypoints_by_others:
-        return "left to the keypoint stages that were given"
+        return Fact("left-to-keypoint-stages")
     if asked.rolling_shutter == "off":
-        return "not asked for"
+        return Fact("not-asked-for")
     if recording.capture.rig:
-        return "keypoints of a rig's cameras are not rectified"
+        return Fact("rig-not-rectified")
     if timing.readout_s is None:
-        return (
-            "the readout is unknown: give readout_s under [timing] in capture.toml (docs/devices says where to find it)"
-        )
-    return "" if timing.readout_s else "global shutter"
+        return Fact("rectifying-without-readout")
+    return None if timing.readout_s else Fact("global-shutter")
 
 
-def _describe_rectification(capture: Capture, timing: FrameTiming) -> str:
-    source = f" ({capture.readout_source})" if capture.readout_source else ""
-    return f"keypoints are rectified, readout {1e3 * (timing.readout_s or 0):.1f} ms{source}"
+def _describe_rectification(capture: Capture, timing: FrameTiming) -> Fact:
+    return Fact("keypoints-rectified", readout_s=timing.readout_s or 0.0, source=capture.readout_source or "")
 
 
 def _limit_px(camera: CameraModel) -> float:
@@ -239,31 +230,27 @@ def _limit_px(camera: CameraModel) -> float:
     return max(_LIMITS.telling_px, GateOptions().skip_below_px * max(camera.width, camera.height) / 1920)
 
 
-def _no_deblurring(recording: Recording, asked: Treatments, progress: Progress) -> str:
-    """Why no frame of a recording can be deblurred; empty where some may be."""
+def _no_deblurring(recording: Recording, asked: Treatments, progress: Progress) -> Fact | None:
+    """Why no frame of a recording can be deblurred; ``None`` where some may be."""
     timing = recording.timing
     if asked.frames_by_others:
-        return "left to the frame stages that were given"
+        return Fact("left-to-frame-stages")
     if asked.deblur == "off" or asked.pairs:
-        return "not asked for"
+        return Fact("not-asked-for")
     if recording.capture.rig:
-        return "frames stay as they were filmed: those of a rig's cameras are not deblurred"
+        return Fact("rig-not-deblurred")
     if timing.exposure_s is None:
-        return (
-            "frames stay as they were filmed: the exposure time is unknown; give exposure_s under [timing] in "
-            "capture.toml, or a column of it in the frame times"
-        )
+        return Fact("no-exposures-to-deblur")
     camera = guess_camera(recording.capture, timing)
     most_px = _most_turned_rad(recording, timing.exposure_s) * 1.2 * colmap_camera(camera).mean_focal_length()
     limit_px = _limit_px(camera)
     if most_px >= limit_px:
-        return ""
-    why_not = f"no frame has more than {most_px:.1f} px of blur, by the quickest turn that the gyroscope felt"
+        return None
     if most_by_sliding_px(timing, camera) < limit_px:
-        return why_not
+        return Fact("blur-nowhere", most_px=most_px, by_sliding=False)
     if any(translating_segments(recording, camera, survey_parts(timing), limit_px, progress)):
-        return ""
-    return f"{why_not}, and by how far pixels move from frame to frame"
+        return None
+    return Fact("blur-nowhere", most_px=most_px, by_sliding=True)
 
 
 def _most_turned_rad(recording: Recording, exposure_s: Array) -> float:
@@ -283,26 +270,14 @@ def _most_turned_rad(recording: Recording, exposure_s: Array) -> float:
     return float(np.max(np.array(within) * exposure_s))
 
 
-def _no_gyro_for_pairs(recording: Recording) -> str:
-    """Why a gyroscope cannot align pairs of exposures; empty where it may."""
+def _no_gyro_for_pairs(recording: Recording) -> Fact | None:
+    """Why a gyroscope cannot align pairs of exposures; ``None`` where it may."""
     exposures, timing = recording.capture.exposures, recording.timing
     if timing.exposure_s is None:
-        return (
-            "the short ones' exposure time is unknown; give exposure_s under [timing] in capture.toml, or a column of "
-            "it in the frame times"
-        )
+        return Fact("short-exposure-unknown")
     if exposures is None or exposures.timing(timing) is None:
-        return (
-            "start or length of the long exposures is unknown; give times with a column exposure_s, or long_delay_s "
-            "and long_exposure_s, under [exposures] in capture.toml"
-        )
-    return ""
-
-
-def _describe_fusion(no_gyro: str) -> str:
-    return "short and long exposures are fused, aligned by the " + (
-        f"pixels alone: {no_gyro}" if no_gyro else "gyroscope and the pixels"
-    )
+        return Fact("long-exposure-unknown")
+    return None
 
 
 def _deblurring(
@@ -382,7 +357,7 @@ class _Surveyed:
 
 
 def _select_blurred(decisions: Sequence[FrameDecision]) -> set[str]:
-    return {decision.name for decision in decisions if decision.action == "deblur"}
+    return {decision.name for decision in decisions if decision.action is Decision.DEBLUR}
 
 
 def _decisions(view: GyroView, parallaxes: Mapping[str, Parallax]) -> tuple[FrameDecision, ...]:
@@ -395,7 +370,7 @@ def _decisions(view: GyroView, parallaxes: Mapping[str, Parallax]) -> tuple[Fram
 
 def _blurred(decisions: Sequence[FrameDecision]) -> list[FrameDecision]:
     """The frames by which to judge, the most blurred first."""
-    telling = [d for d in decisions if d.action == "deblur" and (d.blur_px or 0) >= _LIMITS.telling_px]
+    telling = [d for d in decisions if d.action is Decision.DEBLUR and (d.blur_px or 0) >= _LIMITS.telling_px]
     return sorted(telling, key=lambda d: -(d.blur_px or 0))[: _LIMITS.judged_frames]
 
 
@@ -406,27 +381,28 @@ def _decided(
     chosen = _blurred(decisions)
     if not chosen:
         known = [d.blur_px for d in decisions if d.blur_px is not None]
-        most = f"{max(known):.1f} px" if known else "nothing"
-        return replace(plan, deblur_note=f"frames stay as they were filmed: the gyroscope predicts {most} of blur")
+        return replace(plan, deblur_note=Fact("blur-predicted-nowhere", most_px=max(known) if known else None))
     verdict = judge_frames(view, capture, chosen, parallaxes, progress)
-    note = f"{sum(d.action == 'deblur' for d in decisions)} of {len(decisions)} frames are blurred; {verdict.reason}"
     used = {name: parallaxes[name] for name in sorted(_select_blurred(decisions)) if name in parallaxes}
-    if used:
-        note += f"; the camera's translation is counted in for {len(used)} frames"
-    if view.sign_doubt:
-        note += f"; {view.sign_doubt}, so frames with curved blur stay as they were filmed"
-    if plan.method in _SAID_OF and verdict.trusted is not False:
-        note += _SAID_OF[plan.method]
+    note = Fact(
+        "frames-blurred",
+        blurred=len(_select_blurred(decisions)),
+        frames=len(decisions),
+        verdict=verdict.reason,
+        with_translation=len(used),
+        sign_doubt=view.sign_doubt,
+        method=None if verdict.trusted is False else plan.method,
+    )
     return replace(plan, deblur=(decisions, verdict), parallaxes=used, deblur_note=note)
 
 
 def _keeping_ends(decisions: tuple[FrameDecision, ...]) -> tuple[FrameDecision, ...]:
     """No frame is dropped before the first or after the last one that stays: nothing would bridge the gap."""
-    stay = [i for i, decision in enumerate(decisions) if decision.action != "drop"]
+    stay = [i for i, decision in enumerate(decisions) if decision.action is not Decision.DROP]
     first, last = (stay[0], stay[-1]) if stay else (len(decisions), -1)
     return tuple(
-        replace(d, action="deblur", reason=f"{d.blur_px:.0f} px of blur are too many, but no frame is beyond it")
-        if d.action == "drop" and not first < i < last
+        replace(d, action=Decision.DEBLUR, reason=Fact("blur-at-end", blur_px=d.blur_px))
+        if d.action is Decision.DROP and not first < i < last
         else d
         for i, d in enumerate(decisions)
     )

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import logging
 from collections.abc import Collection, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,8 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 from colmap_inertial.core.camera_clock import CameraTimedImu
-from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.errors import NotObservableError, fact_of
+from colmap_inertial.core.facts import Fact, with_sentences
 from colmap_inertial.core.options import FrameOptions
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import CameraModel, FrameTiming
@@ -25,7 +26,7 @@ from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.imaging.psf import predict_blur_px
 from colmap_inertial.imaging.selection import Chosen, Ranked, Ranking, WindowLimits, choose_frames
 from colmap_inertial.io.capture import Capture
-from colmap_inertial.io.files import read_json, write_json
+from colmap_inertial.io.files import read_json, structured, without_sentences, write_json
 from colmap_inertial.io.frame_sources import Video
 from colmap_inertial.io.frames import read_reduced
 from colmap_inertial.model import colmap_camera
@@ -81,7 +82,7 @@ class Selection:
     frames
         How many the capture has.
     note
-        How they were chosen, in words.
+        How they were chosen.
     windows
         For each chosen frame; empty where all are used. Places count the capture's frames.
     offset_s, offset_sigma_s, offset_from
@@ -92,7 +93,7 @@ class Selection:
 
     names: tuple[str, ...]
     frames: int
-    note: str
+    note: Fact
     windows: tuple[Chosen, ...] = ()
     offset_s: float | None = None
     offset_sigma_s: float | None = None
@@ -109,7 +110,7 @@ class Selection:
         return {
             "frames": self.frames,
             "used": len(self.names),
-            "note": self.note,
+            **with_sentences({"note": self.note}),
             "offset_s": self.offset_s,
             "offset_sigma_s": self.offset_sigma_s,
             "offset_from": self.offset_from,
@@ -139,26 +140,27 @@ def part_of(timing: FrameTiming, names: Collection[str]) -> FrameTiming:
     )
 
 
-def everything(timing: FrameTiming, note: str) -> Selection:
+def everything(timing: FrameTiming, note: Fact) -> Selection:
     """All frames."""
     return Selection(names=timing.names, frames=len(timing.names), note=note)
 
 
-def use_all(capture: Capture, options: FrameOptions) -> str:
-    """Why all frames of a capture are used; empty where they are to be selected."""
+def use_all(capture: Capture, options: FrameOptions) -> Fact | None:
+    """Why all frames of a capture are used; ``None`` where they are to be selected."""
     if options.use == "all":
-        return "all frames, as asked for"
+        return Fact("all-frames-asked")
     if options.use is None and not isinstance(capture.frames, Video):
-        return "all pictures of the folder"
+        return Fact("all-pictures")
     if options.use is None and isinstance(capture.frames, Video) and capture.frames.frames_per_s is not None:
-        return "as frames_per_s in capture.toml has it"
-    return ""
+        return Fact("frames-as-capture-says")
+    return None
 
 
 def write_selection(path: Path, selection: Selection) -> None:
     """Write a selection for :func:`read_selection`."""
     windows = [{key: _or_none(value) for key, value in asdict(window).items()} for window in selection.windows]
-    write_json(path, {**asdict(selection), "windows": windows})
+    values = {f.name: getattr(selection, f.name) for f in fields(selection)}
+    write_json(path, {**with_sentences(values), "windows": windows})
 
 
 def _or_none(value: object) -> object:
@@ -172,17 +174,18 @@ def _chosen(window: dict[str, Any]) -> Chosen:
 
 def read_selection(path: Path) -> Selection:
     """The selection that :func:`write_selection` wrote."""
-    values: dict[str, Any] = read_json(path)
+    values: dict[str, Any] = without_sentences(read_json(path))
     with a_record_of_ours(path):
         windows = tuple(_chosen(window) for window in values.pop("windows"))
-        return Selection(**{**values, "names": tuple(values["names"])}, windows=windows)
+        names, note = tuple(values.pop("names")), structured(Fact, values.pop("note"))
+        return Selection(**values, names=names, note=note, windows=windows)
 
 
 def run_selection(session: Session, recording: Recording, options: FrameOptions) -> Selection:
     """The frames to use, by :func:`select_frames` or all of them."""
     selection_file = session.workspace.selection
     why_all = use_all(recording.capture, options)
-    if why_all:
+    if why_all is not None:
         remove(selection_file)
         return everything(recording.timing, why_all)
 
@@ -206,7 +209,7 @@ class _Clocks:
     motion: GyroCamera | None
     oriented: bool
     camera: CameraModel
-    note: str
+    note: Fact
     offset_s: float | None = None
     offset_sigma_s: float | None = None
     offset_from: str | None = None
@@ -268,12 +271,16 @@ def select_frames(recording: Recording, options: FrameOptions, progress: Progres
             replace(w, place=int(looked[w.place]), first=int(looked[w.first]), last=int(looked[w.last])) for w in chosen
         )
     ways = {window.ranked_by for window in windows}
-    how = {"blur": "predicted blur", "speed": "angular speed", "sharpness": "sharpness of the pictures"}
     return Selection(
         names=tuple(timing.names[window.place] for window in windows),
         frames=len(timing.names),
-        note=f"{len(windows)} of {len(timing.names)} frames, by {' and '.join(how[way] for way in sorted(ways))}; "
-        + clocks.note,
+        note=Fact(
+            "frames-selected",
+            used=len(windows),
+            frames=len(timing.names),
+            ranked_by=sorted(ways),
+            clocks=clocks.note,
+        ),
         windows=windows,
         offset_s=clocks.offset_s,
         offset_sigma_s=clocks.offset_sigma_s,
@@ -321,7 +328,7 @@ def _clocks(recording: Recording, progress: Progress) -> _Clocks:
         motion=GyroCamera.of(imu, prior, camera_epoch_ns=timing.epoch_ns),
         oriented=rotation_rad <= _LIMITS.rotation_rad,
         camera=camera,
-        note=f"the clocks' offset is the capture's, to {1e3 * offset_sigma_s:.0f} ms",
+        note=Fact("offset-of-capture", sigma_s=offset_sigma_s),
         offset_s=prior.clock_offset_s,
         offset_sigma_s=offset_sigma_s,
         offset_from="capture",
@@ -332,20 +339,20 @@ def _clocks(recording: Recording, progress: Progress) -> _Clocks:
     if log_of is not None and log_of.in_video_time and capture.shared_clock and offset_sigma_s > _LIMITS.offset_s:
         # the recorder stamped frames and samples by one clock; measured on such files: some milliseconds
         offset_sigma_s = _LIMITS.offset_s
-        note = "the recorder stamped frames and gyroscope by one clock"
-        known = replace(known, oriented=False, note=note, offset_sigma_s=offset_sigma_s)
+        known = replace(known, oriented=False, note=Fact("one-clock"), offset_sigma_s=offset_sigma_s)
     try:
         indices = sample_beginning(timing, _LIMITS.followed_spacing_s, _LIMITS.followed_frames)
         rotation = measure_sampled_rotation(capture, timing, camera, indices, progress, stage="clocks")
         options = AlignOptions(max_offset_s=recording.max_offset_s)
         aligned = align_clocks(rotation.trajectory(), imu, prior=prior, options=options)
-        calibration, on_rate, rates, rate_sigma = aligned.calibration, imu, "", 0.0
+        calibration, on_rate, rate_sigma = aligned.calibration, imu, 0.0
+        rate: float | None = None
         if aligned.drifts() or not (capture.shared_clock or offset_sigma_s <= _LIMITS.offset_s):
             # what one clock stamped has one rate; another is corrected even where it may be zero: what is left of it is
             # then as small as its deviation says
             rate_sigma = aligned.clock_rate_sigma
             on_rate = CameraTimedImu.from_recording(imu, calibration, timing.epoch_ns).imu
-            rates = f", with rates {1e6 * calibration.clock_rate:+.0f} ppm apart, to {1e6 * rate_sigma:.0f} ppm"
+            rate = calibration.clock_rate
         sigma_s = calibration.clock_sigma_s
         turned = calibration.rotation_sigma_rad
         # what translation does to pixels looks like a bias of the gyroscope
@@ -357,14 +364,13 @@ def _clocks(recording: Recording, progress: Progress) -> _Clocks:
     except NotObservableError as error:
         if offset_sigma_s <= _LIMITS.offset_s:
             return replace(known, oriented=False)
-        return _Clocks(
-            motion=None, oriented=False, camera=camera, note=f"the clocks' offset is not known beforehand: {error}"
-        )
+        unknown = Fact("offset-unknown-beforehand", why=fact_of(error))
+        return _Clocks(motion=None, oriented=False, camera=camera, note=unknown)
     return _Clocks(
         motion=motion,
         oriented=True,
         camera=camera if capture.camera is not None else _correct_focal(camera, agreement.gain),
-        note=f"the clocks' offset was found by following pixels, to {1e3 * sigma_s:.1f} ms{rates}",
+        note=Fact("offset-by-pixels", sigma_s=sigma_s, rate=rate, rate_sigma=rate_sigma),
         offset_s=calibration.clock_offset_s,
         offset_sigma_s=sigma_s,
         offset_from="pixels",

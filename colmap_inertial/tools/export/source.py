@@ -6,14 +6,15 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from colmap_inertial.core.arrays import Array, UInt8Array
 from colmap_inertial.core.errors import FormatError, NotObservableError
+from colmap_inertial.core.facts import Fact, as_fact
 from colmap_inertial.core.options import ExportImages
-from colmap_inertial.core.types import DOWN_IN_WORLD, CameraMotion, CameraTrajectory
+from colmap_inertial.core.types import DOWN_IN_WORLD, Action, CameraMotion, CameraTrajectory
 from colmap_inertial.inertial.georeference import Georeference
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import path_in, read_json, read_record
@@ -60,6 +61,32 @@ class Picture:
     agrees: bool = True
 
 
+@dataclass(frozen=True, kw_only=True)
+class TreatedFrame:
+    """What a run did to a frame.
+
+    Attributes
+    ----------
+    changed
+        Whether COLMAP did not see the file or pixels as they were.
+    sharpened
+        Whether its blur was undone.
+    rectified
+        Whether its keypoints were rectified.
+    """
+
+    changed: bool = False
+    sharpened: bool = False
+    rectified: bool = False
+
+    @classmethod
+    def of(cls, frame: Mapping[str, Any]) -> TreatedFrame:
+        """By the run's ``result.json``; earlier versions said by the action alone whether it was sharpened."""
+        sharpened = bool(frame.get("sharpened", frame["action"] == Action.DEBLURRED))
+        changed = frame["action"] != Action.PASSED
+        return cls(changed=changed, sharpened=sharpened, rectified=bool(frame["rectified"]))
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ExportSource:
     """A model to export.
@@ -77,7 +104,7 @@ class ExportSource:
     motion
         During each frame; ``None`` where it was not kept.
     treated
-        By image name, what a run did to its frames: action and whether keypoints were rectified.
+        By image name, what a run did to its frames.
     """
 
     found: ViewSource
@@ -85,7 +112,7 @@ class ExportSource:
     up_in_world: Array | None
     gravity_in_world_m_s2: Array | None
     motion: CameraMotion | None
-    treated: Mapping[str, tuple[str, bool]]
+    treated: Mapping[str, TreatedFrame]
 
     def pictures(
         self, out: Path, names: list[str], kind: ExportImages, capture: Capture | None = None
@@ -99,7 +126,7 @@ class ExportSource:
         """
         places = places_of(out)
         folders = self.found.images if kind == "rectified" else (places.seen, *self.found.images)
-        changed = [name for name in names if self.treated.get(name, ("passed", False))[0] != "passed"]
+        changed = [name for name in names if self.treated.get(name, TreatedFrame()).changed]
         filmed = {}
         if capture is not None:
             if capture.apertures is not None or capture.exposures is not None:
@@ -111,7 +138,7 @@ class ExportSource:
                     capture.path, f"has no frame {lost!r}: it is not the capture that the run was made of"
                 )
             for name in changed:
-                bent = self.treated[name][1]
+                bent = self.treated[name].rectified
                 filmed[name] = Picture(path=capture.path, filmed=True, agrees=not bent)
         picture_of = {name: filmed.get(name) or self._picture(places.rectified, folders, name) for name in names}
         changed_since = find_change(Workspace(out), (picture.path for picture in picture_of.values()))
@@ -132,9 +159,9 @@ class ExportSource:
                 self.found.folder,
                 f"the picture of its image {name!r} is missing (in {looked}); say where: --image-folder",
             )
-        action, was_rectified = self.treated.get(name, ("passed", False))
-        moved = was_rectified and path.resolve().is_relative_to(rectified.resolve())
-        return Picture(path=path, rectified=moved, sharpened=action == "deblurred", agrees=moved or not was_rectified)
+        treated = self.treated.get(name, TreatedFrame())
+        moved = treated.rectified and path.resolve().is_relative_to(rectified.resolve())
+        return Picture(path=path, rectified=moved, sharpened=treated.sharpened, agrees=moved or not treated.rectified)
 
 
 def read_source(
@@ -163,7 +190,7 @@ def read_source(
     with explaining_losses(Workspace(out)):
         source = find_source(out, model, images=image_folder)
         if source.scale.unit != "m" and not unscaled:
-            why = "; ".join(source.scale.reasons) or "this model was never given one"
+            why = "; ".join(map(str, source.scale.reasons or (Fact("never-scaled"),)))
             raise NotObservableError("scale", f"{why}; --unscaled exports it in its own units")
         reconstruction = read_model(source.folder)
         down, motion = source.down_in_world, None
@@ -240,12 +267,12 @@ def _up(source: ViewSource, model: pycolmap.Reconstruction) -> Array | None:
     return max((0.0 - down for down in DOWN_IN_WORLD.values()), key=lambda up: float(up @ edges))
 
 
-def _treated(workspace: Workspace) -> dict[str, tuple[str, bool]]:
+def _treated(workspace: Workspace) -> dict[str, TreatedFrame]:
     if not workspace.result.is_file():
         return {}
     with a_record_of_ours(workspace.result):
         frames = read_json(workspace.result).get("frames", [])
-        return {str(f["name"]): (str(f["action"]), bool(f["rectified"])) for f in frames}
+        return {str(frame["name"]): TreatedFrame.of(frame) for frame in frames}
 
 
 #: Endings of pictures that stay JPEG; all others become PNG.
@@ -324,7 +351,7 @@ class ExportContent:
     rgb: UInt8Array
     on_map: Georeference | None = None
     pictures: Mapping[str, Picture] = field(default_factory=dict)
-    notes: list[str]
+    notes: list[Fact]
 
     @classmethod
     def of(cls, source: ExportSource, on_map: Georeference | None, *, square: bool) -> ExportContent:
@@ -364,13 +391,13 @@ class ExportContent:
         return _Z_UP if self.source.up_in_world is None else self.source.up_in_world
 
 
-def _notes_on_model(source: ExportSource) -> list[str]:
+def _notes_on_model(source: ExportSource) -> list[Fact]:
     """Notes for the user on the model."""
     notes = []
     if source.found.scale.unit != "m":
-        notes.append(NO_SCALE)
+        notes.append(as_fact(NO_SCALE))
     if source.up_in_world is None:
-        notes.append(NO_UP)
+        notes.append(as_fact(NO_UP))
     elif float(source.up_in_world @ _Z_UP) < 0.9:
-        notes.append("up is not z in this model (up_in_world says what it is), while most trainers' viewers take z")
+        notes.append(Fact("up-is-not-z"))
     return notes

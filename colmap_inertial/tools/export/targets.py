@@ -14,6 +14,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate
 from colmap_inertial.core.options import ExportProgram
 from colmap_inertial.core.types import CameraMotion
@@ -49,7 +50,7 @@ def exposures_of(
     source: ExportSource,
     pictures: Mapping[str, Picture],
     cameras: Mapping[int, Undistortion],
-    notes: list[str],
+    notes: list[Fact],
 ) -> dict[str, Exposure]:
     """Velocity, exposure and readout by image name; images without a velocity are left out.
 
@@ -74,7 +75,7 @@ def exposures_of(
     motion = _require_motion(source.motion, pictures)
     readout_s = motion.readout_s or 0.0
     if motion.exposure_s is None and any(not picture.sharpened for picture in pictures.values()):
-        notes.append("exposure times are not known and count as 0: blur is not modelled")
+        notes.append(Fact("blur-not-modelled"))
     place = {name: i for i, name in enumerate(motion.names)}
     exposures = {}
     for image in map(model.image, model.reg_image_ids()):
@@ -96,7 +97,7 @@ def exposures_of(
     if not exposures:
         raise NotObservableError("camera motion", "none of the model's images has a velocity")
     if motion.exposure_s is not None and len({exposure.exposure_s for exposure in exposures.values()}) > 1:
-        notes.append("exposure times differ between pictures; the program takes one for all, their median")
+        notes.append(Fact("one-exposure-for-all"))
     return exposures
 
 
@@ -308,7 +309,7 @@ def _write_for_trainers(content: ExportContent, folder: Path, add_motion: _AddMo
 def _add_row_poses(values: dict[str, Any], content: ExportContent) -> dict[str, Any]:
     motion = content.source.motion
     if motion is None or not motion.names:
-        content.notes.append("no velocities are known: each picture has one pose, as if it was taken in an instant")
+        content.notes.append(Fact("one-pose-each"))
         return values
     return add_row_poses(values, _exposures(content))
 
@@ -317,7 +318,7 @@ def _add_velocities(values: dict[str, Any], content: ExportContent) -> dict[str,
     exposures = _exposures(content)
     left_out, count = len(content.names) - len(exposures), len(content.names)
     if left_out:
-        content.notes.append(f"{left_out} of {count} images have no velocity and are left out of transforms.json")
+        content.notes.append(Fact("images-without-velocity", left_out=left_out, images=count))
     return add_velocities(values, exposures)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from colmap_inertial import __version__
 from colmap_inertial.core.arrays import AnyArray, UInt8Array
 from colmap_inertial.core.errors import FormatError, OutputError
+from colmap_inertial.core.facts import Fact, as_fact, with_sentences
 from colmap_inertial.core.options import ExportImages, ExportProgram
 from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.threads import frames_at_once, map_in_order
@@ -140,7 +141,7 @@ class Exported:
     unit: str
     images: int
     points: int
-    notes: tuple[str, ...] = ()
+    notes: tuple[Fact, ...] = ()
 
 
 def export_model(
@@ -247,7 +248,7 @@ def _write_georeference(path: Path, content: ExportContent, on_map: Georeference
     centres = np.array([view.cam_in_world for view in content.views])
     names = tuple(view.name for view in content.views)
     write_json(path, {**on_map.as_json(), "cameras": cameras_as_json(on_map, names, centres)})
-    content.notes.extend(on_map.notes)
+    content.notes.extend(map(as_fact, on_map.notes))
 
 
 def _jobs(content: ExportContent, folder: Path, capture: Capture | None) -> Iterator[Job]:
@@ -283,7 +284,7 @@ def _record(made: Exported, content: ExportContent, kind: ExportImages) -> dict[
         "gravity_in_world_m_s2": None if gravity is None else gravity.tolist(),
         "scale": {
             "verdict": scale.verdict,
-            "reasons": list(scale.reasons),
+            **with_sentences({"reasons": list(scale.reasons)}),
             "metres_per_unit": scale.metres_per_unit,
             "relative_ci95": None if scale.relative_ci95 is None else list(scale.relative_ci95),
         },
@@ -291,23 +292,20 @@ def _record(made: Exported, content: ExportContent, kind: ExportImages) -> dict[
         "images": {"kind": kind, "count": made.images},
         "points": made.points,
         "names": {new: old for old, new in content.names.items()},
-        "notes": list(made.notes),
+        **with_sentences({"notes": list(made.notes)}),
     }
 
 
-def _notes_on(pictures: Mapping[str, Picture], kind: ExportImages) -> list[str]:
+def _notes_on(pictures: Mapping[str, Picture], kind: ExportImages) -> list[Fact]:
     """Notes for the user on the pictures."""
     notes = []
     bent = sum(not picture.agrees for picture in pictures.values())
     if bent:
-        notes.append(
-            f"{bent} pictures have their rolling shutter, which the model lacks: they agree with it in the middle "
-            "row alone, unless the program models the shutter"
-        )
+        notes.append(Fact("pictures-with-shutter", count=bent))
     moved = sum(picture.rectified for picture in pictures.values())
     if moved and kind == "original":
-        notes.append(f"{moved} pictures are rectified: those with their rolling shutter (colmap/images) are gone")
+        notes.append(Fact("pictures-rectified", count=moved))
     sharpened = sum(picture.sharpened for picture in pictures.values())
     if sharpened and kind == "original":
-        notes.append(f"{sharpened} pictures are deblurred; with --capture, they are taken from it as they were filmed")
+        notes.append(Fact("pictures-deblurred", count=sharpened))
     return notes

@@ -65,8 +65,8 @@ def contents_text(scene: Scene) -> str:
     if scene.path_percent is not None:
         most = float(np.abs(scene.path_percent).max(initial=0.0))
         lines.append(f"Along the path, red was stretched by the refinement and blue shortened, by up to {most:.2g} %.")
-    if scene.mesh_note:
-        lines.append(_plain(scene.mesh_note))
+    if scene.mesh_note is not None:
+        lines.append(_plain(str(scene.mesh_note)))
     return "\n\n".join(lines)
 
 

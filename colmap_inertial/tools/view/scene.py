@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import quat_conjugate, quat_rotate
 from colmap_inertial.core.types import DOWN_IN_WORLD
 from colmap_inertial.io.files import path_in
@@ -116,7 +117,7 @@ class Scene:
     cloud, mesh
         Points, and the surface where there is one.
     mesh_note
-        Why there is no mesh, where a file is there.
+        Why there is no mesh, where a file is there; else ``None``.
     cameras
         All of them.
     path, path_percent
@@ -139,7 +140,7 @@ class Scene:
     source: ViewSource
     cloud: Cloud
     mesh: Mesh | None
-    mesh_note: str
+    mesh_note: Fact | None
     cameras: Cameras
     path: Array
     path_percent: Array | None
@@ -203,10 +204,10 @@ def load_scene(out: Path, *, model: int | None = None, images: Path | None = Non
         cloud = dense_cloud(source.fused, max_points)
     else:
         cloud = sparse_cloud(reconstruction, max_points)
-    mesh, mesh_note = None, ""
+    mesh, mesh_note = None, None
     if source.mesh is not None and source.mesh.is_file():
         mesh = read_mesh(source.mesh, LIMITS.faces)
-        mesh_note = "" if mesh is not None else f"the mesh has no faces, or more than {LIMITS.faces}"
+        mesh_note = None if mesh is not None else Fact("mesh-not-shown", most_faces=LIMITS.faces)
     up, gravity_known = _find_up(source, cameras)
     centre, reach = centre_and_reach(cloud.xyz.astype(np.float64), cameras.cam_in_world)
     side = _side(centre, reach, up, cameras)

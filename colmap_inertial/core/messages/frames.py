@@ -1,0 +1,332 @@
+"""Words on frames: which are used, what is done to them, and why."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from colmap_inertial.core.messages import message, state
+
+if TYPE_CHECKING:
+    from colmap_inertial.core.facts import Fact
+
+# blur before a frame is decoded
+
+state(
+    "exposure-unknown",
+    "the exposure time is unknown (the images carry none); give exposure_s under [timing] in capture.toml, or a column "
+    "of it in the frame times",
+)
+state("blur-unknown", "the blur of this frame is not known")
+state("exposure-not-covered", "the gyroscope does not cover the exposure of this frame, or pauses in it")
+
+
+@message(example={"blur_px": 12.3})
+def blur_px(blur_px: float) -> str:
+    return f"{blur_px:.1f} px of blur"
+
+
+@message(example={"blur_px": 1.2})
+def blur_too_short(blur_px: float) -> str:
+    return f"{blur_px:.1f} px of blur are too few to matter"
+
+
+@message(example={"blur_px": 61.0})
+def blur_too_long(blur_px: float) -> str:
+    return f"{blur_px:.0f} px of blur are too many, and the frames around it are better"
+
+
+@message(example={"blur_px": 61.0})
+def blur_bridges_gap(blur_px: float) -> str:
+    return f"{blur_px:.0f} px of blur are too many, but the frame bridges a gap"
+
+
+@message(example={"blur_px": 61.0})
+def blur_at_end(blur_px: float) -> str:
+    return f"{blur_px:.0f} px of blur are too many, but no frame is beyond it"
+
+
+@message(example={"blur_px": 140.0})
+def blur_not_undone(blur_px: float) -> str:
+    return f"{blur_px:.0f} px of blur are too long to be undone"
+
+
+# what the pictures say about the gyroscope
+
+
+@message(example={"count": 2})
+def too_few_blurred_frames(count: int) -> str:
+    return f"{count} frames are too few to check the gyroscope against the images"
+
+
+@message(example={"support_sigmas": 0.4, "count": 12})
+def blur_not_shown(support_sigmas: float, count: int) -> str:
+    return (
+        f"the images do not show the blur that the gyroscope predicts ({support_sigmas:.1f} standard deviations in the "
+        f"median of {count} frames): check its axes, the clock offset, the exposure times, and that the "
+        "video was not stabilised"
+    )
+
+
+@message(example={"support_sigmas": 9.0, "extent_factor": 0.8})
+def blur_confirmed(support_sigmas: float, extent_factor: float = 1.0) -> str:
+    confirmed = f"the images confirm the gyroscope's blur ({support_sigmas:.0f} standard deviations)"
+    if extent_factor == 1.0:
+        return confirmed
+    return f"{confirmed}, but for its extent, which is multiplied by {extent_factor:.2f}"
+
+
+@message(example={"support_sigmas": 12.0, "factor": 2.0})
+def exposures_off_by_factor(support_sigmas: float, factor: float) -> str:
+    return f"{blur_confirmed(support_sigmas, factor)}: the exposure times are wrong by this factor"
+
+
+@message(example={"support_sigmas": 4.0})
+def blur_confirmed_below_sky(support_sigmas: float) -> str:
+    return f"the images below the sky confirm the gyroscope's blur ({support_sigmas:.0f} standard deviations)"
+
+
+@message(example={"confirming": 8, "count": 12})
+def blur_confirmed_by_some(confirming: int, count: int) -> str:
+    return (
+        f"{confirming} of {count} frames that were looked at confirm the gyroscope's blur, so each frame must do so "
+        "by itself (close to objects, the camera's translation blurs, too)"
+    )
+
+
+@message(example={"unsure_share": 0.3})
+def blur_uncertain(unsure_share: float) -> str:
+    return f"noise and calibration of the gyroscope leave {unsure_share:.0%} of the blur's length uncertain"
+
+
+state(
+    "frame-sharp-along-blur",
+    "the image has as much detail along the predicted blur as across it, though other frames lack it",
+)
+state("frame-without-blur", "the image does not show the blur that the gyroscope predicts, though other frames do")
+state("frame-not-telling", "too little texture or blur to check the gyroscope's prediction against")
+
+
+@message(example={"support_sigmas": 1.2, "wanted_sigmas": 4.0})
+def frame_blur_not_shown(support_sigmas: float, wanted_sigmas: float) -> str:
+    return (
+        f"the image does not show the blur that the gyroscope predicts ({support_sigmas:.1f} standard deviations where "
+        f"{wanted_sigmas:g} are wanted)"
+    )
+
+
+@message(example={"support_sigmas": 6.0})
+def frame_blur_confirmed(support_sigmas: float) -> str:
+    return f"the image confirms the gyroscope's blur ({support_sigmas:.0f} standard deviations)"
+
+
+# stages
+
+
+@message(example={"doubt": "40 pairs of frames do not tell whether the gyroscope has the right sign"})
+def curved_blur_in_doubt(doubt: Fact) -> str:
+    return f"{doubt}, and with the other one the blur would be curved the other way"
+
+
+state("readout-not-covered", "the gyroscope does not cover the whole readout")
+state("frame-readout-not-covered", "the gyroscope does not cover the readout of this frame, or pauses in it")
+state("shutter-undone", "undone by the gyroscope")
+
+
+@message(example={"count": 4})
+def apertures_fused(count: int) -> str:
+    return f"fused of {count} sub-images"
+
+
+@message(example={"action": "changed"})
+def by_a_stage(action: str) -> str:
+    return f"{action} by a stage"
+
+
+# short and long exposures
+
+state("no-gyroscope", "no gyroscope")
+state("pair-exposure-unknown", "an exposure time is unknown")
+state("pair-not-covered", "the gyroscope does not cover the time from the one to the other, or pauses in it")
+state("frames-without-times", "the frames have no times")
+state("pair-rotation-not-confirmed", "the pictures do not confirm the gyroscope's rotation")
+state(
+    "pair-gain-unknown",
+    "too little of the pictures is neither black in the short nor clipped in the long one; give the exposure "
+    "times and sensitivities",
+)
+state(
+    "short-exposure-unknown",
+    "the short ones' exposure time is unknown; give exposure_s under [timing] in capture.toml, or a column of "
+    "it in the frame times",
+)
+state(
+    "long-exposure-unknown",
+    "start or length of the long exposures is unknown; give times with a column exposure_s, or long_delay_s "
+    "and long_exposure_s, under [exposures] in capture.toml",
+)
+
+
+@message(
+    example={
+        "long": "0001_long.png",
+        "gain": 8.0,
+        "by_gyro": True,
+        "by_pixels": True,
+        "no_gyro": None,
+        "contradicted_gain": 4.0,
+    }
+)
+def exposures_fused(
+    long: str, gain: float, by_gyro: bool, by_pixels: bool, no_gyro: Fact | None, contradicted_gain: float | None
+) -> str:
+    by = [name for name, used in (("the gyroscope", by_gyro), ("the pixels", by_pixels)) if used]
+    aligned = f"aligned by {' and '.join(by)}" if by else "not aligned: no shift makes them agree better"
+    description = f"fused with {long}, which has {gain:.3g} times the light; {aligned}"
+    if no_gyro is not None:
+        description += f" ({no_gyro})"
+    if contradicted_gain is not None:
+        description += f"; exposure times and sensitivities say {contradicted_gain:.3g} times, which the pixels do not"
+    return description
+
+
+@message(example={"long": "0001_long.png", "correlation": 0.12})
+def pair_not_alike(long: str, correlation: float) -> str:
+    return f"{long} does not show the same (correlation {correlation:.2f})"
+
+
+@message(example={"used": "short", "gain": 6.0, "why": "0001_long.png does not show the same (correlation 0.12)"})
+def exposures_not_fused(used: str, gain: float, why: Fact) -> str:
+    what = "the long exposure as it is" if used == "long" else f"the short exposure, {gain:.3g} times as bright"
+    return f"is {what}, and not fused: {why}"
+
+
+@message(example={"no_gyro": None})
+def exposures_aligned(no_gyro: Fact | None) -> str:
+    return "short and long exposures are fused, aligned by the " + (
+        "gyroscope and the pixels" if no_gyro is None else f"pixels alone: {no_gyro}"
+    )
+
+
+# the plan of a recording
+
+state("left-to-frame-stages", "left to the frame stages that were given")
+state("left-to-keypoint-stages", "left to the keypoint stages that were given")
+state("not-asked-for", "not asked for")
+state("rig-not-deblurred", "frames stay as they were filmed: those of a rig's cameras are not deblurred")
+state(
+    "no-exposures-to-deblur",
+    "frames stay as they were filmed: the exposure time is unknown; give exposure_s under [timing] in "
+    "capture.toml, or a column of it in the frame times",
+)
+state("rig-not-rectified", "keypoints of a rig's cameras are not rectified")
+state(
+    "rectifying-without-readout",
+    "the readout is unknown: give readout_s under [timing] in capture.toml (docs/devices says where to find it)",
+)
+state("global-shutter", "global shutter")
+
+
+@message(example={"why": "the pixels' motion is not observable: the video was stabilised"})
+def frames_untreated(why: Fact) -> str:
+    return f"frames stay as they were filmed: {why}"
+
+
+@message(example={"most_px": 1.4, "by_sliding": True})
+def blur_nowhere(most_px: float, by_sliding: bool) -> str:
+    why_not = f"no frame has more than {most_px:.1f} px of blur, by the quickest turn that the gyroscope felt"
+    return f"{why_not}, and by how far pixels move from frame to frame" if by_sliding else why_not
+
+
+@message(example={"most_px": 2.1})
+def blur_predicted_nowhere(most_px: float | None) -> str:
+    most = "nothing" if most_px is None else f"{most_px:.1f} px"
+    return f"frames stay as they were filmed: the gyroscope predicts {most} of blur"
+
+
+#: What the note says of methods other than the default.
+_METHODS = {"deepgyro": "; the network DeepGyro undoes it", "path": "; the half-quadratic filter undoes it"}
+
+
+@message(
+    example={
+        "blurred": 40,
+        "frames": 120,
+        "verdict": "the images confirm the gyroscope's blur (9 standard deviations)",
+        "with_translation": 12,
+        "sign_doubt": None,
+        "method": "path",
+    }
+)
+def frames_blurred(
+    blurred: int, frames: int, verdict: Fact, with_translation: int, sign_doubt: Fact | None, method: str | None
+) -> str:
+    note = f"{blurred} of {frames} frames are blurred; {verdict}"
+    if with_translation:
+        note += f"; the camera's translation is counted in for {with_translation} frames"
+    if sign_doubt is not None:
+        note += f"; {sign_doubt}, so frames with curved blur stay as they were filmed"
+    return note + _METHODS.get(method or "", "")
+
+
+@message(example={"readout_s": 0.02, "source": "the camera's data sheet"})
+def keypoints_rectified(readout_s: float, source: str) -> str:
+    return f"keypoints are rectified, readout {1e3 * readout_s:.1f} ms{f' ({source})' if source else ''}"
+
+
+@message(example={"planned": "left to the keypoint stages that were given", "count": 90})
+def keypoints_rectified_by_stages(planned: Fact | None, count: int) -> str:
+    return f"{planned or ''}, which rectified keypoints of {count} images"
+
+
+state("keypoints-not-covered", "no keypoints are rectified: the gyroscope covers the whole readout of no image")
+
+# camera and gyroscope before the reconstruction
+
+
+@message(example={"focal_px": 1500.0})
+def focal_length_guessed(focal_px: float) -> str:
+    return f"the focal length was guessed: {focal_px:.0f} px"
+
+
+@message(example={"quantity": "clock offset", "why": "the camera hardly turns", "sigma": None})
+def quantity_not_observable(quantity: str, why: Fact | str, sigma: float | None) -> str:
+    spread = "" if sigma is None else f" (standard deviation {100 * sigma:.1f} %)"
+    return f"{quantity} is not observable{spread}: {why if isinstance(why, str) else why.with_advice}"
+
+
+# the frames that are used
+
+state("all-frames-asked", "all frames, as asked for")
+state("all-pictures", "all pictures of the folder")
+state("frames-as-capture-says", "as frames_per_s in capture.toml has it")
+state("one-clock", "the recorder stamped frames and gyroscope by one clock")
+
+_RANKS = {"blur": "predicted blur", "speed": "angular speed", "sharpness": "sharpness of the pictures"}
+
+
+@message(example={"sigma_s": 0.005})
+def offset_of_capture(sigma_s: float) -> str:
+    return f"the clocks' offset is the capture's, to {1e3 * sigma_s:.0f} ms"
+
+
+@message(example={"why": "clock offset is not observable: the camera hardly turns"})
+def offset_unknown_beforehand(why: Fact) -> str:
+    return f"the clocks' offset is not known beforehand: {why}"
+
+
+@message(example={"sigma_s": 0.0012, "rate": 2e-5, "rate_sigma": 4e-6})
+def offset_by_pixels(sigma_s: float, rate: float | None, rate_sigma: float) -> str:
+    rates = "" if rate is None else f", with rates {1e6 * rate:+.0f} ppm apart, to {1e6 * rate_sigma:.0f} ppm"
+    return f"the clocks' offset was found by following pixels, to {1e3 * sigma_s:.1f} ms{rates}"
+
+
+@message(
+    example={
+        "used": 120,
+        "frames": 900,
+        "ranked_by": ("blur",),
+        "clocks": "the clocks' offset is the capture's, to 5 ms",
+    }
+)
+def frames_selected(used: int, frames: int, ranked_by: tuple[str, ...], clocks: Fact) -> str:
+    return f"{used} of {frames} frames, by {' and '.join(_RANKS[way] for way in ranked_by)}; {clocks}"
