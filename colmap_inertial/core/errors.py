@@ -10,7 +10,7 @@ import errno
 from pathlib import Path
 from typing import ClassVar
 
-from colmap_inertial.core.facts import Fact
+from colmap_inertial.core.facts import Fact, as_fact
 
 #: Libraries that open3d and pycolmap-cuda12 take from the system, and their packages on Debian.
 _SYSTEM_LIBRARIES = {
@@ -139,6 +139,11 @@ class NotObservableError(InertialError):
         Why, and what to record instead.
     sigma
         Relative standard deviation, where one was computed.
+
+    Attributes
+    ----------
+    why
+        The hint as a fact.
     """
 
     exit_code = 3
@@ -146,6 +151,7 @@ class NotObservableError(InertialError):
 
     def __init__(self, quantity: str, hint: Fact | str, *, sigma: float | None = None) -> None:
         self.quantity = quantity
+        self.why = as_fact(hint)
         self.hint = in_words(hint)
         self.sigma = sigma
         spread = "" if sigma is None else f" (standard deviation {100 * sigma:.1f} %)"

@@ -21,7 +21,7 @@ class Fact:
     code
         Its stable name, of ``core.messages``.
     values
-        What its message is made of: numbers (units are in the names), names, and tuples of them.
+        What its message is made of: numbers (units are in the names), names, other facts, and tuples of them.
 
     Raises
     ------
@@ -57,7 +57,7 @@ class Fact:
 
     def as_json(self) -> dict[str, object]:
         """Code and values."""
-        return {"code": self.code, "values": dict(self.values)}
+        return {"code": self.code, "values": {name: _plain(value) for name, value in self.values.items()}}
 
     @classmethod
     def stated(cls, text: str) -> Fact:
@@ -104,9 +104,18 @@ def details(facts: Iterable[Fact]) -> list[dict[str, object]]:
 
 
 def _frozen(value: Any) -> Any:
-    """Plain values, with tuples for sequences and numbers for those of arrays."""
+    """Plain values, with tuples for sequences, numbers for those of arrays, and facts for what JSON has of them."""
     if hasattr(value, "tolist"):
         value = value.tolist()
+    if isinstance(value, Mapping) and value.keys() == {"code", "values"}:
+        return Fact(value["code"], **value["values"])
     if isinstance(value, list | tuple):
         return tuple(_frozen(item) for item in value)
     return value
+
+
+def _plain(value: Any) -> Any:
+    """JSON types: facts by code and values."""
+    if isinstance(value, tuple):
+        return [_plain(item) for item in value]
+    return value.as_json() if isinstance(value, Fact) else value

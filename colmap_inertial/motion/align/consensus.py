@@ -19,6 +19,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array, IndexArray
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply, quat_normalize
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.threads import one_blas_thread
@@ -120,47 +121,48 @@ def _require_majority(consensus: RotationConsensus) -> None:
     part = consensus.part[consensus.judged]
     count, placed, largest = len(part), int(np.sum(part >= 0)), int(np.sum(part == 0))
     if count < LIMITS.fewest_judged:
-        hint = f"cameras contradict the gyroscope, and {count} are too few to tell which: record longer"
+        why = Fact("cameras-too-few-to-tell", count=count)
     elif 2 * placed <= count or 2 * largest <= placed:
-        hint = (
-            f"the gyroscope agrees with {largest} of {count} cameras at most: check that the IMU recording belongs to "
-            "these images, and that the images are of one place"
-        )
+        why = Fact("cameras-disagree", agreeing=largest, cameras=count)
     else:
         return
-    raise NotObservableError("camera rotation", hint)
+    raise NotObservableError("camera rotation", why)
 
 
-def describe_consensus(consensus: RotationConsensus) -> tuple[str, ...]:
-    """Describe contradictions to the gyroscope in sentences; empty where there are none."""
+def describe_consensus(consensus: RotationConsensus) -> tuple[Fact, ...]:
+    """Describe contradictions to the gyroscope; empty where there are none."""
     out = []
     wrong, count = consensus.wrong, len(consensus.names)
     if wrong:
-        named = ", ".join(f"{camera.name} ({camera.deviation_deg:.0f} deg)" for camera in wrong[:5])
-        more = f" and {len(wrong) - 5} more" if len(wrong) > 5 else ""
-        out.append(f"{len(wrong)} of {count} cameras contradict the gyroscope and were left out: {named}{more}")
+        deviations_deg = [camera.deviation_deg for camera in wrong]
+        names = [camera.name for camera in wrong]
+        out.append(Fact("cameras-turned", names=names, deviations_deg=deviations_deg, cameras=count))
     if consensus.moved:
-        named = ", ".join(consensus.moved[:5])
-        more = f" and {len(consensus.moved) - 5} more" if len(consensus.moved) > 5 else ""
-        out.append(
-            f"{len(consensus.moved)} of {count} cameras are in another place than the accelerometer says and were left "
-            f"out: {named}{more}"
-        )
+        out.append(Fact("cameras-misplaced", names=consensus.moved, cameras=count))
     out += [
-        f"the model is torn between {seam.before} and {seam.name}: its parts are turned by {seam.turn_deg:.0f} deg "
-        "against each other"
-        for seam in consensus.seams
+        Fact("model-torn", before=seam.before, after=seam.name, turn_deg=seam.turn_deg) for seam in consensus.seams
     ]
     if consensus.seams:
         kept = int(consensus.kept.sum())
         if consensus.joined:
-            out.append(
-                f"the IMU joined {len(consensus.joined)} cameras of other parts to the largest, {kept} of {count}"
-            )
+            out.append(Fact("torn-parts-joined", joined=len(consensus.joined), kept=kept, cameras=count))
         if any(consensus.part[consensus.names.index(name)] > 0 for name in consensus.left_out):
-            rests = f"the scale rests on the largest part, {kept} of {count} cameras; "
-            out.append(f"{'' if consensus.joined else rests}the other parts were left out")
+            whole = Fact("largest-part-kept", kept=kept, cameras=count)
+            out.append(Fact("other-parts-left-out") if consensus.joined else whole)
     return tuple(out)
+
+
+#: The codes of :func:`describe_consensus`.
+CONSENSUS_CODES = frozenset(
+    (
+        "cameras-turned",
+        "cameras-misplaced",
+        "model-torn",
+        "torn-parts-joined",
+        "largest-part-kept",
+        "other-parts-left-out",
+    )
+)
 
 
 def judge_rotations(
