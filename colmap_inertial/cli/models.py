@@ -22,6 +22,7 @@ from colmap_inertial.cli.terminal import (
     show_view,
 )
 from colmap_inertial.core.errors import InertialError
+from colmap_inertial.core.facts import with_sentences
 from colmap_inertial.core.options import (
     ExportImages,
     ExportProgram,
@@ -176,7 +177,7 @@ def _describe_applied(applied: Applied) -> dict[str, Any]:
             "folder": folder,
             "scale": None if scale.similarity is None else scale.similarity.scale,
             "verdict": scale.verdict,
-            "reasons": scale.reasons,
+            **with_sentences({"reasons": list(scale.reasons)}),
         }
         for index, (folder, scale) in applied.models.items()
     ]

@@ -98,6 +98,23 @@ def with_sentences(fields: Mapping[str, object]) -> dict[str, object]:
     return out
 
 
+def read_facts(fields: Mapping[str, Any], name: str) -> tuple[Fact, ...]:
+    """Facts that :func:`with_sentences` wrote; where it wrote no codes, or none that are known here, their sentences.
+
+    Parameters
+    ----------
+    fields, name
+        The JSON object, and which of its fields.
+    """
+    texts, coded = fields.get(name) or (), fields.get(name + DETAILS)
+    if isinstance(coded, list) and len(coded) == len(texts):
+        try:
+            return tuple(Fact(one["code"], **one["values"]) for one in coded)
+        except (KeyError, TypeError, LookupError):
+            pass
+    return tuple(Fact.stated(str(text)) for text in texts)
+
+
 def details(facts: Iterable[Fact]) -> list[dict[str, object]]:
     """Code and values of each fact, as JSON has them beside the sentences."""
     return [fact.as_json() for fact in facts]

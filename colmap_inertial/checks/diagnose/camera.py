@@ -15,6 +15,7 @@ from colmap_inertial.checks.diagnose.clocks import (
 )
 from colmap_inertial.checks.diagnose.findings import UNIT_FACTORS, Finding, Recorded
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import sentences
 from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply
 from colmap_inertial.core.sampling import subtract_running_mean
 from colmap_inertial.core.types import CameraTrajectory, ImuRecording, RotationConsensus
@@ -158,7 +159,7 @@ def check_cameras(recorded: Recorded) -> Iterator[Finding]:
         yield Finding(
             code="cameras-turned",
             severity="warning",
-            evidence="; ".join(describe_consensus(consensus)),
+            evidence="; ".join(sentences(describe_consensus(consensus))),
             numbers={
                 "wrong": float(len(consensus.wrong)),
                 "seams": float(len(consensus.seams)),

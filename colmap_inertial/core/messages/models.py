@@ -92,7 +92,9 @@ def refined_times_far(shift_s: float, readout_s: float) -> str:
     )
 
 
-@message(example={"held_out": 800, "before_px": 0.71, "after_px": 0.65, "chi2": 1.1, "alone_m": None, "refined_m": None})
+@message(
+    example={"held_out": 800, "before_px": 0.71, "after_px": 0.65, "chi2": 1.1, "alone_m": None, "refined_m": None}
+)
 def refinement_evidence(
     held_out: int,
     before_px: float,
@@ -149,7 +151,13 @@ def readout_settled(shift_px: float, before_px: float, after_px: float, accepted
 
 # Gaps between models.
 
-state("gap-not-judged", "")
+
+@message(example={"why": "the scale of model 1 was refused"})
+def model_apart(why: Any) -> str:
+    return _say(why)
+
+
+state("gap-not-judged", "it was not judged")
 state("other-mounting", "the camera of one is mounted to the IMU otherwise than that of the other")
 state("other-imu", "the two contradict each other about the IMU itself: its biases, gains, or clock changed in between")
 state("no-pose-fits", "no relative pose of the two models fits the IMU's motion between them")
@@ -187,8 +195,7 @@ def gap_motion_contradicts(chi2: float, dof: int) -> str:
 @message(example={"sigmas": 8.0})
 def gap_poses_contradict(sigmas: float) -> str:
     return (
-        f"the poses before and after the gap contradict the IMU or the shared images "
-        f"({sigmas:.0f} standard deviations)"
+        f"the poses before and after the gap contradict the IMU or the shared images ({sigmas:.0f} standard deviations)"
     )
 
 

@@ -1,4 +1,4 @@
-"""What is said of a scale estimate: what refuses it or makes it doubtful, what was undone, what else one should know."""
+"""What is said of a scale estimate: what refuses it or makes it doubtful, what was undone, what else to know."""
 
 from __future__ import annotations
 
@@ -55,6 +55,11 @@ PARTS: dict[str, tuple[str, str]] = {
 }
 
 
+def _number(value: float | None) -> float:
+    """A number that may be infinite, which JSON does not know."""
+    return math.inf if value is None else value
+
+
 def _advise_on_part(parts: Sequence[str], half_widths: Sequence[float]) -> str:
     return PARTS[parts[0]][1]
 
@@ -97,7 +102,9 @@ def not_observable(quantity: str, why: Any) -> str:
     return f"{quantity}: {why.with_advice if hasattr(why, 'with_advice') else why}"
 
 
-state("scale-without-accelerometer", "the recording has no accelerometer, without which metres are unknown; record it too")
+state(
+    "scale-without-accelerometer", "the recording has no accelerometer, without which metres are unknown; record it too"
+)
 state("scale-not-estimated", "not looked at")
 state("fit-singular", f"camera and IMU do not determine a scale together: {_RECORD_INSTEAD}")
 state("motion-not-determined", "camera and IMU do not determine its motion")
@@ -192,8 +199,8 @@ def accel_gain_impossible(gain: float) -> str:
 @message(example={"unexplained_m_s2": 1.2, "motion_m_s2": 1.5})
 def accel_contradicts_motion(unexplained_m_s2: float, motion_m_s2: float) -> str:
     return (
-        f"the accelerometer and the camera's motion disagree by {unexplained_m_s2:.2f} m/s2, where the motion itself is "
-        f"{motion_m_s2:.2f} m/s2: check the accelerometer's sign and axes and that both recordings belong "
+        f"the accelerometer and the camera's motion disagree by {unexplained_m_s2:.2f} m/s2, where the motion itself "
+        f"is {motion_m_s2:.2f} m/s2: check the accelerometer's sign and axes and that both recordings belong "
         f"together, or {_RECORD_INSTEAD}"
     )
 
@@ -295,8 +302,8 @@ def model_stretched(stretch: float, axis: Sequence[float]) -> str:
 @message(example={"growth": 0.03, "sigma": 0.004})
 def scale_grows(growth: float, sigma: float) -> str:
     return (
-        f"the reconstruction's scale is not the same throughout: lengths are {100 * growth:+.1f} +- {196 * sigma:.1f} % "
-        f"larger at the end than at the beginning: {_CLOSE_LOOPS}"
+        f"the reconstruction's scale is not the same throughout: lengths are {100 * growth:+.1f} +- {196 * sigma:.1f} "
+        f"% larger at the end than at the beginning: {_CLOSE_LOOPS}"
     )
 
 
@@ -395,8 +402,7 @@ def cameras_misplaced(names: Sequence[str], cameras: int) -> str:
 @message(example={"before": "0030.jpg", "after": "0031.jpg", "turn_deg": 25.0})
 def model_torn(before: str, after: str, turn_deg: float) -> str:
     return (
-        f"the model is torn between {before} and {after}: its parts are turned by {turn_deg:.0f} deg "
-        "against each other"
+        f"the model is torn between {before} and {after}: its parts are turned by {turn_deg:.0f} deg against each other"
     )
 
 
@@ -435,7 +441,7 @@ state("rigs-not-registered-again", "images of several cameras are not registered
 
 
 @message(example={"facts": ("a model is torn", "the other parts were left out")})
-def together(facts: Sequence[Any]) -> str:
+def cameras_judged(facts: Sequence[Any]) -> str:
     return "; ".join(map(str, facts))
 
 
@@ -470,8 +476,8 @@ def rolling_shutter_ignored(readout_s: float, sigma_s: float, direction: str) ->
 def rolling_shutter_possible(readout_s: float, half_width: float | None) -> str:
     return (
         f"a rolling shutter of up to {1e3 * readout_s:.0f} ms, which the points of the "
-        f"model do not rule out, leaves the scale open by {100 * (math.inf if half_width is None else half_width):.0f} %:"
-        " declare readout_s, 0 for a global shutter"
+        f"model do not rule out, leaves the scale open by {100 * _number(half_width):.0f} %: declare readout_s, "
+        "0 for a global shutter"
     )
 
 
@@ -489,7 +495,7 @@ def joined_part_weak(colmap_index: int, images: int, why: Sequence[Any]) -> str:
 
 @message(example={"half_width": 0.12})
 def part_scale_wide(half_width: float | None) -> str:
-    return f"its scale is known to +-{100 * (math.inf if half_width is None else half_width):.1f} % only"
+    return f"its scale is known to +-{100 * _number(half_width):.1f} % only"
 
 
 @message(example={"images": 12, "frames": 60})
@@ -505,6 +511,7 @@ def names_disagree(timed: int, frames: int, example: str, named: str) -> str:
     )
 
 
+state("already-in-metres", "this model is metric already: a scale of 1 says that it is right")
 state("fragment", "a fragment of few images")
 
 # Static calibration of an IMU.
@@ -524,7 +531,9 @@ state("rests-without-accelerometer", "the recording has no accelerometer; record
 
 @message(example={"attitudes": 4, "needed": 6})
 def attitudes_too_few(attitudes: int, needed: int) -> str:
-    rested = "no rest was found" if attitudes == 0 else f"it lay still in {attitudes} attitude{'s' * (attitudes > 1)} only"
+    rested = (
+        "no rest was found" if attitudes == 0 else f"it lay still in {attitudes} attitude{'s' * (attitudes > 1)} only"
+    )
     return f"{rested}, and at least {needed} are needed (twelve are good): {_LAY_STILL}"
 
 

@@ -362,9 +362,7 @@ def _refusals(fit: Fit, t_s: Array) -> list[Fact]:
     # Noise of the accelerometer averaged between states, against the acceleration that it should measure
     unexplained = fit.noise.accel_m_s2(float(np.median(np.diff(t_s))))
     if unexplained > _LIMITS.unexplained * fit.excitation_m_s2:
-        out.append(
-            Fact("accel-contradicts-motion", unexplained_m_s2=unexplained, motion_m_s2=fit.excitation_m_s2)
-        )
+        out.append(Fact("accel-contradicts-motion", unexplained_m_s2=unexplained, motion_m_s2=fit.excitation_m_s2))
     return out
 
 

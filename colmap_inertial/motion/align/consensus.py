@@ -11,7 +11,7 @@ are compared only with those next to them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -139,9 +139,7 @@ def describe_consensus(consensus: RotationConsensus) -> tuple[Fact, ...]:
         out.append(Fact("cameras-turned", names=names, deviations_deg=deviations_deg, cameras=count))
     if consensus.moved:
         out.append(Fact("cameras-misplaced", names=consensus.moved, cameras=count))
-    out += [
-        Fact("model-torn", before=seam.before, after=seam.name, turn_deg=seam.turn_deg) for seam in consensus.seams
-    ]
+    out += [Fact("model-torn", before=seam.before, after=seam.name, turn_deg=seam.turn_deg) for seam in consensus.seams]
     if consensus.seams:
         kept = int(consensus.kept.sum())
         if consensus.joined:
@@ -152,8 +150,13 @@ def describe_consensus(consensus: RotationConsensus) -> tuple[Fact, ...]:
     return tuple(out)
 
 
+def without_consensus(facts: Iterable[Fact]) -> tuple[Fact, ...]:
+    """Facts but for those of :func:`describe_consensus`."""
+    return tuple(fact for fact in facts if fact.code not in _CODES)
+
+
 #: The codes of :func:`describe_consensus`.
-CONSENSUS_CODES = frozenset(
+_CODES = frozenset(
     (
         "cameras-turned",
         "cameras-misplaced",

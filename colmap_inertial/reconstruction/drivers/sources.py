@@ -9,6 +9,7 @@ from pathlib import Path
 
 from colmap_inertial.checks.diagnose import diagnose
 from colmap_inertial.core.errors import FormatError, NotObservableError
+from colmap_inertial.core.facts import Fact, as_fact
 from colmap_inertial.core.options import ScaleOptions
 from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate
 from colmap_inertial.inertial.scale import estimate_scale, first_seconds, learn_lever_arm
@@ -82,7 +83,7 @@ class TimedPoses:
     checked: CheckInputs
     shared_clock: bool
     start_s: float | None = None
-    notes: Sequence[str] = ()
+    notes: Sequence[Fact] = ()
 
     @property
     def calibration(self) -> CameraImuCalibration | None:
@@ -131,7 +132,7 @@ def load_source(source: ScaleSource) -> TimedPoses:
     )
 
 
-def read_source(source: ScaleSource) -> tuple[CheckInputs, Sequence[str]]:
+def read_source(source: ScaleSource) -> tuple[CheckInputs, Sequence[Fact]]:
     """Read what there is of poses and the IMU recorded along, with notes; what cannot be read is among the refused.
 
     Raises
@@ -141,7 +142,7 @@ def read_source(source: ScaleSource) -> tuple[CheckInputs, Sequence[str]]:
     """
     path, reader = source.source, TolerantReader()
     trajectory = timing = capture = None
-    notes: Sequence[str] = ()
+    notes: Sequence[Fact] = ()
     if brings_imu(source):
         read_as = INERTIAL_SCALE
         trajectory = reader.attempt(lambda: read_inertial_scale_poses(path))
@@ -158,7 +159,7 @@ def read_source(source: ScaleSource) -> tuple[CheckInputs, Sequence[str]]:
             placed, known = model, timing
             trajectory, notes = reader.attempt(lambda: trajectory_from_model(placed, known)) or (None, ())
         if is_metric(folder):
-            notes = (*notes, "this model is metric already: a scale of 1 says that it is right")
+            notes = (*notes, Fact("already-in-metres"))
     else:
         read_as = TUM
         trajectory = reader.attempt(lambda: read_tum(path))
@@ -256,7 +257,7 @@ def _refuse_another_convention(recording: TimedPoses, options: AlignOptions, qua
         options=options,
     )
     if likely is not None:
-        raise NotObservableError(quantity, likely.sentence)
+        raise NotObservableError(quantity, as_fact(likely.sentence))
 
 
 def scale_source(
@@ -294,7 +295,7 @@ def scale_source(
     diagnosis = diagnose(measure_recording(checked, silent))
     doubts = tuple(finding.sentence for finding in diagnosis.stopping)
     if doubts and not force:
-        estimate = ScaleEstimate.refused("none", *doubts)
+        estimate = ScaleEstimate.refused("none", *map(as_fact, doubts))
     else:
         estimate = estimate_scale(
             trajectory,

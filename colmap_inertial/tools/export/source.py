@@ -12,6 +12,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, UInt8Array
 from colmap_inertial.core.errors import FormatError, NotObservableError
+from colmap_inertial.core.facts import Fact, sentences
 from colmap_inertial.core.options import ExportImages
 from colmap_inertial.core.types import DOWN_IN_WORLD, CameraMotion, CameraTrajectory
 from colmap_inertial.inertial.georeference import Georeference
@@ -163,7 +164,7 @@ def read_source(
     with explaining_losses(Workspace(out)):
         source = find_source(out, model, images=image_folder)
         if source.scale.unit != "m" and not unscaled:
-            why = "; ".join(source.scale.reasons) or "this model was never given one"
+            why = "; ".join(sentences(source.scale.reasons)) or "this model was never given one"
             raise NotObservableError("scale", f"{why}; --unscaled exports it in its own units")
         reconstruction = read_model(source.folder)
         down, motion = source.down_in_world, None
@@ -324,7 +325,7 @@ class ExportContent:
     rgb: UInt8Array
     on_map: Georeference | None = None
     pictures: Mapping[str, Picture] = field(default_factory=dict)
-    notes: list[str]
+    notes: list[Fact | str]
 
     @classmethod
     def of(cls, source: ExportSource, on_map: Georeference | None, *, square: bool) -> ExportContent:
@@ -364,9 +365,9 @@ class ExportContent:
         return _Z_UP if self.source.up_in_world is None else self.source.up_in_world
 
 
-def _notes_on_model(source: ExportSource) -> list[str]:
+def _notes_on_model(source: ExportSource) -> list[Fact | str]:
     """Notes for the user on the model."""
-    notes = []
+    notes: list[Fact | str] = []
     if source.found.scale.unit != "m":
         notes.append(NO_SCALE)
     if source.up_in_world is None:

@@ -14,6 +14,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate
 from colmap_inertial.core.options import ExportProgram
 from colmap_inertial.core.types import CameraMotion
@@ -49,7 +50,7 @@ def exposures_of(
     source: ExportSource,
     pictures: Mapping[str, Picture],
     cameras: Mapping[int, Undistortion],
-    notes: list[str],
+    notes: list[Fact | str],
 ) -> dict[str, Exposure]:
     """Velocity, exposure and readout by image name; images without a velocity are left out.
 

@@ -12,6 +12,7 @@ import numpy as np
 from colmap_inertial import __version__
 from colmap_inertial.core.arrays import AnyArray, UInt8Array
 from colmap_inertial.core.errors import FormatError, OutputError
+from colmap_inertial.core.facts import Fact, as_fact, with_sentences
 from colmap_inertial.core.options import ExportImages, ExportProgram
 from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.threads import frames_at_once, map_in_order
@@ -140,7 +141,7 @@ class Exported:
     unit: str
     images: int
     points: int
-    notes: tuple[str, ...] = ()
+    notes: tuple[Fact, ...] = ()
 
 
 def export_model(
@@ -236,7 +237,7 @@ def export_model(
             unit=source_view.scale.unit,
             images=len(content.views) if target.has_images else 0,
             points=len(content.xyz) if target.has_points else 0,
-            notes=tuple(content.notes),
+            notes=tuple(map(as_fact, content.notes)),
         )
         write_json(partial / "export.json", _record(made, content, images))
     return made
@@ -283,7 +284,7 @@ def _record(made: Exported, content: ExportContent, kind: ExportImages) -> dict[
         "gravity_in_world_m_s2": None if gravity is None else gravity.tolist(),
         "scale": {
             "verdict": scale.verdict,
-            "reasons": list(scale.reasons),
+            **with_sentences({"reasons": list(scale.reasons)}),
             "metres_per_unit": scale.metres_per_unit,
             "relative_ci95": None if scale.relative_ci95 is None else list(scale.relative_ci95),
         },
@@ -291,7 +292,7 @@ def _record(made: Exported, content: ExportContent, kind: ExportImages) -> dict[
         "images": {"kind": kind, "count": made.images},
         "points": made.points,
         "names": {new: old for old, new in content.names.items()},
-        "notes": list(made.notes),
+        **with_sentences({"notes": list(made.notes)}),
     }
 
 
