@@ -16,6 +16,7 @@ from far_scene import CAM_FROM_IMU, FarScene
 from colmap_inertial.checks.diagnose import Diagnosis, FramesInVideo, Recorded, diagnose
 from colmap_inertial.cli import main
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import quat_conjugate, quat_exp, quat_multiply, quat_rotate, so3_exp
 from colmap_inertial.core.types import CameraModel, CameraTrajectory, Frame, FrameLog, FrameTiming, ImuRecording
 from colmap_inertial.imaging.gyro_camera import FrameShutter
@@ -529,7 +530,7 @@ def test_gravity_that_was_removed_stops_a_reconstruction_unless_forced(clean: di
 def test_a_forced_scale_is_at_most_weak(project: Project, tmp_path: Path) -> None:
     timing, model = read_frame_times(project.frame_times), read_model(project.model)
     verdicts = {}
-    for doubts in ((), ("the video was stabilised",)):
+    for doubts in ((), (Fact.stated("the video was stabilised"),)):
         stage = MetricStage(imu=project.recording.imu, calibration=None)
         scale = stage(Model(reconstruction=model, colmap_index=0, timing=timing, doubts=doubts)).scale
         assert scale is not None and scale.reasons[: len(doubts)] == doubts

@@ -14,6 +14,7 @@ from colmap_inertial.checks.validate import Validation, parse_target
 from colmap_inertial.checks.words import describe_joined
 from colmap_inertial.cli import terminal
 from colmap_inertial.core.errors import FormatError, TimingError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import quat_exp, quat_multiply, quat_rotate
 from colmap_inertial.core.types import (
     CameraModel,
@@ -286,7 +287,7 @@ def test_counts_are_colmap_s_own_but_for_joined_models(run):
 def test_doubts_make_any_stage_s_scale_weak_and_make_the_models_again(run):
     sure, _ = run({0: 40})
     assert sure[0].scale.verdict == "trusted"
-    doubts = ("the video was stabilised",)
+    doubts = (Fact.stated("the video was stabilised"),)
     downgraded, _ = run({0: 40}, doubts=doubts)
     assert downgraded[0].scale.verdict == "weak" and downgraded[0].scale.reasons[:1] == doubts
     assert run.session.runner.worked == ["metric"]

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
+from colmap_inertial.core.facts import Fact
+
 Class = TypeVar("Class", bound=type)
 
 
@@ -64,10 +66,10 @@ def shorten(value: Any) -> str:
     if isinstance(value, Mapping):
         return f"{len(value)} by name: {_cut(', '.join(map(str, value)), _LIMITS.width // 2)}" if value else "()"
     if isinstance(value, tuple | list | frozenset):
-        if all(isinstance(item, float | int | str) for item in value) and len(value) <= _LIMITS.items:
+        if all(isinstance(item, float | int | str | Fact) for item in value) and len(value) <= _LIMITS.items:
             return _cut("(" + ", ".join(shorten(item) for item in value) + ")")
         return f"{len(value)} of {type(next(iter(value))).__name__}"
-    if hasattr(value, "__dataclass_fields__"):
+    if hasattr(value, "__dataclass_fields__") and not isinstance(value, Fact):
         return type(value).__name__
     return _cut(str(value))
 

@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from colmap_inertial.core.arrays import set_fields
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError
-from colmap_inertial.core.facts import Fact, read_facts, with_sentences
+from colmap_inertial.core.facts import Fact, as_fact, read_facts, with_sentences
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_from_matrix
 from colmap_inertial.core.options import WorldAxes
 from colmap_inertial.core.summary import prints_in_lines
@@ -42,6 +43,9 @@ class ModelScale:
     reasons: tuple[Fact, ...] = ()
     joined_of: tuple[int, ...] = ()
     left_out: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        set_fields(self, reasons=tuple(map(as_fact, self.reasons)))
 
     def as_json(self) -> dict[str, object]:
         """The fields in JSON types."""
