@@ -108,9 +108,8 @@ def test_few_attitudes_leave_misalignments_to_their_prior_and_say_so(subtests):
             truth = simulate_rests(RestOptions(attitudes=attitudes), seed=attitudes)
             found = calibrated(truth)
             assert found.verdict == "weak"
-            assert (
-                f"{attitudes} attitudes determine gains and biases of the accelerometer, not its misal"
-                in found.reasons[0]
+            assert f"{attitudes} attitudes determine gains and biases of the accelerometer, not its misal" in str(
+                found.reasons[0]
             )
             calibration = found.calibration
             np.testing.assert_array_equal(calibration.accel_gain.ravel()[BESIDE], 0.0)
@@ -129,10 +128,10 @@ def test_a_device_that_warms_up_is_named_and_not_good(subtests):
             drifting = dataclasses.replace(imu, accel_m_s2=imu.accel_m_s2 + 0.02 * np.array([1.0, -1, 1]) * warm)
             found = calibrate_imu(drifting, gravity_m_s2=9.81, gravity_sigma_m_s2=5e-4)
             assert found.verdict == "weak"
-            (named,) = (reason for reason in found.reasons if "as that of a device that warms up" in reason)
-            assert 0.015 < float(named.split("drifted by ")[1].split(" m/s2")[0]) < 0.05
+            (drifted,) = (reason for reason in found.reasons if reason.code == "accel-bias-drifted")
+            assert 0.015 < drifted.values["drift_m_s2"] < 0.05
             assert not any(
-                "warms up:" in reason for reason in calibrated(simulate_rests(RestOptions(), seed=seed)).reasons
+                "warms up:" in str(reason) for reason in calibrated(simulate_rests(RestOptions(), seed=seed)).reasons
             )
 
 
@@ -171,7 +170,7 @@ def test_a_gyroscope_that_did_not_turn_about_an_axis_keeps_its_prior_there():
     assert np.all(sigma[IMU_CAL.GYRO_GAIN] > 0.009)
     np.testing.assert_allclose(found.calibration.gyro_gain, 0.0, atol=1e-12)
     assert found.verdict == "weak"
-    assert any("gyroscope's gain about x, y and z" in reason for reason in found.reasons)
+    assert any("gyroscope's gain about x, y and z" in str(reason) for reason in found.reasons)
     np.testing.assert_allclose(found.calibration.accel_gain, truth.accel_gain, atol=1e-3)
 
 
@@ -180,7 +179,7 @@ def test_a_gyroscope_with_other_axes_is_left_alone_and_named():
     turned = dataclasses.replace(truth.recording, gyro_rad_s=truth.recording.gyro_rad_s[:, [1, 0, 2]])
     found = calibrate_imu(turned, gravity_m_s2=9.81, gravity_sigma_m_s2=5e-4)
     assert found.verdict == "weak"
-    assert any("does not turn as the accelerometer says" in reason for reason in found.reasons)
+    assert any("does not turn as the accelerometer says" in str(reason) for reason in found.reasons)
     np.testing.assert_allclose(found.calibration.accel_gain, truth.accel_gain, atol=1e-3)
     np.testing.assert_allclose(found.calibration.gyro_gain, 0.0, atol=1e-12)
 
@@ -189,10 +188,10 @@ def test_unknown_gravity_is_counted_in_every_gain_and_said():
     truth = simulate_rests(RestOptions(gravity_m_s2=9.79), seed=4)
     found = calibrate_imu(truth.recording)
     assert found.calibration.gain_sigma > 1.5e-3
-    assert "give the latitude" in found.reasons[-1]
+    assert "give the latitude" in str(found.reasons[-1])
     known = calibrated(truth, gravity_m_s2=9.79)
     assert known.calibration.gain_sigma < 5e-4
-    assert not any("latitude" in reason for reason in known.reasons)
+    assert not any("latitude" in str(reason) for reason in known.reasons)
 
 
 def test_a_calibrated_imu_narrows_the_interval_and_keeps_the_truth_in_it():
@@ -232,8 +231,8 @@ def test_a_recording_warmer_than_its_calibration_is_less_sure_and_says_so():
         return estimate_scale(recorded.trajectory, imu, imu_calibration=calibration)
 
     unknown, alike, warm = estimated(None), estimated(24.0), estimated(51.0)
-    assert not any("calibrated at" in note for note in (*unknown.notes, *alike.notes))
-    assert any("calibrated at 21 °C and was 51 °C warm here" in note for note in warm.notes)
+    assert not any("calibrated at" in str(note) for note in (*unknown.notes, *alike.notes))
+    assert any("calibrated at 21 °C and was 51 °C warm here" in str(note) for note in warm.notes)
     assert unknown.sigma_log <= alike.sigma_log < 1.1 * unknown.sigma_log
     assert warm.sigma_log > 1.4 * alike.sigma_log
     assert warm.as_json()["imu_calibration"]["temperature_c"] == 21.0

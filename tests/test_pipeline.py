@@ -15,6 +15,7 @@ import pytest
 
 from colmap_inertial.cli import main
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError, OutputExistsError
+from colmap_inertial.core.facts import sentences
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate
 from colmap_inertial.core.options import MappingOptions, ReconstructOptions
 from colmap_inertial.io.trajectories import read_tum
@@ -352,7 +353,7 @@ def test_hooks_see_every_frame_keypoint_and_model(tmp_path):
     assert len(list((tmp_path / "out" / "images").iterdir())) == 13
     assert models
     assert models[0][0] == 0
-    assert result.models[0].scale.reasons == ("mine",)
+    assert sentences(result.models[0].scale.reasons) == ("mine",)
     with pycolmap.Database.open(str(tmp_path / "out" / "colmap" / "database.db")) as database:
         for image in database.read_all_images():
             stored = np.array(database.read_keypoints(image.image_id))

@@ -351,7 +351,7 @@ def test_a_sub_model_with_one_timed_image_is_refused_and_the_others_go_on(projec
     stages = [MetricStage(imu=imu, calibration=None)]
     (metric, refused), *_ = run_models(session, recording, stages, Submodels(after=()), fragments=True)
     assert metric.scale.verdict == "trusted"
-    assert refused.scale.verdict == "refused" and "1 of the model's 1 images" in refused.scale.reasons[0]
+    assert refused.scale.verdict == "refused" and "1 of the model's 1 images" in str(refused.scale.reasons[0])
     assert refused.summary["registered_images"] == 1
     result = ReconstructResult(workspace=workspace, models=(metric, refused), frames=(), seconds={})
     assert report_result(session, result, recording.capture).report is not None

@@ -13,6 +13,7 @@ import pytest
 
 from colmap_inertial.colmap import feature_chunks
 from colmap_inertial.core.errors import FormatError, InertialError, TargetNotFoundError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ReconstructOptions, ValidateOptions
 from colmap_inertial.core.types import FrameTiming
 from colmap_inertial.imaging.blur_field import BlurField
@@ -120,11 +121,12 @@ def test_gaps_lie_between_the_last_image_of_a_model_and_the_first_of_the_next():
 
     spans = _spans([model(0, "786"), model(1, ["2", "0", "1"]), model(2, "43"), model(3, ["other"])])
     assert spans == [(0, 4, 1), (6, 8, 2), (12, 16, 0)]
-    assert [(gap.first, gap.second, gap.seconds, gap.joined, gap.reason) for gap in _beside(spans, {2: "no IMU"})] == [
-        (1, 2, 2, False, "no IMU"),
-        (2, 0, 4, False, "no IMU"),
+    why = Fact.stated("no IMU")
+    assert [(gap.first, gap.second, gap.seconds, gap.joined, gap.reason) for gap in _beside(spans, {2: why})] == [
+        (1, 2, 2, False, why),
+        (2, 0, 4, False, why),
     ]
-    assert [(gap.first, gap.second) for gap in _beside(spans, {0: "no IMU"})] == [(2, 0)] and not _beside(spans, {})
+    assert [(gap.first, gap.second) for gap in _beside(spans, {0: why})] == [(2, 0)] and not _beside(spans, {})
 
 
 def test_what_is_neither_a_point_nor_a_marker_is_refused(subtests):

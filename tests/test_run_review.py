@@ -11,6 +11,7 @@ import pytest
 
 from colmap_inertial import AlreadyMetricError, Model, OutputExistsError, ScaleEstimate, Similarity, reconstruct
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.model import downgraded, read_model
 from colmap_inertial.model.similarities import read_scales
 from colmap_inertial.pipeline.run.context import RunContext
@@ -46,7 +47,7 @@ def test_scales_of_a_result_belong_to_colmap_s_numbers(tmp_path):
 
 
 def test_doubts_lower_a_verdict_that_was_raised_again():
-    doubts = ("the video was stabilised",)
+    doubts = (Fact.stated("the video was stabilised"),)
     once = downgraded(ESTIMATE, doubts)
     raised = dataclasses.replace(once, verdict="trusted")
     assert once.verdict == downgraded(raised, doubts).verdict == "weak"

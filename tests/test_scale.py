@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm, t
 
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ScaleOptions
 from colmap_inertial.inertial.scale import check_units, estimate_scale, first_seconds, gravity_at_latitude_m_s2
 from colmap_inertial.inertial.scale.verdict import half_width, student_factor, verdict_of
@@ -42,9 +43,10 @@ def test_few_degrees_of_freedom_widen_as_student_has_it():
 
 
 def test_failed_checks_lower_and_refusals_refuse():
-    assert verdict_of(1.0, 0.001, ["the halves disagree"])[::2] == ("weak", ("the halves disagree",))
-    verdict, _, reasons = verdict_of(1.0, 0.001, ["a"], refusals=["b"])
-    assert verdict == "refused" and reasons == ("b", "a")
+    check, refusal = Fact("half-without-scale"), Fact("fit-not-converged")
+    assert verdict_of(1.0, 0.001, [check])[::2] == ("weak", (check,))
+    verdict, _, reasons = verdict_of(1.0, 0.001, [check], refusals=[refusal])
+    assert verdict == "refused" and reasons == (refusal, check)
 
 
 def test_a_verdict_needs_a_positive_scale():
@@ -81,16 +83,16 @@ def recording():
 def test_units_are_checked(recording):
     imu = recording.imu
     assert check_units(imu) == []
-    assert "in g" in check_units(replace(imu, accel_m_s2=imu.accel_m_s2 / 9.80665))[0]
-    assert "deg/s" in check_units(replace(imu, gyro_rad_s=imu.gyro_rad_s * 180 / np.pi))[0]
+    assert check_units(replace(imu, accel_m_s2=imu.accel_m_s2 / 9.80665))[0].values["likely"] == "g"
+    assert check_units(replace(imu, gyro_rad_s=imu.gyro_rad_s * 180 / np.pi))[0].code == "gyro-in-degrees"
     without_gravity = imu.accel_m_s2 * 0.02
-    assert "gravity was removed" in check_units(replace(imu, accel_m_s2=without_gravity))[0]
+    assert check_units(replace(imu, accel_m_s2=without_gravity))[0].values["likely"] == "without gravity"
 
 
 def test_wrong_units_are_refused_with_what_to_do(recording):
     imu = replace(recording.imu, accel_m_s2=recording.imu.accel_m_s2 / 9.80665)
     estimate = estimate_scale(recording.trajectory, imu)
-    assert estimate.verdict == "refused" and "multiply it by 9.80665" in estimate.reasons[0]
+    assert estimate.verdict == "refused" and "multiply it by 9.80665" in str(estimate.reasons[0])
 
 
 def test_times_of_poses_in_another_unit_are_refused_before_any_search(recording, monkeypatch):
@@ -98,7 +100,7 @@ def test_times_of_poses_in_another_unit_are_refused_before_any_search(recording,
         monkeypatch.setattr(f"colmap_inertial.inertial.scale.{search}", lambda *_, **__: pytest.fail("searched"))
     poses = replace(recording.trajectory, t_s=recording.trajectory.t_s * 1e3)
     (reason,) = estimate_scale(poses, recording.imu).reasons
-    assert "divide them by 1000" in reason and "seconds" in reason
+    assert reason.code == "poses-not-in-seconds" and reason.values["factor"] == 1000
 
 
 def test_the_first_seconds_hold_nothing_of_later_frames(recording):
@@ -118,23 +120,23 @@ def test_clocks_that_run_at_different_rates_give_the_same_scale(recording):
     fast = replace(imu, gyro_t_s=imu.gyro_t_s * 1.01, accel_t_s=imu.accel_t_s * 1.01)
     estimate = estimate_scale(recording.trajectory, fast)
     assert estimate.metres_per_unit == pytest.approx(recording.truth.metres_per_unit, rel=0.01)
-    assert any("IMU's clock is +" in note and "ppm off the camera's" in note for note in estimate.notes)
+    assert any("IMU's clock is +" in str(note) and "ppm off the camera's" in str(note) for note in estimate.notes)
     assert estimate.verdict == "weak"
 
 
 def test_a_gyroscope_alone_gives_no_scale(recording):
     alone = replace(recording.imu, accel_t_s=np.zeros(0), accel_m_s2=np.zeros((0, 3)))
     estimate = estimate_scale(recording.trajectory, alone)
-    assert estimate.verdict == "refused" and "no accelerometer" in estimate.reasons[0]
+    assert estimate.verdict == "refused" and "no accelerometer" in str(estimate.reasons[0])
 
 
 def test_another_recordings_imu_is_refused(recording):
     other = simulate_recording(RecordingOptions(), seed=4)
     estimate = estimate_scale(recording.trajectory, other.imu)
     assert estimate.verdict == "refused" and estimate.metres_per_unit is None
-    assert "time offset" in estimate.reasons[0]
+    assert "time offset" in str(estimate.reasons[0])
 
 
 def test_a_shared_clock_narrows_the_search(recording):
     estimate = estimate_scale(recording.trajectory, recording.imu, options=ScaleOptions(max_offset_s=1.0))
-    assert estimate.verdict == "refused" and "do not overlap" in estimate.reasons[0]
+    assert estimate.verdict == "refused" and "do not overlap" in str(estimate.reasons[0])

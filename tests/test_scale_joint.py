@@ -590,7 +590,7 @@ def test_a_pause_of_the_imu_is_bridged_and_named(recording, calibration):
     )  # fmt: skip
     estimate = estimate_scale(recording.trajectory, holed)
     assert estimate.ci95[0] < recording.truth.metres_per_unit < estimate.ci95[1]
-    assert any("gyroscope pauses once, for 0.6" in note for note in estimate.notes)
+    assert any("gyroscope pauses once, for 0.6" in str(note) for note in estimate.notes)
 
 
 def test_a_break_of_the_path_does_no_harm_and_is_named(subtests, recording, calibration):
@@ -600,7 +600,7 @@ def test_a_break_of_the_path_does_no_harm_and_is_named(subtests, recording, cali
             centre[280:] += np.array([1.0, -0.5, 0.3]) * shift_m / recording.truth.metres_per_unit
             estimate = joint(replace(recording.trajectory, cam_in_world=centre), recording.imu, calibration)
             assert estimate.ci95[0] < recording.truth.metres_per_unit < estimate.ci95[1]
-            assert shift_m < 0.1 or any("jump" in note for note in estimate.notes)
+            assert shift_m < 0.1 or any("jump" in str(note) for note in estimate.notes)
 
 
 @pytest.mark.parametrize("kind", ["static", "pure_rotation", "constant_velocity"])
@@ -610,7 +610,7 @@ def test_motion_that_cannot_give_a_scale_is_refused(kind):
     cov = np.diag(np.array([0.01] * 3 + [0.002, 0.02] + [0.01] * 3 + [0.08] * 3 + [0.02]) ** 2)
     estimate = joint(recording.trajectory, recording.imu, replace(truth, cov=cov))
     assert estimate.verdict == "refused" and estimate.metres_per_unit is None
-    assert any("back and forth" in reason for reason in estimate.reasons)
+    assert any("back and forth" in str(reason) for reason in estimate.reasons)
 
 
 @pytest.mark.parametrize(
@@ -720,7 +720,7 @@ def test_a_wrong_gain_is_named():
     recording = simulate_recording(RecordingOptions(motion=MotionOptions(kind="roam", duration_s=20.0)), seed=7)
     imu = replace(recording.imu, accel_m_s2=1.1 * recording.imu.accel_m_s2)
     estimate = joint(recording.trajectory, imu, align_camera_imu(recording.trajectory, imu))
-    assert estimate.verdict != "trusted" and any("gain" in reason for reason in estimate.reasons)
+    assert estimate.verdict != "trusted" and any("gain" in str(reason) for reason in estimate.reasons)
 
 
 def test_a_scale_that_changes_halfway_is_noticed(recording, calibration):
@@ -730,12 +730,12 @@ def test_a_scale_that_changes_halfway_is_noticed(recording, calibration):
     centre[half:] = centre[half] + 1.2 * (centre[half:] - centre[half])
     estimate = joint(replace(trajectory, cam_in_world=centre), recording.imu, calibration)
     assert estimate.verdict != "trusted"
-    assert any("not the same throughout" in reason for reason in estimate.reasons)
+    assert any("not the same throughout" in str(reason) for reason in estimate.reasons)
 
 
 def test_too_few_frames_are_refused(recording, calibration):
     estimate = joint(first_seconds(recording.trajectory, 1.0), recording.imu, calibration)
-    assert estimate.verdict == "refused" and "longer" in estimate.reasons[0]
+    assert estimate.verdict == "refused" and "longer" in str(estimate.reasons[0])
 
 
 def test_options_must_make_sense():
@@ -845,7 +845,7 @@ def test_a_drift_of_the_scale_is_found_and_measured():
     assert steady.verdict == "trusted" and steady.drift.p_value > 1e-3
     assert np.all(np.abs(steady.drift.log_ratio) < 4 * steady.drift.sigma_log)
     growing = estimate_scale(stretched(recording.trajectory, 0.12), recording.imu)
-    assert growing.verdict == "weak" and any("not the same throughout" in reason for reason in growing.reasons)
+    assert growing.verdict == "weak" and any("not the same throughout" in str(reason) for reason in growing.reasons)
     drift = growing.drift
     assert drift.trend_log_per_s * 45 == pytest.approx(-0.12, abs=4 * 45 * drift.trend_sigma_log_per_s)
     middle_s = 0.5 * (drift.begin_s + drift.end_s)

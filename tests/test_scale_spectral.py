@@ -183,7 +183,7 @@ def test_motion_without_acceleration_gives_no_number(kind):
         estimate = spectral(simulated.trajectory, simulated.imu, known(simulated))
         assert estimate.verdict == "refused"
         assert estimate.metres_per_unit is None
-        assert any("record" in reason or "swing" in reason for reason in estimate.reasons)
+        assert any("record" in str(reason) or "swing" in str(reason) for reason in estimate.reasons)
 
 
 def test_a_spoilt_accelerometer_gives_no_number(subtests, handheld):
@@ -197,19 +197,19 @@ def test_a_spoilt_accelerometer_gives_no_number(subtests, handheld):
             imu = replace(handheld.imu, accel_m_s2=spoil(handheld.imu.accel_m_s2))
             estimate = spectral(handheld.trajectory, imu, known(handheld))
             assert estimate.verdict == "refused"
-            assert re.search(reason, " ".join(estimate.reasons))
+            assert re.search(reason, " ".join(map(str, estimate.reasons)))
 
 
 def test_what_cannot_be_differentiated_is_refused(handheld):
     calibration = known(handheld)
     sparse = handheld.trajectory.select(slice(None, None, 10))
-    assert "joint" in spectral(sparse, handheld.imu, calibration).reasons[0]
+    assert "joint" in str(spectral(sparse, handheld.imu, calibration).reasons[0])
     short = handheld.trajectory.select(slice(0, 60))
-    assert "record longer" in spectral(short, handheld.imu, calibration).reasons[0]
+    assert "record longer" in str(spectral(short, handheld.imu, calibration).reasons[0])
     later = replace(handheld.imu, accel_t_s=handheld.imu.accel_t_s + 29.0)
     assert spectral(handheld.trajectory, later, calibration).verdict == "refused"
     frozen = replace(handheld.trajectory, cam_in_world=np.zeros_like(handheld.trajectory.cam_in_world))
-    assert "does not move" in spectral(frozen, handheld.imu, calibration).reasons[0]
+    assert "does not move" in str(spectral(frozen, handheld.imu, calibration).reasons[0])
     # two frequencies of three axes tell less than nine numbers twice over
     with pytest.raises(NotObservableError, match="at least five seconds"):
         fit_spectra(SimpleNamespace(frequency_hz=np.array([0.5, 1.0])), calibration, 9.8)

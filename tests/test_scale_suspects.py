@@ -15,7 +15,7 @@ from colmap_inertial.inertial.scale import estimate_scale, first_seconds, gravit
 from colmap_inertial.inertial.scale._fit import fit_jointly
 from colmap_inertial.inertial.scale._setup import prepare
 from colmap_inertial.inertial.scale._suspects import Faults, Suspicion, worst
-from colmap_inertial.inertial.scale.verdict import CAUSES, parts_in_words
+from colmap_inertial.inertial.scale.verdict import CAUSES, describe_parts
 from colmap_inertial.motion.align import align_camera_imu
 from colmap_inertial.tools.simulate.motion import MotionOptions
 from colmap_inertial.tools.simulate.recording import RecordingOptions, simulate_recording
@@ -66,7 +66,7 @@ def saturated(imu, share):
 def test_a_fault_of_the_accelerometer_is_named_and_undone(recording, alter, said, value, within):
     estimate = estimate_scale(recording.trajectory, alter(recording.imu))
     assert estimate.verdict == "weak"
-    found = [match for match in (re.search(said, reason) for reason in estimate.reasons) if match]
+    found = [match for match in (re.search(said, str(reason)) for reason in estimate.reasons) if match]
     assert len(found) == 1, estimate.reasons
     assert float(found[0][1]) == pytest.approx(value, abs=within)
     assert estimate.ci95[0] < recording.truth.metres_per_unit < estimate.ci95[1]
@@ -84,7 +84,7 @@ def test_a_path_that_was_smoothed_gives_no_scale(kind, width_s):
     assert estimate.verdict == "refused" and estimate.metres_per_unit is None
     # wider ones may leave nothing that fits at all
     if width_s < 0.1:
-        assert any("poses that were not smoothed" in reason for reason in estimate.reasons)
+        assert any("poses that were not smoothed" in str(reason) for reason in estimate.reasons)
 
 
 def test_a_filter_without_delay_is_the_accelerometer_s_where_the_delay_is_known(recording):
@@ -100,7 +100,7 @@ def test_a_filter_without_delay_is_the_accelerometer_s_where_the_delay_is_known(
     estimate = estimate_scale(
         recording.trajectory, replace(imu, accel_m_s2=smooth), calibration=replace(known, cov=cov)
     )
-    assert estimate.verdict == "weak" and any("low-passed" in reason for reason in estimate.reasons)
+    assert estimate.verdict == "weak" and any("low-passed" in str(reason) for reason in estimate.reasons)
     assert estimate.ci95[0] < recording.truth.metres_per_unit < estimate.ci95[1]
 
 
@@ -137,7 +137,7 @@ def test_a_stream_that_is_cut_off_throughout_is_refused_for_that(recording):
     assert estimate.verdict == "refused"
     hard = np.clip(imu.accel_m_s2, -8.0, 8.0)
     estimate = estimate_scale(short, replace(imu, accel_m_s2=hard))
-    assert estimate.verdict != "trusted" and any("end of its range" in reason for reason in estimate.reasons)
+    assert estimate.verdict != "trusted" and any("end of its range" in str(reason) for reason in estimate.reasons)
 
 
 def test_a_sound_accelerometer_raises_no_suspicion(subtests):
@@ -220,9 +220,9 @@ def test_the_interval_says_what_it_is_made_of_and_a_calibration_takes_its_part_o
         assert set(estimate.parts) == set(CAUSES) - {"rolling_shutter"}
         assert sum(sigma**2 for sigma in estimate.parts.values()) == pytest.approx(estimate.sigma_log**2)
     assert better.parts["accel_gain"] < 0.5 * plain.parts["accel_gain"]
-    said, advice = parts_in_words(plain.parts)
-    assert said.startswith("the accelerometer's gain +-") and "calibrate-imu" in advice
-    assert "calibrate-imu" not in parts_in_words(better.parts)[1]
+    made_of = describe_parts(plain.parts)
+    assert str(made_of).startswith("the accelerometer's gain +-") and "calibrate-imu" in made_of.advice
+    assert "calibrate-imu" not in describe_parts(better.parts).advice
 
 
 def test_the_latitude_takes_the_part_of_gravity_off(recording):
@@ -264,7 +264,9 @@ def test_the_gyroscope_s_cut_off_readings_are_a_gap(recording):
     assert data.gyro_cut_share > 0.01
     assert data.streams.gyro.paused_s[-1] == pytest.approx(data.gyro_cut_share * np.ptp(imu.gyro_t_s), rel=0.5)
     estimate = estimate_scale(recording.trajectory, altered)
-    assert estimate.verdict == "weak" and any("of the gyroscope's readings" in reason for reason in estimate.reasons)
+    assert estimate.verdict == "weak" and any(
+        "of the gyroscope's readings" in str(reason) for reason in estimate.reasons
+    )
     assert estimate.ci95[0] < recording.truth.metres_per_unit < estimate.ci95[1]
 
 

@@ -9,7 +9,7 @@ import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
-from colmap_inertial.inertial.scale.verdict import TRUSTED_HALF_WIDTH, parts_in_words
+from colmap_inertial.inertial.scale.verdict import TRUSTED_HALF_WIDTH, describe_parts
 
 #: A label, and the value with its unit.
 Fact = tuple[str, str]
@@ -252,8 +252,8 @@ def outcome_of_model(model: dict[str, Any]) -> dict[str, Any]:
         f"{fixed(ci95[1])} m (+-{digits(pct, 2)} %).",
     ]
     if model.get("parts"):
-        made_of, advice = parts_in_words(model["parts"])
-        summary.append(f"What makes the interval so wide: {made_of}. To narrow it most, {advice}.")
+        made_of = describe_parts(model["parts"])
+        summary.append(f"What makes the interval so wide: {made_of}. To narrow it most, {made_of.advice}.")
     return {
         "verdict": verdict,
         "headline": headline,

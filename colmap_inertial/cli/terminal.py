@@ -72,7 +72,6 @@ def scale_lines(estimate: ScaleEstimate) -> list[Line]:
     from rich.text import Text
 
     from colmap_inertial.checks.words import half_width_pct, length_in_words, scale_facts, sensor_facts
-    from colmap_inertial.inertial.scale.verdict import parts_in_words
 
     metres = "no metres: the recording does not determine the scale"
     if estimate.metres_per_unit is not None and estimate.ci95 is not None:
@@ -82,11 +81,21 @@ def scale_lines(estimate: ScaleEstimate) -> list[Line]:
         ("metres", Text(metres, "bold")),
         ("verdict", Text(estimate.verdict, f"bold {_COLOUR[estimate.verdict]}")),
         *scale_facts(values),
-        *([] if estimate.parts is None else zip(("made of", "narrower"), parts_in_words(estimate.parts), strict=True)),
+        *_part_lines(estimate),
         *_label_first("reason", estimate.reasons),
         *_label_first("note", estimate.notes),
         *sensor_facts(values),
     ]
+
+
+def _part_lines(estimate: ScaleEstimate) -> list[Line]:
+    """What the interval is made of, and what would narrow it."""
+    from colmap_inertial.inertial.scale.verdict import describe_parts
+
+    if estimate.parts is None:
+        return []
+    made_of = describe_parts(estimate.parts)
+    return [("made of", str(made_of)), ("narrower", made_of.advice)]
 
 
 def _label_first(label: str, texts: Iterable[object]) -> list[Line]:
@@ -124,7 +133,7 @@ def show_applied(applied: Applied) -> None:
         if scale.verdict is not None:
             line.append_text(Text.assemble(" (", (scale.verdict, f"bold {_COLOUR[scale.verdict]}"), ")"))
         lines.append((f"Model {index}", line))
-        lines += [("", reason) for reason in scale.reasons if scale.similarity is None]
+        lines += [("", str(reason)) for reason in scale.reasons if scale.similarity is None]
     kinds: dict[str, list[str]] = {}
     for change in applied.changes:
         kinds.setdefault(change.kind, []).append(f"{change.path} ({', '.join(change.changed)})")

@@ -71,7 +71,7 @@ def shorten(value: Any) -> str:
         if all(isinstance(item, float | int | str | Fact) for item in value) and len(value) <= _LIMITS.items:
             return _cut("(" + ", ".join(shorten(item) for item in value) + ")")
         return f"{len(value)} of {type(next(iter(value))).__name__}"
-    if hasattr(value, "__dataclass_fields__"):
+    if hasattr(value, "__dataclass_fields__") and not isinstance(value, Fact):
         return type(value).__name__
     return _cut(str(value))
 

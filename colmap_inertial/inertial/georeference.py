@@ -22,6 +22,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray, ComplexArray, check_array
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact, read_facts, with_sentences
 from colmap_inertial.core.geometry import matrix_from_quat, rotation_between
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import HeightDatum, PositionFixes
@@ -135,7 +136,7 @@ class Georeference:
     delay_s: float | None = None
     delay_sigma_s: float | None = None
     source: str = ""
-    notes: tuple[str, ...] = ()
+    notes: tuple[Fact, ...] = ()
     alike_assumed: bool = False
 
     def __post_init__(self) -> None:
@@ -195,7 +196,7 @@ class Georeference:
             else {"seconds": self.delay_s, "ci95_s": Z95 * self.delay_sigma_s},
             "length_ratio": self.length_ratio,
             "length_ratio_sigma": self.length_ratio_sigma,
-            "notes": list(self.notes),
+            **with_sentences({"notes": list(self.notes)}),
         }
 
 
@@ -223,7 +224,7 @@ def georeference_of_json(values: Mapping[str, Any]) -> Georeference:
         length_ratio_sigma=float(values["length_ratio_sigma"]),
         delay_s=None if delay is None else float(delay["seconds"]),
         delay_sigma_s=None if delay is None else float(delay["ci95_s"]) / Z95,
-        notes=tuple(map(str, values["notes"])),
+        notes=read_facts(values, "notes"),
         alike_assumed=bool(errors.get("alike_assumed", False)),  # earlier versions did not say
     )
 
@@ -257,9 +258,8 @@ def georeference(
         Where the positions are too few, or leave the heading open.
     """
     if len(fixes.latitude_deg) < _LIMITS.fewest:
-        raise NotObservableError(
-            "heading", f"{len(fixes.latitude_deg)} positions are too few: {_LIMITS.fewest} are needed"
-        )
+        few = Fact("positions-too-few", count=len(fixes.latitude_deg), needed=_LIMITS.fewest)
+        raise NotObservableError("heading", few)
     chosen = np.argsort(t_s, kind="stable")
     chosen = chosen[np.unique(np.linspace(0, len(chosen) - 1, _LIMITS.most).round().astype(np.intp))]
     fixes, path_m, t_s = fixes.select(chosen), np.asarray(cam_in_world_m)[chosen], np.asarray(t_s)[chosen]
@@ -332,36 +332,26 @@ def _require_heading(fit: _Fit, path: ComplexArray) -> None:
     sigma = math.sqrt(fit.cov[0, 0])
     reach_m = float(np.sqrt(np.mean(np.abs(path - path.mean()) ** 2)))
     if np.degrees(sigma) > _LIMITS.least_certain_deg:
-        raise NotObservableError(
-            "heading",
-            f"+-{np.degrees(Z95 * min(sigma, np.pi)):.0f} degrees: the path reaches {reach_m:.1f} m to either side, "
-            f"and the positions err by {math.hypot(fit.white_m, fit.slow_m):.1f} m; walk farther",
-        )
+        half_width_deg, error_m = np.degrees(Z95 * min(sigma, np.pi)), math.hypot(fit.white_m, fit.slow_m)
+        unsure = Fact("heading-unsure", half_width_deg=half_width_deg, reach_m=reach_m, error_m=error_m)
+        raise NotObservableError("heading", unsure)
 
 
 def _require_same_path(fit: _Fit) -> None:
     """Refuse positions whose distances are far from the model's."""
     if fit.ratio_error > _LIMITS.largest_ratio:
-        raise NotObservableError(
-            "heading",
-            f"the positions are {fit.ratio:.2f} times as far apart as the model says: they are of another path, or the "
-            "receiver stood still while the camera moved",
-        )
+        raise NotObservableError("heading", Fact("positions-of-another-path", ratio=fit.ratio))
 
 
-def _notes(fit: _Fit, stated: bool, height_above: HeightDatum | None) -> Iterator[str]:
-    """Sentences for the user on lengths that differ, on sizes of errors that are assumed, and on heights' zero."""
+def _notes(fit: _Fit, stated: bool, height_above: HeightDatum | None) -> Iterator[Fact]:
+    """Notes on lengths that differ, on sizes of errors that are assumed, and on heights' zero."""
     if fit.ratio_error > _LIMITS.least_ratio:
-        yield (
-            f"the positions are {fit.ratio:.3f} times as far apart as the model says (+-{Z95 * fit.ratio_sigma:.3f}): "
-            "one of them is wrong; the model's scale was left as it is"
-        )
+        yield Fact("positions-of-another-scale", ratio=fit.ratio, half_width=Z95 * fit.ratio_sigma)
     if not stated:
         size_m, factor = _LIMITS.unstated_slow
-        yield f"no accuracy is stated: slow errors of {size_m:g} m, within a factor of {factor:g}, were assumed"
+        yield Fact("accuracy-assumed", slow_m=size_m, factor=factor)
     if height_above != "ellipsoid":
-        zero = "the sea" if height_above == "sea" else "what the receiver took for zero"
-        yield f"heights count from {zero}, not from the ellipsoid; the two differ by up to 100 m"
+        yield Fact("heights-not-of-ellipsoid", height_above=height_above)
 
 
 def _level(up_in_world: Array) -> Array:

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array, Int64Array
+from colmap_inertial.core.arrays import Array, Int64Array, set_fields
 from colmap_inertial.core.errors import AlreadyMetricError, FormatError, OutputExistsError, TimingError
-from colmap_inertial.core.facts import Fact
+from colmap_inertial.core.facts import Fact, as_fact
 from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.types import (
     CameraModel,
@@ -98,6 +98,9 @@ class Model:
     joined_covs: Mapping[str, Array] = field(default_factory=dict)
     motion: SolvedMotion | None = None
 
+    def __post_init__(self) -> None:
+        set_fields(self, doubts=tuple(map(as_fact, self.doubts)))
+
     def scaled(self, estimate: ScaleEstimate, similarity: Similarity | None) -> Model:
         """Apply a scale estimate, unless its units were refused; doubts make it weak at most.
 
@@ -124,11 +127,12 @@ def downgraded(estimate: ScaleEstimate, doubts: Sequence[Fact]) -> ScaleEstimate
     """An estimate from a recording with doubts: they are among its reasons, and it is not trusted."""
     if not doubts:
         return estimate
-    has_doubts = estimate.reasons[: len(doubts)] == tuple(doubts)
+    facts = tuple(map(as_fact, doubts))
+    has_doubts = estimate.reasons[: len(facts)] == facts
     return replace(
         estimate,
         verdict="weak" if estimate.verdict == "trusted" else estimate.verdict,
-        reasons=estimate.reasons if has_doubts else (*doubts, *estimate.reasons),
+        reasons=estimate.reasons if has_doubts else (*facts, *estimate.reasons),
     )
 
 
@@ -255,7 +259,7 @@ def colmap_camera(camera: CameraModel, camera_id: int = 1) -> pycolmap.Camera:
 
 def trajectory_from_model(
     reconstruction: pycolmap.Reconstruction, timing: FrameTiming, *, covariances: bool = True
-) -> tuple[CameraTrajectory, tuple[str, ...]]:
+) -> tuple[CameraTrajectory, tuple[Fact, ...]]:
     """Camera poses of a model in the order of time.
 
     Parameters
@@ -269,9 +273,9 @@ def trajectory_from_model(
 
     Returns
     -------
-    CameraTrajectory, tuple of str
+    CameraTrajectory, tuple of Fact
         The poses at mid-exposure of the middle row, in model units, with covariances given the points where the
-        observations determine them, and what was left out, in words.
+        observations determine them, and what was left out.
 
     Raises
     ------
@@ -285,14 +289,12 @@ def trajectory_from_model(
     if len(timed) < 2:
         example = frames[0].images[0].name if frames else "none"
         raise TimingError(
-            f"{len(timed)} of the model's {len(frames)} images have a frame time; "
-            f"names must agree (the model has {example!r}, the frame times {timing.names[0]!r})"
+            Fact("names-disagree", timed=len(timed), frames=len(frames), example=example, named=timing.names[0]),
+            code=TimingError.default_code,
         )
-    notes: tuple[str, ...] = ()
+    notes: tuple[Fact, ...] = ()
     if len(timed) < len(frames):
-        notes = (
-            f"{len(frames) - len(timed)} of the model's {len(frames)} images have no frame time and were left out",
-        )
+        notes = (Fact("images-without-time", images=len(frames) - len(timed), frames=len(frames)),)
     posed = [frame for _, frame in timed]
     trajectory = CameraTrajectory(
         names=tuple(name for name, _ in timed),

@@ -13,6 +13,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import DETAILS, Fact, read_facts, with_sentences
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import DOWN_IN_WORLD, UNDOES, Similarity
@@ -25,10 +26,11 @@ EXPORT_FORMAT = "colmap-inertial export"
 _METRES = re.compile(r"(?:(\d\S*) )?m")
 #: What it says where there is no scale, and no gravity, until a similarity brings them.
 NOT_METRES = "unknown: not metres"
-NO_SCALE = "the scale was refused: units are not metres, and nothing here says how large anything is"
-NO_UP = "the direction of gravity is not known: up is only taken for z"
+NO_SCALE, NO_UP = Fact("units-not-metres"), Fact("up-unknown")
 #: What it said before a similarity made it metres, and in that the provenance of this one.
 _BEFORE, _BY = "before_apply", "provenance"
+_NOTES_DETAILS = f"notes{DETAILS}"
+_UNTIL_METRIC = ("unit", "up_in_world", "scale", "notes", _NOTES_DETAILS)
 _DIRECTIONS = ("up_in_world", "gravity_in_world_m_s2")
 
 
@@ -145,11 +147,14 @@ def transform_export(source: Path, target: Path, similarity: Similarity) -> tupl
     metres = _METRES.fullmatch(str(values.get("unit")))
     before_apply = values.get(_BEFORE)
     if isinstance(before_apply, dict) and similarity.provenance == f"{UNDOES}{before_apply.get(_BY, '')}":
-        del values[_BEFORE]
+        for name in (_BEFORE, _NOTES_DETAILS):
+            values.pop(name, None)
         values |= {name: value for name, value in before_apply.items() if name != _BY}
         changed.append("unit")
     elif values.get("unit") == NOT_METRES and not similarity.provenance.startswith(UNDOES):
-        values |= _describe_metres(values, similarity)
+        in_metres = _describe_metres(values, similarity)
+        values.pop(_NOTES_DETAILS, None)
+        values |= in_metres
         changed.append("unit")
     elif metres is not None and similarity.scale != 1:
         try:
@@ -168,7 +173,8 @@ def _describe_metres(values: Mapping[str, Any], similarity: Similarity) -> dict[
     up = _up(similarity) if up is None else up
     sigma = math.sqrt(similarity.cov[0, 0])
     factor = math.exp(Z95 * sigma)
-    notes = [note for note in values.get("notes", []) if note != NO_SCALE and (up is None or note != NO_UP)]
+    outdated = {NO_SCALE.code} if up is None else {NO_SCALE.code, NO_UP.code}
+    notes = [note for note in read_facts(values, "notes") if note.code not in outdated]
     return {
         "unit": "m",
         "up_in_world": up,
@@ -178,10 +184,10 @@ def _describe_metres(values: Mapping[str, Any], similarity: Similarity) -> dict[
             "metres_per_unit": similarity.scale,
             "relative_ci95": [1 / factor, factor] if sigma > 0 else None,
         },
-        "notes": notes,
+        **with_sentences({"notes": notes}),
         _BEFORE: {
             _BY: similarity.provenance,
-            **{name: values[name] for name in ("unit", "up_in_world", "scale", "notes") if name in values},
+            **{name: values[name] for name in _UNTIL_METRIC if name in values},
         },
     }
 

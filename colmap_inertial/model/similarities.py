@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from colmap_inertial.core.arrays import set_fields
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError
+from colmap_inertial.core.facts import Fact, as_fact, read_facts, with_sentences
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_from_matrix
 from colmap_inertial.core.options import WorldAxes
 from colmap_inertial.core.summary import prints_in_lines
@@ -38,16 +40,20 @@ class ModelScale:
 
     similarity: Similarity | None
     verdict: str | None = None
-    reasons: tuple[str, ...] = ()
+    reasons: tuple[Fact, ...] = ()
     joined_of: tuple[int, ...] = ()
     left_out: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        set_fields(self, reasons=tuple(map(as_fact, self.reasons)))
 
     def as_json(self) -> dict[str, object]:
         """The fields in JSON types."""
         similarity = None if self.similarity is None else similarity_as_json(self.similarity)
         joined = {"joined_of": list(self.joined_of)} if self.joined_of else {}
         left_out = {"left_out": list(self.left_out)} if self.left_out else {}
-        return {"verdict": self.verdict, "reasons": list(self.reasons), "similarity": similarity, **joined, **left_out}
+        reasons = with_sentences({"reasons": list(self.reasons)})
+        return {"verdict": self.verdict, **reasons, "similarity": similarity, **joined, **left_out}
 
 
 def similarity_from_json(path: Path, fields: Mapping[str, Any]) -> Similarity:
@@ -187,7 +193,9 @@ def read_scales(sources: Sequence[str], *, world: WorldAxes = "z-up") -> dict[in
                 raise InertialError(f"{source}: two scales for one model; give each as NUMBER=FILE")
             scales[key] = scale
     if scales and all(scale.similarity is None for scale in scales.values()):
-        raise NotObservableError("scale", "; ".join(reason for scale in scales.values() for reason in scale.reasons))
+        raise NotObservableError(
+            "scale", "; ".join(str(reason) for scale in scales.values() for reason in scale.reasons)
+        )
     return scales
 
 
@@ -217,7 +225,7 @@ def _fragments(path: Path, entries: Any) -> list[tuple[int | None, ModelScale]]:
     numbers = [_colmap_index(entry) for entry in entries] if isinstance(entries, list) else [None]
     if not all(isinstance(number, int) for number in numbers):
         raise FormatError(path, "fragments: each needs a colmap_index")
-    left_out = ModelScale(similarity=None, verdict="refused", reasons=("a fragment of few images",))
+    left_out = ModelScale(similarity=None, verdict="refused", reasons=(Fact("fragment"),))
     return [(number, left_out) for number in numbers]
 
 
@@ -239,7 +247,7 @@ def _model_scale(path: Path, fields: Any, world: WorldAxes) -> ModelScale:
             ci95=None if fields.get("ci95") is None else tuple(fields["ci95"]),
             verdict=fields["verdict"],
             method=str(fields.get("method", "unknown")),
-            reasons=tuple(reasons),
+            reasons=read_facts(fields, "reasons"),
             gravity_in_world_m_s2=fields.get("gravity_in_world_m_s2"),
             cov=fields.get("cov"),
         )

@@ -9,6 +9,7 @@ from colmap_inertial.checks.report.figures import BAD, IMU, QUIET, Figure, axis,
 from colmap_inertial.checks.report.page import render_page
 from colmap_inertial.checks.words import Fact
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.facts import sentences
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import IMU_CAL
 from colmap_inertial.inertial.core.priors import KNOWN_GAIN, UNCALIBRATED, AccelPart, model_scale_sigma
@@ -36,7 +37,7 @@ def calibration_page(found: RestCalibration, *, source: str) -> str:
         source=source,
         footer=f"colmap-inertial {__version__}. The calibration itself is the JSON file beside this page.",
         verdict=found.verdict,
-        reasons=[*found.reasons, gain_effect(found)],
+        reasons=[*sentences(found.reasons), gain_effect(found)],
         values=calibration_facts(found),
         lengths=_dots([("as read", QUIET, middle_s, before, names), corrected], "error of gravity's length (%)"),
         corrected=_dots([corrected], "error of gravity's length (%)"),

@@ -14,6 +14,7 @@ import numpy as np
 from colmap_inertial.checks.report.series import rounded, thinned
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.camera_clock import CameraTimedImu, epoch_shift_s
+from colmap_inertial.core.facts import sentences
 from colmap_inertial.core.geometry import quat_conjugate, quat_rotate, rotation_between, so3_log
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.threads import one_blas_thread
@@ -100,8 +101,8 @@ def signal_record(
     if aligned is None or calibration is None:
         why = "Camera and IMU could not be aligned, so their {} cannot be compared."
         # where these stand in the way, nobody tried (scale.estimate_scale)
-        problem = no_accel if not imu.has_accel else next(iter(check_units(imu)), None)
-        if problem is not None:
+        problem = "; ".join(sentences(check_units(imu)[:1])) if imu.has_accel else no_accel
+        if problem:
             record["alignment"] = "not tried"
             why = "Camera and IMU were not aligned: " + problem[:1].lower() + problem[1:]
         record["rotation_spectrum"] = {"missing": why.format("rotations")}

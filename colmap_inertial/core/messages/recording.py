@@ -80,7 +80,7 @@ def spans_and_rates(frames_s: float, frame_hz: float, imu_s: float, imu_hz: floa
 
 
 @message(example={"poses": 4})
-def poses_too_few(poses: int) -> str:
+def too_few_poses_to_align(poses: int) -> str:
     return f"{poses} poses are too few to compare with the gyroscope"
 
 

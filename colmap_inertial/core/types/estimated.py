@@ -357,7 +357,7 @@ class Gap:
         How the IMU and shared images contradict the velocities, directions of gravity and scales of the two: sum of
         squares over variances, and what chance makes of it.
     joined, reason
-        Whether they are one model, and why not; in words.
+        Whether they are one model, and why not.
     """
 
     first: int
@@ -370,9 +370,10 @@ class Gap:
     chi2: float | None = None
     dof: int | None = None
     joined: bool
-    reason: str
+    reason: Fact
 
     def __post_init__(self) -> None:
+        set_fields(self, reason=as_fact(self.reason))
         if not math.isfinite(self.seconds):
             raise ValueError("a gap's length must be finite")
         if self.joined and (self.sigma_m is None or self.sigma_deg is None):

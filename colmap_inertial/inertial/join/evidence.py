@@ -10,6 +10,7 @@ from itertools import combinations, pairwise
 import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray, Int64Array
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import so3_log
 from colmap_inertial.core.types import ImuRecording
 from colmap_inertial.inertial.core.parameters import DRIFT_S
@@ -81,7 +82,7 @@ class Evidence:
     usable: tuple[ImuLink, ...]
     shared: tuple[SimilarityConstraint, ...]
     matched: tuple[SimilarityConstraint, ...]
-    incompatible: dict[Pair, str]
+    incompatible: dict[Pair, Fact]
 
     @classmethod
     def of(
@@ -230,17 +231,17 @@ def overlaps(submodels: Sequence[FittedSubmodel], link: ImuLink) -> bool:
     return False
 
 
-def incompatible_pairs(submodels: Sequence[FittedSubmodel], shared: Sequence[SimilarityConstraint]) -> dict[Pair, str]:
+def incompatible_pairs(submodels: Sequence[FittedSubmodel], shared: Sequence[SimilarityConstraint]) -> dict[Pair, Fact]:
     """Reasons why pairs of submodels cannot be one model, whatever the IMU measured."""
     agree, out = {pair_of(constraint) for constraint in shared}, {}
     for (a, first), (b, other) in combinations(enumerate(submodels), 2):
         both = len(set(first.trajectory.names) & set(other.trajectory.names))
         if first.cameras and other.cameras and not first.cameras & other.cameras:
-            out[a, b] = "the two models are of different cameras"
+            out[a, b] = Fact("other-cameras")
         elif both > LIMITS.most_shared * min(len(first.trajectory.names), len(other.trajectory.names)):
-            out[a, b] = f"{both} images are in both: they are two models of the same part of the recording"
+            out[a, b] = Fact("same-part-twice", images=both)
         elif both >= LIMITS.images and (a, b) not in agree:
-            out[a, b] = f"the {both} images in both models have different relative poses in the two"
+            out[a, b] = Fact("shared-images-disagree", images=both)
     return out
 
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import (
     matrix_from_quat,
     quat_conjugate,
@@ -18,10 +19,10 @@ from colmap_inertial.core.geometry import (
     skew,
 )
 from colmap_inertial.core.options import WorldAxes
-from colmap_inertial.core.types import DOWN_IN_WORLD, JoinedPart, ScaleEstimate, Similarity, Treatment
+from colmap_inertial.core.types import DOWN_IN_WORLD, Action, JoinedPart, ScaleEstimate, Similarity, Treatment
 from colmap_inertial.inertial.join.placement import FittedSubmodel, Placed
 from colmap_inertial.inertial.join.relative_poses import JoinedGroup, relative_cov, worst
-from colmap_inertial.inertial.scale.verdict import TRUSTED_HALF_WIDTH, half_width, verdict_of
+from colmap_inertial.inertial.scale.verdict import TRUSTED_HALF_WIDTH, finite, half_width, verdict_of
 from colmap_inertial.model import Model, transformed
 from colmap_inertial.model.similarities import compose
 from colmap_inertial.model.submodels.graph import PLACEMENT
@@ -88,16 +89,16 @@ def join_models(
                 sigma_deg=float(np.degrees(sigma_rad)),
             )
         )
-    numbers = ", ".join(str(model.colmap_index) for model in members)
-    reason = f"joined of COLMAP's models {numbers}, {sum(part.images for part in about)} images"
+    numbers, images = [model.colmap_index for model in members], sum(part.images for part in about)
+    reason = Fact("models-joined", numbers=numbers, images=images)
     scale = _scale_of(members, about, float(np.linalg.norm(placed.gravity_m_s2)) * DOWN_IN_WORLD[world])
     return replace(
         _merged(members, moves, fitted, group, placed_images),
-        scale=replace(scale, notes=(*scale.notes, f"the model was {reason}")),
+        scale=replace(scale, notes=(*scale.notes, Fact("model-was", done=reason))),
         similarity=replace(about[0].similarity, provenance=f"{first.similarity.provenance}; {reason}"),
         treatments=(
             *first.treatments,
-            Treatment(stage="join", reason=reason, action="joined", values={"parts": len(members)}),
+            Treatment(stage="join", reason=reason, action=Action.JOINED, values={"parts": len(members)}),
         ),
         observed_px={name: xy for model in reversed(members) for name, xy in model.observed_px.items()},
         parts=tuple(about),
@@ -203,7 +204,7 @@ def _scale_of(members: Sequence[Model], parts: Sequence[JoinedPart], down: Array
     )
 
 
-def _scale_warnings(members: Sequence[Model], parts: Sequence[JoinedPart]) -> list[str]:
+def _scale_warnings(members: Sequence[Model], parts: Sequence[JoinedPart]) -> list[Fact]:
     """Reasons not to trust a joined model's scale, of all parts but the first."""
     out = []
     for model, part in zip(members, parts, strict=True):
@@ -211,10 +212,10 @@ def _scale_warnings(members: Sequence[Model], parts: Sequence[JoinedPart]) -> li
         assert scale is not None and scale.sigma_log is not None
         width = half_width(part.sigma_log)
         if width > TRUSTED_HALF_WIDTH:
-            why = f"its scale is known to +-{100 * width:.1f} % only"
+            why: tuple[Fact, ...] = (Fact("part-scale-wide", half_width=finite(width)),)
         elif scale.verdict == "weak" and half_width(scale.sigma_log) <= TRUSTED_HALF_WIDTH:
-            why = "; ".join(scale.reasons)
+            why = scale.reasons
         else:
             continue
-        out.append(f"its part of {part.images} images, COLMAP's model {part.colmap_index}: {why}")
+        out.append(Fact("joined-part-weak", colmap_index=part.colmap_index, images=part.images, why=why))
     return out

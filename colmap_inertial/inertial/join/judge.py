@@ -9,6 +9,7 @@ from itertools import combinations
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import JoinOptions
 from colmap_inertial.core.types import Gap, ImuRecording
 from colmap_inertial.inertial.join.evidence import (
@@ -30,8 +31,6 @@ from colmap_inertial.model.submodels.matches import PlacedImages
 DEVICE_DOF, LINK_DOF = 26, 7
 #: Numbers that say where a camera is.
 POSE_DOF = 6
-_OTHER_MOUNTING = "the camera of one is mounted to the IMU otherwise than that of the other"
-_OTHER_IMU = "the two contradict each other about the IMU itself: its biases, gains, or clock changed in between"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -63,7 +62,7 @@ class Trial:
     sigmas
         By pairs of places: standard deviations (m, rad) across the worst constraint.
     contradiction
-        Why the submodels cannot be one model; empty where they can.
+        Why the submodels cannot be one model; ``None`` where they can.
     matched
         What of the matches was used, by places of all submodels.
     left_out
@@ -74,7 +73,7 @@ class Trial:
     chi2: float | None = None
     dof: int | None = None
     sigmas: Mapping[Pair, tuple[float, float]] = field(default_factory=dict)
-    contradiction: str = ""
+    contradiction: Fact | None = None
     matched: tuple[SimilarityConstraint, ...] = ()
     left_out: frozenset[Pair] = frozenset()
 
@@ -86,14 +85,11 @@ class Trial:
         sigma_m, sigma_rad = self.sigmas[pair]
         return replace(gap, sigma_m=sigma_m, sigma_deg=float(np.degrees(sigma_rad)))
 
-    def reason(self, gap: Gap, pair: Pair, why_not: str = "") -> str:
+    def reason(self, gap: Gap, pair: Pair, why_not: Fact | None = None) -> Fact:
         """Reason why a gap was joined, or why it was not."""
-        by = [f"{gap.shared_images} images that both have"] if gap.shared_images else []
-        by += [f"{gap.matched_images} images of one that match the other"] if gap.matched_images else []
-        reason = why_not or (f"joined by {', '.join(by)}, and the IMU" if by else "joined by the IMU")
-        if pair in self.left_out:
-            return f"{reason} (matches between the two contradict it, and are left out)"
-        return reason
+        joined = Fact("gap-joined", shared_images=gap.shared_images, matched_images=gap.matched_images)
+        reason = why_not or joined
+        return Fact("gap-matches-left-out", reason=reason) if pair in self.left_out else reason
 
 
 class _Judgement:
@@ -116,29 +112,29 @@ class _Judgement:
         else:
             trial = self.trials[pair] = _try_with_matches(evidence, pair, evidence.matched)
             gap = trial.described(replace(gap, chi2=trial.chi2, dof=trial.dof), pair)
-            if trial.contradiction:
+            if trial.contradiction is not None:
                 # with matches and without: these have no part in it
                 self.against.add(pair)
                 gap = replace(gap, reason=trial.contradiction)
             else:
                 self.left_out |= trial.left_out
                 unsure = _unsure(gap, self.limits)
-                gap = replace(gap, joined=not unsure, reason=trial.reason(gap, pair, unsure))
+                gap = replace(gap, joined=unsure is None, reason=trial.reason(gap, pair, unsure))
         self.gaps[pair] = gap
 
-    def try_group(self, members: tuple[int, ...]) -> str:
-        """Place a group of more than two; why it cannot be one model, in words."""
+    def try_group(self, members: tuple[int, ...]) -> Fact | None:
+        """Place a group of more than two; why it cannot be one model, ``None`` where it can."""
         pairs = set(combinations(members, 2))
         if against := sorted(pairs & self.against):
-            numbers = " and ".join(str(self.evidence.submodels[k].number) for k in against[0])
-            return f"it would bring together models {numbers}, which contradict each other"
+            first, second = (self.evidence.submodels[k].number for k in against[0])
+            return Fact("group-contradicts", first=first, second=second)
         if members not in self.trials:
             # what contradicts fewer submodels contradicts more of them
             kept = [constraint for constraint in self.evidence.matched if pair_of(constraint) not in self.left_out]
             self.trials[members] = _try_with_matches(self.evidence, members, kept)
         trial = self.trials[members]
         inside = (trial.described(gap, pair) for pair, gap in self.gaps.items() if gap.joined and pair in pairs)
-        return trial.contradiction or next(filter(None, (_unsure(gap, self.limits) for gap in inside)), "")
+        return trial.contradiction or next(filter(None, (_unsure(gap, self.limits) for gap in inside)), None)
 
     def merge_groups(self) -> list[tuple[int, ...]]:
         """Bring groups together by the surest gaps, one after the other, where all that ties them suits."""
@@ -149,9 +145,9 @@ class _Judgement:
             if first == second:
                 continue
             members = tuple(sorted(first + second))
-            reason = self.try_group(members)
-            if reason:
-                reason = f"with the parts that either is joined to: {reason}"
+            why_not = self.try_group(members)
+            if why_not is not None:
+                reason = Fact("group-not-joined", why=why_not)
                 self.gaps[pair] = replace(self.gaps[pair], joined=False, reason=reason)
                 continue
             groups |= dict.fromkeys(members, members)
@@ -167,7 +163,7 @@ class _Judgement:
         assert trial.placed is not None
         for pair in set(combinations(members, 2)) & self.gaps.keys():
             gap = trial.described(self.gaps[pair], pair)
-            reason = trial.reason(gap, pair) if gap.joined else "in one model by way of others"
+            reason = trial.reason(gap, pair) if gap.joined else Fact("gap-joined-by-others")
             self.gaps[pair] = replace(gap, joined=True, reason=reason)
         return JoinedGroup(
             members=members,
@@ -239,7 +235,7 @@ def _gap(evidence: Evidence, pair: Pair) -> Gap:
         seconds=seconds,
         shared_images=_count_images(evidence.shared, pair),
         joined=False,
-        reason="",
+        reason=Fact("gap-not-judged"),
     )
 
 
@@ -272,17 +268,17 @@ def _try(evidence: Evidence, members: Sequence[int], matched: Collection[Similar
     images = among([*evidence.shared, *matched], members)
     ties: list[ImuLink | SimilarityConstraint] = [*links, *images]
     if any(mounting_differs(submodels[i], submodels[j]) for i, j in {pair_of(constraint) for constraint in ties}):
-        return Trial(contradiction=_OTHER_MOUNTING)
+        return Trial(contradiction=Fact("other-mounting"))
     if any(clocks_differ(submodels, link) for link in links):
-        return Trial(contradiction=_OTHER_IMU)
+        return Trial(contradiction=Fact("other-imu"))
     problem = Problem(submodels, evidence.streams, links, images)
     device_dof, device_chi2 = DEVICE_DOF * (len(members) - 1) + LINK_DOF * len(links), 0.0
     try:
         device_chi2 = place_submodels(problem, by_imu=False).squares
         placed = place_submodels(problem)
     except np.linalg.LinAlgError:
-        fits_none = "no relative pose of the two models fits the IMU's motion between them"
-        return Trial(contradiction=_OTHER_IMU if device_chi2 > chi2_limit(device_dof, real=True) else fits_none)
+        differs = device_chi2 > chi2_limit(device_dof, real=True)
+        return Trial(contradiction=Fact("other-imu" if differs else "no-pose-fits"))
     # heading and place are all that submodels do not know of each other
     dof = max(1, round(9 * len(links) + sum(constraint.equations for constraint in images)) - 4 * (len(members) - 1))
     chi2 = max(0.0, placed.squares - device_chi2)
@@ -298,19 +294,13 @@ def _try(evidence: Evidence, members: Sequence[int], matched: Collection[Similar
         a, b = pair_of(tie)
         pair = members[a], members[b]
         sigmas[pair] = tuple(np.maximum(sigmas.get(pair, (0.0, 0.0)), worst(cov)).tolist())
-    why = ""
+    why: Fact | None = None
     if device_chi2 > chi2_limit(device_dof, real=True):
-        why = _OTHER_IMU
+        why = Fact("other-imu")
     elif chi2 > chi2_limit(dof, real=True):
-        why = (
-            f"the IMU's motion in the gap contradicts the motion before and after it (chi-square {chi2:.0f}, expected "
-            f"{dof})"
-        )
+        why = Fact("gap-motion-contradicts", chi2=chi2, dof=dof)
     elif farthest > chi2_limit(POSE_DOF, real=False):
-        why = (
-            f"the poses before and after the gap contradict the IMU or the shared images "
-            f"({farthest**0.5:.0f} standard deviations)"
-        )
+        why = Fact("gap-poses-contradict", sigmas=farthest**0.5)
     return Trial(placed=placed, chi2=chi2, dof=dof, sigmas=sigmas, contradiction=why, matched=tuple(matched))
 
 
@@ -320,26 +310,20 @@ def _misfit(placed: Placed, constraint: SimilarityConstraint) -> Array:
     return np.concatenate([turn @ away[1:4], placed.places.scale[constraint.first] * turn @ away[4:]])
 
 
-def _why_unlinked(evidence: Evidence, pair: Pair) -> str:
+def _why_unlinked(evidence: Evidence, pair: Pair) -> Fact:
     links = [link for link in evidence.links if pair_of(link) == pair]
     near = [link for link in links if link.seconds(evidence.submodels) <= LIMITS.longest_s]
     if not near:
-        return f"it is longer than {LIMITS.longest_s:.0f} s"
+        return Fact("gap-too-long", longest_s=LIMITS.longest_s)
     silent = min(silent_s(evidence.submodels, evidence.streams, link) for link in near)
-    return f"the IMU itself recorded nothing for {silent:.2f} s of it"
+    return Fact("gap-without-imu", silent_s=silent)
 
 
-def _unsure(gap: Gap, limits: JoinOptions) -> str:
-    """The part of a relative pose across a gap that is too uncertain; empty where none is."""
+def _unsure(gap: Gap, limits: JoinOptions) -> Fact | None:
+    """The part of a relative pose across a gap that is too uncertain; ``None`` where none is."""
     assert gap.sigma_m is not None and gap.sigma_deg is not None
     if gap.sigma_m > limits.sigma_m:
-        return (
-            f"the position after it is known to {100 * gap.sigma_m:.0f} cm only, and the limit is "
-            f"{100 * limits.sigma_m:.3g} cm (--join-options.sigma-m)"
-        )
+        return Fact("gap-position-unsure", sigma_m=gap.sigma_m, limit_m=limits.sigma_m)
     if gap.sigma_deg > limits.sigma_deg:
-        return (
-            f"the direction after it is known to {gap.sigma_deg:.1f} degrees only, and the limit is "
-            f"{limits.sigma_deg:.3g} (--join-options.sigma-deg)"
-        )
-    return ""
+        return Fact("gap-direction-unsure", sigma_deg=gap.sigma_deg, limit_deg=limits.sigma_deg)
+    return None

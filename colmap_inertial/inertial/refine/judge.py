@@ -9,6 +9,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.inertial.refine._panels import Layout
 from colmap_inertial.inertial.refine._residuals import Moving, moving
 from colmap_inertial.inertial.refine._system import Factored
@@ -82,7 +83,7 @@ class Judged:
     estimate
         The refined poses, points and calibration, of all observations; of the start where it is not believed.
     accepted, reason
-        Whether it is believed, and why not, in words.
+        Whether it is believed, and why not.
     held_out
         How many observations.
     before_px, after_px
@@ -114,7 +115,7 @@ class Judged:
 
     estimate: Estimate
     accepted: bool
-    reason: str
+    reason: Fact | None
     held_out: int
     before_px: float
     after_px: float
@@ -155,8 +156,7 @@ def refine(
     """
     needed = Layout.of(problem.observations, len(t_s)).size_bytes
     if needed > LIMITS.most_bytes:
-        why = f"frames far apart see the same points, and solving for all at once takes {1e-9 * needed:.1f} GB"
-        raise NotObservableError("refinement", why)
+        raise NotObservableError("refinement", Fact("refine-too-large", size_bytes=needed))
     alone = pictures_alone(problem, at_once_px)
     noise = measure_picture_noise(alone, start)
     problem, alone = (apply_noise(each, noise) for each in (problem, alone))
@@ -202,7 +202,7 @@ def refine(
         readout=readout,
         steps=steps,
     )
-    if reason:
+    if reason is not None:
         return judged
     x = seen.estimate
     if points is not None:
@@ -215,11 +215,11 @@ def _solve_all(judged: Judged, problem: Problem, x: Estimate, t_s: Array) -> Jud
     whole = solve(problem, x)
     judged = replace(judged, steps=judged.steps + whole.steps)
     if not whole.converged:
-        return replace(judged, reason="with all observations, the refinement does not converge")
+        return replace(judged, reason=Fact("refinement-not-converged-whole"))
     try:
         solved = factored(problem, whole.estimate)
     except np.linalg.LinAlgError:
-        return replace(judged, reason="nothing says how sure it would be")
+        return replace(judged, reason=Fact("refinement-unsure"))
     assert problem.inertial is not None
     final, cov = whole.estimate, solved.shared_cov()
     if judged.readout is not None:
@@ -302,34 +302,28 @@ def _test_readout(
     return (readout[0], float(np.hypot(readout[1], SHUTTER_LIMITS.cut_share * readout[0]))), problem, seen
 
 
-def _doubt(alone: Solution, seen: Solution, chi2: float, change: float, spread: float) -> str:
-    """Why a refinement is not believed; empty where it is."""
+def _doubt(alone: Solution, seen: Solution, chi2: float, change: float, spread: float) -> Fact | None:
+    """Why a refinement is not believed; ``None`` where it is."""
     if not alone.converged:
-        return "pictures alone, which it is compared with, do not converge"
+        return Fact("pictures-not-converged")
     if not seen.converged:
-        return "the refinement does not converge"
+        return Fact("refinement-not-converged")
     if chi2 > LIMITS.largest_chi2:
-        return (
-            f"the IMU contradicts the pictures ({chi2:.1f} times the squares that its noise explains): check that both "
-            "recordings belong together, and the IMU's axes and gains"
-        )
+        return Fact("imu-contradicts-pictures", chi2=chi2)
     if change >= -spread:
-        return "observations that were held out are predicted no better with the IMU than without"
-    return ""
+        return Fact("refinement-no-better")
+    return None
 
 
-def _too_late(problem: Problem, x: Estimate) -> str:
-    """Why clocks are too far apart, or a readout too long; empty where the readings around each frame reach as far."""
+def _too_late(problem: Problem, x: Estimate) -> Fact | None:
+    """Why clocks are too far apart, or a readout too long; ``None`` where readings were looked up as far."""
     assert problem.inertial is not None
     inertial = problem.inertial
     times_s = inertial.nodes_s[inertial.touched] - inertial.middle_s
     shift_s = float(np.abs(x.offset_s + x.clock_rate * times_s).max())
     if shift_s + 0.5 * abs(x.readout_s) <= inertial.turning.half_span_s:
-        return ""
-    return (
-        f"the time offset would move by {1e3 * shift_s:.0f} ms, with a readout of {1e3 * abs(x.readout_s):.0f} ms, "
-        "farther than readings were looked up: declare them"
-    )
+        return None
+    return Fact("refined-times-far", shift_s=shift_s, readout_s=abs(x.readout_s))
 
 
 def _convert_cost_to_px(costs: Array, sigma_px: float) -> float:

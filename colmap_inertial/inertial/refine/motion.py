@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from colmap_inertial.core.arrays import Array, Int64Array
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import skew
 from colmap_inertial.inertial.refine._panels import Layout
 from colmap_inertial.inertial.refine._residuals import CENTRE, N_MOVING, SPEED, TURN, Moving, moving
@@ -166,18 +167,14 @@ class Worth:
     share
         Processor time that it takes, of that of features, matching and mapping.
     reason
-        Why it is not worth that, in words; empty where it is.
+        Why it is not worth that; ``None`` where it is.
     """
 
     alone_m: float = 0.0
     refined_m: float = 0.0
     risk: float = 0.0
     share: float
-    reason: str = ""
-
-    def describe(self) -> str:
-        """The expected errors, in words."""
-        return f"expected to err by {1e3 * self.alone_m:.2g} mm by images alone, and by {1e3 * self.refined_m:.2g} mm"
+    reason: Fact | None = None
 
 
 def expect_worth(seen: Seen, problem: Problem, start: Estimate, *, bent: bool = False) -> Worth:
@@ -201,24 +198,22 @@ def expect_worth(seen: Seen, problem: Problem, start: Estimate, *, bent: bool = 
     needed_s += _LIMITS.step_product_s * (judging_steps + steps) * layout.products
     share = needed_s / (_LIMITS.mapped_image_s * frames + _LIMITS.mapped_observation_s * observations)
     if share > _LIMITS.share or layout.size_bytes > _LIMITS.most_bytes:
-        return Worth(
-            share=share, reason=f"it would take {100 * share:.0f} % of the time that features and mapping take"
-        )
+        return Worth(share=share, reason=Fact("refine-takes-long", share=share))
     pictures, x = make_pictures(seen)
     pictures = apply_noise(pictures, measure_picture_noise(pictures, x))
     alone, size_m = _shape_cov(seen, factored(pictures, x), moving(pictures, x))
     worth = Worth(alone_m=_sigma(alone), share=share)
     if worth.alone_m < _LIMITS.least_drift * size_m and not bent:
-        held = f"{1e3 * worth.alone_m:.2g} mm, {100 * worth.alone_m / size_m:.2g} % of its size"
-        return replace(worth, reason=f"images hold its shape by themselves: it is expected to err by {held}")
+        held = Fact("refine-shape-held", alone_m=worth.alone_m, share=worth.alone_m / size_m)
+        return replace(worth, reason=held)
     noise = measure_picture_noise(pictures_alone(problem, seen.observations.xy_px), start)
     problem = apply_noise(problem, noise)
     refined, _ = _shape_cov(seen, factored(problem, start), moving(problem, start))
     worth = replace(worth, refined_m=_sigma(refined), risk=_risk(alone, refined))
     if worth.risk <= _LIMITS.most_risk or bent:
         return worth
-    why = f"it is {worth.describe()} with the IMU, but {100 * worth.risk:.0f} % of such paths come out farther off"
-    return replace(worth, reason=why)
+    risky = Fact("refine-risky", alone_m=worth.alone_m, refined_m=worth.refined_m, risk=worth.risk)
+    return replace(worth, reason=risky)
 
 
 def _shape_cov(seen: Seen, solved: Factored, by: Moving) -> tuple[Array, float]:

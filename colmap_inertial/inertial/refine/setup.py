@@ -11,6 +11,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.types import CAL, CameraImuCalibration, CameraModel, FrameTiming, ImuNoise, ImuRecording
@@ -217,7 +218,7 @@ def make_problem(
     # what is estimated of the accelerometer's delay counts from the calibration's
     streams = SensorStreams.from_camera(CameraTimedImu.from_recording(imu, known.calibration, timing.epoch_ns))
     if not len(seen.observations.frame):
-        raise NotObservableError("refinement", "no two of its images see the same point")
+        raise NotObservableError("refinement", Fact("refine-no-common-points"))
     timed = np.isfinite(seen.t_s)
     begin_s = max(streams.gyro.t_s[0], streams.accel.t_s[0])
     end_s = min(streams.gyro.t_s[-1], streams.accel.t_s[-1])
@@ -231,7 +232,7 @@ def make_problem(
     nodes_s[untimed] = nodes_s[timed].max() + 1.0 + np.arange(len(untimed))
     linked = inside[:-1] & inside[1:] & (np.diff(nodes_s) < _LONGEST_STEP_S) & path.covers(nodes_s[:-1], nodes_s[1:])
     if linked.sum() < max(5, 0.5 * (len(nodes_s) - 1)):
-        raise NotObservableError("refinement", "the IMU recorded less than half of what lies between the images")
+        raise NotObservableError("refinement", Fact("refine-imu-missing"))
     inertial = Inertial(
         nodes_s=nodes_s,
         linked=linked,

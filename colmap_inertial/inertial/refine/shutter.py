@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import FrameTiming, ImuRecording, ReadoutDirection, ScaleEstimate
 from colmap_inertial.inertial.refine._residuals import derivatives, project
 from colmap_inertial.inertial.refine.pictures import (
@@ -22,7 +23,7 @@ from colmap_inertial.inertial.refine.pictures import (
 from colmap_inertial.inertial.refine.setup import Known, Seen, make_problem
 from colmap_inertial.inertial.refine.solve import factored, solve
 from colmap_inertial.inertial.refine.values import READOUT
-from colmap_inertial.inertial.scale.verdict import half_width, verdict_of
+from colmap_inertial.inertial.scale.verdict import finite, half_width, verdict_of, without_width
 from colmap_inertial.model import colmap_camera
 
 
@@ -48,6 +49,8 @@ class ShutterLimits:
 
 
 SHUTTER_LIMITS = ShutterLimits()
+#: The code of what is wrong with the scale of a model that ignores a rolling shutter.
+SHUTTER_IGNORED = "rolling-shutter-ignored"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,31 +78,23 @@ class SeenReadout:
         """Whether lines were exposed one after the other, as surely as the refinement asks for."""
         return self.readout_s >= max(SHUTTER_LIMITS.least_s, SHUTTER_LIMITS.sure_sigma * self.sigma_s)
 
-    def sentence(self) -> str:
+    def as_fact(self) -> Fact:
         """What is wrong with the model's scale then."""
-        return (
-            f"the images were exposed line by line within {1e3 * self.readout_s:.1f} +- {1e3 * self.sigma_s:.1f} ms "
-            f"({self.direction}), which the model ignores: declare readout_s and readout_direction before mapping, or "
-            "refine it (--refine inertial)"
-        )
+        return Fact(SHUTTER_IGNORED, readout_s=self.readout_s, sigma_s=self.sigma_s, direction=self.direction)
 
-    def _unknown(self, sigma_log: float) -> str:
+    def _unknown(self, sigma_log: float) -> Fact:
         """Why a scale is refused that a shutter leaves open."""
-        return (
-            f"a rolling shutter of up to {1e3 * (self.readout_s + 2 * self.sigma_s):.0f} ms, which the points of the "
-            f"model do not rule out, leaves the scale open by {100 * half_width(sigma_log):.0f} %: declare readout_s, "
-            "0 for a global shutter"
-        )
+        longest_s = self.readout_s + 2 * self.sigma_s
+        return Fact("rolling-shutter-possible", readout_s=longest_s, half_width=finite(half_width(sigma_log)))
 
     def widen(self, estimate: ScaleEstimate) -> ScaleEstimate:
         """A scale as uncertain as such a shutter makes it; weak where it was found, as the refinement takes it in."""
         assert estimate.parts is not None and estimate.cov is not None
         accepted = estimate.accepted
         sigma = float(np.hypot(self.readout_s, self.sigma_s)) * self.rate_hz
-        widths = verdict_of(accepted.metres_per_unit, accepted.sigma_log)[2]
-        checks = [reason for reason in estimate.reasons if reason not in widths]
+        checks = without_width(estimate.reasons)
         if self.is_found:
-            checks.append(self.sentence())
+            checks.append(self.as_fact())
         sigma_log = float(np.hypot(accepted.sigma_log, sigma))
         verdict, ci95, reasons = verdict_of(accepted.metres_per_unit, sigma_log, checks)
         if verdict == "refused":

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from colmap_inertial.core.arrays import Array, IndexArray
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import matrix_from_quat, skew
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import AcceptedScale, ScaleEstimate, Similarity
@@ -23,7 +24,7 @@ from colmap_inertial.inertial.refine.values import (
     Estimate,
     Problem,
 )
-from colmap_inertial.inertial.scale.verdict import half_width, verdict_of
+from colmap_inertial.inertial.scale.verdict import half_width, verdict_of, without_width
 from colmap_inertial.model.similarities import compose
 
 # Columns of its covariance.
@@ -103,10 +104,8 @@ def state_scale(
     variances = world.parts | {"lens": PRIORS.lens**2, "clocks": (before.parts or {}).get("clocks", 0.0) ** 2}
     variances["accel_gain"] = (variances["accel_gain"] + accel.model_sigma**2) * accel.factor**2
     sigma_log = sum(variances.values()) ** 0.5
-    # what decided before but for the interval's width
-    widths = verdict_of(first.metres_per_unit, first.sigma_log)[2]
-    checks = [reason for reason in before.reasons if reason not in widths]
-    verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, [*checks, *_doubts(first, move, problem, x)])
+    checks = [*without_width(before.reasons), *_doubts(first, move, problem, x)]
+    verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, checks)
     down, turn = inertial.down, matrix_from_quat(similarity.rotation_xyzw)
     by_world, by_gravity = np.zeros((7, COUNT)), np.zeros((7, COUNT))
     by_world[0, SIZE] = by_gravity[0, SIZE] = 1.0
@@ -132,19 +131,15 @@ def state_scale(
     return estimate, replace(similarity, cov=covs[0])
 
 
-def _doubts(first: AcceptedScale, move: Similarity, problem: Problem, x: Estimate) -> list[str]:
+def _doubts(first: AcceptedScale, move: Similarity, problem: Problem, x: Estimate) -> list[Fact]:
     """Reasons why a refinement's own scale is not trusted."""
     out, gains = [], x.columns.accel_gain
     errors = x.accel_gain.ravel()
     if errors @ problem.prior.info[gains, gains] @ errors > LARGEST_GAIN_CHI2:
-        gains_pct = ", ".join(f"{-100 * gain:+.1f}" for gain in np.diagonal(x.accel_gain))
-        out.append(f"the refinement finds the accelerometer off in gain by {gains_pct} % on its axes: calibrate it")
+        out.append(Fact("refinement-gain-large", gains=-np.diagonal(x.accel_gain)))
     if abs(np.log(move.scale)) > Z95 * first.sigma_log:
-        out.append(
-            f"the refinement's scale is {100 * (move.scale - 1):+.1f} % from the first one, which said "
-            f"+-{100 * half_width(first.sigma_log):.1f} %: the reconstruction bends or drifts, or the accelerometer's "
-            "gain is off; a target, or a distance that is known, tells which is right"
-        )
+        width = half_width(first.sigma_log)
+        out.append(Fact("refined-scale-differs", difference=move.scale - 1, half_width=width))
     return out
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.camera_clock import CameraTimedImu, epoch_shift_s
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact, as_fact
 from colmap_inertial.core.options import ScaleOptions
 from colmap_inertial.core.sampling import PAUSE_STEPS, is_gap, time_unit_factor
 from colmap_inertial.core.threads import one_blas_thread
@@ -94,8 +95,8 @@ def learn_lever_arm(calibration: CameraImuCalibration, estimate: ScaleEstimate) 
     return replace(calibration, imu_in_cam_m=refined.imu_in_cam_m, cov=cov)
 
 
-def remarks(trajectory: CameraTrajectory, timed: CameraTimedImu) -> tuple[str, ...]:
-    """Sentences on clocks far apart, pauses of the sensors, frames without IMU, and another warmth than calibrated.
+def find_remarks(trajectory: CameraTrajectory, timed: CameraTimedImu) -> tuple[Fact, ...]:
+    """What to know of clocks far apart, pauses of the sensors, frames without IMU, and another warmth than calibrated.
 
     Parameters
     ----------
@@ -104,54 +105,50 @@ def remarks(trajectory: CameraTrajectory, timed: CameraTimedImu) -> tuple[str, .
     """
     gyro_s, accel_s = timed.gyro_t_s, timed.accel_t_s
     covered = (max(gyro_s[0], accel_s[0]), min(gyro_s[-1], accel_s[-1]))
-    causes = (
+    remarks = (
         _far_apart(trajectory, timed),
         _pauses("gyroscope", gyro_s, trajectory),
         _pauses("accelerometer", accel_s, trajectory),
         _uncovered(trajectory, covered),
         _warmer(timed.imu),
     )
-    return tuple(sentence for sentence in causes if sentence)
+    return tuple(remark for remark in remarks if remark is not None)
 
 
-def _far_apart(trajectory: CameraTrajectory, timed: CameraTimedImu) -> str:
+def _far_apart(trajectory: CameraTrajectory, timed: CameraTimedImu) -> Fact | None:
     shift_s = epoch_shift_s(timed.imu, trajectory.epoch_ns)
     begin_s, end_s = timed.imu.gyro_t_s[0] + shift_s, timed.imu.gyro_t_s[-1] + shift_s
     if begin_s < trajectory.t_s[-1] and end_s > trajectory.t_s[0]:
-        return ""
-    return (
-        "the stamps of camera and IMU have no time in common; the rotations give an offset of "
-        f"{timed.calibration.clock_offset_s:.2f} s"
-    )
+        return None
+    return Fact("clocks-without-common-time", offset_s=timed.calibration.clock_offset_s)
 
 
-def _pauses(sensor: str, t_s: Array, trajectory: CameraTrajectory) -> str:
+def _pauses(sensor: str, t_s: Array, trajectory: CameraTrajectory) -> Fact | None:
     step_s = np.diff(t_s)
     inside = (t_s[1:] > trajectory.t_s[0]) & (t_s[:-1] < trajectory.t_s[-1])
     long_s = step_s[inside & is_gap(t_s, _PAUSE_S, steps=PAUSE_STEPS)]
     if len(long_s) == 0:
-        return ""
-    times = "once" if len(long_s) == 1 else f"{len(long_s)} times"
-    longest = "" if len(long_s) == 1 else f", {long_s.max():.2f} s at the longest"
-    return f"the {sensor} pauses {times}, for {long_s.sum():.2f} s in all{longest}"
+        return None
+    return Fact("sensor-pauses", sensor=sensor, count=len(long_s), total_s=long_s.sum(), longest_s=long_s.max())
 
 
-def _uncovered(trajectory: CameraTrajectory, covered_s: tuple[float, float]) -> str:
+def _uncovered(trajectory: CameraTrajectory, covered_s: tuple[float, float]) -> Fact | None:
     # A frame or so at either end is nothing to speak of.
     slack_s = 2 * float(np.median(np.diff(trajectory.t_s)))
     if covered_s[0] <= trajectory.t_s[0] + slack_s and covered_s[1] >= trajectory.t_s[-1] - slack_s:
-        return ""
+        return None
     count = int(np.sum((trajectory.t_s >= covered_s[0]) & (trajectory.t_s <= covered_s[1])))
-    return f"the IMU runs along with {count} of {len(trajectory)} frames only; the scale rests on those"
+    return Fact("frames-without-imu", covered=count, frames=len(trajectory))
 
 
-def _warmer(imu: ImuRecording) -> str:
+def _warmer(imu: ImuRecording) -> Fact | None:
     if imu.calibration is None or imu.warmer_k is None or abs(imu.warmer_k) < _WARMER_K:
-        return ""
-    then_c, changed_pct = imu.calibration.temperature_c, 100 * PRIORS.calibrated_gain_per_k * abs(imu.warmer_k)
-    return (
-        f"the IMU was calibrated at {then_c:.0f} °C and was {imu.temperature_c:.0f} °C warm here: its gains may have "
-        f"changed by {changed_pct:.1f} %, which the interval counts; calibrate it as warm as you film"
+        return None
+    return Fact(
+        "imu-warmer",
+        calibrated_c=imu.calibration.temperature_c,
+        recorded_c=imu.temperature_c,
+        gain_change=PRIORS.calibrated_gain_per_k * abs(imu.warmer_k),
     )
 
 
@@ -167,7 +164,7 @@ def first_seconds(trajectory: CameraTrajectory, seconds: float, *, start_s: floa
     return trajectory.select(trajectory.t_s <= begin_s + seconds)
 
 
-def check_units(imu: ImuRecording) -> list[str]:
+def check_units(imu: ImuRecording) -> list[Fact]:
     """Reasons why an IMU recording's numbers are implausible as rad/s and m/s2; empty where there are none.
 
     Readers of files raise their own errors before; this guards arrays that come from elsewhere.
@@ -176,19 +173,19 @@ def check_units(imu: ImuRecording) -> list[str]:
     accel = float(np.median(np.linalg.norm(imu.accel_m_s2, axis=1))) if imu.has_accel else np.nan
     low, high = PLAUSIBLE.smallest_gravity_m_s2, PLAUSIBLE.largest_gravity_m_s2
     if imu.has_accel and not low <= accel <= high:
-        hint = "gravity was removed: record the raw accelerometer"
+        likely = "without gravity"
         if low <= STANDARD_GRAVITY_M_S2 * accel <= high:
-            hint = "it is in g: multiply it by 9.80665"
+            likely = "g"
         elif accel > 500:
-            hint = "it is in mg or raw counts: convert it to m/s2"
-        out.append(f"the accelerometer's median length is {accel:.3g} m/s2 instead of about 9.8; {hint}")
+            likely = "counts"
+        out.append(Fact("accel-implausible", accel_m_s2=accel, likely=likely))
     gyro = float(np.median(np.linalg.norm(imu.gyro_rad_s, axis=1)))
     if gyro > PLAUSIBLE.largest_median_rate_rad_s:
-        out.append(f"the gyroscope's median rate is {gyro:.3g} rad/s; it is in deg/s: multiply it by pi / 180")
+        out.append(Fact("gyro-in-degrees", rate_rad_s=gyro))
     return out
 
 
-def check_time_unit(trajectory: CameraTrajectory, imu: ImuRecording) -> list[str]:
+def check_time_unit(trajectory: CameraTrajectory, imu: ImuRecording) -> list[Fact]:
     """The reason why the poses' times are in no seconds; empty where they may be.
 
     Without it, the offset of the clocks would be searched over hours in which there is nothing to find.
@@ -199,10 +196,7 @@ def check_time_unit(trajectory: CameraTrajectory, imu: ImuRecording) -> list[str
     factor = time_unit_factor(poses_s, imu_s) or 1.0
     if factor < 1e3:
         return []
-    return [
-        f"the poses span {poses_s:.4g} s and the IMU {imu_s:.4g} s: the poses' times are in ms, us or ns where seconds "
-        f"are read; divide them by {factor:g}"
-    ]
+    return [Fact("poses-not-in-seconds", poses_s=poses_s, imu_s=imu_s, factor=factor)]
 
 
 def estimate_scale(
@@ -254,7 +248,7 @@ def estimate_scale(
             estimate = replace(estimate, notes=(*estimate.notes, *sampling))
         likely = likely_convention(trajectory, imu, read_as=read_as, prior=calibration, options=search)
     if likely is not None:
-        reasons = (likely.sentence, *estimate.reasons)
+        reasons = (as_fact(likely.sentence), *estimate.reasons)
         estimate = ScaleEstimate.refused(options.method, *reasons, calibration=estimate.calibration)
     return replace(estimate, imu_calibration=imu.calibration, runtime_s=time.perf_counter() - begin_s)
 
@@ -266,10 +260,7 @@ def _estimate_or_refuse(
     options: ScaleOptions,
 ) -> ScaleEstimate:
     if not imu.has_accel:
-        return ScaleEstimate.refused(
-            options.method,
-            "the recording has no accelerometer, without which metres are unknown; record it too",
-        )
+        return ScaleEstimate.refused(options.method, Fact("scale-without-accelerometer"))
     problems = check_units(imu)
     if problems:
         return ScaleEstimate.refused(options.method, *problems)
@@ -284,10 +275,10 @@ def _estimate_or_refuse(
             # also where there is no scale: it says what was found of camera and IMU
             calibration=timed.calibration if estimate.calibration is None else estimate.calibration,
             rotations=consensus,
-            notes=(*estimate.notes, *stretched, *describe_consensus(consensus), *remarks(trajectory, timed)),
+            notes=(*estimate.notes, *stretched, *describe_consensus(consensus), *find_remarks(trajectory, timed)),
         )
     except NotObservableError as error:
-        return ScaleEstimate.refused(options.method, f"{error.quantity}: {error.hint}")
+        return ScaleEstimate.refused(options.method, Fact("not-observable", quantity=error.quantity, why=error.why))
 
 
 def _estimate_without_moved(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import CameraTrajectory, ImuRecording
 
 
@@ -42,21 +43,15 @@ def measure_repeated_share(values: Array) -> float:
     return float(np.mean(np.all(np.diff(values, axis=0) == 0, axis=1))) if len(values) > 1 else 0.0
 
 
-def describe_sampling(trajectory: CameraTrajectory, imu: ImuRecording) -> tuple[str, ...]:
-    """Sentences on streams that scatter or repeat."""
+def describe_sampling(trajectory: CameraTrajectory, imu: ImuRecording) -> tuple[Fact, ...]:
+    """Streams whose stamps scatter or whose readings repeat."""
     out = []
     dense = len(trajectory) > 1 and float(np.median(np.diff(trajectory.t_s))) < _LIMITS.dense_s
     streams = {"gyroscope": imu.gyro_t_s, "accelerometer": imu.accel_t_s, "camera": trajectory.t_s if dense else None}
     for name, t_s in streams.items():
         if t_s is not None and (scatter := scatter_s(t_s)) > _LIMITS.scatter_s:
-            out.append(
-                f"the {name}'s stamps scatter by {1e3 * scatter:.1f} ms about an even rate: give the stamps of the "
-                "samples, not of when they arrived"
-            )
+            out.append(Fact("stamps-scatter", sensor=name, scatter_s=scatter))
     for name, values in (("gyroscope", imu.gyro_rad_s), ("accelerometer", imu.accel_m_s2)):
         if (share := measure_repeated_share(values)) > _LIMITS.repeated:
-            out.append(
-                f"{100 * share:.0f} % of the {name}'s readings repeat the one before: they were held, or read more "
-                "often than the sensor samples; record at the sensor's own rate"
-            )
+            out.append(Fact("readings-repeat", sensor=name, share=share))
     return tuple(out)

@@ -15,6 +15,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, quat_multiply, so3_exp, so3_log
 from colmap_inertial.core.types import CAL, CameraImuCalibration, CameraTrajectory, ImuRecording
 from colmap_inertial.inertial.core import parameters as par
@@ -266,11 +267,7 @@ def prepare(
     gyro_cut, accel_cut = find_saturated(imu)
     for sensor, cut in (("gyroscope", gyro_cut), ("accelerometer", accel_cut)):
         if np.sum(~cut) < _FEWEST_READINGS:
-            raise NotObservableError(
-                "scale",
-                f"nearly all of the {sensor}'s readings stand at the end of its range: move less violently, or give "
-                "the sensor a wider range",
-            )
+            raise NotObservableError("scale", Fact("sensor-saturated", sensor=sensor))
     streams = SensorStreams.from_camera(timed)
     begin_s = max(streams.gyro.t_s[0], streams.accel.t_s[0]) + _MARGIN_S
     end_s = min(streams.gyro.t_s[-1], streams.accel.t_s[-1]) - _MARGIN_S
@@ -322,7 +319,7 @@ def _group_poses(
     """Averaged poses of the frames inside the recording; refuse too few, or a camera that does not move."""
     centre = trajectory.cam_in_world[inside]
     if len(inside) and float(np.max(np.ptp(centre, axis=0))) == 0.0:
-        raise NotObservableError("scale", "the camera does not move in the model: move it, do not only turn it")
+        raise NotObservableError("scale", Fact("camera-still"))
     groups = None
     if len(inside) > 1:
         span_s = float(trajectory.t_s[inside[-1]] - trajectory.t_s[inside[0]])
@@ -337,11 +334,7 @@ def _group_poses(
         )
     k = 0 if groups is None else len(groups.t_s)
     if groups is None or k < _MIN_STATES:
-        raise NotObservableError(
-            "scale",
-            f"only {k} camera poses, an eighth of a second or more apart, lie inside the IMU recording and at least "
-            f"{_MIN_STATES} are needed: record a longer clip, or check that both recordings belong together",
-        )
+        raise NotObservableError("scale", Fact("poses-too-few", count=k, needed=_MIN_STATES))
     return groups
 
 

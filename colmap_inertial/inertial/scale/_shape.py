@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.inertial.core import factors as fac, parameters as par
 from colmap_inertial.inertial.core.arrow import Inverse
 from colmap_inertial.inertial.core.parameters import Estimate, Noise
@@ -113,30 +114,19 @@ class ShapeFault:
             log_scale = log_scale - float(self.value[0])
         return np.asarray(centre[0] + _grown(centre, np.exp(log_scale)))
 
-    def sentence(self, t_s: Array, widened: float) -> str:
-        """The error in words; ``t_s`` are the nodes' times."""
-        # where metres per unit are more, lengths of the model are less
-        (more, less), sigma = 100 * np.expm1(self.value[0] * np.array([1, -1])), 196 * (widened * self.cov[0, 0]) ** 0.5
-        advice = "close loops while recording, or scale its parts apart"
+    def as_fact(self, t_s: Array, widened: float) -> Fact:
+        """What is wrong; ``t_s`` are the nodes' times, ``widened`` the factor on variances."""
         if self.kind == "stretch":
             sizes, axes = np.linalg.eigh(self.strain)
             longest = axes[:, 0] * np.sign(axes[np.argmax(np.abs(axes[:, 0])), 0])
-            return (
-                f"the reconstruction is {100 * (sizes[2] - sizes[0]):.1f} % longer along ({longest[0]:.2f}, "
-                f"{longest[1]:.2f}, {longest[2]:.2f}) than across; lengths are right on average: check the focal "
-                "length and the lens, and film from more sides"
-            )
+            return Fact("model-stretched", stretch=sizes[2] - sizes[0], axis=longest)
+        # where metres per unit are more, lengths of the model are less
+        (more, less), sigma = np.expm1(self.value[0] * np.array([1, -1])), (widened * self.cov[0, 0]) ** 0.5
         if self.kind == "drift":
-            return (
-                f"the reconstruction's scale is not the same throughout: lengths are {less:+.1f} +- {sigma:.1f} % "
-                f"larger at the end than at the beginning: {advice}"
-            )
-        since_s, first = self.at_s - float(t_s[0]), 2 * self.at_s < t_s[0] + t_s[-1]
-        return (
-            f"the reconstruction's scale is not the same throughout: lengths are {more if first else less:+.1f} +- "
-            f"{sigma:.1f} % larger {'before' if first else 'after'} {since_s:.0f} s than in the longer part, whose "
-            f"scale is used: {advice}"
-        )
+            return Fact("scale-grows", growth=less, sigma=sigma)
+        first = bool(2 * self.at_s < t_s[0] + t_s[-1])
+        since_s = self.at_s - float(t_s[0])
+        return Fact("scale-breaks", growth=more if first else less, sigma=sigma, since_s=since_s, first=first)
 
 
 def _profile(t_s: Array, kind: str, at_s: float) -> Array:

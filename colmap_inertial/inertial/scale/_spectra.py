@@ -9,6 +9,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array, BoolArray, ComplexArray
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate
 from colmap_inertial.core.types import CameraTrajectory
 from colmap_inertial.motion.smooth import PositionSmoother, WorldAcceleration, smooth_attitude
@@ -98,12 +99,10 @@ class Signals:
 
         seen = trajectory.select((trajectory.t_s >= stamps_s[0]) & (trajectory.t_s <= stamps_s[-1]))
         if len(seen) < 6:
-            raise NotObservableError("scale", "fewer than six frames were taken while the accelerometer recorded")
+            raise NotObservableError("scale", Fact("frames-too-few"))
         step_s = float(np.median(np.diff(seen.t_s)))
         if step_s > SPARSEST_S:
-            raise NotObservableError(
-                "scale", f"frames {step_s:.2g} s apart are too sparse to differentiate positions: use the joint method"
-            )
+            raise NotObservableError("scale", Fact("frames-too-sparse-to-differentiate", step_s=step_s))
         smoother = PositionSmoother.of(seen)
         at_frames = matrix_from_quat(attitude.at(seen.t_s)[0])
         lever = at_frames @ matrix_from_quat(quat_conjugate(calibration.cam_from_imu_xyzw))

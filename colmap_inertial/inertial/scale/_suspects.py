@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.inertial.core import factors as fac, parameters as par
 from colmap_inertial.inertial.core.parameters import Estimate, Prior
 from colmap_inertial.inertial.core.preintegration import (
@@ -219,31 +220,17 @@ class Faults:
     def _axes_s(self) -> Array:
         return np.asarray(self.values["axes"] @ _AXES)
 
-    def sentences(self) -> list[str]:
-        """The faults in words."""
+    def as_facts(self) -> list[Fact]:
+        """What is wrong, each by itself."""
         out = []
         if "bandwidth" in self.values:
-            hz = 1 / (2 * np.pi * self._time_constant_s)
-            out.append(
-                f"the accelerometer was low-passed at about {hz:.2g} Hz; that is undone as far as it can be: record it "
-                "unfiltered (raw)"
-                if not self.path_is_smoothed
-                else "the camera's path is smoother than what the accelerometer felt, as if low-passed at about "
-                f"{hz:.2g} Hz: give poses that were not smoothed, and all readings of the accelerometer (under "
-                "vibration, readings that were held or left out look the same)"
-            )
+            code = "path-smoothed" if self.path_is_smoothed else "accel-low-passed"
+            out.append(Fact(code, cutoff_hz=1 / (2 * np.pi * self._time_constant_s)))
         if "axes" in self.values:
             # a reading that has to be moved forward was taken late
-            delays = ", ".join(f"{axis} {1e3 * d:+.1f}" for axis, d in zip("xyz", self._axes_s, strict=True))
-            out.append(
-                f"the accelerometer's axes are not read at the same time ({delays} ms against their mean); that is "
-                "undone: give the stamps of each axis, or a recording that was not resampled axis by axis"
-            )
+            out.append(Fact("accel-axes-apart", delays_s=self._axes_s))
         if "rate" in self.values:
-            out.append(
-                f"the accelerometer's stamps run {1e6 * float(self.values['rate'][0]):+.0f} ppm off the gyroscope's; "
-                "that is undone: give both sensors the stamps of one clock"
-            )
+            out.append(Fact("accel-clock-apart", rate=float(self.values["rate"][0])))
         return out
 
 

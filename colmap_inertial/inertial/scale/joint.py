@@ -21,6 +21,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import quat_from_matrix
 from colmap_inertial.core.sampling import MUCH_CUT
 from colmap_inertial.core.types import (
@@ -49,10 +50,6 @@ _MOST_FAULTS = 6
 _UNMODELLED_S = 1.5
 #: Standard deviation of what lies anywhere between none and all.
 _UNIFORM = 12**-0.5
-_RECORD_INSTEAD = (
-    "move the camera itself back and forth by 20 cm or more, in several directions and briskly, for 10 s or longer, "
-    "while it sees texture; panning, walking straight at one speed and a tripod cannot give a scale"
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,8 +68,6 @@ class JudgementLimits:
     #: A keyframe with a robust weight below this may be in the wrong place. Where three of 30 are, they swell the noise
     #: so that their weights are .27 to .57; others keep .8 and more.
     counts_little: float = 0.6
-    #: So many places where poses jump are said by their times.
-    jumps_said: int = 5
 
 
 _LIMITS = JudgementLimits()
@@ -129,12 +124,12 @@ def estimate_joint(
         fit, faults = _fit_soundly(data, prior, timed.imu.noise)
         fit, shape = _fit_shapely(fit, faults.undone(data), faults.loosened(prior), timed.imu.noise, accel=accel)
     except NotObservableError as error:
-        return ScaleEstimate.refused("joint", error.hint)
+        return ScaleEstimate.refused("joint", error.why)
     except np.linalg.LinAlgError:
-        return ScaleEstimate.refused("joint", f"camera and IMU do not determine a scale together: {_RECORD_INSTEAD}")
+        return ScaleEstimate.refused("joint", Fact("fit-singular"))
     left_open = sum(suspicion.scale_variance for suspicion in fit.suspicions if suspicion.name in faults.values)
     fit = replace(fit, variance_parts={**fit.variance_parts, "accel_faults": left_open})
-    wrong = [*faults.sentences(), *_cut_off(data)]
+    wrong = [*faults.as_facts(), *_cut_off(data)]
     # what was taken from a path nobody can put back: its scale is too large by more than any interval says
     estimate = _judged(fit, data.t_s, timed.calibration, accel, wrong, shape, worthless=faults.path_is_smoothed)
     return replace(estimate, jumped=_name_jumped(fit, data, trajectory))
@@ -164,7 +159,7 @@ def _prepared(trajectory: CameraTrajectory, timed: CameraTimedImu, options: Join
 
 def fit_path(
     trajectory: CameraTrajectory, timed: CameraTimedImu, options: JointOptions
-) -> tuple[Data, Fit, tuple[str, ...]]:
+) -> tuple[Data, Fit, tuple[Fact, ...]]:
     """The measurements as they came, their fit, and what is wrong with the accelerometer or the model's shape.
 
     Raises
@@ -180,7 +175,7 @@ def fit_path(
     sound = faults.undone(data), faults.loosened(prior)
     _, shape = _fit_shapely(fit, *sound, timed.imu.noise, accel=accel)
     widened = scale_of(fit, data.t_s, accel).widened
-    return data, fit, (*faults.sentences(), *(fault.sentence(data.t_s, widened) for fault in shape))
+    return data, fit, (*faults.as_facts(), *(fault.as_fact(data.t_s, widened) for fault in shape))
 
 
 def _fit_soundly(data: Data, prior: Prior, sheet: ImuNoise | None) -> tuple[Fit, Faults]:
@@ -229,14 +224,11 @@ def _fit_shapely(
     return replace(fit, drift=before.drift, variance_parts=parts), found
 
 
-def _cut_off(data: Data) -> list[str]:
+def _cut_off(data: Data) -> list[Fact]:
     out = []
     for sensor, share in (("gyroscope", data.gyro_cut_share), ("accelerometer", data.accel_cut_share)):
         if share > MUCH_CUT:
-            out.append(
-                f"{100 * share:.2g} % of the {sensor}'s readings stand at the end of its range; they count as missing: "
-                "move less violently, or give the sensor a wider range"
-            )
+            out.append(Fact("readings-cut-off", sensor=sensor, share=share))
     return out
 
 
@@ -245,7 +237,7 @@ def _judged(
     t_s: Array,
     calibration: CameraImuCalibration,
     accel: AccelPart,
-    wrong: Sequence[str],
+    wrong: Sequence[Fact],
     shape: Sequence[ShapeFault],
     *,
     worthless: bool,
@@ -261,15 +253,12 @@ def _judged(
     if verdict == "refused":
         reasons = (*reasons, *(() if worthless else wrong))
     else:
-        bent = [fault.sentence(t_s, scale.widened) for fault in shape] or _check_drift(fit.drift)
+        bent = [fault.as_fact(t_s, scale.widened) for fault in shape] or _check_drift(fit.drift)
         doubts = [*wrong, *check_clocks(clock_rate), *_checks(fit, t_s, scale.wrong_gain), *bent]
         verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, doubts)
-    notes: tuple[str, ...] = ()
+    notes: tuple[Fact, ...] = ()
     if len(fit.jumped_s):
-        places = "one place" if len(fit.jumped_s) == 1 else f"{len(fit.jumped_s)} places"
-        since = ", ".join(f"{at_s - t_s[0]:.1f}" for at_s in fit.jumped_s[: _LIMITS.jumps_said])
-        more = " s, ..." if len(fit.jumped_s) > _LIMITS.jumps_said else " s"
-        notes = (f"poses jump at {places} ({since}{more}), which hardly counts",)
+        notes = (Fact("poses-jump", since_s=[at_s - t_s[0] for at_s in fit.jumped_s]),)
     refused = verdict == "refused"
     keep = [par.SCALE, *range(par.GRAVITY.start, par.ACCEL_BIAS.stop)]
     signs = np.array([-1.0, *[1.0] * 6])
@@ -358,73 +347,45 @@ def scale_of(fit: Fit, t_s: Array, accel: AccelPart, clock_rate: float = 0.0) ->
     )
 
 
-def _refusals(fit: Fit, t_s: Array) -> list[str]:
-    """Findings that make the number worthless, in the user's words."""
+def _refusals(fit: Fit, t_s: Array) -> list[Fact]:
+    """Findings that make the number worthless."""
     out = []
     x = fit.estimate
     if not fit.converged and float(fit.cov[par.SCALE, par.SCALE]) < 0.15**2:
-        out.append(
-            "the fit of camera and IMU does not converge: check that stamps are those of the samples, to a "
-            f"millisecond, or {_RECORD_INSTEAD}"
-        )
+        out.append(Fact("fit-not-converged"))
     bias = float(np.linalg.norm(x.accel_bias_m_s2))
     if bias > _LIMITS.bias_m_s2:
-        out.append(
-            f"the accelerometer would have to be off by {bias:.1f} m/s2, more than any working sensor is: check its "
-            "unit (m/s2), its sign (at rest it reads +9.8 away from the ground) and its axes"
-        )
+        out.append(Fact("accel-bias-impossible", bias_m_s2=bias))
     gain = float(np.abs(x.accel_gain).max())
     if gain > _LIMITS.gain:
-        out.append(
-            f"the accelerometer's gains or axes would have to be off by {100 * gain:.0f} %, more than those of any "
-            "working sensor are: check its unit (m/s2), its sign (at rest it reads +9.8 away from the ground) and its "
-            "axes"
-        )
+        out.append(Fact("accel-gain-impossible", gain=gain))
     # Noise of the accelerometer averaged between states, against the acceleration that it should measure
     unexplained = fit.noise.accel_m_s2(float(np.median(np.diff(t_s))))
     if unexplained > _LIMITS.unexplained * fit.excitation_m_s2:
-        out.append(
-            f"the accelerometer and the camera's motion disagree by {unexplained:.2f} m/s2, where the motion itself is "
-            f"{fit.excitation_m_s2:.2f} m/s2: check the accelerometer's sign and axes and that both recordings belong "
-            f"together, or {_RECORD_INSTEAD}"
-        )
+        out.append(Fact("accel-contradicts-motion", unexplained_m_s2=unexplained, motion_m_s2=fit.excitation_m_s2))
     return out
 
 
-def _checks(fit: Fit, t_s: Array, wrong_gain: WrongGain | None) -> list[str]:
-    """Findings that make the number doubtful, in the user's words."""
+def _checks(fit: Fit, t_s: Array, wrong_gain: WrongGain | None) -> list[Fact]:
+    """Findings that make the number doubtful."""
     out = []
     span_s = float(t_s[-1] - t_s[0])
     if span_s < _LIMITS.shortest_s:
-        out.append(
-            f"the clip is short ({span_s:.1f} s): it says little about its own noise; "
-            f"record {_LIMITS.shortest_s:.0f} s or more"
-        )
+        out.append(Fact("clip-short", span_s=span_s, needed_s=_LIMITS.shortest_s))
     if fit.gain_chi2 > par.LARGEST_GAIN_CHI2:
-        gains = ", ".join(f"{-100 * g:+.1f}" for g in np.diagonal(fit.estimate.accel_gain))
-        out.append(
-            f"the accelerometer seems to be off in gain by {gains} % on its axes, more than such sensors are, which "
-            "is allowed for: check its unit and the strength of gravity, or calibrate it (calibrate-imu)"
-        )
+        out.append(Fact("accel-gain-large", gains=-np.diagonal(fit.estimate.accel_gain)))
     elif wrong_gain is not None and wrong_gain.is_likely:
-        out.append(
-            f"the accelerometer's gain may be off by {100 * wrong_gain.gain:+.1f} %, which lengths follow (gravity "
-            f"reads {100 * wrong_gain.excess:+.1f} % too long, by gain or bias): check its unit, turn the camera about "
-            "all axes while it moves, or calibrate it (calibrate-imu)"
-        )
+        out.append(Fact("accel-gain-doubtful", gain=wrong_gain.gain, excess=wrong_gain.excess))
     return out
 
 
-def _check_drift(drift: ScaleDrift) -> list[str]:
-    """A sentence where the scales of parts of the recording differ."""
+def _check_drift(drift: ScaleDrift) -> list[Fact]:
+    """A doubt where the scales of parts of the recording differ."""
     out = []
     if scale_drifts(drift.p_value, drift.trend_log_per_s, drift.trend_sigma_log_per_s):
         low, high = np.expm1(drift.log_ratio.min()), np.expm1(drift.log_ratio.max())
-        out.append(
-            f"the reconstruction's scale is not the same throughout: from {100 * low:+.1f} to {100 * high:+.1f} % in "
-            f"parts of {drift.end_s[0] - drift.begin_s[0]:.0f} s (see drift in the JSON); it drifts, or a part of it "
-            "is wrong: close loops while recording, or scale its parts apart"
-        )
+        part_s = drift.end_s[0] - drift.begin_s[0]
+        out.append(Fact("scale-varies", lowest=low, highest=high, part_s=part_s))
     return out
 
 

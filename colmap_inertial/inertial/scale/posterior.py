@@ -14,6 +14,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ScaleOptions
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording
@@ -132,9 +133,9 @@ class FittedPath:
             try:
                 data, fit, wrong = fit_path(trajectory, timed, known)
             except np.linalg.LinAlgError as error:
-                raise NotObservableError("place", "camera and IMU do not determine its motion") from error
+                raise NotObservableError("place", Fact("motion-not-determined")) from error
         if wrong:
-            raise NotObservableError("place", f"what is wrong counts from end to end of a gap: {'; '.join(wrong)}")
+            raise NotObservableError("place", Fact("path-with-faults", faults=wrong))
         clock_rate = timed.calibration.clock_rate + fit.estimate.clock_rate
         scale = scale_of(fit, data.t_s, accel_part(imu), clock_rate)
         ends = (0, -1)

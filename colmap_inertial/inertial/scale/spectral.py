@@ -20,6 +20,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array, ComplexArray
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import CAL, CameraImuCalibration, CameraTrajectory, ScaleEstimate
 from colmap_inertial.inertial.core.priors import clock_scale_sigma
 from colmap_inertial.inertial.scale._spectra import SHORTEST_S, Signals, Spectra
@@ -35,7 +36,6 @@ _GAIN_SIGMA, _AXIS_SIGMA_RAD = 0.005, 0.002
 _LEAST_NOISE, _USUAL_NOISE = 1e-3, 0.05
 #: Columns of the parameters: logarithm of the scale, lever arm, bias, two angles of gravity.
 _SCALE, _LEVER, _BIAS, _TILT, _N = 0, slice(1, 4), slice(4, 7), slice(7, 9), 9
-_WHAT_TO_RECORD = "swing the camera back and forth by 20 cm or more, for 10 s or longer, while it sees texture"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -101,10 +101,10 @@ def fit_spectra(spectra: Spectra, calibration: CameraImuCalibration, gravity_m_s
         Where camera and accelerometer have no acceleration in common.
     """
     if 6 * len(spectra.frequency_hz) < 2 * _N:
-        raise NotObservableError("scale", "the recording is too short: record at least five seconds")
+        raise NotObservableError("scale", Fact("recording-too-short"))
     unit = float(np.sqrt(np.mean(np.abs(spectra.visual[1:]) ** 2)))
     if not unit > 0:
-        raise NotObservableError("scale", f"the camera does not move: {_WHAT_TO_RECORD}")
+        raise NotObservableError("scale", Fact("camera-still-in-spectra"))
     # lengths normalised: accelerations of the camera have a mean square of one
     data = replace(spectra, visual=spectra.visual / unit, visual_noise=spectra.visual_noise / unit**2)
     prior = _prior(calibration)
@@ -187,9 +187,7 @@ def _linear_start(data: Spectra, prior: _Prior, gravity_m_s2: float) -> tuple[_S
         right = np.concatenate([b.real, b.imag, prior.root @ prior.mean])
         x = np.asarray(np.linalg.lstsq(left, right, rcond=None)[0], dtype=np.float64)
         if not x[0] > 0:
-            raise NotObservableError(
-                "scale", f"the accelerometer does not feel the camera's motion, or it is too weak: {_WHAT_TO_RECORD}"
-            )
+            raise NotObservableError("scale", Fact("motion-not-felt"))
         state = _State(scale=float(x[0]), lever=x[1:4], bias=x[4:7], gravity=x[7:])
         scale = state.scale
         noise = _noise_of(data, state, noise)
@@ -331,11 +329,10 @@ def estimate_spectral(
     try:
         signals = Signals.of(trajectory, timed)
         if not signals.segments:
-            needed = f"no stretch of {SHORTEST_S:g} s is covered by camera and accelerometer without a pause"
-            raise NotObservableError("scale", f"{needed}: record longer")
+            raise NotObservableError("scale", Fact("never-covered", needed_s=SHORTEST_S))
         fit = fit_spectra(signals.spectra(options.highest_hz), calibration, options.gravity_m_s2)
     except NotObservableError as error:
-        return ScaleEstimate.refused("spectral", error.hint, calibration=calibration)
+        return ScaleEstimate.refused("spectral", error.why, calibration=calibration)
     checks, refusals = _checks(signals, calibration, options, fit)
     verdict, ci95, reasons = verdict_of(fit.metres_per_unit, fit.sigma_log, checks, refusals=refusals)
     if verdict == "refused":
@@ -359,13 +356,12 @@ def estimate_spectral(
 
 def _checks(
     signals: Signals, calibration: CameraImuCalibration, options: SpectralOptions, fit: SpectralFit
-) -> tuple[list[str], list[str]]:
+) -> tuple[list[Fact], list[Fact]]:
     """Findings that lower the verdict, and findings that refuse the scale."""
     checks, refusals = check_clocks(calibration.clock_rate), []
-    if np.linalg.norm(fit.bias) > _BIAS_LIMIT_M_S2:
-        refusals.append(
-            f"the accelerometer would have a bias of {np.linalg.norm(fit.bias):.1f} m/s2: check its axes, sign and unit"
-        )
+    bias_m_s2 = float(np.linalg.norm(fit.bias))
+    if bias_m_s2 > _BIAS_LIMIT_M_S2:
+        refusals.append(Fact("spectral-bias-large", bias_m_s2=bias_m_s2))
     if signals.duration_s >= _HALVES_FROM_S:
         halves = []
         for which in (0, 1):
@@ -373,12 +369,10 @@ def _checks(
                 spectra = signals.half(which).spectra(options.highest_hz)
                 halves.append(fit_spectra(spectra, calibration, options.gravity_m_s2))
             except NotObservableError:
-                checks.append("half of the recording alone gives no scale")
+                checks.append(Fact("half-without-scale"))
                 return checks, refusals
         first, second = halves
         apart = np.log(second.metres_per_unit / first.metres_per_unit)
         if abs(apart) > _HALVES_SIGMAS * np.hypot(first.sigma_log, second.sigma_log):
-            checks.append(
-                f"the second half of the recording gives a scale {100 * np.expm1(apart):+.1f} % from the first"
-            )
+            checks.append(Fact("halves-differ", difference=np.expm1(apart)))
     return checks, refusals

@@ -15,6 +15,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import IMU_CAL, ImuCalibration, ImuRecording
@@ -38,10 +39,6 @@ _DRIFT_P_VALUE = 2e-3
 #: Gains and angles beyond which the two sensors do not belong together.
 _LARGEST_GAIN, _LARGEST_MISS_RAD = 0.5, np.radians(5.0)
 _AXES = "xyz"
-_HOW = (
-    "lay the device still on its six sides, then leaning on six of its edges, five seconds each, on something solid, "
-    "and turn it over in between"
-)
 
 
 @prints_in_lines
@@ -67,7 +64,7 @@ class RestCalibration:
 
     calibration: ImuCalibration
     verdict: Literal["good", "weak"]
-    reasons: tuple[str, ...]
+    reasons: tuple[Fact, ...]
     rests: Rests
     before_m_s2: Array
     after_m_s2: Array
@@ -111,15 +108,13 @@ def calibrate_imu(
     if imu.calibration is not None:
         raise ValueError("the recording was corrected by a calibration already; give the sensor's own readings")
     if not imu.has_accel:
-        raise NotObservableError("IMU calibration", "the recording has no accelerometer; record it, too")
+        raise NotObservableError("IMU calibration", Fact("rests-without-accelerometer"))
     with one_blas_thread():
         candidates = candidate_rests(imu)
         most = max((rests.attitudes for rests in candidates), default=0)
         if most < FEWEST_ATTITUDES:
-            rested = "no rest was found" if most == 0 else f"it lay still in {most} attitude{'s' * (most > 1)} only"
-            raise NotObservableError(
-                "IMU calibration", f"{rested}, and at least {FEWEST_ATTITUDES} are needed (twelve are good): {_HOW}"
-            )
+            few = Fact("attitudes-too-few", attitudes=most, needed=FEWEST_ATTITUDES)
+            raise NotObservableError("IMU calibration", few)
         usable = [r for r in candidates if r.attitudes >= max(FEWEST_ATTITUDES, _MOST_ATTITUDES * most)]
         alone = [(fit_rests(imu, rests, gravity_m_s2, gravity_sigma_m_s2, accel_only=True), rests) for rests in usable]
         of_accel, rests = min(alone, key=lambda pair: _residual(*pair))
@@ -174,7 +169,7 @@ def _calibration(fit: RestFit, rests: Rests, gravity_m_s2: float, device: str) -
 
 def _judged(
     calibration: ImuCalibration, fit: RestFit, rests: Rests, gravity_sigma_m_s2: float, *, apart: bool
-) -> tuple[Literal["good", "weak"], tuple[str, ...]]:
+) -> tuple[Literal["good", "weak"], tuple[Fact, ...]]:
     """The verdict on a calibration: whether the attitudes were spread enough, and what stays unknown.
 
     Raises
@@ -186,59 +181,32 @@ def _judged(
     gains = sigma[IMU_CAL.ACCEL_GAIN].reshape(3, 3)
     unknown = [axis for axis, s in zip(_AXES, np.diagonal(gains), strict=True) if s > 0.7 * PRIORS.accel_gain]
     if unknown:
-        raise NotObservableError(
-            "IMU calibration",
-            f"the attitudes are too much alike: the accelerometer's gain along {_listed(unknown)} stays unknown. Each "
-            f"axis must point up once and down once: {_HOW}",
-        )
+        raise NotObservableError("IMU calibration", Fact("attitudes-alike", axes=unknown))
     weak, notes = [], []
     count = rests.attitudes
     if count < FULL_ATTITUDES:
         weak.append(
-            f"{count} attitudes determine gains and biases of the accelerometer, not its misalignments, which stay "
-            f"unknown to {100 * MISALIGNMENT_SIGMA:.1f} %; from {FULL_ATTITUDES} on, they are determined, too"
+            Fact("misalignments-unknown", attitudes=count, misalignment=MISALIGNMENT_SIGMA, needed=FULL_ATTITUDES)
         )
     elif gains[np.tril_indices(3, -1)].max() > _GOOD_MISALIGNMENT:
-        weak.append(f"the attitudes leave a misalignment of the accelerometer unknown: {_HOW}")
+        weak.append(Fact("misalignment-unknown"))
     if np.diagonal(gains).max() > KNOWN_GAIN:
         worst = _AXES[int(np.argmax(np.diagonal(gains)))]
-        weak.append(
-            f"the accelerometer's gain along {worst} is known to +-{196 * np.diagonal(gains).max():.2g} % only: {_HOW}"
-        )
+        weak.append(Fact("accel-gain-unsure", axis=worst, sigma=np.diagonal(gains).max()))
     gyro = sigma[IMU_CAL.GYRO_GAIN].reshape(3, 3)
     slack = [axis for axis, s in zip(_AXES, np.diagonal(gyro), strict=True) if s > _GOOD_GYRO_GAIN]
     if apart:
-        weak.append(
-            "the gyroscope does not turn as the accelerometer says, whatever its gains: its axes or its unit differ "
-            "(colmap-inertial diagnose tells), and it was left as it is"
-        )
+        weak.append(Fact("gyro-contradicts-rests"))
     elif slack:
-        weak.append(
-            f"the turns between the rests say little of the gyroscope's gain about {_listed(slack)}: it keeps what is "
-            "assumed of any gyroscope; turn the device about that axis, lying on its side, from one rest to the next"
-        )
+        weak.append(Fact("gyro-gain-unsure", axes=slack))
     if fit.accel_noise > _NOISY or fit.turn_noise > _NOISY:
-        what = "lengths of gravity" if fit.accel_noise > fit.turn_noise else "turns"
-        weak.append(
-            f"{what} agree {max(fit.accel_noise, fit.turn_noise):.0f} times less well than the sensor's noise allows: "
-            "something moved or gave way, or the sensor clips or warms up; the intervals count it"
-        )
+        of = "lengths of gravity" if fit.accel_noise > fit.turn_noise else "turns"
+        weak.append(Fact("rests-disagree", of=of, times=max(fit.accel_noise, fit.turn_noise)))
     if fit.drift_p_value < _DRIFT_P_VALUE:
-        weak.append(
-            f"the accelerometer's bias drifted by {float(np.linalg.norm(fit.drift_m_s2)):.2g} m/s2 during the "
-            "recording, as that of a device that warms up: let it warm up for some minutes, then record again"
-        )
+        weak.append(Fact("accel-bias-drifted", drift_m_s2=np.linalg.norm(fit.drift_m_s2)))
     if gravity_sigma_m_s2 > 2e-3:
-        part = 196 * gravity_sigma_m_s2 / calibration.gravity_m_s2
-        notes.append(
-            f"the strength of gravity is assumed, which alone makes the gains uncertain by +-{part:.1g} %: give the "
-            "latitude (and the height) of the place"
-        )
+        notes.append(Fact("gravity-assumed", sigma=gravity_sigma_m_s2 / calibration.gravity_m_s2))
     return ("weak" if weak else "good"), (*weak, *notes)
-
-
-def _listed(axes: list[str]) -> str:
-    return axes[0] if len(axes) == 1 else ", ".join(axes[:-1]) + " and " + axes[-1]
 
 
 __all__ = [

@@ -173,7 +173,7 @@ def _search(
     options = options or AlignOptions()
     prior = prior or calibration_prior()
     if len(trajectory) < 5:
-        raise NotObservableError("time offset", Fact("poses-too-few", poses=len(trajectory)))
+        raise NotObservableError("time offset", Fact("too-few-poses-to-align", poses=len(trajectory)))
     span_s = float(trajectory.t_s[-1] - trajectory.t_s[0])
     if span_s < _SHORTEST_S:
         raise NotObservableError("time offset", Fact("poses-too-short", span_s=span_s))

@@ -11,7 +11,7 @@ are compared only with those next to them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -128,36 +128,43 @@ def _require_majority(consensus: RotationConsensus) -> None:
         raise NotObservableError("camera rotation", Fact("no-majority-of-cameras", largest=largest, judged=count))
 
 
-def describe_consensus(consensus: RotationConsensus) -> tuple[str, ...]:
-    """Describe contradictions to the gyroscope in sentences; empty where there are none."""
+def describe_consensus(consensus: RotationConsensus) -> tuple[Fact, ...]:
+    """Describe contradictions to the gyroscope; empty where there are none."""
     out = []
     wrong, count = consensus.wrong, len(consensus.names)
     if wrong:
-        named = ", ".join(f"{camera.name} ({camera.deviation_deg:.0f} deg)" for camera in wrong[:5])
-        more = f" and {len(wrong) - 5} more" if len(wrong) > 5 else ""
-        out.append(f"{len(wrong)} of {count} cameras contradict the gyroscope and were left out: {named}{more}")
+        deviations_deg = [camera.deviation_deg for camera in wrong]
+        names = [camera.name for camera in wrong]
+        out.append(Fact("cameras-left-out", names=names, deviations_deg=deviations_deg, cameras=count))
     if consensus.moved:
-        named = ", ".join(consensus.moved[:5])
-        more = f" and {len(consensus.moved) - 5} more" if len(consensus.moved) > 5 else ""
-        out.append(
-            f"{len(consensus.moved)} of {count} cameras are in another place than the accelerometer says and were left "
-            f"out: {named}{more}"
-        )
-    out += [
-        f"the model is torn between {seam.before} and {seam.name}: its parts are turned by {seam.turn_deg:.0f} deg "
-        "against each other"
-        for seam in consensus.seams
-    ]
+        out.append(Fact("cameras-misplaced", names=consensus.moved, cameras=count))
+    out += [Fact("model-torn", before=seam.before, after=seam.name, turn_deg=seam.turn_deg) for seam in consensus.seams]
     if consensus.seams:
         kept = int(consensus.kept.sum())
         if consensus.joined:
-            out.append(
-                f"the IMU joined {len(consensus.joined)} cameras of other parts to the largest, {kept} of {count}"
-            )
+            out.append(Fact("torn-parts-joined", joined=len(consensus.joined), kept=kept, cameras=count))
         if any(consensus.part[consensus.names.index(name)] > 0 for name in consensus.left_out):
-            rests = f"the scale rests on the largest part, {kept} of {count} cameras; "
-            out.append(f"{'' if consensus.joined else rests}the other parts were left out")
+            whole = Fact("largest-part-kept", kept=kept, cameras=count)
+            out.append(Fact("other-parts-left-out") if consensus.joined else whole)
     return tuple(out)
+
+
+def without_consensus(facts: Iterable[Fact]) -> tuple[Fact, ...]:
+    """Facts but for those of :func:`describe_consensus`."""
+    return tuple(fact for fact in facts if fact.code not in _CODES)
+
+
+#: The codes of :func:`describe_consensus`.
+_CODES = frozenset(
+    (
+        "cameras-left-out",
+        "cameras-misplaced",
+        "model-torn",
+        "torn-parts-joined",
+        "largest-part-kept",
+        "other-parts-left-out",
+    )
+)
 
 
 def judge_rotations(

@@ -9,6 +9,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 from colmap_inertial.core.errors import NotObservableError, TimingError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import JoinOptions
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import Gap
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
     import pycolmap
 
 log = logging.getLogger(__name__)
-
-_NO_MATCHES = "without matches between the two: COLMAP's database is gone"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -74,13 +73,13 @@ class JoinStage(InertialStage):
             return tuple(models), ()
         parts: list[FittedSubmodel] = []
         of_part: list[Model] = []
-        why_not: dict[int, str] = {}
+        why_not: dict[int, Fact] = {}
         for model in models:
             try:
                 parts.append(self.part(model))
             except (NotObservableError, TimingError) as error:
-                hint = error.hint if isinstance(error, NotObservableError) else str(error)
-                why_not[model.colmap_index] = hint
+                why = error.why if isinstance(error, NotObservableError) else error.fact
+                why_not[model.colmap_index] = Fact("model-apart", why=why or Fact.stated(str(error)))
             else:
                 of_part.append(model)
         placed = self._found(of_part)
@@ -90,7 +89,7 @@ class JoinStage(InertialStage):
         if self._lacks_database():
             # the same stage with its matches would have joined otherwise: the result has to say so
             log.warning("%s is gone: matches between models do not count", self.database)
-            between = tuple(replace(gap, reason=f"{gap.reason} ({_NO_MATCHES})") for gap in between)
+            between = tuple(replace(gap, reason=Fact("gap-without-database", reason=gap.reason)) for gap in between)
         spans = _spans(models)
         ends_s = {number: end_s for _, end_s, number in spans}
         gaps = sorted([*between, *_beside(spans, why_not)], key=lambda gap: ends_s[gap.first])
@@ -117,11 +116,11 @@ class JoinStage(InertialStage):
         """
         scale, reconstruction = model.scale, model.reconstruction
         if scale is None or model.similarity is None or scale.verdict == "refused":
-            raise NotObservableError("place", f"the scale of model {model.colmap_index} was refused")
+            raise NotObservableError("place", Fact("join-scale-refused", colmap_index=model.colmap_index))
         if scale.method != "joint":
-            raise NotObservableError("place", "scales of the joint method alone say how the models moved at their ends")
+            raise NotObservableError("place", Fact("join-other-method"))
         if has_rigs(reconstruction):
-            raise NotObservableError("place", f"the cameras of model {model.colmap_index} are a rig")
+            raise NotObservableError("place", Fact("join-rig", colmap_index=model.colmap_index))
         trajectory = metric_trajectory(trajectory_from_model(reconstruction, model.timing)[0])
         path = FittedPath.of(trajectory, self.imu, self.calibration_of(model), self.options)
         cameras = _cameras(reconstruction)
@@ -159,7 +158,7 @@ def _spans(models: Sequence[Model]) -> list[tuple[float, float, int]]:
     return sorted(spans)
 
 
-def _beside(spans: Sequence[tuple[float, float, int]], why_not: dict[int, str]) -> list[Gap]:
+def _beside(spans: Sequence[tuple[float, float, int]], why_not: dict[int, Fact]) -> list[Gap]:
     """Gaps next to models that cannot be joined to anything."""
     out = []
     for (_, end_s, first), (begin_s, _, second) in pairwise(spans):

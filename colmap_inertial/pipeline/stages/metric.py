@@ -14,11 +14,13 @@ import numpy as np
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import quat_rotate, so3_log
 from colmap_inertial.core.options import ScaleOptions, WorldAxes
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import (
     CAL,
+    Action,
     CameraImuCalibration,
     CameraMotion,
     CameraTrajectory,
@@ -41,7 +43,7 @@ from colmap_inertial.model import Model, downgraded, trajectory_from_model
 from colmap_inertial.model.deregistration import deregister_images
 from colmap_inertial.model.rigs import has_rigs
 from colmap_inertial.model.submodels.registration import register_again
-from colmap_inertial.motion.align.consensus import describe_consensus
+from colmap_inertial.motion.align.consensus import describe_consensus, without_consensus
 from colmap_inertial.motion.smooth import smooth_trajectory
 from colmap_inertial.pipeline.stages.inputs import StageInputs
 
@@ -150,11 +152,7 @@ class InertialStage:
             trajectory = trajectory.select(np.array([name not in left_out for name in trajectory.names]))
             model = _select_agreeing_images(model, reconstruction, consensus)
         if model.rotations is not None and estimate.rotations is not None:
-            description = describe_consensus(estimate.rotations)
-            notes = (
-                *(note for note in estimate.notes if note not in description),
-                *describe_consensus(model.rotations),
-            )
+            notes = (*without_consensus(estimate.notes), *describe_consensus(model.rotations))
             estimate = replace(estimate, rotations=model.rotations, notes=notes)
         return model, estimate, trajectory
 
@@ -178,17 +176,17 @@ def _select_agreeing_images(
     model: Model, reconstruction: pycolmap.Reconstruction, consensus: RotationConsensus
 ) -> Model:
     """A model of the images that agree with the gyroscope; some of them may have been registered again."""
-    sentences = list(describe_consensus(consensus))
+    facts = list(describe_consensus(consensus))
     if consensus.registered_again:
-        sentences.append(f"registered again, and right now: {', '.join(consensus.registered_again)}")
+        facts.append(Fact("cameras-registered-again", names=consensus.registered_again))
     elif consensus.wrong and has_rigs(reconstruction):
-        sentences.append("images of several cameras are not registered again")
-    reason = "; ".join(sentences)
+        facts.append(Fact("rigs-not-registered-again"))
+    reason = Fact("cameras-judged", facts=facts)
     log.info("model %d: %s", model.colmap_index, reason)
     done = Treatment(
         stage="rotations",
         reason=reason,
-        action="left out" if consensus.left_out else "registered again",
+        action=Action.LEFT_OUT if consensus.left_out else Action.REGISTERED_AGAIN,
         values={"left_out": consensus.left_out, "registered_again": consensus.registered_again},
     )
     others = (consensus.list_part(number) for number in range(1, len(consensus.ref_from_part_xyzw)))
@@ -236,7 +234,7 @@ class MetricStage(InertialStage):
             log.info("model %d: its shutter cannot be looked at: %s", model.colmap_index, error)
             readout = None
         if readout is None:
-            return self._apply(model, replace(estimate, notes=(*estimate.notes, _SHUTTER_UNKNOWN)))
+            return self._apply(model, replace(estimate, notes=(*estimate.notes, Fact("rolling-shutter-unknown"))))
         estimate = readout.widen(estimate)
         if estimate.verdict == "refused":
             return model.scaled(estimate, None)
@@ -244,7 +242,7 @@ class MetricStage(InertialStage):
         if not readout.is_found:
             return metric
         values = {name: getattr(readout, name) for name in ("readout_s", "sigma_s", "direction")}
-        done = Treatment(stage="shutter", reason=readout.sentence(), action="", values=values)
+        done = Treatment(stage="shutter", reason=readout.as_fact(), values=values)
         log.info("model %d: %s", model.colmap_index, done.reason)
         return replace(metric, treatments=(*metric.treatments, done))
 
@@ -273,12 +271,6 @@ class MetricStage(InertialStage):
         seen = read_seen(reconstruction, timing, chosen)
         with one_blas_thread():
             return find_readout(seen, timing, self.imu, known)
-
-
-_SHUTTER_UNKNOWN = (
-    "too little is seen to tell whether the images have a rolling shutter that the model ignores: declare readout_s, 0 "
-    "for a global shutter"
-)
 
 
 def provenance(estimate: ScaleEstimate) -> str:

@@ -10,7 +10,8 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
-from colmap_inertial.core.types import Treatment
+from colmap_inertial.core.facts import Fact
+from colmap_inertial.core.types import Action, Treatment
 from colmap_inertial.imaging.gyro_camera import FrameShutter
 from colmap_inertial.model import Model
 from colmap_inertial.model.readout import settle_readout
@@ -85,13 +86,19 @@ class ReadoutStage(InertialStage):
             refine_intrinsics=self.refine_intrinsics,
             num_threads=self.num_threads,
         )
-        reason = (
-            f"translation within the readout moves points by {what.shift_px:.2f} px; reprojection error "
-            f"{what.before_px:.3f} -> {what.after_px:.3f} px{'' if what.accepted else ': left as it is'}"
+        reason = Fact(
+            "readout-settled",
+            shift_px=what.shift_px,
+            before_px=what.before_px,
+            after_px=what.after_px,
+            accepted=what.accepted,
         )
         log.info("model %d: %s", model.colmap_index, reason)
         done = Treatment(
-            stage="readout", reason=reason, action="adjusted" if what.accepted else "", values=asdict(what)
+            stage="readout",
+            reason=reason,
+            action=Action.ADJUSTED if what.accepted else Action.NOTHING,
+            values=asdict(what),
         )
         return replace(
             model,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Hashable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -13,12 +13,13 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import quat_from_matrix
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import CAL, CameraImuCalibration, Similarity, SolvedMotion, Treatment
+from colmap_inertial.core.types import CAL, Action, CameraImuCalibration, Similarity, SolvedMotion, Treatment
 from colmap_inertial.inertial.core.priors import AccelPart, accel_part, model_scale_sigma
 from colmap_inertial.inertial.refine.judge import Judged, refine
-from colmap_inertial.inertial.refine.motion import add_scale, expect_worth
+from colmap_inertial.inertial.refine.motion import Worth, add_scale, expect_worth
 from colmap_inertial.inertial.refine.pictures import remove_extremes
 from colmap_inertial.inertial.refine.setup import (
     Seen,
@@ -29,6 +30,7 @@ from colmap_inertial.inertial.refine.setup import (
     read_seen,
     write_back,
 )
+from colmap_inertial.inertial.refine.shutter import SHUTTER_IGNORED
 from colmap_inertial.inertial.refine.values import FIRST_INTRINSIC, LEVER, OFFSET, READOUT, ROTATION, Estimate, Problem
 from colmap_inertial.inertial.refine.world import size_of, state_scale
 from colmap_inertial.model import Model
@@ -102,89 +104,84 @@ class RefineStage(InertialStage):
         """Refine the model."""
         begin_s = time.perf_counter()
         why_not = self._why_not(model)
-        if why_not:
-            return _said(model, f"not refined: {why_not}")
+        if why_not is not None:
+            return _record(model, Fact("not-refined", why=why_not))
         try:
             with one_blas_thread():
                 refined = self._refined(model)
         except (NotObservableError, np.linalg.LinAlgError) as error:
-            hint = error.hint if isinstance(error, NotObservableError) else "camera and IMU do not determine its shape"
-            return _said(model, f"not refined: {hint}")
+            why_not = error.why if isinstance(error, NotObservableError) else Fact("refine-not-determined")
+            return _record(model, Fact("not-refined", why=why_not))
         log.info("model %d: the refinement took %.1f s", model.colmap_index, time.perf_counter() - begin_s)
         return refined
 
-    def _why_not(self, model: Model) -> str:
-        """Why a model cannot be refined; empty where it can."""
+    def _why_not(self, model: Model) -> Fact | None:
+        """Why a model cannot be refined; ``None`` where it can."""
         estimate, reconstruction = model.scale, model.reconstruction
         if model.similarity is None or estimate is None or estimate.calibration is None:
-            return "it has no scale"
+            return Fact("refine-without-scale")
         if estimate.noise is None or estimate.accel_bias_m_s2 is None or gravity_in_model(model) is None:
-            return "its scale says nothing of the IMU's noise; the joint method does"
+            return Fact("refine-without-noise")
         if reconstruction.num_reg_images() < _FEWEST_IMAGES:
-            return f"it has fewer than {_FEWEST_IMAGES} images"
+            return Fact("refine-images-few", needed=_FEWEST_IMAGES)
         if reconstruction.num_points3D() < _FEWEST_POINTS:
-            return f"it has fewer than {_FEWEST_POINTS} points"
+            return Fact("refine-points-few", needed=_FEWEST_POINTS)
         if has_rigs(reconstruction) or _alternate(model):
-            return "several cameras took its images, and each has its own place beside the IMU"
+            return Fact("refine-several-cameras")
         if estimate.parts is not None and estimate.parts.get("accel_faults"):
-            return "the accelerometer has faults, which its scale undid and the refinement would not"
+            return Fact("refine-accel-faults")
         if model.rectified and self.shutter is None:
-            return "its keypoints were moved by a stage that cannot say from where"
-        kept = f"{self.made_from} was made from it" if self.made_from else "its parts are in the project by themselves"
+            return Fact("refine-keypoints-moved")
         if self.auto and (self.made_from or (self.made_from is not None and model.parts)):
-            return f"{kept} and would keep their shape (--refine inertial does it all the same)"
-        return ""
+            return Fact("refine-shape-in-use", made_from=self.made_from)
+        return None
 
     def _refined(self, model: Model) -> Model:
         seen = remove_extremes(read_seen(model.reconstruction, model.timing))
         known = self.known_of(model, refine_intrinsics=self.refine_intrinsics)
         problem, start = make_problem(seen, model.timing, self.imu, known, self._exposed_px(model, seen))
-        promised: dict[str, Any] = {}
-        chosen = ""
+        worth: Worth | None = None
         if self.auto:
-            worth = expect_worth(seen, problem, start, bent=bool(list_ignored_shutter(model)))
-            promised = {"expected": {name: value for name, value in asdict(worth).items() if name != "reason"}}
-            if worth.reason:
-                return _said(model, f"not refined: {worth.reason}", **promised)
-            chosen = f"{worth.describe()} with the IMU; "
+            worth = expect_worth(seen, problem, start, bent=_ignores_shutter(model))
+            if worth.reason is not None:
+                return _record(model, Fact("not-refined", why=worth.reason), **_worth_figures(worth))
         declared = model.timing.readout_s is not None
         judged = refine(problem, start, seen.observations.xy_px, seen.t_s, readout_declared=declared)
-        figures = _state_figures(judged) | promised
-        heard = (
-            f"{chosen}{judged.held_out} observations that were held out: {judged.before_px:.4f} -> "
-            f"{judged.after_px:.4f} px; the IMU costs {judged.chi2:.2f} of what its noise explains"
-        )
+        figures, evidence = _state_figures(judged) | _worth_figures(worth), _state_evidence(judged, worth)
         if not judged.accepted:
-            return _said(model, f"left as it is: {judged.reason} ({heard})", **figures)
+            return _record(model, Fact("refinement-rejected", why=judged.reason, evidence=evidence), **figures)
         x = judged.estimate
         figures |= {"drift": [asdict(part) for part in judged.drift]} | _calibration_figures(judged)
         assert model.scale is not None and model.scale.calibration is not None
         assert model.similarity is not None and judged.world is not None
-        written = move_to_middle_lines(problem, x)
-        move = _move_of(seen, written)
-        accel = accel_part(self.imu)
+        middle_lines = move_to_middle_lines(problem, x)
+        refined_from_before = _move_of(seen, middle_lines)
         before = model.scale
         if model.timing.readout_s or judged.readout:
-            now_known = [reason for reason in before.reasons if reason not in list_ignored_shutter(model)]
-            before = replace(before, reasons=tuple(now_known))
-        own, similarity = state_scale(before, model.similarity, move, problem, x, judged.world, accel=accel)
-        if own.verdict == "refused":
-            return _said(model, f"left as it is: refined, {'; '.join(own.reasons)} ({heard})", **figures)
-        figures["size_before"] = 1 / move.scale
+            # the shutter is not ignored any more
+            others = tuple(reason for reason in before.reasons if reason.code != SHUTTER_IGNORED)
+            before = replace(before, reasons=others)
+        accel = accel_part(self.imu)
+        scale, similarity = state_scale(
+            before, model.similarity, refined_from_before, problem, x, judged.world, accel=accel
+        )
+        if scale.verdict == "refused":
+            return _record(model, Fact("refined-scale-refused", reasons=scale.reasons, evidence=evidence), **figures)
+        figures["size_before"] = 1 / refined_from_before.scale
         # a motion's readout has the direction that was declared
         readout_s = x.readout_s if model.timing.readout_s or (judged.readout and x.readout_s > 0) else None
         rolling = not model.rectified and bool(model.timing.readout_s or judged.readout)
-        reconstruction = write_back(model.reconstruction, seen, problem, x, rectified=not rolling)
-        done = replace(
+        refined_model = replace(
             model,
-            reconstruction=reconstruction,
-            scale=replace(own, calibration=_make_refined_calibration(model.scale.calibration, problem, judged)),
+            reconstruction=write_back(model.reconstruction, seen, problem, x, rectified=not rolling),
+            scale=replace(scale, calibration=_make_refined_calibration(model.scale.calibration, problem, judged)),
             similarity=similarity,
-            parts=tuple(replace(part, similarity=_moved(part.similarity, move)) for part in model.parts),
+            parts=tuple(replace(part, similarity=_moved(part.similarity, refined_from_before)) for part in model.parts),
             observed_px={},
-            motion=_motion(seen, written.cam_in_world, judged, accel=accel, readout_s=readout_s),
+            motion=_motion(seen, middle_lines.cam_in_world, judged, accel=accel, readout_s=readout_s),
         )
-        return _said(done, f"refined by the IMU ({heard}){_rolling(x, rolling)}", action="refined", **figures)
+        refined = Fact("refined", evidence=evidence, rolling_readout_s=x.readout_s if rolling else None)
+        return _record(refined_model, refined, action=Action.REFINED, **figures)
 
     def _exposed_px(self, model: Model, seen: Seen) -> Array:
         """(M, 2) observations in the pictures as they were exposed."""
@@ -199,9 +196,9 @@ class RefineStage(InertialStage):
         return keypoints_of(seen, keypoints)
 
 
-def list_ignored_shutter(model: Model) -> list[str]:
-    """What was said of a rolling shutter that a model ignores."""
-    return [treatment.reason for treatment in model.treatments if treatment.stage == "shutter"]
+def _ignores_shutter(model: Model) -> bool:
+    """Whether a model's images were found to have a rolling shutter that it ignores."""
+    return any(treatment.reason.code == SHUTTER_IGNORED for treatment in model.treatments)
 
 
 def _alternate(model: Model) -> bool:
@@ -235,24 +232,33 @@ def _devices(reconstruction: pycolmap.Reconstruction, images: Sequence[pycolmap.
     ]
 
 
-def _said(model: Model, reason: str, *, action: str = "", **values: object) -> Model:
+def _record(model: Model, outcome: Fact, *, action: Action = Action.NOTHING, **values: object) -> Model:
     """The model with what was decided; a note beside its scale says it on the terminal and in the report."""
-    log.info("model %d: %s", model.colmap_index, reason)
-    done = Treatment(stage="refine", reason=reason, action=action, values=values)
+    log.info("model %d: %s", model.colmap_index, outcome)
+    treatment = Treatment(stage="refine", reason=outcome, action=action, values=values)
     scale = model.scale
     if scale is not None and model.similarity is not None:
-        scale = replace(scale, notes=(*scale.notes, f"the model was {reason}"))
-    return replace(model, treatments=(*model.treatments, done), scale=scale)
+        scale = replace(scale, notes=(*scale.notes, Fact("model-was", done=outcome)))
+    return replace(model, treatments=(*model.treatments, treatment), scale=scale)
 
 
-def _rolling(x: Estimate, rolling: bool) -> str:
-    """Describe pictures that keep their rolling shutter."""
-    if not rolling:
-        return ""
-    upwards = "" if x.readout_s > 0 else " from the last line to the first"
-    return (
-        f"; poses are those of the middle line: images and keypoints keep their rolling shutter of "
-        f"{1e3 * abs(x.readout_s):.1f} ms{upwards}"
+def _worth_figures(worth: Worth | None) -> dict[str, Any]:
+    """What a refinement was expected to bring; empty where it was asked for."""
+    if worth is None:
+        return {}
+    return {"expected": {f.name: getattr(worth, f.name) for f in fields(worth) if f.name != "reason"}}
+
+
+def _state_evidence(judged: Judged, worth: Worth | None) -> Fact:
+    """What speaks for or against a refinement."""
+    return Fact(
+        "refinement-evidence",
+        held_out=judged.held_out,
+        before_px=judged.before_px,
+        after_px=judged.after_px,
+        chi2=judged.chi2,
+        alone_m=None if worth is None else worth.alone_m,
+        refined_m=None if worth is None else worth.refined_m,
     )
 
 

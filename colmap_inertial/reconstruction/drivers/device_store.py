@@ -16,7 +16,7 @@ from colmap_inertial.checks.report import require_plotly
 from colmap_inertial.checks.report.imu_calibration import calibration_page
 from colmap_inertial.checks.validate import parse_target
 from colmap_inertial.core.errors import FormatError, InertialError, OutputError, OutputExistsError
-from colmap_inertial.core.facts import Fact
+from colmap_inertial.core.facts import Fact, sentences
 from colmap_inertial.core.options import GravityOptions
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import ImuCalibration
@@ -256,7 +256,7 @@ def calibrate_source(
         check_alive(imu.accel_m_s2, "accel", raw.accel_path or raw.path)
         problems = check_units(imu)
         if problems:
-            raise FormatError(raw.path, "; ".join(problems))
+            raise FormatError(raw.path, "; ".join(sentences(problems)))
     gravity_m_s2, sigma = strength_of_gravity(gravity or GravityOptions())
     calibration = calibrate_imu(imu, gravity_m_s2=gravity_m_s2, gravity_sigma_m_s2=sigma, device=device)
     write_imu_calibration(out, calibration.calibration)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import WorldAxes
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import DOWN_IN_WORLD, FrameTiming, PositionFixes
@@ -16,7 +17,7 @@ from colmap_inertial.io.files import read_record, write_json, write_record
 from colmap_inertial.model import read_model, trajectory_from_model
 from colmap_inertial.pipeline.run.runner import remove
 from colmap_inertial.pipeline.run.session import Session
-from colmap_inertial.reconstruction.drivers.result import ModelResult
+from colmap_inertial.reconstruction.drivers.result import ModelResult, error_as_json
 from colmap_inertial.reconstruction.preparation.geolocation import cameras_as_json, georeference_path
 
 log = logging.getLogger(__name__)
@@ -28,11 +29,14 @@ class _Outcome:
 
     index: int
     found: Georeference | None = None
-    unobservable: str | None = None
-    hint: str = ""
+    unobservable: str = "heading"
+    why: Fact | None = None
 
     def outcome(self) -> Georeference | NotObservableError:
-        return self.found or NotObservableError(self.unobservable or "heading", self.hint)
+        if self.why is not None:
+            return NotObservableError(self.unobservable, self.why)
+        assert self.found is not None
+        return self.found
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -64,8 +68,8 @@ def run_georeference(
             try:
                 georeference = georeference_path(fixes, path, -DOWN_IN_WORLD[world])
             except NotObservableError as error:
-                outcomes.append(_Outcome(index=index, unobservable=error.quantity, hint=error.hint))
-                written.append({"model": index, "error": str(error)})
+                outcomes.append(_Outcome(index=index, unobservable=error.quantity, why=error.why))
+                written.append({"model": index, **error_as_json(error)})
             else:
                 outcomes.append(_Outcome(index=index, found=georeference))
                 written.append(

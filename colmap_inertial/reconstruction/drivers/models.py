@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, TypeAlias
 from colmap_inertial.checks.validate import Target, Validation, validate_model, write_overlays
 from colmap_inertial.colmap.dense import run_dense
 from colmap_inertial.core.errors import NotObservableError, TargetNotFoundError, TimingError
+from colmap_inertial.core.facts import Fact, sentences
 from colmap_inertial.core.options import DenseOptions
 from colmap_inertial.core.types import Gap, JoinedPart, ScaleEstimate
 from colmap_inertial.io.files import read_record, write_record
@@ -215,7 +216,7 @@ def _run_stages(
             scaled = ScaledModel(
                 index=place_of[model.colmap_index],
                 colmap_index=model.colmap_index,
-                scale=_refused("not looked at"),
+                scale=_refused(Fact("scale-not-estimated")),
                 summary=summarize(model.reconstruction),
                 sparse=_within(session.workspace.root, folders[model.colmap_index]),
             )
@@ -228,7 +229,7 @@ def _run_stages(
                         yield replace(scaled, colmap_index=part.colmap_index), _after(stages[:at], part)
             else:
                 untimed.append(reason)
-                yield replace(scaled, scale=_refused(str(reason))), None
+                yield replace(scaled, scale=_refused(reason.fact or Fact.stated(str(reason)))), None
 
     going: Iterable[_Begun] = begun()
     gaps: tuple[Gap, ...] = ()
@@ -244,7 +245,7 @@ def _run_stages(
     made: list[ScaledModel] = []
     for scaled, model in going:
         if model is None:
-            log.info("model %d: refused %s", scaled.index, "; ".join(scaled.scale.reasons))
+            log.info("model %d: refused %s", scaled.index, "; ".join(sentences(scaled.scale.reasons)))
             made.append(scaled)
             continue
         made.append(_placed(session, recording, scaled, _after(stages[at + 1 :], model)))
@@ -328,7 +329,7 @@ def _placed(session: Session, recording: Recording, scaled: ScaledModel, model: 
             write_trajectory(trajectory, model, poses, recording.imu)
             scaled = replace(scaled, trajectory=_within(workspace.root, trajectory))
     write_model_record(workspace, scaled.index, model, poses, recording.imu)
-    log.info("model %d: %s %s", scaled.index, scale.verdict, "; ".join(scale.reasons))
+    log.info("model %d: %s %s", scaled.index, scale.verdict, "; ".join(sentences(scale.reasons)))
     return scaled
 
 
@@ -348,7 +349,7 @@ def _too_few_timed(model: Model) -> TimingError | None:
     return None
 
 
-def _refused(reason: str) -> ScaleEstimate:
+def _refused(reason: Fact) -> ScaleEstimate:
     return ScaleEstimate(
         metres_per_unit=None, sigma_log=None, ci95=None, verdict="refused", method="none", reasons=(reason,)
     )
@@ -360,14 +361,15 @@ class _Checked:
 
     found: Validation | None = None
     unobservable: str | None = None
-    error: str = ""
+    why_not: Fact | None = None
 
     def outcome(self) -> Validation | TargetNotFoundError | NotObservableError:
         if self.found is not None:
             return self.found
+        assert self.why_not is not None
         if self.unobservable is not None:
-            return NotObservableError(self.unobservable, self.error)
-        return TargetNotFoundError(self.error)
+            return NotObservableError(self.unobservable, self.why_not)
+        return TargetNotFoundError(self.why_not, code=TargetNotFoundError.default_code)
 
 
 def run_validation(
@@ -396,9 +398,9 @@ def run_validation(
                     metric, images, target, progress=lambda done, total: session.progress("validation", done, total)
                 )
             except TargetNotFoundError as error:
-                write_record(partial[0], _Checked(error=str(error)))
+                write_record(partial[0], _Checked(why_not=error.fact or Fact.stated(str(error))))
             except NotObservableError as error:
-                write_record(partial[0], _Checked(unobservable=error.quantity, error=error.hint))
+                write_record(partial[0], _Checked(unobservable=error.quantity, why_not=error.why))
             else:
                 write_overlays(validation, images, pictures)
                 write_record(partial[0], _Checked(found=validation))

@@ -15,7 +15,7 @@ from colmap_inertial.colmap.depth_maps import DenseResult
 from colmap_inertial.colmap.mapping import MapRecord
 from colmap_inertial.colmap.sparse import KeypointRecords, MatchRecord
 from colmap_inertial.core.errors import InertialError, NotObservableError
-from colmap_inertial.core.facts import DETAILS, Fact
+from colmap_inertial.core.facts import DETAILS, Fact, sentences, with_sentences
 from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply
 from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.types import Action, CameraImuCalibration, Gap, JoinedPart, ScaleEstimate, Treatment
@@ -180,7 +180,7 @@ class ReconstructResult:
             When a dense reconstruction was asked for and waits for depth maps.
         """
         if all(model.sparse_metric is None for model in self.models):
-            reasons = {model.index: "; ".join(model.scale.reasons) for model in self.models}
+            reasons = {model.index: "; ".join(sentences(model.scale.reasons)) for model in self.models}
             raise NotObservableError(
                 "scale",
                 next(iter(reasons.values()))
@@ -278,7 +278,17 @@ def measurement_as_json(measurement: Validation | Georeference | InertialError |
     """Measurement in a model, or the reason why there is none."""
     if measurement is None:
         return None
-    return {"error": str(measurement)} if isinstance(measurement, InertialError) else measurement.as_json()
+    return error_as_json(measurement) if isinstance(measurement, InertialError) else measurement.as_json()
+
+
+def error_as_json(error: InertialError) -> dict[str, Any]:
+    """What an error says, and its code and values where it has them."""
+    return {"error": str(error)} | ({} if error.fact is None else {"error" + DETAILS: error.fact.as_json()})
+
+
+def _record_as_json(record: Treatment | Gap) -> dict[str, object]:
+    """A record's fields, its reason in words and as a code."""
+    return with_sentences({field.name: getattr(record, field.name) for field in fields(record)})
 
 
 def _part_as_json(part: JoinedPart) -> dict[str, object]:
@@ -318,13 +328,13 @@ def result_as_json(result: ReconstructResult, capture: Capture) -> dict[str, obj
                 "readout_translation": next((t.values for t in model.treatments if t.stage == "readout"), None),
                 "joined_of": [_part_as_json(part) for part in model.parts],
                 "rig": [asdict(sensor) for sensor in model.rig],
-                "treatments": [asdict(treatment) for treatment in model.treatments],
+                "treatments": [_record_as_json(treatment) for treatment in model.treatments],
                 "dense": model.dense and model.dense.as_json(root),
             }
             for model in result.models
         ],
         "fragments": [{**asdict(fragment), "sparse": relative(fragment.sparse)} for fragment in result.fragments],
-        "gaps": [asdict(gap) for gap in result.gaps],
+        "gaps": [_record_as_json(gap) for gap in result.gaps],
         "project_metric": relative(result.project_metric),
         "waiting": bool(result.waiting),
         "selection": result.selection and result.selection.as_json(),

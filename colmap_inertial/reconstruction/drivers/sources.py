@@ -296,7 +296,7 @@ def scale_source(
     diagnosis = diagnose(measure_recording(checked, silent))
     doubts = tuple(finding.reason for finding in diagnosis.stopping)
     if doubts and not force:
-        estimate = ScaleEstimate.refused("none", *doubts)
+        estimate = ScaleEstimate.refused("none", *map(as_fact, doubts))
     else:
         estimate = estimate_scale(
             trajectory,

@@ -6,11 +6,16 @@ import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
+from colmap_inertial.core.facts import Fact
+from colmap_inertial.core.types import Action, Treatment
 from colmap_inertial.model import Model
 from colmap_inertial.model.deregistration import deregister_images
-from colmap_inertial.motion.align.consensus import describe_consensus
+from colmap_inertial.motion.align.consensus import describe_consensus, without_consensus
 
 log = logging.getLogger(__name__)
+
+#: The code of what the stages said of a model's cameras.
+_JUDGED = "cameras-judged"
 
 
 class TornParts:
@@ -50,19 +55,19 @@ class TornParts:
         if not names or before is None or scale is None:
             return model
         now = replace(before, joined=names)
-        old, new = describe_consensus(before), describe_consensus(now)
+        description = describe_consensus(now)
         treatments = (
-            replace(
-                done,
-                reason=done.reason.replace("; ".join(old), "; ".join(new)),
-                action="left out" if now.left_out else "joined",
+            Treatment(
+                stage=done.stage,
+                reason=Fact(_JUDGED, facts=(*description, *without_consensus(done.reason.values["facts"]))),
+                action=Action.LEFT_OUT if now.left_out else Action.JOINED,
                 values={**done.values, "left_out": now.left_out},
             )
-            if done.stage == "rotations"
+            if done.reason.code == _JUDGED
             else done
             for done in model.treatments
         )
-        notes = (*(note for note in scale.notes if note not in old), *new)
+        notes = (*without_consensus(scale.notes), *description)
         return replace(
             model, rotations=now, scale=replace(scale, rotations=now, notes=notes), treatments=tuple(treatments)
         )

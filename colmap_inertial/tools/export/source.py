@@ -393,7 +393,7 @@ class ExportContent:
 
 def _notes_on_model(source: ExportSource) -> list[Fact]:
     """Notes for the user on the model."""
-    notes = []
+    notes: list[Fact | str] = []
     if source.found.scale.unit != "m":
         notes.append(as_fact(NO_SCALE))
     if source.up_in_world is None:

@@ -237,7 +237,7 @@ def export_model(
             unit=source_view.scale.unit,
             images=len(content.views) if target.has_images else 0,
             points=len(content.xyz) if target.has_points else 0,
-            notes=tuple(content.notes),
+            notes=tuple(map(as_fact, content.notes)),
         )
         write_json(partial / "export.json", _record(made, content, images))
     return made

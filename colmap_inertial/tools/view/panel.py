@@ -47,7 +47,7 @@ def scale_text(scene: Scene) -> str:
         lines.append("**Metres**, as the user gave the scale; its uncertainty is not known.")
     if scale.unit == "m" and scale.metres_per_unit is not None:
         lines.append(f"{scale.metres_per_unit:.5g} m per unit of the original model")
-    lines += [f"- {_plain(reason)}" for reason in scale.reasons]
+    lines += [f"- {_plain(str(reason))}" for reason in scale.reasons]
     if not scene.gravity_known:
         lines.append("Gravity is not known: up is where the images' upper edges point on average.")
     return "\n\n".join(lines)

@@ -11,6 +11,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact, read_facts
 from colmap_inertial.core.geometry import quat_rotate
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import LengthUnit
@@ -38,7 +39,7 @@ class ScaleFacts:
 
     unit: LengthUnit
     verdict: str | None = None
-    reasons: tuple[str, ...] = ()
+    reasons: tuple[Fact, ...] = ()
     metres_per_unit: float | None = None
     relative_ci95: tuple[float, float] | None = None
 
@@ -276,7 +277,7 @@ def _estimated(fields: Mapping[str, Any], unit: LengthUnit) -> ScaleFacts:
     return ScaleFacts(
         unit=unit,
         verdict=str(fields["verdict"]),
-        reasons=tuple(map(str, fields["reasons"])),
+        reasons=read_facts(fields, "reasons"),
         metres_per_unit=scale,
         relative_ci95=relative,
     )
@@ -290,7 +291,7 @@ def _read_verdict_of_apply(out: Path, folder: Path) -> dict[str, Any]:
     with a_record_of_ours(path):
         for model in read_json(path).get("models", []):
             if out / model["folder"] == folder:
-                return {"verdict": model["verdict"], "reasons": tuple(map(str, model["reasons"]))}
+                return {"verdict": model["verdict"], "reasons": read_facts(model, "reasons")}
     return {}
 
 

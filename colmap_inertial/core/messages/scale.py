@@ -1,0 +1,586 @@
+"""What is said of a scale estimate: what refuses it or makes it doubtful, what was undone, what else to know."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from colmap_inertial.core.messages import message, state
+
+_RECORD_INSTEAD = (
+    "move the camera itself back and forth by 20 cm or more, in several directions and briskly, for 10 s or longer, "
+    "while it sees texture; panning, walking straight at one speed and a tripod cannot give a scale"
+)
+_SWING = "swing the camera back and forth by 20 cm or more, for 10 s or longer, while it sees texture"
+_TURN = "turn the camera about all of its axes while it moves"
+_LONGER = "record longer, with brisker movements of the camera itself in several directions"
+_CLOSE_LOOPS = "close loops while recording, or scale its parts apart"
+#: So many places where poses jump, and so many cameras, are said by themselves.
+_MOST_JUMPS, _MOST_CAMERAS = 5, 5
+#: Intervals wider than this are none.
+_KNOWN_AT_ALL = 10
+
+#: Every part of an interval, by its key in ``ScaleEstimate.parts``: what it is, and what removes it.
+PARTS: dict[str, tuple[str, str]] = {
+    "accel_gain": ("the accelerometer's gain", "calibrate the IMU once (calibrate-imu)"),
+    "lens": (
+        "the lens and the model's shape",
+        "film a target of known size, or two points whose distance is measured, and take the metres from them",
+    ),
+    "accel_noise": ("the accelerometer's noise", _LONGER),
+    "lost_readings": ("readings that are missing", "record without pauses, and within the ranges of the sensors"),
+    "accel_bias": ("the accelerometer's bias", _TURN),
+    "camera_path": (
+        "the camera's path",
+        f"{_LONGER}; sharper frames, more texture and more frames a second make the path better",
+    ),
+    "gyro": ("the gyroscope", _TURN),
+    "camera_imu": (
+        "how camera and IMU stand to each other",
+        "calibrate camera and IMU once (align), or give what is known of them",
+    ),
+    "clocks": (
+        "whether camera or IMU measures time rightly",
+        "give frames and IMU times of one clock, not of a nominal frame rate",
+    ),
+    "gravity": ("the strength of gravity", "give the latitude"),
+    "accel_faults": ("what was undone of the accelerometer's faults", "record what is undone here rightly"),
+    "model_shape": ("what was undone of the model's wrong shape", "close loops, and film what overlaps more"),
+    "rolling_shutter": (
+        "a rolling shutter that the model ignores",
+        "declare readout_s before mapping, or refine it (--refine inertial)",
+    ),
+    "noise_levels": ("how little the clip says of its own noise", "record longer"),
+}
+
+
+def _number(value: float | None) -> float:
+    """A number that may be infinite, which JSON does not know."""
+    return math.inf if value is None else value
+
+
+def _advise_on_part(parts: Sequence[str], half_widths: Sequence[float]) -> str:
+    return PARTS[parts[0]][1]
+
+
+@message(advice=_advise_on_part, example={"parts": ("lens", "accel_gain"), "half_widths": (0.004, 0.002)})
+def scale_parts(parts: Sequence[str], half_widths: Sequence[float]) -> str:
+    said = [f"{PARTS[part][0]} +-{100 * width:.2g} %" for part, width in zip(parts, half_widths, strict=True)]
+    return f"{', '.join(said)}; they combine as root sum of squares"
+
+
+@message(example={"half_width": 0.42})
+def scale_unknown(half_width: float | None) -> str:
+    is_known = half_width is not None and half_width < _KNOWN_AT_ALL
+    known = f"known to no better than +-{100 * (half_width or 0):.0f} %" if is_known else "not known at all"
+    return (
+        f"the scale is {known}: record a clip in which the camera itself speeds up and slows down "
+        "(swing it back and forth by 20 cm or more, for 10 s or longer) while it sees texture"
+    )
+
+
+@message(example={"half_width": 0.05})
+def scale_interval_wide(half_width: float) -> str:
+    return f"the 95 % interval is +-{100 * half_width:.1f} %: more or livelier motion would narrow it"
+
+
+@message(example={"rate": 0.002})
+def clocks_run_apart(rate: float) -> str:
+    return (
+        f"the clocks of camera and IMU run {100 * rate:.2g} % apart; if it is the camera's that is wrong, "
+        f"lengths are {200 * rate:.2g} % off: check first that frame times are those of the recorder, not "
+        "counted at a nominal frame rate, then the stamps of the IMU"
+    )
+
+
+# What the data cannot give.
+
+
+@message(example={"quantity": "camera rotation", "why": "cameras contradict the gyroscope"})
+def not_observable(quantity: str, why: Any) -> str:
+    return f"{quantity}: {why.with_advice if hasattr(why, 'with_advice') else why}"
+
+
+state(
+    "scale-without-accelerometer", "the recording has no accelerometer, without which metres are unknown; record it too"
+)
+state("scale-not-estimated", "not looked at")
+state("fit-singular", f"camera and IMU do not determine a scale together: {_RECORD_INSTEAD}")
+state("motion-not-determined", "camera and IMU do not determine its motion")
+state("camera-still", "the camera does not move in the model: move it, do not only turn it")
+state("recording-too-short", "the recording is too short: record at least five seconds")
+state("camera-still-in-spectra", f"the camera does not move: {_SWING}")
+state("motion-not-felt", f"the accelerometer does not feel the camera's motion, or it is too weak: {_SWING}")
+state("frames-too-few", "fewer than six frames were taken while the accelerometer recorded")
+
+
+@message(example={"sensor": "accelerometer"})
+def sensor_saturated(sensor: str) -> str:
+    return (
+        f"nearly all of the {sensor}'s readings stand at the end of its range: move less violently, or give "
+        "the sensor a wider range"
+    )
+
+
+@message(example={"count": 3, "needed": 8})
+def poses_too_few(count: int, needed: int) -> str:
+    return (
+        f"only {count} camera poses, an eighth of a second or more apart, lie inside the IMU recording and at least "
+        f"{needed} are needed: record a longer clip, or check that both recordings belong together"
+    )
+
+
+@message(example={"step_s": 0.5})
+def frames_too_sparse_to_differentiate(step_s: float) -> str:
+    return f"frames {step_s:.2g} s apart are too sparse to differentiate positions: use the joint method"
+
+
+@message(example={"needed_s": 5.0})
+def never_covered(needed_s: float) -> str:
+    needed = f"no stretch of {needed_s:g} s is covered by camera and accelerometer without a pause"
+    return f"{needed}: record longer"
+
+
+@message(example={"faults": ("the accelerometer was low-passed at about 5 Hz",)})
+def path_with_faults(faults: Sequence[Any]) -> str:
+    return f"what is wrong counts from end to end of a gap: {'; '.join(map(str, faults))}"
+
+
+@message(example={"accel_m_s2": 0.98, "likely": "g"})
+def accel_implausible(accel_m_s2: float, likely: str) -> str:
+    hint = {
+        "without gravity": "gravity was removed: record the raw accelerometer",
+        "g": "it is in g: multiply it by 9.80665",
+        "counts": "it is in mg or raw counts: convert it to m/s2",
+    }[likely]
+    return f"the accelerometer's median length is {accel_m_s2:.3g} m/s2 instead of about 9.8; {hint}"
+
+
+@message(example={"rate_rad_s": 45.0})
+def gyro_in_degrees(rate_rad_s: float) -> str:
+    return f"the gyroscope's median rate is {rate_rad_s:.3g} rad/s; it is in deg/s: multiply it by pi / 180"
+
+
+@message(example={"poses_s": 60000.0, "imu_s": 60.0, "factor": 1000.0})
+def poses_not_in_seconds(poses_s: float, imu_s: float, factor: float) -> str:
+    return (
+        f"the poses span {poses_s:.4g} s and the IMU {imu_s:.4g} s: the poses' times are in ms, us or ns where seconds "
+        f"are read; divide them by {factor:g}"
+    )
+
+
+# What makes a fit worthless or doubtful.
+
+state(
+    "fit-not-converged",
+    "the fit of camera and IMU does not converge: check that stamps are those of the samples, to a "
+    f"millisecond, or {_RECORD_INSTEAD}",
+)
+
+
+@message(example={"bias_m_s2": 3.5})
+def accel_bias_impossible(bias_m_s2: float) -> str:
+    return (
+        f"the accelerometer would have to be off by {bias_m_s2:.1f} m/s2, more than any working sensor is: check its "
+        "unit (m/s2), its sign (at rest it reads +9.8 away from the ground) and its axes"
+    )
+
+
+@message(example={"gain": 0.4})
+def accel_gain_impossible(gain: float) -> str:
+    return (
+        f"the accelerometer's gains or axes would have to be off by {100 * gain:.0f} %, more than those of any "
+        "working sensor are: check its unit (m/s2), its sign (at rest it reads +9.8 away from the ground) and its "
+        "axes"
+    )
+
+
+@message(example={"unexplained_m_s2": 1.2, "motion_m_s2": 1.5})
+def accel_contradicts_motion(unexplained_m_s2: float, motion_m_s2: float) -> str:
+    return (
+        f"the accelerometer and the camera's motion disagree by {unexplained_m_s2:.2f} m/s2, where the motion itself "
+        f"is {motion_m_s2:.2f} m/s2: check the accelerometer's sign and axes and that both recordings belong "
+        f"together, or {_RECORD_INSTEAD}"
+    )
+
+
+@message(example={"span_s": 4.2, "needed_s": 6.0})
+def clip_short(span_s: float, needed_s: float) -> str:
+    return f"the clip is short ({span_s:.1f} s): it says little about its own noise; record {needed_s:.0f} s or more"
+
+
+@message(example={"gains": (0.02, 0.03, -0.02)})
+def accel_gain_large(gains: Sequence[float]) -> str:
+    said = ", ".join(f"{100 * gain:+.1f}" for gain in gains)
+    return (
+        f"the accelerometer seems to be off in gain by {said} % on its axes, more than such sensors are, which "
+        "is allowed for: check its unit and the strength of gravity, or calibrate it (calibrate-imu)"
+    )
+
+
+@message(example={"gain": 0.02, "excess": 0.015})
+def accel_gain_doubtful(gain: float, excess: float) -> str:
+    return (
+        f"the accelerometer's gain may be off by {100 * gain:+.1f} %, which lengths follow (gravity "
+        f"reads {100 * excess:+.1f} % too long, by gain or bias): check its unit, turn the camera about "
+        "all axes while it moves, or calibrate it (calibrate-imu)"
+    )
+
+
+@message(example={"sensor": "gyroscope", "share": 0.02})
+def readings_cut_off(sensor: str, share: float) -> str:
+    return (
+        f"{100 * share:.2g} % of the {sensor}'s readings stand at the end of its range; they count as missing: "
+        "move less violently, or give the sensor a wider range"
+    )
+
+
+@message(example={"bias_m_s2": 2.1})
+def spectral_bias_large(bias_m_s2: float) -> str:
+    return f"the accelerometer would have a bias of {bias_m_s2:.1f} m/s2: check its axes, sign and unit"
+
+
+state("half-without-scale", "half of the recording alone gives no scale")
+
+
+@message(example={"difference": 0.05})
+def halves_differ(difference: float) -> str:
+    return f"the second half of the recording gives a scale {100 * difference:+.1f} % from the first"
+
+
+# What is wrong with the accelerometer's readings.
+
+
+@message(example={"cutoff_hz": 5.0})
+def accel_low_passed(cutoff_hz: float) -> str:
+    return (
+        f"the accelerometer was low-passed at about {cutoff_hz:.2g} Hz; that is undone as far as it can be: record it "
+        "unfiltered (raw)"
+    )
+
+
+@message(example={"cutoff_hz": 5.0})
+def path_smoothed(cutoff_hz: float) -> str:
+    return (
+        "the camera's path is smoother than what the accelerometer felt, as if low-passed at about "
+        f"{cutoff_hz:.2g} Hz: give poses that were not smoothed, and all readings of the accelerometer (under "
+        "vibration, readings that were held or left out look the same)"
+    )
+
+
+@message(example={"delays_s": (0.002, -0.001, -0.001)})
+def accel_axes_apart(delays_s: Sequence[float]) -> str:
+    delays = ", ".join(f"{axis} {1e3 * d:+.1f}" for axis, d in zip("xyz", delays_s, strict=True))
+    return (
+        f"the accelerometer's axes are not read at the same time ({delays} ms against their mean); that is "
+        "undone: give the stamps of each axis, or a recording that was not resampled axis by axis"
+    )
+
+
+@message(example={"rate": 2e-4})
+def accel_clock_apart(rate: float) -> str:
+    return (
+        f"the accelerometer's stamps run {1e6 * rate:+.0f} ppm off the gyroscope's; "
+        "that is undone: give both sensors the stamps of one clock"
+    )
+
+
+# What is wrong with the model's shape.
+
+
+@message(example={"stretch": 0.02, "axis": (1.0, 0.0, 0.0)})
+def model_stretched(stretch: float, axis: Sequence[float]) -> str:
+    x, y, z = axis
+    return (
+        f"the reconstruction is {100 * stretch:.1f} % longer along ({x:.2f}, "
+        f"{y:.2f}, {z:.2f}) than across; lengths are right on average: check the focal "
+        "length and the lens, and film from more sides"
+    )
+
+
+@message(example={"growth": 0.03, "sigma": 0.004})
+def scale_grows(growth: float, sigma: float) -> str:
+    return (
+        f"the reconstruction's scale is not the same throughout: lengths are {100 * growth:+.1f} +- {196 * sigma:.1f} "
+        f"% larger at the end than at the beginning: {_CLOSE_LOOPS}"
+    )
+
+
+@message(example={"growth": 0.03, "sigma": 0.004, "since_s": 12.0, "first": True})
+def scale_breaks(growth: float, sigma: float, since_s: float, first: bool) -> str:
+    return (
+        f"the reconstruction's scale is not the same throughout: lengths are {100 * growth:+.1f} +- "
+        f"{196 * sigma:.1f} % larger {'before' if first else 'after'} {since_s:.0f} s than in the longer part, whose "
+        f"scale is used: {_CLOSE_LOOPS}"
+    )
+
+
+@message(example={"lowest": -0.02, "highest": 0.03, "part_s": 10.0})
+def scale_varies(lowest: float, highest: float, part_s: float) -> str:
+    return (
+        f"the reconstruction's scale is not the same throughout: from {100 * lowest:+.1f} to {100 * highest:+.1f} % in "
+        f"parts of {part_s:.0f} s (see drift in the JSON); it drifts, or a part of it "
+        f"is wrong: {_CLOSE_LOOPS}"
+    )
+
+
+# What else one should know.
+
+
+@message(example={"since_s": (1.5, 7.2)})
+def poses_jump(since_s: Sequence[float]) -> str:
+    places = "one place" if len(since_s) == 1 else f"{len(since_s)} places"
+    since = ", ".join(f"{at_s:.1f}" for at_s in since_s[:_MOST_JUMPS])
+    more = " s, ..." if len(since_s) > _MOST_JUMPS else " s"
+    return f"poses jump at {places} ({since}{more}), which hardly counts"
+
+
+@message(example={"offset_s": 120.5})
+def clocks_without_common_time(offset_s: float) -> str:
+    return f"the stamps of camera and IMU have no time in common; the rotations give an offset of {offset_s:.2f} s"
+
+
+@message(example={"sensor": "gyroscope", "count": 3, "total_s": 0.5, "longest_s": 0.2})
+def sensor_pauses(sensor: str, count: int, total_s: float, longest_s: float) -> str:
+    times = "once" if count == 1 else f"{count} times"
+    longest = "" if count == 1 else f", {longest_s:.2f} s at the longest"
+    return f"the {sensor} pauses {times}, for {total_s:.2f} s in all{longest}"
+
+
+@message(example={"covered": 280, "frames": 300})
+def frames_without_imu(covered: int, frames: int) -> str:
+    return f"the IMU runs along with {covered} of {frames} frames only; the scale rests on those"
+
+
+@message(example={"calibrated_c": 20.0, "recorded_c": 41.0, "gain_change": 0.004})
+def imu_warmer(calibrated_c: float, recorded_c: float, gain_change: float) -> str:
+    return (
+        f"the IMU was calibrated at {calibrated_c:.0f} °C and was {recorded_c:.0f} °C warm here: its gains may have "
+        f"changed by {100 * gain_change:.1f} %, which the interval counts; calibrate it as warm as you film"
+    )
+
+
+@message(example={"sensor": "gyroscope", "scatter_s": 0.002})
+def stamps_scatter(sensor: str, scatter_s: float) -> str:
+    return (
+        f"the {sensor}'s stamps scatter by {1e3 * scatter_s:.1f} ms about an even rate: give the stamps of the "
+        "samples, not of when they arrived"
+    )
+
+
+@message(example={"sensor": "accelerometer", "share": 0.5})
+def readings_repeat(sensor: str, share: float) -> str:
+    return (
+        f"{100 * share:.0f} % of the {sensor}'s readings repeat the one before: they were held, or read more "
+        "often than the sensor samples; record at the sensor's own rate"
+    )
+
+
+# What cameras are, against the gyroscope.
+
+
+def _name_some(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _MOST_CAMERAS} more" if len(names) > _MOST_CAMERAS else ""
+    return f"{', '.join(names[:_MOST_CAMERAS])}{more}"
+
+
+@message(example={"names": ("0007.jpg", "0031.jpg"), "deviations_deg": (12.0, 31.0), "cameras": 60})
+def cameras_left_out(names: Sequence[str], deviations_deg: Sequence[float], cameras: int) -> str:
+    named = [f"{name} ({deg:.0f} deg)" for name, deg in zip(names, deviations_deg, strict=True)]
+    return f"{len(names)} of {cameras} cameras contradict the gyroscope and were left out: {_name_some(named)}"
+
+
+@message(example={"names": ("0007.jpg",), "cameras": 60})
+def cameras_misplaced(names: Sequence[str], cameras: int) -> str:
+    return (
+        f"{len(names)} of {cameras} cameras are in another place than the accelerometer says and were left "
+        f"out: {_name_some(names)}"
+    )
+
+
+@message(example={"before": "0030.jpg", "after": "0031.jpg", "turn_deg": 25.0})
+def model_torn(before: str, after: str, turn_deg: float) -> str:
+    return (
+        f"the model is torn between {before} and {after}: its parts are turned by {turn_deg:.0f} deg against each other"
+    )
+
+
+@message(example={"joined": 20, "kept": 40, "cameras": 60})
+def torn_parts_joined(joined: int, kept: int, cameras: int) -> str:
+    return f"the IMU joined {joined} cameras of other parts to the largest, {kept} of {cameras}"
+
+
+@message(example={"kept": 40, "cameras": 60})
+def largest_part_kept(kept: int, cameras: int) -> str:
+    return f"the scale rests on the largest part, {kept} of {cameras} cameras; the other parts were left out"
+
+
+state("other-parts-left-out", "the other parts were left out")
+
+
+@message(example={"names": ("0007.jpg",)})
+def cameras_registered_again(names: Sequence[str]) -> str:
+    return f"registered again, and right now: {', '.join(names)}"
+
+
+state("rigs-not-registered-again", "images of several cameras are not registered again")
+
+
+@message(example={"facts": ("a model is torn", "the other parts were left out")})
+def cameras_judged(facts: Sequence[Any]) -> str:
+    return "; ".join(map(str, facts))
+
+
+# What a refinement, a rolling shutter and joined models make of a scale.
+
+
+@message(example={"gains": (0.02, 0.03, -0.02)})
+def refinement_gain_large(gains: Sequence[float]) -> str:
+    said = ", ".join(f"{100 * gain:+.1f}" for gain in gains)
+    return f"the refinement finds the accelerometer off in gain by {said} % on its axes: calibrate it"
+
+
+@message(example={"difference": 0.05, "half_width": 0.02})
+def refined_scale_differs(difference: float, half_width: float) -> str:
+    return (
+        f"the refinement's scale is {100 * difference:+.1f} % from the first one, which said "
+        f"+-{100 * half_width:.1f} %: the reconstruction bends or drifts, or the accelerometer's "
+        "gain is off; a target, or a distance that is known, tells which is right"
+    )
+
+
+@message(example={"readout_s": 0.02, "sigma_s": 0.001, "direction": "down"})
+def rolling_shutter_ignored(readout_s: float, sigma_s: float, direction: str) -> str:
+    return (
+        f"the images were exposed line by line within {1e3 * readout_s:.1f} +- {1e3 * sigma_s:.1f} ms "
+        f"({direction}), which the model ignores: declare readout_s and readout_direction before mapping, or "
+        "refine it (--refine inertial)"
+    )
+
+
+@message(example={"readout_s": 0.03, "half_width": 0.4})
+def rolling_shutter_possible(readout_s: float, half_width: float | None) -> str:
+    return (
+        f"a rolling shutter of up to {1e3 * readout_s:.0f} ms, which the points of the "
+        f"model do not rule out, leaves the scale open by {100 * _number(half_width):.0f} %: declare readout_s, "
+        "0 for a global shutter"
+    )
+
+
+state(
+    "rolling-shutter-unknown",
+    "too little is seen to tell whether the images have a rolling shutter that the model ignores: declare readout_s, 0 "
+    "for a global shutter",
+)
+
+
+@message(example={"colmap_index": 2, "images": 30, "why": ("its scale is known to +-12.0 % only",)})
+def joined_part_weak(colmap_index: int, images: int, why: Sequence[Any]) -> str:
+    return f"its part of {images} images, COLMAP's model {colmap_index}: {'; '.join(map(str, why))}"
+
+
+@message(example={"half_width": 0.12})
+def part_scale_wide(half_width: float | None) -> str:
+    return f"its scale is known to +-{100 * _number(half_width):.1f} % only"
+
+
+@message(example={"images": 12, "frames": 60})
+def images_without_time(images: int, frames: int) -> str:
+    return f"{images} of the model's {frames} images have no frame time and were left out"
+
+
+@message(example={"timed": 1, "frames": 60, "example": "a.jpg", "named": "0001.jpg"})
+def names_disagree(timed: int, frames: int, example: str, named: str) -> str:
+    return (
+        f"{timed} of the model's {frames} images have a frame time; "
+        f"names must agree (the model has {example!r}, the frame times {named!r})"
+    )
+
+
+state("fragment", "a fragment of few images")
+
+# Static calibration of an IMU.
+
+_LAY_STILL = (
+    "lay the device still on its six sides, then leaning on six of its edges, five seconds each, on something solid, "
+    "and turn it over in between"
+)
+
+
+def _list_axes(axes: Sequence[str]) -> str:
+    return axes[0] if len(axes) == 1 else ", ".join(axes[:-1]) + " and " + axes[-1]
+
+
+state("rests-without-accelerometer", "the recording has no accelerometer; record it, too")
+
+
+@message(example={"attitudes": 4, "needed": 6})
+def attitudes_too_few(attitudes: int, needed: int) -> str:
+    rested = (
+        "no rest was found" if attitudes == 0 else f"it lay still in {attitudes} attitude{'s' * (attitudes > 1)} only"
+    )
+    return f"{rested}, and at least {needed} are needed (twelve are good): {_LAY_STILL}"
+
+
+@message(example={"axes": ("x", "z")})
+def attitudes_alike(axes: Sequence[str]) -> str:
+    return (
+        f"the attitudes are too much alike: the accelerometer's gain along {_list_axes(axes)} stays unknown. Each "
+        f"axis must point up once and down once: {_LAY_STILL}"
+    )
+
+
+@message(example={"attitudes": 7, "misalignment": 0.01, "needed": 9})
+def misalignments_unknown(attitudes: int, misalignment: float, needed: int) -> str:
+    return (
+        f"{attitudes} attitudes determine gains and biases of the accelerometer, not its misalignments, which stay "
+        f"unknown to {100 * misalignment:.1f} %; from {needed} on, they are determined, too"
+    )
+
+
+state("misalignment-unknown", f"the attitudes leave a misalignment of the accelerometer unknown: {_LAY_STILL}")
+
+
+@message(example={"axis": "x", "sigma": 0.004})
+def accel_gain_unsure(axis: str, sigma: float) -> str:
+    return f"the accelerometer's gain along {axis} is known to +-{196 * sigma:.2g} % only: {_LAY_STILL}"
+
+
+state(
+    "gyro-contradicts-rests",
+    "the gyroscope does not turn as the accelerometer says, whatever its gains: its axes or its unit differ "
+    "(colmap-inertial diagnose tells), and it was left as it is",
+)
+
+
+@message(example={"axes": ("y",)})
+def gyro_gain_unsure(axes: Sequence[str]) -> str:
+    return (
+        f"the turns between the rests say little of the gyroscope's gain about {_list_axes(axes)}: it keeps what is "
+        "assumed of any gyroscope; turn the device about that axis, lying on its side, from one rest to the next"
+    )
+
+
+@message(example={"of": "turns", "times": 5.0})
+def rests_disagree(of: str, times: float) -> str:
+    return (
+        f"{of} agree {times:.0f} times less well than the sensor's noise allows: "
+        "something moved or gave way, or the sensor clips or warms up; the intervals count it"
+    )
+
+
+@message(example={"drift_m_s2": 0.02})
+def accel_bias_drifted(drift_m_s2: float) -> str:
+    return (
+        f"the accelerometer's bias drifted by {drift_m_s2:.2g} m/s2 during the "
+        "recording, as that of a device that warms up: let it warm up for some minutes, then record again"
+    )
+
+
+@message(example={"sigma": 0.001})
+def gravity_assumed(sigma: float) -> str:
+    return (
+        f"the strength of gravity is assumed, which alone makes the gains uncertain by +-{196 * sigma:.1g} %: give the "
+        "latitude (and the height) of the place"
+    )
