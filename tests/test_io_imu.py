@@ -192,7 +192,7 @@ def test_repeated_rows_are_merged_and_listed(clean: tuple[Path, list[str]]) -> N
     path, lines = clean
     imu = read_imu(write_csv(path, lines[:50] + lines[49:52] + lines[50:]))
     np.testing.assert_array_equal(imu.gyro_rad_s, handheld()[1])
-    assert {repair.code for repair in imu.repairs} == {"rows-merged"}
+    assert "rows-merged" in {repair.code for repair in imu.repairs}
 
 
 def test_rows_of_one_stamp_become_their_average(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from study_mistakes import DESK, stamps, toml, values, write_poses
 from colmap_inertial import ReconstructOptions, reconstruct
 from colmap_inertial.checks.diagnose import Diagnosis, Recorded, diagnose
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ScaleOptions
 from colmap_inertial.core.types import CameraTrajectory, FrameTiming, ImuRecording
 from colmap_inertial.reconstruction.drivers.diagnosis import collect, diagnose_source
@@ -76,7 +77,8 @@ def test_scale_is_refused_for_every_error_that_diagnose_finds_in_the_same_poses(
         assert estimate.verdict != "refused"
     else:
         assert code in {finding.code for finding in stopping}
-        assert tuple(estimate.reasons) == tuple(finding.sentence for finding in stopping)
+        assert estimate.reasons == tuple(Fact("found-beforehand", finding=finding.fact) for finding in stopping)
+        assert [str(reason) for reason in estimate.reasons] == [finding.sentence for finding in stopping]
 
 
 def test_an_image_that_cannot_be_read_is_bad_input_and_forcing_does_not_go_on(scene, tmp_path):
