@@ -149,9 +149,10 @@ def test_lengths_are_summed_up_and_what_they_prove_is_said():
     assert (found.count, found.directions, found.longest_m) == (2, 2, 0.5)
     assert found.rms_m == pytest.approx(np.sqrt((1e-6 + 4e-6) / 2)) and found.largest_m == pytest.approx(-0.002)
     assert found.longest_share == pytest.approx(0.01)
-    assert "1 % of the model's diagonal of 50 m" in found.proves and "nothing of a bend" in found.proves
+    assert "1 % of the model's diagonal of 50 m" in str(found.proves)
+    assert found.proves.values["shows_elsewhere"] == "nothing"
     whole = lengths_of([*board, [(0, 0, 0), (0, 0, 0.6)]], 0.8)
-    assert whole.directions == 3 and "over 75 % of the model's diagonal" in whole.proves
+    assert whole.directions == 3 and "over 75 % of the model's diagonal" in str(whole.proves)
     assert check_lengths([], [], 1.0, 1.0) is None
     assert model_diagonal(np.zeros((1, 3))) is None
 

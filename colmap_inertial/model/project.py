@@ -310,13 +310,12 @@ class _Work:
             for folder in reversed(self.folders):
                 shutil.copymode(self._project / folder, partial / folder)
             if self._foreign:
-                counts = tuple((count, suffix) for suffix, count in sorted(self._foreign.items()))
-                self._notes.append(Fact("formats-not-transformed", counts=counts))
+                self._notes.append(Fact("formats-not-transformed", counts=sorted(self._foreign.items())))
             submodels = plan.layout.submodels
             for index, scale in plan.by_model.items():
                 if scale.left_out and scale.similarity is not None:
-                    folder = str(submodels[index])
-                    self._notes.append(Fact("contradicting-images-left-out", folder=folder, names=scale.left_out))
+                    where, names = str(submodels[index]), scale.left_out
+                    self._notes.append(Fact("contradicting-images-left-out", folder=where, names=names))
             applied = Applied(
                 out=self._out,
                 models={i: (str(submodels[i]), s) for i, s in plan.by_model.items() if i not in plan.left_out},

@@ -51,9 +51,9 @@ def model_left_out(folder: str) -> str:
     return f"{folder} and what was made from it is left out: its scale is refused"
 
 
-@message(example={"counts": ((2, ".splat"), (1, ".e57"))})
-def formats_not_transformed(counts: tuple[tuple[int, str], ...]) -> str:
-    counted = ", ".join(f"{count} {suffix}" for count, suffix in counts)
+@message(example={"counts": ((".e57", 1), (".splat", 2))})
+def formats_not_transformed(counts: tuple[tuple[str, int], ...]) -> str:
+    counted = ", ".join(f"{count} {suffix}" for suffix, count in counts)
     return f"copied in their old units, as their formats are not transformed: {counted}"
 
 
