@@ -224,10 +224,7 @@ def test_a_database_that_is_gone_is_said(returned, stage, tmp_path, caplog):
     _, models, _ = returned
     (whole,), (gap,) = replace(stage, database=tmp_path / "none.db").join_models(models)
     _, (asked,) = replace(stage, database=None).join_models(models)
-    assert (
-        whole.parts
-        and gap.reason == Fact("gap-without-database", reason=asked.reason)
-    )
+    assert whole.parts and gap.reason == Fact("gap-without-database", reason=asked.reason)
     assert "none.db is gone" in caplog.text
     assert not (tmp_path / "none.db").exists()
 
