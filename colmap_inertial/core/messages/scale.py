@@ -514,6 +514,12 @@ def names_disagree(timed: int, frames: int, example: str, named: str) -> str:
 state("already-in-metres", "this model is metric already: a scale of 1 says that it is right")
 state("fragment", "a fragment of few images")
 
+
+@message(example={"images": 4})
+def fragment_too_small(images: int) -> str:
+    return f"a fragment of {images} images: too small to be made metric (--fragments does it all the same)"
+
+
 # Static calibration of an IMU.
 
 _LAY_STILL = (

@@ -16,6 +16,7 @@ from colmap_inertial.checks.validate import parse_target
 from colmap_inertial.colmap.tsdf import require_mesh_maker
 from colmap_inertial.core.choices import check_kind
 from colmap_inertial.core.errors import FormatError, InertialError, TimingError
+from colmap_inertial.core.facts import Fact, as_fact
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.core.types import (
     CameraImuCalibration,
@@ -466,15 +467,16 @@ def _video_times(
 
 def _noted(result: ModelResult, notes: Sequence[str]) -> ModelResult:
     scale = result.scale
-    return dataclasses.replace(result, scale=dataclasses.replace(scale, notes=(*scale.notes, *notes)))
+    return dataclasses.replace(result, scale=dataclasses.replace(scale, notes=(*scale.notes, *map(as_fact, notes))))
 
 
 def _scales(results: Sequence[ModelResult], fragments: Sequence[Fragment]) -> dict[int | None, ModelScale]:
     """Similarity of each sub-model of the project, by COLMAP's number."""
-    small = "a fragment of {} images: too small to be made metric (--fragments does it all the same)"
     scales: dict[int | None, ModelScale] = {
         fragment.colmap_index: ModelScale(
-            similarity=None, verdict="refused", reasons=(small.format(fragment.registered_images),)
+            similarity=None,
+            verdict="refused",
+            reasons=(Fact("fragment-too-small", images=fragment.registered_images),),
         )
         for fragment in fragments
     }

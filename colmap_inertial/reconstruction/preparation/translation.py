@@ -16,6 +16,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import sentences
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.options import ScaleOptions
 from colmap_inertial.core.threads import one_blas_thread
@@ -151,7 +152,7 @@ def _measure_parallax(model: pycolmap.Reconstruction, view: GyroView) -> Iterato
     imu = view.timed().imu
     estimate = estimate_scale(trajectory, imu, calibration=calibration, options=ScaleOptions())
     if estimate.metres_per_unit is None or estimate.gravity_in_world_m_s2 is None:
-        log.info("no blur by translation: %s", "; ".join(estimate.reasons))
+        log.info("no blur by translation: %s", "; ".join(sentences(estimate.reasons)))
         return
     if estimate.rotations is not None:
         trajectory = trajectory.select(estimate.rotations.kept)
