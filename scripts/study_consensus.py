@@ -29,6 +29,7 @@ from real_imu import Window, windows
 from study_scale_real import read_window
 
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.facts import sentences
 from colmap_inertial.core.geometry import quat_exp, quat_multiply, quat_rotate
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.threads import one_blas_thread
@@ -165,7 +166,7 @@ def run(task: Task) -> Outcome:
         else tuple(place[name] for name in (*(one.name for one in check.wrong), *check.moved)),
         seams=(*seams, -1, *(() if check is None else (place[one.name] for one in check.seams))),
         seconds=seconds,
-        reasons=estimate.reasons,
+        reasons=sentences(estimate.reasons),
     )
 
 

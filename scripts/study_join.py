@@ -140,7 +140,7 @@ def judged(
     joined = join_submodels(fitted, imu, limits, found)
     out: list[dict[str, Any]] = []
     for gap in joined.gaps:
-        one: dict[str, Any] = {"joined": gap.joined, "reason": gap.reason}
+        one: dict[str, Any] = {"joined": gap.joined, "reason": str(gap.reason)}
         one |= {"sigma_m": gap.sigma_m, "sigma_deg": gap.sigma_deg, "chi2": gap.chi2, "dof": gap.dof}
         out.append(one)
         for group in joined.groups:

@@ -30,6 +30,7 @@ from real_imu import HANDHELD, RECORDINGS, Window, recorded, windows
 from scipy.stats import norm
 
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.facts import sentences
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import CameraTrajectory, ImuRecording
@@ -137,7 +138,7 @@ def run(task: tuple[Path, Altered]) -> Outcome:
         verdict=estimate.verdict,
         error=None if given is None else float(np.log(given / truth)),
         sigma=estimate.sigma_log,
-        said=(*estimate.reasons, *estimate.notes),
+        said=sentences((*estimate.reasons, *estimate.notes)),
     )
 
 

@@ -39,6 +39,7 @@ import pycolmap
 from check_euroc import similarity
 
 from colmap_inertial.colmap.mapping import map_images
+from colmap_inertial.core.facts import sentences
 from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, quat_multiply, so3_log
 from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.core.types import CAL, CameraImuCalibration, ImuRecording
@@ -248,7 +249,7 @@ def studied(
     begin_s = time.process_time()
     model = ReadoutStage(imu=imu, calibration=prior, refine_intrinsics=True, num_threads=1)(model)
     model = MetricStage(imu=imu, calibration=prior)(model)
-    out["scale"] = {"verdict": model.scale.verdict, "reasons": list(model.scale.reasons)}
+    out["scale"] = {"verdict": model.scale.verdict, "reasons": list(sentences(model.scale.reasons))}
     noise = model.scale.noise
     out["scale"]["accel_noise"] = 0.0 if noise is None else noise.accel_density_m_s2_rthz
     out["before"] = compared(centres_of(model.reconstruction), truth)
@@ -262,11 +263,11 @@ def studied(
     out["declined"] = auto and not said.action and "sigma_px" not in said.values
     if out["declined"]:
         # what it would have done, to judge the choice
-        out["why"], seconds["choice"], begin_s = said.reason, seconds["refine"], time.process_time()
+        out["why"], seconds["choice"], begin_s = str(said.reason), seconds["refine"], time.process_time()
         model = stage(metric)
         seconds["refine"] = time.process_time() - begin_s
         said = model.treatments[-1]
-    out |= {"after": compared(centres_of(model.reconstruction), truth), "said": said.reason, "values": said.values}
+    out |= {"after": compared(centres_of(model.reconstruction), truth), "said": str(said.reason), "values": said.values}
     out["accepted"], out["seconds"] = said.action == "refined", seconds
     out["gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024e-9
     if chance and out["accepted"]:

@@ -40,6 +40,7 @@ from check_euroc import check, similarity
 from real_scores import covered, scores, select_registered
 from real_world import World, film, worlds
 
+from colmap_inertial.core.facts import sentences
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import CameraTrajectory, FrameTiming
@@ -149,7 +150,7 @@ def filmed_window(asked: argparse.Namespace, world: World) -> dict[str, Any]:
     out: dict[str, Any] = {"recording": world.recording, "begin_s": world.begin_s, "seed": world.seed}
     out["recording_pct"] = 100 * filmed.recording_log
     if model.similarity is None:
-        return out | {"said": "; ".join(model.scale.reasons)}
+        return out | {"said": "; ".join(sentences(model.scale.reasons))}
     out["shutter_ms"] = [1e3 * done.values["readout_s"] for done in model.treatments if done.stage == "shutter"]
     filmed = select_registered(model, filmed)
     out["before"] = scores(model, filmed) | covered(model, filmed)
@@ -164,7 +165,7 @@ def filmed_window(asked: argparse.Namespace, world: World) -> dict[str, Any]:
     out["wall_s"], out["cpu_s"] = time.perf_counter() - begin_s, time.process_time() - processor_s
     said = refined.treatments[-1]
     out["readout"] = _readout(said.values, world.readout_s, declared=asked.declared)
-    out |= {"said": said.reason, "accepted": said.action == "refined", "values": said.values}
+    out |= {"said": str(said.reason), "accepted": said.action == "refined", "values": said.values}
     if out["accepted"]:
         out["after"] = scores(refined, filmed) | covered(refined, filmed)
         lever = np.array(said.values["imu_in_cam_m"]) - filmed.imu_in_cam_m

@@ -29,7 +29,6 @@ import argparse
 import json
 import multiprocessing
 import os
-import re
 import sys
 import time
 from collections import Counter
@@ -44,6 +43,7 @@ from rich.table import Table
 from scale_bound import BoundPriors, bound_of
 from scale_faults import FAULTS
 
+from colmap_inertial.core.facts import Fact, sentences
 from colmap_inertial.core.geometry import quat_conjugate, quat_exp, quat_multiply, quat_normalize
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import CameraTrajectory
@@ -85,7 +85,7 @@ class Run:
     vigour: float
     drift_m_rts: float
     verdict: str
-    reasons: tuple[str, ...]
+    reasons: tuple[Fact, ...]
     error: float | None
     sigma: float | None
     bound: float
@@ -263,11 +263,6 @@ def groups(runs: Sequence[Run]) -> dict[str, list[Run]]:
     return {name: members for name, members in out.items() if members}
 
 
-def wording(reason: str) -> str:
-    """A reason without its numbers, so that like ones can be counted."""
-    return re.sub(r"[+-]*\d[\d.]*", "#", reason)[:110]
-
-
 def show(runs: Sequence[Run]) -> None:
     """Tables and findings on the terminal."""
     # Not cut where the output goes to a file
@@ -302,9 +297,9 @@ def _print_observable(runs: Sequence[Run], console: Console) -> None:
     """Why runs were not trusted, and which intervals miss the truth."""
     for part in OBSERVABLE:
         odd = [r for r in runs if r.part == part and (r.verdict != "trusted" or not r.inside)]
-        counts = Counter(wording(reason) for r in odd for reason in r.reasons)
-        for reason, count in counts.most_common(8):
-            console.print(f"{part}: {count} x {reason}", markup=False)
+        counts = Counter(reason.code for r in odd for reason in r.reasons)
+        for code, count in counts.most_common(8):
+            console.print(f"{part}: {count} x {code}", markup=False)
         for r in sorted((r for r in odd if r.error is not None and not r.inside), key=lambda r: r.seed):
             z = abs(r.error or 0) / (r.sigma or 1)
             console.print(f"{part}: seed {r.seed} is {z:.1f} sigma off, {r.verdict}", markup=False)
@@ -324,7 +319,7 @@ def _print_unobservable(futile: Sequence[Run], console: Console) -> None:
         for r in of_kind:
             if r.verdict != "refused":
                 off = f"{100 * (r.error or 0):+.1f} % off, sigma {100 * (r.sigma or 0):.1f} %"
-                console.print(f"  seed {r.seed}: {r.verdict}, {off}; {' | '.join(r.reasons)}", markup=False)
+                console.print(f"  seed {r.seed}: {r.verdict}, {off}; {' | '.join(sentences(r.reasons))}", markup=False)
 
 
 def study(todo: Sequence[int], processes: int) -> list[Run]:

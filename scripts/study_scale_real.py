@@ -35,6 +35,7 @@ from capture_gains import calibration_by
 from interval_coverage import measure_coverage
 from real_imu import HANDHELD, RECORDINGS, Window, recorded, windows
 
+from colmap_inertial.core.facts import sentences
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuCalibration, ImuRecording
@@ -118,7 +119,7 @@ def run(task: tuple[Path, Window, ImuCalibration | None, CameraImuCalibration | 
         verdict=estimate.verdict,
         error=None if given is None else float(np.log(given / truth)),
         sigma=estimate.sigma_log,
-        reasons=estimate.reasons,
+        reasons=sentences(estimate.reasons),
         shift=None if given is None or not shifts else shifts[-1],
     )
 

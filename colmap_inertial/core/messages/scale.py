@@ -500,6 +500,12 @@ def names_disagree(timed: int, frames: int, example: str, named: str) -> str:
 
 state("fragment", "a fragment of few images")
 
+
+@message(example={"images": 4})
+def fragment_too_small(images: int) -> str:
+    return f"a fragment of {images} images: too small to be made metric (--fragments does it all the same)"
+
+
 # Static calibration of an IMU.
 
 _LAY_STILL = (

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, TypeAlias
 from colmap_inertial.checks.validate import Target, Validation, validate_model, write_overlays
 from colmap_inertial.colmap.dense import run_dense
 from colmap_inertial.core.errors import NotObservableError, TargetNotFoundError, TimingError
-from colmap_inertial.core.facts import Fact, sentences
+from colmap_inertial.core.facts import Fact, as_fact, sentences
 from colmap_inertial.core.options import DenseOptions
 from colmap_inertial.core.types import Gap, JoinedPart, ScaleEstimate
 from colmap_inertial.io.files import read_record, write_record
@@ -140,7 +140,7 @@ def run_models(
                 colmap_index=number,
                 timing=recording.timing,
                 rectified=rectified,
-                doubts=recording.doubts,
+                doubts=tuple(map(as_fact, recording.doubts)),
             )
             for number in kept
         )

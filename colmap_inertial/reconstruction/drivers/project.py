@@ -16,7 +16,7 @@ from colmap_inertial.checks.validate import parse_target
 from colmap_inertial.colmap.tsdf import require_mesh_maker
 from colmap_inertial.core.choices import check_kind
 from colmap_inertial.core.errors import FormatError, InertialError, TimingError
-from colmap_inertial.core.facts import Fact
+from colmap_inertial.core.facts import Fact, as_fact
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.core.types import (
     CameraImuCalibration,
@@ -467,7 +467,7 @@ def _video_times(
 
 def _noted(result: ModelResult, notes: Sequence[Fact]) -> ModelResult:
     scale = result.scale
-    return dataclasses.replace(result, scale=dataclasses.replace(scale, notes=(*scale.notes, *notes)))
+    return dataclasses.replace(result, scale=dataclasses.replace(scale, notes=(*scale.notes, *map(as_fact, notes))))
 
 
 def _scales(results: Sequence[ModelResult], fragments: Sequence[Fragment]) -> dict[int | None, ModelScale]:
