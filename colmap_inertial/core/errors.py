@@ -167,7 +167,6 @@ class NotObservableError(InertialError):
 
     def __init__(self, quantity: str, hint: Fact | str, *, sigma: float | None = None) -> None:
         self.quantity = quantity
-        self.why = as_fact(hint)
         self.hint = in_words(hint)
         self.sigma = sigma
         spread = "" if sigma is None else f" (standard deviation {100 * sigma:.1f} %)"

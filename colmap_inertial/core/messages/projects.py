@@ -41,11 +41,6 @@ def video_of_other_images(video: str, found: int, images: int, name: str, why: F
 # a project that is made metric
 
 
-@message(example={"images": 7})
-def fragment_too_small(images: int) -> str:
-    return f"a fragment of {images} images: too small to be made metric (--fragments does it all the same)"
-
-
 @message(example={"folder": "sparse/1"})
 def model_left_out(folder: str) -> str:
     return f"{folder} and what was made from it is left out: its scale is refused"

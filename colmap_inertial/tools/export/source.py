@@ -12,7 +12,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, UInt8Array
 from colmap_inertial.core.errors import FormatError, NotObservableError
-from colmap_inertial.core.facts import Fact, as_fact
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ExportImages
 from colmap_inertial.core.types import DOWN_IN_WORLD, Action, CameraMotion, CameraTrajectory
 from colmap_inertial.inertial.georeference import Georeference
@@ -393,11 +393,11 @@ class ExportContent:
 
 def _notes_on_model(source: ExportSource) -> list[Fact]:
     """Notes for the user on the model."""
-    notes: list[Fact | str] = []
+    notes: list[Fact] = []
     if source.found.scale.unit != "m":
-        notes.append(as_fact(NO_SCALE))
+        notes.append(NO_SCALE)
     if source.up_in_world is None:
-        notes.append(as_fact(NO_UP))
+        notes.append(NO_UP)
     elif float(source.up_in_world @ _Z_UP) < 0.9:
         notes.append(Fact("up-is-not-z"))
     return notes
