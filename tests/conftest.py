@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from returned_values import Recorder, differences, explain, read_kept, write_seen
 
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, SimulatedRecording, simulate_recording
@@ -20,10 +19,6 @@ QUICK = Path(__file__).with_name("quick.txt").read_text().split()
 
 #: Files that take longest, the longest first: a worker that is handed one of them last keeps the others waiting.
 SLOW = Path(__file__).with_name("slow.txt").read_text().split()
-
-
-#: By test: what functions of the package returned in it when this was written (scripts/record_values.py).
-RETURNED = read_kept()
 
 
 # What is imported and collected stays to the end: nobody needs to look through it for garbage again and again.
@@ -38,22 +33,6 @@ def pytest_collection_finish() -> None:
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--quick", action="store_true", help="only the files named in tests/quick.txt")
     parser.addoption("--no-skips", action="store_true", help="a test that would be skipped fails")
-    parser.addoption("--write-returned", type=Path, metavar="FOLDER", help="write what functions return in each test")
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_call(item: pytest.Item):
-    kept, folder = RETURNED.get(item.nodeid), item.config.getoption("--write-returned")
-    if kept is None and folder is None:
-        return (yield)
-    with Recorder(kept if folder is None else None) as recorder:
-        result = yield
-    if folder is not None:
-        write_seen(folder, item.nodeid, recorder)
-    else:
-        changed = differences(recorder.summaries(), kept)
-        assert not changed, explain(changed)
-    return result
 
 
 @pytest.hookimpl(hookwrapper=True)
