@@ -14,11 +14,13 @@ import pytest
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, SimulatedRecording, simulate_recording
 
-#: Files of the quick tier: each takes a few seconds at most.
-QUICK = Path(__file__).with_name("quick.txt").read_text().split()
+TESTS = Path(__file__).parent
+
+#: Files of the quick tier, relative to this folder: each takes a few seconds at most.
+QUICK = (TESTS / "quick.txt").read_text().split()
 
 #: Files that take longest, the longest first: a worker that is handed one of them last keeps the others waiting.
-SLOW = Path(__file__).with_name("slow.txt").read_text().split()
+SLOW = (TESTS / "slow.txt").read_text().split()
 
 
 # What is imported and collected stays to the end: nobody needs to look through it for garbage again and again.
@@ -55,7 +57,7 @@ def _fail_skipped(config: pytest.Config, report: pytest.TestReport | pytest.Coll
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     if config.getoption("--quick") and collection_path.suffix == ".py":
-        return collection_path.name not in QUICK or None
+        return _listed_name(collection_path) not in QUICK or None
     return None
 
 
@@ -63,7 +65,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if not hasattr(config, "workerinput"):
         return  # one process runs tests in the order in which they are named
     place = {name: i for i, name in enumerate(SLOW)}
-    items.sort(key=lambda item: place.get(item.path.name, len(place)))
+    items.sort(key=lambda item: place.get(_listed_name(item.path), len(place)))
+
+
+def _listed_name(path: Path) -> str:
+    """A test file as ``quick.txt`` and ``slow.txt`` name it."""
+    return path.relative_to(TESTS).as_posix() if path.is_relative_to(TESTS) else path.name
 
 
 @pytest.fixture(scope="session", autouse=True)
