@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from colmap_inertial.core.camera_clock import CameraTimedImu
+from colmap_inertial.core.types import ScaleDrift
 from colmap_inertial.inertial.core.parameters import N_GLOBALS, SCALE
 from colmap_inertial.inertial.core.priors import AccelPart
-from colmap_inertial.inertial.scale.joint import estimate_joint, scale_of
+from colmap_inertial.inertial.scale.joint import _check_drift, estimate_joint, scale_of
 from colmap_inertial.tools.simulate import RecordingOptions, simulate_recording
 
 
@@ -51,3 +52,18 @@ def test_a_camera_that_stands_in_its_model_has_no_scale(recording):
     refused = estimate_joint(still, timed)
     assert (refused.verdict, refused.metres_per_unit) == ("refused", None)
     assert refused.reasons == ("the camera does not move in the model: move it, do not only turn it",)
+
+
+def test_a_drift_names_the_least_and_the_largest_scale_and_the_length_of_its_parts():
+    parts = {
+        "begin_s": np.array([100.0, 105.0, 110.0]),
+        "end_s": np.array([105.0, 110.0, 115.0]),
+        "log_ratio": np.log([1.02, 0.99, 1.0]),
+        "sigma_log": np.full(3, 1e-3),
+        "chi2": 400.0,
+        "dof": 2,
+    }
+    trend = {"trend_log_per_s": 0.0, "trend_sigma_log_per_s": 1e-3}
+    (sentence,) = _check_drift(ScaleDrift(**parts, **trend, p_value=1e-9))
+    assert "from -1.0 to +2.0 % in parts of 5 s" in sentence
+    assert _check_drift(ScaleDrift(**parts, **trend, p_value=0.5)) == []

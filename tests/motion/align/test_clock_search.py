@@ -1,14 +1,16 @@
 """Clock offsets: the rotation and rate that fit best, and the gain of each offset."""
 
 from dataclasses import replace
+from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.motion.align import _clock_search
-from colmap_inertial.motion.align._clock_search import Intervals, _best_rotation, _fit
+from colmap_inertial.motion.align._clock_search import Intervals, _best_rotation, _fit, search_offsets
 
 
 def turned_intervals(rng, noise_rad, count=240):
@@ -70,3 +72,37 @@ def test_gains_of_dense_frames_are_those_of_what_overlaps_about_its_mean():
         v, g = (x - x.mean(axis=0) for x in (visual[cells], rate[cells + shift]))
         left = max(np.sum((v - g) ** 2), 1e-3 * np.sum(v**2))
         assert gain == pytest.approx(0.5 * per_second * step_s * len(cells) * np.log(np.sum(v**2) / left), abs=1e-6)
+
+
+def test_the_offset_of_sparse_frames_is_found_whichever_recording_begins_first(subtests):
+    """Camera time is IMU time plus the offset; frames are half a second apart, attitudes are multiplied by SciPy."""
+    rng, step_s, offset_s = np.random.default_rng(15), 0.01, 7.3
+    t_s = step_s * np.arange(4001)
+    waves = rng.uniform(0.2, 1.2, (6, 3)), rng.uniform(0, 2 * np.pi, (6, 3))
+    rate = np.sum(0.3 * np.sin(2 * np.pi * waves[0] * t_s[:, None, None] + waves[1]), axis=1)
+    world_from_imu = [Rotation.identity()]
+    for mean in 0.5 * (rate[1:] + rate[:-1]):
+        world_from_imu.append(world_from_imu[-1] * Rotation.from_rotvec(step_s * mean))
+    cam_from_imu = Rotation.random(random_state=5)
+    for label, camera, gyroscope in (
+        ("camera within the gyroscope", (10.0, 30.0), (0.0, 40.0)),
+        ("gyroscope within the camera", (0.0, 40.0), (10.0, 30.0)),
+        ("camera first", (0.0, 30.0), (8.0, 40.0)),
+        ("gyroscope first", (8.0, 40.0), (0.0, 30.0)),
+    ):
+        with subtests.test(label):
+            frames = np.flatnonzero((t_s >= camera[0]) & (t_s <= camera[1]))[::50]
+            turns = [
+                cam_from_imu * world_from_imu[i].inv() * world_from_imu[j] * cam_from_imu.inv()
+                for i, j in pairwise(frames)
+            ]
+            intervals = Intervals(
+                begin_s=t_s[frames[:-1]] + offset_s,
+                end_s=t_s[frames[1:]] + offset_s,
+                turn_rad=np.stack([turn.as_rotvec() for turn in turns]),
+            )
+            felt = (t_s >= gyroscope[0]) & (t_s <= gyroscope[1])
+            path = GyroPath(t_s[felt], rate[felt], np.zeros(3))
+            best = search_offsets(intervals, path, (-100.0, 100.0), min_overlap=0.5)[0]
+            assert best.offset_s == pytest.approx(offset_s, abs=0.02) and best.explained > 0.99
+            assert (Rotation.from_quat(best.cam_from_imu_xyzw) * cam_from_imu.inv()).magnitude() < 0.02
