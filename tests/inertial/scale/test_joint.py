@@ -11,12 +11,12 @@ from colmap_inertial.core.types import ScaleDrift
 from colmap_inertial.inertial.core.parameters import N_GLOBALS, SCALE
 from colmap_inertial.inertial.core.priors import AccelPart
 from colmap_inertial.inertial.scale.joint import _check_drift, estimate_joint, scale_of
-from colmap_inertial.tools.simulate import RecordingOptions, simulate_recording
+from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, simulate_recording
 
 
 @pytest.fixture(scope="module")
 def recording():
-    return simulate_recording(RecordingOptions(), seed=3)
+    return simulate_recording(RecordingOptions(motion=MotionOptions(duration_s=15.0)), seed=3)
 
 
 def test_a_fit_that_overstates_the_accelerometer_s_noise_is_corrected_by_its_share(subtests):

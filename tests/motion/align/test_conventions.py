@@ -3,12 +3,12 @@
 import pytest
 
 from colmap_inertial.motion.align.conventions import quick_accelerations
-from colmap_inertial.tools.simulate import RecordingOptions, simulate_recording
+from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, simulate_recording
 
 
 @pytest.fixture(scope="module")
 def recording():
-    return simulate_recording(RecordingOptions(), seed=3)
+    return simulate_recording(RecordingOptions(motion=MotionOptions(duration_s=15.0)), seed=3)
 
 
 def test_steady_gravity_is_steady(recording):

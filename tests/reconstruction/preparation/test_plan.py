@@ -9,12 +9,12 @@ import pytest
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.reconstruction.preparation import plan
 from colmap_inertial.reconstruction.preparation.plan import _most_turned_rad
-from colmap_inertial.tools.simulate import RecordingOptions, simulate_recording
+from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, simulate_recording
 
 
 @pytest.fixture(scope="module")
 def recording():
-    return simulate_recording(RecordingOptions(), seed=3)
+    return simulate_recording(RecordingOptions(motion=MotionOptions(duration_s=15.0)), seed=3)
 
 
 def test_what_a_gyroscope_felt_just_before_an_uncertain_exposure_counts(recording):
