@@ -8,8 +8,8 @@
 draws faults at random, at least 12 in each room and of each kind alike: a sign, a factor in place of a divisor, a
 transpose, the order of two operands or arguments, a power, minimum for maximum, a bound of whole numbers that is one
 off, a dropped term, a unit, a condition turned round, a check that is left out. Each is made in a copy of the package.
-Tests that run its line are run until one fails: the quickest, those that run little beside its module, and those that
-compare what its functions return. Printed: each fault, and the share caught by room.
+Tests that run its line are run until one fails: the quickest, and those that run little beside its module. A fault
+counts as caught where a test fails that passes without it. Printed: each fault, and the share caught by room.
 """
 
 from __future__ import annotations
@@ -17,26 +17,30 @@ from __future__ import annotations
 import argparse
 import ast
 import concurrent.futures
+import functools
 import json
 import os
 import random
 import re
+import shutil
 import subprocess
 import sys
+import sysconfig
 import tempfile
 import threading
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from mutants import PACKAGE, ROOT, Trial
-from record_values import functions_of, read_kept
-
-#: Tests of one fault that run its line: the quickest for so long (s), as long those of little but its module, and as
-#: long those that compare what its functions return.
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = "colmap_inertial"
+#: Tests of one fault that run its line: the quickest for so long (s), and as long those that run little but its module.
 MOST_S = 15.0
+#: A fault that makes its tests run for longer than this is caught, too (s).
+LONGEST_S = 900
 LEAST_IN_A_ROOM = 12
 
 _SWAPPED = {ast.Add: "-", ast.Sub: "+", ast.Mult: "/", ast.Div: "*"}
@@ -290,16 +294,95 @@ def write_map(file: Path) -> None:
     file.write_text(json.dumps({"lines": lines, "seconds": seconds}))
 
 
+class Trial:
+    """A copy of the package in which one fault at a time is made."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        shutil.copytree(ROOT / PACKAGE, folder / PACKAGE)
+        # An editable install keeps the compiled kernels with the installed packages, and is found before any folder.
+        for kernel in Path(sysconfig.get_path("platlib"), PACKAGE).rglob("*.so"):
+            shutil.copy2(kernel, folder / PACKAGE / kernel.relative_to(Path(sysconfig.get_path("platlib"), PACKAGE)))
+        (folder / "sitecustomize.py").write_text(
+            'import sys\nsys.meta_path[:] = [f for f in sys.meta_path if "ScikitBuild" not in type(f).__name__]\n'
+        )
+        self._environment = {
+            **os.environ,
+            "PYTHONPATH": str(folder),
+            "PYTHONDONTWRITEBYTECODE": "1",
+            "OMP_NUM_THREADS": "1",
+            "OPENBLAS_NUM_THREADS": "1",
+        }
+        code = f"import {PACKAGE}; print({PACKAGE}.__file__)"
+        found = self._run([sys.executable, "-c", code]).stdout.strip()
+        if not Path(found).is_relative_to(folder):
+            raise SystemExit(f"tests would use {found} instead of the copy")
+
+    @contextmanager
+    def module(self, file: str, text: str) -> Iterator[None]:
+        """While the context lasts, a module of the copy has this text."""
+        target = self._folder / PACKAGE / file
+        target.write_text(text, encoding="utf-8")
+        try:
+            yield
+        finally:
+            shutil.copy2(ROOT / PACKAGE / file, target)
+
+    def tested(self, tests: Sequence[str]) -> tuple[str, str]:
+        """``caught`` and the test that failed first, ``survived``, or ``broken`` and what pytest said.
+
+        A test that fails without the fault as well counts for nothing (``broken``).
+        """
+        try:
+            done = self._pytest(tests)
+        except subprocess.TimeoutExpired:
+            return "caught", f"tests run for more than {LONGEST_S} s"
+        failed = re.search(r"^(?:FAILED|ERROR) \S*?(tests/.+?)(?: - .*)?$", done.stdout, re.MULTILINE)
+        if failed is not None:
+            sound = "::" not in failed[1] or self._passes(failed[1])
+            return ("caught", failed[1]) if sound else ("broken", f"{failed[1]} fails without the fault")
+        if done.returncode < 0:
+            return "caught", f"tests end by signal {-done.returncode}"
+        if "ImportError while loading conftest" in done.stderr and self._passes(tests[0]):
+            return "caught", "the package cannot be imported"
+        printed = (done.stdout + done.stderr).strip().splitlines()
+        return ("survived", "") if done.returncode == 0 else ("broken", printed[-1] if printed else "pytest failed")
+
+    @functools.cache  # noqa: B019 (a trial lives as long as the script)
+    def _passes(self, test: str) -> bool:
+        """Whether a test passes in the installed package, without any fault."""
+        return self._pytest([test], where=ROOT, environment={**os.environ}).returncode == 0
+
+    def _pytest(
+        self, tests: Sequence[str], where: Path | None = None, environment: dict[str, str] | None = None
+    ) -> subprocess.CompletedProcess[str]:
+        words = [sys.executable, "-m", "pytest", "-x", "-q", "--tb=no", "-p", "no:cacheprovider", f"--rootdir={ROOT}"]
+        return self._run([*words, *(str(ROOT / test) for test in tests)], where, environment, timeout=LONGEST_S)
+
+    def _run(
+        self,
+        words: Sequence[str],
+        where: Path | None = None,
+        environment: dict[str, str] | None = None,
+        timeout: float | None = None,
+    ) -> subprocess.CompletedProcess[str]:
+        # in the copy's folder: Python finds modules where it is started before it looks elsewhere
+        return subprocess.run(
+            words,
+            cwd=where or self._folder,
+            env=environment or self._environment,
+            capture_output=True,
+            text=True,
+            timeout=timeout,
+        )
+
+
 class Tests:
-    """Which tests run a line: the quickest, those that run little beside its module, those that keep its values."""
+    """Which tests run a line: the quickest, and those that run little beside its module."""
 
     def __init__(self, file: Path) -> None:
         known = json.loads(file.read_text())
         self._lines, self._seconds = known["lines"], known["seconds"]
-        #: Functions of which a test compares what they return with what they returned before.
-        self._kept: dict[str, set[str]] = defaultdict(set)
-        for test, functions in read_kept().items():
-            self._kept[_function(test)].update(functions)
         #: Lines of a module that a test runs, and of all modules.
         self._run: Counter[tuple[str, str]] = Counter()
         self._run_by: Counter[str] = Counter()
@@ -316,10 +399,8 @@ class Tests:
         contexts = lines.get(str(fault.line)) or sorted(set().union(*lines.values()))
         by_time = sorted({_function(context) for context in contexts}, key=self._time)
         by_share = sorted(by_time, key=lambda name: -self._run[name, fault.file] / self._run_by[name])
-        functions = {name for name, body in functions_of(fault.file) if fault.line in body}
-        by_kept = [name for name in by_time if functions & self._kept[name]]
         chosen = {by_time[0]} if by_time else set()
-        for names in (by_time, by_share, by_kept):
+        for names in (by_time, by_share):
             left_s = MOST_S
             for name in names:
                 if self._time(name) < left_s:

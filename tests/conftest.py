@@ -10,20 +10,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from returned_values import Recorder, differences, explain, read_kept, write_seen
 
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, SimulatedRecording, simulate_recording
 
-#: Files of the quick tier: each takes a few seconds at most.
-QUICK = Path(__file__).with_name("quick.txt").read_text().split()
+TESTS = Path(__file__).parent
+
+#: Files of the quick tier, relative to this folder: each takes a few seconds at most.
+QUICK = (TESTS / "quick.txt").read_text().split()
 
 #: Files that take longest, the longest first: a worker that is handed one of them last keeps the others waiting.
-SLOW = Path(__file__).with_name("slow.txt").read_text().split()
-
-
-#: By test: what functions of the package returned in it when this was written (scripts/record_values.py).
-RETURNED = read_kept()
+SLOW = (TESTS / "slow.txt").read_text().split()
 
 
 # What is imported and collected stays to the end: nobody needs to look through it for garbage again and again.
@@ -38,22 +35,6 @@ def pytest_collection_finish() -> None:
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--quick", action="store_true", help="only the files named in tests/quick.txt")
     parser.addoption("--no-skips", action="store_true", help="a test that would be skipped fails")
-    parser.addoption("--write-returned", type=Path, metavar="FOLDER", help="write what functions return in each test")
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_call(item: pytest.Item):
-    kept, folder = RETURNED.get(item.nodeid), item.config.getoption("--write-returned")
-    if kept is None and folder is None:
-        return (yield)
-    with Recorder(kept if folder is None else None) as recorder:
-        result = yield
-    if folder is not None:
-        write_seen(folder, item.nodeid, recorder)
-    else:
-        changed = differences(recorder.summaries(), kept)
-        assert not changed, explain(changed)
-    return result
 
 
 @pytest.hookimpl(hookwrapper=True)
@@ -76,7 +57,7 @@ def _fail_skipped(config: pytest.Config, report: pytest.TestReport | pytest.Coll
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     if config.getoption("--quick") and collection_path.suffix == ".py":
-        return collection_path.name not in QUICK or None
+        return _listed_name(collection_path) not in QUICK or None
     return None
 
 
@@ -84,7 +65,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if not hasattr(config, "workerinput"):
         return  # one process runs tests in the order in which they are named
     place = {name: i for i, name in enumerate(SLOW)}
-    items.sort(key=lambda item: place.get(item.path.name, len(place)))
+    items.sort(key=lambda item: place.get(_listed_name(item.path), len(place)))
+
+
+def _listed_name(path: Path) -> str:
+    """A test file as ``quick.txt`` and ``slow.txt`` name it."""
+    return path.relative_to(TESTS).as_posix() if path.is_relative_to(TESTS) else path.name
 
 
 @pytest.fixture(scope="session", autouse=True)

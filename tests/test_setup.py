@@ -33,7 +33,7 @@ def test_known():
 
 @pytest.mark.parametrize(("switch", "outcome"), [([], "1 passed, 3 skipped, 1 xfailed"), (["--no-skips"], "")])
 def test_skips_are_failures_where_that_is_asked_for(tmp_path, switch, outcome):
-    for name in ("conftest.py", "returned_values.py", "quick.txt", "slow.txt"):
+    for name in ("conftest.py", "quick.txt", "slow.txt"):
         shutil.copy(ROOT / "tests" / name, tmp_path)
     (tmp_path / "pytest.ini").write_text("[pytest]\n")
     (tmp_path / "test_some.py").write_text(TESTS)

@@ -216,7 +216,7 @@ def calibration_too_loose(rotation_sigma_rad: float, offset_sigma_s: float) -> s
     example={
         "by_pixels": {"code": "camera-hardly-rotates", "values": {}},
         "quantity": "time offset",
-        "by_model": {"code": "poses-too-few", "values": {"poses": 3}},
+        "by_model": {"code": "too-few-poses-to-align", "values": {"poses": 3}},
     }
 )
 def neither_by_pixels_nor_model(by_pixels: Fact, quantity: str, by_model: Fact) -> str:

@@ -1,0 +1,10 @@
+"""Matches of two images."""
+
+import numpy as np
+
+from colmap_inertial.colmap.two_views import _count_matches
+
+
+def test_single_descriptors_are_no_matches():
+    one, many = np.full((1, 128), 45, np.uint8), np.eye(128, dtype=np.uint8)[:40] * 255
+    assert [_count_matches(*pair) for pair in ((one, many), (many, one), (many[:0], many))] == [0, 0, 0]
