@@ -200,7 +200,7 @@ def _estimate_orientations(
     database: Path, recording: Recording, close: Sequence[FramePair], camera: CameraModel | None
 ) -> GyroOrientations:
     names = recording.timing.names
-    turn_rad = read_rotations_rad(database, names)
+    turn_rad = read_rotations_rad(database, names, close)
     return estimate_gyro_orientations(recording, turn_rad, read_ray_pairs(database, names, close), camera)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,10 +13,11 @@ import numpy as np
 from colmap_inertial.colmap.gyro_orientations import RayPairs
 from colmap_inertial.colmap.relative_track import FramePair, LoopPose, Observations, RelativeTrack, link_observations
 from colmap_inertial.core.arrays import Array, BoolArray, IndexArray, UInt8Array
-from colmap_inertial.core.geometry import matrix_from_quat, so3_log
+from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.io.files import reading
 from colmap_inertial.model.database import UNREADABLE, check_records
+from colmap_inertial.motion.rotation_averaging import average_rotations
 
 if TYPE_CHECKING:
     import pycolmap
@@ -169,13 +169,16 @@ def _is_visible(xy_px: Array, camera: pycolmap.Camera, other: pycolmap.Camera, o
     return np.asarray(inside, dtype=np.bool_)
 
 
-def read_rotations_rad(database: Path, names: Sequence[str]) -> Array:
-    """(N - 1, 3) rotation vectors ``earlier_from_later`` of consecutive images; NaN where there are too few matches."""
-    rotations = compare(database, list(itertools.pairwise(names))).first_from_second
+def read_rotations_rad(database: Path, names: Sequence[str], pairs: Sequence[FramePair]) -> Array:
+    """(N - 1, 3) rotation vectors ``earlier_from_later`` of consecutive images, by all of some pairs of images.
+
+    Those of single pairs may be wrong: of frames that follow each other quickly, most are poor. NaN where too few
+    matches connect two images.
+    """
+    rotations = compare(database, [(names[i], names[j]) for i, j in pairs]).first_from_second
     measured = np.isfinite(rotations).all(axis=(1, 2))
-    turn_rad = np.full((len(rotations), 3), np.nan)
-    turn_rad[measured] = so3_log(rotations[measured])
-    return turn_rad
+    first, second = np.array(pairs, dtype=np.intp).reshape(-1, 2)[measured].T
+    return average_rotations(len(names), first, second, rotations[measured])
 
 
 def read_ray_pairs(database: Path, names: Sequence[str], pairs: Sequence[FramePair]) -> RayPairs:

@@ -263,7 +263,7 @@ class _Search:
 
     def mixture(self, trajectory: CameraTrajectory) -> ClockFit | None:
         """The coarse fit of sound rotations among wrong ones; ``None`` where they do not tell an offset from others."""
-        intervals, options, prior = intervals_of(trajectory, _SPACING_S), self.options, self.prior
+        intervals, options, prior = intervals_of(trajectory, TRIMMED.spacing_s), self.options, self.prior
         for held in (None, prior.cam_from_imu_xyzw) if prior.rotation_sigma_rad < 0.2 else (None,):
             fits = search_offsets(
                 intervals,
