@@ -23,8 +23,8 @@ class AveragingLimits:
     #: Rounds of weighting; weights fall (Geman-McClure) beyond this angle at first, less by this factor each round, and
     #: in the end beyond so many times the usual error, which is at least this.
     rounds: int = 30
-    widest_rad: float = np.radians(5.0)
-    narrower: float = 0.6
+    widest_rad: float = np.radians(20.0)
+    narrower: float = 0.75
     sigmas: float = 2.0
     least_rad: float = 1e-4
     #: Of frames that hang on others by this little; keeps the equations solvable.
