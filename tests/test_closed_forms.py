@@ -27,7 +27,7 @@ from colmap_inertial.cli.help import Option, _shorten
 from colmap_inertial.colmap import dense, rigs, tsdf
 from colmap_inertial.colmap.loops import key_frames
 from colmap_inertial.colmap.sparse import require_room_for_features
-from colmap_inertial.colmap.two_views import _count_matches
+from colmap_inertial.colmap.two_views import match_quickly
 from colmap_inertial.core import summary
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError, OutputError, TargetNotFoundError
@@ -963,7 +963,7 @@ def test_three_letters_name_the_axes_of_a_gopro():
 
 def test_single_descriptors_are_no_matches():
     one, many = np.full((1, 128), 45, np.uint8), np.eye(128, dtype=np.uint8)[:40] * 255
-    assert [_count_matches(*pair) for pair in ((one, many), (many, one), (many[:0], many))] == [0, 0, 0]
+    assert [len(match_quickly(*pair)[0]) for pair in ((one, many), (many, one), (many[:0], many))] == [0, 0, 0]
 
 
 def test_readings_are_cut_off_where_their_end_is_common_and_what_is_next_to_it_is_rare():

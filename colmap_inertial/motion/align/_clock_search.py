@@ -484,7 +484,7 @@ def _closest(
         gain, explained, turned = independent * mixture.log_likelihood, mixture.sound, mixture.gain
         cross, rate_v, rate_g = mixture.cross, mixture.rate_v, mixture.rate_g
         if rotation is None:
-            at = np.argmax(gain)[None]
+            at = np.array([np.argmax(gain)])
             reflected = _fit_mixture(intervals, inertial[at], mask[at], None, mirrored=True)
             mirrored = independent * float(reflected.log_likelihood[0])
     else:
