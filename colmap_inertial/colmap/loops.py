@@ -179,8 +179,9 @@ class LoopSearch:
         verified, turned, poses = self._judge(first)
         likely = sorted(poses)
         step = max(1, int(np.median(np.diff(keys))) // 2) if len(keys) > 1 else 1
-        beside = {pair: self._pairs_beside(pair, step) | _within(step, pair, possible) for pair in likely}
-        more = sorted(set().union(*(beside[pair] for pair in likely if pair in voted)) - set(first))
+        around = turned.union(likely) if self.lenient else likely
+        beside = {pair: self._pairs_beside(pair, step) | _within(step, pair, possible) for pair in around}
+        more = sorted(set().union(*(beside[pair] for pair in around if pair in voted)) - set(first))
         match(more)
         verified_beside, turned_beside, poses_beside = self._judge(more)
         consistent = select_loops(self.track, self.orientations, {**poses, **poses_beside})
