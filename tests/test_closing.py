@@ -196,7 +196,6 @@ def test_the_mapper_s_model_is_the_joined_one_where_the_order_in_time_is_known(t
     monkeypatch.setattr(pycolmap, "incremental_mapping", made)
     monkeypatch.setattr(mapping, "close_gaps", close)
     options = MappingOptions(overlap=3, refine_intrinsics=False)
-    assert mapping.matches_every_pair(FRAMES, options)
     record = mapping.map_images(
         ring.database,
         tmp_path,
@@ -204,6 +203,7 @@ def test_the_mapper_s_model_is_the_joined_one_where_the_order_in_time_is_known(t
         options,
         context=RunContext(scratch=tmp_path),
         in_time=NAMES if given else (),
+        judged=False,
     )
     assert asked == ([(NAMES, 2 * options.overlap)] if given else [])
     written = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))

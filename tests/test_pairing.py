@@ -354,8 +354,8 @@ def closing(monkeypatch, seen, votes, *, centre=None, said=None, also=(), given=
     monkeypatch.setattr(loops, "localise_frames", returned)
     monkeypatch.setattr(loops, "delete_matches", lambda database, pairs: forgotten.extend(pairs))
     search = search_of(headings, way, names, Counted())
-    found = search.close_loops(matched.extend, doubtful=also, neighbours=[(0, 1)], given=given)
-    assert matched[0] == (0, 1) and len(set(matched)) == len(matched) == found.candidates + 1
+    found = search.close_loops(matched.extend, doubtful=also, given=given)
+    assert len(set(matched)) == len(matched) == found.candidates
     return found, forgotten
 
 
@@ -499,6 +499,12 @@ def test_where_the_gyroscope_looked_elsewhere_no_loop_is_sought(monkeypatch):
 # --- the whole -------------------------------------------------------------------------------------------------------
 
 
+def none_stands(monkeypatch, count):
+    """Nothing is read of features, and no frame shows what the one before does."""
+    moving = SimpleNamespace(find_standing=lambda: np.arange(count))
+    monkeypatch.setattr(pairing.Covisibility, "of", lambda *_: moving)
+
+
 def test_pairs_without_a_gyroscope_are_those_of_before(database, tmp_path, monkeypatch):
     matched = []
     monkeypatch.setattr(pairing, "match_pairs", lambda db, pairs, context, **_: matched.extend(pairs) or 0)
@@ -525,6 +531,7 @@ def test_without_a_gyroscope_a_long_capture_matches_neighbours_only(database, tm
         raise NotObservableError("time offset", "no")
 
     monkeypatch.setattr(pairing, "read_rotations_rad", refused)
+    none_stands(monkeypatch, 40)
     names = tuple(f"{i:03}" for i in range(40))
     recording = type("Recording", (), {"timing": FrameTiming(names=names, t_s=np.arange(40.0))})()
     options = MappingOptions(pairing="sequential", overlap=3)
@@ -538,18 +545,19 @@ def test_loops_are_sought_farther_apart_than_twice_the_overlap(database, tmp_pat
     matched, sought = [], []
 
     class Search:
-        def __init__(self, database, names, orientations, track, covisibility, nearest):
+        def __init__(self, database, names, orientations, track, covisibility, nearest, *, lenient):
+            assert not lenient
             sought.append(nearest)
 
-        def close_loops(self, match, *, doubtful, neighbours, given):
-            match(neighbours)
+        def close_loops(self, match, *, doubtful, given):
             sought.append({j - i for i, j in doubtful})
             return loops.Loops(compared=7, candidates=5, refused=3, closed=((0, 39),))
 
     headings = headings_of(np.zeros(40), np.arange(40.0))
+    monkeypatch.setattr(pairing, "delete_matches", lambda *_: None)
     monkeypatch.setattr(pairing, "match_pairs", lambda db, pairs, context, **_: matched.extend(pairs) or 0)
     monkeypatch.setattr(pairing, "_estimate_orientations", lambda *_: headings)
-    monkeypatch.setattr(pairing.Covisibility, "of", lambda *_: None)
+    none_stands(monkeypatch, 40)
     monkeypatch.setattr(pairing, "_estimate_track", lambda *_: None)
     monkeypatch.setattr(pairing, "LoopSearch", Search)
     names = tuple(f"{i:03}" for i in range(40))
@@ -651,9 +659,9 @@ def test_a_capture_too_short_for_loops_has_none(monkeypatch):
     monkeypatch.setattr(loops, "delete_matches", lambda database, pairs: None)
     empty = TwoViews(first_from_second=np.zeros((0, 3, 3)), covered=np.zeros(0))
     monkeypatch.setattr(loops, "compare", lambda database, pairs: empty)
-    voters = Covisibility(descriptors=(), xy_px=())
+    voters = Covisibility(descriptors=(), xy_px=(), long_side_px=np.zeros(0))
     search = search_of(headings, way_along(circle(3)), ["a", "b", "c"], voters)
-    found = search.close_loops(len, doubtful=[], neighbours=[])
+    found = search.close_loops(len, doubtful=[])
     assert found.compared == found.candidates == found.refused == 0 and found.closed == ()
 
 

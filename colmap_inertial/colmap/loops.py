@@ -64,17 +64,21 @@ class Loops:
         Of these, pairs that COLMAP verified and that were not believed.
     closed
         Pairs of frames that show the same place.
+    returns
+        Pairs that stay though no more is known of them than that they turned as the gyroscope did.
     """
 
     compared: int
     candidates: int
     refused: int
     closed: tuple[FramePair, ...]
+    returns: tuple[FramePair, ...] = ()
 
     def counts(self) -> dict[str, int]:
         """The numbers of pairs, by their names in a record of matching."""
-        numbers = (self.compared, self.candidates, self.refused, len(self.closed))
-        return dict(zip(("loops_compared", "loop_candidates", "loops_refused", "loops_closed"), numbers, strict=True))
+        numbers = (self.compared, self.candidates, self.refused, len(self.closed), len(self.returns))
+        names = ("loops_compared", "loop_candidates", "loops_refused", "loops_closed", "returns")
+        return dict(zip(names, numbers, strict=True))
 
 
 def key_frames(t_s: Array) -> IndexArray:
@@ -108,6 +112,16 @@ def name_pairs(names: Sequence[str], pairs: Sequence[FramePair]) -> list[tuple[s
     return [(names[a], names[b]) for a, b in pairs]
 
 
+def find_returns(covisibility: Covisibility, t_s: Array, nearest: int) -> list[FramePair]:
+    """Pairs of frames about a second apart, at least so many places from each other, that look most alike."""
+    keys = key_frames(t_s)
+    i, j = (keys[places] for places in np.triu_indices(len(keys), 1))
+    far = j - i >= nearest
+    i, j = i[far], j[far]
+    chosen = candidates(covisibility.count(i, j), i, j)
+    return list(zip(i[chosen].tolist(), j[chosen].tolist(), strict=True))
+
+
 @dataclass(frozen=True, eq=False)
 class LoopSearch:
     """A capture whose loops are sought.
@@ -122,6 +136,8 @@ class LoopSearch:
         Of these.
     nearest
         Frames fewer places apart than this are no loop.
+    lenient
+        Whether what agrees with the gyroscope's rotation stays: of a capture so short that every pair might be matched.
     """
 
     database: Path
@@ -130,13 +146,13 @@ class LoopSearch:
     track: RelativeTrack
     covisibility: Covisibility
     nearest: int
+    lenient: bool = False
 
     def close_loops(
         self,
         match: Callable[[Sequence[FramePair]], None],
         *,
         doubtful: Sequence[FramePair],
-        neighbours: Sequence[FramePair],
         given: Sequence[FramePair] = (),
     ) -> Loops:
         """Match pairs that may close a loop; the matches of those that are not accepted leave the database again.
@@ -147,9 +163,6 @@ class LoopSearch:
             Matches and verifies pairs in the database.
         doubtful
             Pairs that are candidates, too, if they have quick matches enough; those beside them are not.
-        neighbours
-            Pairs that are matched and not judged; in one go with candidates, as COLMAP indexes the features of all
-            images anew each time.
         given
             Pairs that somebody else matched as loops: candidates without quick matches, which bear each other out.
         """
@@ -162,26 +175,30 @@ class LoopSearch:
         alike = ~self._surely_apart(a, b)
         alike[alike] = self.covisibility.count(a[alike], b[alike]) >= _LIMITS.least_quick_matches
         first = sorted(voted.union(itertools.compress(doubtful, alike)))
-        match([*neighbours, *first])
-        verified, poses = self._judge(first)
+        match(first)
+        verified, turned, poses = self._judge(first)
         likely = sorted(poses)
         step = max(1, int(np.median(np.diff(keys))) // 2) if len(keys) > 1 else 1
-        beside = {pair: self._pairs_beside(pair, step) | _within(step, pair, possible) for pair in likely}
-        more = sorted(set().union(*(beside[pair] for pair in likely if pair in voted)) - set(first))
+        around = turned.union(likely) if self.lenient else likely
+        beside = {pair: self._pairs_beside(pair, step) | _within(step, pair, possible) for pair in around}
+        more = sorted(set().union(*(beside[pair] for pair in around if pair in voted)) - set(first))
         match(more)
-        verified_beside, poses_beside = self._judge(more)
+        verified_beside, turned_beside, poses_beside = self._judge(more)
         consistent = select_loops(self.track, self.orientations, {**poses, **poses_beside})
         enough = _LIMITS.least_witnesses
         closed = {pair for pair in consistent & set(likely) if len(beside[pair] & consistent) >= enough}
         closed |= set().union(*(beside[pair] & consistent for pair in closed))
+        returns = (turned | turned_beside) - closed if self.lenient else set()
+        kept = closed | returns
         delete_matches(
-            self.database, name_pairs(self.names, [pair for pair in [*first, *more, *given] if pair not in closed])
+            self.database, name_pairs(self.names, [pair for pair in [*first, *more, *given] if pair not in kept])
         )
         return Loops(
             compared=len(i),
             candidates=len(first) + len(more),
-            refused=len((verified | verified_beside) - closed),
+            refused=len((verified | verified_beside) - kept),
             closed=tuple(sorted(closed)),
+            returns=tuple(sorted(returns)),
         )
 
     def _displacements(self, i: IndexArray, j: IndexArray) -> tuple[Array, Array]:
@@ -216,22 +233,24 @@ class LoopSearch:
     def _depths(self) -> Array:
         return np.array([self.track.depth(k) for k in range(len(self.track.part))])
 
-    def _judge(self, pairs: Sequence[FramePair]) -> tuple[set[FramePair], dict[FramePair, LoopPose]]:
-        """Pairs with verified matches; and the poses of those of them that may close a loop.
+    def _judge(self, pairs: Sequence[FramePair]) -> tuple[set[FramePair], set[FramePair], dict[FramePair, LoopPose]]:
+        """Pairs with verified matches; those that turned as the gyroscope did; and the poses of those of them that may
+        close a loop.
 
         Their matches cover enough of both images, agree with the gyroscope's rotation, and with the relative track.
         """
         views = compare(self.database, name_pairs(self.names, pairs))
         verified = np.isfinite(views.first_from_second).all(axis=(1, 2))
         i, j = split_pairs(pairs)
-        likely = verified & (views.covered >= _LIMITS.least_covered) & self.track.known(i, j)
-        likely[likely] = self.orientations.agree(i[likely], j[likely], views.first_from_second[likely])
+        turned = verified.copy()
+        turned[turned] = self.orientations.agree(i[turned], j[turned], views.first_from_second[turned])
+        likely = turned & (views.covered >= _LIMITS.least_covered) & self.track.known(i, j)
         some = list(itertools.compress(pairs, likely))
         localised = localise_frames(self.database, self.names, some, self.track) if some else []
         poses = {pair: pose for pair, pose in zip(some, localised, strict=True) if pose is not None}
         agree = select_likely_loops(self.track, self.orientations, poses)
         poses = {pair: pose for pair, pose in poses.items() if pair in agree}
-        return {pairs[k] for k in np.flatnonzero(verified).tolist()}, poses
+        return set(itertools.compress(pairs, verified)), set(itertools.compress(pairs, turned)), poses
 
     def _pairs_beside(self, pair: FramePair, step: int) -> set[FramePair]:
         """Pairs of frames a little before or after one or both of a pair."""

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 from colmap_inertial.colmap.installed import InstalledColmap
 from colmap_inertial.colmap.loop_closure import LoopClosure, MappedCapture, close_gaps
-from colmap_inertial.colmap.sparse import matches_every_pair
 from colmap_inertial.colmap.submaps import join_runs, map_runs, split_capture
 from colmap_inertial.core.errors import MappingError
 from colmap_inertial.core.options import MappingOptions
@@ -87,7 +86,8 @@ def map_images(
         The images in order of time, where they are of one recording: loops of a model are closed then, and what is too
         long for one go is mapped in parts.
     judged
-        Whether somebody looked which pairs far apart in time join copies. Nobody does where every pair is matched.
+        Whether somebody looked which pairs far apart in time join copies (``MatchRecord.judged``). Nobody does where
+        every pair is matched.
 
     Raises
     ------
@@ -105,7 +105,7 @@ def map_images(
     with open_foreign(database) as opened:
         (num_images,) = opened.execute("SELECT COUNT(name) FROM images").fetchone()
     context.progress("mapping", 0, num_images)
-    every_pair = matches_every_pair(num_images, options)
+    every_pair = options.pairing == "exhaustive"
     near = _NEIGHBOURS * options.overlap
     if options.mapper == "incremental":
         pipeline = incremental_options(options.refine_intrinsics, context)

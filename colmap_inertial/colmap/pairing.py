@@ -1,4 +1,9 @@
-"""Choose the pairs of images to match: all but those that the gyroscope or a quick comparison excludes."""
+"""Choose the pairs of images to match.
+
+Of few images, or of pictures taken seconds apart: all but those that the gyroscope or a quick comparison excludes. Of a
+video: neighbours in time, and returns to a place. A frame that shows what the one before does, as the camera stands
+still, is matched with the first of its kind alone.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +18,7 @@ import numpy as np
 
 from colmap_inertial.colmap.given_database import can_match, read_matched_pairs
 from colmap_inertial.colmap.gyro_orientations import GyroOrientations, estimate_gyro_orientations
-from colmap_inertial.colmap.loops import LoopSearch, name_pairs, split_pairs
+from colmap_inertial.colmap.loops import LoopSearch, find_returns, name_pairs, split_pairs
 from colmap_inertial.colmap.relative_track import FramePair, RelativeTrack, estimate_relative_track
 from colmap_inertial.colmap.sparse import (
     MatchRecord,
@@ -33,7 +38,7 @@ from colmap_inertial.colmap.two_views import (
 from colmap_inertial.core.arrays import BoolArray, IndexArray
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.options import MappingOptions
-from colmap_inertial.core.types import CameraModel
+from colmap_inertial.core.types import CameraModel, FrameTiming
 from colmap_inertial.pipeline.run.context import Recording, RunContext
 
 log = logging.getLogger(__name__)
@@ -64,6 +69,8 @@ class _Pairs:
         Whether no others can be matched, for want of descriptors.
     every
         Whether every pair is there.
+    short
+        Whether it is not, of a video so short that nothing speaks against it but time.
     near
         Pairs of images no more places apart are neighbours.
     """
@@ -73,17 +80,20 @@ class _Pairs:
     given: Set[FramePair]
     only_given: bool
     every: bool
+    short: bool
     near: int
 
     @classmethod
-    def of(cls, database: Path, names: Sequence[str], options: MappingOptions) -> _Pairs:
+    def of(cls, database: Path, timing: FrameTiming, options: MappingOptions) -> _Pairs:
+        names, t_s = timing.names, timing.t_s
         place = {name: k for k, name in enumerate(names)}
-        pairs = [(place[a], place[b]) for a, b in image_pairs(names, options)]
+        pairs = [(place[a], place[b]) for a, b in image_pairs(names, options, t_s)]
         given = read_matched_pairs(database, names)
         i, j = split_pairs([*pairs, *sorted(given.difference(pairs))])
         only_given = bool(given) and not can_match(database)
-        every, near = matches_every_pair(len(names), options), _NEAR * options.overlap
-        return cls(i=i, j=j, given=given, only_given=only_given, every=every, near=near)
+        every, near = matches_every_pair(len(names), options, t_s), _NEAR * options.overlap
+        short = options.pairing == "auto" and not every and matches_every_pair(len(names), options)
+        return cls(i=i, j=j, given=given, only_given=only_given, every=every, short=short, near=near)
 
     @property
     def count(self) -> int:
@@ -126,8 +136,9 @@ def match_capture(
 
     Images close in time come first: their rotations give the gyroscope's calibration, and with it the orientation of
     all frames. Pairs that look apart are left out then, and where every pair is matched, those whose largest features
-    have nothing in common. Of a capture too long for every pair, loops are closed. Where the gyroscope contradicts the
-    images, all other pairs are matched; but nothing could tell a loop from a copy, and so none is closed.
+    have nothing in common. Of a video, loops are closed. Where the gyroscope contradicts the images, all other pairs
+    are matched; but nothing could tell a loop from a copy. Those of a short video are then matched as they are, as
+    where every pair is, and those of a longer one are left out.
 
     Parameters
     ----------
@@ -139,11 +150,19 @@ def match_capture(
         Which pairs there are.
     """
     shutil.copyfile(features, database)
+    every_name = recording.timing.names
+    covisibility = Covisibility.of(database, every_name)
+    still: list[FramePair] = []
+    if options.pairing != "exhaustive":
+        recording, covisibility, still = _leave_standing_frames(recording, covisibility)
     names = recording.timing.names
-    pairs = _Pairs.of(database, names, options)
-    close = pairs.where(pairs.close)
-    first, rest = (name_pairs(names, several) for several in (close, pairs.where(pairs.rest)))
-    done, matched = match_pairs(database, first, context, total=_expect_work(first, rest)), len(close)
+    pairs = _Pairs.of(database, recording.timing, options)
+    close, beside = pairs.where(pairs.close), pairs.where(pairs.rest)
+    first, rest = name_pairs(names, close) + name_pairs(every_name, still), name_pairs(names, beside)
+    if not pairs.every:
+        # as COLMAP indexes the features of all images anew each time, neighbours are matched in one go
+        first, rest = [*first, *rest], []
+    done, matched = match_pairs(database, first, context, total=_expect_work(first, rest)), len(first)
 
     def match(more: Sequence[FramePair]) -> None:
         nonlocal matched, done
@@ -158,28 +177,33 @@ def match_capture(
         orientations = _estimate_orientations(database, recording, close, camera)
     except NotObservableError as error:
         note = f"not used: {error}"
-        match(pairs.where(pairs.rest | (pairs.far & pairs.is_given)))
+        others, returns = pairs.where(pairs.far & pairs.is_given), []
+        if pairs.short:
+            returns = find_returns(covisibility, recording.timing.t_s, pairs.near + 1)
+            counts = {"returns": len(returns)}
+        match([*(beside if pairs.every else []), *sorted({*others, *returns})])
     else:
         note = "the frames turn as the gyroscope does"
         sigma_deg = _largest_sigma_deg(orientations)
-        covisibility = Covisibility.of(database, names)
         near_pairs, counts = _exclude_pairs(orientations, covisibility if pairs.every else None, pairs)
         loops = pairs.where(pairs.far & pairs.is_given)
-        delete_matches(database, name_pairs(names, sorted(pairs.given - {*close, *near_pairs, *loops})))
+        asked = pairs.given if pairs.every else {*pairs.given, *beside}
+        delete_matches(database, name_pairs(names, sorted(asked - {*close, *near_pairs, *loops})))
         if pairs.every:
             match(near_pairs)
         else:
             track = _estimate_track(database, names, close, orientations)
-            search = LoopSearch(database, names, orientations, track, covisibility, pairs.near + 1)
+            search = LoopSearch(database, names, orientations, track, covisibility, pairs.near + 1, lenient=pairs.short)
             doubtful = pairs.where(pairs.far & (pairs.j - pairs.i <= _NEAR * pairs.near) & ~pairs.is_given)
-            counts |= search.close_loops(match, doubtful=doubtful, neighbours=near_pairs, given=loops).counts()
+            counts |= search.close_loops(match, doubtful=doubtful, given=loops).counts()
     context.progress("matches", done, done)
     record = MatchRecord(
         device=context.device if context.executable is None else context.executable.device,
         pairing="exhaustive" if pairs.every else "sequential",
-        images=len(names),
-        pairs=pairs.count,
+        images=len(every_name),
+        pairs=pairs.count + len(still),
         given=len(pairs.given),
+        still=len(still),
         far=int(pairs.far.sum()),
         matched=matched,
         verified=count_verified(database),
@@ -191,6 +215,19 @@ def match_capture(
     return record
 
 
+def _leave_standing_frames(
+    recording: Recording, covisibility: Covisibility
+) -> tuple[Recording, Covisibility, list[FramePair]]:
+    """The recording, and its features, without frames that show what one before them does; and pairs of the two."""
+    anchor = covisibility.find_standing()
+    place = np.arange(len(anchor))
+    if (anchor == place).all():
+        return recording, covisibility, []
+    moving = np.flatnonzero(anchor == place)
+    still = [(int(anchor[k]), k) for k in np.flatnonzero(anchor != place).tolist()]
+    return recording.using(recording.timing.select(moving)), covisibility.only(moving), still
+
+
 def _expect_work(first: Sequence[tuple[str, str]], rest: Sequence[tuple[str, str]]) -> int:
     """Work of all pairs before it is known how many of the rest are worth matching: 0.6 to 0.8 on desk and EuRoC."""
     return matching_work(first) + round(0.7 * matching_work(rest)) + 1
@@ -200,7 +237,7 @@ def _estimate_orientations(
     database: Path, recording: Recording, close: Sequence[FramePair], camera: CameraModel | None
 ) -> GyroOrientations:
     names = recording.timing.names
-    turn_rad = read_rotations_rad(database, names)
+    turn_rad = read_rotations_rad(database, names, close)
     return estimate_gyro_orientations(recording, turn_rad, read_ray_pairs(database, names, close), camera)
 
 

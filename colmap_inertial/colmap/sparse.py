@@ -39,8 +39,9 @@ if TYPE_CHECKING:
 
 Item = TypeVar("Item")
 
-#: Up to this many images every pair is matched; above it, neighbours in time.
-_EXHAUSTIVE_UP_TO = 150
+#: Up to this many images every pair is matched; above it, neighbours in time. Of a video, whose frames are usually less
+#: than so far apart, up to fewer: those beside a frame show what it does, and a pair of two places is as good as ten.
+_EXHAUSTIVE_UP_TO, _EXHAUSTIVE_OF_VIDEO, _VIDEO_SPACING_S = 150, 60, 0.5
 #: Images whose features are found in one go; the first ones are few, so that one sees soon how quickly it goes.
 _FIRST_EXTRACTION_BATCH, _EXTRACTION_BATCH = 4, 16
 _ALIKED_FILES = ("AlikedExtraction.n16rot_model_path", "AlikedMatching.lightglue_model_path")
@@ -121,14 +122,16 @@ def check_pair_names(names: Sequence[str]) -> None:
             )
 
 
-def matches_every_pair(count: int, options: MappingOptions) -> bool:
-    """Whether every pair of so many images is matched, and not only neighbours in time."""
-    return options.pairing == "exhaustive" or (options.pairing == "auto" and count <= _EXHAUSTIVE_UP_TO)
+def matches_every_pair(count: int, options: MappingOptions, t_s: Array | None = None) -> bool:
+    """Whether every pair of so many images, taken at ``t_s``, is matched, and not only neighbours in time."""
+    video = t_s is not None and len(t_s) > 1 and float(np.median(np.diff(t_s))) < _VIDEO_SPACING_S
+    most = _EXHAUSTIVE_OF_VIDEO if video else _EXHAUSTIVE_UP_TO
+    return options.pairing == "exhaustive" or (options.pairing == "auto" and count <= most)
 
 
-def image_pairs(names: Sequence[str], options: MappingOptions) -> list[tuple[str, str]]:
-    """The pairs to match, by names in order of time."""
-    if matches_every_pair(len(names), options):
+def image_pairs(names: Sequence[str], options: MappingOptions, t_s: Array | None = None) -> list[tuple[str, str]]:
+    """The pairs to match, by names in order of time, and times where they are known."""
+    if matches_every_pair(len(names), options, t_s):
         return list(itertools.combinations(names, 2))
     steps = set(range(1, options.overlap + 1))
     steps |= {2**k for k in range(len(names).bit_length())}
@@ -457,6 +460,8 @@ class MatchRecord:
         How many there are, and pairs by the pairing.
     given
         Pairs that a given database has matches of.
+    still
+        Frames that show what one before them does, as the camera stood still; they are matched with that one alone.
     far
         Pairs of neighbours far apart in time that were left out, or matched only as candidates for loops: loops are
         sought in their place, where the gyroscope can be used.
@@ -474,6 +479,9 @@ class MatchRecord:
         contradict the gyroscope's rotation, the relative track, or other loops, or no pair beside them agrees.
     loops_closed
         Of these, pairs that stay.
+    returns
+        Pairs of frames far apart in time of a short video that stay as they look alike and, where the gyroscope can
+        be used, turned as it did; no more is known of them.
     matched, verified
         Pairs that were matched, and those of them whose matches COLMAP verified.
     gyroscope
@@ -487,6 +495,7 @@ class MatchRecord:
     images: int
     pairs: int
     given: int = 0
+    still: int = 0
     far: int = 0
     apart: int = 0
     unlike: int = 0
@@ -494,7 +503,13 @@ class MatchRecord:
     loop_candidates: int = 0
     loops_refused: int = 0
     loops_closed: int = 0
+    returns: int = 0
     matched: int
     verified: int
     gyroscope: str
     heading_sigma_deg: float | None = None
+
+    @property
+    def judged(self) -> bool:
+        """Whether somebody looked which pairs far apart in time join copies."""
+        return self.pairing != "exhaustive" and not self.returns

@@ -106,7 +106,8 @@ def run_colmap(
     def models(partial: Sequence[Path]) -> None:
         database, images, own = workspace.colmap_database, workspace.colmap_images, _keep_poses(context, rig)
         in_time = () if rig else recording.timing.names
-        record = map_images(database, images, partial[0], mapping, own, in_time=in_time)
+        judged = read_record(workspace.matches, MatchRecord).judged
+        record = map_images(database, images, partial[0], mapping, own, in_time=in_time, judged=judged)
         write_record(partial[1], record)
 
     runner.run("matches", pairing, outputs, matches, after=["frames"])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,10 +13,11 @@ import numpy as np
 from colmap_inertial.colmap.gyro_orientations import RayPairs
 from colmap_inertial.colmap.relative_track import FramePair, LoopPose, Observations, RelativeTrack, link_observations
 from colmap_inertial.core.arrays import Array, BoolArray, IndexArray, UInt8Array
-from colmap_inertial.core.geometry import matrix_from_quat, so3_log
+from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.io.files import reading
 from colmap_inertial.model.database import UNREADABLE, check_records
+from colmap_inertial.motion.rotation_averaging import average_rotations
 
 if TYPE_CHECKING:
     import pycolmap
@@ -49,6 +49,11 @@ class TwoViewLimits:
     farthest_rad: float = 0.7
     #: COLMAP stores descriptors of this length.
     length: float = 512.0
+    #: A camera stands still where so many quick matches of two pictures, this share of them, lie less than this part of
+    #: the longer side apart: a pixel of 750.
+    least_still: int = 50
+    still_share: float = 0.75
+    still_part: float = 1 / 750
 
 
 _LIMITS = TwoViewLimits()
@@ -169,13 +174,16 @@ def _is_visible(xy_px: Array, camera: pycolmap.Camera, other: pycolmap.Camera, o
     return np.asarray(inside, dtype=np.bool_)
 
 
-def read_rotations_rad(database: Path, names: Sequence[str]) -> Array:
-    """(N - 1, 3) rotation vectors ``earlier_from_later`` of consecutive images; NaN where there are too few matches."""
-    rotations = compare(database, list(itertools.pairwise(names))).first_from_second
+def read_rotations_rad(database: Path, names: Sequence[str], pairs: Sequence[FramePair]) -> Array:
+    """(N - 1, 3) rotation vectors ``earlier_from_later`` of consecutive images, by all of some pairs of images.
+
+    Those of single pairs may be wrong: of frames that follow each other quickly, most are poor. NaN where too few
+    matches connect two images.
+    """
+    rotations = compare(database, [(names[i], names[j]) for i, j in pairs]).first_from_second
     measured = np.isfinite(rotations).all(axis=(1, 2))
-    turn_rad = np.full((len(rotations), 3), np.nan)
-    turn_rad[measured] = so3_log(rotations[measured])
-    return turn_rad
+    first, second = np.array(pairs, dtype=np.intp).reshape(-1, 2)[measured].T
+    return average_rotations(len(names), first, second, rotations[measured])
 
 
 def read_ray_pairs(database: Path, names: Sequence[str], pairs: Sequence[FramePair]) -> RayPairs:
@@ -300,15 +308,18 @@ class Covisibility:
         Of each image (K, 128), as COLMAP stores them.
     xy_px
         Of each image (K, 2).
+    long_side_px
+        (N,) of the images.
     """
 
     descriptors: tuple[UInt8Array, ...]
     xy_px: tuple[Array, ...]
+    long_side_px: Array
 
     @classmethod
     def of(cls, database: Path, names: Sequence[str]) -> Covisibility:
         """Read the features of images from a database."""
-        descriptors, places = [], []
+        descriptors, places, sides = [], [], []
         with open_features(database) as features:
             for name in names:
                 number = features.images[name].image_id
@@ -321,7 +332,33 @@ class Covisibility:
                 largest = np.argsort(-size, kind="stable")[: _LIMITS.compared_features]
                 descriptors.append(stored[largest])
                 places.append(keypoints[largest, :2])
-        return cls(descriptors=tuple(descriptors), xy_px=tuple(places))
+                sides.append(max(features.camera(name).width, features.camera(name).height))
+        return cls(descriptors=tuple(descriptors), xy_px=tuple(places), long_side_px=np.array(sides, dtype=np.float64))
+
+    def find_standing(self) -> IndexArray:
+        """(N,) of each image, in order of time, which one before it shows the same, seen from the same place.
+
+        Of a camera that stands still it is the first one; of any other, the image itself.
+        """
+        anchor = np.arange(len(self.descriptors))
+        with one_blas_thread():
+            for k in range(1, len(anchor)):
+                before = int(anchor[k - 1])
+                first, second = match_quickly(self.descriptors[before], self.descriptors[k])
+                if len(first) < _LIMITS.least_still:
+                    continue
+                moved_px = np.linalg.norm(self.xy_px[before][first] - self.xy_px[k][second], axis=1)
+                if np.mean(moved_px < _LIMITS.still_part * self.long_side_px[k]) > _LIMITS.still_share:
+                    anchor[k] = before
+        return anchor
+
+    def only(self, index: IndexArray) -> Covisibility:
+        """Of some of the images."""
+        return Covisibility(
+            descriptors=tuple(self.descriptors[i] for i in index.tolist()),
+            xy_px=tuple(self.xy_px[i] for i in index.tolist()),
+            long_side_px=self.long_side_px[index],
+        )
 
     def are_unlike(self, i: IndexArray, j: IndexArray, least: int) -> BoolArray:
         """(M,) whether images i and j, both with features enough, have fewer quick matches than this."""
@@ -337,14 +374,14 @@ class Covisibility:
         counted = np.zeros(len(i), dtype=np.intp)
         with one_blas_thread():
             for place in range(len(i)):
-                counted[place] = _count_matches(self.descriptors[i[place]], self.descriptors[j[place]])
+                counted[place] = len(match_quickly(self.descriptors[i[place]], self.descriptors[j[place]])[0])
         return counted
 
 
-def _count_matches(first: UInt8Array, second: UInt8Array) -> int:
-    """Mutually nearest descriptors that are clearly nearer than the next."""
+def match_quickly(first: UInt8Array, second: UInt8Array) -> tuple[IndexArray, IndexArray]:
+    """Places (K,) and (K,) of mutually nearest descriptors that are clearly nearer than the next."""
     if len(first) < 2 or len(second) < 2:
-        return 0
+        return np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
     cosine = first.astype(np.float32) @ second.astype(np.float32).T / np.float32(_LIMITS.length**2)
     row = np.arange(len(first))
     nearest = cosine.argmax(axis=1)
@@ -353,4 +390,5 @@ def _count_matches(first: UInt8Array, second: UInt8Array) -> int:
     cosine[row, nearest] = -1
     near = np.flatnonzero(mutual & (best > np.cos(_LIMITS.farthest_rad)))
     angle, next_angle = (np.arccos(np.clip(c, -1, 1)) for c in (best[near], cosine[near].max(axis=1, initial=-1)))
-    return int(np.count_nonzero(angle < _LIMITS.ratio * next_angle))
+    near = near[angle < _LIMITS.ratio * next_angle]
+    return near, nearest[near]

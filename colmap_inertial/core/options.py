@@ -75,7 +75,8 @@ class MappingOptions(CheckedOptions):
     """Options of COLMAP's mapping."""
 
     pairing: Literal["auto", "exhaustive", "sequential"] = "auto"
-    """Which images are matched: every pair, neighbours in time, or `auto`: every pair up to 150 images."""
+    """Which images are matched: every pair, neighbours in time and returns, or `auto`: every pair up to 150 images, or
+    60 of a video."""
     overlap: int = 4
     """Sequential pairing: match each frame with this many next ones, and with the 1, 2, 4, 8, ... th after it."""
     max_image_size: int | None = None

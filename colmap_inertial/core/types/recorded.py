@@ -224,6 +224,12 @@ class FrameTiming:
         exposure = 0.0 if self.exposure_s is None else self.exposure_s
         return np.asarray(self.t_s + 0.5 * exposure + 0.5 * (self.readout_s or 0.0))
 
+    def select(self, index: IndexArray) -> FrameTiming:
+        """Some of the frames, by places in order of time."""
+        exposure_s = None if self.exposure_s is None else self.exposure_s[index]
+        names = tuple(self.names[i] for i in index.tolist())
+        return replace(self, names=names, t_s=self.t_s[index], exposure_s=exposure_s)
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FrameLog:

@@ -40,6 +40,11 @@ _SHORTEST_S = 1.0
 #: tried; the largest drift (action cameras: 1 %), and how far the parts may lie off a steady drift.
 _PART_S, _PARTS, _FASTEST_DRIFT, _UNSTEADY_S = 15.0, 8, 0.02, 0.2
 
+#: Of rotations some of which are wrong, at least this share follows the gyroscope; they turn as far as it does to
+#: within this factor (a wrong unit is a factor of 57, of counts any); and its mirror image is likelier by so much (in
+#: nats) at most.
+_LEAST_SOUND, _GAIN_WITHIN, _MOST_MIRRORED = 0.5, 1.5, 3.0
+
 #: Rotation within a second, rms, below which the camera counts as still: what noise of poses looks like.
 _STILL_RAD_RTS = 0.015
 
@@ -62,7 +67,7 @@ class AlignOptions(CheckedOptions):
     """
 
     min_explained: float = 0.75
-    """Smallest part of the camera's rotation over 0.3 s that the gyroscope must explain."""
+    """Smallest part of the camera's rotation over 0.3 s that the gyroscope must explain, where none of it is wrong."""
 
 
 def align_camera_imu(
@@ -104,6 +109,9 @@ def align_clocks(
     options
         Search range and thresholds.
 
+    Rotations of which some are wrong, as those of two views are, spoil least squares over all of them. Where these
+    find no offset, a mixture of sound and wrong rotations does (``_robust.py``), by what the sound ones say.
+
     Returns
     -------
     The calibration has a covariance in the order of ``CALIBRATION_PARAMETERS``. It is that of generalised least
@@ -124,9 +132,13 @@ def align_clocks(
     start = search.whole(trajectory)
     if isinstance(start, NotObservableError):
         drifting = search.parts(trajectory)
-        if drifting is None:
-            raise start
-        start, rate = drifting
+        if drifting is not None:
+            start, rate = drifting
+        else:
+            mixed = search.mixture(trajectory)
+            if mixed is None:
+                raise start
+            start = mixed
     keep = select_spaced_frames(trajectory.t_s, _SPACING_S)
     return refine_alignment(trajectory.select(keep), imu, start, prior, clock_rate=rate)
 
@@ -236,6 +248,31 @@ class _Search:
         if explained < options.min_explained:
             return NotObservableError("time offset", Fact("no-offset-fits", explained=explained))
         return NotObservableError("time offset", Fact("offset-ambiguous"))
+
+    def mixture(self, trajectory: CameraTrajectory) -> ClockFit | None:
+        """The coarse fit of sound rotations among wrong ones; ``None`` where they do not tell an offset from others."""
+        intervals, options, prior = intervals_of(trajectory, TRIMMED.spacing_s), self.options, self.prior
+        for held in (None, prior.cam_from_imu_xyzw) if prior.rotation_sigma_rad < 0.2 else (None,):
+            fits = search_offsets(
+                intervals,
+                self.path,
+                self.offsets_s,
+                min_overlap=options.min_overlap,
+                cam_from_imu_xyzw=held,
+                share=None,
+            )
+            if not fits:
+                return None
+            best = fits[0]
+            ahead = best.log_likelihood - max([0.0, *(fit.log_likelihood for fit in fits[1:])])
+            if (
+                ahead >= options.min_log_likelihood
+                and best.explained >= _LEAST_SOUND
+                and 1 / _GAIN_WITHIN <= best.gain <= _GAIN_WITHIN
+                and best.mirrored <= best.log_likelihood + _MOST_MIRRORED
+            ):
+                return best
+        return None
 
     def parts(self, trajectory: CameraTrajectory) -> tuple[ClockFit, float] | None:
         """Offset in the middle and clock rate from short parts, if at least two of them agree on a steady drift."""

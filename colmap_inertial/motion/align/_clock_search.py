@@ -7,7 +7,8 @@ gained over two recordings that have nothing to do with each other. It is negati
 gyroscope's gain is known to be one; and it grows with the overlap, so that short chance overlaps do not win.
 
 Poses that are wrong would spoil least squares. Least trimmed squares (Rousseeuw and Van Driessen 2006) fit the share of
-the intervals that fits best, and judge an offset by this share alone.
+the intervals that fits best, and judge an offset by this share alone; a mixture of sound and wrong rotations
+(``_robust.py``) finds the share itself, and judges by what the sound ones say.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from colmap_inertial.core.arrays import Array, BoolArray, ComplexArray, IndexArr
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_from_matrix, quat_log, quat_multiply
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory
+from colmap_inertial.motion.align._robust import Mixture, fit_mixture
 
 #: Frames this close together sample the rotation densely enough to be correlated on a grid.
 DENSE_S = 0.25
@@ -87,7 +89,11 @@ class ClockFit:
     log_likelihood
         Gain over recordings that have nothing to do with each other.
     explained
-        Fraction of the camera's rotation that the gyroscope explains.
+        Fraction of the camera's rotation that the gyroscope explains; of a mixture, the share of sound rotations.
+    gain
+        How far sound rotations turn for what the gyroscope turns, by a mixture.
+    mirrored
+        Log-likelihood that a mixture gains with the gyroscope's mirror image.
     cam_from_imu_xyzw, gyro_bias_rad_s
         The fitted rotation and bias.
     """
@@ -97,6 +103,8 @@ class ClockFit:
     explained: float
     cam_from_imu_xyzw: Array
     gyro_bias_rad_s: Array
+    gain: float = 1.0
+    mirrored: float = -np.inf
 
     def applied(self, prior: CameraImuCalibration, shift_s: float) -> CameraImuCalibration:
         """A calibration with what was fitted; ``shift_s`` is that of the two epochs (``epoch_shift_s``)."""
@@ -135,7 +143,7 @@ def search_offsets(
     *,
     min_overlap: float,
     cam_from_imu_xyzw: Array | None = None,
-    share: float = 1.0,
+    share: float | None = 1.0,
 ) -> list[ClockFit]:
     """The best fit and its competitors: peaks of the log-likelihood over the offset, best first.
 
@@ -152,7 +160,8 @@ def search_offsets(
     cam_from_imu_xyzw
         Fixes the rotation; without it, it is fitted anew at each offset.
     share
-        Of the intervals that are fitted at each offset, by least trimmed squares.
+        Of the intervals that are fitted at each offset, by least trimmed squares; ``None`` for those that a mixture
+        finds sound.
 
     Returns
     -------
@@ -304,7 +313,7 @@ def _scan(
     offsets_s: tuple[float, float],
     min_overlap: float,
     rotation: Array | None,
-    share: float,
+    share: float | None,
 ) -> tuple[Array, Array, float]:
     """Gain at a range of offsets, for sparse frames, from the rotations over the very intervals."""
     grid = np.arange(path.t_s[0], path.t_s[-1], _SCAN_S)
@@ -331,8 +340,12 @@ def _scan(
         i, j = np.clip(i, 0, len(grid) - 1), np.clip(j, 0, len(grid) - 1)
         inertial = quat_log(quat_multiply(quat_conjugate(attitude[i]), attitude[j]))
         covered_s = np.sum(inside * some.dt_s, axis=1)
-        energy, left, _ = _fit(some, inertial, inside, rotation, share)
-        value = _gain(energy, left, 3 * effective * share * covered_s / some.dt_s.sum())
+        if share is None:
+            mixture = _fit_mixture(some, inertial, inside, rotation)
+            value = mixture.log_likelihood * min(effective / len(some), 1.0)
+        else:
+            energy, left, _ = _fit(some, inertial, inside, rotation, share)
+            value = _gain(energy, left, 3 * effective * share * covered_s / some.dt_s.sum())
         gain[at] = np.where((covered_s >= needed_s) & (covered_s > 0), value, np.nan)
     return offset_s, gain, float(3 * _effective_intervals(intervals) / intervals.dt_s.sum())
 
@@ -383,6 +396,30 @@ def _fit(
     return energy, left, (cross, rate_v, rate_g)
 
 
+def _fit_mixture(
+    intervals: Intervals, inertial_rad: Array, inside: BoolArray, rotation: Array | None, *, mirrored: bool = False
+) -> Mixture:
+    free = _mirror_image if mirrored else _best_rotation
+    return fit_mixture(
+        intervals.turn_rad,
+        inertial_rad,
+        intervals.dt_s,
+        inside,
+        moments=lambda weight: _moments_and_rates(intervals, inertial_rad, weight),
+        best_rotation=free if rotation is None else lambda _: rotation[None],
+    )
+
+
+def _mirror_image(cross: Array) -> Array:
+    """(L, 3, 3) reflections of the largest ``tr(R' cross)``."""
+    return -_best_rotation(-cross)
+
+
+def _moments_and_rates(intervals: Intervals, inertial_rad: Array, weight: Array) -> tuple[Array, Array, Array]:
+    cross, _, _, (rate_v, rate_g) = _moments(intervals, inertial_rad, weight)
+    return cross, rate_v, rate_g
+
+
 def _best_rotation(cross: Array) -> Array:
     """(L, 3, 3) rotations ``R`` of the largest ``tr(R' cross)``."""
     u, _, vt = np.linalg.svd(cross)
@@ -391,12 +428,12 @@ def _best_rotation(cross: Array) -> Array:
 
 
 def _moments(
-    intervals: Intervals, inertial_rad: Array, inside: BoolArray
+    intervals: Intervals, inertial_rad: Array, inside: BoolArray | Array
 ) -> tuple[Array, Array, Array, tuple[Array, Array]]:
     """Cross moments (L, 3, 3) and energies (L,), (L,) of the interval rotations after a common rate is taken out.
 
-    ``inertial_rad`` (L, K, 3) and ``inside`` (L, K) for L offsets. Intervals weigh by 1 / dt, as for a random walk.
-    Also returns the two common rates (L, 3), camera and IMU.
+    ``inertial_rad`` (L, K, 3) and ``inside`` (L, K), or weights, for L offsets. Intervals weigh by 1 / dt, as for a
+    random walk. Also returns the two common rates (L, 3), camera and IMU.
     """
     dt_s = intervals.dt_s
     weight = inside / dt_s
@@ -431,7 +468,7 @@ def _peaks(offset_s: Array, gain: Array) -> list[int]:
 
 
 def _closest(
-    intervals: Intervals, path: GyroPath, offset_s: Array, effective: float, rotation: Array | None, share: float
+    intervals: Intervals, path: GyroPath, offset_s: Array, effective: float, rotation: Array | None, share: float | None
 ) -> ClockFit:
     """The best of a few neighbouring offsets, with its rotation and bias."""
     # an interval begins where the one before ends
@@ -440,16 +477,29 @@ def _closest(
     first, last = attitude[:, place[: len(intervals)]], attitude[:, place[len(intervals) :]]
     inertial = quat_log(quat_multiply(quat_conjugate(first), last))
     mask = path.covers(intervals.begin_s - offset_s[:, None], intervals.end_s - offset_s[:, None])
-    energy, left, (cross, rate_v, rate_g) = _fit(intervals, inertial, mask, rotation, share)
-    covered = np.sum(mask * intervals.dt_s, axis=1) / intervals.dt_s.sum()
-    gain = _gain(energy, left, effective * share * covered)
+    turned, mirrored = np.ones(len(offset_s)), -np.inf
+    if share is None:
+        mixture = _fit_mixture(intervals, inertial, mask, rotation)
+        independent = min(effective / (3 * len(intervals)), 1.0)
+        gain, explained, turned = independent * mixture.log_likelihood, mixture.sound, mixture.gain
+        cross, rate_v, rate_g = mixture.cross, mixture.rate_v, mixture.rate_g
+        if rotation is None:
+            at = np.array([np.argmax(gain)])
+            reflected = _fit_mixture(intervals, inertial[at], mask[at], None, mirrored=True)
+            mirrored = independent * float(reflected.log_likelihood[0])
+    else:
+        energy, left, (cross, rate_v, rate_g) = _fit(intervals, inertial, mask, rotation, share)
+        covered = np.sum(mask * intervals.dt_s, axis=1) / intervals.dt_s.sum()
+        gain, explained = _gain(energy, left, effective * share * covered), 1 - left / np.maximum(energy, 1e-15)
     best = int(np.argmax(gain))
     if rotation is None:
         rotation = _best_rotation(cross[best : best + 1])[0]
     return ClockFit(
         offset_s=float(offset_s[best]),
         log_likelihood=float(gain[best]),
-        explained=float(1 - left[best] / max(energy[best], 1e-15)),
+        explained=float(explained[best]),
         cam_from_imu_xyzw=quat_from_matrix(rotation),
         gyro_bias_rad_s=rate_g[best] - rotation.T @ rate_v[best],
+        gain=float(turned[best]),
+        mirrored=mirrored,
     )
