@@ -240,7 +240,7 @@ class LoopSearch:
         Their matches cover enough of both images, agree with the gyroscope's rotation, and with the relative track.
         """
         views = compare(self.database, name_pairs(self.names, pairs))
-        verified = np.isfinite(views.first_from_second).all(axis=(1, 2))
+        verified = np.asarray(np.isfinite(views.first_from_second).all(axis=(1, 2)), dtype=np.bool_)
         i, j = split_pairs(pairs)
         turned = verified.copy()
         turned[turned] = self.orientations.agree(i[turned], j[turned], views.first_from_second[turned])
