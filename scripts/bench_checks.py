@@ -359,9 +359,10 @@ def resting(count: int = 27, seed: int = 0) -> Iterator[Case]:
                 t_s=t_s,
                 world_from_cam=matrix_from_quat(poses.world_from_cam_xyzw),
                 cam_in_world_m=poses.cam_in_world_m,
-                imu_t_s=imu.gyro_t_s,
+                # the device's own readings, on its own clock, are taken below
+                imu_t_s=sampled.gyro_t_cam_s,
                 gyro_rad_s=imu.gyro_rad_s,
-                accel_m_s2=imu.accel_m_s2[: len(imu.gyro_t_s)],
+                accel_m_s2=np.zeros_like(imu.gyro_rad_s),
             )
             window = Window(
                 recording="resting",

@@ -31,6 +31,8 @@ class MotionCheckLimits:
     #: recordings that turn by 0.3 rad/s, 0.11 and less in simulated ones on the spot that turn by 1.5.
     least_accel_m_s2: float = 0.08
     accel_per_turn_m_s: float = 0.05
+    #: So many windows in which the camera accelerates are motion, however long it rests.
+    lively: int = 3
     #: A camera that turns slower than this (rms) stands on something.
     rotated_rad_s: float = 0.02
     #: A path is straight where it is this many times longer than its points lie off a steady glide.
@@ -67,6 +69,8 @@ def check_motion_content(recorded: Recorded) -> Iterator[Finding]:
 def acceleration_rms_m_s2(imu: ImuRecording) -> float | None:
     """Rms of the acceleration that is left once gravity, drift, bias and a lever arm are out; ``None`` where short.
 
+    That of the median window, or of the third where fewer are lively.
+
     The specific force, turned by the integrated gyroscope, is gravity plus acceleration. In each window what is
     constant or changes evenly is taken out, as gravity and the gyroscope's drift do; over all of them, what a bias and
     a lever arm between the IMU and the centre of rotation explain.
@@ -91,9 +95,9 @@ def acceleration_rms_m_s2(imu: ImuRecording) -> float | None:
     residual = columns - np.einsum("kp,lp,wlij->wkij", even, even, columns)
     y, x = residual[..., 0].ravel(), residual[..., 1:].reshape(-1, 6)
     rest = y - x @ np.linalg.lstsq(x, y, rcond=1e-6)[0]
-    # the median over windows: a moment of lifting the camera does not make a recording lively
-    energy = np.sum(rest.reshape(len(starts), -1) ** 2, axis=1) / steps
-    return float(np.sqrt(np.median(energy)))
+    energy = np.sort(np.sum(rest.reshape(len(starts), -1) ** 2, axis=1) / steps)
+    # a moment of lifting the camera does not make a recording lively; a rest does not make it still
+    return float(np.sqrt(max(np.median(energy), energy[-min(_MOTION_LIMITS.lively, len(energy))])))
 
 
 def _glides(trajectory: CameraTrajectory) -> bool:

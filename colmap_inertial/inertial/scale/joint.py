@@ -35,7 +35,7 @@ from colmap_inertial.inertial.core import parameters as par
 from colmap_inertial.inertial.core.parameters import Prior
 from colmap_inertial.inertial.core.priors import PRIORS, AccelPart, accel_part, clock_scale_sigma
 from colmap_inertial.inertial.scale._fit import Fit, fit_jointly
-from colmap_inertial.inertial.scale._gain import WrongGain, judge_gain
+from colmap_inertial.inertial.scale._gain import WrongGain, exceeds_usual, judge_gain
 from colmap_inertial.inertial.scale._setup import Data, prepare
 from colmap_inertial.inertial.scale._shape import LIMITS as SHAPE_LIMITS, ShapeFault, confirmed, suspect
 from colmap_inertial.inertial.scale._suspects import Faults, worst
@@ -71,6 +71,11 @@ class JudgementLimits:
     #: A keyframe with a robust weight below this may be in the wrong place. Where three of 30 are, they swell the noise
     #: so that their weights are .27 to .57; others keep .8 and more.
     counts_little: float = 0.6
+    #: An accelerometer whose stamps are off by more than so many standard deviations, and than the second, is moved;
+    #: what is known of the delay of an unknown device.
+    delay_sigmas: float = 3.0
+    small_delay_s: float = 0.03
+    unknown_delay_s: float = 0.02
     #: So many places where poses jump are said by their times.
     jumps_said: int = 5
 
@@ -123,10 +128,10 @@ def estimate_joint(
     reason.
     """
     options = options or JointOptions()
-    accel = accel_part(timed.imu)
+    accel, expected_s = accel_part(timed.imu), timed.calibration.accel_delay_s
     try:
-        data, prior = _prepared(trajectory, timed, options)
-        fit, faults = _fit_soundly(data, prior, timed.imu.noise)
+        timed, data, prior, fit = _fit_in_step(trajectory, timed, options)
+        fit, faults = _fit_soundly(fit, data, prior, timed.imu.noise)
         fit, shape = _fit_shapely(fit, faults.undone(data), faults.loosened(prior), timed.imu.noise, accel=accel)
     except NotObservableError as error:
         return ScaleEstimate.refused("joint", error.hint)
@@ -137,7 +142,18 @@ def estimate_joint(
     wrong = [*faults.sentences(), *_cut_off(data)]
     # what was taken from a path nobody can put back: its scale is too large by more than any interval says
     estimate = _judged(fit, data.t_s, timed.calibration, accel, wrong, shape, worthless=faults.path_is_smoothed)
-    return replace(estimate, jumped=_name_jumped(fit, data, trajectory))
+    notes = (*estimate.notes, *_out_of_step(timed.calibration.accel_delay_s - expected_s))
+    return replace(estimate, notes=notes, jumped=_name_jumped(fit, data, trajectory))
+
+
+def _out_of_step(moved_s: float) -> list[str]:
+    """A sentence where the accelerometer's stamps were moved."""
+    if moved_s == 0:
+        return []
+    return [
+        f"the accelerometer's stamps are {-1e3 * moved_s:+.0f} ms off the gyroscope's, as the fit finds; that is "
+        "undone: stamp both sensors when they are sampled"
+    ]
 
 
 def _name_jumped(fit: Fit, data: Data, trajectory: CameraTrajectory) -> tuple[str, ...]:
@@ -174,19 +190,55 @@ def fit_path(
     numpy.linalg.LinAlgError
         When the data leave the system singular.
     """
-    data, prior = _prepared(trajectory, timed, options)
-    fit, faults = _fit_soundly(data, prior, timed.imu.noise)
+    timed, data, prior, fit = _fit_in_step(trajectory, timed, options)
+    fit, faults = _fit_soundly(fit, data, prior, timed.imu.noise)
     accel = accel_part(timed.imu)
     sound = faults.undone(data), faults.loosened(prior)
     _, shape = _fit_shapely(fit, *sound, timed.imu.noise, accel=accel)
     widened = scale_of(fit, data.t_s, accel).widened
-    return data, fit, (*faults.sentences(), *(fault.sentence(data.t_s, widened) for fault in shape))
+    wrong = (*shape.undone, *shape.said)
+    return data, fit, (*faults.sentences(), *(fault.sentence(data.t_s, widened) for fault in wrong))
 
 
-def _fit_soundly(data: Data, prior: Prior, sheet: ImuNoise | None) -> tuple[Fit, Faults]:
+def _fit_in_step(
+    trajectory: CameraTrajectory, timed: CameraTimedImu, options: JointOptions
+) -> tuple[CameraTimedImu, Data, Prior, Fit]:
+    """The recording, its measurements and their fit; with the accelerometer's stamps moved where they are far off.
+
+    A delay beyond its prior is pulled towards it, and frames were averaged by readings of another moment: the fit
+    starts again from what was found, which is as little known as that of an unknown device.
+    """
+    data, prior = _prepared(trajectory, timed, options)
+    fit = fit_jointly(data, prior, timed.imu.noise)
+    delay_s, expected_s = fit.estimate.accel_delay_s, float(prior.info[par.ACCEL_DELAY, par.ACCEL_DELAY]) ** -0.5
+    sigma_s = float(fit.cov[par.ACCEL_DELAY, par.ACCEL_DELAY]) ** 0.5
+    if not is_out_of_step(delay_s, sigma_s, expected_s):
+        return timed, data, prior, fit
+    timed = replace(timed, calibration=timed.calibration.shift_clock_offsets(0.0, delay_s))
+    data, prior = _prepared(trajectory, timed, options)
+    info, at = prior.info.copy(), par.ACCEL_DELAY
+    info[at, at] = max(expected_s, _LIMITS.unknown_delay_s) ** -2
+    prior = replace(prior, info=info)
+    return timed, data, prior, fit_jointly(data, prior, timed.imu.noise)
+
+
+def is_out_of_step(delay_s: float, sigma_s: float, expected_s: float) -> bool:
+    """Whether an accelerometer's stamps are further off than was expected, than chance makes them, and than matters.
+
+    Parameters
+    ----------
+    delay_s, sigma_s
+        As fitted.
+    expected_s
+        Standard deviation of what was known before.
+    """
+    known = _LIMITS.delay_sigmas * max(sigma_s, expected_s)
+    return abs(delay_s) > max(known, _LIMITS.small_delay_s)
+
+
+def _fit_soundly(fit: Fit, data: Data, prior: Prior, sheet: ImuNoise | None) -> tuple[Fit, Faults]:
     """The fit, with what shows to be wrong with the accelerometer undone, and what that was."""
     faults, sound = Faults(values={}), data
-    fit = fit_jointly(data, prior, sheet)
     for _ in range(_MOST_FAULTS):
         if fit.gain_chi2 > par.LARGEST_GAIN_CHI2 and not prior.heavy_gains:
             # not from the start: on its way a fit passes gains that it would not find back from
@@ -204,29 +256,49 @@ def _fit_soundly(data: Data, prior: Prior, sheet: ImuNoise | None) -> tuple[Fit,
     return fit, faults
 
 
-def _fit_shapely(
-    fit: Fit, data: Data, prior: Prior, sheet: ImuNoise | None, *, accel: AccelPart
-) -> tuple[Fit, list[ShapeFault]]:
-    """The fit of a model without what shows to be wrong with its shape, and what that was."""
-    found: list[ShapeFault] = []
-    before = fit
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Shape:
+    """What seems to be wrong with a model's shape: what was undone, and what is only said."""
+
+    undone: tuple[ShapeFault, ...] = ()
+    said: tuple[ShapeFault, ...] = ()
+
+
+def _fit_shapely(fit: Fit, data: Data, prior: Prior, sheet: ImuNoise | None, *, accel: AccelPart) -> tuple[Fit, Shape]:
+    """The fit of a model without what shows to be wrong with its shape, and what that was.
+
+    What it does to the scale, or would do where there is too little evidence to undo it, is in the interval.
+    """
+    shape, before = Shape(), fit
+    open_variance = 0.0
     # wrong gains look like a stretch
     sound = fit.gain_chi2 <= par.LARGEST_GAIN_CHI2 and not _refusals(fit, data.t_s)
-    while sound and len(found) < SHAPE_LIMITS.most:
+    while sound and len(shape.undone) < SHAPE_LIMITS.most:
         suspected = suspect(fit.shape, scale_of(fit, data.t_s, accel).widened)
         if suspected is None:
             break
         mended = replace(data.groups, centre=suspected.undo(data.t_s, data.groups.centre))
         trial_data = replace(data, groups=mended)
         trial = fit_jointly(trial_data, prior, sheet)
-        fault = confirmed(suspected, trial.shape, scale_of(trial, data.t_s, accel).widened)
+        widened = scale_of(trial, data.t_s, accel).widened
+        fault = confirmed(suspected, trial.shape, widened)
         if fault is None:
             break
+        if fault.chi2(widened) <= fault.undone_limit:
+            shape = replace(shape, said=(fault,))
+            open_variance += _log_ratio(trial, fit) ** 2
+            break
         data, fit = trial_data, trial
-        found.append(fault)
-    open_variance = sum(float(one.by_scale @ one.cov @ one.by_scale) for one in found)
+        shape = replace(shape, undone=(*shape.undone, fault))
+    open_variance += sum(float(one.by_scale @ one.cov @ one.by_scale) for one in shape.undone)
+    open_variance += _log_ratio(fit, before) ** 2
     parts = {**fit.variance_parts, "model_shape": open_variance}
-    return replace(fit, drift=before.drift, variance_parts=parts), found
+    return replace(fit, drift=before.drift, variance_parts=parts), shape
+
+
+def _log_ratio(fit: Fit, before: Fit) -> float:
+    """Logarithm of the scale of a fit over that of another."""
+    return float(np.log(fit.estimate.metres_per_unit / before.estimate.metres_per_unit))
 
 
 def _cut_off(data: Data) -> list[str]:
@@ -246,7 +318,7 @@ def _judged(
     calibration: CameraImuCalibration,
     accel: AccelPart,
     wrong: Sequence[str],
-    shape: Sequence[ShapeFault],
+    shape: Shape,
     *,
     worthless: bool,
 ) -> ScaleEstimate:
@@ -258,18 +330,26 @@ def _judged(
     metres_per_unit, sigma_log = scale.metres_per_unit, scale.sigma_log
     refusals = [*_refusals(fit, t_s), *(wrong if worthless else ())]
     verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, refusals=refusals)
+    notes: tuple[str, ...] = ()
     if verdict == "refused":
         reasons = (*reasons, *(() if worthless else wrong))
     else:
-        bent = [fault.sentence(t_s, scale.widened) for fault in shape] or _check_drift(fit.drift)
-        doubts = [*wrong, *check_clocks(clock_rate), *_checks(fit, t_s, scale.wrong_gain), *bent]
+        bent = [fault.sentence(t_s, scale.widened) for fault in shape.undone] or _check_drift(fit.drift)
+        large, usual = _check_gains(fit, scale)
+        doubts = [*wrong, *check_clocks(clock_rate), *_check_length(t_s), *large, *bent]
         verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, doubts)
-    notes: tuple[str, ...] = ()
+        # what is in the interval makes nothing weak by itself; where the interval is wide, it may be why
+        counted = [*usual, *(fault.sentence(t_s, scale.widened) for fault in shape.said)]
+        counted = [f"{sentence} (this is in the interval)" for sentence in counted]
+        if verdict == "trusted":
+            notes = tuple(counted)
+        else:
+            reasons = (*reasons, *counted)
     if len(fit.jumped_s):
         places = "one place" if len(fit.jumped_s) == 1 else f"{len(fit.jumped_s)} places"
         since = ", ".join(f"{at_s - t_s[0]:.1f}" for at_s in fit.jumped_s[: _LIMITS.jumps_said])
         more = " s, ..." if len(fit.jumped_s) > _LIMITS.jumps_said else " s"
-        notes = (f"poses jump at {places} ({since}{more}), which hardly counts",)
+        notes = (*notes, f"poses jump at {places} ({since}{more}), which hardly counts")
     refused = verdict == "refused"
     keep = [par.SCALE, *range(par.GRAVITY.start, par.ACCEL_BIAS.stop)]
     signs = np.array([-1.0, *[1.0] * 6])
@@ -391,28 +471,36 @@ def _refusals(fit: Fit, t_s: Array) -> list[str]:
     return out
 
 
-def _checks(fit: Fit, t_s: Array, wrong_gain: WrongGain | None) -> list[str]:
-    """Findings that make the number doubtful, in the user's words."""
-    out = []
+def _check_length(t_s: Array) -> list[str]:
+    """A sentence where a clip is too short for its number not to be doubtful."""
     span_s = float(t_s[-1] - t_s[0])
-    if span_s < _LIMITS.shortest_s:
-        out.append(
-            f"the clip is short ({span_s:.1f} s): it says little about its own noise; "
-            f"record {_LIMITS.shortest_s:.0f} s or more"
-        )
+    if span_s >= _LIMITS.shortest_s:
+        return []
+    return [
+        f"the clip is short ({span_s:.1f} s): it says little about its own noise; "
+        f"record {_LIMITS.shortest_s:.0f} s or more"
+    ]
+
+
+def _check_gains(fit: Fit, scale: FoundScale) -> tuple[list[str], list[str]]:
+    """Sentences on gains of the accelerometer: larger than any sensor's, and others that are worth a word."""
+    gains, wrong_gain = fit.estimate.accel_gain, scale.wrong_gain
     if fit.gain_chi2 > par.LARGEST_GAIN_CHI2:
-        gains = ", ".join(f"{-100 * g:+.1f}" for g in np.diagonal(fit.estimate.accel_gain))
-        out.append(
-            f"the accelerometer seems to be off in gain by {gains} % on its axes, more than such sensors are, which "
+        sigma = np.sqrt(scale.widened * np.diagonal(fit.cov[par.ACCEL_GAIN, par.ACCEL_GAIN])).reshape(3, 3)
+        percent = ", ".join(f"{-100 * g:+.1f}" for g in np.diagonal(gains))
+        sentence = (
+            f"the accelerometer seems to be off in gain by {percent} % on its axes, more than such sensors are, which "
             "is allowed for: check its unit and the strength of gravity, or calibrate it (calibrate-imu)"
         )
-    elif wrong_gain is not None and wrong_gain.is_likely:
-        out.append(
-            f"the accelerometer's gain may be off by {100 * wrong_gain.gain:+.1f} %, which lengths follow (gravity "
-            f"reads {100 * wrong_gain.excess:+.1f} % too long, by gain or bias): check its unit, turn the camera about "
-            "all axes while it moves, or calibrate it (calibrate-imu)"
-        )
-    return out
+        return ([sentence], []) if exceeds_usual(gains, sigma).any() else ([], [sentence])
+    if wrong_gain is None or not wrong_gain.is_likely:
+        return [], []
+    sentence = (
+        f"the accelerometer's gain may be off by {100 * wrong_gain.gain:+.1f} %, which lengths follow (gravity "
+        f"reads {100 * wrong_gain.excess:+.1f} % too long, by gain or bias): check its unit, turn the camera about "
+        "all axes while it moves, or calibrate it (calibrate-imu)"
+    )
+    return ([sentence], []) if wrong_gain.is_large else ([], [sentence])
 
 
 def _check_drift(drift: ScaleDrift) -> list[str]:

@@ -166,7 +166,7 @@ def run_preflight(
     force: bool,
     model: CameraTrajectory | Literal["untimed"] | None = None,
 ) -> tuple[str, ...]:
-    """The checks, written down and told to ``findings``; the doubts of a run that is forced to go on.
+    """The checks, written down and told to ``findings``; the doubts of a run that goes on, also of a forced one.
 
     Of a ``model``, its poses are checked in place of the images.
 
@@ -195,7 +195,7 @@ def run_preflight(
 
 
 def stop_or_doubt(diagnosis: Diagnosis, *, force: bool) -> tuple[str, ...]:
-    """Stop where the recording cannot give metres; when forced to go on, the reasons not to trust them.
+    """Stop where the recording cannot give metres; else, and when forced to go on, the reasons not to trust them.
 
     Raises
     ------
@@ -209,7 +209,8 @@ def stop_or_doubt(diagnosis: Diagnosis, *, force: bool) -> tuple[str, ...]:
         raise NotObservableError("scale", f"{stopping[0].sentence} (--force goes on)")
     for finding in stopping:
         log.warning("forced to go on: %s", finding.evidence)
-    return tuple(f"{finding.evidence}; forced to go on" for finding in stopping)
+    doubts = tuple(finding.sentence for finding in diagnosis.doubting)
+    return (*(f"{finding.evidence}; forced to go on" for finding in stopping), *doubts)
 
 
 def measure_images(capture: Capture, timing: FrameTiming, progress: Progress) -> VisualRotation | None:
