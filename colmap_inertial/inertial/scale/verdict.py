@@ -14,8 +14,8 @@ TRUSTED_HALF_WIDTH = 0.03
 WEAK_HALF_WIDTH = 0.30
 #: A drift of the scale is reported where chance would show as much once in ten thousand recordings.
 _DRIFT_PROBABILITY, _DRIFT_SIGMAS = 1e-4, 3.89
-#: Clocks of camera and IMU that part faster make a scale weak: action cameras' do by up to .2 % (one standard deviation;
-#: none of 2,076 clean windows of other recordings by .1), and what either makes of metres is in the interval.
+#: Clocks of camera and IMU that part faster make a scale weak: action cameras' do by .2 % (one standard deviation;
+#: none of 2,076 clean windows of other recordings does by .1), and what either makes of metres is in the interval.
 _APART_RATE = 3e-3
 
 
