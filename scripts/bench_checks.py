@@ -8,7 +8,7 @@ frames. All windows of 10, 15, 20, 30, 40 and 60 s of tablets' recordings (``ine
 IMUs with motion capture (``real_imu``, ``euroc_v101``: poses with the errors of a reconstruction), of a phone with
 LiDAR (``iphone_lidar``) and of a flight that stands still in the end (``euroc_mh01``, frames at 5 and 20 Hz); and 200
 simulated recordings of every kind of motion, device, length and frame rate, among them short orbits and ones that
-stand still for a part of their time.
+stand still for a part of their time. And faults of every kind, at sizes from harmless to gross, in three of them.
 
 Each goes the way of ``scale``: the checks beforehand, then the estimate, also where a check stops it, as ``--force``
 would. Rows are kept in a CSV, and those that are there are not run again. ``--table`` prints the tables of a CSV.
@@ -31,6 +31,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import study_model_faults
 from real_imu import FLOWN, HANDHELD, RECORDINGS, Motion, Window, read, reconstructed
 
 from colmap_inertial.checks.diagnose import Recorded, diagnose
@@ -398,6 +399,205 @@ SETS: dict[str, Callable[[Path], Iterator[Case]]] = {
 }
 
 
+# --- faults ----------------------------------------------------------------------------------------------------------
+
+Change = Callable[[CameraTrajectory, ImuRecording, float, float], tuple[CameraTrajectory, ImuRecording]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fault:
+    """What is put into a sound recording: sizes from harmless to gross, and the codes or words that name it."""
+
+    sizes: tuple[float, ...]
+    named: str
+    change: Change
+
+
+def of_model(fault: str) -> Change:
+    """A fault of ``study_model_faults.py``."""
+
+    def change(
+        poses: CameraTrajectory, imu: ImuRecording, truth: float, size: float
+    ) -> tuple[CameraTrajectory, ImuRecording]:
+        window = Window(recording="", length_s=0, begin_s=0, end_s=0, noise_m=0, correlation_s=0, seed=3)
+        return study_model_faults.alter(
+            study_model_faults.Altered(window=window, fault=fault, size=size), poses, imu, truth
+        )
+
+    return change
+
+
+def of_accel(change: Callable[[ImuRecording, float], Array]) -> Change:
+    return lambda poses, imu, truth, size: (poses, replace(imu, accel_m_s2=change(imu, size)))
+
+
+def of_gyro(change: Callable[[ImuRecording, float], Array]) -> Change:
+    return lambda poses, imu, truth, size: (poses, replace(imu, gyro_rad_s=change(imu, size)))
+
+
+def low_passed(imu: ImuRecording, hz: float) -> Array:
+    """A filter of the first order, as applications have it."""
+    out = imu.accel_m_s2.copy()
+    for i, step_s in enumerate(np.diff(imu.accel_t_s), start=1):
+        out[i] = out[i - 1] + (1 - np.exp(-2 * np.pi * hz * step_s)) * (out[i] - out[i - 1])
+    return out
+
+
+def smoothed(poses: CameraTrajectory, width_s: float) -> CameraTrajectory:
+    step_s = float(np.median(np.diff(poses.t_s)))
+    reach = max(1, round(3 * width_s / step_s))
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) * step_s / width_s) ** 2)
+    padded = np.pad(poses.cam_in_world, ((reach, reach), (0, 0)), mode="edge")
+    smooth = [np.convolve(column, kernel / kernel.sum(), mode="valid") for column in padded.T]
+    return replace(poses, cam_in_world=np.stack(smooth, axis=1))
+
+
+def wandering(poses: CameraTrajectory, amplitude_s: float) -> CameraTrajectory:
+    return replace(poses, t_s=poses.t_s + amplitude_s * np.sin(2 * np.pi * poses.t_s / 10.0))
+
+
+def paused(imu: ImuRecording, length_s: float) -> ImuRecording:
+    middle_s = 0.5 * (imu.gyro_t_s[0] + imu.gyro_t_s[-1])
+    gyro, accel = (np.abs(t_s - middle_s) > 0.5 * length_s for t_s in (imu.gyro_t_s, imu.accel_t_s))
+    return replace(
+        imu,
+        gyro_t_s=imu.gyro_t_s[gyro],
+        gyro_rad_s=imu.gyro_rad_s[gyro],
+        accel_t_s=imu.accel_t_s[accel],
+        accel_m_s2=imu.accel_m_s2[accel],
+    )
+
+
+def saturated(imu: ImuRecording, share: float) -> Array:
+    limit = np.quantile(np.abs(imu.accel_m_s2).max(axis=1), 1 - share)
+    return np.clip(imu.accel_m_s2, -limit, limit)
+
+
+def jumping(poses: CameraTrajectory, truth: float, size_m: float, *, last_s: float) -> CameraTrajectory:
+    """Nine jumps, in the last seconds."""
+    rng = np.random.default_rng(9)
+    late = np.flatnonzero(poses.t_s > poses.t_s[-1] - last_s)
+    path = poses.cam_in_world.copy()
+    for k in np.sort(rng.choice(late, min(9, len(late)), replace=False)):
+        path[k:] += size_m / truth * rng.standard_normal(3)
+    return replace(poses, cam_in_world=path)
+
+
+FAULTS: dict[str, Fault] = {
+    "accelerometer late, s": Fault(
+        sizes=(0.02, 0.06, 0.1, -0.1, 0.2, -0.4),
+        named="sensors-offset|ms off the gyroscope",
+        change=lambda poses, imu, truth, size: (poses, replace(imu, accel_t_s=imu.accel_t_s + size)),
+    ),
+    "camera's clock fast": Fault(
+        sizes=(0.001, 0.003, 0.01, 0.02), named="clock-rate|clocks of camera", change=of_model("clock")
+    ),
+    "frame times wander, s": Fault(
+        sizes=(0.01, 0.03, 0.06, 0.12),
+        named="frame-times-uneven",
+        change=lambda poses, imu, truth, size: (wandering(poses, size), imu),
+    ),
+    "accelerometer's gain": Fault(sizes=(0.01, -0.02, 0.03, 0.05, -0.1), named="gain", change=of_model("gain")),
+    "accelerometer's bias, m/s2": Fault(sizes=(0.2, 0.45, 1.0, 2.5), named="gain|bias", change=of_model("bias")),
+    "torn": Fault(sizes=(0.01, 0.03, 0.05, 0.1), named="same throughout|longer along", change=of_model("torn")),
+    "drifting": Fault(sizes=(0.01, 0.03, 0.05, 0.1), named="same throughout|longer along", change=of_model("drift")),
+    "stretched": Fault(sizes=(0.01, 0.03, 0.05, 0.1), named="longer along|same throughout", change=of_model("stretch")),
+    "accelerometer low-passed, Hz": Fault(sizes=(20.0, 8.0, 4.0, 2.0), named="low-passed", change=of_accel(low_passed)),
+    "path smoothed, s": Fault(
+        sizes=(0.02, 0.05, 0.1),
+        named="low-passed|not smoothed|converge|disagree",
+        change=lambda poses, imu, truth, size: (smoothed(poses, size), imu),
+    ),
+    "pause, s": Fault(
+        sizes=(0.05, 0.3, 2.0, 5.0),
+        named="gap|pauses",
+        change=lambda poses, imu, truth, size: (poses, paused(imu, size)),
+    ),
+    "accelerometer cut off": Fault(
+        sizes=(0.0005, 0.01, 0.05), named="saturated|end of its range", change=of_accel(saturated)
+    ),
+    "poses jump in the last .6 s, m": Fault(
+        sizes=(0.02, 0.1, 1.0),
+        named="poses jump|left out",
+        change=lambda poses, imu, truth, size: (jumping(poses, truth, size, last_s=0.6), imu),
+    ),
+    "accelerometer's sign": Fault(
+        sizes=(-1.0,), named="accel-flipped|axes|sign", change=of_accel(lambda imu, size: size * imu.accel_m_s2)
+    ),
+    "accelerometer's x mirrored": Fault(
+        sizes=(-1.0,), named="axes", change=of_accel(lambda imu, size: imu.accel_m_s2 * [size, 1, 1])
+    ),
+    "gyroscope's gain": Fault(
+        sizes=(1.02, 1.1, 1.3), named="gyro-gain", change=of_gyro(lambda imu, size: size * imu.gyro_rad_s)
+    ),
+    "gyroscope in steps, rad/s": Fault(
+        sizes=(0.002, 0.02, 0.2),
+        named="coarse-resolution",
+        change=of_gyro(lambda imu, size: size * np.round(imu.gyro_rad_s / size)),
+    ),
+    "accelerometer in steps, m/s2": Fault(
+        sizes=(0.01, 0.1, 1.0),
+        named="coarse-resolution",
+        change=of_accel(lambda imu, size: size * np.round(imu.accel_m_s2 / size)),
+    ),
+    "IMU of another time": Fault(
+        sizes=(1.0,),
+        named="imu-does-not-fit|offset-undecided",
+        change=lambda poses, imu, truth, size: (
+            poses,
+            replace(imu, gyro_rad_s=imu.gyro_rad_s[::-1].copy(), accel_m_s2=imu.accel_m_s2[::-1].copy()),
+        ),
+    ),
+}
+
+
+def faulted(shared: Path) -> Iterator[Case]:
+    """Each fault of each size in recordings by a tablet, of a room, and of a simulated phone, 20 s of each."""
+    bases = [case for case in tablets(shared) if case.key == "tablet/D9/20/0.0"]
+    bases += [case for case in with_mocap(shared, by_hand=True) if case.key == "rooms/room3/20/20.0"]
+    motion = simulate.MotionOptions(kind="orbit", duration_s=20.0)
+    bases.append(_simulated("phone", motion, "phone", 30.0, [0, 59]))
+    for name, fault in FAULTS.items():
+        for size in fault.sizes:
+            for base in bases:
+                yield replace(
+                    base,
+                    group="faults",
+                    name=f"{name}: {size:g}, {base.group}",
+                    make=partial(_with_fault, base, fault, size),
+                )
+
+
+def _with_fault(base: Case, fault: Fault, size: float) -> Made:
+    poses, imu, truth = base.make()
+    return (*fault.change(poses, imu, truth, size), truth)
+
+
+SETS["faults"] = faulted
+
+
+def print_faults(rows: Sequence[dict[str, str]]) -> None:
+    """Each fault and size: outcomes, whether it is named, whether the interval holds the truth."""
+    print(
+        f"{'':<36}{'stopped':>9}{'refused':>9}{'weak':>6}{'trusted':>9}{'named':>7}{'inside':>10}{'trusted, wrong':>16}"
+    )
+    names = [row["name"].rpartition(", ")[0] for row in rows]
+    for name in dict.fromkeys(names):
+        of = [row for row, its in zip(rows, names, strict=True) if its == name]
+        outcome = Counter(row["outcome"] for row in of)
+        words = FAULTS[name.rpartition(": ")[0]].named
+        said = sum(
+            bool(re.search(words, " ".join(row[key] for key in ("errors", "warnings", "infos", "sentences", "notes"))))
+            for row in of
+        )
+        given = [row for row in of if row["inside"] and row["outcome"] != "stopped"]
+        wrong = sum(row["outcome"] == "trusted" and row["inside"] == "0" for row in given)
+        print(
+            f"{name:<36}{outcome['stopped']:9d}{outcome['refused']:9d}{outcome['weak']:6d}{outcome['trusted']:9d}"
+            f"{said:7d}{sum(int(row['inside']) for row in given):5d} of {len(given):<3d}{wrong:12d}"
+        )
+
+
 # --- judging ---------------------------------------------------------------------------------------------------------
 
 #: Words of a reason by what it is about.
@@ -445,6 +645,9 @@ def judge(case: Case) -> dict[str, object]:
         severity: [f.code for f in diagnosis.findings if f.severity == severity]
         for severity in ("error", "warning", "info")
     }
+    outcome = "stopped" if diagnosis.stopping else str(estimate.verdict)
+    if outcome == "trusted" and diagnosis.doubting:
+        outcome = "weak"
     error = width = inside = None
     if estimate.metres_per_unit is not None and estimate.sigma_log is not None:
         error = float(np.log(estimate.metres_per_unit / truth))
@@ -457,7 +660,7 @@ def judge(case: Case) -> dict[str, object]:
         "length_s": f"{case.length_s:g}",
         "begin_s": f"{case.begin_s:.1f}",
         "by_hand": int(case.by_hand),
-        "outcome": "stopped" if diagnosis.stopping else estimate.verdict,
+        "outcome": outcome,
         "errors": " ".join(of["error"]),
         "warnings": " ".join(of["warning"]),
         "infos": " ".join(of["info"]),
@@ -551,7 +754,7 @@ def print_tables(rows: Sequence[dict[str, str]]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--shared", type=Path, default=HERE.parent / "shared")
-    parser.add_argument("--sets", nargs="+", choices=SETS, default=list(SETS))
+    parser.add_argument("--sets", nargs="+", choices=SETS, default=list(SETS), help="of recordings, and faults")
     parser.add_argument("--rows", type=Path, default=Path("bench_checks.csv"), help="CSV of outcomes, continued")
     parser.add_argument("--keys", default="", help="only cases whose key matches this pattern")
     parser.add_argument("--table", action="store_true", help="print the tables of the CSV, and run nothing")
@@ -579,7 +782,9 @@ def main() -> None:
                 if case.key not in known:
                     writer.writerow(judge(case))
                     file.flush()
-    print_tables(read_rows(args.rows))
+    rows = read_rows(args.rows)
+    print_tables([row for row in rows if row["group"] != "faults"])
+    print_faults([row for row in rows if row["group"] == "faults"])
 
 
 if __name__ == "__main__":
