@@ -161,7 +161,13 @@ def correlated(rng: np.random.Generator, t_s: Array, correlation_s: float) -> Ar
 
 def recorded(folder: Path, window: Window) -> tuple[CameraTrajectory, ImuRecording, float]:
     """What the estimator gets of a window, and the true metres per unit."""
-    motion = read(folder, window.recording)
+    return reconstructed(read(folder, window.recording), window)
+
+
+def reconstructed(
+    motion: Motion, window: Window, *, margin_s: float = MARGIN_S
+) -> tuple[CameraTrajectory, ImuRecording, float]:
+    """The same of any motion, with so much of the IMU before and after the frames."""
     rng = np.random.default_rng([7, window.seed])
     keep = (motion.t_s >= window.begin_s) & (motion.t_s < window.end_s)
     t_s, n = motion.t_s[keep], int(keep.sum())
@@ -181,7 +187,7 @@ def recorded(folder: Path, window: Window) -> tuple[CameraTrajectory, ImuRecordi
     trajectory = CameraTrajectory(
         names=names, t_s=t_s, cam_from_world_xyzw=quat_from_matrix(cam_from_world), cam_in_world=centre
     )
-    near = (motion.imu_t_s >= t_s[0] - MARGIN_S) & (motion.imu_t_s <= t_s[-1] + MARGIN_S)
+    near = (motion.imu_t_s >= t_s[0] - margin_s) & (motion.imu_t_s <= t_s[-1] + margin_s)
     imu = ImuRecording(
         gyro_t_s=motion.imu_t_s[near] - offset_s,
         gyro_rad_s=motion.gyro_rad_s[near],

@@ -70,7 +70,7 @@ class Scale(DeviceCommand, SourceReader):
     """
 
     first_s: float | None = None
-    """Use only this many seconds from the start of the camera's recording."""
+    """Use only this many seconds from the start of the camera's recording, and the IMU's samples around them."""
     force: bool = False
     """Go on where `diagnose` finds an error; the scale is weak at most."""
     options: Annotated[ScaleOptions, arg(name="")] = dataclasses.field(default_factory=ScaleOptions)

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.arrays import Array, BoolArray
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types.imu import CameraImuCalibration, ImuRecording
 
@@ -84,3 +84,20 @@ class CameraTimedImu:
     def accel_t_s(self) -> Array:
         """(M,) camera times of the accelerometer's samples."""
         return np.asarray(self.imu.accel_t_s + self.accel_offset_s)
+
+    def between(self, begin_s: float, end_s: float) -> ImuRecording:
+        """The samples of an interval of camera time, as they were stamped; all of a sensor that has fewer than two."""
+        gyro = _inside(self.gyro_t_s, begin_s, end_s)
+        accel = _inside(self.accel_t_s, begin_s, end_s)
+        return replace(
+            self.imu,
+            gyro_t_s=self.imu.gyro_t_s[gyro],
+            gyro_rad_s=self.imu.gyro_rad_s[gyro],
+            accel_t_s=self.imu.accel_t_s[accel],
+            accel_m_s2=self.imu.accel_m_s2[accel],
+        )
+
+
+def _inside(t_s: Array, begin_s: float, end_s: float) -> BoolArray:
+    inside = (t_s >= begin_s) & (t_s <= end_s)
+    return np.asarray(inside if inside.sum() > 1 else np.ones_like(inside))

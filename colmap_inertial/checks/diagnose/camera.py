@@ -24,7 +24,7 @@ from colmap_inertial.io.plausible import best_mirrored_reading
 from colmap_inertial.io.units import Axes
 from colmap_inertial.motion.align import Alignment
 from colmap_inertial.motion.align.consensus import describe_consensus
-from colmap_inertial.motion.align.conventions import quick_accelerations
+from colmap_inertial.motion.align.conventions import ACCELERATION_S, QuickAccelerations, quick_accelerations
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,8 +68,9 @@ class CameraCheckLimits:
     #: Rotations that correlate less tell no gain; quick ones are those against the mean of so many intervals.
     gain_correlation: float = 0.7
     quick_intervals: int = 9
-    #: The correlation of visual and inertial acceleration that tells its sign.
+    #: The correlation of visual and inertial acceleration that tells its sign, and the standard deviations of chance.
     opposite: float = -0.3
+    opposite_sigmas: float = 4.0
 
 
 _LIMITS = CameraCheckLimits()
@@ -322,15 +323,20 @@ def check_accelerometer_sign(recorded: Recorded) -> Iterator[Finding]:
         return
     if recorded.likely_convention is not None:
         return
-    correlation = acceleration_correlation(poses, imu, aligned)
-    if correlation is not None and correlation < _LIMITS.opposite:
-        yield Finding(fact=Fact("accel-flipped", correlation=correlation), severity="error")
-
-
-def acceleration_correlation(poses: CameraTrajectory, imu: ImuRecording, aligned: Alignment) -> float | None:
-    """Correlation of visual and inertial acceleration in the world, without what is slow; ``None`` where sparse."""
     quick = quick_accelerations(poses, imu, aligned.calibration)
     if quick is None:
-        return None
+        return
+    correlation, sigma = correlate_accelerations(quick)
+    if correlation < min(_LIMITS.opposite, -_LIMITS.opposite_sigmas * sigma):
+        fact = Fact("accel-flipped", correlation=correlation, correlation_sigma=sigma)
+        yield Finding(fact=fact, severity="error")
+
+
+def correlate_accelerations(quick: QuickAccelerations) -> tuple[float, float]:
+    """Correlation of visual and inertial acceleration in the world, without what is slow, and that of chance.
+
+    The latter is its standard deviation where the two have nothing in common: one independent vector in each window.
+    """
     inertial, visual = quick.inertial_m_s2, quick.visual
-    return float(np.sum(inertial * visual) / max(np.sqrt(np.sum(inertial**2) * np.sum(visual**2)), 1e-12))
+    size = max(float(np.sqrt(np.sum(inertial**2) * np.sum(visual**2))), 1e-12)
+    return float(np.sum(inertial * visual)) / size, (3 * quick.seconds / ACCELERATION_S) ** -0.5

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from colmap_inertial.checks.diagnose.findings import Finding, Recorded, Severity
+from colmap_inertial.core.arrays import Array, BoolArray
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import CameraTrajectory
 from colmap_inertial.imaging.gyro_camera import GyroCamera
@@ -31,6 +32,12 @@ class ClockCheckLimits:
     part_step_s: float = 0.01
     uneven_s: float = 0.05
     part_explained: float = 0.6
+    #: Standard deviations of a part's offset that count (five: once in 10,000 recordings of a minute, with room for
+    #: errors that are not normal), how well an offset is known at best, in frames, and which share of the offset
+    #: another part has: clocks wander, and poses that are wrong for a moment do not.
+    uneven_sigmas: float = 5.0
+    known_frames: float = 0.1
+    another: float = 0.5
 
 
 _LIMITS = ClockCheckLimits()
@@ -108,42 +115,124 @@ def check_even_times(recorded: Recorded) -> Iterator[Finding]:
     if float(np.median(np.diff(turning.t_s))) > _LIMITS.part_reach_s / 2:
         return
     motion = GyroCamera.of(imu, aligned.calibration, camera_epoch_ns=turning.epoch_ns)
-    middles, offsets = [], []
+    parts = []
     count = int(np.ptp(turning.t_s) / _LIMITS.part_s)
     for begin_s in turning.t_s[0] + _LIMITS.part_s * np.arange(count):
         inside = np.flatnonzero((turning.t_s >= begin_s) & (turning.t_s < begin_s + _LIMITS.part_s))
-        middle_s = begin_s + 0.5 * _LIMITS.part_s
-        drift_s = float(aligned.calibration.drift_s(middle_s))
-        part_offset_s = _part_offset_s(turning.select(inside), motion, drift_s)
-        if part_offset_s is not None:
-            middles.append(middle_s)
-            offsets.append(part_offset_s)
-    if len(offsets) < 3:
+        drift_s = float(aligned.calibration.drift_s(begin_s + 0.5 * _LIMITS.part_s))
+        part = _compare_part(turning.select(inside), motion, drift_s)
+        if part is not None:
+            parts.append(part)
+    if len(parts) < 3:
         return
-    off = np.array(offsets)
-    off -= np.median(off)
-    worst = int(np.argmax(np.abs(off)))
-    if abs(off[worst]) > _LIMITS.uneven_s:
-        fact = Fact("frame-times-uneven", wander_s=np.ptp(off), worst_s=middles[worst] - turning.t_s[0], parts=len(off))
+    middle_s = float(np.median([part.offset_s for part in parts]))
+    off = np.array([part.offset_s - middle_s for part in parts])
+    sigmas = np.array([part.sigmas_from(middle_s) for part in parts])
+    counts = wandering(off, sigmas)
+    if counts.any():
+        worst = int(np.argmax(np.where(counts, np.abs(off), 0.0)))
+        fact = Fact(
+            "frame-times-uneven",
+            wander_s=np.ptp(off),
+            worst_s=parts[worst].middle_s - turning.t_s[0],
+            parts=len(off),
+            sigmas=sigmas[worst],
+        )
         yield Finding(fact=fact, severity="error")
 
 
-def _part_offset_s(part: CameraTrajectory, motion: GyroCamera, drift_s: float) -> float | None:
-    """Correction of the time offset with which the gyroscope explains this part best."""
+def wandering(off_s: Array, sigmas: Array) -> BoolArray:
+    """Parts whose offsets differ from the usual one by more than chance and by what matters, and not they alone.
+
+    Parameters
+    ----------
+    off_s, sigmas
+        (N,) differences, and their sizes in standard deviations.
+    """
+    sizes = np.where(sigmas > _LIMITS.uneven_sigmas, np.abs(off_s), 0.0)
+    others = np.sum(sizes > _LIMITS.another * _LIMITS.uneven_s) > 1
+    return np.asarray((sizes > _LIMITS.uneven_s) & others)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _ComparedPart:
+    """A part of the frames against the gyroscope at many corrections of the offset.
+
+    Attributes
+    ----------
+    middle_s
+        When it is.
+    shifts_s, squares
+        (S,) corrections, and twice the negative log likelihood of each; infinite where the gyroscope does not cover it.
+    offset_s, sigma_s
+        The best correction, and its standard deviation.
+    """
+
+    middle_s: float
+    shifts_s: Array
+    squares: Array
+    offset_s: float
+    sigma_s: float
+
+    def sigmas_from(self, shift_s: float) -> float:
+        """Standard deviations by which another correction is worse: by its likelihood, which may have other maxima, and
+        by its distance.
+        """
+        known = np.isfinite(self.squares)
+        worse = float(np.interp(shift_s, self.shifts_s[known], self.squares[known]) - self.squares.min())
+        return min(max(worse, 0.0) ** 0.5, abs(shift_s - self.offset_s) / self.sigma_s)
+
+
+def _compare_part(part: CameraTrajectory, motion: GyroCamera, drift_s: float) -> _ComparedPart | None:
+    """Compare the rotations of a part; ``None`` where the gyroscope explains too little of it to tell."""
     if len(part) < 8:
         return None
     visual = part.turn_rad()
     shifts = np.arange(-_LIMITS.part_reach_s, _LIMITS.part_reach_s + 1e-9, _LIMITS.part_step_s)
-    residual = np.full(len(shifts), np.inf)
     t_s = part.t_s - drift_s - shifts[:, None]
     covered = motion.covers(t_s[:, 0], t_s[:, -1])
     difference = visual - motion.turn_rad(t_s[covered])
     spread = difference - difference.mean(axis=1, keepdims=True)
-    residual[covered] = np.median(np.sum(spread**2, axis=2), axis=1)
-    best = int(np.argmin(residual))
+    squares = np.full(len(shifts), np.inf)
+    squares[covered] = np.median(np.sum(spread**2, axis=2), axis=1)
+    best = int(np.argmin(squares))
     energy = float(np.median(np.sum((visual - visual.mean(axis=0)) ** 2, axis=1)))
-    if best in (0, len(residual) - 1) or not np.isfinite(residual[best - 1 : best + 2]).all():
+    if best in (0, len(shifts) - 1) or not np.isfinite(squares[best - 1 : best + 2]).all():
         return None
-    if residual[best] > (1 - _LIMITS.part_explained) * energy:
+    if squares[best] > (1 - _LIMITS.part_explained) * energy:
         return None
-    return float(shifts[best])
+    # Cauchy's likelihood, at the scatter that the best offset leaves; errors of neighbouring frames go together
+    scatter = max(squares[best] / _MEDIAN_CHI2, 1e-16)
+    left = spread[int(np.flatnonzero(np.flatnonzero(covered) == best)[0])]
+    squares[covered] = np.sum(3 * _CAUCHY**2 * np.log1p(np.sum(spread**2, axis=2) / scatter / (3 * _CAUCHY**2)), axis=1)
+    squares /= _correlation_time(left)
+    best = int(np.argmin(squares))
+    if best in (0, len(shifts) - 1) or not np.isfinite(squares[best - 1 : best + 2]).all():
+        return None
+    before, least, after = squares[best - 1 : best + 2]
+    curvature = max(before - 2 * least + after, 1e-9)
+    sigma_s = (2 / curvature) ** 0.5 * _LIMITS.part_step_s
+    return _ComparedPart(
+        middle_s=0.5 * float(part.t_s[0] + part.t_s[-1]),
+        shifts_s=shifts,
+        squares=squares,
+        offset_s=float(shifts[best] + 0.5 * _LIMITS.part_step_s * (before - after) / curvature),
+        sigma_s=float(np.hypot(sigma_s, _LIMITS.known_frames * np.median(np.diff(part.t_s)))),
+    )
+
+
+#: Median of a chi-square of three degrees of freedom; standard deviations from which Cauchy's likelihood cuts.
+_MEDIAN_CHI2, _CAUCHY = 2.366, 3.0
+
+
+def _correlation_time(errors: Array) -> float:
+    """How many of (N, 3) errors in a row count as one: Geyer's (1992) initial positive sequence; 1 at least."""
+    centred = errors - errors.mean(axis=0)
+    total = max(float(np.sum(centred**2)), 1e-30)
+    out = 1.0
+    for lag in range(1, len(centred) // 2):
+        correlation = float(np.sum(centred[:-lag] * centred[lag:])) / total
+        if correlation <= 0:
+            break
+        out += 2 * correlation
+    return out

@@ -36,6 +36,8 @@ from colmap_inertial.motion.flow import Stabilisation, VisualRotation, find_stab
 
 Severity = Literal["info", "warning", "error"]
 SEVERITIES: tuple[Severity, ...] = ("info", "warning", "error")
+#: Codes of errors that stop nothing: readings that are missing or coarse, which the fit counts as what they are.
+DOUBTS = frozenset({"short-gap", "long-gap", "saturated", "coarse-resolution"})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,8 +126,13 @@ class Diagnosis:
 
     @property
     def stopping(self) -> tuple[Finding, ...]:
-        """Those that stop a reconstruction: every error, as it makes a scale wrong or impossible."""
-        return tuple(finding for finding in self.findings if finding.severity == "error")
+        """Those that stop a reconstruction: errors that make a scale wrong or impossible."""
+        return tuple(one for one in self.findings if one.severity == "error" and one.code not in DOUBTS)
+
+    @property
+    def doubting(self) -> tuple[Finding, ...]:
+        """Errors that a scale can be given with, weak at most: what they take from it is in its interval."""
+        return tuple(one for one in self.findings if one.severity == "error" and one.code in DOUBTS)
 
     @property
     def codes(self) -> frozenset[str]:

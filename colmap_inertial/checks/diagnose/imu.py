@@ -32,6 +32,8 @@ class MotionCheckLimits:
     #: recordings that turn by 0.3 rad/s, 0.11 and less in simulated ones on the spot that turn by 1.5.
     least_accel_m_s2: float = 0.08
     accel_per_turn_m_s: float = 0.05
+    #: So many windows in which the camera accelerates are motion, however long it rests.
+    lively: int = 3
     #: A camera that turns slower than this (rms) stands on something.
     rotated_rad_s: float = 0.02
     #: A path is straight where it is this many times longer than its points lie off a steady glide.
@@ -66,6 +68,8 @@ def check_motion_content(recorded: Recorded) -> Iterator[Finding]:
 def acceleration_rms_m_s2(imu: ImuRecording) -> float | None:
     """Rms of the acceleration that is left once gravity, drift, bias and a lever arm are out; ``None`` where short.
 
+    That of the median window, or of the third where fewer are lively.
+
     The specific force, turned by the integrated gyroscope, is gravity plus acceleration. In each window what is
     constant or changes evenly is taken out, as gravity and the gyroscope's drift do; over all of them, what a bias and
     a lever arm between the IMU and the centre of rotation explain.
@@ -90,9 +94,9 @@ def acceleration_rms_m_s2(imu: ImuRecording) -> float | None:
     residual = columns - np.einsum("kp,lp,wlij->wkij", even, even, columns)
     y, x = residual[..., 0].ravel(), residual[..., 1:].reshape(-1, 6)
     rest = y - x @ np.linalg.lstsq(x, y, rcond=1e-6)[0]
-    # the median over windows: a moment of lifting the camera does not make a recording lively
-    energy = np.sum(rest.reshape(len(starts), -1) ** 2, axis=1) / steps
-    return float(np.sqrt(np.median(energy)))
+    energy = np.sort(np.sum(rest.reshape(len(starts), -1) ** 2, axis=1) / steps)
+    # a moment of lifting the camera does not make a recording lively; a rest does not make it still
+    return float(np.sqrt(max(np.median(energy), energy[-min(_MOTION_LIMITS.lively, len(energy))])))
 
 
 def _glides(trajectory: CameraTrajectory) -> bool:
@@ -116,14 +120,20 @@ class ImuCheckLimits:
     rounding_share: float = 0.1
     #: Gyroscope and accelerometer must run together for this share of the shorter one.
     together: float = 0.5
-    #: Search of the delay between the sensors: grid, smoothing, reach, and what counts. Measured: up to 0.04 s of bias
-    #: by the hand's accelerations in clean recordings, correlations of 0.66 to 0.90 handheld, up to 0.51 where they
-    #: tell nothing (a drone, an action camera on one).
+    #: Search of the delay between the sensors: grid, smoothing, reach, and what counts. Measured: correlations of 0.66
+    #: to 0.90 handheld, up to 0.51 where they tell nothing (a drone, an action camera on one).
     grid_hz: float = 50.0
     smooth_cells: int = 25
     reach_s: float = 0.5
     delay_s: float = 0.055
     delay_correlation: float = 0.6
+    #: The hand's own acceleration turns with the hand, and moves what is found by 66 ms (rms) in 10 s of clean
+    #: recordings, 38 in 30, 27 in 60: a random error that lasts for seconds, in seconds times the root of a second.
+    hand_s_rts: float = 0.21
+    #: Blocks of the jackknife, and how many standard deviations count: once in 10,000 recordings by chance.
+    block_s: float = 2.0
+    fewest_blocks: int = 4
+    delay_sigmas: float = 4.0
     #: Hands shake up to 12 times a second. Below the first rate that is lost in part, below the second all of it.
     slow_hz: float = 45.0
     too_slow_hz: float = 18.0
@@ -197,12 +207,14 @@ def check_repairs(recorded: Recorded) -> Iterator[Finding]:
 
 
 def check_pauses(recorded: Recorded) -> Iterator[Finding]:
-    """Pauses of either sensor."""
+    """Pauses of either sensor while frames came, where it is known when they did."""
+    begin_s, end_s = _filmed(recorded)
     for sensor, t_s, _ in _sensors(recorded.imu):
         step_s = np.diff(t_s)
         usual_s = float(np.median(step_s))
-        pauses = step_s[is_gap(t_s, _LIMITS.pause_s, steps=PAUSE_STEPS)]
-        share = float(pauses.sum() / (t_s[-1] - t_s[0]))
+        inside = (t_s[1:] > begin_s) & (t_s[:-1] < end_s)
+        pauses = step_s[inside & is_gap(t_s, _LIMITS.pause_s, steps=PAUSE_STEPS)]
+        share = float(pauses.sum() / max(min(t_s[-1], end_s) - max(t_s[0], begin_s), usual_s))
         for code, some in (
             ("short-gap", pauses[pauses < _LIMITS.long_pause_s]),
             ("long-gap", pauses[pauses >= _LIMITS.long_pause_s]),
@@ -219,6 +231,15 @@ def check_pauses(recorded: Recorded) -> Iterator[Finding]:
                 share=share,
             )
             yield Finding(fact=fact, severity="error" if share > _LIMITS.most_paused else "warning")
+
+
+def _filmed(recorded: Recorded) -> tuple[float, float]:
+    """First and last frame on the IMU's clock; without limits where it is not known."""
+    frames = recorded.trajectory or recorded.timing
+    shift_s = None if frames is None else recorded.offset_s(frames.epoch_ns)
+    if frames is None or shift_s is None:
+        return -np.inf, np.inf
+    return float(frames.t_s[0]) - shift_s, float(frames.t_s[-1]) - shift_s
 
 
 def check_rate(recorded: Recorded) -> Iterator[Finding]:
@@ -321,27 +342,47 @@ def _resolution(values: Array) -> float:
 
 
 def check_delay(recorded: Recorded) -> Iterator[Finding]:
-    """Gyroscope against accelerometer: as the device turns, gravity turns the other way in it, at the same time."""
+    """Gyroscope against accelerometer: as the device turns, gravity turns the other way in it, at the same time.
+
+    A warning: the fit of camera and IMU finds the delay far better, and corrects it.
+    """
     imu = recorded.imu
     if imu is None or not imu.has_accel or recorded.implausible:
         return
-    delay_s, correlation = accel_delay_s(imu)
-    if abs(delay_s) > _LIMITS.delay_s and correlation > _LIMITS.delay_correlation:
-        yield Finding(fact=Fact("sensors-offset", delay_s=delay_s, correlation=correlation), severity="error")
+    delay = find_accel_delay(imu)
+    if delay is not None and delay.counts:
+        fact = Fact("sensors-offset", delay_s=delay.delay_s, delay_sigma_s=delay.sigma_s, correlation=delay.correlation)
+        yield Finding(fact=fact, severity="warning")
 
 
-def accel_delay_s(imu: ImuRecording) -> tuple[float, float]:
-    """Delay of the accelerometer's stamps, and the correlation there (0 where it cannot be estimated).
+@dataclass(frozen=True, kw_only=True)
+class AccelDelay:
+    """Delay of the accelerometer's stamps to the gyroscope's, its standard deviation, and the correlation there."""
+
+    delay_s: float
+    sigma_s: float
+    correlation: float
+
+    @property
+    def counts(self) -> bool:
+        """Whether it is larger than what matters, and than chance makes it."""
+        least_s = max(_LIMITS.delay_s, _LIMITS.delay_sigmas * self.sigma_s)
+        return self.correlation > _LIMITS.delay_correlation and abs(self.delay_s) > least_s
+
+
+def find_accel_delay(imu: ImuRecording) -> AccelDelay | None:
+    """Delay of the accelerometer's stamps; ``None`` where it cannot be estimated.
 
     Slow changes of the specific force a are those of gravity: its derivative is ``a x w``. The delay is where the two
-    correlate best.
+    correlate best. Its standard deviation is that of the jackknife over blocks (Efron 1982), and what the hand's
+    acceleration leaves.
     """
     begin_s, end_s = max(imu.gyro_t_s[0], imu.accel_t_s[0]), min(imu.gyro_t_s[-1], imu.accel_t_s[-1])
     edges = np.arange(begin_s, end_s, 1 / _LIMITS.grid_hz)
     reach = round(_LIMITS.reach_s * _LIMITS.grid_hz)
     margin = 2 * _LIMITS.smooth_cells + reach
     if len(edges) < 6 * margin:
-        return 0.0, 0.0
+        return None
     rate, force = (
         np.diff(integral_at(t_s, values, edges), axis=0) * _LIMITS.grid_hz
         for t_s, values in ((imu.gyro_t_s, imu.gyro_rad_s), (imu.accel_t_s, imu.accel_m_s2))
@@ -349,19 +390,34 @@ def accel_delay_s(imu: ImuRecording) -> tuple[float, float]:
     slow = _smooth(force)
     change = np.gradient(slow, 1 / _LIMITS.grid_hz, axis=0)[margin:-margin]
     delays = np.arange(-reach, reach + 1)
-    correlations = np.array(
-        [_correlation(change, _smooth(np.cross(slow, np.roll(rate, k, axis=0)))[margin:-margin]) for k in delays]
+    turned = np.stack([_smooth(np.cross(slow, np.roll(rate, k, axis=0)))[margin:-margin] for k in delays])
+    span_s = len(change) / _LIMITS.grid_hz
+    blocks = max(_LIMITS.fewest_blocks, int(span_s / _LIMITS.block_s))
+    block = np.arange(len(change)) * blocks // len(change)
+    sums = [
+        np.stack([np.bincount(block, row, blocks) for row in products.sum(axis=2)])
+        for products in (turned * change, turned * turned, (change * change)[None])
+    ]
+    whole = _best_delay(*(part.sum(axis=1) for part in sums))
+    without = [_best_delay(*(part.sum(axis=1) - part[:, i] for part in sums)) for i in range(blocks)]
+    if whole is None or any(one is None for one in without):
+        return None
+    left = np.array([one[0] for one in without if one is not None])
+    scatter_s2 = (blocks - 1) / blocks * float(np.sum((left - left.mean()) ** 2))
+    return AccelDelay(
+        delay_s=whole[0], sigma_s=(scatter_s2 + _LIMITS.hand_s_rts**2 / span_s) ** 0.5, correlation=whole[1]
     )
-    k = int(np.argmax(correlations))
-    if k in (0, len(delays) - 1):
-        return 0.0, 0.0
+
+
+def _best_delay(together: Array, of_turned: Array, of_change: Array) -> tuple[float, float] | None:
+    """Delay of the best correlation, and that; ``None`` where it lies at an end."""
+    correlations = together / np.maximum(np.sqrt(of_turned * of_change), 1e-12)
+    reach, k = len(correlations) // 2, int(np.argmax(correlations))
+    if k in (0, len(correlations) - 1):
+        return None
     before, best, after = correlations[k - 1 : k + 2]
-    peak = delays[k] + 0.5 * (before - after) / (before - 2 * best + after)
+    peak = k - reach + 0.5 * (before - after) / (before - 2 * best + after)
     return float(peak / _LIMITS.grid_hz), float(best)
-
-
-def _correlation(a: Array, b: Array) -> float:
-    return float(np.sum(a * b) / max(np.sqrt(np.sum(a * a) * np.sum(b * b)), 1e-12))
 
 
 def _smooth(values: Array) -> Array:

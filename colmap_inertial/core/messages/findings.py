@@ -279,12 +279,12 @@ def coarse_resolution(sensor: str, step: float, different_on_x: int, rounding_sh
 
 @message(
     advice="stamp both sensors by one clock, when they were sampled and not when they were written",
-    example={"delay_s": 0.08, "correlation": 0.8},
+    example={"delay_s": 0.08, "delay_sigma_s": 0.004, "correlation": 0.8},
 )
-def sensors_offset(delay_s: float, correlation: float) -> str:
+def sensors_offset(delay_s: float, delay_sigma_s: float, correlation: float) -> str:
     return (
-        f"the accelerometer's stamps are {1e3 * delay_s:+.0f} ms off the gyroscope's: there, gravity turns against the "
-        f"gyroscope with a correlation of {correlation:.2f}"
+        f"the accelerometer's stamps are {1e3 * delay_s:+.0f} +- {1e3 * delay_sigma_s:.0f} ms off the gyroscope's: "
+        f"there, gravity turns against the gyroscope with a correlation of {correlation:.2f}"
     )
 
 
@@ -639,9 +639,10 @@ def focal_length(gain: float, gain_sigma: float, focal_px: float) -> str:
 
 
 @message(
-    advice='set axes = "-x,-y,-z" and mirrored = true under [imu.accel] in capture.toml', example={"correlation": -0.8}
+    advice='set axes = "-x,-y,-z" and mirrored = true under [imu.accel] in capture.toml',
+    example={"correlation": -0.8, "correlation_sigma": 0.05},
 )
-def accel_flipped(correlation: float) -> str:
+def accel_flipped(correlation: float, correlation_sigma: float) -> str:
     return (
         "the accelerometer measures the opposite of the camera's acceleration (correlation "
         f"{correlation:.2f}): its sign is flipped"
@@ -656,9 +657,9 @@ _TIMES = "give the presentation stamps of the frames, or the video itself as [vi
 @message(
     advice="time frames by the video's presentation stamps or the recorder's own times, never by counting; frames that "
     "were dropped or repeated must not shift the rest",
-    example={"wander_s": 0.2, "worst_s": 12.0, "parts": 6},
+    example={"wander_s": 0.2, "worst_s": 12.0, "parts": 6, "sigmas": 8.0},
 )
-def frame_times_uneven(wander_s: float, worst_s: float, parts: int) -> str:
+def frame_times_uneven(wander_s: float, worst_s: float, parts: int, sigmas: float) -> str:
     return (
         f"against the gyroscope, frame times wander by {1e3 * wander_s:.0f} ms; worst {worst_s:.0f} s after the first "
         "frame"

@@ -228,6 +228,19 @@ def accel_gain_doubtful(gain: float, excess: float) -> str:
     )
 
 
+@message(example={"found": {"code": "accel-gain-large", "values": {"gains": (0.01, 0.015, -0.01)}}})
+def counted_in_interval(found: object) -> str:
+    return f"{found} (this is in the interval)"
+
+
+@message(example={"delay_s": 0.06})
+def accel_delay_undone(delay_s: float) -> str:
+    return (
+        f"the accelerometer's stamps are {1e3 * delay_s:+.0f} ms off the gyroscope's, as the fit finds; that is "
+        "undone: stamp both sensors when they are sampled"
+    )
+
+
 @message(example={"sensor": "gyroscope", "share": 0.02})
 def readings_cut_off(sensor: str, share: float) -> str:
     return (
@@ -311,8 +324,8 @@ def scale_grows(growth: float, sigma: float) -> str:
 def scale_breaks(growth: float, sigma: float, since_s: float, first: bool) -> str:
     return (
         f"the reconstruction's scale is not the same throughout: lengths are {100 * growth:+.1f} +- "
-        f"{196 * sigma:.1f} % larger {'before' if first else 'after'} {since_s:.0f} s than in the longer part, whose "
-        f"scale is used: {_CLOSE_LOOPS}"
+        f"{196 * sigma:.1f} % larger {'before' if first else 'after'} {since_s:.0f} s than in the rest, whose "
+        f"scale is used as it tells more: {_CLOSE_LOOPS}"
     )
 
 

@@ -23,6 +23,7 @@ from colmap_inertial.core.types import (
     ScaleEstimate,
 )
 from colmap_inertial.inertial.core.priors import PRIORS
+from colmap_inertial.inertial.scale._ends import jumping_ends
 from colmap_inertial.inertial.scale._inputs import align_recording, gravity_at_latitude_m_s2, strength_of_gravity
 from colmap_inertial.inertial.scale._sampling import describe_sampling
 from colmap_inertial.inertial.scale.verdict import verdict_of
@@ -248,7 +249,7 @@ def estimate_scale(
             estimate = replace(estimate, notes=(*estimate.notes, *sampling))
         likely = likely_convention(trajectory, imu, read_as=read_as, prior=calibration, options=search)
     if likely is not None:
-        reasons = (as_fact(likely.sentence), *estimate.reasons)
+        reasons = (likely.reason, *estimate.reasons)
         estimate = ScaleEstimate.refused(options.method, *reasons, calibration=estimate.calibration)
     return replace(estimate, imu_calibration=imu.calibration, runtime_s=time.perf_counter() - begin_s)
 
@@ -284,8 +285,14 @@ def _estimate_or_refuse(
 def _estimate_without_moved(
     trajectory: CameraTrajectory, timed: CameraTimedImu, options: ScaleOptions
 ) -> tuple[ScaleEstimate, tuple[str, ...]]:
-    """The scale, and keyframes that it does without as it is known better so: the largest errors first hide others."""
-    moved: tuple[str, ...] = ()
+    """The scale, and what it does without.
+
+    The ends of a video at which its poses jump, and keyframes without which it is known better: the largest errors
+    first hide others.
+    """
+    beyond = jumping_ends(trajectory)
+    moved = tuple(name for name, cut in zip(trajectory.names, beyond.tolist(), strict=True) if cut)
+    trajectory = trajectory.select(~beyond)
     estimate = _estimate(trajectory, timed, options)
     at_once = int(max(_MOVED.most, _MOVED.share * len(trajectory)))
     while estimate.cov is not None and estimate.jumped and len(moved) < at_once:
@@ -325,7 +332,11 @@ def _estimate_without_end(
             else:
                 many, without = between, trial
         best, kept = without, sound & (from_end >= many)
-        left_out = tuple(name for name, is_kept in zip(trajectory.names, kept.tolist(), strict=True) if not is_kept)
+        beyond = set(moved) - set(trajectory.names)
+        left_out = (
+            *(name for name in moved if name in beyond),
+            *(name for name, is_kept in zip(trajectory.names, kept.tolist(), strict=True) if not is_kept),
+        )
     return best, left_out
 
 

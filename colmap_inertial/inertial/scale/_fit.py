@@ -20,6 +20,8 @@ from colmap_inertial.inertial.scale._setup import Data
 
 #: Length of a part, and how many there are at most.
 _PART_S, _MOST_PARTS = 10.0, 12
+#: Of a part that knows nothing of its scale, by how much its logarithm may be off.
+_NOTHING_KNOWN = 1e3
 
 
 def chi2_tail(chi2: float, dof: int) -> float:
@@ -34,7 +36,7 @@ def chi2_tail(chi2: float, dof: int) -> float:
     return total
 
 
-def scale_drift(data: Data, noise: Noise, optimum: _Optimum, inflation: float) -> ScaleDrift:
+def scale_drift(data: Data, noise: Noise, optimum: _Optimum, inflation: float, taken: float) -> ScaleDrift:
     """Scales of parts of the recording, and a test of whether they are the same.
 
     Each part gets a scale of its own, to first order about the joint fit; all other parameters follow. A deviation of a
@@ -46,6 +48,9 @@ def scale_drift(data: Data, noise: Noise, optimum: _Optimum, inflation: float) -
         The joint fit.
     inflation
         By how much variances are larger than the noise levels say.
+    taken
+        How many of the visual noise's degrees of freedom the fitted path follows. A part that stands still has that
+        noise for a path, and no scale: each may be off by up to its variance times its share of them.
     """
     # standard deviation of the parts' scales that is no drift to speak of
     tolerated_log = model_scale_sigma()
@@ -61,9 +66,12 @@ def scale_drift(data: Data, noise: Noise, optimum: _Optimum, inflation: float) -
     score = optimum.score(columns, data, noise)
     # All parts together are the scale itself, so that only contrasts between parts are known
     contrasts = np.linalg.qr(np.column_stack([np.ones(parts), np.eye(parts)[:, 1:]]))[0][:, 1:]
-    cov = np.linalg.inv(contrasts.T @ score.information @ contrasts) * inflation
+    fitted = np.linalg.inv(contrasts.T @ score.information @ contrasts)
     # The columns are those of u, the inverse of the metres per unit
-    log_ratio = (cov / inflation) @ (contrasts.T @ -score.score)
+    log_ratio = fitted @ (contrasts.T @ -score.score)
+    counts = (nodes[1] - nodes[0]) / len(data.t_s)
+    biases = np.minimum(taken * counts / np.maximum(np.diagonal(score.information), 1e-9), _NOTHING_KNOWN)
+    cov = inflation * fitted + contrasts.T @ np.diag(biases**2 / 3) @ contrasts
     tested = np.linalg.inv(cov + tolerated_log**2 * np.eye(parts - 1))
     chi2 = float(log_ratio @ tested @ log_ratio)
     middle_s = 0.5 * (edges_s[1:] + edges_s[:-1])
@@ -195,7 +203,8 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
     level_variance, freedom = search.scale_variance(groups, states[:, :, 3:4], z[:, 3:4])
     states, z = states[:, :, :3], z[:, :3]
     inflation = max(1.0, *(squares / expected for squares, expected in sums.values()))
-    drift = scale_drift(data, noise, at, inflation)
+    taken = max(0.0, 3 * k - sums["centre_m"][1] - sums["drift_m_rts"][1])
+    drift = scale_drift(data, noise, at, inflation, taken)
     weights = [groups[name].weight for name in ("rotation", "centre")]
     weight = np.min([each for each in weights if each is not None], axis=0)
     return Fit(
@@ -217,7 +226,7 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         gain_surprise=_gain_surprise(at.prior, x, cov),
         variance_parts=variance_parts,
         suspicions=suspicions,
-        shape=_find_shape_faults(data, noise, at),
+        shape=_find_shape_faults(data, noise, at, taken),
         system=at.system,
         rate_rad_s=at.pre.rate_rad_s,
         prior_info=at.prior.info,
@@ -299,12 +308,13 @@ _CAUSE_OF_GLOBALS = {
 }
 
 
-def _find_shape_faults(data: Data, noise: Noise, at: _Optimum) -> list[shape.ShapeFault]:
+def _find_shape_faults(data: Data, noise: Noise, at: _Optimum, taken: float) -> list[shape.ShapeFault]:
     """What may be wrong with the model's shape; nothing where the clip is too short to tell."""
     if data.t_s[-1] - data.t_s[0] < shape.LIMITS.shortest_s:
         return []
     kinds, columns = shape.shape_columns(data.t_s, shape.camera_path(at.estimate))
-    return shape.find_faults(kinds, at.score(columns, data, noise), shaken=levels.vibrates(data))
+    scores = at.score(columns, data, noise)
+    return shape.find_faults(kinds, scores, shaken=levels.vibrates(data), t_s=data.t_s, taken=taken)
 
 
 def _gain_surprise(prior: Prior, x: Estimate, cov: Array) -> float:

@@ -30,6 +30,10 @@ class SensorPriors:
     motion_sigmas: float = 2.0
     #: From this probability on, a wrong gain is said.
     said: float = 1 / 3
+    #: Gains as sensors have, which are in the interval; and the standard deviations by which a gain must be larger to
+    #: make a scale weak by itself.
+    usual_gain: float = 0.02
+    sigmas: float = 4.0
 
 
 _PRIORS = SensorPriors()
@@ -43,14 +47,15 @@ class WrongGain:
     ----------
     probability
         Of it.
-    gain, excess
-        What it would be, and by what share gravity reads too long.
+    gain, sigma, excess
+        What it would be, with its standard deviation, and by what share gravity reads too long.
     variance
         Of the logarithm of the scale, as it may be so: the mean square of what it would change by.
     """
 
     probability: float
     gain: float
+    sigma: float
     excess: float
     variance: float
 
@@ -58,6 +63,16 @@ class WrongGain:
     def is_likely(self) -> bool:
         """Whether the user should know."""
         return self.probability > _PRIORS.said
+
+    @property
+    def is_large(self) -> bool:
+        """Whether no sensor's gain is that far off."""
+        return self.is_likely and bool(exceeds_usual(np.array(self.gain), np.array(self.sigma)))
+
+
+def exceeds_usual(gain: Array, sigma: Array) -> Array:
+    """Which gains are larger than those of sensors, by more than chance: (|gain| - usual) in standard deviations."""
+    return np.asarray(np.abs(gain) - _PRIORS.usual_gain > _PRIORS.sigmas * sigma)
 
 
 def judge_gain(x: Estimate, cov: Array, prior_info: Array, widened: float) -> WrongGain:
@@ -95,11 +110,15 @@ def judge_gain(x: Estimate, cov: Array, prior_info: Array, widened: float) -> Wr
     exponent = -0.5 * np.einsum("i,kij,j->k", seen, np.linalg.inv(spread), seen)
     likely = shares * np.exp(exponent - exponent.max()) / np.linalg.det(spread) ** 0.5
     likely = (likely / likely.sum())[2:]
-    expected = np.sum(seen / observed, axis=1) / (np.sum(1 / observed, axis=1) + gain**-2)
+    known = np.sum(1 / observed, axis=1) + gain**-2
+    expected = np.sum(seen / observed, axis=1) / known
     change = float(cov[par.SCALE] @ mean_gain) / variance * (expected[2:] - fitted)
+    mean = float(likely @ expected[2:] / likely.sum())
+    square = float(likely @ (expected[2:] ** 2 + 1 / known[2:]) / likely.sum())
     return WrongGain(
         probability=float(likely.sum()),
-        gain=float(likely @ expected[2:] / likely.sum()),
+        gain=mean,
+        sigma=max(square - mean**2, 0.0) ** 0.5,
         excess=excess_m_s2 / gravity,
         variance=float(likely @ change**2),
     )

@@ -32,11 +32,16 @@ class ShapeLimits:
     spacing_s: float = 1.0
     margin_s: float = 3.0
     most_breaks: int = 120
-    #: Squared deviations, in standard deviations, from which a break anywhere, a drift, a stretch count. In 27 clean
-    #: clips by hand they are 3.5, 4.3 and 5.0 at most.
+    #: Squared deviations, in standard deviations, from which a break anywhere, a drift, a stretch are said, and widen
+    #: the interval by what they would do to the scale. In 27 clean clips by hand they are 3.5, 4.3 and 5.0 at most.
     break_chi2: float = 10.0
     drift_chi2: float = 7.5
     stretch_chi2: float = 14.0
+    #: And from which they are undone, which changes the scale: one sound recording in 10,000, by chi-square of 1, 1 and
+    #: 5 degrees of freedom, of some eight independent places for a break.
+    break_undone_chi2: float = 19.2
+    drift_undone_chi2: float = 15.1
+    stretch_undone_chi2: float = 25.7
     #: So many are undone at most.
     most: int = 2
     #: Part of these from which a suspicion is worth another fit.
@@ -77,6 +82,8 @@ class ShapeFault:
         (q,) change of the logarithm of the scale with each.
     at_s
         Where it breaks, camera time.
+    keeps_after
+        Whether the part after the break tells more of the scale than the one before, so that it keeps its metres.
     """
 
     kind: Kind
@@ -84,11 +91,21 @@ class ShapeFault:
     cov: Array
     by_scale: Array
     at_s: float = float("nan")
+    keeps_after: bool = False
 
     @property
     def limit(self) -> float:
-        """Chi-square from which it counts."""
+        """Chi-square from which it is said."""
         return {"break": LIMITS.break_chi2, "drift": LIMITS.drift_chi2, "stretch": LIMITS.stretch_chi2}[self.kind]
+
+    @property
+    def undone_limit(self) -> float:
+        """Chi-square from which it is undone."""
+        return {
+            "break": LIMITS.break_undone_chi2,
+            "drift": LIMITS.drift_undone_chi2,
+            "stretch": LIMITS.stretch_undone_chi2,
+        }[self.kind]
 
     @property
     def strain(self) -> Array:
@@ -106,11 +123,11 @@ class ShapeFault:
         return float(self.value @ np.linalg.solve(cov + tolerated_log**2 * np.eye(len(cov)), self.value))
 
     def undo(self, t_s: Array, centre: Array) -> Array:
-        """(K, 3) centres of a model without it; the larger part of a broken one keeps its steps."""
+        """(K, 3) centres of a model without it; the part of a broken one that tells more keeps its steps."""
         if self.kind == "stretch":
             return np.asarray(centre @ (np.eye(3) + self.strain))
         log_scale = float(self.value[0]) * _profile(t_s, self.kind, self.at_s)
-        if self.at_s < 0.5 * (t_s[0] + t_s[-1]):
+        if self.keeps_after:
             log_scale = log_scale - float(self.value[0])
         return np.asarray(centre[0] + _grown(centre, np.exp(log_scale)))
 
@@ -124,8 +141,7 @@ class ShapeFault:
         (more, less), sigma = np.expm1(self.value[0] * np.array([1, -1])), (widened * self.cov[0, 0]) ** 0.5
         if self.kind == "drift":
             return Fact("scale-grows", growth=less, sigma=sigma)
-        first = bool(2 * self.at_s < t_s[0] + t_s[-1])
-        since_s = self.at_s - float(t_s[0])
+        first, since_s = bool(self.keeps_after), self.at_s - float(t_s[0])
         return Fact("scale-breaks", growth=more if first else less, sigma=sigma, since_s=since_s, first=first)
 
 
@@ -193,8 +209,18 @@ def shape_columns(t_s: Array, path: Array) -> tuple[list[tuple[Kind, float]], Ar
     return kinds, np.stack([*grown, *strained], axis=2)
 
 
-def find_faults(kinds: Sequence[tuple[Kind, float]], scores: Scores, *, shaken: bool) -> list[ShapeFault]:
-    """Each of :func:`shape_columns` by itself; ``shaken`` under vibration."""
+def find_faults(
+    kinds: Sequence[tuple[Kind, float]], scores: Scores, *, shaken: bool, t_s: Array, taken: float
+) -> list[ShapeFault]:
+    """Each of :func:`shape_columns` by itself.
+
+    Parameters
+    ----------
+    shaken
+        Under vibration.
+    t_s, taken
+        (K,) times of the nodes; how many of the visual noise's degrees of freedom the fitted path follows.
+    """
     out, widened = [], LIMITS.shaken if shaken else 1.0
     for i, (kind, at_s) in enumerate(kinds):
         at = slice(i, i + (5 if kind == "stretch" else 1))
@@ -204,8 +230,29 @@ def find_faults(kinds: Sequence[tuple[Kind, float]], scores: Scores, *, shaken: 
             continue
         cov = np.asarray(np.linalg.inv(information), dtype=np.float64)
         value, by_scale = cov @ scores.score[at], scores.by_scale[at]
-        out.append(ShapeFault(kind=kind, at_s=at_s, value=value, cov=widened * cov, by_scale=by_scale))
+        fault = ShapeFault(kind=kind, at_s=at_s, value=value, cov=widened * cov, by_scale=by_scale)
+        if kind == "break":
+            # without the break, the scale goes with what follows it by as much as that tells of it
+            after = float(np.clip(np.abs(by_scale[0]), 0.0, 1.0))
+            bias = bias_of_break(float(cov[0, 0]), after, taken * np.array([np.mean(t_s <= at_s), np.mean(t_s > at_s)]))
+            fault = replace(fault, cov=fault.cov + bias**2 / 3, keeps_after=after > 0.5)
+        out.append(fault)
     return out
+
+
+def bias_of_break(variance: float, after: float, taken: Array) -> float:
+    """What noise in the fitted path may add to a break: a part that stands still has its noise for a path.
+
+    Parameters
+    ----------
+    variance, after
+        Of the break; the share of what is known of the scale that comes from after it.
+    taken
+        (2,) degrees of freedom of the visual noise that the path follows before and after it.
+    """
+    # information adds: each part's variance is that of the break less the other's
+    parts = variance * np.array([after, 1 - after])
+    return float(np.diff(parts * taken)[0])
 
 
 def suspect(faults: Sequence[ShapeFault], widened: float) -> ShapeFault | None:
@@ -218,6 +265,6 @@ def confirmed(fault: ShapeFault, left: Sequence[ShapeFault], widened: float) -> 
     """A fault that was undone, with what is left of it, if it counts against noise that it no longer swells."""
     for one in left:
         if one.kind == fault.kind and (one.kind != "break" or one.at_s == fault.at_s):
-            found = replace(one, value=fault.value + one.value)
+            found = replace(one, value=fault.value + one.value, keeps_after=fault.keeps_after)
             return found if found.chi2(widened) > found.limit else None
     return None

@@ -36,7 +36,7 @@ from colmap_inertial.inertial.core import parameters as par
 from colmap_inertial.inertial.core.parameters import Prior
 from colmap_inertial.inertial.core.priors import PRIORS, AccelPart, accel_part, clock_scale_sigma
 from colmap_inertial.inertial.scale._fit import Fit, fit_jointly
-from colmap_inertial.inertial.scale._gain import WrongGain, judge_gain
+from colmap_inertial.inertial.scale._gain import WrongGain, exceeds_usual, judge_gain
 from colmap_inertial.inertial.scale._setup import Data, prepare
 from colmap_inertial.inertial.scale._shape import LIMITS as SHAPE_LIMITS, ShapeFault, confirmed, suspect
 from colmap_inertial.inertial.scale._suspects import Faults, worst
@@ -68,6 +68,11 @@ class JudgementLimits:
     #: A keyframe with a robust weight below this may be in the wrong place. Where three of 30 are, they swell the noise
     #: so that their weights are .27 to .57; others keep .8 and more.
     counts_little: float = 0.6
+    #: An accelerometer whose stamps are off by more than so many standard deviations, and than the second, is moved;
+    #: what is known of the delay of an unknown device.
+    delay_sigmas: float = 3.0
+    small_delay_s: float = 0.03
+    unknown_delay_s: float = 0.02
 
 
 _LIMITS = JudgementLimits()
@@ -118,10 +123,10 @@ def estimate_joint(
     reason.
     """
     options = options or JointOptions()
-    accel = accel_part(timed.imu)
+    accel, expected_s = accel_part(timed.imu), timed.calibration.accel_delay_s
     try:
-        data, prior = _prepared(trajectory, timed, options)
-        fit, faults = _fit_soundly(data, prior, timed.imu.noise)
+        timed, data, prior, fit = _fit_in_step(trajectory, timed, options)
+        fit, faults = _fit_soundly(fit, data, prior, timed.imu.noise)
         fit, shape = _fit_shapely(fit, faults.undone(data), faults.loosened(prior), timed.imu.noise, accel=accel)
     except NotObservableError as error:
         return ScaleEstimate.refused("joint", error.why)
@@ -132,7 +137,13 @@ def estimate_joint(
     wrong = [*faults.as_facts(), *_cut_off(data)]
     # what was taken from a path nobody can put back: its scale is too large by more than any interval says
     estimate = _judged(fit, data.t_s, timed.calibration, accel, wrong, shape, worthless=faults.path_is_smoothed)
-    return replace(estimate, jumped=_name_jumped(fit, data, trajectory))
+    notes = (*estimate.notes, *_out_of_step(timed.calibration.accel_delay_s - expected_s))
+    return replace(estimate, notes=notes, jumped=_name_jumped(fit, data, trajectory))
+
+
+def _out_of_step(moved_s: float) -> list[Fact]:
+    """A note where the accelerometer's stamps were moved."""
+    return [] if moved_s == 0 else [Fact("accel-delay-undone", delay_s=-moved_s)]
 
 
 def _name_jumped(fit: Fit, data: Data, trajectory: CameraTrajectory) -> tuple[str, ...]:
@@ -169,19 +180,55 @@ def fit_path(
     numpy.linalg.LinAlgError
         When the data leave the system singular.
     """
-    data, prior = _prepared(trajectory, timed, options)
-    fit, faults = _fit_soundly(data, prior, timed.imu.noise)
+    timed, data, prior, fit = _fit_in_step(trajectory, timed, options)
+    fit, faults = _fit_soundly(fit, data, prior, timed.imu.noise)
     accel = accel_part(timed.imu)
     sound = faults.undone(data), faults.loosened(prior)
     _, shape = _fit_shapely(fit, *sound, timed.imu.noise, accel=accel)
     widened = scale_of(fit, data.t_s, accel).widened
-    return data, fit, (*faults.as_facts(), *(fault.as_fact(data.t_s, widened) for fault in shape))
+    wrong = (*shape.undone, *shape.said)
+    return data, fit, (*faults.as_facts(), *(fault.as_fact(data.t_s, widened) for fault in wrong))
 
 
-def _fit_soundly(data: Data, prior: Prior, sheet: ImuNoise | None) -> tuple[Fit, Faults]:
+def _fit_in_step(
+    trajectory: CameraTrajectory, timed: CameraTimedImu, options: JointOptions
+) -> tuple[CameraTimedImu, Data, Prior, Fit]:
+    """The recording, its measurements and their fit; with the accelerometer's stamps moved where they are far off.
+
+    A delay beyond its prior is pulled towards it, and frames were averaged by readings of another moment: the fit
+    starts again from what was found, which is as little known as that of an unknown device.
+    """
+    data, prior = _prepared(trajectory, timed, options)
+    fit = fit_jointly(data, prior, timed.imu.noise)
+    delay_s, expected_s = fit.estimate.accel_delay_s, float(prior.info[par.ACCEL_DELAY, par.ACCEL_DELAY]) ** -0.5
+    sigma_s = float(fit.cov[par.ACCEL_DELAY, par.ACCEL_DELAY]) ** 0.5
+    if not is_out_of_step(delay_s, sigma_s, expected_s):
+        return timed, data, prior, fit
+    timed = replace(timed, calibration=timed.calibration.shift_clock_offsets(0.0, delay_s))
+    data, prior = _prepared(trajectory, timed, options)
+    info, at = prior.info.copy(), par.ACCEL_DELAY
+    info[at, at] = max(expected_s, _LIMITS.unknown_delay_s) ** -2
+    prior = replace(prior, info=info)
+    return timed, data, prior, fit_jointly(data, prior, timed.imu.noise)
+
+
+def is_out_of_step(delay_s: float, sigma_s: float, expected_s: float) -> bool:
+    """Whether an accelerometer's stamps are further off than was expected, than chance makes them, and than matters.
+
+    Parameters
+    ----------
+    delay_s, sigma_s
+        As fitted.
+    expected_s
+        Standard deviation of what was known before.
+    """
+    known = _LIMITS.delay_sigmas * max(sigma_s, expected_s)
+    return abs(delay_s) > max(known, _LIMITS.small_delay_s)
+
+
+def _fit_soundly(fit: Fit, data: Data, prior: Prior, sheet: ImuNoise | None) -> tuple[Fit, Faults]:
     """The fit, with what shows to be wrong with the accelerometer undone, and what that was."""
     faults, sound = Faults(values={}), data
-    fit = fit_jointly(data, prior, sheet)
     for _ in range(_MOST_FAULTS):
         if fit.gain_chi2 > par.LARGEST_GAIN_CHI2 and not prior.heavy_gains:
             # not from the start: on its way a fit passes gains that it would not find back from
@@ -199,29 +246,49 @@ def _fit_soundly(data: Data, prior: Prior, sheet: ImuNoise | None) -> tuple[Fit,
     return fit, faults
 
 
-def _fit_shapely(
-    fit: Fit, data: Data, prior: Prior, sheet: ImuNoise | None, *, accel: AccelPart
-) -> tuple[Fit, list[ShapeFault]]:
-    """The fit of a model without what shows to be wrong with its shape, and what that was."""
-    found: list[ShapeFault] = []
-    before = fit
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Shape:
+    """What seems to be wrong with a model's shape: what was undone, and what is only said."""
+
+    undone: tuple[ShapeFault, ...] = ()
+    said: tuple[ShapeFault, ...] = ()
+
+
+def _fit_shapely(fit: Fit, data: Data, prior: Prior, sheet: ImuNoise | None, *, accel: AccelPart) -> tuple[Fit, Shape]:
+    """The fit of a model without what shows to be wrong with its shape, and what that was.
+
+    What it does to the scale, or would do where there is too little evidence to undo it, is in the interval.
+    """
+    shape, before = Shape(), fit
+    open_variance = 0.0
     # wrong gains look like a stretch
     sound = fit.gain_chi2 <= par.LARGEST_GAIN_CHI2 and not _refusals(fit, data.t_s)
-    while sound and len(found) < SHAPE_LIMITS.most:
+    while sound and len(shape.undone) < SHAPE_LIMITS.most:
         suspected = suspect(fit.shape, scale_of(fit, data.t_s, accel).widened)
         if suspected is None:
             break
         mended = replace(data.groups, centre=suspected.undo(data.t_s, data.groups.centre))
         trial_data = replace(data, groups=mended)
         trial = fit_jointly(trial_data, prior, sheet)
-        fault = confirmed(suspected, trial.shape, scale_of(trial, data.t_s, accel).widened)
+        widened = scale_of(trial, data.t_s, accel).widened
+        fault = confirmed(suspected, trial.shape, widened)
         if fault is None:
             break
+        if fault.chi2(widened) <= fault.undone_limit:
+            shape = replace(shape, said=(fault,))
+            open_variance += _log_ratio(trial, fit) ** 2
+            break
         data, fit = trial_data, trial
-        found.append(fault)
-    open_variance = sum(float(one.by_scale @ one.cov @ one.by_scale) for one in found)
+        shape = replace(shape, undone=(*shape.undone, fault))
+    open_variance += sum(float(one.by_scale @ one.cov @ one.by_scale) for one in shape.undone)
+    open_variance += _log_ratio(fit, before) ** 2
     parts = {**fit.variance_parts, "model_shape": open_variance}
-    return replace(fit, drift=before.drift, variance_parts=parts), found
+    return replace(fit, drift=before.drift, variance_parts=parts), shape
+
+
+def _log_ratio(fit: Fit, before: Fit) -> float:
+    """Logarithm of the scale of a fit over that of another."""
+    return float(np.log(fit.estimate.metres_per_unit / before.estimate.metres_per_unit))
 
 
 def _cut_off(data: Data) -> list[Fact]:
@@ -238,7 +305,7 @@ def _judged(
     calibration: CameraImuCalibration,
     accel: AccelPart,
     wrong: Sequence[Fact],
-    shape: Sequence[ShapeFault],
+    shape: Shape,
     *,
     worthless: bool,
 ) -> ScaleEstimate:
@@ -250,15 +317,23 @@ def _judged(
     metres_per_unit, sigma_log = scale.metres_per_unit, scale.sigma_log
     refusals = [*_refusals(fit, t_s), *(wrong if worthless else ())]
     verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, refusals=refusals)
+    notes: tuple[str, ...] = ()
     if verdict == "refused":
         reasons = (*reasons, *(() if worthless else wrong))
     else:
-        bent = [fault.as_fact(t_s, scale.widened) for fault in shape] or _check_drift(fit.drift)
-        doubts = [*wrong, *check_clocks(clock_rate), *_checks(fit, t_s, scale.wrong_gain), *bent]
+        bent = [fault.as_fact(t_s, scale.widened) for fault in shape.undone] or _check_drift(fit.drift)
+        large, usual = _check_gains(fit, scale)
+        doubts = [*wrong, *check_clocks(clock_rate), *_check_length(t_s), *large, *bent]
         verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, doubts)
-    notes: tuple[Fact, ...] = ()
+        # what is in the interval makes nothing weak by itself; where the interval is wide, it may be why
+        within = [*usual, *(fault.as_fact(t_s, scale.widened) for fault in shape.said)]
+        counted = tuple(Fact("counted-in-interval", found=one) for one in within)
+        if verdict == "trusted":
+            notes = counted
+        else:
+            reasons = (*reasons, *counted)
     if len(fit.jumped_s):
-        notes = (Fact("poses-jump", since_s=[at_s - t_s[0] for at_s in fit.jumped_s]),)
+        notes = (*notes, Fact("poses-jump", since_s=[at_s - t_s[0] for at_s in fit.jumped_s]))
     refused = verdict == "refused"
     keep = [par.SCALE, *range(par.GRAVITY.start, par.ACCEL_BIAS.stop)]
     signs = np.array([-1.0, *[1.0] * 6])
@@ -366,17 +441,25 @@ def _refusals(fit: Fit, t_s: Array) -> list[Fact]:
     return out
 
 
-def _checks(fit: Fit, t_s: Array, wrong_gain: WrongGain | None) -> list[Fact]:
-    """Findings that make the number doubtful."""
-    out = []
+def _check_length(t_s: Array) -> list[Fact]:
+    """Whether a clip is too short for its number not to be doubtful."""
     span_s = float(t_s[-1] - t_s[0])
-    if span_s < _LIMITS.shortest_s:
-        out.append(Fact("clip-short", span_s=span_s, needed_s=_LIMITS.shortest_s))
+    if span_s >= _LIMITS.shortest_s:
+        return []
+    return [Fact("clip-short", span_s=span_s, needed_s=_LIMITS.shortest_s)]
+
+
+def _check_gains(fit: Fit, scale: FoundScale) -> tuple[list[Fact], list[Fact]]:
+    """Gains of the accelerometer: larger than any sensor's, and others that are worth a word."""
+    gains, wrong_gain = fit.estimate.accel_gain, scale.wrong_gain
     if fit.gain_chi2 > par.LARGEST_GAIN_CHI2:
-        out.append(Fact("accel-gain-large", gains=-np.diagonal(fit.estimate.accel_gain)))
-    elif wrong_gain is not None and wrong_gain.is_likely:
-        out.append(Fact("accel-gain-doubtful", gain=wrong_gain.gain, excess=wrong_gain.excess))
-    return out
+        sigma = np.sqrt(scale.widened * np.diagonal(fit.cov[par.ACCEL_GAIN, par.ACCEL_GAIN])).reshape(3, 3)
+        found = Fact("accel-gain-large", gains=-np.diagonal(gains))
+        return ([found], []) if exceeds_usual(gains, sigma).any() else ([], [found])
+    if wrong_gain is None or not wrong_gain.is_likely:
+        return [], []
+    found = Fact("accel-gain-doubtful", gain=wrong_gain.gain, excess=wrong_gain.excess)
+    return ([found], []) if wrong_gain.is_large else ([], [found])
 
 
 def _check_drift(drift: ScaleDrift) -> list[Fact]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from colmap_inertial.checks.diagnose import diagnose
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import FormatError, NotObservableError
 from colmap_inertial.core.facts import Fact, as_fact
 from colmap_inertial.core.options import ScaleOptions
@@ -280,24 +281,26 @@ def scale_source(
     json
         Where to write it, also when the scale is refused.
     first_s
-        Use only the first seconds of the camera's recording, for the alignment too.
+        Use only the first seconds of the camera's recording, for the alignment too; of the IMU's, a second more on
+        either side.
     force
         Estimate it also where ``diagnose`` finds an error; it is weak at most.
     """
     if json is not None:
         check_output(json, [source.source, source.imu, source.frame_times, *list_paths(source.calibration)])
     recording = load_source(source)
-    trajectory = recording.trajectory
-    if first_s is not None:
-        trajectory = first_seconds(trajectory, first_s, start_s=recording.start_s)
     limit_s = largest_offset_s(recording.shared_clock, options.max_offset_s)
     options = dataclasses.replace(options, max_offset_s=limit_s)
+    if first_s is not None:
+        recording = _begin_of(recording, first_s, limit_s)
+    trajectory = recording.trajectory
     checked = dataclasses.replace(recording.checked, trajectory=trajectory, max_offset_s=limit_s)
     diagnosis = diagnose(measure_recording(checked, silent))
-    doubts = tuple(finding.reason for finding in diagnosis.stopping)
-    if doubts and not force:
-        estimate = ScaleEstimate.refused("none", *map(as_fact, doubts))
+    stops = tuple(finding.reason for finding in diagnosis.stopping)
+    if stops and not force:
+        estimate = ScaleEstimate.refused("none", *stops)
     else:
+        doubts = (*stops, *(finding.reason for finding in diagnosis.doubting))
         estimate = estimate_scale(
             trajectory,
             recording.imu,
@@ -311,6 +314,30 @@ def scale_source(
     if json is not None:
         write_json(json, scale_as_json(estimate, source.calibration))
     return estimate
+
+
+#: What is kept of the IMU before and after frames that are cut.
+_AROUND_S = 1.0
+
+
+def _begin_of(recording: TimedPoses, first_s: float, max_offset_s: float | None) -> TimedPoses:
+    """The first seconds of a recording; where the clocks cannot be aligned, with the whole of its IMU."""
+    trajectory = first_seconds(recording.trajectory, first_s, start_s=recording.start_s)
+    cut = dataclasses.replace(recording, trajectory=trajectory)
+    try:
+        options = AlignOptions(max_offset_s=max_offset_s)
+        aligned, _ = align_by_consensus(trajectory, recording.imu, prior=recording.calibration, options=options)
+    except NotObservableError:
+        return cut
+    timed = CameraTimedImu(imu=recording.imu, calibration=aligned.calibration, camera_epoch_ns=trajectory.epoch_ns)
+    around_s = trajectory.t_s[0] - _AROUND_S, trajectory.t_s[-1] + _AROUND_S
+    raw = recording.checked.raw
+    if raw is not None:
+        whole = CameraTimedImu(imu=raw.imu, calibration=aligned.calibration, camera_epoch_ns=trajectory.epoch_ns)
+        raw = dataclasses.replace(raw, imu=whole.between(*around_s))
+    return dataclasses.replace(
+        cut, imu=timed.between(*around_s), checked=dataclasses.replace(recording.checked, raw=raw)
+    )
 
 
 def _judge_shutter(

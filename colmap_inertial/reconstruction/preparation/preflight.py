@@ -169,7 +169,7 @@ def run_preflight(
     force: bool,
     model: CameraTrajectory | Literal["untimed"] | None = None,
 ) -> tuple[Fact, ...]:
-    """The checks, written down and told to ``findings``; the doubts of a run that is forced to go on.
+    """The checks, written down and told to ``findings``; the doubts of a run that goes on, also of a forced one.
 
     Of a ``model``, its poses are checked in place of the images.
 
@@ -198,7 +198,7 @@ def run_preflight(
 
 
 def stop_or_doubt(diagnosis: Diagnosis, *, force: bool) -> tuple[Fact, ...]:
-    """Stop where the recording cannot give metres; when forced to go on, the reasons not to trust them.
+    """Stop where the recording cannot give metres; else, and when forced to go on, the reasons not to trust them.
 
     Raises
     ------
@@ -212,7 +212,8 @@ def stop_or_doubt(diagnosis: Diagnosis, *, force: bool) -> tuple[Fact, ...]:
         raise NotObservableError("scale", Fact("stopped-by-finding", finding=stopping[0].fact))
     for finding in stopping:
         log.warning("forced to go on: %s", finding.evidence)
-    return tuple(Fact("forced-to-go-on", finding=finding.fact) for finding in stopping)
+    doubts = tuple(finding.reason for finding in diagnosis.doubting)
+    return (*(Fact("forced-to-go-on", finding=finding.fact) for finding in stopping), *doubts)
 
 
 def measure_images(capture: Capture, timing: FrameTiming, progress: Progress) -> VisualRotation | None:
