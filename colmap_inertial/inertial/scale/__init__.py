@@ -10,7 +10,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.camera_clock import CameraTimedImu, epoch_shift_s
 from colmap_inertial.core.errors import NotObservableError
-from colmap_inertial.core.facts import Fact, as_fact
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ScaleOptions
 from colmap_inertial.core.sampling import PAUSE_STEPS, is_gap, time_unit_factor
 from colmap_inertial.core.threads import one_blas_thread
