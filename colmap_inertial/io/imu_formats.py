@@ -252,6 +252,12 @@ _OWN: tuple[ImuFormat, ...] = (
         read=imu_text.read_euroc,
     ),
     ImuFormat(
+        name="scan-capture",
+        layout="a folder of LaMAR's ScanCapture",
+        accepts=ios.is_scan_capture,
+        read=ios.read_scan_capture,
+    ),
+    ImuFormat(
         name="inertial-scale",
         layout="a folder with gyroscope.txt and accelerometer.txt",
         accepts=imu_text.is_inertial_scale,

@@ -8,6 +8,10 @@ CoreMotion gave, rad/s), ``odometry.csv`` with the time of each frame of ``rgb.m
 poses, ``camera_matrix.csv``. Its description says m/s2, its source writes CoreMotion's g; which one it is shows in the
 numbers (github.com/strayrobots/scanner).
 
+ScanCapture of the LaMAR benchmark writes ``gyroscope.txt`` and ``accelerometer.txt`` with comments ``# timestamp, rx,
+ry, rz`` and ``# timestamp, ax, ay, az``: microseconds since boot, rad/s, CoreMotion's g
+(github.com/microsoft/lamar-benchmark).
+
 Sensor Logger writes a zip, or the folder in it, with one table for each sensor: ``time`` (nanoseconds UTC), ``z``,
 ``y``, ``x`` in an order of its own. ``Accelerometer`` is without gravity, ``Gravity`` the rest; ``TotalAcceleration``
 (Android) and ``AccelerometerUncalibrated`` hold both, the latter in g on iOS. ``Metadata.csv`` names the platform and
@@ -25,7 +29,7 @@ from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.geometry import colmap_px_from_opencv
 from colmap_inertial.core.types import CameraModel, FrameLog, ImuRecording
-from colmap_inertial.io.files import first_line
+from colmap_inertial.io.files import first_line, read_bytes
 from colmap_inertial.io.frame_times import frame_log
 from colmap_inertial.io.imu_text import build_recording, order_rows
 from colmap_inertial.io.mp4 import is_mp4, read_movie
@@ -41,9 +45,10 @@ _G_BELOW = 3.0
 
 
 def is_stray_scanner(path: Path) -> bool:
-    """Whether ``path`` is a Stray Scanner folder, or its imu.csv."""
+    """Whether ``path`` is a Stray Scanner folder, or its imu.csv, whatever it is called: its columns tell it."""
     file = path if path.is_file() else path / "imu.csv"
-    return file.name == "imu.csv" and "alpha_x" in first_line(file)
+    names = {cell.strip().strip("#").strip() for cell in first_line(file).split(",")}
+    return {"a_x", "a_y", "a_z", "alpha_x", "alpha_y", "alpha_z"} <= names
 
 
 def read_stray_scanner(path: Path, units: DeclaredUnits) -> ImuRecording:
@@ -86,6 +91,38 @@ def _camera_matrix(folder: Path) -> CameraModel | None:
     centre = colmap_px_from_opencv(matrix[:2, 2])
     params = (matrix[0, 0], matrix[1, 1], float(centre[0]), float(centre[1]))
     return CameraModel(model="PINHOLE", width=track.width_px, height=track.height_px, params=params)
+
+
+# --- ScanCapture -----------------------------------------------------------------------------------------------------
+
+
+def is_scan_capture(path: Path) -> bool:
+    """Whether ``path`` is a folder of LaMAR's ScanCapture: comments over its two tables name their columns."""
+    names = {"gyroscope.txt": ("timestamp", "rx", "ry", "rz"), "accelerometer.txt": ("timestamp", "ax", "ay", "az")}
+    return path.is_dir() and all(_commented_header(path / file) == cells for file, cells in names.items())
+
+
+def _commented_header(path: Path) -> tuple[str, ...]:
+    """The last comment before the first row, cell by cell."""
+    if not path.is_file():
+        return ()
+    head = read_bytes(path, 2000).decode("utf-8-sig", errors="replace").splitlines()
+    comments = [line for i, line in enumerate(head) if all(above.lstrip().startswith("#") for above in head[: i + 1])]
+    return tuple(cell.strip() for cell in comments[-1].strip().lstrip("#").split(",")) if comments else ()
+
+
+def read_scan_capture(path: Path, units: DeclaredUnits) -> ImuRecording:
+    """Read ``gyroscope.txt`` and ``accelerometer.txt`` of ScanCapture: microseconds since boot, rad/s, CoreMotion's g."""
+    samples = []
+    for name, quantity, unit, sign in (
+        ("gyroscope.txt", "gyro", units.gyro or "rad/s", 1.0),
+        ("accelerometer.txt", "accel", units.accel or "g", -1.0),
+    ):
+        table = read_table(path / name)
+        t_ns = table.stamps_ns(table.column("timestamp"), "us")
+        values = sign * table.numbers([1, 2, 3])
+        samples.append(order_rows(table, "gyro" if quantity == "gyro" else "accel", unit, t_ns, values))
+    return build_recording(samples[0], samples[1], device="ScanCapture")
 
 
 # --- Sensor Logger ---------------------------------------------------------------------------------------------------

@@ -158,10 +158,15 @@ def read_table(path: Path) -> Table:
 def parse_bytes(path: Path, data: bytes) -> Table:
     """:func:`read_table` of bytes that lie elsewhere than in a file of their own; ``path`` is for messages."""
     text, encoding = decode(data)
+    table = parse_text(path, text)
+    return table if encoding == "utf-8" else replace(table, found=(encoding.upper(), *table.found))
+
+
+def parse_text(path: Path, text: str) -> Table:
+    """:func:`parse_bytes` of what was decoded."""
     plain = plain_text(text)
     table = parse_table(path, plain.text, plain.delimiter)
-    found = plain.found if encoding == "utf-8" else (encoding.upper(), *plain.found)
-    return replace(table, preamble=plain.preamble, found=found)
+    return replace(table, preamble=plain.preamble, found=plain.found)
 
 
 def parse_table(path: Path, text: str, delimiter: str = "") -> Table:
