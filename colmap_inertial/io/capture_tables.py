@@ -61,7 +61,7 @@ class ImuTables:
     noise: ImuNoise | None = None
 
 
-IMU_KEYS = ("path", "format", "gyro", "accel", "noise")
+IMU_KEYS = ("path", "format", "stamps", "topic", "gyro", "accel", "noise")
 _CORRECTION_KEYS = ("unit", "axes", "mirrored")
 _TIME_KEYS = ("time", "time_unit", "time_counts_per_s", "date_order", "rate_hz")
 _SENSOR_KEYS = ("file", *_TIME_KEYS, "columns", "where", "zero", "counts_per_unit", *_CORRECTION_KEYS)
@@ -70,6 +70,7 @@ _SENSOR_KEYS = ("file", *_TIME_KEYS, "columns", "where", "zero", "counts_per_uni
 def read_imu_table(table: Section) -> ImuPath | ImuTables:
     """The ``[imu]`` table with its sub-tables."""
     path, fmt = table.file("path"), table.text("format")
+    stamps, topic = table.choice("stamps", ("header", "arrival")), table.text("topic")
     gyro, accel = table.section("gyro"), table.section("accel")
     noise = _read_noise(table.section("noise"))
     if path is not None:
@@ -80,13 +81,14 @@ def read_imu_table(table: Section) -> ImuPath | ImuTables:
         return ImuPath(
             path=path,
             format=fmt or "auto",
-            units=DeclaredUnits(gyro=gyro_unit, accel=accel_unit),
+            units=DeclaredUnits(gyro=gyro_unit, accel=accel_unit, stamps=stamps, topic=topic),
             gyro_axes=gyro_axes,
             accel_axes=accel_axes,
             noise=noise,
         )
-    if fmt is not None:
-        table.fail("format", "belongs to path, which is missing")
+    for key, value in (("format", fmt), ("stamps", stamps), ("topic", topic)):
+        if value is not None:
+            table.fail(key, "belongs to path, which is missing")
     if gyro is None:
         table.fail(None, "needs path, or [imu.gyro] (and [imu.accel], for scale and gravity) that describe tables")
     gyro_table, gyro_axes = _read_sensor_table(gyro, "gyro")

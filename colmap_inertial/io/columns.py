@@ -207,8 +207,11 @@ def _kind(rest: Sequence[str], axis: int | None, unit: str | None) -> str:
 
 
 def _by_words(table: Table, cells: Sequence[Cell]) -> Columns:
-    sensors = {quantity: find_sensor(table, cells, quantity) for quantity in ("gyro", "accel")}
-    gyro, accel = sensors["gyro"], sensors["accel"]
+    gyro, accel = find_sensor(table, cells, "gyro"), find_sensor(table, cells, "accel")
+    unsaid = find_sensor(table, cells, "gyro", ("axis",))
+    if (gyro.columns is None) != (accel.columns is None) and unsaid.columns is not None and unsaid.unit is None:
+        proposed = replace(unsaid, about="the file does not say what these columns are")
+        gyro, accel = (proposed, accel) if gyro.columns is None else (gyro, proposed)
     sure = gyro.is_complete and accel.is_complete
     why = ["the header names the columns and their units"] if sure else []
     return Columns(gyro=gyro, accel=accel, is_sure=sure, why=tuple(why))

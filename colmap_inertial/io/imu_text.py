@@ -25,6 +25,9 @@ from colmap_inertial.io.sensor_yaml import read_imu_noise
 from colmap_inertial.io.stamps import DateOrder, TimeColumns, read_stamps
 from colmap_inertial.io.tables import Table, read_table, recognise
 from colmap_inertial.io.units import SENSOR_NAMES, SENSOR_UNITS, Axes, DeclaredUnits, Quantity, seconds
+#: What names of tables end with.
+TABLE_SUFFIXES = (".csv", ".txt", ".tsv", ".json", ".jsonl", ".ndjson", ".log", ".dat", ".asc")
+
 
 @dataclass(frozen=True, kw_only=True)
 class SensorTable:
@@ -142,7 +145,7 @@ def read_euroc(path: Path, units: DeclaredUnits) -> ImuRecording:
 
 def is_csv(path: Path) -> bool:
     """Whether ``path`` is a text table with a header; :func:`read_csv` says what is wrong with the header."""
-    return path.is_file() and path.suffix.lower() in (".csv", ".txt", ".tsv")
+    return path.is_file() and path.suffix.lower() in TABLE_SUFFIXES
 
 
 def read_csv(path: Path, units: DeclaredUnits) -> ImuRecording:

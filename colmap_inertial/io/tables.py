@@ -19,6 +19,7 @@ from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.io.dialect import decode, plain_text
 from colmap_inertial.io.files import first_line, read_bytes, read_limits, reading
+from colmap_inertial.io.json_rows import rows_of_json
 from colmap_inertial.io.units import SENSOR_UNITS, TIME_UNITS_NS, Quantity, stamps_ns, unit_of
 
 #: A delimiter that stands for any white space.
@@ -164,6 +165,9 @@ def parse_bytes(path: Path, data: bytes) -> Table:
 
 def parse_text(path: Path, text: str) -> Table:
     """:func:`parse_bytes` of what was decoded."""
+    rows = rows_of_json(text)
+    if rows is not None:
+        return replace(parse_table(path, rows, ","), found=("JSON",))
     plain = plain_text(text)
     table = parse_table(path, plain.text, plain.delimiter)
     return replace(table, preamble=plain.preamble, found=plain.found)

@@ -73,10 +73,22 @@ def scaled_unit_of(text: str) -> tuple[str, float] | None:
 
 @dataclass(frozen=True, kw_only=True)
 class DeclaredUnits:
-    """Units that the user states in place of what a file or format says; ``None`` leaves the file's."""
+    """What the user states in place of what a file or format says; ``None`` leaves the file's.
+
+    Attributes
+    ----------
+    gyro, accel
+        Units.
+    stamps
+        Of a bag: ``"header"``, or ``"arrival"``.
+    topic
+        Of a bag that has several.
+    """
 
     gyro: str | None = None
     accel: str | None = None
+    stamps: str | None = None
+    topic: str | None = None
 
 
 def convert_to_si(values: Array, quantity: Quantity, unit: str) -> Array:

@@ -245,6 +245,22 @@ LAYOUTS = (
         is_defined=False,
     ),
     Layout(
+        name="RunCam and its kin",
+        preamble="",
+        needs=("time",),
+        gyro=Part(
+            columns="r{}",
+            unit="deg/s",
+            counts_per_unit=None,
+            times=(Times(columns=("time",), units=("ms",)),),
+            about="65.536 where the range is 500 deg/s (RunCam 5 Orange, iFlight, Mobius), 32.768 for 1000 (Thumb)",
+        ),
+        accel=Part(
+            columns="a{}", unit="g", counts_per_unit=16384.0, times=(Times(columns=("time",), units=("ms",)),)
+        ),
+        is_defined=False,
+    ),
+    Layout(
         name="OpenLog Artemis",
         needs=("imu_degc",),
         gyro=Part(
