@@ -110,12 +110,16 @@ def read_calibration_table(
     imu: ImuPath | ImuTables | None,
     readout_s: float | None,
     shared_clock: bool,
+    clock_offset_s: float | None = None,
 ) -> Calibrations:
-    """The ``[calibration]`` table, completed by the sheets of camera and IMU and by ``[timing]``."""
+    """The ``[calibration]`` table, completed by the sheets of camera and IMU and by ``[timing]``.
+
+    ``clock_offset_s`` is what the camera's sheet says, in place of what the table does not.
+    """
     files = table.files("file")
     if any(key in table for key in CALIBRATION_KEYS[1:]) and not all(holds_imu_alone(file) for file in files):
         table.fail("file", "gives the calibration; leave out the other keys of this table")
-    calibrations = read_for_recording(files, shared_clock=shared_clock)
+    calibrations = read_for_recording(files, shared_clock=shared_clock, readout_s=readout_s)
     if calibrations.camera_imu is not None:
         return calibrations
     rotation, lever = _read_pose(table)
@@ -125,11 +129,12 @@ def read_calibration_table(
         rotation = quat_from_matrix(cam_from_imu[:3, :3])
         lever = cam_from_imu[:3, 3] if lever is None else lever
     sigmas = {key: value for key in _SIGMA_KEYS if (value := table.positive(key)) is not None}
+    gyro_offset_s, accel_offset_s = table.number("gyro_time_offset_s"), table.number("accel_time_offset_s")
     declared = Declared(
         cam_from_imu_xyzw=rotation,
         imu_in_cam_m=lever,
-        gyro_time_offset_s=table.number("gyro_time_offset_s"),
-        accel_time_offset_s=table.number("accel_time_offset_s"),
+        gyro_time_offset_s=gyro_offset_s if gyro_offset_s is not None or accel_offset_s is not None else clock_offset_s,
+        accel_time_offset_s=accel_offset_s,
         gyro_bias_rad_s=table.numbers("gyro_bias_rad_s", 3),
         readout_s=readout_s,
         **sigmas,

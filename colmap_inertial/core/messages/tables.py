@@ -67,3 +67,24 @@ def bag_of_two_drivers(path: str, topic: str, nodes: Sequence[str]) -> str:
 @message(example={"topic": "/imu", "topics": ("/imu0", "/imu1")})
 def bag_without_topic(topic: str, topics: Sequence[str]) -> str:
     return f"has no IMU topic {topic}; it has {', '.join(topics)}"
+
+
+@message(
+    advice="give Kalibr's camchain-imucam, a configuration of OpenVINS, VINS-Mono, VINS-Fusion or ORB-SLAM, or a JSON "
+    "file that align wrote"
+)
+def calibration_unknown() -> str:
+    return "is no calibration of a camera and an IMU that is known here"
+
+
+@message(
+    advice="name one (camera under [camera]), or copy its block into a file of its own",
+    example={"cameras": ("cam0", "cam1")},
+)
+def calibration_of_several(cameras: Sequence[str]) -> str:
+    return f"calibrates several cameras ({', '.join(cameras)})"
+
+
+@message(advice="give Kalibr's camchain-imucam, in which T_cam_imu stands, or state cam_from_imu under [calibration]")
+def calibration_without_imu() -> str:
+    return "says nothing of an IMU: it calibrates the camera alone, for sensor_yaml under [camera]"
