@@ -210,7 +210,7 @@ def read_calibration(path: StrPath) -> CameraImuCalibration:
     """
     path = Path(path)
     if is_yaml(path):
-        return calibration_prior(declared_by(path))
+        return calibration_prior(read_declared(path))
     # a file that states neither is of this kind and order
     values = {"kind": CAMERA_IMU, "cov_parameters": list(CALIBRATION_PARAMETERS), **read_json(path)}
     if values.pop("kind") != CAMERA_IMU:
@@ -218,7 +218,7 @@ def read_calibration(path: StrPath) -> CameraImuCalibration:
     return _read_fields(path, values, CameraImuCalibration, CALIBRATION_PARAMETERS, _CLOCK)
 
 
-def declared_by(path: Path, readout_s: float | None = None) -> Declared:
+def read_declared(path: Path, readout_s: float | None = None) -> Declared:
     """What the YAML of another program states of camera and IMU; ``readout_s`` where it is known otherwise.
 
     Raises
@@ -407,6 +407,6 @@ def read_for_recording(
         return calibrations
     sheet = next((path for path in list_paths(paths) if is_yaml(path)), None)
     if sheet is not None:
-        prior = calibration_prior(declared_by(sheet, readout_s), shared_clock=shared_clock)
+        prior = calibration_prior(read_declared(sheet, readout_s), shared_clock=shared_clock)
         return replace(calibrations, camera_imu=prior)
     return replace(calibrations, camera_imu=reset_for_recording(calibrations.camera_imu, shared_clock=shared_clock))

@@ -25,7 +25,11 @@ def read_camera_table(table: Section) -> tuple[CameraModel, Array | None, float 
             return sensor_yaml.read_camera(sheet), sensor_yaml.read_body_from_sensor(sheet), None
         mounted = read_device_yaml(sheet, name)
         pose = mounted.cam_from_imu
-        return mounted.camera(), None if pose is None else np.linalg.inv(pose), mounted.clock_offset_s
+        return (
+            mounted.camera(),
+            None if pose is None else np.asarray(np.linalg.inv(pose), dtype=np.float64),
+            mounted.clock_offset_s,
+        )
     if name is not None:
         table.fail("camera", "belongs to sensor_yaml, which is missing")
     model = table.require("model", table.choice("model", CAMERA_MODELS))

@@ -233,9 +233,7 @@ def _read_time(table: Section) -> TimeColumns:
         return TimeColumns(columns=tuple(columns), counts_per_second=counts)
     units = table.require("time_unit", unit) if isinstance(unit, list) else [table.require("time_unit", unit)]
     if units == ["date"]:
-        return TimeColumns(
-            columns=tuple(columns), units=("date",), date_order=table.choice("date_order", DATE_ORDERS)
-        )
+        return TimeColumns(columns=tuple(columns), units=("date",), date_order=table.choice("date_order", DATE_ORDERS))
     if any(name not in TIME_UNITS_NS for name in units) or len(units) != len(columns):
         several = "" if len(columns) == 1 else f", a list with one of them for each of the {len(columns)} columns"
         allowed = ", ".join(map(repr, (*TIME_UNITS_NS, "date")))
@@ -249,7 +247,7 @@ def _read_where(table: Section) -> tuple[str | int, str] | None:
     if where is None:
         return None
     if not isinstance(where, list) or len(where) != 2 or not _is_column(where[0]) or isinstance(where[1], list | dict):
-        table.fail("where", f"must be a column and its value in the rows to take, as [1, \"GYRO\"]; found {where!r}")
+        table.fail("where", f'must be a column and its value in the rows to take, as [1, "GYRO"]; found {where!r}')
     return where[0], str(where[1])
 
 

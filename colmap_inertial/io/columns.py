@@ -12,13 +12,12 @@ import numpy as np
 
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.io import vocabulary as words
+from colmap_inertial.io.sensor_columns import ROWS, Columns, SensorColumns
 from colmap_inertial.io.stamps import TimeColumns, is_date
 from colmap_inertial.io.tables import Table, split_unit
-from colmap_inertial.io.units import SENSOR_UNITS, TIME_UNITS_NS, Quantity, scaled_unit_of
+from colmap_inertial.io.units import SENSOR_UNITS, TIME_UNITS_NS, Quantity, unit_and_scale
 from colmap_inertial.io.vocabulary import LAYOUTS, ROS2_ECHO, Bare, Layout, Part
 
-#: Rows that are looked at.
-ROWS = 2000
 _WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W\d_]+")
 _LETTERS = {**{letter: i for i, letter in enumerate("xyz")}, **{str(i): i for i in range(3)}}
 
@@ -49,80 +48,13 @@ class Cell:
     scale: float = 1.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class SensorColumns:
-    """Three columns of a sensor, and what is known of them.
-
-    Attributes
-    ----------
-    columns
-        Indices from 0; ``None`` where they are unknown.
-    unit
-        ``None`` where it is unknown.
-    counts_per_unit
-        ``None`` where it is unknown.
-    axes
-        As in a capture.toml; empty where they are the file's.
-    time
-        ``None`` where it is unknown; units are empty where they are.
-    about
-        What a person has to know or confirm.
-    others
-        Names of other columns that could be meant.
-    where
-        Column and value of the rows that are this sensor's; ``None`` for all.
-    """
-
-    columns: tuple[int, int, int] | None = None
-    unit: str | None = None
-    counts_per_unit: float | None = 1.0
-    axes: str = ""
-    time: TimeColumns | None = None
-    about: str = ""
-    others: tuple[str, ...] = ()
-    where: tuple[str | int, str] | None = None
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether nothing is open."""
-        time = self.time
-        timed = time is not None and bool(time.units or time.rate_hz or time.counts_per_second)
-        return self.columns is not None and None not in (self.unit, self.counts_per_unit) and timed and not self.others
-
-
-@dataclass(frozen=True, kw_only=True)
-class Columns:
-    """What a table was taken for.
-
-    Attributes
-    ----------
-    gyro, accel
-        Its sensors.
-    source
-        The export that it is, or empty.
-    is_sure
-        Whether it can be read without a person's word.
-    why
-        What this rests on, in words.
-    kinds
-        What each column was taken for.
-    """
-
-    gyro: SensorColumns
-    accel: SensorColumns
-    source: str = ""
-    is_sure: bool = False
-    why: tuple[str, ...] = ()
-    kinds: tuple[str, ...] = ()
-
-
 def recognise_columns(table: Table) -> Columns:
     """What the columns of a table hold."""
     if table.header is None:
         return _bare(table) or Columns(gyro=SensorColumns(), accel=SensorColumns())
     cells = [read_name(name) for name in table.header]
-    found = next((taken for layout in LAYOUTS if (taken := _as_layout(table, layout)) is not None), None)
-    found = found or _by_words(table, cells)
+    found = next((taken for layout in LAYOUTS if (taken := _match_layout(table, layout)) is not None), None)
+    found = found or _match_words(table, cells)
     kinds = [cell.kind for cell in cells]
     for quantity, sensor in (("gyro", found.gyro), ("accel", found.accel)):
         for index in sensor.columns or ():
@@ -140,13 +72,13 @@ def read_name(name: str) -> Cell:
         bare, unit_text = f"{bare} {unit_text}", None
     tokens = [token.lower() for token in _WORD.findall(bare.lstrip("%#"))]
     tokens = [part for token in tokens for part in _split_axis(token)]
-    unit = None if unit_text is None else scaled_unit_of(unit_text)
+    unit = None if unit_text is None else unit_and_scale(unit_text)
     if unit is None:
         tokens, unit = _unit_at_the_end(tokens)
     if unit is None and len(tokens) == 1 and tokens[0] in words.TIME and len(tokens[0]) > 4:
-        unit = scaled_unit_of(tokens[0])  # millis
+        unit = unit_and_scale(tokens[0])  # millis
     axes = [i for i, token in enumerate(tokens) if token in _LETTERS]
-    axis = _LETTERS[tokens[axes[-1]]] if axes and tokens[axes[-1]] != "0" or _is_indexed(tokens, axes) else None
+    axis = _LETTERS[tokens[axes[-1]]] if (axes and tokens[axes[-1]] != "0") or _is_indexed(tokens, axes) else None
     rest = tuple(t for i, t in enumerate(tokens) if not (axes and i == axes[-1] and axis is not None))
     kind = _kind(rest, axis, None if unit is None else unit[0])
     return Cell(
@@ -169,7 +101,7 @@ def _unit_at_the_end(tokens: list[str]) -> tuple[list[str], tuple[str, float] | 
     for count in (4, 3, 2, 1):
         last = "".join(tokens[-count:])
         if len(tokens) > count and len(last) > 1 and tokens[-count] not in ("x", "y", "z"):
-            unit = scaled_unit_of(last)
+            unit = unit_and_scale(last)
             if unit is not None:
                 rest = tokens[:-count]
                 return rest[:-1] if rest[-1:] == ["in"] else rest, unit
@@ -206,7 +138,7 @@ def _kind(rest: Sequence[str], axis: int | None, unit: str | None) -> str:
 # --- by words ---------------------------------------------------------------------------------------------------------
 
 
-def _by_words(table: Table, cells: Sequence[Cell]) -> Columns:
+def _match_words(table: Table, cells: Sequence[Cell]) -> Columns:
     gyro, accel = find_sensor(table, cells, "gyro"), find_sensor(table, cells, "accel")
     unsaid = find_sensor(table, cells, "gyro", ("axis",))
     if (gyro.columns is None) != (accel.columns is None) and unsaid.columns is not None and unsaid.unit is None:
@@ -217,9 +149,7 @@ def _by_words(table: Table, cells: Sequence[Cell]) -> Columns:
     return Columns(gyro=gyro, accel=accel, is_sure=sure, why=tuple(why))
 
 
-def find_sensor(
-    table: Table, cells: Sequence[Cell], quantity: Quantity, kinds: tuple[str, ...] = ()
-) -> SensorColumns:
+def find_sensor(table: Table, cells: Sequence[Cell], quantity: Quantity, kinds: tuple[str, ...] = ()) -> SensorColumns:
     """The columns of a sensor: of several those of the fewest doubtful words.
 
     Parameters
@@ -271,13 +201,15 @@ def _find_time(table: Table, cells: Sequence[Cell], quantity: Quantity) -> TimeC
         unit = "date" if kind == "date" else cell.unit if cell.unit in TIME_UNITS_NS else None
         score = 2.0 * bool(have & own) + (unit is not None) + 0.5 * bool(have & words.NEAR_CLOCK)
         score -= 0.5 * bool(have & words.LATE_CLOCK) + 0.25 * (kind == "date")
-        scored.append((score, -index, TimeColumns(columns=(_name(table, index),), units=() if unit is None else (unit,))))
+        scored.append(
+            (score, -index, TimeColumns(columns=(_name(table, index),), units=() if unit is None else (unit,)))
+        )
     pair = _seconds_and_nanoseconds(table, cells) or _date_and_time(table, cells)
     if pair is not None and not any(score > 1.4 for score, _, _ in scored):
         return pair
     if scored:
         return max(scored, key=lambda item: item[:2])[2]
-    rate = stated_rate(table.preamble)
+    rate = find_rate(table.preamble)
     return None if rate is None else TimeColumns(rate_hz=rate)
 
 
@@ -328,7 +260,7 @@ def column_kind(table: Table, index: int) -> str:
     return "number" if (steps < 0).mean() < 0.05 else "other"
 
 
-def stated_rate(lines: Iterable[str]) -> float | None:
+def find_rate(lines: Iterable[str]) -> float | None:
     """The one sampling rate that lines before a header state, in Hz."""
     rates = {float(rate) for line in lines for rate in re.findall(words.RATE, line, re.IGNORECASE)}
     rate = rates.pop() if len(rates) == 1 else 0.0
@@ -342,7 +274,7 @@ def _flat(name: str) -> str:
     return re.sub(r"\s+", " ", name.strip().lower())
 
 
-def _as_layout(table: Table, layout: Layout) -> Columns | None:
+def _match_layout(table: Table, layout: Layout) -> Columns | None:
     """The columns of an export, where the table is one."""
     assert table.header is not None
     names = [_flat(name) for name in table.header]
@@ -352,7 +284,7 @@ def _as_layout(table: Table, layout: Layout) -> Columns | None:
         return None
     sensors = []
     for part in (layout.gyro, layout.accel):
-        sensor = _as_part(table, names, layout, part)
+        sensor = _match_part(table, names, layout, part)
         if sensor is None or sensor.columns is None:
             return None
         sensors.append(sensor)
@@ -367,7 +299,7 @@ def _as_layout(table: Table, layout: Layout) -> Columns | None:
     )
 
 
-def _as_part(table: Table, names: Sequence[str], layout: Layout, part: Part) -> SensorColumns | None:
+def _match_part(table: Table, names: Sequence[str], layout: Layout, part: Part) -> SensorColumns | None:
     wanted = [part.columns.format(letter) for letter in layout.letters]
     if not wanted[0].startswith("field.") and layout.name.startswith("sensor_msgs"):
         places = [_ending(names, name) for name in wanted]
@@ -378,7 +310,7 @@ def _as_part(table: Table, names: Sequence[str], layout: Layout, part: Part) -> 
     time = _layout_time(table, names, part)
     counts = part.counts_per_unit
     if counts is None:
-        counts = _stated_counts(table.preamble, layout.preamble_counts)
+        counts = _find_counts(table.preamble, layout.preamble_counts)
     return SensorColumns(
         columns=(places[0], places[1], places[2]),  # type: ignore[arg-type]
         unit=part.unit,
@@ -398,13 +330,15 @@ def _ending(names: Sequence[str], wanted: str) -> int | None:
 def _layout_time(table: Table, names: Sequence[str], part: Part) -> TimeColumns | None:
     for times in part.times:
         places = [_ending(names, name) for name in times.columns]
-        if None not in places and all(column_kind(table, p) != "constant" or len(places) > 1 for p in places if p is not None):
+        if None not in places and all(
+            column_kind(table, p) != "constant" or len(places) > 1 for p in places if p is not None
+        ):
             columns = tuple(_name(table, p) for p in places if p is not None)
             return TimeColumns(columns=columns, units=times.units, counts_per_second=times.counts_per_second)
     return None
 
 
-def _stated_counts(preamble: Sequence[str], key: str) -> float | None:
+def _find_counts(preamble: Sequence[str], key: str) -> float | None:
     """What a line ``key, number`` before the header says."""
     for line in preamble:
         match = re.match(rf'\s*"?{re.escape(key)}"?\s*[,;:=\t]\s*"?(\d+(?:\.\d+)?)"?\s*$', line, re.IGNORECASE)
@@ -426,7 +360,11 @@ def _bare(table: Table) -> Columns | None:
     whole = (values[:, :2] == np.floor(values[:, :2])).all() and (nanoseconds >= 0).all() and (nanoseconds < 1e9).all()
     turned = values[:, 2:6]
     unit = np.abs(np.linalg.norm(turned, axis=1) - 1) < 1e-2
-    if not (whole and (np.diff(seconds) >= 0).mean() > 0.9 and (unit.all() or (values[:, 6] == -1).all() or not turned.any())):
+    if not (
+        whole
+        and (np.diff(seconds) >= 0).mean() > 0.9
+        and (unit.all() or (values[:, 6] == -1).all() or not turned.any())
+    ):
         return None
     time = TimeColumns(columns=kind.time, units=kind.units)
 

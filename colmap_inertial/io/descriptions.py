@@ -6,47 +6,63 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.io.columns import ROWS, Columns, SensorColumns
 from colmap_inertial.io.plausible import PLAUSIBLE
+from colmap_inertial.io.sensor_columns import ROWS, Columns, SensorColumns
 from colmap_inertial.io.stamps import TimeColumns
-from colmap_inertial.io.tables import Table
 from colmap_inertial.io.units import SENSOR_UNITS, STANDARD_GRAVITY_M_S2, TIME_UNITS_NS, Axes, Quantity
+
+if TYPE_CHECKING:
+    from colmap_inertial.io.tables import Table
 
 #: Steps between readings of an IMU, in seconds.
 _STEP_S = (2.5e-4, 0.2)
 _OPEN = "?"
 
 
-def describe(path: Path, found: Columns, table: Table | None = None) -> str:
-    """The lines of a capture.toml: ``[imu.gyro]`` and ``[imu.accel]``."""
+def describe(path: Path, found: Columns, table: Table | None = None, name: str = "") -> str:
+    """The lines of a capture.toml: ``[imu.gyro]`` and ``[imu.accel]``.
+
+    Parameters
+    ----------
+    name
+        Of the table, seen from the folder of the capture.toml; by default that beside it.
+    """
+    name = name or path.name
     gyro, accel, guessed = found.gyro, found.accel, False
     if table is not None and table.header is None and gyro.columns is None and gyro.where is None:
-        gyro, accel = _by_numbers(table)
+        gyro, accel = _propose_columns(table)
         guessed = True
     elif table is not None and (gyro.time is None or accel.time is None) and gyro.where is None:
         gyro, accel = _add_time(table, gyro), _add_time(table, accel)
     lines = [] if not found.source else [f"# by the definition of {found.source}"]
     if guessed:
         lines.append("# columns as their numbers look: check them")
-    for quantity, part in (("gyro", gyro), ("accel", accel)):
-        lines += [*_section(path, quantity, part, table), ""]
+    parts: tuple[tuple[Quantity, SensorColumns], ...] = (("gyro", gyro), ("accel", accel))
+    for quantity, part in parts:
+        lines += [*_section(name, quantity, part, table), ""]
     return "\n".join(lines[:-1])
 
 
-def _section(path: Path, quantity: Quantity, part: SensorColumns, table: Table | None) -> list[str]:
-    lines = [f"[imu.{quantity}]", f"file = {_text(path.name)}", *_time_lines(part.time, table)]
+def _section(name: str, quantity: Quantity, part: SensorColumns, table: Table | None) -> list[str]:
+    lines = [
+        f"[imu.{quantity}]",
+        f"file = {_text(part.file or name)}",
+        *_time_lines(part.time, None if part.file else table),
+    ]
     if part.where is not None:
         lines.append(f"where = [{_column(part.where[0])}, {_text(part.where[1])}]")
     if part.columns is None:
         lines.append(f'columns = ["{_OPEN}", "{_OPEN}", "{_OPEN}"]  # names, or numbers from 1, of x, y, z')
     else:
-        names = ", ".join(_column(_name(table, column)) for column in part.columns)
+        names = ", ".join(map(_column, part.names or [_name(table, column) for column in part.columns]))
         other = f"  # or {', '.join(part.others)}" if part.others else ""
         lines.append(f"columns = [{names}]{other}")
     units = " or ".join(SENSOR_UNITS[quantity])
@@ -126,15 +142,13 @@ def _values(table: Table) -> Array:
 
 
 def _add_time(table: Table, part: SensorColumns) -> SensorColumns:
-    from dataclasses import replace
-
     if part.time is not None:
         return part
     place = _time(_values(table))
     return part if place is None else replace(part, time=TimeColumns(columns=(_name(table, place),)))
 
 
-def _by_numbers(table: Table) -> tuple[SensorColumns, SensorColumns]:
+def _propose_columns(table: Table) -> tuple[SensorColumns, SensorColumns]:
     values = _values(table)
     place = _time(values)
     time = None if place is None else TimeColumns(columns=(place + 1,))

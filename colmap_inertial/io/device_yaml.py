@@ -148,17 +148,15 @@ def _kalibr(blocks: Mapping[str, Sheet]) -> dict[str, SheetCamera]:
     before: Array | None = None
     for name in sorted(blocks, key=lambda n: (len(n), n)):
         sheet = blocks[name]
-        pose = None
+        pose: Array | None = None
         if "T_cam_imu" in sheet.values:
             pose = sheet.pose("T_cam_imu", "T_cam_imu")
         elif "T_imu_cam" in sheet.values:
-            pose = np.linalg.inv(sheet.pose("T_imu_cam", "T_imu_cam"))
+            pose = _inverse(sheet.pose("T_imu_cam", "T_imu_cam"))
         elif "T_cn_cnm1" in sheet.values and before is not None:
             pose = sheet.pose("T_cn_cnm1", "T_cn_cnm1") @ before
         shift = sheet.numbers("timeshift_cam_imu", 1)[0] if "timeshift_cam_imu" in sheet.values else None
-        cameras[name] = SheetCamera(
-            sheet=sheet, cam_from_imu=pose, clock_offset_s=None if shift is None else -shift
-        )
+        cameras[name] = SheetCamera(sheet=sheet, cam_from_imu=pose, clock_offset_s=None if shift is None else -shift)
         before = pose
     return cameras
 
@@ -180,15 +178,15 @@ def _vins(sheet: Sheet) -> SheetCamera:
     offset = -sheet.numbers("td", 1)[0] if "td" in values else None
     rolls = "rolling_shutter" in values and bool(sheet.numbers("rolling_shutter", 1)[0])
     return SheetCamera(
-        sheet=_linked_camera(sheet),
-        cam_from_imu=None if mode == 2 else np.linalg.inv(body_from_cam),
+        sheet=_follow_camera(sheet),
+        cam_from_imu=None if mode == 2 else _inverse(body_from_cam),
         clock_offset_s=offset,
         readout_s=sheet.numbers("rolling_shutter_tr", 1)[0] if rolls else None,
         is_first_guess=mode == 1,
     )
 
 
-def _linked_camera(sheet: Sheet) -> Sheet:
+def _follow_camera(sheet: Sheet) -> Sheet:
     """VINS-Fusion keeps intrinsics in a file of their own."""
     linked = sheet.values.get("cam0_calib")
     if isinstance(linked, str) and "/" not in linked and (sheet.path.parent / linked).is_file():
@@ -197,12 +195,16 @@ def _linked_camera(sheet: Sheet) -> Sheet:
     return sheet
 
 
+def _inverse(pose: Array) -> Array:
+    return np.asarray(np.linalg.inv(pose), dtype=np.float64)
+
+
 # --- intrinsics -------------------------------------------------------------------------------------------------------
 
 
 def _intrinsics(sheet: Sheet) -> tuple[str, tuple[float, ...], tuple[int, int]]:
     values = sheet.values
-    if "distortion_coeffs" in values or "camera_model" in values and "intrinsics" in values:
+    if "distortion_coeffs" in values or ("camera_model" in values and "intrinsics" in values):
         return sheet.pinhole("distortion_coeffs")
     if "projection_parameters" in values:
         return _camodocal(sheet)
@@ -217,7 +219,7 @@ def _intrinsics(sheet: Sheet) -> tuple[str, tuple[float, ...], tuple[int, int]]:
     coefficients = [] if key is None else _data(sheet, key)
     model = str(values.get("distortion_model", "plumb_bob"))
     size = [int(sheet.numbers(key, 1)[0]) for key in _size_keys(values)]
-    return _as_colmap(sheet, model, (fx, fy, cx, cy), coefficients, (size[0], size[1]))
+    return _convert_to_colmap(sheet, model, (fx, fy, cx, cy), coefficients, (size[0], size[1]))
 
 
 def _size_keys(values: Mapping[str, Any]) -> tuple[str, str]:
@@ -241,10 +243,12 @@ def _camodocal(sheet: Sheet) -> tuple[str, tuple[float, ...], tuple[int, int]]:
         distortion = _map(sheet, "distortion_parameters")
         bent = Sheet(path=sheet.path, values=distortion, part="distortion_parameters")
         coefficients = [bent.numbers(key, 1)[0] for key in ("k1", "k2", "p1", "p2")] if distortion else []
-        return _as_colmap(sheet, "plumb_bob", values, coefficients, size)
+        return _convert_to_colmap(sheet, "plumb_bob", values, coefficients, size)
     if model == "KANNALA_BRANDT":
         values = tuple(projection.numbers(key, 1)[0] for key in ("mu", "mv", "u0", "v0"))
-        return _as_colmap(sheet, "equidistant", values, [projection.numbers(f"k{i}", 1)[0] for i in (2, 3, 4, 5)], size)
+        return _convert_to_colmap(
+            sheet, "equidistant", values, [projection.numbers(f"k{i}", 1)[0] for i in (2, 3, 4, 5)], size
+        )
     raise sheet.fault(f"model_type {model!r} is not known here (PINHOLE and KANNALA_BRANDT are)")
 
 
@@ -261,10 +265,12 @@ def _orb_slam(sheet: Sheet, before: str) -> tuple[str, tuple[float, ...], tuple[
         sheet.numbers(f"{before}{name}", 1)[0] if f"{before}{name}" in sheet.values else 0.0 for name in names
     ]
     size = int(sheet.numbers("Camera.width", 1)[0]), int(sheet.numbers("Camera.height", 1)[0])
-    return _as_colmap(sheet, "equidistant" if kind == "KannalaBrandt8" else "plumb_bob", values, coefficients, size)
+    return _convert_to_colmap(
+        sheet, "equidistant" if kind == "KannalaBrandt8" else "plumb_bob", values, coefficients, size
+    )
 
 
-def _as_colmap(
+def _convert_to_colmap(
     sheet: Sheet, model: str, values: Sequence[float], coefficients: Sequence[float], size: tuple[int, int]
 ) -> tuple[str, tuple[float, ...], tuple[int, int]]:
     """COLMAP's model and parameters of OpenCV's, whose pixels count from the centre of the first."""
@@ -273,7 +279,9 @@ def _as_colmap(
     if model in _EQUIDISTANT:
         return "OPENCV_FISHEYE", (fx, fy, *centre, *([*coefficients, *[0.0] * 4][:4])), size
     if model not in (*_PLUMB_BOB, *_RATIONAL):
-        raise sheet.fault(f"distortion_model {model!r} is not known here (plumb_bob, rational_polynomial, equidistant are)")
+        raise sheet.fault(
+            f"distortion_model {model!r} is not known here (plumb_bob, rational_polynomial, equidistant are)"
+        )
     if any(coefficients[8:]):
         raise sheet.fault("prism or tilt coefficients are not known to COLMAP's cameras")
     bent = [*coefficients, *[0.0] * 8][:8]

@@ -13,8 +13,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from colmap_inertial.io.units import scaled_unit_of
-
 #: What is looked at: characters, lines, and rows under the header that must agree.
 _HEAD_CHARACTERS, _HEAD_LINES, _ALIKE = 1 << 16, 600, 3
 #: Delimiter and decimal sign, those of plain tables first.
@@ -23,6 +21,12 @@ _WAYS = ((";", "."), (",", "."), ("\t", "."), (None, "."), (";", ","), ("\t", ",
 _CLEARLY = 0.05
 #: Rows of a header.
 _MOST_HEADER_ROWS = 4
+#: Units, as a row under the header may spell them: letters, after blanks and signs of powers are taken out.
+_UNIT = re.compile(
+    r"(m|micro|µ|μ|u|n|milli|k)?(s|sec|seconds|g|gs|dps|t|hz|v|volts|m)|m/\(?s(ec)?2\)?|m/s²|m/s/s|ms-2|(m|k)?rad(ians)?(/s(ec)?|s-1)?|"
+    r"(m?deg(rees)?|°|º)(/s(ec)?|s-1|c)?|(u|µ|μ|m|n)?(t|tesla|gauss|pa)|h?pa|mbar|%|celsius|local_flux",
+    re.IGNORECASE,
+)
 #: Words of a row under the header that name no column.
 _NO_NAMES = {"cal", "raw", "uncal", "no units", "no_units", "n/a", "-"}
 
@@ -178,9 +182,11 @@ def _layout(head: Sequence[str], standard: str | None, stated: str | None) -> _L
             continue
         if (delimiter, decimal) == (standard, "."):
             plain_share = share
-        if best is None or share > best[0] + _CLEARLY:
-            best = share, layout
-        elif (delimiter, decimal) == (standard, ".") and share >= best[0] - _CLEARLY:
+        if (
+            best is None
+            or share > best[0] + _CLEARLY
+            or ((delimiter, decimal) == (standard, ".") and share >= best[0] - _CLEARLY)
+        ):
             best = share, layout
     if best is None:
         return None
@@ -287,7 +293,7 @@ def join_header(rows: Sequence[Sequence[str]]) -> tuple[str, ...]:
         unit = ""
         for i, cell in enumerate(cells):
             bare = cell[1:-1] if cell[:1] in ("(", "[") else cell
-            if i and scaled_unit_of(bare) is not None:
+            if i and _UNIT.fullmatch(re.sub(r"[\s_^*·]", "", bare)):
                 unit = bare
             elif cell and cell.lower() not in _NO_NAMES and cell not in words:
                 words.append(cell)

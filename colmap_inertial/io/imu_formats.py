@@ -350,6 +350,12 @@ _OWN: tuple[ImuFormat, ...] = (
         frames=telemetry.read_telemetry_frames,
     ),
     ImuFormat(
+        name="tables",
+        layout="a folder with one table of a gyroscope and one of an accelerometer, whose headers name the units",
+        accepts=imu_text.has_separate_tables,
+        read=imu_text.read_separate_tables,
+    ),
+    ImuFormat(
         name="csv",
         layout='a CSV file with a header such as "t [ns],gx [rad/s],...,az [m/s2]"',
         accepts=imu_text.is_csv,

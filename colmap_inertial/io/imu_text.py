@@ -16,17 +16,22 @@ from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import ImuNoise, ImuRecording
-from colmap_inertial.io.columns import Columns, SensorColumns, recognise_columns
+from colmap_inertial.io.columns import recognise_columns
 from colmap_inertial.io.descriptions import describe
 from colmap_inertial.io.files import first_line, read_bytes
 from colmap_inertial.io.interleaved import find_rows_of_sensors, read_rows
 from colmap_inertial.io.samples import Samples, order_samples
+from colmap_inertial.io.sensor_columns import Columns, SensorColumns
 from colmap_inertial.io.sensor_yaml import read_imu_noise
 from colmap_inertial.io.stamps import DateOrder, TimeColumns, read_stamps
-from colmap_inertial.io.tables import Table, read_table, recognise
+from colmap_inertial.io.tables import Table, parse_bytes, read_table, recognise
 from colmap_inertial.io.units import SENSOR_NAMES, SENSOR_UNITS, Axes, DeclaredUnits, Quantity, seconds
+
 #: What names of tables end with.
 TABLE_SUFFIXES = (".csv", ".txt", ".tsv", ".json", ".jsonl", ".ndjson", ".log", ".dat", ".asc")
+
+#: Tables of a folder that are looked into.
+MOST_TABLES = 40
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -248,20 +253,99 @@ def _read_columns(
     if not (gyro.is_complete and accel.is_complete and (found.is_sure or not found.source)):
         if table is not None and table.header is not None:
             reason += f"; the header is: {table.header_text[:300]}"
-        raise FormatError(path, Fact("table-unclear", reason=reason, hint=describe(path, found, table)))
-    recording = read_tables(as_sensor_table(path, gyro), as_sensor_table(path, accel))
-    turned = {
-        name: Axes.parse(part.axes).apply(values)
-        for name, part, values in (
-            ("gyro_rad_s", gyro, recording.gyro_rad_s),
-            ("accel_m_s2", accel, recording.accel_m_s2),
-        )
-        if part.axes
-    }
-    return replace(recording, noise=noise, device=recording.device or found.source, **turned)
+        found = _add_other_table(path, found)
+        fact = Fact("table-unclear", reason=reason, hint=describe(path, found, table))
+        raise FormatError(path, fact, code=FormatError.default_code)
+    recording = read_tables(make_sensor_table(path, gyro), make_sensor_table(path, accel))
+    gyro_rad_s, accel_m_s2 = (
+        Axes.parse(part.axes).apply(values) if part.axes else values
+        for part, values in ((gyro, recording.gyro_rad_s), (accel, recording.accel_m_s2))
+    )
+    device = recording.device or found.source
+    return replace(recording, noise=noise, device=device, gyro_rad_s=gyro_rad_s, accel_m_s2=accel_m_s2)
 
 
-def as_sensor_table(path: Path, part: SensorColumns) -> SensorTable:
+def _add_other_table(path: Path, found: Columns) -> Columns:
+    """The columns of one sensor, with those of the other in the one table beside it that has them."""
+    for name, part, other in (("gyro", found.gyro, found.accel), ("accel", found.accel, found.gyro)):
+        if part.columns is None and other.is_complete and other.where is None:
+            beside = [file for file in _tables_in(path.parent) if file != path]
+            parts = [(file, own) for file in beside if (own := _one_sensor(file, name)) is not None]
+            if len(parts) == 1:
+                file, own = parts[0]
+                own = replace(own, file=file.name)
+                return replace(found, gyro=own) if name == "gyro" else replace(found, accel=own)
+    return found
+
+
+def _tables_in(folder: Path) -> list[Path]:
+    files = [file for file in folder.iterdir() if file.suffix.lower() in TABLE_SUFFIXES and file.is_file()]
+    return sorted(files) if len(files) <= MOST_TABLES else []
+
+
+def _one_sensor(path: Path, wanted: str) -> SensorColumns | None:
+    """The columns of a sensor in a table that has nothing of the other."""
+    if re.search(r"lin|grav|uncal|user", path.name, re.IGNORECASE):
+        return None
+    try:
+        table = parse_bytes(path, _head(path))
+        columns = recognise_columns(table)
+    except FormatError:
+        return None
+    own, other = (columns.gyro, columns.accel) if wanted == "gyro" else (columns.accel, columns.gyro)
+    if other.columns is not None or not own.is_complete or own.columns is None:
+        return None
+    x, y, z = (_header_name(table, column) for column in own.columns)
+    return replace(own, names=(x, y, z))
+
+
+def _header_name(table: Table, column: int) -> str | int:
+    name = "" if table.header is None else table.header[column]
+    return name if name and (table.header or ()).count(name) == 1 else column + 1
+
+
+def _head(path: Path) -> bytes:
+    """The first rows."""
+    head = read_bytes(path, 1 << 16)
+    return head if len(head) < 1 << 16 else head[: head.rfind(b"\n") + 1]
+
+
+def has_separate_tables(path: Path) -> bool:
+    """Whether a folder has one table of a gyroscope and one of an accelerometer, whose headers say all."""
+    return _separate_tables(path) is not None
+
+
+def read_separate_tables(path: Path, units: DeclaredUnits) -> ImuRecording:
+    """Read a folder in which each sensor has a table of its own.
+
+    Raises
+    ------
+    FormatError
+        Where there are not just two.
+    """
+    found = _separate_tables(path)
+    if found is None:
+        raise FormatError(path, "holds no single table of a gyroscope and one of an accelerometer that say their units")
+    tables = [
+        make_sensor_table(file, part if unit is None else replace(part, unit=unit))
+        for (file, part), unit in zip(found, (units.gyro, units.accel), strict=True)
+    ]
+    return read_tables(tables[0], tables[1])
+
+
+def _separate_tables(folder: Path) -> list[tuple[Path, SensorColumns]] | None:
+    if not folder.is_dir():
+        return None
+    found = []
+    for name in ("gyro", "accel"):
+        parts = [(file, part) for file in _tables_in(folder) if (part := _one_sensor(file, name)) is not None]
+        if len(parts) != 1:
+            return None
+        found += parts
+    return found
+
+
+def make_sensor_table(path: Path, part: SensorColumns) -> SensorTable:
     """The description of a sensor whose columns are known."""
     assert part.columns is not None and part.time is not None and part.unit is not None
     time = part.time

@@ -12,9 +12,10 @@ import numpy as np
 
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.io import vocabulary as words
-from colmap_inertial.io.columns import Columns, SensorColumns, find_sensor, read_name
+from colmap_inertial.io.columns import find_sensor, read_name
 from colmap_inertial.io.dialect import decode, split_cells
 from colmap_inertial.io.files import read_bytes
+from colmap_inertial.io.sensor_columns import Columns, SensorColumns
 from colmap_inertial.io.tables import Table, parse_table, read_table
 from colmap_inertial.io.units import Quantity
 
@@ -104,7 +105,7 @@ def find_rows_of_sensors(path: Path) -> Columns | None:
         gyro = _best(named, words.GYRO_ROWS)
         accel = _best(named, words.ACCEL_ROWS)
         if gyro is not None and accel is not None:
-            parts = [_sensor(path, column, name, kind) for name, kind in ((gyro, "gyro"), (accel, "accel"))]
+            parts = [_sensor(path, column, gyro, "gyro"), _sensor(path, column, accel, "accel")]
             sure = all(part.is_complete for part in parts)
             why = (f"column {column} names the sensor of each row: {gyro}, {accel}",)
             return Columns(gyro=parts[0], accel=parts[1], is_sure=sure, why=why)

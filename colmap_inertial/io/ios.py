@@ -102,10 +102,10 @@ def _camera_matrix(folder: Path) -> CameraModel | None:
 def is_scan_capture(path: Path) -> bool:
     """Whether ``path`` is a folder of LaMAR's ScanCapture: comments over its two tables name their columns."""
     names = {"gyroscope.txt": ("timestamp", "rx", "ry", "rz"), "accelerometer.txt": ("timestamp", "ax", "ay", "az")}
-    return path.is_dir() and all(_commented_header(path / file) == cells for file, cells in names.items())
+    return path.is_dir() and all(_read_comment(path / file) == cells for file, cells in names.items())
 
 
-def _commented_header(path: Path) -> tuple[str, ...]:
+def _read_comment(path: Path) -> tuple[str, ...]:
     """The last comment before the first row, cell by cell."""
     if not path.is_file():
         return ()

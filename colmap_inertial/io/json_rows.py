@@ -58,7 +58,9 @@ def objects_of_json(text: str) -> Iterator[dict[str, Any]]:
 
 def _flat_rows(text: str) -> Iterator[dict[str, Any]]:
     for value in objects_of_json(text):
-        key = next((k for k in _LISTS if isinstance(value.get(k), list) and value[k] and isinstance(value[k][0], dict)), None)
+        key = next(
+            (k for k in _LISTS if isinstance(value.get(k), list) and value[k] and isinstance(value[k][0], dict)), None
+        )
         for row in value[key] if key else (value,):
             if isinstance(row, dict):
                 yield _flat(row)

@@ -137,13 +137,13 @@ def _check_stamps(path: Path, name: str, topic: _Topic) -> None:
         raise TimingError(Fact("bag-stamps-empty", path=str(path), topic=name, count=empty, total=count, **arrival))
     repeated = count - len(np.unique(stamps))
     if repeated > LIMITS.harmless_share * count:
-        raise TimingError(Fact("bag-stamps-repeated", path=str(path), topic=name, count=repeated, total=count, **arrival))
+        raise TimingError(
+            Fact("bag-stamps-repeated", path=str(path), topic=name, count=repeated, total=count, **arrival)
+        )
     late = np.maximum.accumulate(stamps) - stamps
     back = int((late > LIMITS.latest_arrival_ns).sum())
     if back:
-        raise TimingError(
-            Fact("bag-stamps-jump-back", path=str(path), topic=name, count=back, total=count, **arrival)
-        )
+        raise TimingError(Fact("bag-stamps-jump-back", path=str(path), topic=name, count=back, total=count, **arrival))
 
 
 def _jitter_ms(arrival_ns: Int64Array) -> float:
@@ -179,7 +179,7 @@ def _topics(reader: AnyReader) -> dict[str, _Topic]:
             stamp_ns=np.array(stamps[topic], dtype=np.int64),
             arrival_ns=np.array(arrivals[topic], dtype=np.int64),
             parts={n: part for n, part in parts.items() if n not in absent[topic] and np.any(part != 0)},
-            publishers=_in_turn(np.array(nodes[topic]), names),
+            publishers=_find_publishers(np.array(nodes[topic]), names),
         )
     return topics
 
@@ -189,7 +189,7 @@ def _node(connection: Any) -> str:
     return str(getattr(connection.ext, "callerid", None) or f"connection {connection.id}")
 
 
-def _in_turn(sources: IndexArray, names: list[str]) -> tuple[str, ...]:
+def _find_publishers(sources: IndexArray, names: list[str]) -> tuple[str, ...]:
     """The nodes of a topic whose messages come in turn, not one recording after another."""
     several = np.unique(sources)
     turns = int((np.diff(sources) != 0).sum())

@@ -115,7 +115,9 @@ def _read(path: Path) -> Sheet:
 def is_asl(path: Path) -> bool:
     """Whether a sheet is the ASL format's: of one sensor, whose keys stand at the top."""
     known = {"T_BS", "sensor_type", "camera_model", "rate_hz"}
-    return not path.is_file() or bool(known & {line.partition(":")[0].strip() for line in read_text(path).splitlines() if line[:1].strip()})
+    return not path.is_file() or bool(
+        known & {line.partition(":")[0].strip() for line in read_text(path).splitlines() if line[:1].strip()}
+    )
 
 
 def read_imu_noise(path: Path) -> ImuNoise | None:

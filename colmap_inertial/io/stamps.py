@@ -7,15 +7,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date
 from functools import lru_cache
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from colmap_inertial.core.arrays import Int64Array
 from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.core.facts import Fact
-from colmap_inertial.io.tables import Table
 from colmap_inertial.io.units import TIME_UNITS_NS
+
+if TYPE_CHECKING:
+    from colmap_inertial.io.tables import Table
 
 DateOrder = Literal["ymd", "dmy", "mdy"]
 DATE_ORDERS: tuple[DateOrder, ...] = ("ymd", "dmy", "mdy")

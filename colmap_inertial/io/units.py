@@ -65,7 +65,7 @@ def unit_of(text: str) -> str | None:
     return _ALIASES.get(re.sub(r"[\s_^*·]", "", text).lower())
 
 
-def scaled_unit_of(text: str) -> tuple[str, float] | None:
+def unit_and_scale(text: str) -> tuple[str, float] | None:
     """:func:`unit_of`, and how many of what ``text`` spells make one: ``"mg"`` gives ``("g", 1000)``."""
     unit = unit_of(text)
     return (unit, 1.0) if unit is not None else _SCALED.get(re.sub(r"[\s_^*·]", "", text).lower())

@@ -31,7 +31,19 @@ OTHER = {
     *("relative", "interval", "heading", "speed", "rms", "mean", "calibration", "motor", "rc", "axis p"),
 }
 #: Words of columns that are taken only where there is nothing better, and of no consequence.
-LESSER = {"uncal", "uncalibrated", "raw", "filt", "filtered", "unfilt", "unfiltered", "lowpass", "smoothed", "stab", "wr"}
+LESSER = {
+    "uncal",
+    "uncalibrated",
+    "raw",
+    "filt",
+    "filtered",
+    "unfilt",
+    "unfiltered",
+    "lowpass",
+    "smoothed",
+    "stab",
+    "wr",
+}
 
 TIME = {
     *("t", "time", "timestamp", "timestamps", "stamp", "ts", "elapsed", "clock", "epoch", "tick", "ticks", "utc"),
@@ -175,9 +187,7 @@ LAYOUTS = (
     _ros("sensor_msgs/Imu", "", "/"),
     Layout(
         name="Gyroflow",
-        gyro=Part(
-            columns="org_gyro_{}", unit="deg/s", times=(Times(columns=("timestamp_ms",), units=("ms",)),)
-        ),
+        gyro=Part(columns="org_gyro_{}", unit="deg/s", times=(Times(columns=("timestamp_ms",), units=("ms",)),)),
         accel=Part(columns="org_acc_{}", unit="m/s2", times=(Times(columns=("timestamp_ms",), units=("ms",)),)),
     ),
     Layout(
@@ -255,17 +265,13 @@ LAYOUTS = (
             times=(Times(columns=("time",), units=("ms",)),),
             about="65.536 where the range is 500 deg/s (RunCam 5 Orange, iFlight, Mobius), 32.768 for 1000 (Thumb)",
         ),
-        accel=Part(
-            columns="a{}", unit="g", counts_per_unit=16384.0, times=(Times(columns=("time",), units=("ms",)),)
-        ),
+        accel=Part(columns="a{}", unit="g", counts_per_unit=16384.0, times=(Times(columns=("time",), units=("ms",)),)),
         is_defined=False,
     ),
     Layout(
         name="OpenLog Artemis",
         needs=("imu_degc",),
-        gyro=Part(
-            columns="g{}", unit="deg/s", times=(Times(columns=("rtcdate", "rtctime"), units=("date",)),)
-        ),
+        gyro=Part(columns="g{}", unit="deg/s", times=(Times(columns=("rtcdate", "rtctime"), units=("date",)),)),
         accel=Part(
             columns="a{}",
             unit="g",

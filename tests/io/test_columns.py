@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from colmap_inertial.core.errors import FormatError, TimingError
-from colmap_inertial.io.columns import recognise_columns, stated_rate
+from colmap_inertial.io.columns import find_rate, recognise_columns
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.io.tables import read_table
 
@@ -17,7 +17,10 @@ G = 9.80665
 
 
 def write(path, header, columns, delimiter=",", before="", form="{:.7g}"):
-    rows = [delimiter.join(form.format(v) if isinstance(v, float) else str(v) for v in row) for row in zip(*columns, strict=True)]
+    rows = [
+        delimiter.join(form.format(v) if isinstance(v, float) else str(v) for v in row)
+        for row in zip(*columns, strict=True)
+    ]
     path.write_text(before + (header + "\n" if header else "") + "\n".join(rows) + "\n")
     return path
 
@@ -171,7 +174,11 @@ def test_what_the_file_does_not_say_is_a_blank_with_candidates(tmp_path):
     assert 'unit = "?"  # rad/s or deg/s' in toml.read_text() and 'unit = "?"  # m/s2 or g' in toml.read_text()
     with pytest.raises(FormatError, match=r"unit: must be one of 'rad/s', 'deg/s'; found '\?'"):
         read_imu(toml)
-    filled = toml.read_text().replace('unit = "?"  # r', 'unit = "rad/s"  # r').replace('unit = "?"  # m', 'unit = "m/s2"  # m')
+    filled = (
+        toml.read_text()
+        .replace('unit = "?"  # r', 'unit = "rad/s"  # r')
+        .replace('unit = "?"  # m', 'unit = "m/s2"  # m')
+    )
     toml.write_text(filled)
     check(read_imu(toml))
 
@@ -211,15 +218,20 @@ def test_a_clock_that_was_set_back_is_no_counter(tmp_path):
 
 def test_a_stated_rate_stands_for_stamps(tmp_path):
     before = "# PLab data\n# Config: data_rate = 100.0 Hz, filter = 488 Hz\n"
-    assert stated_rate(["Config: data_rate = 100.0 Hz, filter = 488 Hz", "made at 3 km"]) == 100.0
+    assert find_rate(["Config: data_rate = 100.0 Hz, filter = 488 Hz", "made at 3 km"]) == 100.0
     header = "count,a_x [g],a_y [g],a_z [g],g_x [dps],g_y [dps],g_z [dps]"
     columns = [list(range(COUNT)), *floats(ACCEL / G), *floats(np.degrees(GYRO))]
     check(read_imu(write(tmp_path / "quake.csv", header, columns, before="Logger\n" + before[2:])))
 
 
 def test_rows_of_several_sensors(tmp_path):
-    lines = ["# Header", "# UncalAccel,utcTimeMillis,elapsedRealtimeNanos,UncalAccelXMps2,UncalAccelYMps2,UncalAccelZMps2"]
-    lines += ["# UncalGyro,utcTimeMillis,elapsedRealtimeNanos,UncalGyroXRadPerSec,UncalGyroYRadPerSec,UncalGyroZRadPerSec,D"]
+    lines = [
+        "# Header",
+        "# UncalAccel,utcTimeMillis,elapsedRealtimeNanos,UncalAccelXMps2,UncalAccelYMps2,UncalAccelZMps2",
+    ]
+    lines += [
+        "# UncalGyro,utcTimeMillis,elapsedRealtimeNanos,UncalGyroXRadPerSec,UncalGyroYRadPerSec,UncalGyroZRadPerSec,D"
+    ]
     lines += ["# Fix,Provider,LatitudeDegrees"]
     for i in range(COUNT):
         t_ns = int(round(T_S[i] * 1e9)) + 10**12
@@ -239,7 +251,11 @@ def test_rows_of_several_sensors(tmp_path):
         read_imu(path)
     toml = paste(caught, path)
     assert 'where = [2, "gyro"]' in toml.read_text()
-    text = toml.read_text().replace('unit = "?"  # r', 'unit = "rad/s"  # r').replace('unit = "?"  # m', 'unit = "m/s2"  # m')
+    text = (
+        toml.read_text()
+        .replace('unit = "?"  # r', 'unit = "rad/s"  # r')
+        .replace('unit = "?"  # m', 'unit = "m/s2"  # m')
+    )
     toml.write_text(text)
     check(read_imu(toml))
 
@@ -277,3 +293,31 @@ def test_names_that_mean_something_else_are_not_taken(tmp_path):
     found = recognise_columns(read_table(path))
     assert found.gyro.columns is None and found.accel.columns is None
     assert found.kinds[7] == "linear" and found.kinds[0] == "time" and found.kinds[10] == "other"
+
+
+def test_a_table_for_each_sensor(tmp_path):
+    ns = ints(T_S * 1e9 + 6e17)
+    phone = [f"2026-06-10T22:00:{i // 100:02d}.{i % 100:03d}" for i in range(COUNT)]
+    write(
+        tmp_path / "Polar_ACC.txt",
+        "Phone timestamp;sensor timestamp [ns];X [mg];Y [mg];Z [mg]",
+        [phone, ns, *floats(1e3 * ACCEL / G)],
+        ";",
+    )
+    path = write(
+        tmp_path / "Polar_GYRO.txt",
+        "Phone timestamp;sensor timestamp [ns];X [dps];Y [dps];Z [dps]",
+        [phone, ns, *floats(np.degrees(GYRO))],
+        ";",
+    )
+    check(read_imu(tmp_path))
+    with pytest.raises(FormatError) as caught:
+        read_imu(path)
+    assert 'file = "Polar_ACC.txt"' in str(caught.value)
+    check(read_imu(paste(caught, path)))
+
+
+def test_columns_without_a_name_are_proposed_and_stay_open(tmp_path):
+    path = write(tmp_path / "a.csv", "time,x,y,z,ax,ay,az", [ints(1e3 * T_S), *floats(GYRO), *floats(ACCEL)])
+    with pytest.raises(FormatError, match=r'columns = \["x", "y", "z"\]\nunit = "\?"'):
+        read_imu(path)

@@ -99,7 +99,9 @@ def test_camera_info_is_the_camera_alone(tmp_path):
         read_calibration(path)
 
 
-@pytest.mark.parametrize("text", ["a: 1\n", "- 1\n", "cam0: {intrinsics: [1]}\n", "cam0:\n  T_cam_imu: [1, 2]\n", "%YAML:1.0\n"])
+@pytest.mark.parametrize(
+    "text", ["a: 1\n", "- 1\n", "cam0: {intrinsics: [1]}\n", "cam0:\n  T_cam_imu: [1, 2]\n", "%YAML:1.0\n"]
+)
 def test_other_sheets_are_refused(tmp_path, text):
     path = tmp_path / "a.yaml"
     path.write_text(text)

@@ -23,7 +23,7 @@ def table_unclear(reason: str, hint: str) -> str:
     return reason
 
 
-def _by_arrival(jitter_ms: float, hint: str, **_: object) -> str:
+def _arrival_advice(jitter_ms: float, hint: str, **_: object) -> str:
     return (
         f"have the driver stamp its messages, or take the times of their arrival (uneven by {jitter_ms:.2g} ms; delays "
         f"stay) by a capture.toml:\n{hint}"
@@ -33,14 +33,14 @@ def _by_arrival(jitter_ms: float, hint: str, **_: object) -> str:
 _BAG = {"path": "imu.bag", "topic": "/imu", "count": 2000, "total": 2000, "jitter_ms": 0.6, "hint": "[imu]\n..."}
 
 
-@message(advice=_by_arrival, example=_BAG)
+@message(advice=_arrival_advice, example=_BAG)
 def bag_stamps_empty(path: str, topic: str, count: int, total: int, jitter_ms: float, hint: str) -> str:
     if not count:
         return f"{path}: header.stamp is the same in all {total} messages of {topic}"
     return f"{path}: the driver left header.stamp empty in {count} of {total} messages of {topic}"
 
 
-@message(advice=_by_arrival, example={**_BAG, "count": 240})
+@message(advice=_arrival_advice, example={**_BAG, "count": 240})
 def bag_stamps_repeated(path: str, topic: str, count: int, total: int, jitter_ms: float, hint: str) -> str:
     return (
         f"{path}: {count} of {total} messages of {topic} repeat the header.stamp of another one: its clock is too coarse, "
@@ -48,7 +48,7 @@ def bag_stamps_repeated(path: str, topic: str, count: int, total: int, jitter_ms
     )
 
 
-@message(advice=_by_arrival, example={**_BAG, "count": 7})
+@message(advice=_arrival_advice, example={**_BAG, "count": 7})
 def bag_stamps_jump_back(path: str, topic: str, count: int, total: int, jitter_ms: float, hint: str) -> str:
     return (
         f"{path}: the header.stamp of {count} of {total} messages of {topic} lies more than half a second behind one "
@@ -61,7 +61,9 @@ def bag_stamps_jump_back(path: str, topic: str, count: int, total: int, jitter_m
     example={"path": "imu.bag", "topic": "/imu", "nodes": ("/driver", "/filter")},
 )
 def bag_of_two_drivers(path: str, topic: str, nodes: Sequence[str]) -> str:
-    return f"{path}: {len(nodes)} drivers publish on {topic} in turn ({', '.join(nodes)}); as one IMU they make no sense"
+    return (
+        f"{path}: {len(nodes)} drivers publish on {topic} in turn ({', '.join(nodes)}); as one IMU they make no sense"
+    )
 
 
 @message(example={"topic": "/imu", "topics": ("/imu0", "/imu1")})
