@@ -148,7 +148,7 @@ def test_pages_keep_within_their_length():
 
     developers = [page for page in PAGES if page.is_relative_to(DOCS / "dev")]
     users = [page for page in PAGES if page.is_relative_to(DOCS) and page not in developers]
-    assert words([ROOT / "README.md"]) <= 1100 and words(users) <= 18_000 and words(developers) <= 12_000
+    assert words([ROOT / "README.md"]) <= 1100 and words(users) <= 18_200 and words(developers) <= 12_000
 
 
 def test_every_command_parses(tmp_path):

@@ -220,9 +220,8 @@ def show_table(report: TableReport, written: Path | None) -> None:
     if written is not None:
         say(f"{written} describes it{'; fill in what is ?' if report.is_open else ''}")
         return
-    say(
-        f"as a capture.toml (--capture FILE writes it{', ? is to be filled in' if report.is_open else ''}):\n{report.toml}"
-    )
+    fill = ", ? is to be filled in" if report.is_open else ""
+    say(f"as a capture.toml (--capture FILE writes it{fill}):\n{report.toml}")
 
 
 #: What columns are called to people.

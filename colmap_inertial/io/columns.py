@@ -4,6 +4,7 @@ units. What neither header nor definition of an export says stays open; numbers 
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -110,7 +111,7 @@ def _unit_at_the_end(tokens: list[str]) -> tuple[list[str], tuple[str, float] | 
 
 def _kind(rest: Sequence[str], axis: int | None, unit: str | None) -> str:
     have = set(rest)
-    pairs = set(zip(rest, rest[1:], strict=False))
+    pairs = set(itertools.pairwise(rest))
     joined = "".join(rest)
     is_gyro = bool(have & words.GYRO or pairs & words.GYRO_PAIRS or joined in words.GYRO)
     is_accel = bool(have & words.ACCEL or pairs & words.ACCEL_PAIRS or joined in words.ACCEL)
@@ -308,6 +309,8 @@ def _match_part(table: Table, names: Sequence[str], layout: Layout, part: Part) 
     if None in places:
         return None
     time = _layout_time(table, names, part)
+    if time is None and not part.times and (rate := find_rate(table.preamble)) is not None:
+        time = TimeColumns(rate_hz=rate)
     counts = part.counts_per_unit
     if counts is None:
         counts = _find_counts(table.preamble, layout.preamble_counts)

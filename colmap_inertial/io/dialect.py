@@ -1,8 +1,8 @@
 """How a table of text is written: encoding, delimiter, decimal sign, lines before the header, rows of the header.
 
 Nobody states these. They are found in the first lines, and the table is written anew as
-:func:`~colmap_inertial.io.tables.parse_table` knows it, each row on its own line. What is a plain table already stays as
-it is.
+:func:`~colmap_inertial.io.tables.parse_table` knows it, each row on its own line. What is a plain table already stays
+as it is.
 """
 
 from __future__ import annotations

@@ -239,7 +239,7 @@ def _read_dji(path: Path, units: DeclaredUnits) -> NoReturn:
         path,
         "is a DJI video: it holds orientations but no accelerometer, so it can give no scale and no gravity. What "
         "still works: COLMAP's own reconstruction, in its arbitrary units; deblurring and the rolling shutter, with a "
-        "gyroscope log (.gcsv) that Gyroflow exports from it. For metres, record an IMU beside it, or film a target of "
+        "gyroscope log of another device in the same housing. For metres, record an IMU beside it, or film a target of "
         "known size",
     )
 

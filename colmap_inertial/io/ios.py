@@ -115,7 +115,7 @@ def _read_comment(path: Path) -> tuple[str, ...]:
 
 
 def read_scan_capture(path: Path, units: DeclaredUnits) -> ImuRecording:
-    """Read ``gyroscope.txt`` and ``accelerometer.txt`` of ScanCapture: microseconds since boot, rad/s, CoreMotion's g."""
+    """Read the two tables of ScanCapture: microseconds since boot, rad/s, CoreMotion's g."""
     samples = []
     for name, quantity, unit, sign in (
         ("gyroscope.txt", "gyro", units.gyro or "rad/s", 1.0),
@@ -132,8 +132,8 @@ def read_scan_capture(path: Path, units: DeclaredUnits) -> ImuRecording:
 
 
 _RECORD_GRAVITY = (
-    "export TotalAcceleration.csv, Gravity.csv or AccelerometerUncalibrated.csv as well (in the app: Total Acceleration, "
-    "Gravity, or Accelerometer Uncalibrated)"
+    "export TotalAcceleration.csv, Gravity.csv or AccelerometerUncalibrated.csv as well (in the app: Total "
+    "Acceleration, Gravity, or Accelerometer Uncalibrated)"
 )
 _GYROSCOPES = ("Gyroscope.csv", "GyroscopeUncalibrated.csv")
 

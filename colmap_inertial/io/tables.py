@@ -170,7 +170,7 @@ def parse_text(path: Path, text: str) -> Table:
         return replace(parse_table(path, rows, ","), found=("JSON",))
     plain = plain_text(text)
     table = parse_table(path, plain.text, plain.delimiter)
-    return replace(table, preamble=plain.preamble, found=plain.found)
+    return replace(table, preamble=plain.preamble or table.preamble, found=plain.found)
 
 
 def parse_table(path: Path, text: str, delimiter: str = "") -> Table:
@@ -214,6 +214,7 @@ def parse_table(path: Path, text: str, delimiter: str = "") -> Table:
         delimiter=between,
         width=width,
         repairs=tuple(repairs),
+        preamble=tuple(comments),
     )
 
 

@@ -280,6 +280,13 @@ LAYOUTS = (
         ),
         is_defined=False,
     ),
+    Layout(
+        name="PicoQuake",
+        preamble="PicoQuake",
+        needs=("count",),
+        gyro=Part(columns="g_{}", unit="deg/s", times=()),
+        accel=Part(columns="a_{}", unit="g", times=()),
+    ),
     _blackbox(r"(?i)betaflight|inav|emuflight|rotorflight", "deg/s"),
     _blackbox("", None),
 )

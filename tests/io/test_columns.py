@@ -234,7 +234,7 @@ def test_rows_of_several_sensors(tmp_path):
     ]
     lines += ["# Fix,Provider,LatitudeDegrees"]
     for i in range(COUNT):
-        t_ns = int(round(T_S[i] * 1e9)) + 10**12
+        t_ns = round(T_S[i] * 1e9) + 10**12
         lines.append(f"UncalAccel,{1_600_000_000_000 + 10 * i},{t_ns}," + ",".join(f"{v:.6f}" for v in ACCEL[i]))
         lines.append(f"UncalGyro,{1_600_000_000_000 + 10 * i},{t_ns}," + ",".join(f"{v:.6f}" for v in GYRO[i]) + ",0")
         if i % 50 == 0:

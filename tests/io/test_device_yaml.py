@@ -39,7 +39,8 @@ SHEETS = {
     f"  timeshift_cam_imu: {SHIFT_S}\n",
     "vins-mono": f"%YAML:1.0\n\n{VINS_LENS}estimate_extrinsic: 0\nextrinsicRotation: {opencv(IMU_FROM_CAM[:3, :3])}\n"
     f"extrinsicTranslation: {opencv(IMU_FROM_CAM[:3, 3:])}\ntd: {SHIFT_S}\n",
-    "vins-fusion": f"%YAML:1.0\n\n{VINS_LENS}estimate_extrinsic: 1\nbody_T_cam0: {opencv(IMU_FROM_CAM)}\ntd: {SHIFT_S}\n",
+    "vins-fusion": f"%YAML:1.0\n\n{VINS_LENS}estimate_extrinsic: 1\n"
+    f"body_T_cam0: {opencv(IMU_FROM_CAM)}\ntd: {SHIFT_S}\n",
 }
 
 

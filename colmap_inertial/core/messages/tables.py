@@ -43,8 +43,8 @@ def bag_stamps_empty(path: str, topic: str, count: int, total: int, jitter_ms: f
 @message(advice=_arrival_advice, example={**_BAG, "count": 240})
 def bag_stamps_repeated(path: str, topic: str, count: int, total: int, jitter_ms: float, hint: str) -> str:
     return (
-        f"{path}: {count} of {total} messages of {topic} repeat the header.stamp of another one: its clock is too coarse, "
-        "or two drivers publish on the topic"
+        f"{path}: {count} of {total} messages of {topic} repeat the header.stamp of another one: its clock is too "
+        "coarse, or two drivers publish on the topic"
     )
 
 
