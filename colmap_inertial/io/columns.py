@@ -145,6 +145,12 @@ def _match_words(table: Table, cells: Sequence[Cell]) -> Columns:
     if (gyro.columns is None) != (accel.columns is None) and unsaid.columns is not None and unsaid.unit is None:
         proposed = replace(unsaid, about="the file does not say what these columns are")
         gyro, accel = (proposed, accel) if gyro.columns is None else (gyro, proposed)
+    linear = find_sensor(table, cells, "accel", ("linear",))
+    if accel.columns is None and linear.columns is not None and gyro.columns is not None and table.header is not None:
+        pair = {cells[gyro.columns[0]].words[-2:], cells[linear.columns[0]].words[-2:]}
+        if pair == {("angular", "velocity"), ("linear", "acceleration")}:
+            about = "gravity is in it where this comes from sensor_msgs/Imu of ROS, and not where it is a phone's"
+            accel = replace(linear, unit=None, about=about)
     sure = gyro.is_complete and accel.is_complete
     why = ["the header names the columns and their units"] if sure else []
     return Columns(gyro=gyro, accel=accel, is_sure=sure, why=tuple(why))
@@ -205,25 +211,29 @@ def _find_time(table: Table, cells: Sequence[Cell], quantity: Quantity) -> TimeC
         scored.append(
             (score, -index, TimeColumns(columns=(_name(table, index),), units=() if unit is None else (unit,)))
         )
-    pair = _seconds_and_nanoseconds(table, cells) or _date_and_time(table, cells)
-    if pair is not None and not any(score > 1.4 for score, _, _ in scored):
+    pair = _seconds_and_parts(table) or _date_and_time(table, cells)
+    best = max(scored, key=lambda item: item[:2])[2] if scored else None
+    if pair is not None and (best is None or set(best.columns) <= set(pair.columns) or max(scored)[0] < 1.4):
         return pair
-    if scored:
-        return max(scored, key=lambda item: item[:2])[2]
+    if best is not None:
+        return best
     rate = find_rate(table.preamble)
     return None if rate is None else TimeColumns(rate_hz=rate)
 
 
-def _seconds_and_nanoseconds(table: Table, cells: Sequence[Cell]) -> TimeColumns | None:
-    found: dict[str, int] = {}
+def _seconds_and_parts(table: Table) -> TimeColumns | None:
+    """Whole seconds and what is below them, in two columns of otherwise equal names."""
+    found: dict[tuple[str, ...], dict[str, int]] = {}
     for index, name in enumerate(table.header or ()):
-        tokens = [token.lower() for token in _WORD.findall(split_unit(name)[0])]
-        for part, spelled in (("s", words.SECONDS), ("ns", words.NANOSECONDS)):
+        tokens = tuple(token.lower() for token in _WORD.findall(split_unit(name)[0]))
+        for part, spelled in words.PARTS.items():
             if tokens and tokens[-1] in spelled and not set(tokens) & words.OTHER:
-                found.setdefault(part, index)
-    if len(found) != 2:
-        return None
-    return TimeColumns(columns=(_name(table, found["s"]), _name(table, found["ns"])), units=("s", "ns"))
+                found.setdefault(tokens[:-1], {}).setdefault(part, index)
+    for parts in found.values():
+        below = next((part for part in ("ns", "us", "ms") if part in parts), None)
+        if "s" in parts and below is not None:
+            return TimeColumns(columns=(_name(table, parts["s"]), _name(table, parts[below])), units=("s", below))
+    return None
 
 
 def _date_and_time(table: Table, cells: Sequence[Cell]) -> TimeColumns | None:

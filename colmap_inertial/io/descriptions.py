@@ -58,7 +58,8 @@ def _section(name: str, quantity: Quantity, part: SensorColumns, table: Table | 
         *_time_lines(part.time, None if part.file else table),
     ]
     if part.where is not None:
-        lines.append(f"where = [{_column(part.where[0])}, {_text(part.where[1])}]")
+        which = f"  # {part.about}" if part.where[1] == _OPEN else ""
+        lines.append(f"where = [{_column(part.where[0])}, {_text(part.where[1])}]{which}")
     if part.columns is None:
         lines.append(f'columns = ["{_OPEN}", "{_OPEN}", "{_OPEN}"]  # names, or numbers from 1, of x, y, z')
     else:
@@ -66,7 +67,7 @@ def _section(name: str, quantity: Quantity, part: SensorColumns, table: Table | 
         other = f"  # or {', '.join(part.others)}" if part.others else ""
         lines.append(f"columns = [{names}]{other}")
     units = " or ".join(SENSOR_UNITS[quantity])
-    about = f": {part.about}" if part.about else ": the file does not say"
+    about = f": {part.about}" if part.about and part.where is None else ": the file does not say"
     lines.append(f"unit = {_text(part.unit)}" if part.unit else f'unit = "{_OPEN}"  # {units}{about}')
     if part.counts_per_unit is None:
         lines.append(f'counts_per_unit = "{_OPEN}"  # {part.about or "the file does not say"}')

@@ -8,6 +8,7 @@ as it is.
 from __future__ import annotations
 
 import csv
+import functools
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -16,14 +17,26 @@ from dataclasses import dataclass
 #: What is looked at: characters, lines, and rows under the header that must agree.
 _HEAD_CHARACTERS, _HEAD_LINES, _ALIKE = 1 << 16, 600, 3
 #: Delimiter and decimal sign, those of plain tables first.
-_WAYS = ((";", "."), (",", "."), ("\t", "."), (None, "."), (";", ","), ("\t", ","), (None, ","), ("|", "."), ("|", ","))
+_WAYS = (
+    (";", "."),
+    (",", "."),
+    ("\t", "."),
+    (None, "."),
+    (";", ","),
+    ("\t", ","),
+    (None, ","),
+    ("|", "."),
+    ("|", ","),
+    (",", ","),
+)
 #: How much better another way must read than the plain one.
 _CLEARLY = 0.05
 #: Rows of a header.
 _MOST_HEADER_ROWS = 4
 #: Units, as a row under the header may spell them: letters, after blanks and signs of powers are taken out.
 _UNIT = re.compile(
-    r"(m|micro|µ|μ|u|n|milli|k)?(s|sec|seconds|g|gs|dps|t|hz|v|volts|m)|m/\(?s(ec)?2\)?|m/s²|m/s/s|ms-2|(m|k)?rad(ians)?(/s(ec)?|s-1)?|"
+    r"(m|micro|µ|μ|u|n|milli|k)?(s|sec|seconds|g|gs|dps|t|hz|v|volts|m)|m/\(?s(ec)?2\)?|m/s²|m/s/s|ms-2|"
+    r"(m|k)?rad(ians)?(/s(ec)?|s-1)?|"
     r"(m?deg(rees)?|°|º)(/s(ec)?|s-1|c)?|(u|µ|μ|m|n)?(t|tesla|gauss|pa)|h?pa|mbar|%|celsius|local_flux",
     re.IGNORECASE,
 )
@@ -314,8 +327,9 @@ def _write_plainly(text: str, layout: _Layout) -> PlainText:
     for i in range(layout.first_row, len(lines)):
         line = lines[i]
         if layout.quoted and '"' in line:
-            line = _QUOTED.sub(lambda match: match[1].replace(delimiter, " "), line)
-        if layout.decimal == ",":
+            inside = "." if layout.decimal == "," else " "
+            line = _QUOTED.sub(functools.partial(_replace_inside, delimiter, inside), line)
+        if layout.decimal == "," and delimiter != ",":
             line = line.replace(",", ".")
         if layout.trailing:
             line = line.rstrip().removesuffix(delimiter)
@@ -327,6 +341,10 @@ def _write_plainly(text: str, layout: _Layout) -> PlainText:
             if lines[i][:1].isalpha() and split_cells(lines[i], layout.delimiter) == repeated:
                 lines[i] = ""
     return PlainText(text="\n".join(lines), delimiter=delimiter, preamble=preamble, found=_describe(layout, preamble))
+
+
+def _replace_inside(delimiter: str, by: str, quoted: re.Match[str]) -> str:
+    return quoted[1].replace(delimiter, by)
 
 
 def _describe(layout: _Layout, preamble: Sequence[str]) -> tuple[str, ...]:

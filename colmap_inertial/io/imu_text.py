@@ -19,7 +19,7 @@ from colmap_inertial.core.types import ImuNoise, ImuRecording
 from colmap_inertial.io.columns import recognise_columns
 from colmap_inertial.io.descriptions import describe
 from colmap_inertial.io.files import first_line, read_bytes
-from colmap_inertial.io.interleaved import find_rows_of_sensors, read_rows
+from colmap_inertial.io.interleaved import find_numbered_rows, find_rows_of_sensors, read_rows
 from colmap_inertial.io.samples import Samples, order_samples
 from colmap_inertial.io.sensor_columns import Columns, SensorColumns
 from colmap_inertial.io.sensor_yaml import read_imu_noise
@@ -185,12 +185,10 @@ def _read_csv(path: Path, units: DeclaredUnits, noise: ImuNoise | None) -> ImuRe
             raise fault
         return _read_columns(path, rows, units, noise, "has rows of several sensors")
     if table.header is None:
-        columns = find_rows_of_sensors(path) or recognise_columns(table)
-        return _read_columns(path, columns, units, noise, "has no header that names its columns", table)
+        return _read_columns(path, _columns(path, table), units, noise, "has no header that names its columns", table)
     place, reason = _places(table, units)
     if reason:
-        columns = find_rows_of_sensors(path) or recognise_columns(table)
-        return _read_columns(path, columns, units, noise, reason, table)
+        return _read_columns(path, _columns(path, table), units, noise, reason, table)
 
     def unit(kind: str, declared: str | None) -> str:
         found = recognise(table.header[place[kind, 0]])  # type: ignore[index]
@@ -203,6 +201,14 @@ def _read_csv(path: Path, units: DeclaredUnits, noise: ImuNoise | None) -> ImuRe
     numbers = table.numbers([place[sensor, axis] for sensor in ("gyro", "accel") for axis in range(3)])
     gyro = order_rows(table, "gyro", gyro_unit, t_ns, numbers[:, :3])
     return build_recording(gyro, order_rows(table, "accel", accel_unit, t_ns, numbers[:, 3:]), noise=noise)
+
+
+def _columns(path: Path, table: Table) -> Columns:
+    """What a table's columns hold, whether or not its rows are of several sensors."""
+    columns = find_rows_of_sensors(path) or recognise_columns(table)
+    if columns.gyro.columns is None and columns.accel.columns is None:
+        return find_numbered_rows(table) or columns
+    return columns
 
 
 def _places(table: Table, units: DeclaredUnits) -> tuple[dict[tuple[str, int], int], str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -16,11 +17,14 @@ from colmap_inertial.io.columns import find_sensor, read_name
 from colmap_inertial.io.dialect import decode, split_cells
 from colmap_inertial.io.files import read_bytes
 from colmap_inertial.io.sensor_columns import Columns, SensorColumns
+from colmap_inertial.io.stamps import TimeColumns
 from colmap_inertial.io.tables import Table, parse_table, read_table
 from colmap_inertial.io.units import Quantity
 
 #: Where the column of sensors is looked for, in how many lines, and how many sensors a phone has at most.
 _COLUMNS, _LINES, _SENSORS = 4, 4000, 40
+#: Sensors that have numbers.
+_NUMBERS = 12
 
 
 def read_rows(path: Path, column: str | int, value: str) -> Table:
@@ -110,6 +114,43 @@ def find_rows_of_sensors(path: Path) -> Columns | None:
             why = (f"column {column} names the sensor of each row: {gyro}, {accel}",)
             return Columns(gyro=parts[0], accel=parts[1], is_sure=sure, why=why)
     return None
+
+
+def find_numbered_rows(table: Table) -> Columns | None:
+    """Columns of a table whose rows are of sensors that have numbers; which is which is open."""
+    for column in range(min(_COLUMNS, table.width)):
+        cells = table.text(column)[:_LINES]
+        counts = Counter(cells)
+        changes = sum(a != b for a, b in itertools.pairwise(cells))
+        few = 2 <= len(counts) <= _NUMBERS and all(re.fullmatch(r"\d{1,3}", value) for value in counts)
+        if few and 5 * changes > len(cells) and (part := _numbered(table, column, counts)) is not None:
+            return Columns(gyro=part, accel=part, why=(f"column {column + 1} numbers the sensor of each row",))
+    return None
+
+
+def _numbered(table: Table, column: int, counts: Counter[str]) -> SensorColumns | None:
+    """Three columns of values, and what they are by number of the sensor."""
+    time = None
+    if table.header is None:
+        places = [i for i in range(table.width) if i != column]
+        if len(places) < 4:
+            return None
+        time = TimeColumns(columns=(places[0] + 1,))
+        columns = (places[1], places[2], places[3])
+    else:
+        part = find_sensor(table, [read_name(name) for name in table.header], "gyro", ("axis",))
+        if part.columns is None:
+            return None
+        time, columns = part.time, part.columns
+    try:
+        lengths = np.linalg.norm(table.numbers(columns)[:_LINES], axis=1)
+    except FormatError:
+        return None
+    said = np.array(table.text(column)[:_LINES])
+    each = []
+    for value, count in counts.items():
+        each.append(f"{value} ({count} rows, mean length {lengths[said == value].mean():.3g})")
+    return SensorColumns(columns=columns, time=time, where=(column + 1, "?"), about=f"sensors: {', '.join(each)}")
 
 
 def _best(named: dict[str, str], known: set[str]) -> str | None:

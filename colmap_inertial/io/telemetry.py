@@ -2,8 +2,10 @@
 
 Of the latter only raw samples, units, scales and orientations are taken; the conversion is ours. A reading's letters
 say which of the file's axes is x, y, z, a small letter its opposite. RunCam 5, iFlight and
-Thumb write counts into a CSV that only its name tells from others; Mobius adds a temperature. Insta360 appends records to its video: six numbers a sample,
-either counts, or rad/s and g. None of these makers documents its axes: where gyroscope and accelerometer do not turn
+Thumb write counts into a CSV that only its name tells from others; Mobius adds a temperature. Insta360 appends records
+to its video: six numbers
+a sample, either counts, or rad/s and g. None of these makers documents its axes: where gyroscope and accelerometer do
+not turn
 together, the checks of every recording say so.
 """
 

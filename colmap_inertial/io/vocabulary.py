@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 # --- words ------------------------------------------------------------------------------------------------------------
 
 #: Words that name a sensor by themselves, small letters, and those that do in pairs.
-GYRO = {"gyro", "gyr", "gyros", "gyroscope", "omega", "angvel", "angularvelocity", "angularrate", "rotationrate"}
+GYRO = {"pqr", "gyro", "gyr", "gyros", "gyroscope", "omega", "angvel", "angularvelocity", "angularrate", "rotationrate"}
 ACCEL = {"acc", "acce", "accel", "accels", "accelerometer", "acceleration", "accs", "specificforce"}
 GYRO_PAIRS = {("angular", "velocity"), ("angular", "rate"), ("ang", "vel"), ("rotation", "rate"), ("rot", "rate")}
 ACCEL_PAIRS = {("specific", "force"), ("g", "force")}
@@ -54,7 +54,13 @@ NO_TIME = {"zone", "timezone", "uncertainty", "exposure", "bias", "leap", "week"
 NEAR_CLOCK = {"sensor", "sample", "hardware", "device", "chip", "boot", "reboot", "header", "stamp", "fine", "start"}
 LATE_CLOCK = {"app", "phone", "host", "system", "logging", "arrival", "received", "rx", "gps", "utc", "backend", "txt"}
 COUNTERS = {"counter", "count", "sample", "index", "frame", "row", "packet", "iteration", "seq", "number", "id", "n"}
-SECONDS, NANOSECONDS = {"sec", "secs", "seconds"}, {"nsec", "nsecs", "nanosec", "nanosecs", "nanoseconds"}
+#: Parts of a time in two columns, by unit.
+PARTS = {
+    "s": {"sec", "secs", "seconds"},
+    "ns": {"nsec", "nsecs", "nanosec", "nanosecs", "nanoseconds"},
+    "us": {"usec", "usecs", "microsec", "microsecs", "microseconds"},
+    "ms": {"msec", "msecs", "millisec", "millisecs", "milliseconds"},
+}
 
 #: Words that say nothing of what was measured.
 VALUES = ("measurement", "value", "values", "data", "reading", "v")

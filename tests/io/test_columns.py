@@ -321,3 +321,33 @@ def test_columns_without_a_name_are_proposed_and_stay_open(tmp_path):
     path = write(tmp_path / "a.csv", "time,x,y,z,ax,ay,az", [ints(1e3 * T_S), *floats(GYRO), *floats(ACCEL)])
     with pytest.raises(FormatError, match=r'columns = \["x", "y", "z"\]\nunit = "\?"'):
         read_imu(path)
+
+
+def test_seconds_are_never_read_without_their_parts(tmp_path):
+    us = ints(1e6 * T_S)
+    names = "{}," + ",".join(f"gyro_{a} [rad/s]" for a in "xyz") + "," + ",".join(f"acc_{a} [m/s2]" for a in "xyz")
+    sensors = [*floats(GYRO), *floats(ACCEL)]
+    for first, second, part in (("stamp_sec", "stamp_nanosec", 1000), ("tv_sec", "tv_usec", 1)):
+        columns = [[u // 10**6 for u in us], [u % 10**6 * part for u in us], *sensors]
+        check(read_imu(write(tmp_path / "log.csv", names.format(f"{first},{second}"), columns)))
+
+
+def test_numbers_of_sensors_are_blanks_with_what_they_measure(tmp_path):
+    lines = []
+    for i in range(COUNT):
+        for number, values in ((1, ACCEL), (4, GYRO)):
+            lines.append(f"{10 * i},{number}," + ",".join(f"{v:.6f}" for v in values[i]))
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(lines) + "\n")
+    with pytest.raises(FormatError) as caught:
+        read_imu(path)
+    assert 'where = [2, "?"]  # sensors: 1 (300 rows, mean length 9.' in str(caught.value)
+    gyro, accel = paste(caught, path).read_text().split("[imu.accel]")
+    filled = [
+        part.replace('where = [2, "?"]', f'where = [2, "{number}"]')
+        .replace('time_unit = "?"', 'time_unit = "ms"')
+        .replace('\nunit = "?"', f'\nunit = "{unit}"')
+        for part, number, unit in ((gyro, 4, "rad/s"), (accel, 1, "m/s2"))
+    ]
+    (tmp_path / "capture.toml").write_text("[imu.accel]".join(filled))
+    check(read_imu(tmp_path / "capture.toml"))
