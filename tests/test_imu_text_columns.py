@@ -7,7 +7,7 @@ import pytest
 
 from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.core.facts import Fact
-from colmap_inertial.io import imu_text
+from colmap_inertial.io import descriptions
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.io.tables import parse_table
 
@@ -33,9 +33,9 @@ def test_the_accelerometer_leaves_three_columns_for_the_gyroscope(readings):
     gyro, accel = readings
     steadier = np.column_stack([gyro[:, 2], accel[:, :2]])
     assert np.ptp(np.linalg.norm(steadier, axis=1)) < 0.1 * np.ptp(np.linalg.norm(accel, axis=1))
-    assert imu_text._accel(table(gyro, accel), 0) == (4, "m/s2")
-    assert imu_text._accel(table(gyro, accel / 9.80665), 0) == (4, "g")
-    assert imu_text._accel(table(accel, gyro), 0) == (1, "m/s2")
+    assert descriptions._accel(table(gyro, accel), 0) == 4
+    assert descriptions._accel(table(gyro, accel / 9.80665), 0) == 4
+    assert descriptions._accel(table(accel, gyro), 0) == 1
 
 
 def test_a_table_that_is_none_is_named_with_its_line(subtests):

@@ -148,11 +148,12 @@ def test_an_unclear_header_is_shown_with_what_to_write(tmp_path: Path, header: s
     assert said in message and "[imu.gyro]" in message and 'file = "unclear.csv"' in message
     assert header is None or header.strip("#") in message or said in message
     if said == "no header":
-        assert 'time = 1, time_unit = "ns", columns = [2, 3, 4], unit = "rad/s"' in message
-        assert 'columns = [5, 6, 7], unit = "m/s2"' in message
+        assert "time = 1\n" in message and 'time_unit = "?"  # s, ms, us, ns' in message and "ns would be" in message
+        assert 'columns = [2, 3, 4]\nunit = "?"  # rad/s or deg/s' in message
+        assert 'columns = [5, 6, 7]\nunit = "?"  # m/s2 or g' in message
 
 
-def test_the_hint_for_a_table_says_what_its_numbers_look_like(tmp_path: Path) -> None:
+def test_the_hint_for_a_table_names_its_columns_and_no_unit(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     accel, rate = rng.normal([0, 0, 9.8], 0.3, (50, 3)), rng.normal(0, 40, (50, 3))
     lines = [
@@ -163,10 +164,10 @@ def test_the_hint_for_a_table_says_what_its_numbers_look_like(tmp_path: Path) ->
     with pytest.raises(FormatError) as caught:
         read_imu(path)
     message = str(caught.value)
-    assert 'time = "clock", time_unit = "ms", columns = ["rx", "ry", "rz"], unit = "deg/s"' in message
-    assert 'columns = ["ux", "uy", "uz"], unit = "m/s2"' in message
+    assert 'time = "clock"\ntime_unit = "?"' in message and "ms would be 200 Hz" in message
+    assert message.count('columns = ["?", "?", "?"]') == 2 and message.count('unit = "?"') == 4
     path = write_csv(tmp_path / "words.csv", ["1,2,x", "2,3,y"], "a,b,c")
-    with pytest.raises(FormatError, match=re.escape('time = ..., time_unit = "...", columns = [...]')):
+    with pytest.raises(FormatError, match=re.escape('time = "?"')):
         read_imu(path)
 
 

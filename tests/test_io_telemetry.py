@@ -31,7 +31,6 @@ def imu():
 
 
 def test_a_log_of_counts_is_read_in_the_camera_s_axes(subtests, tmp_path_factory, imu):
-    pytest.importorskip("telemetry_parser")
     for camera in RUNCAMS:
         with subtests.test(camera=camera):
             tmp_path = tmp_path_factory.mktemp("given")
@@ -53,7 +52,6 @@ def test_an_insta360_s_records_are_read_in_the_camera_s_axes(subtests, tmp_path_
 
 
 def test_a_gyroscope_alone_is_for_imaging(tmp_path, imu):
-    pytest.importorskip("telemetry_parser")
     path = write_runcam(tmp_path, imu, "GOCam GR")
     path.write_text("\n".join(",".join(line.split(",")[:4]) for line in path.read_text().splitlines()) + "\n")
     assert not read_imu(path).has_accel
@@ -74,11 +72,11 @@ def test_an_insta360_is_known_by_the_end_of_its_file(tmp_path):
 
 
 def test_damage_is_an_error_of_ours(tmp_path, imu):
-    pytest.importorskip("telemetry_parser")
     path = write_runcam(tmp_path, imu, "Thumb")
     path.write_text(path.read_text() + "1,2,three,4,5,6,7\n")
-    with pytest.raises(FormatError, match="telemetry-parser cannot read it"):
+    with pytest.raises(FormatError, match="'three' in column 3 is not a number"):
         read_imu(path)
+    pytest.importorskip("telemetry_parser")
     cut = write_insta360(tmp_path / "cut.mp4", imu, "Insta360 OneR", counts=False)
     cut.write_bytes(cut.read_bytes()[-300:])
     with pytest.raises(FormatError, match="telemetry-parser cannot read it"):
@@ -89,19 +87,19 @@ def test_a_parser_that_aborts_ends_in_a_sentence(tmp_path, imu, monkeypatch):
     pytest.importorskip("telemetry_parser")
     monkeypatch.setattr(telemetry, "_PARSE", "import os; os.abort()")
     with pytest.raises(FormatError, match="telemetry-parser cannot read it: it ended with signal 6"):
-        read_imu(write_runcam(tmp_path, imu, "Mobius Maxi 4K"))
+        read_imu(write_insta360(tmp_path / "VID.mp4", imu, "Insta360 OneR", counts=False))
 
 
 def test_a_parser_takes_no_more_than_its_memory(tmp_path, imu, monkeypatch):
     pytest.importorskip("telemetry_parser")
-    path = write_runcam(tmp_path, imu, "Mobius Maxi 4K")
+    path = write_insta360(tmp_path / "VID.mp4", imu, "Insta360 OneR", counts=False)
     monkeypatch.setattr(telemetry, "_LIMITS", telemetry.TelemetryLimits(memory_bytes=1 << 20))
     with pytest.raises(FormatError, match="telemetry-parser cannot read it"):
         read_imu(path)
 
 
 def test_without_the_package_it_says_what_to_install(tmp_path, imu, monkeypatch):
-    path = write_runcam(tmp_path, imu, "Mobius Maxi 4K")
+    path = write_insta360(tmp_path / "VID.mp4", imu, "Insta360 OneR", counts=False)
     monkeypatch.setitem(sys.modules, "telemetry_parser", None)
     with pytest.raises(MissingExtraError, match="extra `devices`: pip install 'telemetry-parser"):
         read_imu(path)
@@ -111,3 +109,12 @@ def test_a_table_of_anybody_else_s_is_none_of_theirs(tmp_path):
     path = tmp_path / "mine.csv"
     path.write_text("time,x,y,z,ax,ay,az\n0,1,2,3,4,5,6\n")
     assert find_imu_format(path).name == "csv"
+
+
+def test_counts_of_a_log_with_another_name_are_asked_for(tmp_path, imu):
+    path = write_runcam(tmp_path, imu, "Runcam 5 Orange").rename(tmp_path / "flight.csv")
+    wanted = r'(?s)columns = \["rx", "ry", "rz"\].*counts_per_unit = "\?"  # 65.536 where'
+    with pytest.raises(FormatError, match=wanted):
+        FormatError, match=r'(?s)columns = \["rx", "ry", "rz"\].*counts_per_unit = "\?"  # 65.536 where'
+    ):
+        read_imu(path)

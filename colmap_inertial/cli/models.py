@@ -18,6 +18,7 @@ from colmap_inertial.cli.terminal import (
     show_exported,
     show_imu_calibration,
     show_scale,
+    show_table,
     show_validation,
     show_view,
 )
@@ -290,13 +291,23 @@ class Diagnose(SourceReader):
     source: Positional[Path]
     """What would be reconstructed: a capture.toml, a video or a recorder's folder. Or an IMU recording alone; or a
     COLMAP model folder, TUM trajectory or InertialScale folder."""
+    capture: Path | None = None
+    """Of a table of samples: write the capture.toml that describes it; what it does not say stays "?"."""
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.reconstruction.drivers.diagnosis import diagnose_source
+        from colmap_inertial.reconstruction.drivers.diagnosis import describe_table, diagnose_source
 
-        with self.progress() as progress:
-            diagnosis = diagnose_source(self.read_from(), json=self.json_file, progress=progress)
+        report = describe_table(self.read_from(), self.capture) if self.imu is None else None
+        if report is not None and self.talks:
+            show_table(report, self.capture)
+        try:
+            with self.progress() as progress:
+                diagnosis = diagnose_source(self.read_from(), json=self.json_file, progress=progress)
+        except InertialError as error:
+            if report is None or not self.talks or error.fact is None or error.fact.code != "table-unclear":
+                raise
+            raise InertialError(f"{self.source}: {error.fact}; the capture.toml above describes it") from None
         self.tell(lambda: show_diagnosis(diagnosis, self.source), diagnosis.as_json(), written=True)
         return 1 if diagnosis.worst == "error" else 0
 

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from colmap_inertial.checks.validate import Validation
     from colmap_inertial.core.types import CameraImuCalibration, ImuCalibration, ScaleEstimate
     from colmap_inertial.inertial.static_calibration import RestCalibration
+    from colmap_inertial.io.table_report import TableReport
     from colmap_inertial.model.project import Applied
     from colmap_inertial.pipeline.run.workspace import Workspace
     from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
@@ -205,6 +206,40 @@ def show_diagnosis(diagnosis: Diagnosis, source: Path) -> None:
     unchecked = not_checked(diagnosis.checked)
     if unchecked:
         say(f"not checked: {unchecked}")
+
+
+def show_table(report: TableReport, written: Path | None) -> None:
+    """Print what each column of a table was taken for, and the capture.toml that says so."""
+    from rich.table import Table
+    from rich.text import Text
+
+    title = f"{report.path}{': ' if report.found else ''}{', '.join(report.found)}"
+    table = Table(title=Text(title), title_justify="left")
+    for name in ("", "Column", "Taken for", "Unit", "Mean", "Scatter", "Rate"):
+        table.add_column(name, overflow="fold", justify="right" if name in ("", "Mean", "Scatter", "Rate") else "left")
+    for column in report.columns:
+        numbers = ("" if value is None else f"{value:.4g}" for value in (column.mean, column.scatter))
+        rate = "" if column.rate_hz is None else f"{column.rate_hz:.4g} Hz"
+        word, _, rest = column.kind.partition(" ")
+        kind = "" if word == "other" else f"{_KINDS.get(word, word)} {rest}".strip()
+        table.add_row(str(column.number), Text(column.name), kind, Text(column.unit), *numbers, rate)
+    open_console().print(table)
+    for reason in report.why:
+        say(f"read so because {reason}")
+    if written is not None:
+        say(f"{written} describes it{'; fill in what is ?' if report.is_open else ''}")
+        return
+    fill = ", ? is to be filled in" if report.is_open else ""
+    say(f"as a capture.toml (--capture FILE writes it{fill}):\n{report.toml}")
+
+
+#: What columns are called to people.
+_KINDS = {
+    "gyro": "gyroscope",
+    "accel": "accelerometer",
+    "linear": "acceleration without gravity",
+    "axis": "an axis of something",
+}
 
 
 def show_validation(result: Validation) -> None:

@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
+from colmap_inertial.core.geometry import quat_from_matrix
 from colmap_inertial.core.types import (
     CAL,
     CALIBRATION_PARAMETERS,
@@ -22,6 +24,7 @@ from colmap_inertial.core.types import (
     CameraImuCalibration,
     ImuCalibration,
 )
+from colmap_inertial.io.device_yaml import is_yaml, read_device_yaml
 from colmap_inertial.io.files import StrPath, read_json, reader, write_json
 
 if TYPE_CHECKING:
@@ -57,6 +60,10 @@ class CalibrationSigmas:
     known_offset_s: float = 0.002
     #: What was stated without a standard deviation.
     known_gyro_bias_rad_s: float = 0.002
+    #: What a program was told to refine.
+    guessed_rotation_rad: float = 0.05
+    #: What a program was told to refine.
+    guessed_lever_arm_m: float = 0.05
     #: A readout that was stated, as a share of it, and at least.
     known_readout_share: float = 0.02
     #: A readout that was stated, as a share of it, and at least.
@@ -202,11 +209,35 @@ def read_calibration(path: StrPath) -> CameraImuCalibration:
         Where a field is missing, unknown, of a wrong shape, or not finite.
     """
     path = Path(path)
+    if is_yaml(path):
+        return calibration_prior(read_declared(path))
     # a file that states neither is of this kind and order
     values = {"kind": CAMERA_IMU, "cov_parameters": list(CALIBRATION_PARAMETERS), **read_json(path)}
     if values.pop("kind") != CAMERA_IMU:
         raise FormatError(path, "holds no calibration of a camera and an IMU (its kind is another)")
     return _read_fields(path, values, CameraImuCalibration, CALIBRATION_PARAMETERS, _CLOCK)
+
+
+def read_declared(path: Path, readout_s: float | None = None) -> Declared:
+    """What the YAML of another program states of camera and IMU; ``readout_s`` where it is known otherwise.
+
+    Raises
+    ------
+    FormatError
+        Where it says nothing of an IMU.
+    """
+    sheet = read_device_yaml(path)
+    pose = sheet.cam_from_imu
+    if pose is None and sheet.clock_offset_s is None:
+        raise FormatError(path, Fact("calibration-without-imu"))
+    guess = {"rotation_sigma_rad": SIGMAS.guessed_rotation_rad, "imu_in_cam_sigma_m": SIGMAS.guessed_lever_arm_m}
+    return Declared(
+        cam_from_imu_xyzw=None if pose is None else quat_from_matrix(pose[:3, :3]),
+        imu_in_cam_m=None if pose is None else pose[:3, 3],
+        gyro_time_offset_s=sheet.clock_offset_s,
+        readout_s=sheet.readout_s if readout_s is None else readout_s,
+        **(guess if sheet.is_first_guess else {}),
+    )
 
 
 def _write_fields(
@@ -318,6 +349,8 @@ def calibration_kind(path: StrPath) -> str:
         For a file of another kind.
     """
     path = Path(path)
+    if is_yaml(path):
+        return CAMERA_IMU
     kind = read_json(path).get("kind", CAMERA_IMU)
     if not isinstance(kind, str) or kind not in _WRITERS:
         known = ", ".join(f'"{name}" ({command})' for name, command in _WRITERS.items())
@@ -362,9 +395,18 @@ def read_calibrations(paths: CalibrationFiles) -> Calibrations:
     )
 
 
-def read_for_recording(paths: CalibrationFiles, *, shared_clock: bool = False) -> Calibrations:
-    """:func:`read_calibrations` as priors for another recording of the device."""
+def read_for_recording(
+    paths: CalibrationFiles, *, shared_clock: bool = False, readout_s: float | None = None
+) -> Calibrations:
+    """:func:`read_calibrations` as priors for another recording of the device.
+
+    The YAML of another program states its offset of the clocks for all recordings; ``readout_s`` goes before its.
+    """
     calibrations = read_calibrations(paths)
     if calibrations.camera_imu is None:
         return calibrations
+    sheet = next((path for path in list_paths(paths) if is_yaml(path)), None)
+    if sheet is not None:
+        prior = calibration_prior(read_declared(sheet, readout_s), shared_clock=shared_clock)
+        return replace(calibrations, camera_imu=prior)
     return replace(calibrations, camera_imu=reset_for_recording(calibrations.camera_imu, shared_clock=shared_clock))

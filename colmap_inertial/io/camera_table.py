@@ -8,19 +8,30 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import colmap_px_from_opencv
 from colmap_inertial.core.types import CameraModel
 from colmap_inertial.io import sensor_yaml
+from colmap_inertial.io.device_yaml import read_device_yaml
 from colmap_inertial.io.sensor_yaml import CAMERA_MODELS
 from colmap_inertial.io.toml_section import Section
 
-CAMERA_KEYS = ("sensor_yaml", "model", "width", "height", "params", "pixel_origin")
+CAMERA_KEYS = ("sensor_yaml", "camera", "model", "width", "height", "params", "pixel_origin")
 
 
-def read_camera_table(table: Section) -> tuple[CameraModel, Array | None]:
-    """The ``[camera]`` table: the model, and (4, 4) body_from_cam where a sensor.yaml gives it."""
-    sheet = table.file("sensor_yaml")
+def read_camera_table(table: Section) -> tuple[CameraModel, Array | None, float | None]:
+    """The ``[camera]`` table: the model; (4, 4) body_from_cam and the clock's offset where a sheet gives them."""
+    sheet, name = table.file("sensor_yaml"), table.text("camera")
     if sheet is not None:
-        if any(key in table for key in CAMERA_KEYS[1:]):
+        if any(key in table for key in CAMERA_KEYS[2:]):
             table.fail("sensor_yaml", "gives the intrinsics; leave out model, width, height, params and pixel_origin")
-        return sensor_yaml.read_camera(sheet), sensor_yaml.read_body_from_sensor(sheet)
+        if sensor_yaml.is_asl(sheet):
+            return sensor_yaml.read_camera(sheet), sensor_yaml.read_body_from_sensor(sheet), None
+        mounted = read_device_yaml(sheet, name)
+        pose = mounted.cam_from_imu
+        return (
+            mounted.camera(),
+            None if pose is None else np.asarray(np.linalg.inv(pose), dtype=np.float64),
+            mounted.clock_offset_s,
+        )
+    if name is not None:
+        table.fail("camera", "belongs to sensor_yaml, which is missing")
     model = table.require("model", table.choice("model", CAMERA_MODELS))
     width, height = (table.require(key, table.integer(key)) for key in ("width", "height"))
     params = table.require("params", table.numbers("params"))
@@ -38,7 +49,7 @@ def read_camera_table(table: Section) -> tuple[CameraModel, Array | None]:
         values[centre : centre + 2] = colmap_px_from_opencv(values[centre : centre + 2])
     if (values[:centre] <= 0).any():
         table.fail("params", "focal lengths must be above 0")
-    return CameraModel(model=model, width=width, height=height, params=tuple(values.tolist())), None
+    return CameraModel(model=model, width=width, height=height, params=tuple(values.tolist())), None, None
 
 
 def check_transform(table: Section, key: str, rows: list[list[float]]) -> Array:

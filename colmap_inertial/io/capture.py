@@ -70,6 +70,8 @@ class Capture:
         ``None`` lets COLMAP calibrate.
     body_from_cam
         (4, 4) by the camera's sensor.yaml; ``None`` where there is none.
+    clock_offset_s
+        Camera time minus IMU stamp by the camera's sheet; ``None`` where it does not say.
     imu
         ``None`` where nothing inertial was recorded.
     calibration
@@ -99,6 +101,7 @@ class Capture:
     shared_clock: bool = False
     camera: CameraModel | None = None
     body_from_cam: Array | None = None
+    clock_offset_s: float | None = None
     imu: ImuPath | ImuTables | None = None
     calibration: CameraImuCalibration
     imu_calibration: ImuCalibration | None = None
@@ -228,8 +231,8 @@ def _add_recorder_notes(capture: Capture) -> Capture:
 
 
 def _read_camera(table: Section, capture: Capture) -> Capture:
-    camera, body_from_cam = read_camera_table(table)
-    return replace(capture, camera=camera, body_from_cam=body_from_cam)
+    camera, body_from_cam, offset_s = read_camera_table(table)
+    return replace(capture, camera=camera, body_from_cam=body_from_cam, clock_offset_s=offset_s)
 
 
 def _read_apertures(table: Section, capture: Capture) -> Capture:
@@ -267,6 +270,7 @@ def _read_calibration(table: Section, capture: Capture) -> Capture:
         imu=capture.imu,
         readout_s=capture.readout_s,
         shared_clock=capture.shared_clock,
+        clock_offset_s=capture.clock_offset_s,
     )
     prior = calibrations.camera_imu or calibration_prior(shared_clock=capture.shared_clock)
     return replace(capture, calibration=prior, imu_calibration=calibrations.imu)

@@ -164,7 +164,7 @@ def _read_camera(part: Section, name: str, body_from_reference: Array | None) ->
     camera, body_from_cam = None, None
     if table is not None:
         table.require_known(CAMERA_KEYS)
-        camera, body_from_cam = read_camera_table(table)
+        camera, body_from_cam, _ = read_camera_table(table)
     rows, pose = part.matrix("cam_from_reference"), None
     if rows is not None:
         if len(rows) != 4:

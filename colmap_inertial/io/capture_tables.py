@@ -21,6 +21,7 @@ from colmap_inertial.io.calibration import (
 )
 from colmap_inertial.io.camera_table import check_transform
 from colmap_inertial.io.imu_text import SensorTable
+from colmap_inertial.io.stamps import DATE_ORDERS, TimeColumns
 from colmap_inertial.io.toml_section import Section
 from colmap_inertial.io.units import SENSOR_UNITS, TIME_UNITS_NS, Axes, DeclaredUnits, Quantity
 
@@ -60,14 +61,16 @@ class ImuTables:
     noise: ImuNoise | None = None
 
 
-IMU_KEYS = ("path", "format", "gyro", "accel", "noise")
+IMU_KEYS = ("path", "format", "stamps", "topic", "gyro", "accel", "noise")
 _CORRECTION_KEYS = ("unit", "axes", "mirrored")
-_SENSOR_KEYS = ("file", "time", "time_unit", "columns", "zero", "counts_per_unit", *_CORRECTION_KEYS)
+_TIME_KEYS = ("time", "time_unit", "time_counts_per_s", "date_order", "rate_hz")
+_SENSOR_KEYS = ("file", *_TIME_KEYS, "columns", "where", "zero", "counts_per_unit", *_CORRECTION_KEYS)
 
 
 def read_imu_table(table: Section) -> ImuPath | ImuTables:
     """The ``[imu]`` table with its sub-tables."""
     path, fmt = table.file("path"), table.text("format")
+    stamps, topic = table.choice("stamps", ("header", "arrival")), table.text("topic")
     gyro, accel = table.section("gyro"), table.section("accel")
     noise = _read_noise(table.section("noise"))
     if path is not None:
@@ -78,13 +81,14 @@ def read_imu_table(table: Section) -> ImuPath | ImuTables:
         return ImuPath(
             path=path,
             format=fmt or "auto",
-            units=DeclaredUnits(gyro=gyro_unit, accel=accel_unit),
+            units=DeclaredUnits(gyro=gyro_unit, accel=accel_unit, stamps=stamps, topic=topic),
             gyro_axes=gyro_axes,
             accel_axes=accel_axes,
             noise=noise,
         )
-    if fmt is not None:
-        table.fail("format", "belongs to path, which is missing")
+    for key, value in (("format", fmt), ("stamps", stamps), ("topic", topic)):
+        if value is not None:
+            table.fail(key, "belongs to path, which is missing")
     if gyro is None:
         table.fail(None, "needs path, or [imu.gyro] (and [imu.accel], for scale and gravity) that describe tables")
     gyro_table, gyro_axes = _read_sensor_table(gyro, "gyro")
@@ -106,12 +110,16 @@ def read_calibration_table(
     imu: ImuPath | ImuTables | None,
     readout_s: float | None,
     shared_clock: bool,
+    clock_offset_s: float | None = None,
 ) -> Calibrations:
-    """The ``[calibration]`` table, completed by the sheets of camera and IMU and by ``[timing]``."""
+    """The ``[calibration]`` table, completed by the sheets of camera and IMU and by ``[timing]``.
+
+    ``clock_offset_s`` is what the camera's sheet says, in place of what the table does not.
+    """
     files = table.files("file")
     if any(key in table for key in CALIBRATION_KEYS[1:]) and not all(holds_imu_alone(file) for file in files):
         table.fail("file", "gives the calibration; leave out the other keys of this table")
-    calibrations = read_for_recording(files, shared_clock=shared_clock)
+    calibrations = read_for_recording(files, shared_clock=shared_clock, readout_s=readout_s)
     if calibrations.camera_imu is not None:
         return calibrations
     rotation, lever = _read_pose(table)
@@ -121,11 +129,12 @@ def read_calibration_table(
         rotation = quat_from_matrix(cam_from_imu[:3, :3])
         lever = cam_from_imu[:3, 3] if lever is None else lever
     sigmas = {key: value for key in _SIGMA_KEYS if (value := table.positive(key)) is not None}
+    gyro_offset_s, accel_offset_s = table.number("gyro_time_offset_s"), table.number("accel_time_offset_s")
     declared = Declared(
         cam_from_imu_xyzw=rotation,
         imu_in_cam_m=lever,
-        gyro_time_offset_s=table.number("gyro_time_offset_s"),
-        accel_time_offset_s=table.number("accel_time_offset_s"),
+        gyro_time_offset_s=gyro_offset_s if gyro_offset_s is not None or accel_offset_s is not None else clock_offset_s,
+        accel_time_offset_s=accel_offset_s,
         gyro_bias_rad_s=table.numbers("gyro_bias_rad_s", 3),
         readout_s=readout_s,
         **sigmas,
@@ -182,27 +191,64 @@ def _read_correction(table: Section | None, quantity: Quantity) -> tuple[str | N
 def _read_sensor_table(table: Section, quantity: Quantity) -> tuple[SensorTable, Axes | None]:
     table.require_known(_SENSOR_KEYS)
     file = table.require("file", table.file("file"))
-    time = table.require("time", table.raw("time"))
-    time_unit = table.require("time_unit", table.choice("time_unit", TIME_UNITS_NS))
+    stamps = _read_time(table)
     columns = table.require("columns", table.raw("columns"))
     unit = table.require("unit", table.choice("unit", SENSOR_UNITS[quantity]))
-    if not _is_column(time):
-        table.fail("time", f"must be a column's name, or its number counted from 1; found {time!r}")
     if not isinstance(columns, list) or len(columns) != 3 or not all(map(_is_column, columns)):
         table.fail("columns", f"must be three names, or numbers counted from 1, of x, y and z; found {columns!r}")
-    if len({time, *columns}) != 4:
+    if len({*stamps.columns, *columns}) != len(stamps.columns) + 3:
         table.fail("columns", "must be three columns, none of them twice, and another than time")
     x, y, z = columns
     described = SensorTable(
         file=file,
-        time=time,
-        time_unit=time_unit,
+        time=stamps.columns,
+        time_unit=stamps.units,
+        time_counts_per_s=stamps.counts_per_second,
+        rate_hz=stamps.rate_hz,
+        date_order=stamps.date_order,
         columns=(x, y, z),
         unit=unit,
+        where=_read_where(table),
         zero=table.number("zero") or 0.0,
         counts_per_unit=table.positive("counts_per_unit") or 1.0,
     )
     return described, _read_axes(table)
+
+
+def _read_time(table: Section) -> TimeColumns:
+    """Where the time stands: ``time`` with ``time_unit`` or ``time_counts_per_s``, or ``rate_hz``."""
+    rate_hz, counts = table.positive("rate_hz"), table.positive("time_counts_per_s")
+    time, unit = table.raw("time"), table.raw("time_unit")
+    if rate_hz is not None:
+        for key in _TIME_KEYS[:-1]:
+            if key in table:
+                table.fail(key, "and rate_hz say the same; leave one out")
+        return TimeColumns(rate_hz=rate_hz)
+    columns = table.require("time", time) if isinstance(time, list) else [table.require("time", time)]
+    if not columns or not all(map(_is_column, columns)) or len(set(columns)) != len(columns):
+        table.fail("time", f"must be a column's name, or its number counted from 1; found {time!r}")
+    if counts is not None:
+        if unit is not None or len(columns) > 1:
+            table.fail("time_counts_per_s", "belongs to one column of time without time_unit")
+        return TimeColumns(columns=tuple(columns), counts_per_second=counts)
+    units = table.require("time_unit", unit) if isinstance(unit, list) else [table.require("time_unit", unit)]
+    if units == ["date"]:
+        return TimeColumns(columns=tuple(columns), units=("date",), date_order=table.choice("date_order", DATE_ORDERS))
+    if any(name not in TIME_UNITS_NS for name in units) or len(units) != len(columns):
+        several = "" if len(columns) == 1 else f", a list with one of them for each of the {len(columns)} columns"
+        allowed = ", ".join(map(repr, (*TIME_UNITS_NS, "date")))
+        table.fail("time_unit", f"must be one of {allowed}{several}; found {unit!r}")
+    return TimeColumns(columns=tuple(columns), units=tuple(units))
+
+
+def _read_where(table: Section) -> tuple[str | int, str] | None:
+    """Which rows are this sensor's: a column, and what it says in them."""
+    where = table.raw("where")
+    if where is None:
+        return None
+    if not isinstance(where, list) or len(where) != 2 or not _is_column(where[0]) or isinstance(where[1], list | dict):
+        table.fail("where", f'must be a column and its value in the rows to take, as [1, "GYRO"]; found {where!r}')
+    return where[0], str(where[1])
 
 
 def _is_column(value: object) -> bool:

@@ -239,7 +239,7 @@ def _read_dji(path: Path, units: DeclaredUnits) -> NoReturn:
         path,
         "is a DJI video: it holds orientations but no accelerometer, so it can give no scale and no gravity. What "
         "still works: COLMAP's own reconstruction, in its arbitrary units; deblurring and the rolling shutter, with a "
-        "gyroscope log (.gcsv) that Gyroflow exports from it. For metres, record an IMU beside it, or film a target of "
+        "gyroscope log of another device in the same housing. For metres, record an IMU beside it, or film a target of "
         "known size",
     )
 
@@ -250,6 +250,12 @@ _OWN: tuple[ImuFormat, ...] = (
         layout="an ASL/EuRoC dataset with mav0/imu0/data.csv",
         accepts=imu_text.is_euroc,
         read=imu_text.read_euroc,
+    ),
+    ImuFormat(
+        name="scan-capture",
+        layout="a folder of LaMAR's ScanCapture",
+        accepts=ios.is_scan_capture,
+        read=ios.read_scan_capture,
     ),
     ImuFormat(
         name="inertial-scale",
@@ -342,6 +348,12 @@ _OWN: tuple[ImuFormat, ...] = (
         accepts=telemetry.is_telemetry,
         read=telemetry.read_telemetry,
         frames=telemetry.read_telemetry_frames,
+    ),
+    ImuFormat(
+        name="tables",
+        layout="a folder with one table of a gyroscope and one of an accelerometer, whose headers name the units",
+        accepts=imu_text.has_separate_tables,
+        read=imu_text.read_separate_tables,
     ),
     ImuFormat(
         name="csv",

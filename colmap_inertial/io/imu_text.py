@@ -1,10 +1,12 @@
 """Inertial recordings in text files: ASL/EuRoC folders, InertialScale folders, CSV with a header, described tables.
 
-For a table that nobody described, messages suggest lines of a capture.toml by its numbers; it is never read by them.
+A table that nobody described is read where its header, or the definition of the export that it is, leaves nothing open.
+For others, messages hold the lines of a capture.toml.
 """
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,99 +14,24 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import ImuNoise, ImuRecording
-from colmap_inertial.io.files import first_line
-from colmap_inertial.io.plausible import PLAUSIBLE
+from colmap_inertial.io.columns import recognise_columns
+from colmap_inertial.io.descriptions import describe
+from colmap_inertial.io.files import first_line, read_bytes
+from colmap_inertial.io.interleaved import find_numbered_rows, find_rows_of_sensors, read_rows
 from colmap_inertial.io.samples import Samples, order_samples
+from colmap_inertial.io.sensor_columns import Columns, SensorColumns
 from colmap_inertial.io.sensor_yaml import read_imu_noise
-from colmap_inertial.io.tables import Table, read_table, recognise
-from colmap_inertial.io.units import (
-    SENSOR_NAMES,
-    SENSOR_UNITS,
-    STANDARD_GRAVITY_M_S2,
-    TIME_UNITS_NS,
-    DeclaredUnits,
-    Quantity,
-    seconds,
-)
+from colmap_inertial.io.stamps import DateOrder, TimeColumns, read_stamps
+from colmap_inertial.io.tables import Table, parse_bytes, read_table, recognise
+from colmap_inertial.io.units import SENSOR_NAMES, SENSOR_UNITS, Axes, DeclaredUnits, Quantity, seconds
 
-#: Steps between readings of an IMU, in seconds; rows that are looked at.
-_STEP_S, _ROWS = (2.5e-4, 0.2), 2000
+#: What names of tables end with.
+TABLE_SUFFIXES = (".csv", ".txt", ".tsv", ".json", ".jsonl", ".ndjson", ".log", ".dat", ".asc")
 
-
-def how_to_describe(table: Table) -> str:
-    """The lines of a capture.toml for a table, as its numbers look; "..." stands for what they do not tell."""
-    try:
-        values = table.numbers(range(table.width))[:_ROWS]
-    except FormatError:
-        values = np.full((0, table.width), np.nan)
-    time, time_unit = _time(values)
-    accel, accel_unit = _accel(values, time)
-    gyro, gyro_unit = _gyro(values, time, accel)
-
-    def column(i: int | None) -> str:
-        if i is None:
-            return "..."
-        return str(i + 1) if table.header is None else f'"{table.header[i]}"'
-
-    def sensor(first: int | None, unit: str) -> str:
-        columns = "..." if first is None else ", ".join(column(first + k) for k in range(3))
-        return f'columns = [{columns}], unit = "{unit}"'
-
-    own = f'file = "{table.path.name}", time = {column(time)}, time_unit = "{time_unit}", '
-    return (
-        f"describe the file in a capture.toml, as its numbers look (check them): [imu.gyro] {own}"
-        f"{sensor(gyro, gyro_unit)}; [imu.accel] {own}{sensor(accel, accel_unit)} (each key on a line of its own; "
-        "columns by name, or by number from 1; time_unit s, ms, us or ns; unit rad/s or deg/s, m/s2 or g)"
-    )
-
-
-def _time(values: Array) -> tuple[int | None, str]:
-    """The first column that never falls, and the unit in which its steps are those of an IMU."""
-    if len(values) < 3:
-        return None, "..."
-    for i, column in enumerate(values.T):
-        steps = np.diff(column)
-        if not (np.isfinite(steps).all() and (steps >= 0).all() and (steps > 0).any()) or (steps == 1).all():
-            continue  # the last is a column that counts the rows
-        step = float(np.median(steps[steps > 0]))
-        units = [unit for unit, ns in TIME_UNITS_NS.items() if _STEP_S[0] <= step * ns * 1e-9 <= _STEP_S[1]]
-        if len(units) == 1:
-            return i, units[0]
-    return None, "..."
-
-
-def _triples(values: Array, without: set[int | None]) -> list[int]:
-    """First columns of three neighbours that hold numbers which change."""
-    changes = np.isfinite(values).all(axis=0) & (np.ptp(values, axis=0) > 0) if len(values) else np.zeros(0, bool)
-    usable = [bool(change) and i not in without for i, change in enumerate(changes)]
-    return [i for i in range(len(usable) - 2) if all(usable[i : i + 3])]
-
-
-def _accel(values: Array, time: int | None) -> tuple[int | None, str]:
-    """Three columns whose length stays near gravity, and which leave three for the gyroscope where they can."""
-    low, high = PLAUSIBLE.smallest_gravity_m_s2, PLAUSIBLE.largest_gravity_m_s2
-    readings: list[tuple[bool, float, int, str]] = []
-    for i in _triples(values, {time}):
-        few, median = (float(v) for v in np.percentile(np.linalg.norm(values[:, i : i + 3], axis=1), [5, 50]))
-        if few > PLAUSIBLE.steady_share * median:
-            others = bool(_triples(values, {time, i, i + 1, i + 2}))
-            units = (("m/s2", 1.0), ("g", STANDARD_GRAVITY_M_S2))
-            readings += [(others, few / median, i, unit) for unit, factor in units if low <= median * factor <= high]
-    if not readings:
-        return None, "..."
-    _, _, first, unit = max(readings)
-    return first, unit
-
-
-def _gyro(values: Array, time: int | None, accel: int | None) -> tuple[int | None, str]:
-    """The first three other columns; in deg/s where they are too large for rad/s."""
-    taken = {time} if accel is None else {time, accel, accel + 1, accel + 2}
-    triples = _triples(values, taken)
-    if accel is None or not triples:
-        return None, "..."
-    median = float(np.median(np.linalg.norm(values[:, triples[0] : triples[0] + 3], axis=1)))
-    return triples[0], "rad/s" if median <= PLAUSIBLE.largest_median_rate_rad_s else "deg/s"
+#: Tables of a folder that are looked into.
+MOST_TABLES = 40
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,20 +43,42 @@ class SensorTable:
     file
         The table.
     time, columns
-        Columns of the stamps and of x, y, z: names in the header, or numbers counted from 1.
+        Columns of the stamps and of x, y, z: names in the header, or numbers counted from 1. Several columns of stamps
+        are added up.
     time_unit, unit
-        Of the stamps, and of the samples.
+        Of the stamps (of each column), and of the samples. Stamps may be ``"date"``.
     zero, counts_per_unit
         Of raw counts: what the table says for nothing, and how many make one ``unit``.
+    time_counts_per_s, rate_hz
+        Of a counter, in place of ``time_unit``; of samples, in place of stamps.
+    date_order
+        Of dates that do not begin with the year.
+    where
+        Column and value of the rows that are this sensor's; ``None`` for all.
     """
 
     file: Path
-    time: str | int
-    time_unit: str
+    time: str | int | tuple[str | int, ...]
+    time_unit: str | tuple[str, ...]
     columns: tuple[str | int, str | int, str | int]
     unit: str
     zero: float = 0.0
     counts_per_unit: float = 1.0
+    time_counts_per_s: float | None = None
+    rate_hz: float | None = None
+    date_order: DateOrder | None = None
+    where: tuple[str | int, str] | None = None
+
+    @property
+    def stamps(self) -> TimeColumns:
+        """Where the time stands."""
+        if self.rate_hz is not None:
+            return TimeColumns(rate_hz=self.rate_hz)
+        columns = self.time if isinstance(self.time, tuple) else (self.time,)
+        units = self.time_unit if isinstance(self.time_unit, tuple) else (self.time_unit,)
+        if self.time_counts_per_s is not None:
+            return TimeColumns(columns=columns, counts_per_second=self.time_counts_per_s)
+        return TimeColumns(columns=columns, units=units, date_order=self.date_order)
 
 
 def read_tables(gyro: SensorTable, accel: SensorTable | None, *, layout: str | None = None) -> ImuRecording:
@@ -152,8 +101,15 @@ def read_tables(gyro: SensorTable, accel: SensorTable | None, *, layout: str | N
 
 
 def is_inertial_scale(path: Path) -> bool:
-    """Whether ``path`` is a folder with gyroscope.txt and accelerometer.txt."""
-    return (path / "gyroscope.txt").is_file() and (path / "accelerometer.txt").is_file()
+    """Whether ``path`` is a folder with gyroscope.txt and accelerometer.txt, and no names of columns in them."""
+    files = [path / f"{name}.txt" for name in ("gyroscope", "accelerometer")]
+    return all(file.is_file() for file in files) and not any(_names_columns(file) for file in files)
+
+
+def _names_columns(path: Path) -> bool:
+    """Whether the first lines name axes: whoever writes that states another layout than ours."""
+    head = read_bytes(path, 1000).decode("utf-8-sig", errors="replace").splitlines()[:5]
+    return any(re.search(r"\b([agwr]_?|acc\w*|gyr\w*)x\b", line, re.IGNORECASE) for line in head)
 
 
 def read_inertial_scale_imu(path: Path, units: DeclaredUnits) -> ImuRecording:
@@ -194,7 +150,7 @@ def read_euroc(path: Path, units: DeclaredUnits) -> ImuRecording:
 
 def is_csv(path: Path) -> bool:
     """Whether ``path`` is a text table with a header; :func:`read_csv` says what is wrong with the header."""
-    return path.is_file() and path.suffix.lower() in (".csv", ".txt", ".tsv")
+    return path.is_file() and path.suffix.lower() in TABLE_SUFFIXES
 
 
 def read_csv(path: Path, units: DeclaredUnits) -> ImuRecording:
@@ -221,57 +177,210 @@ def _is_imu_table(path: Path) -> bool:
 
 
 def _read_csv(path: Path, units: DeclaredUnits, noise: ImuNoise | None) -> ImuRecording:
-    table = read_table(path)
-    how = how_to_describe(table)
+    try:
+        table = read_table(path)
+    except FormatError as fault:
+        rows = find_rows_of_sensors(path)
+        if rows is None:
+            raise fault
+        return _read_columns(path, rows, units, noise, "has rows of several sensors")
     if table.header is None:
-        raise FormatError(path, f"has no header that names its columns; {how}", line=int(table.line_numbers[0]))
+        return _read_columns(path, _columns(path, table), units, noise, "has no header that names its columns", table)
+    place, reason = _places(table, units)
+    if reason:
+        return _read_columns(path, _columns(path, table), units, noise, reason, table)
+
+    def unit(kind: str, declared: str | None) -> str:
+        found = recognise(table.header[place[kind, 0]])  # type: ignore[index]
+        return declared or str(found.unit if found else None)
+
+    gyro_unit, accel_unit = unit("gyro", units.gyro), unit("accel", units.accel)
+    time = TimeColumns(columns=(place["time", 0] + 1,), units=(unit("time", None),))
+    t_ns, mended = read_stamps(table, time)
+    table = replace(table, repairs=(*table.repairs, *mended))
+    numbers = table.numbers([place[sensor, axis] for sensor in ("gyro", "accel") for axis in range(3)])
+    gyro = order_rows(table, "gyro", gyro_unit, t_ns, numbers[:, :3])
+    return build_recording(gyro, order_rows(table, "accel", accel_unit, t_ns, numbers[:, 3:]), noise=noise)
+
+
+def _columns(path: Path, table: Table) -> Columns:
+    """What a table's columns hold, whether or not its rows are of several sensors."""
+    columns = find_rows_of_sensors(path) or recognise_columns(table)
+    if columns.gyro.columns is None and columns.accel.columns is None:
+        return find_numbered_rows(table) or columns
+    return columns
+
+
+def _places(table: Table, units: DeclaredUnits) -> tuple[dict[tuple[str, int], int], str]:
+    """The columns that a plain header names, and what it lacks, in words."""
+    assert table.header is not None
+    place: dict[tuple[str, int], int] = {}
     try:
         columns = [recognise(cell) for cell in table.header]
     except ValueError as error:
-        raise FormatError(path, f"{error}; {how}") from None
-    shown = f"the header is: {table.header_text[:300]}; {how}"
-    place: dict[tuple[str, int], int] = {}
+        return place, str(error)
     for index, column in enumerate(columns):
         if column is None:
             continue
         key = (column.kind, column.axis)
         if key in place:
             twice = f'"{table.header[place[key]]}" and "{table.header[index]}"'
-            raise FormatError(path, f"two columns mean the same: {twice}; {shown}")
+            return place, f"two columns mean the same: {twice}"
         place[key] = index
     wanted = [("time", 0), *((sensor, axis) for sensor in ("gyro", "accel") for axis in range(3))]
     missing = [
         kind if kind == "time" else f"{kind}_{'xyz'[axis]}" for kind, axis in wanted if (kind, axis) not in place
     ]
     if missing:
-        raise FormatError(path, f"no column for {', '.join(missing)} was recognised; {shown}")
+        return place, f"no column for {', '.join(missing)} was recognised"
+    for kind, axes, declared in (("gyro", 3, units.gyro), ("accel", 3, units.accel), ("time", 1, None)):
+        stated = {columns[place[kind, axis]].unit for axis in range(axes)}  # type: ignore[union-attr]
+        if declared is None and (None in stated or len(stated) > 1):
+            names = ", ".join(f'"{table.header[place[kind, axis]]}"' for axis in range(axes))
+            return place, f"no single unit is given for {names}"
+    return place, ""
 
-    def unit(kind: str, axes: int, declared: str | None) -> str:
-        stated_units = {columns[place[kind, axis]].unit for axis in range(axes)}  # type: ignore[union-attr]
-        if declared is not None:
-            return declared
-        if len(stated_units) != 1 or None in stated_units:
-            names = ", ".join(f'"{table.header[place[kind, axis]]}"' for axis in range(axes))  # type: ignore[index]
-            raise FormatError(path, f"no single unit is given for {names}; {shown}")
-        return str(stated_units.pop())
 
-    gyro_unit, accel_unit = unit("gyro", 3, units.gyro), unit("accel", 3, units.accel)
-    t_ns = table.stamps_ns(place["time", 0], unit("time", 1, None))
-    numbers = table.numbers([place[sensor, axis] for sensor in ("gyro", "accel") for axis in range(3)])
-    gyro = order_rows(table, "gyro", gyro_unit, t_ns, numbers[:, :3])
-    return build_recording(gyro, order_rows(table, "accel", accel_unit, t_ns, numbers[:, 3:]), noise=noise)
+def _read_columns(
+    path: Path, found: Columns, units: DeclaredUnits, noise: ImuNoise | None, reason: str, table: Table | None = None
+) -> ImuRecording:
+    """Read what columns were taken for, where nothing is open.
+
+    Raises
+    ------
+    FormatError
+        Where something is; it says what, and how to describe the table.
+    """
+    gyro, accel = (
+        part if declared is None else replace(part, unit=declared, counts_per_unit=1.0)
+        for part, declared in ((found.gyro, units.gyro), (found.accel, units.accel))
+    )
+    found = replace(found, gyro=gyro, accel=accel)
+    if not (gyro.is_complete and accel.is_complete and (found.is_sure or not found.source)):
+        if table is not None and table.header is not None:
+            reason += f"; the header is: {table.header_text[:300]}"
+        found = _add_other_table(path, found)
+        fact = Fact("table-unclear", reason=reason, hint=describe(path, found, table))
+        raise FormatError(path, fact, code=FormatError.default_code)
+    recording = read_tables(make_sensor_table(path, gyro), make_sensor_table(path, accel))
+    gyro_rad_s, accel_m_s2 = (
+        Axes.parse(part.axes).apply(values) if part.axes else values
+        for part, values in ((gyro, recording.gyro_rad_s), (accel, recording.accel_m_s2))
+    )
+    device = recording.device or found.source
+    return replace(recording, noise=noise, device=device, gyro_rad_s=gyro_rad_s, accel_m_s2=accel_m_s2)
+
+
+def _add_other_table(path: Path, found: Columns) -> Columns:
+    """The columns of one sensor, with those of the other in the one table beside it that has them."""
+    for name, part, other in (("gyro", found.gyro, found.accel), ("accel", found.accel, found.gyro)):
+        if part.columns is None and other.is_complete and other.where is None:
+            beside = [file for file in _tables_in(path.parent) if file != path]
+            parts = [(file, own) for file in beside if (own := _one_sensor(file, name)) is not None]
+            if len(parts) == 1:
+                file, own = parts[0]
+                own = replace(own, file=file.name)
+                return replace(found, gyro=own) if name == "gyro" else replace(found, accel=own)
+    return found
+
+
+def _tables_in(folder: Path) -> list[Path]:
+    files = [file for file in folder.iterdir() if file.suffix.lower() in TABLE_SUFFIXES and file.is_file()]
+    return sorted(files) if len(files) <= MOST_TABLES else []
+
+
+def _one_sensor(path: Path, wanted: str) -> SensorColumns | None:
+    """The columns of a sensor in a table that has nothing of the other."""
+    if re.search(r"lin|grav|uncal|user", path.name, re.IGNORECASE):
+        return None
+    try:
+        table = parse_bytes(path, _head(path))
+        columns = recognise_columns(table)
+    except FormatError:
+        return None
+    own, other = (columns.gyro, columns.accel) if wanted == "gyro" else (columns.accel, columns.gyro)
+    if other.columns is not None or not own.is_complete or own.columns is None:
+        return None
+    x, y, z = (_header_name(table, column) for column in own.columns)
+    return replace(own, names=(x, y, z))
+
+
+def _header_name(table: Table, column: int) -> str | int:
+    name = "" if table.header is None else table.header[column]
+    return name if name and (table.header or ()).count(name) == 1 else column + 1
+
+
+def _head(path: Path) -> bytes:
+    """The first rows."""
+    head = read_bytes(path, 1 << 16)
+    return head if len(head) < 1 << 16 else head[: head.rfind(b"\n") + 1]
+
+
+def has_separate_tables(path: Path) -> bool:
+    """Whether a folder has one table of a gyroscope and one of an accelerometer, whose headers say all."""
+    return _separate_tables(path) is not None
+
+
+def read_separate_tables(path: Path, units: DeclaredUnits) -> ImuRecording:
+    """Read a folder in which each sensor has a table of its own.
+
+    Raises
+    ------
+    FormatError
+        Where there are not just two.
+    """
+    found = _separate_tables(path)
+    if found is None:
+        raise FormatError(path, "holds no single table of a gyroscope and one of an accelerometer that say their units")
+    tables = [
+        make_sensor_table(file, part if unit is None else replace(part, unit=unit))
+        for (file, part), unit in zip(found, (units.gyro, units.accel), strict=True)
+    ]
+    return read_tables(tables[0], tables[1])
+
+
+def _separate_tables(folder: Path) -> list[tuple[Path, SensorColumns]] | None:
+    if not folder.is_dir():
+        return None
+    found = []
+    for name in ("gyro", "accel"):
+        parts = [(file, part) for file in _tables_in(folder) if (part := _one_sensor(file, name)) is not None]
+        if len(parts) != 1:
+            return None
+        found += parts
+    return found
+
+
+def make_sensor_table(path: Path, part: SensorColumns) -> SensorTable:
+    """The description of a sensor whose columns are known."""
+    assert part.columns is not None and part.time is not None and part.unit is not None
+    time = part.time
+    x, y, z = (column + 1 for column in part.columns)
+    return SensorTable(
+        file=path,
+        time=time.columns,
+        time_unit=time.units,
+        columns=(x, y, z),
+        unit=part.unit,
+        counts_per_unit=part.counts_per_unit or 1.0,
+        time_counts_per_s=time.counts_per_second,
+        rate_hz=time.rate_hz,
+        date_order=time.date_order,
+        where=part.where,
+    )
 
 
 def _read_described(source: SensorTable, quantity: Quantity, layout: str | None) -> Samples:
     if source.unit not in SENSOR_UNITS[quantity]:
         raise ValueError(f"{source.unit} is not a unit of the {SENSOR_NAMES[quantity]}")
-    table = read_table(source.file)
+    table = read_table(source.file) if source.where is None else read_rows(source.file, *source.where)
     if layout is not None:
         table.require_width(layout)
     values = table.numbers([table.column(column) for column in source.columns])
     if source.zero != 0 or source.counts_per_unit != 1:
         values = (values - source.zero) / source.counts_per_unit
-    t_ns = table.stamps_ns(table.column(source.time), source.time_unit)
+    t_ns, mended = read_stamps(table, source.stamps)
+    table = replace(table, repairs=(*table.repairs, *mended))
     return order_rows(table, quantity, source.unit, t_ns, values)
 
 

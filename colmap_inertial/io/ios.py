@@ -8,6 +8,10 @@ CoreMotion gave, rad/s), ``odometry.csv`` with the time of each frame of ``rgb.m
 poses, ``camera_matrix.csv``. Its description says m/s2, its source writes CoreMotion's g; which one it is shows in the
 numbers (github.com/strayrobots/scanner).
 
+ScanCapture of the LaMAR benchmark writes ``gyroscope.txt`` and ``accelerometer.txt`` with comments ``# timestamp, rx,
+ry, rz`` and ``# timestamp, ax, ay, az``: microseconds since boot, rad/s, CoreMotion's g
+(github.com/microsoft/lamar-benchmark).
+
 Sensor Logger writes a zip, or the folder in it, with one table for each sensor: ``time`` (nanoseconds UTC), ``z``,
 ``y``, ``x`` in an order of its own. ``Accelerometer`` is without gravity, ``Gravity`` the rest; ``TotalAcceleration``
 (Android) and ``AccelerometerUncalibrated`` hold both, the latter in g on iOS. ``Metadata.csv`` names the platform and
@@ -17,7 +21,10 @@ whether "Standardise Units & Frames" was on, which makes iOS write what Android 
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +32,7 @@ from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.geometry import colmap_px_from_opencv
 from colmap_inertial.core.types import CameraModel, FrameLog, ImuRecording
-from colmap_inertial.io.files import first_line
+from colmap_inertial.io.files import first_line, read_bytes
 from colmap_inertial.io.frame_times import frame_log
 from colmap_inertial.io.imu_text import build_recording, order_rows
 from colmap_inertial.io.mp4 import is_mp4, read_movie
@@ -41,9 +48,10 @@ _G_BELOW = 3.0
 
 
 def is_stray_scanner(path: Path) -> bool:
-    """Whether ``path`` is a Stray Scanner folder, or its imu.csv."""
+    """Whether ``path`` is a Stray Scanner folder, or its imu.csv, whatever it is called: its columns tell it."""
     file = path if path.is_file() else path / "imu.csv"
-    return file.name == "imu.csv" and "alpha_x" in first_line(file)
+    names = {cell.strip().strip("#").strip() for cell in first_line(file).split(",")}
+    return {"a_x", "a_y", "a_z", "alpha_x", "alpha_y", "alpha_z"} <= names
 
 
 def read_stray_scanner(path: Path, units: DeclaredUnits) -> ImuRecording:
@@ -88,14 +96,52 @@ def _camera_matrix(folder: Path) -> CameraModel | None:
     return CameraModel(model="PINHOLE", width=track.width_px, height=track.height_px, params=params)
 
 
+# --- ScanCapture -----------------------------------------------------------------------------------------------------
+
+
+def is_scan_capture(path: Path) -> bool:
+    """Whether ``path`` is a folder of LaMAR's ScanCapture: comments over its two tables name their columns."""
+    names = {"gyroscope.txt": ("timestamp", "rx", "ry", "rz"), "accelerometer.txt": ("timestamp", "ax", "ay", "az")}
+    return path.is_dir() and all(_read_comment(path / file) == cells for file, cells in names.items())
+
+
+def _read_comment(path: Path) -> tuple[str, ...]:
+    """The last comment before the first row, cell by cell."""
+    if not path.is_file():
+        return ()
+    head = read_bytes(path, 2000).decode("utf-8-sig", errors="replace").splitlines()
+    comments = [line for i, line in enumerate(head) if all(above.lstrip().startswith("#") for above in head[: i + 1])]
+    return tuple(cell.strip() for cell in comments[-1].strip().lstrip("#").split(",")) if comments else ()
+
+
+def read_scan_capture(path: Path, units: DeclaredUnits) -> ImuRecording:
+    """Read the two tables of ScanCapture: microseconds since boot, rad/s, CoreMotion's g."""
+    samples = []
+    for name, quantity, unit, sign in (
+        ("gyroscope.txt", "gyro", units.gyro or "rad/s", 1.0),
+        ("accelerometer.txt", "accel", units.accel or "g", -1.0),
+    ):
+        table = read_table(path / name)
+        t_ns = table.stamps_ns(table.column("timestamp"), "us")
+        values = sign * table.numbers([1, 2, 3])
+        samples.append(order_rows(table, "gyro" if quantity == "gyro" else "accel", unit, t_ns, values))
+    return build_recording(samples[0], samples[1], device="ScanCapture")
+
+
 # --- Sensor Logger ---------------------------------------------------------------------------------------------------
 
 
+_RECORD_GRAVITY = (
+    "export TotalAcceleration.csv, Gravity.csv or AccelerometerUncalibrated.csv as well (in the app: Total "
+    "Acceleration, Gravity, or Accelerometer Uncalibrated)"
+)
 _GYROSCOPES = ("Gyroscope.csv", "GyroscopeUncalibrated.csv")
 
 
 def is_sensor_logger(path: Path) -> bool:
-    """Whether ``path`` is a Sensor Logger zip or folder."""
+    """Whether ``path`` is a Sensor Logger zip or folder, or its JSON."""
+    if path.is_file() and path.suffix.lower() in _JSON:
+        return bool(re.search(rb'"sensor"\s*:|"payload"\s*:\s*\[', read_bytes(path, 4000)))
     members = members_of(path)
     return any(name in members and _is_its_table(path, members[name]) for name in _GYROSCOPES)
 
@@ -115,6 +161,8 @@ def read_sensor_logger(path: Path, units: DeclaredUnits) -> ImuRecording:
     FormatError
         Where nothing says on which platform it was recorded, on which the accelerometer's sign depends.
     """
+    if path.is_file() and path.suffix.lower() in _JSON:
+        return _read_json(path, units)
     members = members_of(path)
     name = next((n for n in _GYROSCOPES if n in members), None)
     if name is None:
@@ -124,6 +172,73 @@ def read_sensor_logger(path: Path, units: DeclaredUnits) -> ImuRecording:
     return build_recording(gyro, _accelerometer(path, members, units), device="Sensor Logger")
 
 
+_JSON = (".json", ".jsonl", ".ndjson")
+#: Names of sensors in JSON, small and without blanks: the gyroscope's, and those with gravity and without.
+_JSON_GYRO = ("gyroscope", "gyroscopeuncalibrated")
+_JSON_WHOLE = ("totalacceleration", "accelerometeruncalibrated")
+
+
+def _read_json(path: Path, units: DeclaredUnits) -> ImuRecording:
+    """Read the rows of an array, or of lines, in which each row names its sensor."""
+    table = read_table(path)
+    header = table.header or ()
+    column = next((name for name in ("sensor", "name") if name in header), None)
+    if column is None or not {"time", "x", "y", "z"} <= set(header):
+        raise FormatError(path, "holds no rows of Sensor Logger with sensor, time, x, y, z")
+    names = np.array([re.sub(r"[^a-z]", "", name.lower()) for name in table.text(table.column(column))])
+
+    def rows(name: str) -> tuple[Table, Int64Array, Array]:
+        kept = names == name
+        lines = tuple(line for line, keep in zip(table.lines, kept, strict=True) if keep)
+        part = replace(table, lines=lines, line_numbers=table.line_numbers[kept])
+        return part, part.stamps_ns(part.column("time"), "ns"), part.numbers([part.column(axis) for axis in "xyz"])
+
+    gyro_name = next((name for name in _JSON_GYRO if name in names), None)
+    if gyro_name is None:
+        raise FormatError(path, "holds no gyroscope of Sensor Logger")
+    part, t_ns, values = rows(gyro_name)
+    gyro = order_rows(part, "gyro", units.gyro or "rad/s", t_ns, values)
+    whole = next((name for name in _JSON_WHOLE if name in names), None)
+    if whole is None and not {"accelerometer", "gravity"} <= set(names):
+        if "accelerometer" in names:
+            raise FormatError(path, f"its accelerometer is without gravity; {_RECORD_GRAVITY}")
+        return build_recording(gyro, None, device="Sensor Logger")
+    ios, standardised = _json_platform(path, table, names)
+    unit = "g" if whole == "accelerometeruncalibrated" and ios and not standardised else "m/s2"
+    part, t_ns, values = rows(whole or "accelerometer")
+    if whole is None:
+        values = values + _at(rows("gravity"), t_ns)
+    sign = -1.0 if ios and not standardised else 1.0
+    accel = order_rows(part, "accel", units.accel or unit, t_ns, sign * values)
+    return build_recording(gyro, accel, device="Sensor Logger")
+
+
+def _json_platform(path: Path, table: Table, names: Any) -> tuple[bool, bool]:
+    """As of :func:`_platform`, by the row of metadata."""
+    header = {name.lower(): i for i, name in enumerate(table.header or ())}
+    row = int(np.argmax(names == "metadata"))
+    if (names == "metadata").any() and "platform" in header:
+        cells = [cell.strip().lower() for cell in table.lines[row].split(table.delimiter)]
+        if cells[header["platform"]] in ("ios", "android"):
+            standardised = cells[header["standardisation"]] == "true" if "standardisation" in header else False
+            return cells[header["platform"]] == "ios", standardised
+    raise FormatError(
+        path,
+        "no row of metadata says whether this is from iOS or Android, and the accelerometer's sign differs; describe "
+        'its rows under [imu.gyro] and [imu.accel] in a capture.toml, with where = ["sensor", "Gyroscope"] '
+        '(["name", "gyroscope"] in messages), time = "time", time_unit = "ns", columns = ["x", "y", "z"], and for iOS '
+        'axes = "-x,-y,-z" with mirrored = true under [imu.accel]',
+    )
+
+
+def _at(rows: tuple[Table, Int64Array, Array], t_ns: Int64Array) -> Array:
+    """Values of a sensor at other times."""
+    _, own_ns, values = rows
+    origin = min(int(t_ns[0]), int(own_ns[0]))
+    at, known = seconds(t_ns, origin), seconds(own_ns, origin)
+    return np.stack([np.interp(at, known, column) for column in values.T], axis=1)
+
+
 def _accelerometer(path: Path, members: dict[str, str], units: DeclaredUnits) -> Samples | None:
     whole = next((n for n in ("TotalAcceleration.csv", "AccelerometerUncalibrated.csv") if n in members), None)
     parts = {"Accelerometer.csv", "Gravity.csv"} <= members.keys()
@@ -131,9 +246,7 @@ def _accelerometer(path: Path, members: dict[str, str], units: DeclaredUnits) ->
         if "Accelerometer.csv" in members:
             raise FormatError(
                 path,
-                "its Accelerometer.csv is without gravity; export TotalAcceleration.csv, Gravity.csv or "
-                "AccelerometerUncalibrated.csv as well (in the app: Total Acceleration, Gravity, or Accelerometer "
-                "Uncalibrated)",
+                f"its Accelerometer.csv is without gravity; {_RECORD_GRAVITY}",
             )
         return None
     ios, standardised = _platform(path, members)
@@ -142,10 +255,7 @@ def _accelerometer(path: Path, members: dict[str, str], units: DeclaredUnits) ->
         unit = "g" if whole == "AccelerometerUncalibrated.csv" and ios and not standardised else "m/s2"
     else:
         table, t_ns, values = _sensor(path, members, "Accelerometer.csv")
-        _, gravity_ns, gravity = _sensor(path, members, "Gravity.csv")
-        origin = min(int(t_ns[0]), int(gravity_ns[0]))
-        at, known = seconds(t_ns, origin), seconds(gravity_ns, origin)
-        values = values + np.stack([np.interp(at, known, column) for column in gravity.T], axis=1)
+        values = values + _at(_sensor(path, members, "Gravity.csv"), t_ns)
         unit = "m/s2"
     sign = -1.0 if ios and not standardised else 1.0
     return order_rows(table, "accel", units.accel or unit, t_ns, sign * values)

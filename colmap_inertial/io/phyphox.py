@@ -2,6 +2,7 @@
 
 ``Gyroscope.csv`` and ``Accelerometer.csv`` have ``Time (s)`` and columns such as ``Gyroscope x (rad/s)`` and
 ``Acceleration x (m/s^2)``, on one clock that starts with the experiment. ``Linear Acceleration`` is without gravity.
+Simple experiments of iOS have ``X (rad/s)`` and ``X (m/s^2)``, and the sensor is the name of the table.
 Delimiters and the decimal sign are as chosen when exporting (phyphox.org). The sign is Android's.
 """
 
@@ -15,12 +16,12 @@ from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.types import ImuRecording
 from colmap_inertial.io.imu_text import build_recording, order_rows
 from colmap_inertial.io.samples import Samples
-from colmap_inertial.io.tables import Table, head_of, members_of, parse_table, text_of
+from colmap_inertial.io.tables import Table, head_of, members_of, parse_text, text_of
 from colmap_inertial.io.units import DeclaredUnits
 
 #: A line of the header of a table of phyphox, and of what sensor it is.
 _TIME = re.compile(r'^"?Time \(s\)"?', re.IGNORECASE)
-_GYRO, _ACCEL = r"gyroscope {} \(rad/s\)", r"acceleration {} \(m/s(\^2|²)\)"
+_GYRO, _ACCEL = r"(?:gyroscope )?{} \(rad/s\)", r"(?:(?:linear )?acceleration )?{} \(m/s(?:\^2|²)\)"
 
 
 def is_phyphox(path: Path) -> bool:
@@ -28,7 +29,7 @@ def is_phyphox(path: Path) -> bool:
     seconds.
     """
     members = members_of(path)
-    return any(_kind(head_of(path, members[name])) == "gyro" for name in sorted(members) if _may_be(name))
+    return any(_kind(head_of(path, members[name]), name) == "gyro" for name in sorted(members) if _may_be(name))
 
 
 def read_phyphox(path: Path, units: DeclaredUnits) -> ImuRecording:
@@ -45,7 +46,7 @@ def read_phyphox(path: Path, units: DeclaredUnits) -> ImuRecording:
     for name in sorted(members):
         if not _may_be(name):
             continue
-        kind = _kind(head_of(path, members[name]))
+        kind = _kind(head_of(path, members[name]), name)
         linear = linear or kind == "linear"
         if kind == "gyro" and "gyro" not in samples_of:
             samples_of["gyro"] = _samples(path, members[name], name, "gyro", _GYRO, units.gyro or "rad/s")
@@ -65,32 +66,25 @@ def _may_be(name: str) -> bool:
     return name.lower() not in ("device.csv", "time.csv")
 
 
-def _kind(header: str) -> str | None:
+def _kind(header: str, name: str) -> str | None:
+    """Which sensor a table is, by its header and, where that is silent on gravity, its name."""
     header = header.lower()
     if not _TIME.match(header):
         return None
-    if re.search(_GYRO.format("x"), header):
+    if re.search(r"\b" + _GYRO.format("x"), header):
         return "gyro"
-    if re.search(_ACCEL.format("x"), header):
-        return "linear" if "linear acceleration" in header else "accel"
+    if re.search(r"\b" + _ACCEL.format("x"), header):
+        is_linear = "linear" in (header if "acceleration" in header else name.lower())
+        return "linear" if is_linear else "accel"
     return None
 
 
 def _samples(path: Path, member: str, name: str, quantity: str, pattern: str, unit: str) -> Samples:
-    text = text_of(path, member)
-    if _decimal_comma(text):
-        text = text.replace(",", ".")
-    table = parse_table(path / name if path.is_dir() else path, text)
+    table = parse_text(path / name if path.is_dir() else path, text_of(path, member))
     columns = [_column(table, pattern.format(axis)) for axis in "xyz"]
     values: Array = table.numbers(columns)
     t_ns = table.stamps_ns(_column(table, r"time \(s\)"), "s")
     return order_rows(table, "gyro" if quantity == "gyro" else "accel", unit, t_ns, values)
-
-
-def _decimal_comma(text: str) -> bool:
-    """Whether numbers have a comma: then columns are apart by a semicolon or a tab."""
-    header, _, rest = text.partition("\n")
-    return (";" in header or "\t" in header) and "," in rest.partition("\n")[0]
 
 
 def _column(table: Table, pattern: str) -> int:

@@ -271,10 +271,14 @@ class RawImu:
 
 def check_exchanged(imu: ImuRecording, path: Path) -> None:
     """Refuse a gyroscope that reads gravity beside an accelerometer that does not."""
-    gyro = float(np.median(np.linalg.norm(imu.gyro_rad_s, axis=1)))
-    accel = float(np.median(np.linalg.norm(imu.accel_m_s2, axis=1)))
+    lengths = (np.linalg.norm(values, axis=1) for values in (imu.gyro_rad_s, imu.accel_m_s2))
+    (gyro_few, gyro), (accel_few, accel) = (np.percentile(length, [5, 50]).tolist() for length in lengths)
     low, high = PLAUSIBLE.smallest_gravity_m_s2, PLAUSIBLE.largest_gravity_m_s2
-    if low < gyro < high and not low < accel < high and accel < PLAUSIBLE.largest_median_rate_rad_s:
+    # gravity in g or m/s2 that was read as a rate keeps its length, and rates that were read as force do not
+    as_rate = any(low < gyro * unit * g < high for unit in (1.0, 180 / pi) for g in (1.0, STANDARD_GRAVITY_M_S2))
+    steady = gyro_few > PLAUSIBLE.steady_share * gyro and accel_few <= PLAUSIBLE.steady_share * accel
+    near = low < gyro < high and accel < PLAUSIBLE.largest_median_rate_rad_s
+    if not low < accel < high and (near or (as_rate and steady)):
         raise FormatError(path, Fact("sensors-exchanged", gyro_median=gyro, accel_median=accel))
 
 

@@ -14,7 +14,8 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.geometry import colmap_px_from_opencv, matrix_from_quat
 from colmap_inertial.core.types import LengthUnit
-from colmap_inertial.io.files import read_bytes, read_json_value, read_yaml, reader
+from colmap_inertial.io.device_yaml import read_tagged_yaml
+from colmap_inertial.io.files import read_bytes, read_json_value, reader
 from colmap_inertial.io.sensor_yaml import CAMERA_MODELS, Sheet, is_rotation
 
 Metres = Literal["m", "mm"]
@@ -90,7 +91,7 @@ def read_rig_calibration(path: Path, *, unit: Metres | None = None) -> RigCalibr
             "is no calibration of several cameras: give Kalibr's or OpenCV's YAML, COLMAP's rig_config.json, or the "
             "folder of a COLMAP model with rigs.bin",
         )
-    sheet = _read_yaml(path)
+    sheet = read_tagged_yaml(path)
     if all(isinstance(entry, dict) and "intrinsics" in entry for entry in sheet.values()) and sheet:
         if unit not in (None, "m"):
             raise FormatError(path, "Kalibr writes metres; leave out unit")
@@ -171,21 +172,6 @@ def _opencv_camera(given: Sheet, metres: float) -> MountedCamera:
         size=size,
         cam_from_rig=pose,
     )
-
-
-def _read_yaml(path: Path) -> dict[str, Any]:
-    import yaml
-
-    class Loader(yaml.SafeLoader):
-        """Knows OpenCV's matrices."""
-
-    def matrix(loader: yaml.SafeLoader, node: yaml.MappingNode) -> object:
-        return loader.construct_mapping(node, deep=True).get("data")
-
-    for tag in ("opencv-matrix", "opencv-nd-matrix"):  # OpenCV 5 writes the latter for one-dimensional arrays
-        Loader.add_constructor(f"tag:yaml.org,2002:{tag}", matrix)
-    sheet = read_yaml(path, "a calibration", Loader)
-    return {str(key): value for key, value in sheet.items()}
 
 
 # --- COLMAP ---------------------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.geometry import colmap_px_from_opencv
 from colmap_inertial.core.types import CameraModel, ImuNoise
-from colmap_inertial.io.files import read_yaml
+from colmap_inertial.io.files import read_text, read_yaml
 
 _NOISE_KEYS = {
     "gyro_density_rad_s_rthz": "gyroscope_noise_density",
@@ -110,6 +110,14 @@ def is_rotation(matrix: Array) -> bool:
 
 def _read(path: Path) -> Sheet:
     return Sheet(path=path, values=read_yaml(path, "a sensor.yaml"))
+
+
+def is_asl(path: Path) -> bool:
+    """Whether a sheet is the ASL format's: of one sensor, whose keys stand at the top."""
+    known = {"T_BS", "sensor_type", "camera_model", "rate_hz"}
+    return not path.is_file() or bool(
+        known & {line.partition(":")[0].strip() for line in read_text(path).splitlines() if line[:1].strip()}
+    )
 
 
 def read_imu_noise(path: Path) -> ImuNoise | None:

@@ -9,7 +9,7 @@ import re
 import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import IO, Literal
 
@@ -18,9 +18,13 @@ import numpy as np
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.facts import Fact
-from colmap_inertial.io.files import first_line, read_limits, read_text, reading
+from colmap_inertial.io.dialect import decode, plain_text
+from colmap_inertial.io.files import first_line, read_bytes, read_limits, reading
+from colmap_inertial.io.json_rows import rows_of_json
 from colmap_inertial.io.units import SENSOR_UNITS, TIME_UNITS_NS, Quantity, stamps_ns, unit_of
 
+#: A delimiter that stands for any white space.
+_BLANKS = " "
 _BLANK_OR_COMMENT = re.compile(r"\n\s*(\n|#|\Z)")
 
 
@@ -42,6 +46,10 @@ class Table:
         Cells in each line.
     repairs
         What was dropped to make the table whole.
+    preamble
+        Lines of the file before the header, where they are no part of the table.
+    found
+        What is unusual about the way in which it is written, in words.
     """
 
     path: Path
@@ -52,6 +60,8 @@ class Table:
     delimiter: str | None
     width: int
     repairs: tuple[Fact, ...] = ()
+    preamble: tuple[str, ...] = ()
+    found: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.lines)
@@ -131,7 +141,9 @@ def _number(cell: str) -> float | None:
 
 
 def read_table(path: Path) -> Table:
-    """Read a table of numbers: comma, semicolon, tab or white space between cells, at most one header line.
+    """Read a table of numbers: comma, semicolon, tab or white space between cells.
+
+    Encoding, decimal commas, lines before the header and further rows of it are found by :mod:`.dialect`.
 
     Blank lines are passed over, as are lines that start with ``#`` (the last one before the data is the header where
     it has as many cells as the data). A last line that is cut off (no line end, and cells missing or broken) is
@@ -142,42 +154,68 @@ def read_table(path: Path) -> Table:
     FormatError
         Where the file is missing or holds no rows, or a line has another number of cells than the first.
     """
-    return parse_table(path, read_text(path))
+    return parse_bytes(path, read_bytes(path))
 
 
-def parse_table(path: Path, text: str) -> Table:
-    """:func:`read_table` of a text that lies elsewhere than in a file of its own; ``path`` is for messages."""
+def parse_bytes(path: Path, data: bytes) -> Table:
+    """:func:`read_table` of bytes that lie elsewhere than in a file of their own; ``path`` is for messages."""
+    text, encoding = decode(data)
+    table = parse_text(path, text)
+    return table if encoding == "utf-8" else replace(table, found=(encoding.upper(), *table.found))
+
+
+def parse_text(path: Path, text: str) -> Table:
+    """:func:`parse_bytes` of what was decoded."""
+    rows = rows_of_json(text)
+    if rows is not None:
+        return replace(parse_table(path, rows, ","), found=("JSON",))
+    plain = plain_text(text)
+    table = parse_table(path, plain.text, plain.delimiter)
+    return replace(table, preamble=plain.preamble or table.preamble, found=plain.found)
+
+
+def parse_table(path: Path, text: str, delimiter: str = "") -> Table:
+    """:func:`read_table` of the text of a plain table: one header line at most, and decimal points.
+
+    Parameters
+    ----------
+    delimiter
+        A blank is any white space; without one it is found in the second line.
+    """
     text = text.replace("\r\n", "\n").replace("\r", "\n")
     lines, numbers, comments, repairs = _split_lines(path, text.rstrip("\n"))
-    delimiter = _delimiter(lines[min(1, len(lines) - 1)])
+    between = (
+        _delimiter(lines[min(1, len(lines) - 1)]) if not delimiter else None if delimiter == _BLANKS else delimiter
+    )
     most = read_limits().table_columns
-    if any(_width(line, delimiter, most) > most for line in lines[:2]):
+    if any(_width(line, between, most) > most for line in lines[:2]):
         raise too_wide(path, int(numbers[0]))
-    has_header = _is_header(lines[0], delimiter)
+    has_header = _is_header(lines[0], between)
     candidates = [lines[0]] if has_header else comments[::-1]
     lines, numbers = lines[has_header:], numbers[has_header:]
     if not lines:
         raise FormatError(path, "holds a header and no rows")
-    width = len(lines[0].split(delimiter))
-    candidates = [line.strip() for line in candidates if _width(line, delimiter, most) <= most]
-    header_text = next((line for line in candidates if len(_header_cells(line, delimiter)) == width), None)
+    width = len(lines[0].split(between))
+    candidates = [line.strip() for line in candidates if _width(line, between, most) <= most]
+    header_text = next((line for line in candidates if len(_header_cells(line, between)) == width), None)
     if has_header and header_text is None:
-        cells = len(_header_cells(candidates[0], delimiter))
+        cells = len(_header_cells(candidates[0], between))
         reason = f"{width} cells under a header of {cells}: {candidates[0][:200]}"
         raise FormatError(path, reason, line=int(numbers[0]))
-    if not text.endswith("\n") and len(lines) > 1 and _is_cut_off(lines[-1], lines[-2], delimiter, width):
+    if not text.endswith("\n") and len(lines) > 1 and _is_cut_off(lines[-1], lines[-2], between, width):
         repairs.append(Fact("last-line-cut-off", file=path.name, line=numbers[-1]))
         lines, numbers = lines[:-1], numbers[:-1]
-    _require_one_width(path, lines, numbers, delimiter, width)
+    _require_one_width(path, lines, numbers, between, width)
     return Table(
         path=path,
-        header=None if header_text is None else _header_cells(header_text, delimiter),
+        header=None if header_text is None else _header_cells(header_text, between),
         header_text=header_text or "",
         lines=tuple(lines),
         line_numbers=numbers,
-        delimiter=delimiter,
+        delimiter=between,
         width=width,
         repairs=tuple(repairs),
+        preamble=tuple(comments),
     )
 
 
@@ -366,7 +404,7 @@ def text_of(path: Path, member: str) -> str:
         Where it is damaged, too large, or larger than its packed bytes can honestly make it.
     """
     if path.is_dir():
-        return read_text(path / member)
+        return decode(read_bytes(path / member))[0]
     largest_gib = read_limits().file_gib
     with _unpacking(path, member) as (file, packed):
         parts, size, memory = list[bytes](), 0, 0
@@ -382,7 +420,7 @@ def text_of(path: Path, member: str) -> str:
                     f"its {member} unpacks to {size >> 20} MB and more, out of proportion to {packed} packed bytes; if "
                     "it is meant, unpack it and give the folder",
                 )
-        return b"".join(parts).decode("utf-8-sig", errors="replace")
+        return decode(b"".join(parts))[0]
 
 
 @contextmanager

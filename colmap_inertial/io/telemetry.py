@@ -1,9 +1,11 @@
-"""Cameras that the package ``telemetry-parser`` reads (extra ``devices``): RunCam and its kin, Insta360.
+"""RunCam and its kin, which write counts; Insta360, which the package ``telemetry-parser`` (extra ``devices``) reads.
 
-Only its raw samples, units, scales and orientations are taken; the conversion is ours. A reading's letters say which of
-the file's axes is x, y, z, a small letter its opposite. RunCam 5, iFlight and Thumb write counts into a CSV that only
-its name tells from others; Mobius adds a temperature. Insta360 appends records to its video: six numbers a sample,
-either counts, or rad/s and g. None of these makers documents its axes: where gyroscope and accelerometer do not turn
+Of the latter only raw samples, units, scales and orientations are taken; the conversion is ours. A reading's letters
+say which of the file's axes is x, y, z, a small letter its opposite. RunCam 5, iFlight and
+Thumb write counts into a CSV that only its name tells from others; Mobius adds a temperature. Insta360 appends records
+to its video: six numbers
+a sample, either counts, or rad/s and g. None of these makers documents its axes: where gyroscope and accelerometer do
+not turn
 together, the checks of every recording say so.
 """
 
@@ -24,14 +26,24 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, MissingExtraError
 from colmap_inertial.core.types import FrameLog, ImuRecording
 from colmap_inertial.io.files import first_line
-from colmap_inertial.io.imu_text import build_recording
+from colmap_inertial.io.imu_text import build_recording, order_rows
 from colmap_inertial.io.samples import Samples, order_samples
+from colmap_inertial.io.tables import read_table
 from colmap_inertial.io.units import SENSOR_NAMES, Axes, DeclaredUnits, Quantity
 
 #: Names of logs of counts, and the columns with which they begin; the columns that tell Mobius by itself.
 _NAMES = re.compile(r"(RC_GyroData|gyroDat[ae]|Thumb).*\.csv", re.IGNORECASE)
 _COLUMNS = re.compile(r"time,r?x,r?y,r?z(,ax,ay,az)?$")
 _MOBIUS = "time,rx,ry,rz,ax,ay,az,temp"
+#: Cameras by the beginning of the name: range of the gyroscope (deg/s of 32768 counts), and axes.
+_CAMERAS = {
+    "rc_": ("Runcam 5 Orange", 500.0, "xzY"),
+    "gyrodat": ("iFlight GOCam GR", 500.0, "xZy"),
+    "thumb": ("Runcam Thumb", 1000.0, "Yxz"),
+}
+_MOBIUS_CAMERA = ("Mobius Maxi 4K", 500.0, "yxz")
+#: Counts of the accelerometer for one g.
+_COUNTS_PER_G = 16384.0
 #: An Insta360 video ends with this.
 _INSTA360 = b"8db42d694ccc418790edff439fe026bf"
 #: Its units in our spelling.
@@ -89,6 +101,8 @@ def read_telemetry(path: Path, units: DeclaredUnits) -> ImuRecording:
     FormatError
         Where it cannot read the recording, or finds no gyroscope in it.
     """
+    if path.suffix.lower() == ".csv":
+        return _read_counts(path, units)
     camera, groups = _parsed(path)
     gyro = _samples(path, groups, "gyro", units.gyro)
     if gyro is None:
@@ -96,8 +110,31 @@ def read_telemetry(path: Path, units: DeclaredUnits) -> ImuRecording:
     return build_recording(gyro, _samples(path, groups, "accel", units.accel), device=camera)
 
 
+def _read_counts(path: Path, units: DeclaredUnits) -> ImuRecording:
+    """Read a log of counts: milliseconds, gyroscope, accelerometer."""
+    table = read_table(path)
+    header = ",".join(table.header or ()).lower().replace(" ", "")
+    known = [camera for begin, camera in _CAMERAS.items() if path.name.lower().startswith(begin)]
+    name, range_deg_s, letters = _MOBIUS_CAMERA if header == _MOBIUS or not known else known[0]
+    if table.width < 4:
+        raise FormatError(path, "holds no gyroscope; its camera writes one where gyro data is switched on")
+    t_ns = table.stamps_ns(0, "ms")
+    axes = Axes.of_letters(letters)
+    rates = axes.apply(table.numbers([1, 2, 3]) * (range_deg_s / 32768.0))
+    gyro = order_rows(table, "gyro", units.gyro or "deg/s", t_ns, rates)
+    if table.width < 7:
+        return build_recording(gyro, None, device=name)
+    force = table.numbers([4, 5, 6]) / _COUNTS_PER_G
+    if name == "Runcam 5 Orange":
+        force = Axes.parse("y,z,-x").apply(force)
+    accel = order_rows(table, "accel", units.accel or "g", t_ns, axes.apply(force))
+    return build_recording(gyro, accel, device=name)
+
+
 def read_telemetry_frames(path: Path) -> FrameLog | None:
     """The readout that an Insta360 states of its frames; ``None`` where it states none."""
+    if path.suffix.lower() == ".csv":
+        return None
     _, groups = _parsed(path)
     metadata = groups.get("Default", {}).get("Metadata")
     readout_s = 1e-3 * float(metadata.get("rolling_shutter_time") or 0.0) if isinstance(metadata, dict) else 0.0

@@ -32,12 +32,29 @@ SENSOR_NAMES: dict[Quantity, str] = {"gyro": "gyroscope", "accel": "acceleromete
 _ALIASES = {
     **dict.fromkeys(("rad/s", "rads-1", "rads", "rad/sec", "radians/s"), "rad/s"),
     **dict.fromkeys(("deg/s", "degs-1", "degs", "dps", "°/s", "deg/sec", "degrees/s"), "deg/s"),
+    **dict.fromkeys(("º/s", "°/sec", "d/s", "degree/s", "degree/sec", "degrees/sec", "°s-1", "degpersec"), "deg/s"),
+    **dict.fromkeys(("rad/second", "radpersec", "radian/s", "radians/sec", "radps", "radianspersecond"), "rad/s"),
+    **dict.fromkeys(("degreespersecond", "degpersecond", "deg/second", "degrees/second"), "deg/s"),
     **dict.fromkeys(("m/s2", "ms-2", "ms2", "m/s²", "m/s/s", "mps2", "m/sec2"), "m/s2"),
+    **dict.fromkeys(("m/(s2)", "m/sec²", "m/s2.", "ms−2", "mps²", "m/second2", "m/s−2"), "m/s2"),
     **dict.fromkeys(("g", "g0"), "g"),
     **dict.fromkeys(("s", "sec", "second", "seconds"), "s"),
     **dict.fromkeys(("ms", "msec", "millisec", "milliseconds"), "ms"),
     **dict.fromkeys(("us", "µs", "μs", "usec", "microsec", "microseconds"), "us"),
     **dict.fromkeys(("ns", "nsec", "nanosec", "nanoseconds"), "ns"),
+}
+# Units of which many make one of ours: as they are spelled, ours, and how many.
+_SCALED = {
+    **dict.fromkeys(("mg", "millig", "milli-g", "milligs"), ("g", 1000.0)),
+    **dict.fromkeys(("gs", "g-force", "gforce", "gee", "gn"), ("g", 1.0)),
+    **dict.fromkeys(("mdps", "mdeg/s", "millideg/s"), ("deg/s", 1000.0)),
+    **dict.fromkeys(("mrad/s",), ("rad/s", 1000.0)),
+    **dict.fromkeys(("cm/s2", "cm/s²", "gal"), ("m/s2", 100.0)),
+    **dict.fromkeys(("mm/s2", "mm/s²"), ("m/s2", 1000.0)),
+    **dict.fromkeys(("millis", "millisecond"), ("ms", 1.0)),
+    **dict.fromkeys(("micros", "microsecond"), ("us", 1.0)),
+    **dict.fromkeys(("nanos", "nanosecond"), ("ns", 1.0)),
+    **dict.fromkeys(("secs",), ("s", 1.0)),
 }
 # Differences of two stamps must fit 64 bits as well.
 _LARGEST_STAMP_NS = 4_500_000_000_000_000_000
@@ -48,12 +65,30 @@ def unit_of(text: str) -> str | None:
     return _ALIASES.get(re.sub(r"[\s_^*·]", "", text).lower())
 
 
+def unit_and_scale(text: str) -> tuple[str, float] | None:
+    """:func:`unit_of`, and how many of what ``text`` spells make one: ``"mg"`` gives ``("g", 1000)``."""
+    unit = unit_of(text)
+    return (unit, 1.0) if unit is not None else _SCALED.get(re.sub(r"[\s_^*·]", "", text).lower())
+
+
 @dataclass(frozen=True, kw_only=True)
 class DeclaredUnits:
-    """Units that the user states in place of what a file or format says; ``None`` leaves the file's."""
+    """What the user states in place of what a file or format says; ``None`` leaves the file's.
+
+    Attributes
+    ----------
+    gyro, accel
+        Units.
+    stamps
+        Of a bag: ``"header"``, or ``"arrival"``.
+    topic
+        Of a bag that has several.
+    """
 
     gyro: str | None = None
     accel: str | None = None
+    stamps: str | None = None
+    topic: str | None = None
 
 
 def convert_to_si(values: Array, quantity: Quantity, unit: str) -> Array:

@@ -5,13 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 from colmap_inertial.checks.diagnose import Diagnosis, Recorded, diagnose, unreadable
+from colmap_inertial.core.errors import FormatError, OutputExistsError
 from colmap_inertial.io.calibration import CalibrationFiles, largest_offset_s
 from colmap_inertial.io.capture import Capture, load_capture
-from colmap_inertial.io.files import write_json
+from colmap_inertial.io.files import write_json, write_text
 from colmap_inertial.io.frames import read_frame_timing
 from colmap_inertial.io.imu import is_capture, read_raw_capture_imu, read_raw_imu
 from colmap_inertial.io.imu_formats import find_recording
 from colmap_inertial.io.rig_frames import pair_rig_frames
+from colmap_inertial.io.table_report import TableReport, report_table
 from colmap_inertial.pipeline.run.context import prior_calibration
 from colmap_inertial.pipeline.run.progress import Progress
 from colmap_inertial.reconstruction.drivers.paths import check_output
@@ -45,6 +47,31 @@ def diagnose_source(
     if json is not None:
         write_json(json, diagnosis.as_json())
     return diagnosis
+
+
+def describe_table(source: ScaleSource, capture: Path | None = None) -> TableReport | None:
+    """What a table of samples was taken for; ``None`` for any other source.
+
+    Parameters
+    ----------
+    capture
+        Where to write the capture.toml.
+
+    Raises
+    ------
+    OutputExistsError
+        Where there is a file already.
+    FormatError
+        Where one is to be written, and the source is no table.
+    """
+    report = report_table(source.source, None if capture is None else capture.parent)
+    if capture is not None:
+        if report is None:
+            raise FormatError(source.source, "is no table of samples: --capture is for one")
+        if capture.exists():
+            raise OutputExistsError(f"{capture} exists; choose another name or remove it")
+        write_text(capture, report.toml)
+    return report
 
 
 def collect(source: ScaleSource, progress: Progress) -> Recorded:

@@ -1,0 +1,92 @@
+"""Words of what is found in tables, bags and calibrations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from colmap_inertial.core.messages import message
+
+
+@message(
+    advice='state date_order = "dmy" or "mdy" in the table of the sensor',
+    example={"path": "log.csv", "example": "3/4/2024"},
+)
+def date_order_unknown(path: str, example: str) -> str:
+    return f"{path}: nothing tells the day from the month in dates such as {example}"
+
+
+@message(
+    advice=lambda reason, hint: f"describe it in a capture.toml, where ? stands for what it does not say:\n{hint}",
+    example={"reason": "has no header", "hint": "[imu.gyro]\n..."},
+)
+def table_unclear(reason: str, hint: str) -> str:
+    return reason
+
+
+def _arrival_advice(jitter_ms: float, hint: str, **_: object) -> str:
+    return (
+        f"have the driver stamp its messages, or take the times of their arrival (uneven by {jitter_ms:.2g} ms; delays "
+        f"stay) by a capture.toml:\n{hint}"
+    )
+
+
+_BAG = {"path": "imu.bag", "topic": "/imu", "count": 2000, "total": 2000, "jitter_ms": 0.6, "hint": "[imu]\n..."}
+
+
+@message(advice=_arrival_advice, example=_BAG)
+def bag_stamps_empty(path: str, topic: str, count: int, total: int, jitter_ms: float, hint: str) -> str:
+    if not count:
+        return f"{path}: header.stamp is the same in all {total} messages of {topic}"
+    return f"{path}: the driver left header.stamp empty in {count} of {total} messages of {topic}"
+
+
+@message(advice=_arrival_advice, example={**_BAG, "count": 240})
+def bag_stamps_repeated(path: str, topic: str, count: int, total: int, jitter_ms: float, hint: str) -> str:
+    return (
+        f"{path}: {count} of {total} messages of {topic} repeat the header.stamp of another one: its clock is too "
+        "coarse, or two drivers publish on the topic"
+    )
+
+
+@message(advice=_arrival_advice, example={**_BAG, "count": 7})
+def bag_stamps_jump_back(path: str, topic: str, count: int, total: int, jitter_ms: float, hint: str) -> str:
+    return (
+        f"{path}: the header.stamp of {count} of {total} messages of {topic} lies more than half a second behind one "
+        "before it: the driver's clock was set, or drivers with two clocks publish on the topic"
+    )
+
+
+@message(
+    advice="record one of them, or keep one by its node (rosbag filter with m._connection_header['callerid'])",
+    example={"path": "imu.bag", "topic": "/imu", "nodes": ("/driver", "/filter")},
+)
+def bag_of_two_drivers(path: str, topic: str, nodes: Sequence[str]) -> str:
+    return (
+        f"{path}: {len(nodes)} drivers publish on {topic} in turn ({', '.join(nodes)}); as one IMU they make no sense"
+    )
+
+
+@message(example={"topic": "/imu", "topics": ("/imu0", "/imu1")})
+def bag_without_topic(topic: str, topics: Sequence[str]) -> str:
+    return f"has no IMU topic {topic}; it has {', '.join(topics)}"
+
+
+@message(
+    advice="give Kalibr's camchain-imucam, a configuration of OpenVINS, VINS-Mono, VINS-Fusion or ORB-SLAM, or a JSON "
+    "file that align wrote"
+)
+def calibration_unknown() -> str:
+    return "is no calibration of a camera and an IMU that is known here"
+
+
+@message(
+    advice="name one (camera under [camera]), or copy its block into a file of its own",
+    example={"cameras": ("cam0", "cam1")},
+)
+def calibration_of_several(cameras: Sequence[str]) -> str:
+    return f"calibrates several cameras ({', '.join(cameras)})"
+
+
+@message(advice="give Kalibr's camchain-imucam, in which T_cam_imu stands, or state cam_from_imu under [calibration]")
+def calibration_without_imu() -> str:
+    return "says nothing of an IMU: it calibrates the camera alone, for sensor_yaml under [camera]"
