@@ -460,6 +460,22 @@ def check_names(names: Iterable[str], source: Path | str) -> None:
             raise FormatError(source, f"names the file {name[:80]!r}, which {fault}; such names are not followed")
 
 
+def check_image_names(names: Iterable[str], source: Path | str) -> None:
+    """Refuse names of images that nothing can hold: empty ones, and such as are no UTF-8 or hold a control character.
+
+    Where a name leads to does not matter while it is only a name; see :func:`path_in` for when it becomes a path.
+
+    Raises
+    ------
+    FormatError
+        For such a name.
+    """
+    for name in names:
+        fault = _fault(name.replace("/", ""))
+        if fault in (_EMPTY, _UNPRINTABLE):
+            raise FormatError(source, f"names the file {name[:80]!r}, which {fault}; such names are not followed")
+
+
 def require_utf8(*paths: StrPath) -> None:
     """Raise :class:`FormatError` for a path that native libraries would end the process for, and JSON cannot hold."""
     for path in paths:
@@ -497,15 +513,18 @@ def path_in(folder: Path, name: str, source: Path | str | None = None) -> Path:
     return path
 
 
+_EMPTY, _UNPRINTABLE = "is empty", "is no UTF-8, or holds a control character"
+
+
 def _fault(name: str) -> str | None:
     if not name or not name.strip("./\\ "):
-        return "is empty"
+        return _EMPTY
     if name.startswith("/") or Path(name).anchor:
         return "is absolute"
     parts = re.split(r"[/\\]", name)
     if ".." in parts:
         return 'leads out of its folder by ".."'
     if printable(name) != name or "\n" in name or "\t" in name:
-        return "is no UTF-8, or holds a control character"
+        return _UNPRINTABLE
     longest = max(len(part.encode()) for part in parts)
     return f"is longer than {_LONGEST} bytes" if longest > _LONGEST else None
