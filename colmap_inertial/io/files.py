@@ -455,24 +455,8 @@ def check_names(names: Iterable[str], source: Path | str) -> None:
         For a name that is empty or absolute, that holds ``..`` or a control character, that is no UTF-8 or too long.
     """
     for name in names:
-        fault = _fault(name)
+        fault = name_fault(name)
         if fault is not None:
-            raise FormatError(source, f"names the file {name[:80]!r}, which {fault}; such names are not followed")
-
-
-def check_image_names(names: Iterable[str], source: Path | str) -> None:
-    """Refuse names of images that nothing can hold: empty ones, and such as are no UTF-8 or hold a control character.
-
-    Where a name leads to does not matter while it is only a name; see :func:`path_in` for when it becomes a path.
-
-    Raises
-    ------
-    FormatError
-        For such a name.
-    """
-    for name in names:
-        fault = _fault(name.replace("/", ""))
-        if fault in (_EMPTY, _UNPRINTABLE):
             raise FormatError(source, f"names the file {name[:80]!r}, which {fault}; such names are not followed")
 
 
@@ -513,18 +497,19 @@ def path_in(folder: Path, name: str, source: Path | str | None = None) -> Path:
     return path
 
 
-_EMPTY, _UNPRINTABLE = "is empty", "is no UTF-8, or holds a control character"
+EMPTY, UNPRINTABLE = "is empty", "is no UTF-8, or holds a control character"
 
 
-def _fault(name: str) -> str | None:
+def name_fault(name: str) -> str | None:
+    """What is wrong with a name of a file in a folder; ``None`` where nothing is."""
     if not name or not name.strip("./\\ "):
-        return _EMPTY
+        return EMPTY
     if name.startswith("/") or Path(name).anchor:
         return "is absolute"
     parts = re.split(r"[/\\]", name)
     if ".." in parts:
         return 'leads out of its folder by ".."'
     if printable(name) != name or "\n" in name or "\t" in name:
-        return _UNPRINTABLE
+        return UNPRINTABLE
     longest = max(len(part.encode()) for part in parts)
     return f"is longer than {_LONGEST} bytes" if longest > _LONGEST else None

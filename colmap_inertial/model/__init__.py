@@ -29,7 +29,8 @@ from colmap_inertial.core.types import (
     SolvedMotion,
     Treatment,
 )
-from colmap_inertial.io.files import StrPath, check_image_names, convert_to_plain, read_json, reader, write_json
+from colmap_inertial.io.files import StrPath, convert_to_plain, read_json, reader, write_json
+from colmap_inertial.io.picture_names import check_image_names
 from colmap_inertial.model.pose_covariances import pose_covariances
 from colmap_inertial.model.references import check_references
 from colmap_inertial.model.rigs import list_posed_frames

@@ -29,6 +29,7 @@ _METRES = re.compile(r"(?:(\d\S*) )?m")
 #: What it says where there is no scale, and no gravity, until a similarity brings them.
 NOT_METRES = "unknown: not metres"
 NO_SCALE = "the scale was refused: units are not metres, and nothing here says how large anything is"
+NEVER_SCALED = "this model was never given a scale: units are not metres, and nothing here says how large anything is"
 NO_UP = "the direction of gravity is not known: up is only taken for z"
 #: What it said before a similarity made it metres, and in that the provenance of this one.
 _BEFORE, _BY = "before_apply", "provenance"
@@ -178,7 +179,11 @@ def _describe_metres(values: Mapping[str, Any], similarity: Similarity) -> dict[
     up = _up(similarity) if up is None else up
     sigma = math.sqrt(similarity.cov[0, 0])
     factor = math.exp(Z95 * sigma)
-    notes = [note for note in values.get("notes", []) if note != NO_SCALE and (up is None or note != NO_UP)]
+    notes = [
+        note
+        for note in values.get("notes", [])
+        if note not in (NO_SCALE, NEVER_SCALED) and (up is None or note != NO_UP)
+    ]
     return {
         "unit": "m",
         "up_in_world": up,

@@ -118,3 +118,14 @@ def _distance(points: Array, model: Array) -> float:
     there, _ = cKDTree(model).query(points)
     back, _ = cKDTree(points).query(model)
     return float(min(np.median(there), np.median(back)))
+
+
+def translation(by: Array) -> Similarity:
+    """A shift by (3,), exactly."""
+    return Similarity(
+        scale=1.0,
+        rotation_xyzw=np.array([0.0, 0.0, 0.0, 1.0]),
+        translation_m=by,
+        cov=np.zeros((7, 7)),
+        provenance="shift",
+    )

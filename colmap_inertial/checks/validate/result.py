@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from colmap_inertial.checks.validate.contradictions import find_contradictions
 from colmap_inertial.checks.validate.fit import FIT
 from colmap_inertial.checks.validate.targets import Target
 from colmap_inertial.checks.words import target_facts
@@ -410,7 +411,8 @@ class Validation:
                 f"{self.tolerance_pct:g} % of the longest, {1000 * lengths.longest_m:.4g} mm: check its columns, rows "
                 "and that it is flat"
             )
-        return tuple(doubts)
+        found = find_contradictions(self.target, self.distances, self.views, self.tolerance_pct)
+        return (*doubts, *(fact.with_advice for fact in found))
 
     def as_json(self) -> dict[str, Any]:
         """Everything but pixel coordinates, ready for ``json.dump``."""

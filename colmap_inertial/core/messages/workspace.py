@@ -215,3 +215,71 @@ def scale_taken_all_the_same(difference: str) -> str:
 
 
 state("scale-without-identity", "the scale does not say of which model it is: it is taken for that of this one")
+
+
+# exports
+
+
+@message(example={"offset": (432100.0, 5664700.0, 120.0)})
+def recentred(offset: tuple[float, ...]) -> str:
+    where = ", ".join(f"{x:.9g}" for x in offset)
+    return (
+        f"the model lies too far from the origin for single precision: {where} is taken off all coordinates, and "
+        "stands in metadata.xml (SRSOrigin) and export.json"
+    )
+
+
+@message(example={"folder": "project/masks"})
+def masks_left(folder: str) -> str:
+    return f"the masks in {folder} are of the pictures before they were undistorted, and are not exported"
+
+
+@message(example={"direction": "up"})
+def no_row_poses(direction: str) -> str:
+    return f"these pictures are read out {direction}: there is no viewmats_rs.json, which is of rows from the top"
+
+
+# targets
+
+
+def _contradiction_advice(
+    kind: str,
+    gap: float,
+    lengths_mm: tuple[float, ...],
+    off_pct: tuple[float, ...],
+    along: tuple[str, ...],
+    likely_gap: float | None = None,
+) -> str:
+    if kind == "aprilgrid":
+        likely = "" if likely_gap is None else f"; the pictures show {likely_gap:.3g}"
+        return (
+            f"check the gap, which is {gap:g} in its description: the distance between two tags divided by a tag's "
+            f"side{likely}"
+        )
+    return "check its columns, rows and sizes, that it is flat, and that it was not printed stretched"
+
+
+@message(
+    advice=_contradiction_advice,
+    example={
+        "kind": "aprilgrid",
+        "gap": 0.25,
+        "lengths_mm": (10.0, 40.0),
+        "off_pct": (16.0, -3.6),
+        "along": ("row", "column"),
+        "likely_gap": 0.3,
+    },
+)
+def lengths_contradict(
+    kind: str,
+    gap: float,
+    lengths_mm: tuple[float, ...],
+    off_pct: tuple[float, ...],
+    along: tuple[str, ...],
+    likely_gap: float | None = None,
+) -> str:
+    listed = ", ".join(
+        f"{length:.4g} mm in a {line} {off:+.2g} %"
+        for length, off, line in zip(lengths_mm, off_pct, along, strict=True)
+    )
+    return f"its lengths contradict each other, all of a kind alike: {listed}"
