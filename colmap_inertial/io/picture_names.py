@@ -37,9 +37,10 @@ def picture_in(folder: Path, name: str, source: Path | str | None = None) -> Pat
         As of :func:`path_in`.
     """
     parts = [part for part in re.split(r"[/\\]", name) if part not in ("", ".")]
-    if not Path(name).anchor and not name.startswith("/") and ".." not in parts:
+    is_plain = not Path(name).anchor and not re.match(r"[/\\]|[A-Za-z]:[/\\]", name)
+    if is_plain and ".." not in parts:
         return path_in(folder, name, source)
     last = len(parts) - 1 - parts[::-1].index("..") if ".." in parts else -1
     tails = ["/".join(parts[i:]) for i in range(last + 1, len(parts))]
-    paths = [path_in(folder, tail, source) for tail in tails if tail]
+    paths = [path_in(folder, tail, source) for tail in tails if name_fault(tail) is None]
     return next((path for path in paths if path.is_file()), paths[-1] if paths else path_in(folder, name, source))

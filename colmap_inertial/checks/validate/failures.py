@@ -50,9 +50,17 @@ def explain_failure(search: Search, images: Path) -> Exception:
         return search.one_line
     return TargetNotFoundError(
         f"{target.spec} was found in {len(seen)} images, but no two of them agree on where it is in the model "
-        f"(to {search.options.max_residual_px:g} px): false detections, wrong poses, a target that moved between the "
-        "images, or images that do not belong to this model"
+        f"(to {search.options.max_residual_px:g} px): {_REASONS.get(target.kind, _REASONS[''])}, a target that moved "
+        "between the images, or images that do not belong to this model"
     )
+
+
+#: What else than moving places a target that is found in many images nowhere, the likelier first.
+_REASONS = {
+    "aprilgrid": "columns and rows may be swapped (COLSxROWS of tags), or the tags not numbered row by row from the "
+    "lower left one, as kalibr has them; else wrong poses",
+    "": "false detections, wrong poses",
+}
 
 
 def _find_mirroring(search: Search) -> str | None:
@@ -157,6 +165,11 @@ def _count_boards(images: Mapping[int, UInt8Array], size: tuple[int, int], targe
 
 
 def _hint_at_absence(search: Search) -> str:
+    if search.target.kind == "aprilgrid":
+        return (
+            "its tags are those of kalibr, 36h11 from number 0 on with a black border of two bits: are those of yours, "
+            "and is the target large and sharp enough in the images?"
+        )
     if search.target.kind != "checkerboard":
         return "is the description right, and is the target large and sharp enough in the images?"
     votes = _vote_on_sizes(_images_of_hints(search), {})
