@@ -115,6 +115,4 @@ def test_counts_of_a_log_with_another_name_are_asked_for(tmp_path, imu):
     path = write_runcam(tmp_path, imu, "Runcam 5 Orange").rename(tmp_path / "flight.csv")
     wanted = r'(?s)columns = \["rx", "ry", "rz"\].*counts_per_unit = "\?"  # 65.536 where'
     with pytest.raises(FormatError, match=wanted):
-        FormatError, match=r'(?s)columns = \["rx", "ry", "rz"\].*counts_per_unit = "\?"  # 65.536 where'
-    ):
         read_imu(path)

@@ -89,7 +89,9 @@ class Scale(DeviceCommand, SourceReader):
         calibration = self.add_remembered(self.calibration, self.imu or self.source)
         source = self.read_from(calibration)
         estimate = scale_source(source, self.options, json=self.json_file, first_s=self.first_s, force=self.force)
-        self.tell(lambda: show_scale(estimate, self.source), scale_as_json(estimate, calibration), written=True)
+        self.tell(
+            lambda: show_scale(estimate, self.source), scale_as_json(estimate, calibration, self.source), written=True
+        )
         return 3 if estimate.verdict == "refused" else 0
 
 
@@ -122,9 +124,11 @@ class Apply(Reader):
     link: bool = False
     """Hard links for files that do not change; an edit of one then changes the original, too."""
     keep: tuple[str, ...] = ()
-    """Patterns of paths in PROJECT that are copied as they are, such as "old/*"."""
+    """Patterns of names or paths in PROJECT that are copied as they are, such as "old/*" or "*.bak"."""
     follow_links: bool = False
     """Take what symbolic links out of PROJECT lead to into the copy; without, they are refused."""
+    any_model: bool = False
+    """Take a scale that was measured on another model; without, it is refused."""
 
     def __post_init__(self) -> None:
         given = (bool(self.scale), self.factor is not None, self.sim3 is not None, self.undo)
@@ -165,6 +169,8 @@ class Apply(Reader):
                     link=self.link,
                     keep=self.keep,
                     follow_links=self.follow_links,
+                    about_origin=self.sim3 is not None,
+                    any_model=self.any_model,
                     progress=files,
                 )
         self.tell(lambda: show_applied(applied), _describe_applied(applied))
@@ -187,6 +193,7 @@ def _describe_applied(applied: Applied) -> dict[str, Any]:
         "models": models,
         "changes": applied.changes,
         "files_kept": applied.unchanged,
+        "unmoved": applied.unmoved,
         **with_sentences({"notes": list(applied.notes)}),
     }
 

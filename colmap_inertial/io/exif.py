@@ -19,9 +19,10 @@ import numpy as np
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.core.types import HeightDatum
-from colmap_inertial.io.files import path_in, read_bytes, reader, reading
+from colmap_inertial.io.files import read_bytes, reader, reading
 from colmap_inertial.io.frame_times import FrameStamps, stamps_in_order
 from colmap_inertial.io.images import PNG, TIFF_ORDERS, jpeg_segments, png_chunks, tiff_entries
+from colmap_inertial.io.picture_names import picture_in
 from colmap_inertial.io.tiff_metadata import carry_tiff_metadata
 
 _EXIF_HEADER = b"Exif\0\0"
@@ -76,7 +77,7 @@ def stamps_of_exif(folder: Path, names: Sequence[str]) -> tuple[FrameStamps, int
     """
     t_ns, digits, offsets = [], [], []
     for name in names:
-        path = path_in(folder, name)
+        path = picture_in(folder, name)
         texts = _texts(path)
         fraction = texts.get(_Tag.FRACTION, "").strip()
         if not re.fullmatch(r"\d{2,9}", fraction):

@@ -455,7 +455,7 @@ def check_names(names: Iterable[str], source: Path | str) -> None:
         For a name that is empty or absolute, that holds ``..`` or a control character, that is no UTF-8 or too long.
     """
     for name in names:
-        fault = _fault(name)
+        fault = name_fault(name)
         if fault is not None:
             raise FormatError(source, f"names the file {name[:80]!r}, which {fault}; such names are not followed")
 
@@ -497,15 +497,19 @@ def path_in(folder: Path, name: str, source: Path | str | None = None) -> Path:
     return path
 
 
-def _fault(name: str) -> str | None:
+EMPTY, UNPRINTABLE = "is empty", "is no UTF-8, or holds a control character"
+
+
+def name_fault(name: str) -> str | None:
+    """What is wrong with a name of a file in a folder; ``None`` where nothing is."""
     if not name or not name.strip("./\\ "):
-        return "is empty"
+        return EMPTY
     if name.startswith("/") or Path(name).anchor:
         return "is absolute"
     parts = re.split(r"[/\\]", name)
     if ".." in parts:
         return 'leads out of its folder by ".."'
     if printable(name) != name or "\n" in name or "\t" in name:
-        return "is no UTF-8, or holds a control character"
+        return UNPRINTABLE
     longest = max(len(part.encode()) for part in parts)
     return f"is longer than {_LONGEST} bytes" if longest > _LONGEST else None

@@ -13,6 +13,7 @@ import numpy as np
 from colmap_inertial.core.arrays import UInt8Array, UInt16Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.io.files import read_bytes, read_limits, reader
+from colmap_inertial.io.stand_ins import foreign_picture, what_stands_in
 
 #: File endings of pictures that both OpenCV and the published builds of pycolmap read (the latter read no WebP).
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".pgm", ".ppm")
@@ -97,7 +98,8 @@ def require_modest(path: Path, data: bytes) -> None:
     """
     size, most = _read_size(data), read_limits().megapixels
     if size is None:
-        raise FormatError(path, "is empty" if not data else _UNREADABLE)
+        found = what_stands_in(data[:512]) or foreign_picture(data[:64])
+        raise FormatError(path, "is empty" if not data else found or _UNREADABLE)
     weight = _weigh(data, size[0] * size[1])
     if size[0] * size[1] * weight > 1e6 * most:
         raise FormatError(
@@ -141,7 +143,9 @@ def _is_in_scans(data: bytes) -> bool:
 
 
 def _read_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height by the header of a PNG, JPEG, BMP, PGM, PPM or TIFF; ``None`` where it does not tell."""
+    """Width and height by the header of a PNG, JPEG, BMP, PGM, PPM, TIFF, WebP or JPEG 2000; ``None`` where it does
+    not tell.
+    """
     try:
         if data.startswith(PNG) and len(data) > 25:
             return struct.unpack_from(">II", data, 16)
@@ -154,12 +158,37 @@ def _read_size(data: bytes) -> tuple[int, int] | None:
             return abs(width), abs(height)
         if pnm := re.match(rb"P[1-6](?:\s|#[^\n]*\n)+(\d{1,9})(?:\s|#[^\n]*\n)+(\d{1,9})\s", data[:4096]):
             return int(pnm[1]), int(pnm[2])
+        if data.startswith(b"RIFF") and data[8:12] == b"WEBP":
+            return _webp_size(data)
+        if data.startswith((b"\0\0\0\x0cjP  ", b"\xff\x4f\xff\x51")):
+            return _jpeg2000_size(data)
         if data[:4] in TIFF_ORDERS:
             width, height = (_tiff_number(data, TIFF_ORDERS[data[:4]], tag, 0) for tag in (256, 257))
             return (width, height) if width and height else None
     except (struct.error, IndexError):
         pass
     return None
+
+
+def _webp_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height of a WebP (RFC 9649)."""
+    if data[12:16] == b"VP8X":
+        width, height = (int.from_bytes(data[at : at + 3], "little") + 1 for at in (24, 27))
+        return width, height
+    if data[12:16] == b"VP8L":
+        (bits,) = struct.unpack_from("<I", data, 21)
+        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    width, height = struct.unpack_from("<HH", data, 26)
+    return (width & 0x3FFF, height & 0x3FFF) if data[12:16] == b"VP8 " else None
+
+
+def _jpeg2000_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height of a JPEG 2000 file, or bare code stream (ISO/IEC 15444-1)."""
+    if data.startswith(b"\xff\x4f"):
+        right, bottom, left, top = struct.unpack_from(">IIII", data, 8)
+        return right - left, bottom - top
+    at = data.find(b"ihdr", 0, 4096)
+    return None if at < 0 else struct.unpack_from(">II", data, at + 4)[::-1]
 
 
 def _tiff_number(data: bytes, order: str, tag: int, default: int) -> int:

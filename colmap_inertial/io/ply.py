@@ -15,11 +15,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.types import Similarity
 from colmap_inertial.io.files import advise
 from colmap_inertial.io.splats import SplatMover, fault_of_splats, list_changed_fields
+from colmap_inertial.io.stand_ins import refuse_stand_in
 
 _CHUNK_BYTES = 512 << 10
 _LONGEST_HEADER = 1 << 20
@@ -86,6 +88,7 @@ def read_ply_header(path: Path, file: BufferedReader) -> Header:
     """
     raw = [file.readline(64)]
     if raw[0].strip() != b"ply":
+        refuse_stand_in(path)
         raise FormatError(path, "not a PLY file", line=1)
     formats: list[str] = []
     elements: list[Element] = []
@@ -136,7 +139,41 @@ def _read_header_line(words: list[str], formats: list[str], elements: list[Eleme
     return None
 
 
-def transform_ply(source: Path, target: Path, similarity: Similarity) -> tuple[str, ...]:
+#: What a file says whose positions were given double precision, and lose it again with ``--undo``.
+_WAS_SINGLE = b"comment colmap-inertial: x y z were float\n"
+
+
+def _in_precision(header: Header, doubles: bool | None) -> Header:
+    """The header of the copy: positions of vertices in double precision, or as they were before that."""
+    vertices = next((e for e in header.elements if e.name == "vertex"), None)
+    was_single = _WAS_SINGLE in header.raw
+    if vertices is None or doubles is None or doubles == was_single:
+        return header
+    kinds = {p.name: p.kind for p in vertices.properties if p.count is None}
+    old, new = ("f4", "f8") if doubles else ("f8", "f4")
+    if {kinds.get(name) for name in _POSITION} != {old}:
+        return header
+    word, element, lines = {"f4": b"float", "f8": b"double"}[new], b"", []
+    for line in header.raw.splitlines(keepends=True):
+        words = line.split()
+        if words[:1] == [b"element"]:
+            element = words[1]
+        if element == b"vertex" and words[:1] == [b"property"] and words[-1].decode("latin-1") in _POSITION:
+            line = line.replace(words[1], word, 1)
+        if line != _WAS_SINGLE:
+            lines.append(line)
+        if doubles and words[:1] == [b"format"]:
+            lines.append(_WAS_SINGLE)
+    properties = tuple(
+        Property(p.name, new) if p.name in _POSITION and p.count is None else p for p in vertices.properties
+    )
+    elements = tuple(Element(e.name, e.rows, properties) if e is vertices else e for e in header.elements)
+    return Header(b"".join(lines), header.order, elements)
+
+
+def transform_ply(
+    source: Path, target: Path, similarity: Similarity, *, doubles: bool | None = None
+) -> tuple[str, ...]:
     """Write a copy with positions ``x y z`` moved and normals ``nx ny nz`` rotated, wherever an element has them.
 
     Parameters
@@ -145,6 +182,9 @@ def transform_ply(source: Path, target: Path, similarity: Similarity) -> tuple[s
         Files; the target is written anew.
     similarity
         Target from source.
+    doubles
+        ``True`` gives positions of single precision double precision, where they come to lie too far away for it;
+        ``False`` takes that back; ``None`` keeps them as they are.
 
     Returns
     -------
@@ -163,15 +203,49 @@ def transform_ply(source: Path, target: Path, similarity: Similarity) -> tuple[s
         changed = () if vertices is None else _check_vertices(source, vertices)
         body = source.stat().st_size - len(header.raw)
         with open(target, "wb") as out:
-            out.write(header.raw)
+            made = _in_precision(header, doubles if changed else None)
+            out.write(made.raw)
             n_vertices = 0 if vertices is None else vertices.rows
             chunks: Iterator[bytes | memoryview]
             if header.order is None:
-                chunks = _ascii(source, file, header, similarity)
+                chunks = _ascii(source, file, header, similarity, made)
             else:
-                chunks = _binary(source, file, header, header.order, body, n_vertices, similarity)
+                chunks = _binary(source, file, header, made, body, n_vertices, similarity)
             out.writelines(chunks)
     return changed
+
+
+def sample_vertices(path: Path, most: int = 20_000) -> Array:
+    """(N, 3) positions of some vertices from all over a file; empty where it has none that can be told quickly.
+
+    Raises
+    ------
+    FormatError
+        Where it is no PLY file.
+    """
+    with open(path, "rb") as file:
+        header = read_ply_header(path, file)
+        first = header.elements[0] if header.elements else None
+        if first is None or first.name != "vertex" or first.has_list:
+            return np.empty((0, 3))
+        names = [p.name for p in first.properties]
+        if not set(names).issuperset(_POSITION):
+            return np.empty((0, 3))
+        if header.order is None:
+            columns = [names.index(name) for name in _POSITION]
+            lines = (file.readline(_LONGEST_LINE).split() for _ in range(first.rows))
+            rows = [line for i, line in enumerate(lines) if i % (first.rows // most + 1) == 0]
+            try:
+                return np.array([[float(row[c]) for c in columns] for row in rows]).reshape(-1, 3)
+            except (ValueError, IndexError):
+                return np.empty((0, 3))
+        dtype = first.dtype(header.order)
+        count = min(first.rows, (path.stat().st_size - len(header.raw)) // dtype.itemsize)
+        if count == 0:
+            return np.empty((0, 3))
+        mapped = np.memmap(path, dtype, mode="r", offset=len(header.raw), shape=(count,))
+        some = mapped[:: count // most + 1]
+        return np.stack([np.asarray(some[name], dtype=np.float64) for name in _POSITION], axis=1)
 
 
 def _check_vertices(path: Path, vertices: Element) -> tuple[str, ...]:
@@ -244,19 +318,20 @@ class Mover:
 
 
 def _binary(
-    path: Path, file: BufferedReader, header: Header, order: str, left: int, n_vertices: int, similarity: Similarity
+    path: Path, file: BufferedReader, header: Header, made: Header, left: int, n_vertices: int, similarity: Similarity
 ) -> Iterator[memoryview]:
-    for element in header.elements:
+    order = header.order or "<"
+    for element, new in zip(header.elements, made.elements, strict=True):
         smallest = sum(np.dtype(p.count or p.kind).itemsize for p in element.properties)
         if element.rows * smallest > left:
             raise FormatError(path, f"truncated: {element.rows} rows of {element.name} do not fit into the file")
+        before = file.tell()
         if element.has_list:
             walked = _binary_lists(path, file, element, order, n_vertices)
         else:
-            walked = _binary_rows(path, file, element, order, _mover(similarity, element))
-        for chunk in walked:
-            left -= len(chunk)
-            yield chunk
+            walked = _binary_rows(path, file, element, order, _mover(similarity, element), new.dtype(order))
+        yield from walked
+        left -= file.tell() - before
     if left != 0:
         raise FormatError(path, f"damaged: {left} bytes follow the last element")
 
@@ -268,16 +343,28 @@ def _read(path: Path, file: BufferedReader, buffer: memoryview, element: Element
 
 
 def _binary_rows(
-    path: Path, file: BufferedReader, element: Element, order: str, mover: Mover | SplatMover
+    path: Path,
+    file: BufferedReader,
+    element: Element,
+    order: str,
+    mover: Mover | SplatMover,
+    made: np.dtype[np.void],
 ) -> Iterator[memoryview]:
     dtype = element.dtype(order)
+    wide = max(dtype, made, key=lambda kind: kind.itemsize)
     per_chunk = max(1, _CHUNK_BYTES // dtype.itemsize)
     buffer = bytearray(min(per_chunk, element.rows) * dtype.itemsize)
     for start in range(0, element.rows, per_chunk):
         n = min(per_chunk, element.rows - start)
         data = _read(path, file, memoryview(buffer)[: n * dtype.itemsize], element)
-        mover(np.frombuffer(data, dtype))
-        yield data
+        if made == dtype:
+            mover(np.frombuffer(data, dtype))
+            yield data
+        else:
+            rows = np.frombuffer(data, dtype).astype(wide)
+            mover(rows)
+            with np.errstate(over="ignore"):
+                yield memoryview(rows.astype(made).tobytes())
 
 
 def _binary_lists(
@@ -330,14 +417,16 @@ def _lengths(path: Path, file: BufferedReader, element: Element, order: str) -> 
     return lengths
 
 
-def _ascii(path: Path, file: BufferedReader, header: Header, similarity: Similarity) -> Iterator[bytes]:
+def _ascii(path: Path, file: BufferedReader, header: Header, similarity: Similarity, made: Header) -> Iterator[bytes]:
     number = header.lines
     n_vertices = next((e.rows for e in header.elements if e.name == "vertex"), 0)
-    for element in header.elements:
+    for element, new in zip(header.elements, made.elements, strict=True):
         names = [p.name for p in element.properties]
         mover = _mover(similarity, element)
         columns = [names.index(name) for name in mover.names]
-        dtype = np.dtype([(name, element.properties[i].kind) for name, i in zip(mover.names, columns, strict=True)])
+        kinds = {p.name: (p.kind, q.kind) for p, q in zip(element.properties, new.properties, strict=True)}
+        dtype = np.dtype([(name, max(kinds[name])) for name in mover.names])
+        written = np.dtype([(name, kinds[name][1]) for name in mover.names])
         left = element.rows
         while left:
             lines = []
@@ -354,6 +443,8 @@ def _ascii(path: Path, file: BufferedReader, header: Header, similarity: Similar
             if columns:
                 table = np.array([tuple(float(row[2 * c + 1]) for c in columns) for row in rows], dtype)
                 mover(table)
+                with np.errstate(over="ignore"):
+                    table = table.astype(written)
                 for column, name in zip(columns, mover.names, strict=True):
                     # numpy's shortest text that reads back as the same number of this precision
                     for row, text in zip(rows, table[name].astype("S32").tolist(), strict=True):

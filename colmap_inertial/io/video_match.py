@@ -14,8 +14,8 @@ import numpy as np
 from colmap_inertial.core.arrays import Float32Array, UInt8Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.facts import Fact
-from colmap_inertial.io.files import path_in
 from colmap_inertial.io.images import grey_8bit, read_image
+from colmap_inertial.io.picture_names import picture_in
 from colmap_inertial.io.video import decode_grey
 
 
@@ -124,7 +124,7 @@ def match_to_video(
     FormatError
         For a picture or video that cannot be decoded.
     """
-    images = (grey_8bit(read_image(path_in(folder, name))) for name in names)
+    images = (grey_8bit(read_image(picture_in(folder, name))) for name in names)
     thumbnails = np.array([_thumbnail(image, _LIMITS.large_px) for image in images])
     turns: dict[int, _Candidates] = {}
     for seen, (t_ns, angle, grey) in enumerate(decode_grey(video), start=1):

@@ -6,6 +6,7 @@ import os
 import shutil
 import signal
 import sys
+import tempfile
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -29,10 +30,13 @@ from colmap_inertial.core.types import (
     SolvedMotion,
     Treatment,
 )
-from colmap_inertial.io.files import StrPath, check_names, convert_to_plain, read_json, reader, write_json
+from colmap_inertial.io.files import StrPath, convert_to_plain, read_json, reader, write_json
+from colmap_inertial.io.picture_names import check_image_names
 from colmap_inertial.model.pose_covariances import pose_covariances
+from colmap_inertial.model.references import check_references
 from colmap_inertial.model.rigs import list_posed_frames
-from colmap_inertial.model.soundness import check_binary_model, check_values
+from colmap_inertial.model.soundness import add_tracks, check_binary_model, check_values
+from colmap_inertial.model.text_model import count_images, text_model_as_binary
 
 if TYPE_CHECKING:
     import pycolmap
@@ -191,13 +195,15 @@ def num_registered(folder: Path) -> int:
     if suffix == ".bin":
         with open(file, "rb") as opened:
             return int.from_bytes(opened.read(8), "little")
-    with open(file, "rb") as opened:  # two lines for each image
-        return sum(not line.startswith(b"#") for line in opened) // 2
+    return count_images(file)
 
 
 @reader("a COLMAP model")
-def read_model(folder: StrPath, suffix: str | None = None) -> pycolmap.Reconstruction:
-    """Read a COLMAP model, binary or text.
+def read_model(folder: StrPath, suffix: str | None = None, *, unique_names: bool = True) -> pycolmap.Reconstruction:
+    """Read a COLMAP model, binary or text, whatever program wrote it.
+
+    What names something that the model lacks counts as naming nothing; the user is told
+    (:mod:`~colmap_inertial.model.notes`).
 
     Parameters
     ----------
@@ -205,6 +211,8 @@ def read_model(folder: StrPath, suffix: str | None = None) -> pycolmap.Reconstru
         The model.
     suffix
         ``".bin"`` or ``".txt"`` where it has to be this one; otherwise what ``model_format`` says.
+    unique_names
+        Whether images that share a name are refused; else the user is told.
 
     Raises
     ------
@@ -215,24 +223,39 @@ def read_model(folder: StrPath, suffix: str | None = None) -> pycolmap.Reconstru
     suffix = suffix or require_format(folder)
     if suffix == ".bin":
         check_binary_model(folder)
+        files = {path.stem: path.read_bytes() for path in model_files(folder, suffix)}
+    else:
+        files = text_model_as_binary(folder)
+    sound = check_references(files, folder, suffix, unique_names=unique_names)
     load_pycolmap()
     try:
-        reconstruction = _read_from(folder, suffix)
+        if suffix == ".bin" and not sound.changed:
+            reconstruction = _read_from(folder)
+        else:
+            reconstruction = _read_files({**files, **sound.changed})
     except (ValueError, RuntimeError, IndexError, MemoryError) as error:
         raise FormatError(folder, f"COLMAP cannot read this model: {error}") from error
     if reconstruction.num_reg_images() == 0:
         raise FormatError(folder, "the model has no registered image")
     check_values(reconstruction, folder, suffix)
-    check_names((image.name for image in reconstruction.images.values()), folder / f"images{suffix}")
+    check_image_names((image.name for image in reconstruction.images.values()), folder / f"images{suffix}")
+    add_tracks(reconstruction, sound.untracked, folder / f"points3D{suffix}")
     return reconstruction
 
 
-def _read_from(folder: Path, suffix: str) -> pycolmap.Reconstruction:
+def _read_from(folder: Path) -> pycolmap.Reconstruction:
     import pycolmap
 
     reconstruction = pycolmap.Reconstruction()
-    (reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text)(str(folder))
+    reconstruction.read_binary(str(folder))
     return reconstruction
+
+
+def _read_files(files: Mapping[str, bytes]) -> pycolmap.Reconstruction:
+    with tempfile.TemporaryDirectory(prefix="colmap-inertial-") as folder:
+        for name, data in files.items():
+            (Path(folder) / f"{name}.bin").write_bytes(data)
+        return _read_from(Path(folder))
 
 
 def colmap_camera(camera: CameraModel, camera_id: int = 1) -> pycolmap.Camera:
@@ -313,8 +336,16 @@ def similarity_as_json(similarity: Similarity) -> dict[str, object]:
 
 
 def is_metric(folder: Path) -> bool:
-    """Whether a folder's lengths were already changed by us."""
-    return (folder / TRANSFORM_FILE).is_file()
+    """Whether a folder's lengths were already changed by us: other programs' files may have that name."""
+    path = folder / TRANSFORM_FILE
+    if not path.is_file():
+        return False
+    try:
+        record = read_json(path)
+    except FormatError:
+        return False
+    ours = isinstance(record.get("provenance"), str) and ("rotation_xyzw" in record or "models" in record)
+    return ours
 
 
 def apply_similarity(source: StrPath, target: StrPath, similarity: Similarity) -> None:

@@ -10,7 +10,7 @@ import shutil
 import sqlite3
 import tempfile
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,6 +22,7 @@ from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.types import Similarity
 from colmap_inertial.io.files import reading
 from colmap_inertial.io.sqlite import open_foreign
+from colmap_inertial.io.stand_ins import refuse_stand_in
 
 SIDE_FILES = ("-wal", "-journal")
 _MATRIX = (
@@ -71,11 +72,18 @@ class PlacedModel:
         (3,) camera centre of each image, by name, before the similarity.
     sensors
         (3,) translation of ``sensor_from_rig``, by sensor type and id.
+    points
+        (N, 3) some of its points.
     """
 
     index: int
     centres: Mapping[str, Array]
     sensors: Mapping[tuple[int, int], Array]
+    points: Array = field(default_factory=lambda: np.empty((0, 3)))
+
+    def shown(self) -> Array:
+        """(N, 3) where its cameras and points are."""
+        return np.concatenate([np.array(list(self.centres.values())).reshape(-1, 3), self.points])
 
     def extent(self) -> float:
         """Diagonal of the box around the cameras."""
@@ -172,6 +180,7 @@ def copy_database(source: Path, target: Path) -> None:
         head = file.read(100)
     size = source.stat().st_size
     alone = not any(source.with_name(source.name + suffix).exists() for suffix in SIDE_FILES)
+    refuse_stand_in(source, head)
     if size and (len(head) < 100 or not head.startswith(b"SQLite format 3\0")):
         raise FormatError(source, "not an SQLite database")
     page = int.from_bytes(head[16:18], "big")

@@ -11,27 +11,34 @@ import numpy as np
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.types import Similarity
+from colmap_inertial.io.files import read_bytes
 from colmap_inertial.io.ply import transform_ply
+from colmap_inertial.io.stand_ins import is_apple_double
 from colmap_inertial.model import model_format, read_model, require_format
 from colmap_inertial.model.artefacts import check_map, transform_depth_map, transform_obj, transform_options
+from colmap_inertial.model.camera_files import (
+    bounds_cameras,
+    is_depth_params,
+    splat_cameras,
+    transform_bounds,
+    transform_depth_params,
+    transform_splat_cameras,
+)
 from colmap_inertial.model.database import PlacedModel, is_database
+from colmap_inertial.model.inventory import lengths_of
 from colmap_inertial.model.nerf import is_export, is_transforms, transform_export, transform_transforms
 
-#: Formats that carry length and are left as they are; the user is told.
-_SUFFIXES = (
-    *(".stl", ".off", ".glb", ".gltf", ".fbx", ".dae", ".las", ".laz", ".pcd", ".xyz", ".pts", ".e57", ".splat"),
-    *(".mvs", ".nvm", ".out", ".ksplat", ".spz", ".sog", ".tum"),
-)
-_NAMES = ("georeference.json", "cameras.csv")
 #: Kinds of files that have the shape of the model that they were made from.
-_SHAPED = ("depth map", "ply", "obj", "transforms", "export")
+_SHAPED = ("depth map", "ply", "obj", "transforms", "export", "splat cameras", "poses and bounds", "depth parameters")
+#: Kinds of files whose cameras tell whether they are of a model here.
+CAMERA_KINDS = ("transforms", "splat cameras", "poses and bounds")
 
 
-def foreign_kind(path: Path) -> str | None:
-    """Ending or name of a file that carries length and is left as it is, of which the user is told."""
-    if path.name in _NAMES:
-        return path.name
-    return suffix if (suffix := path.suffix.lower()) in _SUFFIXES else None
+def kind_to_move(file: Path, path: Path) -> str | None:
+    """Kind of a file whose lengths are moved; ``None`` for any other, and for what stands in for a file."""
+    if path.name.startswith("._") and is_apple_double(read_bytes(file, 4)):
+        return None
+    return kind_of(file, path)
 
 
 def kind_of(file: Path, path: Path) -> str | None:
@@ -50,6 +57,12 @@ def kind_of(file: Path, path: Path) -> str | None:
         return "transforms"
     if is_export(file):
         return "export"
+    if path.name == "cameras.json" and splat_cameras(file):
+        return "splat cameras"
+    if path.name == "poses_bounds.npy" and bounds_cameras(file):
+        return "poses and bounds"
+    if is_depth_params(file):
+        return "depth parameters"
     return {".ply": "ply", ".ini": "options"}.get(suffix) or ("database" if is_database(file) else None)
 
 
@@ -60,6 +73,9 @@ WRITERS: dict[str, Callable[[Path, Path, Similarity], tuple[str, ...]]] = {
     "options": transform_options,
     "transforms": transform_transforms,
     "export": transform_export,
+    "splat cameras": transform_splat_cameras,
+    "poses and bounds": transform_bounds,
+    "depth parameters": transform_depth_params,
 }
 
 
@@ -143,7 +159,10 @@ def find_made_from(root: Path, layout: Layout, files: Sequence[Path]) -> Path | 
     for path in sorted(files):
         if path.parent in layout.owners and path.parent not in own:
             return path
-        if foreign_kind(path) or (path.parent not in own and kind_of(root / path, path) in _SHAPED):
+        if (kind := kind_to_move(root / path, path)) in _SHAPED and path.parent not in own:
+            return path
+        lengths = None if kind is not None else lengths_of(root / path, path)
+        if lengths is not None and lengths[1] == "carried":
             return path
     return None
 
@@ -171,16 +190,24 @@ def _nearest_to_root(folders: list[Path]) -> list[Path]:
     return [folder for folder in folders if len(folder.parts) == depth]
 
 
+#: So many of a model's points tell where it is.
+_POINTS = 20_000
+
+
 def _placed(folder: Path, index: int) -> PlacedModel:
-    model = read_model(folder)
+    model = read_model(folder, unique_names=False)
     images = [model.image(i) for i in model.reg_image_ids()]
     sensors: dict[tuple[int, int], Array] = {}
     for rig in model.rigs.values():
         for sensor, pose in rig.non_ref_sensors.items():
             if pose is not None:
                 sensors[int(sensor.type), int(sensor.id)] = np.array(pose.translation)
+    points = [point.xyz for point in model.points3D.values()]
     return PlacedModel(
-        index=index, centres={image.name: image.projection_center() for image in images}, sensors=sensors
+        index=index,
+        centres={image.name: image.projection_center() for image in images},
+        sensors=sensors,
+        points=np.array(points[:: len(points) // _POINTS + 1]).reshape(-1, 3),
     )
 
 

@@ -6,7 +6,7 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,15 +18,18 @@ from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import DOWN_IN_WORLD, UNDOES, Similarity
 from colmap_inertial.io.files import read_json
+from colmap_inertial.model.camera_files import are_cameras_of
 from colmap_inertial.model.database import PlacedModel
 
 _MATRICES = ("transform_matrix", "transform_matrix_start", "transform_matrix_end")
+#: Depths between which a camera sees, as some programs have them.
+_RANGES = {"near", "far", "z_near", "z_far", "znear", "zfar", "near_plane", "far_plane"}
 #: What ``export.json`` says of itself, and of its unit: metres, or so many of them.
 EXPORT_FORMAT = "colmap-inertial export"
 _METRES = re.compile(r"(?:(\d\S*) )?m")
 #: What it says where there is no scale, and no gravity, until a similarity brings them.
 NOT_METRES = "unknown: not metres"
-NO_SCALE, NO_UP = Fact("units-not-metres"), Fact("up-unknown")
+NO_SCALE, NEVER_SCALED, NO_UP = Fact("units-not-metres"), Fact("units-never-scaled"), Fact("up-unknown")
 #: What it said before a similarity made it metres, and in that the provenance of this one.
 _BEFORE, _BY = "before_apply", "provenance"
 _NOTES_DETAILS = f"notes{DETAILS}"
@@ -50,22 +53,24 @@ def cameras_are_those_of(path: Path, placed: Sequence[PlacedModel]) -> bool:
     if values is None:
         return False
     back = np.linalg.inv(_applied(path, values))
-    centre_of = {
-        PurePosixPath(str(frame.get("file_path", ""))).name: (back @ _matrix(path, frame["transform_matrix"]))[:3, 3]
+    written = [
+        (str(frame.get("file_path", "")), (back @ _matrix(path, frame["transform_matrix"]))[:3, 3])
         for frame in values["frames"]
-    }
-    # some leave out the ending
-    centre_of |= {PurePosixPath(name).stem: centre for name, centre in centre_of.items()}
-    for model in placed:
-        pairs = []
-        for name, centre in model.centres.items():
-            image = PurePosixPath(name)
-            if (written := centre_of.get(image.name, centre_of.get(image.stem))) is not None:
-                pairs.append((centre, written))
-        enough = 2 * len(pairs) >= min(len(model.centres), len(values["frames"])) > 0
-        if enough and model.has_cameras_at(pairs):
-            return True
-    return False
+    ]
+    return any(are_cameras_of(model, written) for model in placed)
+
+
+def applied_transform(path: Path) -> Array | None:
+    """(4, 4) what was done to the model's world in a ``transforms.json``; ``None`` for any other file."""
+    values = _frames(path)
+    return None if values is None else _applied(path, values)
+
+
+def depth_pictures(path: Path) -> set[str]:
+    """Pictures of depths that a ``transforms.json`` names, as paths relative to it."""
+    values = _frames(path)
+    frames = [] if values is None else values["frames"]
+    return {str(frame["depth_file_path"]) for frame in frames if frame.get("depth_file_path")}
 
 
 def transform_transforms(source: Path, target: Path, similarity: Similarity) -> tuple[str, ...]:
@@ -87,6 +92,11 @@ def transform_transforms(source: Path, target: Path, similarity: Similarity) -> 
     moving = applied @ moving @ np.linalg.inv(applied)
     rotation = moving[:3, :3] / similarity.scale
     changed = ["cameras"]
+    for fields in (values, *values["frames"]):
+        for name in _RANGES & fields.keys():
+            if isinstance(fields[name], int | float) and not isinstance(fields[name], bool):
+                fields[name] *= similarity.scale
+                changed.append("depth ranges")
     for frame in values["frames"]:
         for name in _MATRICES:
             if name in frame:
@@ -173,7 +183,7 @@ def _describe_metres(values: Mapping[str, Any], similarity: Similarity) -> dict[
     up = _up(similarity) if up is None else up
     sigma = math.sqrt(similarity.cov[0, 0])
     factor = math.exp(Z95 * sigma)
-    outdated = {NO_SCALE.code} if up is None else {NO_SCALE.code, NO_UP.code}
+    outdated = {NO_SCALE.code, NEVER_SCALED.code, *(() if up is None else (NO_UP.code,))}
     notes = [note for note in read_facts(values, "notes") if note.code not in outdated]
     return {
         "unit": "m",

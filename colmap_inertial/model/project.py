@@ -7,18 +7,16 @@ import fnmatch
 import functools
 import shutil
 from collections import Counter
-from collections.abc import Callable, Collection, Generator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextvars import copy_context
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from colmap_inertial import __version__
-from colmap_inertial.core.errors import AlreadyMetricError, FormatError, InertialError, NotObservableError, OutputError
+from colmap_inertial.core.errors import AlreadyMetricError, FormatError, OutputError
 from colmap_inertial.core.facts import Fact, with_sentences
 from colmap_inertial.core.summary import prints_in_lines
-from colmap_inertial.core.threads import one_blas_thread, usable_processors
+from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import Similarity
 from colmap_inertial.io.files import StrPath, read_json, write_json
 from colmap_inertial.model import (
@@ -31,23 +29,19 @@ from colmap_inertial.model import (
     transformed,
     write_files,
 )
-from colmap_inertial.model.copying import begin_writing, copy_file, list_tree, new_folder
+from colmap_inertial.model.assigning import assign_scales, compare_models, put_about_places, require_free_records
+from colmap_inertial.model.copying import copy_file, list_tree, new_folder
 from colmap_inertial.model.database import SHARED_MEMORY, SIDE_FILES, is_database, transform_database
 from colmap_inertial.model.deregistration import deregister_images
-from colmap_inertial.model.layout import WRITERS, Layout, foreign_kind, kind_of, read_layout
-from colmap_inertial.model.nerf import cameras_are_those_of
+from colmap_inertial.model.file_jobs import Change, copy, files_of_models, side_by_side, transform
+from colmap_inertial.model.inventory import Inventory, Unmoved, lengths_of
+from colmap_inertial.model.keeping import Kept
+from colmap_inertial.model.layout import CAMERA_KINDS, Layout, kind_to_move, read_layout
+from colmap_inertial.model.notes import collecting_notes
+from colmap_inertial.model.places import Place
 from colmap_inertial.model.similarities import ModelScale, require_not_joined, similarity_from_json, undoing
 from colmap_inertial.model.soundness import check_binary_model
-
-
-@dataclass(frozen=True, kw_only=True)
-class Change:
-    """Change of one file or model folder: its path in the project, its kind, the change, and the model of its frame."""
-
-    path: str
-    kind: str
-    changed: tuple[str, ...]
-    model: int | None
+from colmap_inertial.model.worlds import Worlds
 
 
 @prints_in_lines
@@ -65,6 +59,8 @@ class Applied:
         Number of other files, by how they came over: ``copied``, ``reflinked``, ``linked``, ``link``.
     notes
         What the user should know.
+    unmoved
+        Other files that have lengths, or may have, by kind.
     """
 
     out: Path
@@ -72,6 +68,7 @@ class Applied:
     changes: tuple[Change, ...]
     unchanged: Mapping[str, int]
     notes: tuple[Fact, ...]
+    unmoved: tuple[Unmoved, ...] = ()
 
 
 def apply_to_project(
@@ -83,6 +80,8 @@ def apply_to_project(
     keep: Sequence[str] = (),
     follow_links: bool = False,
     only_metric: bool = False,
+    about_origin: bool = True,
+    any_model: bool = False,
     progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> Applied:
     """Write a copy of a COLMAP project in which everything that carries length is transformed.
@@ -108,6 +107,11 @@ def apply_to_project(
         Copy what symbolic links out of the project lead to; without, they are refused.
     only_metric
         Leave out sub-models with a refused scale and what was made from them; without, they keep their own units.
+    about_origin
+        Whether similarities act about the origin, as they say, also on models that lie far from it; else about a point
+        in their middle, which stays.
+    any_model
+        Whether scales of other models are taken, too.
     progress
         Called with the number of files done and of all.
 
@@ -124,21 +128,27 @@ def apply_to_project(
         When ``out`` exists or cannot be written.
     """
     project, out = Path(project), Path(out)
-    work = _Work(project, out, keep, follow_links)
-    for folder in (Path(), *work.folders):
-        if not work.is_kept(folder / TRANSFORM_FILE) and is_metric(project / folder):
-            provenance = read_json(project / folder / TRANSFORM_FILE).get("provenance", "unknown")
-            raise AlreadyMetricError(
-                f"{project / folder} already holds a metric scale ({provenance}); apply it to COLMAP's own project, "
-                "or take it back with --undo"
-            )
-    common = scales if isinstance(scales, Similarity) else None
-    layout = read_layout(project, work.open_folders(), one_for_all=common is not None)
-    by_model = _assign_scales(project, layout, scales)
-    left_out = [index for index, scale in by_model.items() if only_metric and scale.similarity is None]
-    work.leave_out(layout, left_out)
-    plan = _Plan(layout=layout, by_model=by_model, one_for_all=common, left_out=left_out, link=link)
-    return work.run(plan, progress)
+    with collecting_notes() as read:
+        work = _Work(project, out, keep, follow_links, read)
+        for folder in (Path(), *work.folders):
+            if not work.is_kept(folder / TRANSFORM_FILE) and is_metric(project / folder):
+                provenance = read_json(project / folder / TRANSFORM_FILE).get("provenance", "unknown")
+                raise AlreadyMetricError(
+                    f"{project / folder} already holds a metric scale ({provenance}); apply it to COLMAP's own "
+                    "project, or take it back with --undo"
+                )
+        common = scales if isinstance(scales, Similarity) else None
+        layout = read_layout(project, work.open_folders(), one_for_all=common is not None)
+        require_free_records(project, layout)
+        by_model = assign_scales(project, layout, scales)
+        work.note(compare_models(layout, by_model, any_model=any_model))
+        by_model, facts = put_about_places(layout, by_model, about_origin=about_origin, one_for_all=common is not None)
+        work.note(facts)
+        common = None if common is None else next(iter(by_model.values())).similarity
+        left_out = [index for index, scale in by_model.items() if only_metric and scale.similarity is None]
+        work.leave_out(layout, left_out)
+        plan = _Plan(layout=layout, by_model=by_model, one_for_all=common, left_out=left_out, link=link)
+        return work.run(plan, progress)
 
 
 def undo_project(
@@ -172,37 +182,14 @@ def undo_project(
         index: ModelScale(similarity=None if fields is None else undoing(similarity_from_json(path, fields)))
         for index, fields in models
     }
-    work = _Work(project, out, keep, follow_links, beside)
-    common = undoing(similarity_from_json(path, record)) if record.get("one_for_all") is True else None
-    layout = read_layout(project, work.open_folders(), one_for_all=common is not None)
-    if layout.submodels.keys() != by_model.keys():
-        raise FormatError(path, "the models of the project are not those that it records")
-    plan = _Plan(layout=layout, by_model=by_model, one_for_all=common, databases=databases, link=link, is_undo=True)
-    return work.run(plan, progress)
-
-
-def _assign_scales(
-    project: Path, layout: Layout, scales: Similarity | Mapping[int | None, ModelScale]
-) -> dict[int, ModelScale]:
-    if isinstance(scales, Similarity):
-        return {index: ModelScale(similarity=scales) for index in layout.submodels}
-    numbers = ", ".join(str(i) for i in layout.submodels)
-    if None in scales:
-        if len(layout.submodels) > 1:
-            raise InertialError(
-                f"{project} has the sub-models {numbers}, each with a scale of its own: "
-                "give one for each, --scale NUMBER=FILE"
-            )
-        scales = {next(iter(layout.submodels)): scales[None]}
-    if all(scale.similarity is None for scale in scales.values()):
-        raise NotObservableError(
-            "scale", "; ".join(str(reason) for scale in scales.values() for reason in scale.reasons)
-        )
-    missing = [index for index in layout.submodels if index not in scales]
-    if missing or len(scales) > len(layout.submodels):
-        given = ", ".join(str(i) for i in scales)
-        raise InertialError(f"{project} has the sub-models {numbers}, but there are scales of {given}")
-    return {index: scales[index] for index in layout.submodels}
+    with collecting_notes() as read:
+        work = _Work(project, out, keep, follow_links, read, beside)
+        common = undoing(similarity_from_json(path, record)) if record.get("one_for_all") is True else None
+        layout = read_layout(project, work.open_folders(), one_for_all=common is not None)
+        if layout.submodels.keys() != by_model.keys():
+            raise FormatError(path, "the models of the project are not those that it records")
+        plan = _Plan(layout=layout, by_model=by_model, one_for_all=common, databases=databases, link=link, is_undo=True)
+        return work.run(plan, progress)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -235,6 +222,12 @@ class _Plan:
     link: bool = False
     is_undo: bool = False
 
+    def lies_far(self, owner: int | None, move: Similarity) -> bool:
+        """Whether files of a model come to lie too far from the origin for single precision."""
+        models = [model for model in self.layout.placed if owner is None or model.index == owner]
+        places = [Place.of(model.shown()) for model in models]
+        return any(place is not None and place.moved(move).is_far for place in places)
+
     @property
     def similarities(self) -> dict[int, Similarity | None]:
         """Similarities by sub-model."""
@@ -245,14 +238,20 @@ class _Work:
     """One copy of a project, file by file."""
 
     def __init__(
-        self, project: Path, out: Path, keep: Sequence[str], follow_links: bool, beside: Sequence[str] = ()
+        self,
+        project: Path,
+        out: Path,
+        keep: Sequence[str],
+        follow_links: bool,
+        read: Sequence[tuple[Path, Fact]],
+        beside: Sequence[str] = (),
     ) -> None:
         if not project.is_dir():
             raise FormatError(project, "no such folder")
         inner, outer = out.resolve(), project.resolve()
         if inner.is_relative_to(outer) or outer.is_relative_to(inner):
             raise OutputError(f"{out} and {project} lie within each other; choose a folder elsewhere")
-        self._project, self._out, self._keep = project, out, tuple(keep)
+        self._project, self._out, self._keep, self._read = project, out, Kept(tuple(keep), project), read
         tree = list_tree(project, follow_links=follow_links)
         self.folders, self._files, self._links = (
             [p for p in paths if not any(fnmatch.fnmatch(p.parts[0], pattern) for pattern in beside)] for paths in tree
@@ -260,11 +259,16 @@ class _Work:
         self._changes: list[Change] = []
         self._databases: dict[str, dict[str, Any]] = {}
         self._notes: list[Fact] = []
-        self._foreign: Counter[str] = Counter()
+        self._inventory = Inventory()
+        self.note(self._keep.idle_patterns((*self.folders, *self._files, *self._links)))
 
     def is_kept(self, path: Path) -> bool:
         """Whether a path, or a folder above it, is to be copied as it is."""
-        return any(fnmatch.fnmatch(str(p), pattern) for p in (path, *path.parents[:-1]) for pattern in self._keep)
+        return self._keep.covers(path)
+
+    def note(self, facts: Iterable[Fact]) -> None:
+        """Tell the user."""
+        self._notes += [Fact("noted-with-advice", found=fact) for fact in facts]
 
     def open_folders(self) -> list[Path]:
         """Folders that are not kept as they are."""
@@ -300,7 +304,7 @@ class _Work:
                 if not self._write_database(path, partial, plan):
                     unchanged["copied"] += 1
                 progress(done := done + 1, total)
-            with contextlib.closing(_side_by_side(jobs)) as outcomes:
+            with contextlib.closing(side_by_side(jobs)) as outcomes:
                 for outcome in outcomes:
                     if isinstance(outcome, Change):
                         self._changes.append(outcome)
@@ -309,8 +313,10 @@ class _Work:
                     progress(done := done + 1, total)
             for folder in reversed(self.folders):
                 shutil.copymode(self._project / folder, partial / folder)
-            if self._foreign:
-                self._notes.append(Fact("formats-not-transformed", counts=sorted(self._foreign.items())))
+            scales = [s.similarity.scale for s in plan.by_model.values() if s.similarity is not None]
+            self.note(self._inventory.notes(scales))
+            of_files = ((str(self._in_project(path)), fact) for path, fact in self._read)
+            self._notes += [Fact("read-all-the-same", file=file, found=fact) for file, fact in of_files]
             submodels = plan.layout.submodels
             for index, scale in plan.by_model.items():
                 if scale.left_out and scale.similarity is not None:
@@ -321,7 +327,8 @@ class _Work:
                 models={i: (str(submodels[i]), s) for i, s in plan.by_model.items() if i not in plan.left_out},
                 changes=tuple(self._changes),
                 unchanged=dict(unchanged),
-                notes=tuple(self._notes),
+                notes=tuple(dict.fromkeys(self._notes)),
+                unmoved=self._inventory.unmoved,
             )
             if not plan.is_undo:
                 write_json(partial / TRANSFORM_FILE, self._record(applied, plan.one_for_all))
@@ -329,39 +336,45 @@ class _Work:
 
     def _sort_files(self, plan: _Plan, partial: Path) -> tuple[list[Path], list[Callable[[], Change | str]]]:
         """The databases, and the work on every other file that COLMAP does not write itself."""
-        skipped = _model_files(self._project, plan.layout.owners)
+        skipped = files_of_models(self._project, plan.layout.owners)
         if plan.is_undo:
             skipped |= {folder / TRANSFORM_FILE for folder in (Path(), *plan.layout.owners)}
         similarities = plan.similarities
         databases: list[Path] = []
         jobs: list[Callable[[], Change | str]] = []
-        for path in self._files:
-            if path in skipped or self._is_side_file(path):
-                continue
-            kind = None if self.is_kept(path) else kind_of(self._project / path, path)
+        files = [path for path in self._files if path not in skipped and not self._is_side_file(path)]
+        worlds = Worlds(
+            self._project,
+            plan.layout.placed,
+            [path for path in files if not self.is_kept(path)],
+            lambda fact: self.note([fact]),
+        )
+        for path in files:
+            source, target = self._project / path, partial / path
+            kind = None if self.is_kept(path) else kind_to_move(source, path)
             if kind == "database":
                 databases.append(path)
                 continue
-            if kind == "transforms" and not self._is_of_a_model(plan.layout, path):
+            if kind in CAMERA_KINDS and not worlds.is_of_a_model(path, str(kind)):
                 kind = None
             owner = None if plan.one_for_all is not None or kind is None else self._owner(plan.layout, path)
             similarity = plan.one_for_all if owner is None else similarities[owner]
-            other = None if kind is not None or self.is_kept(path) else foreign_kind(path)
-            if other is not None:
-                self._foreign[other] += 1
-            source, target = self._project / path, partial / path
+            if kind is None and not self.is_kept(path):
+                lengths = lengths_of(source, path, worlds.depths)
+                if lengths is not None:
+                    self._inventory.add(path, *lengths)
             if kind is None or similarity is None:
-                jobs.append(functools.partial(_copy, source, target, link=plan.link))
+                jobs.append(functools.partial(copy, source, target, link=plan.link))
             else:
-                jobs.append(functools.partial(_transform, source, target, kind, similarity, (str(path), owner)))
+                move = worlds.similarity_of(path, kind, owner, similarity)
+                doubles = False if plan.is_undo else (plan.lies_far(owner, move) or None)
+                place = (str(path), owner)
+                jobs.append(functools.partial(transform, source, target, kind, move, place, doubles=doubles))
         return databases, jobs
 
-    def _is_of_a_model(self, layout: Layout, path: Path) -> bool:
-        """Whether a NeRF trainer's cameras are those of a model here; the user is told where they are not."""
-        if cameras_are_those_of(self._project / path, layout.placed):
-            return True
-        self._notes.append(Fact("cameras-elsewhere", file=str(path)))
-        return False
+    def _in_project(self, path: Path) -> Path:
+        """A path as it is in the project, also of what was read from the copy."""
+        return path.relative_to(self._project) if path.is_relative_to(self._project) else path
 
     def _owner(self, layout: Layout, path: Path) -> int:
         owner = layout.owner(path)
@@ -385,7 +398,7 @@ class _Work:
         source, target = self._project / folder, partial / folder
         similarity = plan.one_for_all or plan.by_model[index].similarity
         for suffix in model_formats(source):
-            model = read_model(source, suffix)
+            model = read_model(source, suffix, unique_names=False)
             left_out = plan.by_model[index].left_out
             if left_out and similarity is not None:
                 model = deregister_images(model, left_out)
@@ -400,7 +413,7 @@ class _Work:
                 if suffix == ".bin":
                     check_binary_model(target)
                 else:
-                    again = read_model(target, suffix)
+                    again = read_model(target, suffix, unique_names=False)
                     if (again.num_reg_images(), again.num_points3D()) != counts:
                         raise FormatError(target, "truncated")
             except (FormatError, ValueError, RuntimeError) as error:
@@ -449,7 +462,7 @@ class _Work:
             "one_for_all": common is not None,
             "source": str(self._project.resolve()),
             "version": __version__,
-            "keep": list(self._keep),
+            "keep": list(self._keep.patterns),
             "models": [
                 {"index": index, "folder": folder, **scale.as_json()}
                 for index, (folder, scale) in applied.models.items()
@@ -457,44 +470,6 @@ class _Work:
             "databases": self._databases,
             "files": [asdict(change) for change in applied.changes],
             "unchanged": applied.unchanged,
+            "unmoved": self._inventory.as_json(),
             **with_sentences({"notes": list(applied.notes)}),
         }
-
-
-def _copy(source: Path, target: Path, *, link: bool) -> str:
-    """Copy a file, and return how."""
-    how = copy_file(source, target, link=link)
-    if how == "copied":
-        begin_writing(target)
-    return how
-
-
-def _transform(
-    source: Path, target: Path, kind: str, similarity: Similarity, place: tuple[str, int | None]
-) -> Change | str:
-    """Transform one file; ``place`` is its path in the project and the sub-model that owns it."""
-    changed = WRITERS[kind](source, target, similarity)
-    begin_writing(target)
-    shutil.copymode(source, target)
-    return Change(path=place[0], kind=kind, changed=changed, model=place[1]) if changed else "copied"
-
-
-def _side_by_side(jobs: Sequence[Callable[[], Change | str]]) -> Generator[Change | str, None, None]:
-    """Results of the jobs in their order; a few at a time, as disk and processor take turns within one."""
-    with ThreadPoolExecutor(max_workers=min(4, usable_processors())) as pool:
-        try:
-            for future in [pool.submit(copy_context().run, job) for job in jobs]:
-                yield future.result()
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-
-
-def _model_files(project: Path, models: Collection[Path]) -> set[Path]:
-    """The files of COLMAP's models, which COLMAP reads and writes itself."""
-    return {
-        path.relative_to(project)
-        for folder in models
-        for suffix in model_formats(project / folder)
-        for path in model_files(project / folder, suffix)
-    }

@@ -19,6 +19,10 @@ from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.types import UNDOES, ScaleEstimate, Similarity
 from colmap_inertial.io.files import StrPath, read_json, reader, reading
 from colmap_inertial.model import similarity_as_json
+from colmap_inertial.model.identity import ModelIdentity, identity_from_json
+
+#: What an estimate's file says of the model that it is of.
+OF_MODEL = "of_model"
 
 
 @prints_in_lines
@@ -36,6 +40,10 @@ class ModelScale:
         The sub-models whose images it holds as well since it was joined of them; empty where it is one by itself.
     left_out
         Images that are not in the metric model, as they contradict the gyroscope.
+    identity
+        Of which model it is, where that is known.
+    of_file
+        Whether it was read from a file.
     """
 
     similarity: Similarity | None
@@ -43,6 +51,8 @@ class ModelScale:
     reasons: tuple[Fact, ...] = ()
     joined_of: tuple[int, ...] = ()
     left_out: tuple[str, ...] = ()
+    identity: ModelIdentity | None = None
+    of_file: bool = False
 
     def __post_init__(self) -> None:
         set_fields(self, reasons=tuple(map(as_fact, self.reasons)))
@@ -260,7 +270,14 @@ def _model_scale(path: Path, fields: Any, world: WorldAxes) -> ModelScale:
         provenance = f"inertial scale, method {estimate.method}, {estimate.verdict}, from {path.name}"
         similarity = Similarity.from_scale(estimate, world=world, provenance=provenance)
     left_out = () if similarity is None else _read_left_out(path, fields.get("rotations"))
-    return ModelScale(similarity=similarity, verdict=estimate.verdict, reasons=estimate.reasons, left_out=left_out)
+    return ModelScale(
+        similarity=similarity,
+        verdict=estimate.verdict,
+        reasons=estimate.reasons,
+        left_out=left_out,
+        identity=identity_from_json(path, fields.get(OF_MODEL)),
+        of_file=True,
+    )
 
 
 def _read_left_out(path: Path, rotations: Any) -> tuple[str, ...]:

@@ -13,17 +13,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.sensor_yaml import CAMERA_MODELS
+from colmap_inertial.io.stand_ins import refuse_stand_in
+from colmap_inertial.model.lenses import farthest_corner_px, find_fold
+from colmap_inertial.model.notes import take_note
 
 if TYPE_CHECKING:
     import pycolmap
 
 
 #: Number of parameters of COLMAP's camera models, by id; the last one is EQUIRECTANGULAR, which no capture has.
-_CAMERA_PARAMETERS = (*(count for count, _ in CAMERA_MODELS.values()), 2)
+NUM_PARAMETERS = (*(count for count, _ in CAMERA_MODELS.values()), 2)
 #: No camera, pose or point has a number as large as this.
 LARGEST = 1e12
 _U32, _U64 = struct.Struct("<I"), struct.Struct("<Q")
@@ -48,6 +53,7 @@ def check_binary_model(folder: Path) -> None:
         if not path.is_file():
             continue
         size = path.stat().st_size
+        refuse_stand_in(path)
         if size < _U64.size:
             raise FormatError(path, "truncated")
         with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
@@ -70,11 +76,11 @@ def _cameras(data: mmap.mmap, count: int) -> int:
     at = 8
     for _ in range(count):
         _, model, width, height = _CAMERA.unpack_from(data, at)
-        if not 0 <= model < len(_CAMERA_PARAMETERS):
+        if not 0 <= model < len(NUM_PARAMETERS):
             raise _Damaged(f"camera model {model} is unknown")
         if not (0 < width < 2**31 and 0 < height < 2**31):
             raise _Damaged(f"a camera of {width} x {height} pixels")
-        at += 24 + 8 * _CAMERA_PARAMETERS[model]
+        at += 24 + 8 * NUM_PARAMETERS[model]
     return at
 
 
@@ -154,6 +160,7 @@ def check_values(reconstruction: pycolmap.Reconstruction, folder: Path, suffix: 
             raise FormatError(
                 path, f"camera {camera_id} ({camera.model.name}) cannot be: {camera.params_info} = {_listed(params)}"
             )
+        _note_odd_lens(camera, path)
     for image_id in reconstruction.reg_image_ids():
         image = reconstruction.image(image_id)
         pose = image.cam_from_world()
@@ -168,6 +175,63 @@ def check_values(reconstruction: pycolmap.Reconstruction, folder: Path, suffix: 
         for point_id, point in reconstruction.points3D.items():
             if not _sane(point.xyz):
                 raise FormatError(folder / "points3D.txt", f"point {point_id} lies at {_listed(point.xyz)}")
+
+
+def _note_odd_lens(camera: pycolmap.Camera, path: Path) -> None:
+    """Tell of a lens that folds within its pictures, and of a principal point outside of them."""
+    if camera.is_spherical():
+        return
+    named = {"camera": int(camera.camera_id)}
+    cx, cy = float(camera.principal_point_x), float(camera.principal_point_y)
+    if not (0 <= cx <= camera.width and 0 <= cy <= camera.height):
+        fact = Fact("odd-principal-point", **named, width=int(camera.width), height=int(camera.height), cx=cx, cy=cy)
+        take_note(path, fact)
+        return
+    fold, corner_px = find_fold(camera), farthest_corner_px(camera)
+    if fold is not None and fold.radius_px < corner_px:
+        values = {"radius_px": fold.radius_px, "corner_px": corner_px}
+        take_note(path, Fact("folded-lens", **named, model=camera.model.name, **values))
+
+
+#: Key points farther from where their points are seen do not see these, pixels (median).
+_SAME_POINT_PX = 8.0
+
+
+def add_tracks(reconstruction: pycolmap.Reconstruction, observations: NDArray[np.int64], path: Path) -> None:
+    """Give points that name no images the key points that name them, where these see them.
+
+    Parameters
+    ----------
+    reconstruction
+        Is changed.
+    observations
+        (N, 3) image, key point and point.
+    path
+        Of the points, for the note.
+    """
+    import pycolmap
+
+    if not len(observations):
+        return
+    errors = []
+    for image_id in np.unique(observations[:, 0]).tolist():
+        rows = observations[observations[:, 0] == image_id]
+        image = reconstruction.image(image_id)
+        if not image.has_pose:
+            continue
+        world = np.array([reconstruction.point3D(number).xyz for number in rows[:, 2].tolist()])
+        pose = image.cam_from_world()
+        cam = world @ pose.rotation.matrix().T + pose.translation
+        seen = np.asarray(reconstruction.camera(image.camera_id).img_from_cam(cam), dtype=np.float64)
+        where = np.array([image.point2D(index).xy for index in rows[:, 1].tolist()])
+        errors.append(np.linalg.norm(seen - where, axis=1))
+    found = np.concatenate(errors) if errors else np.empty(0)
+    if not len(found) or not np.nanmedian(np.where(np.isfinite(found), found, np.inf)) <= _SAME_POINT_PX:
+        take_note(path, Fact("lost-points", count=len(observations), points=len(np.unique(observations[:, 2]))))
+        return
+    for image_id, index, point in observations.tolist():
+        reconstruction.add_observation(point, pycolmap.TrackElement(image_id, index))
+    take_note(path, Fact("tracks-from-images", count=len(observations)))
 
 
 def _sane(numbers: Array) -> bool:

@@ -48,6 +48,7 @@ def explain_failure(search: Search, images: Path) -> Exception:
         Fact(
             "target-nowhere-alike",
             spec=target.spec,
+            kind=target.kind,
             images=len(seen),
             residual_px=search.options.max_residual_px,
         )
@@ -158,6 +159,8 @@ def _count_boards(images: Mapping[int, UInt8Array], size: tuple[int, int], targe
 
 
 def _hint_at_absence(search: Search) -> Fact:
+    if search.target.kind == "aprilgrid":
+        return Fact("aprilgrid-in-doubt")
     if search.target.kind != "checkerboard":
         return Fact("target-description-in-doubt")
     votes = _vote_on_sizes(_images_of_hints(search), {})

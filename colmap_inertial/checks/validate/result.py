@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from colmap_inertial.checks.validate.contradictions import find_contradictions
 from colmap_inertial.checks.validate.fit import FIT
 from colmap_inertial.checks.validate.targets import Target
 from colmap_inertial.checks.words import target_facts
@@ -411,7 +412,8 @@ class Validation:
                     longest_m=lengths.longest_m,
                 )
             )
-        return tuple(doubts)
+        found = find_contradictions(self.target, self.distances, self.views, self.tolerance_pct)
+        return (*doubts, *(fact.with_advice for fact in found))
 
     def as_json(self) -> dict[str, Any]:
         """Everything but pixel coordinates, ready for ``json.dump``."""

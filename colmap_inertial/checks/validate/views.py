@@ -12,8 +12,9 @@ from colmap_inertial.checks.validate.detect import DETECTION, Detection
 from colmap_inertial.core.arrays import Array, IndexArray, UInt8Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.facts import Fact
-from colmap_inertial.io.files import path_in, read_bytes
+from colmap_inertial.io.files import read_bytes
 from colmap_inertial.io.images import require_modest
+from colmap_inertial.io.picture_names import picture_in
 from colmap_inertial.model import model_format, read_model
 
 if TYPE_CHECKING:
@@ -143,7 +144,7 @@ def load_views(model: Path | pycolmap.Reconstruction, images: Path) -> tuple[lis
     middle = np.median([image.projection_center() for image in posed], axis=0)
     views, missing = [], dict[str, Fact]()
     for image in posed:
-        path = path_in(images, image.name, model if isinstance(model, Path) else None)
+        path = picture_in(images, image.name, model if isinstance(model, Path) else None)
         if not path.is_file():
             missing[image.name] = Fact("view-without-file")
             continue

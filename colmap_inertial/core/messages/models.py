@@ -309,4 +309,8 @@ def heights_not_of_ellipsoid(height_above: str | None) -> str:
 # Exports without metres or up.
 
 state("units-not-metres", "the scale was refused: units are not metres, and nothing here says how large anything is")
+state(
+    "units-never-scaled",
+    "this model was never given a scale: units are not metres, and nothing here says how large anything is",
+)
 state("up-unknown", "the direction of gravity is not known: up is only taken for z")

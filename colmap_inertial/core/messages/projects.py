@@ -233,6 +233,11 @@ state(
     "target-description-in-doubt", "is the description right, and is the target large and sharp enough in the images?"
 )
 state(
+    "aprilgrid-in-doubt",
+    "its tags are those of kalibr, 36h11 from number 0 on with a black border of two bits: are those of yours, and is "
+    "the target large and sharp enough in the images?",
+)
+state(
     "inner-corners",
     "COLSxROWS counts inner corners, one less than squares; the whole board must be in view, with a white rim",
 )
@@ -243,12 +248,19 @@ def other_board_visible(columns: int, rows: int) -> str:
     return f"a board with {columns}x{rows} inner corners is visible: is the size in the description right?"
 
 
-@message(example={"spec": "checkerboard:9x6:0.025", "images": 30, "residual_px": 20.0})
-def target_nowhere_alike(spec: str, images: int, residual_px: float) -> str:
+#: What else than moving places a target that is found in many images nowhere, the likelier first, by its kind.
+_PLACED_NOWHERE = {
+    "aprilgrid": "columns and rows may be swapped (COLSxROWS of tags), or the tags not numbered row by row from the "
+    "lower left one, as kalibr has them; else wrong poses",
+}
+
+
+@message(example={"spec": "checkerboard:9x6:0.025", "kind": "checkerboard", "images": 30, "residual_px": 20.0})
+def target_nowhere_alike(spec: str, kind: str, images: int, residual_px: float) -> str:
     return (
         f"{spec} was found in {images} images, but no two of them agree on where it is in the model "
-        f"(to {residual_px:g} px): false detections, wrong poses, a target that moved between the "
-        "images, or images that do not belong to this model"
+        f"(to {residual_px:g} px): {_PLACED_NOWHERE.get(kind, 'false detections, wrong poses')}, a target that moved "
+        "between the images, or images that do not belong to this model"
     )
 
 

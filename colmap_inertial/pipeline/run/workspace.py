@@ -155,6 +155,8 @@ class Workspace:
         """
         if self.root.exists() and not self.root.is_dir():
             raise OutputExistsError(f"{self.root} is a file; choose another output folder")
+        if not os.path.lexists(self.owner):  # whose links are none of ours to speak of
+            self._require_empty()
         refuse_links(self.root)
         identity: dict[str, str | int] = {"capture": str(source.resolve()), "command": command, "layout": _LAYOUT}
         if self.owner.is_file():
@@ -175,13 +177,18 @@ class Workspace:
                         f"{self.root} holds a run of another {what} ({known.get(what)}); choose another folder or "
                         "remove it"
                     )
-        elif self.root.is_dir() and any(p.name != self.stamps.name for p in self.root.iterdir()):
-            raise OutputExistsError(f"{self.root} is not empty; choose another output folder")
+        else:
+            self._require_empty()
         try:
             self.stamps.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise OutputError(f"{self.root} cannot be made: {error.strerror or error}") from error
         return identity
+
+    def _require_empty(self) -> None:
+        """Raise :class:`OutputExistsError` where a folder that is not ours holds anything."""
+        if self.root.is_dir() and any(p.name != self.stamps.name for p in self.root.iterdir()):
+            raise OutputExistsError(f"{self.root} is not empty; choose another output folder")
 
     def unfinish(self) -> None:
         """Something is made again: what the result says no longer stands."""

@@ -244,10 +244,18 @@ def _same_memory(a: AnyArray, b: AnyArray) -> bool:
     return a.__array_interface__ == b.__array_interface__
 
 
-def encode_image(target: Path, image: AnyArray, original: Path | None = None, *, moved: bool = False) -> None:
+def encode_image(
+    target: Path,
+    image: AnyArray,
+    original: Path | None = None,
+    *,
+    moved: bool = False,
+    alpha: AnyArray | None = None,
+) -> None:
     """Write an image in the format of its file name, with the metadata of the file that it was made from.
 
-    A JPEG has that one's quality and sampling of colours; PNG and TIFF keep its alpha, unless pixels have ``moved``.
+    A JPEG has that one's quality and sampling of colours; PNG and TIFF keep its alpha, unless pixels have ``moved``, or
+    have the one that is given.
 
     Raises
     ------
@@ -259,7 +267,8 @@ def encode_image(target: Path, image: AnyArray, original: Path | None = None, *,
     bgr = image if image.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2BGR)
     before = None if original is None else original.read_bytes()
     options = _jpeg_options(before) if target.suffix.lower() in (".jpg", ".jpeg") else []
-    alpha = None if before is None or moved or target.suffix.lower() not in _WITH_ALPHA else read_alpha(before)
+    if alpha is None and before is not None and not moved and target.suffix.lower() in _WITH_ALPHA:
+        alpha = read_alpha(before)
     if alpha is not None and alpha.shape == image.shape[:2] and alpha.dtype == image.dtype:
         bgr = np.dstack([bgr, alpha] if bgr.ndim == 3 else [bgr, bgr, bgr, alpha])
     # Through memory: cv2.imwrite reports a full disk as success.

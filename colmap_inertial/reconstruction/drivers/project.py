@@ -28,12 +28,13 @@ from colmap_inertial.core.types import (
 from colmap_inertial.io.calibration import calibration_prior, describe_files
 from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.exif import read_exposures_s, stamps_of_exif
-from colmap_inertial.io.files import StrPath, path_in, read_record, reading_within, write_record
+from colmap_inertial.io.files import StrPath, read_record, reading_within, write_record
 from colmap_inertial.io.frame_sources import Video
 from colmap_inertial.io.frame_times import FrameStamps, stamps_of_pattern
 from colmap_inertial.io.frames import read_frame_times, read_frame_timing
 from colmap_inertial.io.imu import is_capture, read_raw_capture_imu, read_raw_imu
 from colmap_inertial.io.imu_formats import find_recording
+from colmap_inertial.io.picture_names import picture_in
 from colmap_inertial.io.plausible import RawImu
 from colmap_inertial.io.video import video_stamps_ns
 from colmap_inertial.io.video_match import match_to_video
@@ -421,7 +422,7 @@ def _times(
         timing = read_frame_timing(capture, first_of)
     # an exposure that the pictures state belongs to the frames; one that they do not is no reason to stop
     if timing.exposure_s is None and images is not None:
-        paths = [path_in(images, name) for name in timing.names]
+        paths = [picture_in(images, name) for name in timing.names]
         if all(path.is_file() for path in paths):
             timing = dataclasses.replace(timing, exposure_s=read_exposures_s(paths))
     return timing, notes

@@ -295,6 +295,8 @@ def reconstruct_by(
     """
     capture, out = Path(capture), Path(out)
     check_reference(reference)
+    if out.is_dir() and any(out.iterdir()) and not (out / "colmap" / _MADE_FROM).exists():
+        raise OutputExistsError(f"{out} is not empty; choose another output folder")
     refuse_links(out)
     if options.colmap_executable is not None:
         raise InertialError("--colmap-executable goes with a capture whose metres come from the IMU; leave it out")

@@ -38,7 +38,9 @@ from colmap_inertial.model import (
     read_model,
     trajectory_from_model,
 )
+from colmap_inertial.model.identity import ModelIdentity
 from colmap_inertial.model.rigs import frames_of_rigs
+from colmap_inertial.model.similarities import OF_MODEL
 from colmap_inertial.motion.align import AlignOptions
 from colmap_inertial.motion.align.consensus import align_by_consensus
 from colmap_inertial.motion.align.conventions import likely_convention
@@ -312,7 +314,7 @@ def scale_source(
     notes = (*estimate.notes, *recording.imu.repairs, *recording.notes)
     estimate = dataclasses.replace(estimate, notes=notes)
     if json is not None:
-        write_json(json, scale_as_json(estimate, source.calibration))
+        write_json(json, scale_as_json(estimate, source.calibration, source.source))
     return estimate
 
 
@@ -356,6 +358,16 @@ def _judge_shutter(
     return judged
 
 
-def scale_as_json(estimate: ScaleEstimate, calibration: CalibrationFiles = None) -> dict[str, object]:
-    """Output of ``scale --json``: the estimate, and the calibration files that it used."""
-    return {**estimate.as_json(), "calibration_files": describe_files(calibration)}
+def scale_as_json(
+    estimate: ScaleEstimate, calibration: CalibrationFiles = None, source: Path | None = None
+) -> dict[str, object]:
+    """Output of ``scale --json``: the estimate, the calibration files that it used, and of which model it is."""
+    known = {} if source is None or (model := _identify(source)) is None else {OF_MODEL: model.as_json()}
+    return {**estimate.as_json(), **known, "calibration_files": describe_files(calibration)}
+
+
+def _identify(source: Path) -> ModelIdentity | None:
+    """The model in a folder; ``None`` for poses of any other kind."""
+    if not source.is_dir() or is_inertial_scale(source):
+        return None
+    return ModelIdentity.of(read_model(only_model(source)))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from colmap_inertial.core.arrays import AnyArray, Array, UInt8Array
+from colmap_inertial.core.arrays import AnyArray, Array, UInt8Array, UInt16Array
 from colmap_inertial.core.errors import FormatError, MissingExtraError
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_from_matrix, rotation_between
 from colmap_inertial.core.printing import cell
@@ -111,8 +111,11 @@ def write_gltf(
     xyz: Array,
     rgb: UInt8Array,
     up_in_world: Array,
+    offset: Array | None = None,
 ) -> None:
     """Write cameras, points, the path as a line and as an animated camera: glTF 2.0, binary, metres, y up.
+
+    Colours of points are linear, as the standard has them.
 
     Parameters
     ----------
@@ -124,6 +127,8 @@ def write_gltf(
         (N, 3) points and colours.
     up_in_world
         (3,) becomes +y by the node that all others hang from.
+    offset
+        (3,) the place of a node that all others hang from, too: what buffers hold in single precision is about it.
 
     Raises
     ------
@@ -133,9 +138,10 @@ def write_gltf(
     require_pygltflib()
     import pygltflib as gl
 
-    made = _Gltf(gl)
-    children = [made.node(name="points", mesh=made.points(xyz, rgb))] if len(xyz) else []
+    made, place = _Gltf(gl), np.zeros(3) if offset is None else offset
+    children = [made.node(name="points", mesh=made.points(xyz - place, rgb))] if len(xyz) else []
     centres = np.array([view.cam_in_world for view in views]) if trajectory is None else trajectory.cam_in_world
+    centres = centres - place
     if len(centres) > 1:
         children.append(made.node(name="path", mesh=made.line(centres)))
     seen: dict[tuple[object, ...], int] = {}
@@ -145,14 +151,16 @@ def write_gltf(
         if key not in seen:
             seen[key] = made.camera(camera.width / camera.params[0], camera.height / camera.params[1])
         pose = {
-            "translation": view.cam_in_world.tolist(),
+            "translation": (view.cam_in_world - place).tolist(),
             "rotation": _opengl(view.cam_from_world_xyzw[None])[0].tolist(),
         }
         children.append(made.node(name=view.name.rpartition(".")[0], camera=seen[key], **pose))
     if trajectory is not None:
         moving = made.node(name="moving camera", camera=next(iter(seen.values())))
-        made.animate(moving, trajectory.t_s, trajectory.cam_in_world, _opengl(trajectory.cam_from_world_xyzw))
+        made.animate(moving, trajectory.t_s, centres, _opengl(trajectory.cam_from_world_xyzw))
         children.append(moving)
+    if offset is not None:
+        children = [made.node(name="place", translation=offset.tolist(), children=children)]
     root = made.node(name="world", rotation=rotation_between(up_in_world, _GLTF_UP).tolist(), children=children)
     made.write(path, root)
 
@@ -160,6 +168,13 @@ def write_gltf(
 def _opengl(cam_from_world_xyzw: Array) -> Array:
     """(N, 4) world from camera with the axes that glTF's cameras have."""
     return quat_from_matrix(matrix_from_quat(quat_conjugate(cam_from_world_xyzw)) @ OPENGL_FROM_CAM)
+
+
+def _linear(rgb: UInt8Array) -> UInt16Array:
+    """(N, 3) linear values of 16 bit of colours as pictures have them (sRGB, IEC 61966-2-1)."""
+    share = rgb / 255.0
+    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    return np.round(65535 * linear).astype(np.uint16)
 
 
 class _Gltf:
@@ -183,7 +198,7 @@ class _Gltf:
         return len(self._gltf.cameras) - 1
 
     def points(self, xyz: Array, rgb: UInt8Array) -> int:
-        colours = np.concatenate([rgb, np.full((len(rgb), 1), 255, np.uint8)], axis=1)
+        colours = np.concatenate([_linear(rgb), np.full((len(rgb), 1), 65535, np.uint16)], axis=1)
         attributes = self._gl.Attributes(
             POSITION=self._accessor(xyz, "VEC3", bounds=True), COLOR_0=self._accessor(colours, "VEC4")
         )
@@ -212,16 +227,16 @@ class _Gltf:
         return len(self._gltf.meshes) - 1
 
     def _accessor(self, values: AnyArray, kind: str, *, bounds: bool = False) -> int:
-        """Values (N, K) into the buffer: bytes as they are (normalised), all else as float."""
-        gl, is_bytes = self._gl, values.dtype == np.uint8
-        stored = values if is_bytes else values.astype("<f4")
+        """Values (N, K) into the buffer: whole numbers of 16 bit as they are (normalised), all else as float."""
+        gl, is_whole = self._gl, values.dtype == np.uint16
+        stored = values.astype("<u2" if is_whole else "<f4")
         self._gltf.bufferViews.append(gl.BufferView(buffer=0, byteOffset=len(self._data), byteLength=stored.nbytes))
         self._data += stored.tobytes()
         self._gltf.accessors.append(
             gl.Accessor(
                 bufferView=len(self._gltf.bufferViews) - 1,
-                componentType=gl.UNSIGNED_BYTE if is_bytes else gl.FLOAT,
-                normalized=is_bytes,
+                componentType=gl.UNSIGNED_SHORT if is_whole else gl.FLOAT,
+                normalized=is_whole,
                 count=len(stored),
                 type=kind,
                 min=stored.min(axis=0).tolist() if bounds else None,
@@ -238,14 +253,17 @@ def sparse_points(model: pycolmap.Reconstruction) -> tuple[Array, UInt8Array]:
     return xyz, np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
 
 
-def write_ply(path: Path, xyz: Array, rgb: UInt8Array, comments: tuple[str, ...] = ()) -> None:
-    """Write points as PLY: binary, little-endian, float positions, 8-bit colours."""
+def write_ply(
+    path: Path, xyz: Array, rgb: UInt8Array, comments: tuple[str, ...] = (), *, doubles: bool = False
+) -> None:
+    """Write points as PLY: binary, little-endian, positions of single or double precision, 8-bit colours."""
+    kind, stored = ("double", "<f8") if doubles else ("float", "<f4")
     rows = np.zeros(
-        len(xyz), [(name, "<f4") for name in ("x", "y", "z")] + [(name, "u1") for name in ("red", "green", "blue")]
+        len(xyz), [(name, stored) for name in ("x", "y", "z")] + [(name, "u1") for name in ("red", "green", "blue")]
     )
     for i, (place, colour) in enumerate((("x", "red"), ("y", "green"), ("z", "blue"))):
         rows[place], rows[colour] = xyz[:, i], rgb[:, i]
-    kinds = ("float x", "float y", "float z", "uchar red", "uchar green", "uchar blue")
+    kinds = (f"{kind} x", f"{kind} y", f"{kind} z", "uchar red", "uchar green", "uchar blue")
     header = [
         "ply",
         "format binary_little_endian 1.0",

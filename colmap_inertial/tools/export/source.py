@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
@@ -17,11 +17,13 @@ from colmap_inertial.core.options import ExportImages
 from colmap_inertial.core.types import DOWN_IN_WORLD, Action, CameraMotion, CameraTrajectory
 from colmap_inertial.inertial.georeference import Georeference
 from colmap_inertial.io.capture import Capture
-from colmap_inertial.io.files import path_in, read_json, read_record
+from colmap_inertial.io.files import read_json, read_record
 from colmap_inertial.io.frames import read_frame_timing
+from colmap_inertial.io.picture_names import picture_in
 from colmap_inertial.io.positions import positions_in_pictures
-from colmap_inertial.model import read_model
-from colmap_inertial.model.nerf import NO_SCALE, NO_UP
+from colmap_inertial.model import read_model, transformed
+from colmap_inertial.model.nerf import NEVER_SCALED, NO_SCALE, NO_UP
+from colmap_inertial.model.places import Place, translation
 from colmap_inertial.pipeline.run.runner import explaining_losses, find_change
 from colmap_inertial.pipeline.run.workspace import Workspace, a_record_of_ours, places_of
 from colmap_inertial.pipeline.stages.metric import motion_file
@@ -151,7 +153,7 @@ class ExportSource:
         return picture_of
 
     def _picture(self, rectified: Path, folders: tuple[Path, ...], name: str) -> Picture:
-        paths = (path_in(folder, name, self.found.folder) for folder in folders if folder.is_dir())
+        paths = (picture_in(folder, name, self.found.folder) for folder in folders if folder.is_dir())
         path = next((path for path in paths if path.is_file()), None)
         if path is None:
             looked = ", ".join(str(folder) for folder in folders if folder.is_dir()) or "no folder of images"
@@ -341,6 +343,10 @@ class ExportContent:
         By image name, the file that is exported; empty where none are.
     notes
         What the user should know; writers add to it.
+    is_recentred
+        Whether ``offset`` was taken off everything.
+    offset
+        (3,) of a model that lies far from the origin, a point in its middle: single precision cannot hold it as it is.
     """
 
     source: ExportSource
@@ -352,6 +358,8 @@ class ExportContent:
     on_map: Georeference | None = None
     pictures: Mapping[str, Picture] = field(default_factory=dict)
     notes: list[Fact]
+    is_recentred: bool = False
+    offset: Array | None = None
 
     @classmethod
     def of(cls, source: ExportSource, on_map: Georeference | None, *, square: bool) -> ExportContent:
@@ -378,6 +386,21 @@ class ExportContent:
             rgb=rgb,
             on_map=on_map,
             notes=_notes_on_model(source),
+            offset=_offset(views, xyz),
+        )
+
+    def recentred(self) -> ExportContent:
+        """The same about the offset; the user is told."""
+        assert self.offset is not None
+        offset = self.offset
+        self.notes.append(Fact("recentred", offset=offset))
+        model = transformed(self.source.model, translation(-offset))
+        return replace(
+            self,
+            source=replace(self.source, model=model),
+            views=[replace(view, cam_in_world=view.cam_in_world - offset) for view in self.views],
+            xyz=self.xyz - offset,
+            is_recentred=True,
         )
 
     @property
@@ -391,11 +414,17 @@ class ExportContent:
         return _Z_UP if self.source.up_in_world is None else self.source.up_in_world
 
 
+def _offset(views: list[View], xyz: Array) -> Array | None:
+    """(3,) a point in the middle of a model that lies far from the origin."""
+    place = Place.of(np.concatenate([np.array([view.cam_in_world for view in views]).reshape(-1, 3), xyz]))
+    return place.pivot() if place is not None and place.is_far else None
+
+
 def _notes_on_model(source: ExportSource) -> list[Fact]:
     """Notes for the user on the model."""
     notes: list[Fact] = []
     if source.found.scale.unit != "m":
-        notes.append(NO_SCALE)
+        notes.append(NO_SCALE if source.found.scale.verdict == "refused" else NEVER_SCALED)
     if source.up_in_world is None:
         notes.append(NO_UP)
     elif float(source.up_in_world @ _Z_UP) < 0.9:

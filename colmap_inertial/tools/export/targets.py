@@ -38,6 +38,7 @@ from colmap_inertial.tools.export.transforms import (
     add_row_poses,
     add_velocities,
     transforms,
+    view_matrices,
 )
 from colmap_inertial.tools.export.undistort import Undistortion, pinhole_model
 
@@ -133,6 +134,8 @@ def _rows(undistortion: Undistortion) -> tuple[float, float]:
 _LOCAL_METRES = (
     'LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["Local Datum",0],UNIT["metre",1,AUTHORITY["EPSG","9001"]]]'
 )
+
+_LOCAL_UNITS = 'LOCAL_CS["Local Coordinates",LOCAL_DATUM["Local Datum",0],UNIT["unknown",1]]'
 
 
 def write_metashape(path: Path, views: list[View], *, metres: bool) -> None:
@@ -241,6 +244,8 @@ class ExportTarget:
         Whether ``images/`` is written.
     has_images, has_points
         Whether images and points of the model are in what is written.
+    recentres
+        Whether a model far from the origin is brought to it, as the program calculates in single precision.
     square
         Whether pixels must be square.
     require
@@ -253,6 +258,7 @@ class ExportTarget:
     pictures: bool = True
     has_images: bool = True
     has_points: bool = True
+    recentres: bool = False
     square: bool = False
     require: Callable[[], None] = lambda: None
 
@@ -264,7 +270,8 @@ class ExportTarget:
 def _write_ply(content: ExportContent, folder: Path) -> None:
     unit = "metres" if content.is_metric else "unknown, not metres"
     up = " ".join(f"{value:.6g}" for value in content.up_in_world)
-    write_ply(folder / "points.ply", content.xyz, content.rgb, (f"unit: {unit}", f"up: {up}"))
+    doubles = content.offset is not None
+    write_ply(folder / "points.ply", content.xyz, content.rgb, (f"unit: {unit}", f"up: {up}"), doubles=doubles)
 
 
 def _write_las(content: ExportContent, folder: Path) -> None:
@@ -284,7 +291,7 @@ def _write_csv(content: ExportContent, folder: Path) -> None:
 def _write_gltf(content: ExportContent, folder: Path) -> None:
     source = content.source.found
     path = None if source.trajectory is None else smooth_path(source.trajectory, source.folder)
-    write_gltf(folder / "scene.glb", content.views, path, content.xyz, content.rgb, content.up_in_world)
+    write_gltf(folder / "scene.glb", content.views, path, content.xyz, content.rgb, content.up_in_world, content.offset)
 
 
 def _write_metashape(content: ExportContent, folder: Path) -> None:
@@ -304,6 +311,33 @@ def _write_for_trainers(content: ExportContent, folder: Path, add_motion: _AddMo
     write_ply(folder / "sparse_pc.ply", content.xyz, content.rgb)
     values = transforms(content.views, content.xyz, content.up_in_world)
     write_json(folder / "transforms.json", values if add_motion is None else add_motion(values, content))
+
+
+def _write_for_gsplat(content: ExportContent, folder: Path) -> None:
+    """The same, and the poses between which gsplat draws rolling-shutter pictures."""
+    _write_for_trainers(content, folder)
+    motion = content.source.motion
+    if motion is None or not motion.names or not (motion.readout_s or 0.0) > 0:
+        return
+    if all(picture.rectified for picture in content.pictures.values()):
+        return
+    if motion.readout_direction != "down":
+        content.notes.append(Fact("no-row-poses", direction=motion.readout_direction))
+        return
+    exposures = exposures_of(content.source.model, content.source, content.pictures, content.cameras, [])
+    named = {content.names[name]: exposure for name, exposure in exposures.items()}
+    write_json(folder / "viewmats_rs.json", view_matrices(content.views, named))
+
+
+def write_metadata(path: Path, offset: Array | None, *, metres: bool) -> None:
+    """Write what was taken off all coordinates, as ContextCapture, Metashape and others have it: ``SRSOrigin``."""
+    document = ElementTree.Element("ModelMetadata", version="1")
+    ElementTree.SubElement(document, "SRS").text = _LOCAL_METRES if metres else _LOCAL_UNITS
+    origin = np.zeros(3) if offset is None else offset
+    ElementTree.SubElement(document, "SRSOrigin").text = ",".join(repr(value) for value in origin.tolist())
+    ElementTree.indent(document)
+    text = ElementTree.tostring(document, encoding="unicode")
+    write_text(path, f'<?xml version="1.0" encoding="utf-8"?>\n{text}\n')
 
 
 def _add_row_poses(values: dict[str, Any], content: ExportContent) -> dict[str, Any]:
@@ -335,7 +369,7 @@ _NERFSTUDIO = (
 )
 
 #: What all splatting and NeRF trainers read.
-TRAINERS = ExportTarget(write=_write_for_trainers, says="")
+TRAINERS = ExportTarget(write=_write_for_trainers, says="", recentres=True)
 
 #: By name: each stands here, and among the choices of ``--for`` (``core.options.ExportProgram``).
 TARGETS: Mapping[ExportProgram, ExportTarget] = {
@@ -377,33 +411,44 @@ TARGETS: Mapping[ExportProgram, ExportTarget] = {
         require=require_pygltflib,
     ),
     "3dgs": ExportTarget(
+        recentres=True,
         write=_write_for_trainers,
         command="python train.py -s {folder}",
         says="nothing is needed for metres and up to stay",
     ),
     "gsplat": ExportTarget(
-        write=_write_for_trainers,
+        recentres=True,
+        write=_write_for_gsplat,
         command="python examples/simple_trainer.py default --data-dir {folder} --data-factor 1 "
         "--no-normalize-world-space --result-dir {folder}_gsplat",
         says="metres and up stay by --no-normalize-world-space",
     ),
     "nerfstudio": ExportTarget(
+        recentres=True,
         write=_write_for_trainers,
         command=_NERFSTUDIO.replace("{method}", "splatfacto"),
         says="metres and up stay by these options; without them, dataparser_transforms.json leads back",
     ),
     "brush": ExportTarget(
-        write=_write_for_trainers, command="brush {folder}", says="nothing is needed for metres and up to stay"
+        recentres=True,
+        write=_write_for_trainers,
+        command="brush {folder}",
+        says="nothing is needed for metres and up to stay",
     ),
     "opensplat": ExportTarget(
-        write=_write_for_trainers, command="opensplat {folder} --keep-crs", says="metres and up stay by --keep-crs"
+        recentres=True,
+        write=_write_for_trainers,
+        command="opensplat {folder} --keep-crs",
+        says="metres and up stay by --keep-crs",
     ),
     "instant-ngp": ExportTarget(
+        recentres=True,
         write=partial(_write_for_trainers, add_motion=_add_row_poses),
         command="instant-ngp {folder}/transforms.json",
         says="p = (p' - offset) / scale leads back to metres, with scale and offset of transforms.json",
     ),
     "3dgs-deblur": ExportTarget(
+        recentres=True,
         write=partial(_write_for_trainers, add_motion=_add_velocities),
         command=_NERFSTUDIO.replace("{method}", "splatfacto --pipeline.model.blur-samples 5"),
         says="metres and up stay by these options; velocities are in m/s and rad/s",

@@ -176,6 +176,37 @@ def add_row_poses(content: Mapping[str, Any], exposures: Mapping[str, Exposure])
     return {**content, "frames": frames}
 
 
+def view_matrices(views: Sequence[View], exposures: Mapping[str, Exposure]) -> dict[str, Any]:
+    """Poses at the begin and end of each picture's readout, as gsplat's ``rasterization`` takes them.
+
+    ``viewmats`` and ``viewmats_rs``: (4, 4) camera from world, x right, y down, z forward, of the first row and of one
+    past the last. Of a picture without a readout, or a velocity, both are the pose.
+    """
+    frames = []
+    for view in views:
+        moved = exposures.get(view.name)
+        half_s = 0.0 if moved is None else 0.5 * moved.readout_s
+        late_s = 0.0 if moved is None else moved.late_s
+        both = []
+        for shift_s in (late_s - half_s, late_s + half_s):
+            pose = view.matrix() if moved is None else _at(view.matrix(), moved, shift_s)
+            pose[:3, :3] = pose[:3, :3] @ OPENGL_FROM_CAM
+            both.append(np.linalg.inv(pose).tolist())
+        fx, fy, cx, cy = view.camera.params
+        frames.append(
+            {
+                "file_path": f"images/{view.name}",
+                "width": view.camera.width,
+                "height": view.camera.height,
+                "K": [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]],
+                "readout_s": 2 * half_s,
+                "viewmats": both[0],
+                "viewmats_rs": both[1],
+            }
+        )
+    return {"rolling_shutter": "ROLLING_TOP_TO_BOTTOM", "frames": frames}
+
+
 def _at(matrix: Array, moved: Exposure, late_s: float) -> Array:
     """(4, 4) the pose so much later, to first order."""
     turned = np.array(matrix)

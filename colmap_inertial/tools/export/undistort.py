@@ -16,6 +16,7 @@ from colmap_inertial.core.types import CameraModel
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.rolling_shutter import grid_nodes, sampling_maps
 from colmap_inertial.model import colmap_camera
+from colmap_inertial.model.lenses import Fold, beyond, find_fold
 
 if TYPE_CHECKING:
     import pycolmap
@@ -51,10 +52,13 @@ class Undistortion:
         COLMAP's, with any lens.
     pinhole
         ``PINHOLE`` of fx, fy, and cx, cy in the middle.
+    fold
+        Where the lens folds: nothing is known of what lies beyond.
     """
 
     camera: pycolmap.Camera
     pinhole: CameraModel
+    fold: Fold | None = None
 
     @classmethod
     def of(cls, camera: pycolmap.Camera, where: Path, *, square: bool = False) -> Undistortion:
@@ -83,7 +87,8 @@ class Undistortion:
         fx, fy = float(camera.focal_length_x), float(camera.focal_length_y)
         if square:
             fx = fy = 0.5 * (fx + fy)
-        half = _half_extent(camera)
+        fold = find_fold(camera)
+        half = _half_extent(camera, fold)
         for _ in range(_LIMITS.rounds):
             # what is left of a whole pixel by rounding counts as one
             width, height = (
@@ -95,7 +100,7 @@ class Undistortion:
             pinhole = CameraModel(
                 model="PINHOLE", width=width, height=height, params=(fx, fy, 0.5 * width, 0.5 * height)
             )
-            undistortion = cls(camera, pinhole)
+            undistortion = cls(camera, pinhole, fold)
             if undistortion.is_inside():
                 return undistortion
             half = half * (1 - _LIMITS.shrink)
@@ -114,12 +119,14 @@ class Undistortion:
         """(N, 2) where (N, 2) points of the new picture are in the old one; nan where nowhere."""
         fx, fy, cx, cy = self.pinhole.params
         rays = np.stack([(xy_px[:, 0] - cx) / fx, (xy_px[:, 1] - cy) / fy, np.ones(len(xy_px))], axis=1)
-        return np.asarray(self.camera.img_from_cam(rays), dtype=np.float64)
+        source = np.array(self.camera.img_from_cam(rays), dtype=np.float64)
+        source[beyond(rays[:, :2], self.fold)] = np.nan
+        return source
 
     def moved_px(self, xy_px: Array) -> Array:
         """(N, 2) where (N, 2) points of the old picture are in the new one; nan where they have no ray."""
         fx, fy, cx, cy = self.pinhole.params
-        return np.asarray(_normalised(self.camera, xy_px) * [fx, fy] + [cx, cy])
+        return np.asarray(_normalised(self.camera, xy_px, self.fold) * [fx, fy] + [cx, cy])
 
     def is_same(self) -> bool:
         """Whether the camera is that pinhole already."""
@@ -128,7 +135,10 @@ class Undistortion:
         return size and bool(np.abs(self.source_px(corners) - corners).max() < 1e-6)
 
     def resampled(self, image: UInt8Array) -> UInt8Array:
-        """(h, w, C) the picture (H, W, C) as the pinhole camera would have taken it, by bicubic interpolation."""
+        """(h, w, C) or (h, w) the picture (H, W, C) or (H, W) as the pinhole camera would have taken it.
+
+        By bicubic interpolation.
+        """
         import cv2
 
         if self.is_same():
@@ -153,8 +163,8 @@ def _continued(shift: Array) -> Array:
     return shift
 
 
-def _normalised(camera: pycolmap.Camera, xy_px: Array) -> Array:
-    """(N, 2) rays at z = 1 of (N, 2) pixels; nan where the lens model does not lead there and back."""
+def _normalised(camera: pycolmap.Camera, xy_px: Array, fold: Fold | None) -> Array:
+    """(N, 2) rays at z = 1 of (N, 2) pixels; nan where the lens model does not lead there and back, or has folded."""
     if len(xy_px) == 0:
         return np.zeros((0, 2))
     rays = np.asarray(camera.cam_from_img(xy_px), dtype=np.float64)[:, :2].copy()
@@ -162,11 +172,11 @@ def _normalised(camera: pycolmap.Camera, xy_px: Array) -> Array:
     ahead[~np.isfinite(rays).all(axis=1)] = [0.0, 0.0, 1.0]
     back = np.asarray(camera.img_from_cam(ahead), dtype=np.float64)
     lost = ~(np.abs(back - xy_px).max(axis=1) < _LIMITS.undone_px)
-    rays[lost] = np.nan
+    rays[lost | beyond(rays, fold)] = np.nan
     return rays
 
 
-def _half_extent(camera: pycolmap.Camera) -> Array:
+def _half_extent(camera: pycolmap.Camera, fold: Fold | None = None) -> Array:
     """(2,) how far the picture reaches at z = 1, to the nearer side of each two."""
     width, height = camera.width, camera.height
     x, y = np.linspace(0, width, _LIMITS.border), np.linspace(0, height, _LIMITS.border)
@@ -179,8 +189,10 @@ def _half_extent(camera: pycolmap.Camera) -> Array:
     # where no ray leads to the border, the lens sees further than a pinhole may
     size = np.array([width, height])
     reach = 0.5 * _LIMITS.largest * size / [camera.focal_length_x, camera.focal_length_y]
+    if fold is not None:
+        reach = np.minimum(reach, fold.tangent)
     for (axis, sign), border in sides.items():
-        rays = sign * _normalised(camera, border)[:, axis]
+        rays = sign * _normalised(camera, border, fold)[:, axis]
         rays = rays[np.isfinite(rays) & (rays > 0)]
         if len(rays):
             reach[axis] = min(reach[axis], float(rays.min()))

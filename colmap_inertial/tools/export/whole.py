@@ -18,16 +18,16 @@ from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.threads import frames_at_once, map_in_order
 from colmap_inertial.inertial.georeference import Georeference
 from colmap_inertial.io.capture import Capture, load_capture
-from colmap_inertial.io.files import StrPath, write_json
+from colmap_inertial.io.files import StrPath, read_bytes, write_json
 from colmap_inertial.io.frames import read_frames
-from colmap_inertial.io.images import read_image
+from colmap_inertial.io.images import read_alpha, read_image
 from colmap_inertial.model.copying import new_folder
 from colmap_inertial.model.nerf import EXPORT_FORMAT, NOT_METRES
 from colmap_inertial.pipeline.run.progress import Progress, silent
 from colmap_inertial.pipeline.stages.frame_folder import encode_image
 from colmap_inertial.reconstruction.preparation.geolocation import cameras_as_json
 from colmap_inertial.tools.export.source import ExportContent, Picture, find_georeference, read_source
-from colmap_inertial.tools.export.targets import TARGETS, TRAINERS
+from colmap_inertial.tools.export.targets import TARGETS, TRAINERS, write_metadata
 from colmap_inertial.tools.export.undistort import Undistortion
 
 
@@ -65,7 +65,16 @@ class Job:
         if self.pixels is None and self.undistortion.is_same() and _is_plain(self.source, self.target, image):
             shutil.copyfile(self.source, self.target)
         else:
-            encode_image(self.target, self.undistortion.resampled(three_channels(image)))
+            encode_image(self.target, self.undistortion.resampled(three_channels(image)), alpha=self._alpha())
+
+    def _alpha(self) -> UInt8Array | None:
+        """(h, w) alpha of the new picture, where the file has one and the new format holds it."""
+        if self.pixels is not None or self.target.suffix.lower() != ".png":
+            return None
+        alpha = read_alpha(read_bytes(self.source, what="picture"))
+        if alpha is None:
+            return None
+        return self.undistortion.resampled(np.asarray(alpha // 257 if alpha.dtype == np.uint16 else alpha, np.uint8))
 
 
 def write_pictures(jobs: Iterable[Job], count: int, progress: Progress) -> None:
@@ -222,7 +231,11 @@ def export_model(
         if target.pictures:
             content = replace(content, pictures=source.pictures(out, list(content.names), images, filmed))
             content.notes.extend(_notes_on(content.pictures, images))
+            content.notes.extend(_notes_on_masks(out, source.found.images))
             (partial / "images").mkdir()
+        if target.recentres and content.offset is not None:
+            content = content.recentred()
+            write_metadata(partial / "metadata.xml", content.offset, metres=content.is_metric)
         target.write(content, partial)
         if target.pictures:
             write_pictures(_jobs(content, partial / "images", filmed), len(content.pictures), progress)
@@ -281,6 +294,7 @@ def _record(made: Exported, content: ExportContent, kind: ExportImages) -> dict[
         "keeps_metres_and_up": made.says,
         "unit": "m" if scale.unit == "m" else NOT_METRES,
         "up_in_world": None if up is None else up.tolist(),
+        **({"offset_in_world": content.offset.tolist()} if content.is_recentred and content.offset is not None else {}),
         "gravity_in_world_m_s2": None if gravity is None else gravity.tolist(),
         "scale": {
             "verdict": scale.verdict,
@@ -294,6 +308,17 @@ def _record(made: Exported, content: ExportContent, kind: ExportImages) -> dict[
         "names": {new: old for old, new in content.names.items()},
         **with_sentences({"notes": list(made.notes)}),
     }
+
+
+#: Names of folders with masks.
+_MASKS = ("masks", "mask")
+
+
+def _notes_on_masks(out: Path, pictures: Iterable[Path]) -> list[Fact]:
+    """Note for the user on masks beside the pictures."""
+    folders = {folder / name for folder in (out, *(path.parent for path in pictures)) for name in _MASKS}
+    found = [folder for folder in sorted(folders) if folder.is_dir() and any(folder.iterdir())]
+    return [Fact("masks-left", folder=str(folder)) for folder in found]
 
 
 def _notes_on(pictures: Mapping[str, Picture], kind: ExportImages) -> list[Fact]:

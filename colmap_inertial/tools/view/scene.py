@@ -12,7 +12,7 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import quat_conjugate, quat_rotate
 from colmap_inertial.core.types import DOWN_IN_WORLD
-from colmap_inertial.io.files import path_in
+from colmap_inertial.io.picture_names import picture_in
 from colmap_inertial.io.trajectories import read_tum
 from colmap_inertial.model import read_model
 from colmap_inertial.pipeline.run.runner import explaining_losses
@@ -166,7 +166,7 @@ class Scene:
     def image_of(self, camera: int) -> Path | None:
         """The file of a camera's image; ``None`` where none of the folders has it."""
         name = self.cameras.names[camera]
-        paths = (path_in(folder, name, self.source.folder) for folder in self.source.images if folder.is_dir())
+        paths = (picture_in(folder, name, self.source.folder) for folder in self.source.images if folder.is_dir())
         return next((path for path in paths if path.is_file()), None)
 
     def pickable(self) -> Array:

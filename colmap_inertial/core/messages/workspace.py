@@ -1,0 +1,306 @@
+"""Models and workspaces that other programs made."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from colmap_inertial.core.messages import message, state
+
+if TYPE_CHECKING:
+    from colmap_inertial.core.facts import Fact
+
+
+def _of(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
+@message(example={"found": {"code": "git-lfs-pointer", "values": {}}})
+def noted_with_advice(found: Fact) -> str:
+    return found.with_advice
+
+
+@message(example={"file": "sparse/0/images.txt", "found": {"code": "zeros", "values": {}}})
+def read_all_the_same(file: str, found: Fact) -> str:
+    return f"{file}: {found.with_advice}"
+
+
+# files that are none
+
+message(
+    code="git-lfs-pointer",
+    advice="run git lfs pull there, or leave it out with --keep or by moving it away",
+)(lambda: "is a Git LFS pointer: this clone holds only a note of where the file is")
+message(code="git-annex-pointer", advice="run git annex get there, or move it away")(
+    lambda: "is a git-annex pointer: this clone holds only a note of where the file is"
+)
+state(
+    "apple-double",
+    "is what macOS leaves beside a file on foreign drives and in archives (AppleDouble), not the file itself",
+    advice="remove it: find . -name '._*' -delete",
+)
+state("web-page", "is a web page, as a download without access gives in place of the file", advice="download it again")
+state("zeros", "holds nothing but zeros, as an interrupted copy or download leaves", advice="copy it again")
+
+
+@message(advice="unpack it first", example={"kind": "gzip"})
+def packed_file(kind: str) -> str:
+    return f"is packed ({kind})"
+
+
+@message(advice="convert it to PNG or JPEG", example={"kind": "HEIF or AVIF"})
+def picture_format(kind: str) -> str:
+    return f"is a {kind} picture, a format that is not read here"
+
+
+# models
+
+
+@message(example={"count": 3, "points": 2})
+def lost_points(count: int, points: int) -> str:
+    return (
+        f"{_of(count, 'key point')} {'names' if count == 1 else 'name'} {_of(points, 'point')} that the model lacks or "
+        "that do not name them: they count as key points without a point"
+    )
+
+
+@message(example={"count": 3})
+def lost_observations(count: int) -> str:
+    return f"{_of(count, 'entry' if count == 1 else 'entrie')} of points' tracks name no such key point: left out"
+
+
+@message(example={"count": 30})
+def tracks_from_images(count: int) -> str:
+    return f"the points name no images: their tracks are taken from the {count} key points that name them"
+
+
+@message(example={"count": 3, "frames": 1})
+def lost_images(count: int, frames: int) -> str:
+    return f"frames name {_of(count, 'image')} that the model lacks: left out"
+
+
+@message(example={"stated": 12, "found": 10, "what": "images"})
+def other_count(stated: int, found: int, what: str) -> str:
+    return f"its head states {stated} {what}, and {found} are there: was the file cut off or edited?"
+
+
+@message(example={"count": 10})
+def images_without_second_line(count: int) -> str:
+    return f"{_of(count, 'image')} lack{'s' if count == 1 else ''} the second line, of key points: taken as empty"
+
+
+@message(example={"count": 10})
+def decimal_commas(count: int) -> str:
+    return f"{_of(count, 'line')} with commas among the numbers: read as decimal commas, or as separators"
+
+
+@message(
+    advice="names join everything: rename them where the model was made (names with blanks are cut by some readers of "
+    "text models)",
+    example={"count": 10, "name": "A-DJI_2024"},
+)
+def repeated_name(count: int, name: str) -> str:
+    return f"{count} images have the name {name!r}"
+
+
+@message(advice="the file was damaged or put together of two models", example={"what": "image", "number": 3})
+def repeated_number(what: str, number: int) -> str:
+    return f"{what} {number} is there twice"
+
+
+@message(advice="write the model again where it was made", example={"image": "a.jpg", "camera": 3})
+def unknown_camera(image: str, camera: int) -> str:
+    return f"its image {image!r} is of camera {camera}, which cameras lacks"
+
+
+@message(example={"expects": "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", "text": "1, 2"})
+def text_line(expects: str, text: str) -> str:
+    return f"expected {expects}, found {text!r}"
+
+
+@message(
+    advice="rays beyond it are not used; a lens model with more terms fits wide lenses",
+    example={"camera": 1, "model": "SIMPLE_RADIAL", "radius_px": 310.0, "corner_px": 400.0},
+)
+def folded_lens(camera: int, model: str, radius_px: float, corner_px: float) -> str:
+    return (
+        f"the lens of camera {camera} ({model}) folds back {radius_px:.0f} px from the middle, while pictures reach "
+        f"{corner_px:.0f} px: nothing is known of what lies beyond"
+    )
+
+
+@message(
+    advice="its parameters may be of another size of picture",
+    example={"camera": 1, "width": 640, "height": 480, "cx": 1280.0, "cy": 960.0},
+)
+def odd_principal_point(camera: int, width: int, height: int, cx: float, cy: float) -> str:
+    return f"the principal point of camera {camera}, {cx:.0f}, {cy:.0f}, is outside its {width} x {height} pixels"
+
+
+# what an applied similarity leaves as it is
+
+
+@message(example={"kinds": ("2 .las", "1 .splat")})
+def carried_lengths(kinds: tuple[str, ...]) -> str:
+    return f"copied in their old units, as their formats are not transformed: {', '.join(kinds)}"
+
+
+@message(example={"kinds": ("3 .ckpt (outputs/step.ckpt)",)})
+def possible_lengths(kinds: tuple[str, ...]) -> str:
+    return f"copied as they are, and may hold lengths, as nothing is known of them: {', '.join(kinds)}"
+
+
+def _depth_advice(count: int, example: str, factors: tuple[float, ...]) -> str:
+    if len(factors) != 1:
+        return ""
+    return f"nerfstudio's --depth-unit-scale-factor (0.001 by default) becomes {factors[0]:.9g} times as large"
+
+
+@message(advice=_depth_advice, example={"count": 10, "example": "depth/frame_00001.png", "factors": (2.5,)})
+def unmoved_depths(count: int, example: str, factors: tuple[float, ...]) -> str:
+    times = (
+        f"{factors[0]:.9g} times as much as before" if len(factors) == 1 else "as much more as its model's scale says"
+    )
+    return f"depths in {_of(count, 'picture')} of whole numbers ({example}) stay as they are: a step means {times}"
+
+
+@message(example={"path": "transforms.json"})
+def cameras_elsewhere_in_file(path: str) -> str:
+    return f"{path}: copied as it is, as its cameras do not stand where those of a model do"
+
+
+@message(
+    advice="look at it, or leave it out with --keep",
+    example={"path": "exports/splat.ply", "share_pct": 40.0},
+)
+def other_frame(path: str, share_pct: float) -> str:
+    return (
+        f"{path}: moved with the model, although its points are {share_pct:.0f} % of the model's size away from the "
+        "model's: it may be of another frame"
+    )
+
+
+@message(example={"path": "sparse_pc.ply", "by": "transforms.json"})
+def frame_of_transforms(path: str, by: str) -> str:
+    return f"{path} is in the world of {by}, and moved in it"
+
+
+@message(advice="a pattern is a name, or a path in the project", example={"pattern": "old"})
+def idle_pattern(pattern: str) -> str:
+    return f"--keep {pattern} is none of the project's paths"
+
+
+@message(
+    advice="rename it, or move it out of the project",
+    example={"provenance": ""},
+)
+def foreign_record(provenance: str = "") -> str:
+    return "is not a record of colmap-inertial, which writes its own by this name"
+
+
+# where a model lies, and whose scale it is given
+
+
+@message(example={"folder": "sparse/0", "pivot": (432100.0, 5664700.0, 120.0)})
+def about_place(folder: str, pivot: tuple[float, ...]) -> str:
+    return (
+        f"{folder} lies far from the origin: it is turned and scaled about {', '.join(f'{x:.9g}' for x in pivot)}, "
+        "which stays where it is"
+    )
+
+
+@message(
+    advice="a translation_m of p - s R p does that about a point p",
+    example={"folder": "sparse/0", "distance": 28000.0},
+)
+def moved_away(folder: str, distance: float) -> str:
+    return f"{folder} lies far from the origin, about which the similarity acts, and moves by {distance:.6g}"
+
+
+@message(
+    advice="measure this model with scale; --any-model takes it all the same",
+    example={"folder": "sparse/0", "difference": "12 images instead of 10"},
+)
+def scale_of_another_model(folder: str, difference: str) -> str:
+    return f"the scale is of another model than {folder}: {difference}"
+
+
+@message(example={"difference": "12 images instead of 10"})
+def scale_taken_all_the_same(difference: str) -> str:
+    return f"the scale is of another model ({difference}), and taken all the same"
+
+
+state("scale-without-identity", "the scale does not say of which model it is: it is taken for that of this one")
+
+
+# exports
+
+
+@message(example={"offset": (432100.0, 5664700.0, 120.0)})
+def recentred(offset: tuple[float, ...]) -> str:
+    where = ", ".join(f"{x:.9g}" for x in offset)
+    return (
+        f"the model lies too far from the origin for single precision: {where} is taken off all coordinates, and "
+        "stands in metadata.xml (SRSOrigin) and export.json"
+    )
+
+
+@message(example={"offset": (432100.0, 5664700.0, 120.0)})
+def offset_node(offset: tuple[float, ...]) -> str:
+    where = ", ".join(f"{x:.9g}" for x in offset)
+    return f"the model lies far from the origin: buffers are about {where}, the translation of the node 'place'"
+
+
+@message(example={"folder": "project/masks"})
+def masks_left(folder: str) -> str:
+    return f"the masks in {folder} are of the pictures before they were undistorted, and are not exported"
+
+
+@message(example={"direction": "up"})
+def no_row_poses(direction: str) -> str:
+    return f"these pictures are read out {direction}: there is no viewmats_rs.json, which is of rows from the top"
+
+
+# targets
+
+
+def _contradiction_advice(
+    kind: str,
+    gap: float,
+    lengths_mm: tuple[float, ...],
+    off_pct: tuple[float, ...],
+    along: tuple[str, ...],
+    likely_gap: float | None = None,
+) -> str:
+    if kind == "aprilgrid":
+        likely = "" if likely_gap is None else f"; the pictures show {likely_gap:.3g}"
+        return (
+            f"check the gap, which is {gap:g} in its description: the distance between two tags divided by a tag's "
+            f"side{likely}"
+        )
+    return "check its columns, rows and sizes, that it is flat, and that it was not printed stretched"
+
+
+@message(
+    advice=_contradiction_advice,
+    example={
+        "kind": "aprilgrid",
+        "gap": 0.25,
+        "lengths_mm": (10.0, 40.0),
+        "off_pct": (16.0, -3.6),
+        "along": ("row", "column"),
+        "likely_gap": 0.3,
+    },
+)
+def lengths_contradict(
+    kind: str,
+    gap: float,
+    lengths_mm: tuple[float, ...],
+    off_pct: tuple[float, ...],
+    along: tuple[str, ...],
+    likely_gap: float | None = None,
+) -> str:
+    listed = ", ".join(
+        f"{length:.4g} mm in a {line} {off:+.2g} %"
+        for length, off, line in zip(lengths_mm, off_pct, along, strict=True)
+    )
+    return f"its lengths contradict each other, all of a kind alike: {listed}"

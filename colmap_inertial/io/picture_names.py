@@ -1,0 +1,46 @@
+"""Names of a model's images: only names, until a picture is looked for."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.io.files import EMPTY, UNPRINTABLE, name_fault, path_in
+
+
+def check_image_names(names: Iterable[str], source: Path | str) -> None:
+    """Refuse names of images that nothing can hold: empty ones, and such as are no UTF-8 or hold a control character.
+
+    Where a name leads to does not matter while it is only a name; see :func:`picture_in` for when it becomes a path.
+
+    Raises
+    ------
+    FormatError
+        For such a name.
+    """
+    for name in names:
+        fault = name_fault(name.replace("/", ""))
+        if fault in (EMPTY, UNPRINTABLE):
+            raise FormatError(source, f"names the file {name[:80]!r}, which {fault}; such names are not followed")
+
+
+def picture_in(folder: Path, name: str, source: Path | str | None = None) -> Path:
+    """The path of a picture by its name in a model; of one that leads elsewhere, of its last parts that are there.
+
+    Some programs name pictures by absolute paths, or by such that begin with ``..``: these are only names.
+
+    Raises
+    ------
+    FormatError
+        As of :func:`path_in`.
+    """
+    parts = [part for part in re.split(r"[/\\]", name) if part not in ("", ".")]
+    is_plain = not Path(name).anchor and not re.match(r"[/\\]|[A-Za-z]:[/\\]", name)
+    if is_plain and ".." not in parts:
+        return path_in(folder, name, source)
+    last = len(parts) - 1 - parts[::-1].index("..") if ".." in parts else -1
+    tails = ["/".join(parts[i:]) for i in range(last + 1, len(parts))]
+    paths = [path_in(folder, tail, source) for tail in tails if name_fault(tail) is None]
+    return next((path for path in paths if path.is_file()), paths[-1] if paths else path_in(folder, name, source))
