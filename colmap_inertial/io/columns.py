@@ -78,17 +78,21 @@ def read_name(name: str) -> Cell:
         tokens, unit = _unit_at_the_end(tokens)
     if unit is None and len(tokens) == 1 and tokens[0] in words.TIME and len(tokens[0]) > 4:
         unit = unit_and_scale(tokens[0])  # millis
-    axes = [i for i, token in enumerate(tokens) if token in _LETTERS]
-    axis = _LETTERS[tokens[axes[-1]]] if (axes and tokens[axes[-1]] != "0") or _is_indexed(tokens, axes) else None
-    rest = tuple(t for i, t in enumerate(tokens) if not (axes and i == axes[-1] and axis is not None))
+    place = _axis_place(tokens)
+    axis = None if place is None else _LETTERS[tokens[place]]
+    rest = tuple(token for i, token in enumerate(tokens) if i != place)
     kind = _kind(rest, axis, None if unit is None else unit[0])
-    return Cell(
-        kind=kind, words=rest, axis=axis, unit=None if unit is None else unit[0], scale=1.0 if unit is None else unit[1]
-    )
+    name_of_unit, scale = unit or (None, 1.0)
+    return Cell(kind=kind, words=rest, axis=axis, unit=name_of_unit, scale=scale)
 
 
-def _is_indexed(tokens: Sequence[str], axes: Sequence[int]) -> bool:
-    return bool(axes) and axes[-1] == len(tokens) - 1
+def _axis_place(tokens: Sequence[str]) -> int | None:
+    """Where the axis stands: the last x, y or z, or a number at the end."""
+    places = [i for i, token in enumerate(tokens) if token in _LETTERS]
+    letters = [i for i in places if tokens[i].isalpha()]
+    if letters:
+        return letters[-1]
+    return places[-1] if places and places[-1] == len(tokens) - 1 else None
 
 
 def _split_axis(token: str) -> list[str]:
@@ -110,30 +114,31 @@ def _unit_at_the_end(tokens: list[str]) -> tuple[list[str], tuple[str, float] | 
 
 
 def _kind(rest: Sequence[str], axis: int | None, unit: str | None) -> str:
-    have = set(rest)
-    pairs = set(itertools.pairwise(rest))
-    joined = "".join(rest)
-    is_gyro = bool(have & words.GYRO or pairs & words.GYRO_PAIRS or joined in words.GYRO)
-    is_accel = bool(have & words.ACCEL or pairs & words.ACCEL_PAIRS or joined in words.ACCEL)
+    have, joined = set(rest), "".join(rest)
     if have & words.TIME or joined in words.TIME:
-        return "other" if axis is not None or have & words.NO_TIME or have & words.OTHER - {"dt"} else "time"
+        return "other" if axis is not None or have & (words.NO_TIME | words.OTHER - {"dt"}) else "time"
     if axis is None or have & (words.OTHER | words.WORLD):
         return "other"
     if have & words.GRAVITY:
         return "gravity"
+    quantity = _quantity(rest, unit)
     if have & words.NO_GRAVITY:
-        return "linear" if is_accel or have & {"linacc", "linaccel", "freeacc"} else "other"
-    if is_gyro and not (is_accel and unit in SENSOR_UNITS["accel"]):
-        return "gyro" if unit is None or unit in SENSOR_UNITS["gyro"] else "other"
-    if is_accel:
-        return "accel" if unit is None or unit in SENSOR_UNITS["accel"] else "other"
-    if joined in words.SHORT_GYRO:
-        return "gyro" if unit is None or unit in SENSOR_UNITS["gyro"] else "other"
-    if joined in words.SHORT_ACCEL:
-        return "accel" if unit is None or unit in SENSOR_UNITS["accel"] else "other"
+        return "linear" if quantity == "accel" or have & {"linacc", "linaccel", "freeacc"} else "other"
+    if quantity is not None:
+        return quantity if unit is None or unit in SENSOR_UNITS[quantity] else "other"
     if joined in ("", "axis", "rate", "rateofturn", *words.VALUES):
         return next((quantity for quantity, units in SENSOR_UNITS.items() if unit in units), "axis")
     return "other"
+
+
+def _quantity(rest: Sequence[str], unit: str | None) -> Quantity | None:
+    """The sensor that words name."""
+    have, joined, pairs = set(rest), "".join(rest), set(itertools.pairwise(rest))
+    is_gyro = bool(have & words.GYRO or pairs & words.GYRO_PAIRS) or joined in words.GYRO | words.SHORT_GYRO
+    is_accel = bool(have & words.ACCEL or pairs & words.ACCEL_PAIRS) or joined in words.ACCEL | words.SHORT_ACCEL
+    if is_gyro and not (is_accel and unit in SENSOR_UNITS["accel"]):
+        return "gyro"
+    return "accel" if is_accel else None
 
 
 # --- by words ---------------------------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import csv
 import functools
+import itertools
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -229,20 +230,19 @@ def _is_plain(head: Sequence[str], standard: str | None, layout: _Layout) -> boo
 def _read_as(head: Sequence[str], delimiter: str | None, decimal: str) -> tuple[float, _Layout | None]:
     """Share of cells that hold values, and where the table lies, if cells are written like this."""
     split = [split_cells(line, delimiter) if line.strip() else [] for line in head]
-    rows = [_is_row(cells, decimal) for cells in split]
-    counted = [len(cells) for cells, is_row in zip(split, rows, strict=True) if is_row]
-    if not counted:
+    rows = [i for i, cells in enumerate(split) if _is_row(cells, decimal)]
+    if not rows:
         return 0.0, None
-    width = Counter(counted[len(counted) // 2 :]).most_common(1)[0][0]
-    good = [i for i, (cells, is_row) in enumerate(zip(split, rows, strict=True)) if is_row and len(cells) == width]
+    width = Counter(len(split[i]) for i in rows[len(rows) // 2 :]).most_common(1)[0][0]
+    good = [i for i in rows if len(split[i]) == width]
     alike = min(_ALIKE, len(good))
     first = next((i for n, i in enumerate(good) if len(good) >= n + alike and _follow(head, good[n : n + alike])), None)
     if first is None or width < 2:
         return 0.0, None
-    values = sum(is_value(cell, decimal) for i in good for cell in split[i] if i >= first)
-    filled = sum(bool(cell) for i in range(first, len(head)) for cell in split[i])
+    good = [i for i in good if i >= first]
+    values = sum(is_value(cell, decimal) for i in good for cell in split[i])
+    filled = sum(map(bool, itertools.chain(*split[first:])))
     header, line, joined, trailing = _find_header(head, split, first, width, delimiter)
-    bare = [line.count(delimiter) + 1 if delimiter else width for line in (head[i] for i in good if i >= first)]
     return values / max(filled, 1), _Layout(
         delimiter=delimiter,
         decimal=decimal,
@@ -251,7 +251,7 @@ def _read_as(head: Sequence[str], delimiter: str | None, decimal: str) -> tuple[
         first_row=first,
         width=width - trailing,
         trailing=trailing,
-        quoted=any(count != width for count in bare),
+        quoted=delimiter is not None and any(head[i].count(delimiter) + 1 != width for i in good),
         joined=joined,
     )
 
@@ -268,6 +268,24 @@ def _find_header(
     """Names of the columns, the line of the header, how many rows it has, and whether rows end with a delimiter."""
     data = [cells for cells in split[first:] if len(cells) == width]
     empty_end = width > 2 and all(not cells[-1] for cells in data)
+    block = _header_block(head, split, first, width, empty_end)
+    if block:
+        trailing = empty_end and all(len(cells) < width or not cells[-1] for _, cells in block)
+        rows = [cells[: width - 1] if trailing else cells for _, cells in reversed(block)]
+        return join_header(rows), block[0][0], len(block), trailing
+    for i in range(first - 1, -1, -1):
+        line = head[i].strip()
+        if line.startswith(_COMMENTS):
+            cells = split_cells(line.lstrip("#%/;").strip(), delimiter)
+            if len(cells) == width and not all(map(is_value, cells)):
+                return tuple(cells), i, 1, False
+    return (), first, 0, False
+
+
+def _header_block(
+    head: Sequence[str], split: Sequence[Sequence[str]], first: int, width: int, empty_end: bool
+) -> list[tuple[int, list[str]]]:
+    """Lines above the first row that have as many cells, the nearest first."""
     block: list[tuple[int, list[str]]] = []
     for i in range(first - 1, -1, -1):
         if not head[i].strip():
@@ -279,17 +297,7 @@ def _find_header(
         if not fits or head[i].lstrip().startswith(_COMMENTS) or len(block) == _MOST_HEADER_ROWS:
             break
         block.append((i, cells))
-    if block:
-        trailing = empty_end and all(len(cells) < width or not cells[-1] for _, cells in block)
-        rows = [cells[: width - 1] if trailing else cells for _, cells in reversed(block)]
-        return join_header(rows), block[0][0], len(block), trailing
-    for i in range(first - 1, -1, -1):
-        line = head[i].strip()
-        if line.startswith(_COMMENTS):
-            cells = split_cells(line.lstrip("#%/;").strip(), delimiter)
-            if len(cells) == width and not all(is_value(cell) for cell in cells):
-                return tuple(cells), i, 1, False
-    return (), first, 0, False
+    return block
 
 
 def join_header(rows: Sequence[Sequence[str]]) -> tuple[str, ...]:
@@ -318,29 +326,28 @@ def _write_plainly(text: str, layout: _Layout) -> PlainText:
     lines = text.split("\n")
     delimiter = layout.delimiter or " "
     preamble = tuple(line for line in lines[: layout.header_line] if line.strip())
+    header = split_cells(lines[layout.header_line], layout.delimiter) if layout.header else []
     for i in range(layout.first_row):
         lines[i] = ""
     names = [_QUOTED.sub(r"\1", name).replace(delimiter, "_" if delimiter == " " else " ") for name in layout.header]
     if names:
         lines[layout.first_row - 1] = delimiter.join(name or f"column_{i + 1}" for i, name in enumerate(names))
-    repeated = split_cells(text.split("\n")[layout.header_line], layout.delimiter) if names else None
     for i in range(layout.first_row, len(lines)):
         line = lines[i]
-        if layout.quoted and '"' in line:
-            inside = "." if layout.decimal == "," else " "
-            line = _QUOTED.sub(functools.partial(_replace_inside, delimiter, inside), line)
-        if layout.decimal == "," and delimiter != ",":
-            line = line.replace(",", ".")
-        if layout.trailing:
-            line = line.rstrip().removesuffix(delimiter)
-        if line.lstrip().startswith(_COMMENTS[1:3]):
-            line = ""
-        lines[i] = line
-    if repeated and layout.header_line < layout.first_row:
-        for i in range(layout.first_row, len(lines)):
-            if lines[i][:1].isalpha() and split_cells(lines[i], layout.delimiter) == repeated:
-                lines[i] = ""
+        again = bool(header) and line[:1].isalpha() and split_cells(line, layout.delimiter) == header
+        lines[i] = "" if again else _write_row(line, layout, delimiter)
     return PlainText(text="\n".join(lines), delimiter=delimiter, preamble=preamble, found=_describe(layout, preamble))
+
+
+def _write_row(line: str, layout: _Layout, delimiter: str) -> str:
+    if line.lstrip().startswith(_COMMENTS[1:3]):
+        return ""
+    if layout.quoted and '"' in line:
+        inside = "." if layout.decimal == "," else " "
+        line = _QUOTED.sub(functools.partial(_replace_inside, delimiter, inside), line)
+    if layout.decimal == "," and delimiter != ",":
+        line = line.replace(",", ".")
+    return line.rstrip().removesuffix(delimiter) if layout.trailing else line
 
 
 def _replace_inside(delimiter: str, by: str, quoted: re.Match[str]) -> str:

@@ -187,30 +187,35 @@ def _read_json(path: Path, units: DeclaredUnits) -> ImuRecording:
         raise FormatError(path, "holds no rows of Sensor Logger with sensor, time, x, y, z")
     names = np.array([re.sub(r"[^a-z]", "", name.lower()) for name in table.text(table.column(column))])
 
-    def rows(name: str) -> tuple[Table, Int64Array, Array]:
-        kept = names == name
-        lines = tuple(line for line, keep in zip(table.lines, kept, strict=True) if keep)
-        part = replace(table, lines=lines, line_numbers=table.line_numbers[kept])
-        return part, part.stamps_ns(part.column("time"), "ns"), part.numbers([part.column(axis) for axis in "xyz"])
-
     gyro_name = next((name for name in _JSON_GYRO if name in names), None)
     if gyro_name is None:
         raise FormatError(path, "holds no gyroscope of Sensor Logger")
-    part, t_ns, values = rows(gyro_name)
+    part, t_ns, values = _json_rows(table, names, gyro_name)
     gyro = order_rows(part, "gyro", units.gyro or "rad/s", t_ns, values)
     whole = next((name for name in _JSON_WHOLE if name in names), None)
     if whole is None and not {"accelerometer", "gravity"} <= set(names):
         if "accelerometer" in names:
             raise FormatError(path, f"its accelerometer is without gravity; {_RECORD_GRAVITY}")
         return build_recording(gyro, None, device="Sensor Logger")
+    return build_recording(gyro, _json_accelerometer(path, table, names, whole, units), device="Sensor Logger")
+
+
+def _json_rows(table: Table, names: Any, name: str) -> tuple[Table, Int64Array, Array]:
+    """The rows of one sensor, their stamps and values."""
+    kept = names == name
+    lines = tuple(line for line, keep in zip(table.lines, kept, strict=True) if keep)
+    part = replace(table, lines=lines, line_numbers=table.line_numbers[kept])
+    return part, part.stamps_ns(part.column("time"), "ns"), part.numbers([part.column(axis) for axis in "xyz"])
+
+
+def _json_accelerometer(path: Path, table: Table, names: Any, whole: str | None, units: DeclaredUnits) -> Samples:
     ios, standardised = _json_platform(path, table, names)
     unit = "g" if whole == "accelerometeruncalibrated" and ios and not standardised else "m/s2"
-    part, t_ns, values = rows(whole or "accelerometer")
+    part, t_ns, values = _json_rows(table, names, whole or "accelerometer")
     if whole is None:
-        values = values + _at(rows("gravity"), t_ns)
+        values = values + _at(_json_rows(table, names, "gravity"), t_ns)
     sign = -1.0 if ios and not standardised else 1.0
-    accel = order_rows(part, "accel", units.accel or unit, t_ns, sign * values)
-    return build_recording(gyro, accel, device="Sensor Logger")
+    return order_rows(part, "accel", units.accel or unit, t_ns, sign * values)
 
 
 def _json_platform(path: Path, table: Table, names: Any) -> tuple[bool, bool]:

@@ -5,6 +5,7 @@ Objects are read one by one, so that a recording takes no more than its text and
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 from collections.abc import Iterator
@@ -23,18 +24,16 @@ def rows_of_json(text: str) -> str | None:
     if start not in ("[", "{"):
         return None
     try:
-        rows = list(_flat_rows(text))
+        first = list(itertools.islice(_flat_rows(text), _FIRST))
+        if len(first) == 1 and (columns := _columns(first[0])) is not None:
+            return columns
+        names = tuple(dict.fromkeys(itertools.chain(*first)))
+        if len(first) < 2 or not 2 <= len(names) <= _MOST_KEYS:
+            return None
+        lines = [",".join(map(_cell, names))]
+        lines += (",".join(_cell(row.get(name, "")) for name in names) for row in _flat_rows(text))
     except (ValueError, RecursionError):
         return None
-    if len(rows) == 1 and (columns := _columns(rows[0])) is not None:
-        return columns
-    names: dict[str, None] = {}
-    for row in rows[:_FIRST]:
-        names.update(dict.fromkeys(row))
-    if len(rows) < 2 or not 2 <= len(names) <= _MOST_KEYS:
-        return None
-    lines = [",".join(map(_cell, names))]
-    lines += [",".join(_cell(row.get(name, "")) for name in names) for row in rows]
     return "\n".join(lines) + "\n"
 
 

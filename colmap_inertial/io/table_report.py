@@ -131,41 +131,34 @@ def _columns(path: Path, found: Columns, table: Table | None) -> Iterator[Column
 
 
 def _report_columns(found: Columns, table: Table) -> Iterator[ColumnReport]:
-    rates = {"gyro": _rate(table, found.gyro), "accel": _rate(table, found.accel)}
-    kinds = found.kinds or ("other",) * table.width
+    kinds = [f"{kind} (not taken)" if kind in ("time", "gyro", "accel") else kind for kind in found.kinds]
+    kinds = kinds or ["other"] * table.width
+    units = ["" if table.header is None else read_name(name).unit or "" for name in table.header or [""] * table.width]
+    rates: list[float | None] = [None] * table.width
+    for quantity, part in (("gyro", found.gyro), ("accel", found.accel)):
+        for column in () if part.time is None or part.columns is None else part.time.columns:
+            index = table.column(column)
+            kinds[index], units[index] = "time", _unit_of_stamp(table, part.time, index)
+        for index in part.columns or ():
+            counts = "" if part.counts_per_unit in (None, 1.0) else f"1/{part.counts_per_unit:g} "
+            kinds[index], units[index] = quantity, f"{counts}{part.unit}" if part.unit else ""
+            rates[index] = _rate(table, part)
     for index in range(table.width):
-        name = "" if table.header is None else table.header[index]
-        kind = "time (not taken)" if kinds[index] == "time" else kinds[index]
-        for quantity, part in (("gyro", found.gyro), ("accel", found.accel)):
-            if part.columns is not None and index in part.columns:
-                kind = quantity
-        part = found.gyro if kind == "gyro" else found.accel
-        unit = read_name(name).unit if name else None
-        if kind in rates and part.columns is not None and index in part.columns:
-            unit = part.unit
-            if unit and part.counts_per_unit not in (None, 1.0):
-                unit = f"1/{part.counts_per_unit:g} {unit}"
-        elif kind in rates:
-            kind += " (not taken)"
-        if part.time is not None and _is_stamp(table, part.time, index):
-            kind, unit = "time", _unit_of_stamp(table, part.time, index)
         mean, scatter = _statistics(table, index)
         yield ColumnReport(
             number=index + 1,
-            name=name,
-            kind=kind,
-            unit=unit or "",
+            name="" if table.header is None else table.header[index],
+            kind=kinds[index],
+            unit=units[index],
             mean=mean,
             scatter=scatter,
-            rate_hz=rates.get(kind) if kind in rates and part.columns and index in part.columns else None,
+            rate_hz=rates[index],
         )
 
 
-def _is_stamp(table: Table, time: TimeColumns, index: int) -> bool:
-    return any(table.column(column) == index for column in time.columns)
-
-
-def _unit_of_stamp(table: Table, time: TimeColumns, index: int) -> str:
+def _unit_of_stamp(table: Table, time: TimeColumns | None, index: int) -> str:
+    if time is None:
+        return ""
     if time.counts_per_second is not None:
         return f"1/{time.counts_per_second:g} s"
     units = time.units if len(time.units) == len(time.columns) else time.units * len(time.columns)
