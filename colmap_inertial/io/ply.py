@@ -6,6 +6,7 @@ through in chunks, and what the format lets one check on the way is checked: siz
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -143,7 +144,7 @@ def _read_header_line(words: list[str], formats: list[str], elements: list[Eleme
 _WAS_SINGLE = b"comment colmap-inertial: x y z were float\n"
 
 
-def _in_precision(header: Header, doubles: bool | None) -> Header:
+def _set_precision(header: Header, doubles: bool | None) -> Header:
     """The header of the copy: positions of vertices in double precision, or as they were before that."""
     vertices = next((e for e in header.elements if e.name == "vertex"), None)
     was_single = _WAS_SINGLE in header.raw
@@ -153,22 +154,24 @@ def _in_precision(header: Header, doubles: bool | None) -> Header:
     old, new = ("f4", "f8") if doubles else ("f8", "f4")
     if {kinds.get(name) for name in _POSITION} != {old}:
         return header
-    word, element, lines = {"f4": b"float", "f8": b"double"}[new], b"", []
-    for line in header.raw.splitlines(keepends=True):
+    lines = _retype(header.raw, b"double" if doubles else b"float")
+    lines[2:2] = [_WAS_SINGLE] if doubles else []
+    properties = tuple(Property(p.name, new) if p.name in _POSITION else p for p in vertices.properties)
+    elements = tuple(Element(e.name, e.rows, properties) if e is vertices else e for e in header.elements)
+    return Header(b"".join(lines), header.order, elements)
+
+
+def _retype(raw: bytes, word: bytes) -> list[bytes]:
+    """Lines of a header with another type of vertices' positions, without the line on what they were."""
+    element, lines = b"", []
+    for line in raw.splitlines(keepends=True):
         words = line.split()
         if words[:1] == [b"element"]:
             element = words[1]
         if element == b"vertex" and words[:1] == [b"property"] and words[-1].decode("latin-1") in _POSITION:
             line = line.replace(words[1], word, 1)
-        if line != _WAS_SINGLE:
-            lines.append(line)
-        if doubles and words[:1] == [b"format"]:
-            lines.append(_WAS_SINGLE)
-    properties = tuple(
-        Property(p.name, new) if p.name in _POSITION and p.count is None else p for p in vertices.properties
-    )
-    elements = tuple(Element(e.name, e.rows, properties) if e is vertices else e for e in header.elements)
-    return Header(b"".join(lines), header.order, elements)
+        lines.append(line)
+    return [line for line in lines if line != _WAS_SINGLE]
 
 
 def transform_ply(
@@ -203,7 +206,7 @@ def transform_ply(
         changed = () if vertices is None else _check_vertices(source, vertices)
         body = source.stat().st_size - len(header.raw)
         with open(target, "wb") as out:
-            made = _in_precision(header, doubles if changed else None)
+            made = _set_precision(header, doubles if changed else None)
             out.write(made.raw)
             n_vertices = 0 if vertices is None else vertices.rows
             chunks: Iterator[bytes | memoryview]
@@ -235,15 +238,14 @@ def sample_vertices(path: Path, most: int = 20_000) -> Array:
             columns = [names.index(name) for name in _POSITION]
             lines = (file.readline(_LONGEST_LINE).split() for _ in range(first.rows))
             rows = [line for i, line in enumerate(lines) if i % (first.rows // most + 1) == 0]
-            try:
+            with contextlib.suppress(ValueError, IndexError):
                 return np.array([[float(row[c]) for c in columns] for row in rows]).reshape(-1, 3)
-            except (ValueError, IndexError):
-                return np.empty((0, 3))
+            return np.empty((0, 3))
         dtype = first.dtype(header.order)
         count = min(first.rows, (path.stat().st_size - len(header.raw)) // dtype.itemsize)
-        if count == 0:
-            return np.empty((0, 3))
-        mapped = np.memmap(path, dtype, mode="r", offset=len(header.raw), shape=(count,))
+        mapped = (
+            np.memmap(path, dtype, mode="r", offset=len(header.raw), shape=(count,)) if count else np.empty(0, dtype)
+        )
         some = mapped[:: count // most + 1]
         return np.stack([np.asarray(some[name], dtype=np.float64) for name in _POSITION], axis=1)
 

@@ -67,8 +67,8 @@ def is_date(cell: str) -> bool:
     return match is not None and (match["first"] is not None or match["hour"] is not None)
 
 
-def read_stamps(table: Table, time: TimeColumns) -> tuple[Int64Array, tuple[str, ...]]:
-    """(N,) nanoseconds of the rows, and what was mended, in words.
+def read_stamps(table: Table, time: TimeColumns) -> tuple[Int64Array, tuple[Fact, ...]]:
+    """(N,) nanoseconds of the rows, and what was mended.
 
     Raises
     ------
@@ -93,8 +93,7 @@ def read_stamps(table: Table, time: TimeColumns) -> tuple[Int64Array, tuple[str,
         periods = [period * unit_ns // part for period in _COUNTS for part in (1, 1000, 1_000_000)]
         periods += [_DAY_NS, _WEEK_NS]
     turns, t_ns = unwrap(t_ns, periods)
-    name = table.path.name
-    return t_ns, (f"{name}: the clock began anew {turns} times, and was counted on",) if turns else ()
+    return t_ns, (Fact("clock-began-anew", file=table.path.name, times=turns),) if turns else ()
 
 
 def unwrap(t_ns: Int64Array, periods_ns: Sequence[int]) -> tuple[int, Int64Array]:

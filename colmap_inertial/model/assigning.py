@@ -40,7 +40,9 @@ def assign_scales(
             )
         scales = {next(iter(layout.submodels)): scales[None]}
     if all(scale.similarity is None for scale in scales.values()):
-        raise NotObservableError("scale", "; ".join(reason for scale in scales.values() for reason in scale.reasons))
+        raise NotObservableError(
+            "scale", "; ".join(str(reason) for scale in scales.values() for reason in scale.reasons)
+        )
     missing = [index for index in layout.submodels if index not in scales]
     if missing or len(scales) > len(layout.submodels):
         given = ", ".join(str(i) for i in scales)

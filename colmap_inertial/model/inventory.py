@@ -87,20 +87,25 @@ def lengths_of(file: Path, path: Path, depths: frozenset[Path] = frozenset()) ->
         return suffix, "carried"
     if path in depths or suffix in _PICTURES:
         return (f"depths ({suffix})", "depths") if path in depths or _is_deep(file, path) else None
-    if suffix in _FREE or name in _FREE_NAMES or not _FREE_NAMES.isdisjoint({path.stem.lower()} - {"thumbs"}):
-        return None
-    if suffix == ".bin" and any(folder in path.parts[:-1] for folder in _FREE_FOLDERS):
-        return None
-    if "vocab" in name:
-        return None
-    head = _head(file)
+    is_free = _is_free_by_name(path) or _is_free_by_content(_head(file), suffix)
+    return None if is_free else (suffix or path.name, "possible")
+
+
+def _is_free_by_name(path: Path) -> bool:
+    """Whether a file of this name has no lengths."""
+    name, suffix = path.name.lower(), path.suffix.lower()
+    if suffix in _FREE or name in _FREE_NAMES or path.stem.lower() in _FREE_NAMES or "vocab" in name:
+        return True
+    return suffix == ".bin" and any(folder in path.parts[:-1] for folder in _FREE_FOLDERS)
+
+
+def _is_free_by_content(head: bytes, suffix: str) -> bool:
+    """Whether a file that begins so has no lengths."""
     if not head or is_apple_double(head) or is_pointer(head):
-        return None
+        return True
     if suffix in _TEXT and b"\0" not in head and not _has_rows_of_numbers(head):
-        return None
-    if suffix == ".db" or head.startswith(b"SQLite format 3\0"):
-        return None
-    return suffix or path.name, "possible"
+        return True
+    return suffix == ".db" or head.startswith(b"SQLite format 3\0")
 
 
 def _head(file: Path) -> bytes:
@@ -157,9 +162,10 @@ class Inventory:
     def __init__(self) -> None:
         self._found: dict[tuple[str, Lengths], list[str]] = {}
 
-    def add(self, path: Path, kind: str, lengths: Lengths) -> None:
-        """Note a file."""
-        self._found.setdefault((kind, lengths), []).append(path.as_posix())
+    def add(self, path: Path, lengths: tuple[str, Lengths] | None) -> None:
+        """Note a file, where it has lengths or may have some."""
+        if lengths is not None:
+            self._found.setdefault(lengths, []).append(path.as_posix())
 
     @property
     def unmoved(self) -> tuple[Unmoved, ...]:

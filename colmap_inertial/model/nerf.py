@@ -60,7 +60,7 @@ def cameras_are_those_of(path: Path, placed: Sequence[PlacedModel]) -> bool:
     return any(are_cameras_of(model, written) for model in placed)
 
 
-def applied_transform(path: Path) -> Array | None:
+def read_applied_transform(path: Path) -> Array | None:
     """(4, 4) what was done to the model's world in a ``transforms.json``; ``None`` for any other file."""
     values = _frames(path)
     return None if values is None else _applied(path, values)

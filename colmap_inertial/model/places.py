@@ -62,7 +62,7 @@ def about(similarity: Similarity, pivot: Array) -> Similarity:
     return replace(similarity, translation_m=similarity.translation_m + pivot - similarity.scale * turn @ pivot)
 
 
-def in_world_of(similarity: Similarity, applied: Array) -> Similarity | None:
+def express_in_world(similarity: Similarity, applied: Array) -> Similarity | None:
     """What a similarity of the model's world is in a world that (4, 4) ``applied`` leads to; ``None`` of no similarity.
 
     Sizes and turns stay those of the similarity up to that.

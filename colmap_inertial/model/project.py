@@ -222,11 +222,13 @@ class _Plan:
     link: bool = False
     is_undo: bool = False
 
-    def lies_far(self, owner: int | None, move: Similarity) -> bool:
-        """Whether files of a model come to lie too far from the origin for single precision."""
+    def in_doubles(self, owner: int | None, move: Similarity) -> bool | None:
+        """Whether points of a model come to lie too far off for single precision, as of ``transform_ply``."""
+        if self.is_undo:
+            return False
         models = [model for model in self.layout.placed if owner is None or model.index == owner]
         places = [Place.of(model.shown()) for model in models]
-        return any(place is not None and place.moved(move).is_far for place in places)
+        return any(place is not None and place.moved(move).is_far for place in places) or None
 
     @property
     def similarities(self) -> dict[int, Similarity | None]:
@@ -313,10 +315,7 @@ class _Work:
                     progress(done := done + 1, total)
             for folder in reversed(self.folders):
                 shutil.copymode(self._project / folder, partial / folder)
-            scales = [s.similarity.scale for s in plan.by_model.values() if s.similarity is not None]
-            self.note(self._inventory.notes(scales))
-            of_files = ((str(self._in_project(path)), fact) for path, fact in self._read)
-            self._notes += [Fact("read-all-the-same", file=file, found=fact) for file, fact in of_files]
+            self._note_what_stays(plan)
             submodels = plan.layout.submodels
             for index, scale in plan.by_model.items():
                 if scale.left_out and scale.similarity is not None:
@@ -333,6 +332,13 @@ class _Work:
             if not plan.is_undo:
                 write_json(partial / TRANSFORM_FILE, self._record(applied, plan.one_for_all))
         return applied
+
+    def _note_what_stays(self, plan: _Plan) -> None:
+        """Tell of files that may have lengths and stay, and of what was odd in the models."""
+        scales = [s.similarity.scale for s in plan.by_model.values() if s.similarity is not None]
+        self.note(self._inventory.notes(scales))
+        of_files = ((str(self._in_project(path)), fact) for path, fact in self._read)
+        self._notes += [Fact("read-all-the-same", file=file, found=fact) for file, fact in of_files]
 
     def _sort_files(self, plan: _Plan, partial: Path) -> tuple[list[Path], list[Callable[[], Change | str]]]:
         """The databases, and the work on every other file that COLMAP does not write itself."""
@@ -360,15 +366,12 @@ class _Work:
             owner = None if plan.one_for_all is not None or kind is None else self._owner(plan.layout, path)
             similarity = plan.one_for_all if owner is None else similarities[owner]
             if kind is None and not self.is_kept(path):
-                lengths = lengths_of(source, path, worlds.depths)
-                if lengths is not None:
-                    self._inventory.add(path, *lengths)
+                self._inventory.add(path, lengths_of(source, path, worlds.depths))
             if kind is None or similarity is None:
                 jobs.append(functools.partial(copy, source, target, link=plan.link))
             else:
                 move = worlds.similarity_of(path, kind, owner, similarity)
-                doubles = False if plan.is_undo else (plan.lies_far(owner, move) or None)
-                place = (str(path), owner)
+                doubles, place = plan.in_doubles(owner, move), (str(path), owner)
                 jobs.append(functools.partial(transform, source, target, kind, move, place, doubles=doubles))
         return databases, jobs
 

@@ -104,12 +104,12 @@ def check_references(files: Mapping[str, bytes], folder: Path, suffix: str, *, u
         if gone.any():
             fact = Fact("lost-points", count=int(gone.sum()), points=len(np.unique(images.point[gone])))
             take_note(folder / f"images{suffix}", fact)
-        changed["images"] = _without_points(files["images"], images, lost)
+        changed["images"] = _clear_points(files["images"], images, lost)
     if not agrees.all():
         take_note(folder / f"points3D{suffix}", Fact("lost-observations", count=int((~agrees).sum())))
-        changed["points3D"] = _with_tracks(files["points3D"], starts, lengths, elements, agrees)
+        changed["points3D"] = _shorten_tracks(files["points3D"], starts, lengths, elements, agrees)
     if "frames" in files:
-        frames = _with_images(files["frames"], set(images.numbers.tolist()), folder / f"frames{suffix}")
+        frames = _drop_images(files["frames"], set(images.numbers.tolist()), folder / f"frames{suffix}")
         if frames is not None:
             changed["frames"] = frames
     return Sound(changed=changed, untracked=untracked)
@@ -179,7 +179,7 @@ def _read_points(data: bytes) -> tuple[NDArray[np.uint64], list[int], list[int],
     return np.array(numbers, np.uint64), starts, lengths, np.frombuffer(b"".join(tracks), _ELEMENT)
 
 
-def _without_points(data: bytes, images: _Images, lost: NDArray[np.bool_]) -> bytes:
+def _clear_points(data: bytes, images: _Images, lost: NDArray[np.bool_]) -> bytes:
     """Images whose lost key points name no point."""
     out, at = bytearray(data), 8
     for i in range(len(images.numbers)):
@@ -192,7 +192,7 @@ def _without_points(data: bytes, images: _Images, lost: NDArray[np.bool_]) -> by
     return bytes(out)
 
 
-def _with_tracks(
+def _shorten_tracks(
     data: bytes, starts: list[int], lengths: list[int], elements: NDArray[np.void], kept: NDArray[np.bool_]
 ) -> bytes:
     """Points whose tracks have the kept elements alone."""
@@ -204,7 +204,7 @@ def _with_tracks(
     return b"".join(out)
 
 
-def _with_images(data: bytes, known: set[int], path: Path) -> bytes | None:
+def _drop_images(data: bytes, known: set[int], path: Path) -> bytes | None:
     """Frames without images that are not there; ``None`` where all are."""
     out, at, lost, empty = [], 8, 0, 0
     for _ in range(_U64.unpack_from(data)[0]):

@@ -15,8 +15,8 @@ from colmap_inertial.core.types import Similarity
 from colmap_inertial.io.ply import sample_vertices
 from colmap_inertial.model.camera_files import CAMERAS_OF, are_cameras_of
 from colmap_inertial.model.database import PlacedModel
-from colmap_inertial.model.nerf import applied_transform, cameras_are_those_of, depth_pictures, is_transforms
-from colmap_inertial.model.places import find_world, in_world_of, is_elsewhere
+from colmap_inertial.model.nerf import cameras_are_those_of, depth_pictures, is_transforms, read_applied_transform
+from colmap_inertial.model.places import express_in_world, find_world, is_elsewhere
 
 
 class Worlds:
@@ -44,7 +44,7 @@ class Worlds:
         for path in files:
             if not is_transforms(path):
                 continue
-            applied = applied_transform(project / path)
+            applied = read_applied_transform(project / path)
             if applied is None:
                 continue
             for name in depth_pictures(project / path):
@@ -84,7 +84,7 @@ class Worlds:
             self._note(Fact("other-frame", path=str(path), share_pct=100 * distance))
         if best == 0:
             return similarity
-        moved = in_world_of(similarity, list(near.values())[best - 1])
+        moved = express_in_world(similarity, list(near.values())[best - 1])
         if moved is None:
             return similarity
         self._note(Fact("frame-of-transforms", path=str(path), by=str(list(near)[best - 1])))

@@ -8,15 +8,36 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
 from colmap_inertial.checks.validate.targets import Target
+from colmap_inertial.core.arrays import Array, IndexArray
 from colmap_inertial.core.facts import Fact
 
-if TYPE_CHECKING:
-    from colmap_inertial.checks.validate.result import Distance, ViewResiduals
+
+class Distance(Protocol):
+    """A known distance, as ``result.Distance``."""
+
+    @property
+    def pair(self) -> tuple[str, str]: ...
+    @property
+    def known_m(self) -> float: ...
+    @property
+    def measured(self) -> float: ...
+    @property
+    def residual_m(self) -> float: ...
+
+
+class SeenView(Protocol):
+    """The target in one image, as ``result.ViewResiduals``."""
+
+    @property
+    def corner(self) -> IndexArray: ...
+    @property
+    def observed_px(self) -> Array: ...
+
 
 #: Corners of printed targets are found so far off, all alike: ink and light spread over edges, pixels.
 _EDGE_PX = 0.5
@@ -25,7 +46,7 @@ _SIGMAS, _LEAST = 4.0, 4
 
 
 def find_contradictions(
-    target: Target, distances: Sequence[Distance], views: Sequence[ViewResiduals], tolerance_pct: float
+    target: Target, distances: Sequence[Distance], views: Sequence[SeenView], tolerance_pct: float
 ) -> list[Fact]:
     """Kinds of lengths, by size and direction on the board, whose mean is off against their own length.
 
@@ -80,7 +101,7 @@ def find_contradictions(
     ]
 
 
-def _pixel_on_target(target: Target, views: Sequence[ViewResiduals]) -> float | None:
+def _pixel_on_target(target: Target, views: Sequence[SeenView]) -> float | None:
     """Size of a pixel on the target, metres: the median over the images."""
     sizes = []
     for view in views:

@@ -413,7 +413,7 @@ class Validation:
                 )
             )
         found = find_contradictions(self.target, self.distances, self.views, self.tolerance_pct)
-        return (*doubts, *(fact.with_advice for fact in found))
+        return (*doubts, *(Fact("noted-with-advice", found=fact) for fact in found))
 
     def as_json(self) -> dict[str, Any]:
         """Everything but pixel coordinates, ready for ``json.dump``."""

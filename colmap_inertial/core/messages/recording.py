@@ -294,3 +294,8 @@ def forced_to_go_on(finding: Fact) -> str:
 @message(example={"doubts": ("its squares measure 3 % off",)})
 def target_doubtful(doubts: tuple[str, ...]) -> str:
     return f"its target may not be the stated one: {'; '.join(doubts)}"
+
+
+@message(example={"file": "imu.csv", "times": 2})
+def clock_began_anew(file: str, times: int) -> str:
+    return f"{file}: the clock began anew {times} times, and was counted on"

@@ -317,7 +317,7 @@ def _judged(
     metres_per_unit, sigma_log = scale.metres_per_unit, scale.sigma_log
     refusals = [*_refusals(fit, t_s), *(wrong if worthless else ())]
     verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, refusals=refusals)
-    notes: tuple[str, ...] = ()
+    notes: tuple[Fact, ...] = ()
     if verdict == "refused":
         reasons = (*reasons, *(() if worthless else wrong))
     else:
