@@ -82,7 +82,7 @@ def write_run(
         "sparse_metric": "sparse/0" if metric else None,
         "trajectory": "trajectory.tum" if metric else None,
         **estimate.as_json(),
-        "reasons": [*estimate.reasons, f"something about {name}"],
+        "reasons": [*map(str, estimate.reasons), f"something about {name}"],
         "calibration_change": None,
         "readout_translation": {"shift_px": 1.2, "before_px": 0.5, "after_px": 0.4, "accepted": True},
         "validation": _validation(name) if metric else None,

@@ -15,8 +15,8 @@ from colmap_inertial.checks.diagnose import Finding, Recorded, diagnose, unreada
 from colmap_inertial.checks.words import not_checked, outcome_of_model
 from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.core.facts import Fact
-from colmap_inertial.core.messages import all_messages
 from colmap_inertial.core.types import ImuRecording
+from colmap_inertial.messages import all_messages
 from colmap_inertial.motion.flow import VisualRotation
 
 ROOT = Path(__file__).parents[1]

@@ -42,6 +42,7 @@ from colmap_inertial.io.frame_sources import Video
 from colmap_inertial.io.frames import read_frame_times
 from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.io.imu_formats import imu_formats
+from colmap_inertial.messages import all_messages, findings
 from colmap_inertial.pipeline.run.config import config_as_toml
 from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
 from colmap_inertial.pipeline.stages.imaging_plan import GyroView, ImagingPlan
@@ -393,18 +394,11 @@ def test_the_reference_names_every_format_and_every_key():
 
 
 def test_every_finding_is_explained():
-    codes = set()
-    for file in (ROOT / "colmap_inertial").rglob("*.py"):
-        text = file.read_text()
-        for node in ast.walk(ast.parse(text)) if re.search(r"\bcode\s*=", text) else ():
-            if isinstance(node, ast.keyword) and node.arg == "code":
-                codes |= {n.value for n in ast.walk(node.value) if isinstance(n, ast.Constant)}
-        codes |= set(re.findall(r'code, what = "([a-z-]+)"', text))
-        codes |= set(re.findall(r'code: str = "([a-z-]+)"', text))
-        codes |= set(re.findall(r'\("((?:short|long)-gap)"', text))
-    codes = {code for code in codes if isinstance(code, str) and re.fullmatch(r"[a-z]+(-[a-z]+)*", code)}
-    codes -= {"mirrored"}  # what the message compares with
-    assert len(codes) > 50
+    # a message is a function that is named like its code, or a sentence under it
+    source = Path(findings.__file__).read_text()
+    forms = ("def {0}(", 'state("{1}"', 'state(\n    "{1}"', 'code="{1}"')
+    names = {code: (code.replace("-", "_"), code) for code in all_messages()}
+    codes = {code for code, name in names.items() if any(form.format(*name) in source for form in forms)}
     explained = (DOCS / "troubleshooting.md").read_text()
     rows = explained[explained.index("### IMU") :].splitlines()
     listed = {code for row in rows if row.startswith("| `") for code in re.findall(r"`([a-z-]+)`", row.split("|")[1])}
@@ -428,7 +422,7 @@ def test_every_reason_in_the_text_is_one_that_is_printed():
     table = page[page.index("| text (in part)") :].split("\n\n")[0]
     texts = [
         text
-        for folder in ("inertial", "motion", "pipeline", "colmap", "reconstruction")
+        for folder in ("messages", "inertial", "motion", "pipeline", "colmap", "reconstruction")
         for text in said(ROOT / "colmap_inertial" / folder)
     ]
     phrases = [
@@ -497,7 +491,9 @@ def test_results_have_the_form_that_their_schemas_describe(examples, project, tm
     frames, keypoints = (
         json.loads((folder / "out_hooks" / f"{name}.json").read_text()) for name in ("frames", "keypoints")
     )
-    assert {frozenset(record) for record in frames["frames"]} == {frozenset(("name", "action", "camera", "treatments"))}
+    assert {frozenset(record) for record in frames["frames"]} == {
+        frozenset(("name", "action", "sharpened", "rectified", "camera", "treatments"))
+    }
     assert {frozenset(record) for record in keypoints["images"]} == {frozenset(("name", "rectified", "treatments"))}
     treatments = [one for record in [*frames["frames"], *keypoints["images"]] for one in record["treatments"]]
     assert len(treatments) >= len(frames["frames"])

@@ -43,6 +43,7 @@ IMPORTS = imports()
 
 #: Each room imports only itself and rooms of earlier rows.
 ROWS = [
+    ("messages",),
     ("core", "_kernels"),
     ("io", "imaging"),
     ("model", "motion"),
@@ -172,7 +173,7 @@ def test_importing_the_command_line_loads_nothing_heavy():
 def test_importing_the_command_line_loads_only_what_describes_the_commands():
     rooms = "{m.split('.')[1] for m in sys.modules if m.startswith('colmap_inertial.')}"
     code = f"import sys, colmap_inertial.cli; print(sorted({rooms}))"
-    assert output_of(code) == "['cli', 'core']"
+    assert output_of(code) == "['cli', 'core', 'messages']"
 
 
 def test_importing_every_module_works_on_its_own():

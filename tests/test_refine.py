@@ -395,12 +395,12 @@ def test_an_offset_beyond_the_readings_that_were_looked_up_is_refused(small):
     _, problem, start, _ = small
     reach_s = problem.inertial.turning.half_span_s - 0.5 * abs(start.readout_s)
     near_s, far_s = reach_s - 0.001, reach_s + 0.001
-    assert judge._too_late(problem, replace(start, offset_s=near_s)) == ""
-    assert f"by {1e3 * far_s:.0f} ms" in judge._too_late(problem, replace(start, offset_s=-far_s))
+    assert judge._too_late(problem, replace(start, offset_s=near_s)) is None
+    assert f"by {1e3 * far_s:.0f} ms" in str(judge._too_late(problem, replace(start, offset_s=-far_s)))
     drifting = replace(start, offset_s=near_s, clock_rate=0.002 / np.ptp(problem.inertial.nodes_s) * 2)
-    assert f"by {1e3 * far_s:.0f} ms" in judge._too_late(problem, drifting)
+    assert f"by {1e3 * far_s:.0f} ms" in str(judge._too_late(problem, drifting))
     longer = replace(start, offset_s=near_s, readout_s=start.readout_s + 0.004)
-    assert "a readout of" in judge._too_late(problem, longer)
+    assert "a readout of" in str(judge._too_late(problem, longer))
 
 
 def test_a_step_that_leaves_no_camera_is_not_tried(small):
@@ -414,9 +414,9 @@ def test_a_step_that_leaves_no_camera_is_not_tried(small):
 def test_what_is_held_out_must_be_predicted_better_than_chance_does(small):
     _, problem, start, _ = small
     rests = solver._solution(_evaluate(problem, start, problem.observations), 1, converged=True)
-    assert judge._doubt(rests, rests, 1.0, -0.02, 0.01) == ""
+    assert judge._doubt(rests, rests, 1.0, -0.02, 0.01) is None
     for change, spread in ((-0.009, 0.01), (0.0, 0.0), (-1.0, np.inf)):
-        assert "no better" in judge._doubt(rests, rests, 1.0, change, spread)
+        assert "no better" in str(judge._doubt(rests, rests, 1.0, change, spread))
 
 
 def test_what_is_held_out_leaves_each_point_enough(small):

@@ -467,9 +467,11 @@ def test_frames_speak_for_themselves_where_too_few_confirm_the_gyroscope(subtest
                 SimpleNamespace(evidence=SimpleNamespace(enough=tells), blur_px=px, shows=False, is_mostly_sky=False)
                 for tells, px in ((False, 99.0), (True, 0.9 * GATE_LIMITS.must_show_px))
             ] * 20
-            verdict = RecordingVerdict(trusted=True, support=5.0, extent_factor=1.0, frames=9, reason="as it was")
+            verdict = RecordingVerdict(
+                trusted=True, support=5.0, extent_factor=1.0, frames=9, reason=Fact.stated("as it was")
+            )
             found = judging.judge_each_frame(verdict, looked)
             assert found.trusted is trusted
-            assert found.reason == "as it was" if trusted else f"{shown} of {telling} frames" in found.reason
+            assert str(found.reason) == "as it was" if trusted else f"{shown} of {telling} frames" in str(found.reason)
             doubted = replace(verdict, trusted=False)
             assert judging.judge_each_frame(doubted, looked) is doubted

@@ -1,6 +1,6 @@
 """Facts: what was found, decided or done, as a code with values.
 
-Code that decides looks at codes and values. Their words are in ``core.messages``, and nowhere else.
+Code that decides looks at codes and values. Their words are in ``messages``, and nowhere else.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from colmap_inertial.core import messages
+from colmap_inertial import messages
 
 
 @dataclass(frozen=True, init=False)
@@ -19,7 +19,7 @@ class Fact:
     Parameters
     ----------
     code
-        Its stable name, of ``core.messages``.
+        Its stable name, of ``messages``.
     values
         What its message is made of: numbers (units are in the names), names, other facts, and tuples of them.
 

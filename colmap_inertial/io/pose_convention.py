@@ -8,8 +8,8 @@ from typing import Literal
 import numpy as np
 
 from colmap_inertial.core.geometry import quat_conjugate, quat_rotate
-from colmap_inertial.core.messages.findings import describe_convention
 from colmap_inertial.core.types import CameraTrajectory
+from colmap_inertial.messages.findings import describe_convention
 
 
 @dataclass(frozen=True, kw_only=True)

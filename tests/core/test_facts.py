@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import colmap_inertial
-from colmap_inertial.core import messages
+from colmap_inertial import messages
 from colmap_inertial.core.errors import FormatError, NotObservableError
 from colmap_inertial.core.facts import Fact, as_fact, with_sentences
 from colmap_inertial.core.types import Action, Treatment

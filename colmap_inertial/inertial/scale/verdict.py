@@ -6,9 +6,9 @@ import math
 from collections.abc import Mapping, Sequence
 
 from colmap_inertial.core.facts import Fact
-from colmap_inertial.core.messages.scale import PARTS
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import Verdict
+from colmap_inertial.messages.scale import PARTS
 
 #: Half-widths of the 95 % interval, relative to the scale, up to which a scale is trusted, and given at all.
 TRUSTED_HALF_WIDTH = 0.03

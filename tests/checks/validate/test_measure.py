@@ -15,7 +15,7 @@ def test_few_views_are_remarked_on_below_five():
     search = SimpleNamespace(sightings=[], searched=range(9), views=range(9), target=parse_target("aruco:4X4_50:0.1"))
     fit = SimpleNamespace(noise=SimpleNamespace(pose_ratio=np.zeros(2)))
     said = [_list_remarks(search, None, fit, tuple(range(count))) for count in (4, 5)]
-    assert [any("the interval is wide" in line for line in lines) for lines in said] == [True, False]
+    assert [any("the interval is wide" in str(line) for line in lines) for lines in said] == [True, False]
 
 
 @pytest.mark.parametrize(("images", "agree"), [(10, True), (11, False)])

@@ -64,6 +64,6 @@ def test_a_drift_names_the_least_and_the_largest_scale_and_the_length_of_its_par
         "dof": 2,
     }
     trend = {"trend_log_per_s": 0.0, "trend_sigma_log_per_s": 1e-3}
-    (sentence,) = _check_drift(ScaleDrift(**parts, **trend, p_value=1e-9))
-    assert "from -1.0 to +2.0 % in parts of 5 s" in sentence
+    (doubt,) = _check_drift(ScaleDrift(**parts, **trend, p_value=1e-9))
+    assert "from -1.0 to +2.0 % in parts of 5 s" in str(doubt)
     assert _check_drift(ScaleDrift(**parts, **trend, p_value=0.5)) == []

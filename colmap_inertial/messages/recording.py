@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 from math import degrees
-from typing import TYPE_CHECKING
 
-from colmap_inertial.core.messages import message, state
-
-if TYPE_CHECKING:
-    from colmap_inertial.core.facts import Fact
+from colmap_inertial.messages import Said, message, state
 
 # samples, as they were read
 
@@ -219,7 +215,7 @@ def calibration_too_loose(rotation_sigma_rad: float, offset_sigma_s: float) -> s
         "by_model": {"code": "too-few-poses-to-align", "values": {"poses": 3}},
     }
 )
-def neither_by_pixels_nor_model(by_pixels: Fact, quantity: str, by_model: Fact) -> str:
+def neither_by_pixels_nor_model(by_pixels: Said, quantity: str, by_model: Said) -> str:
     return f"{by_pixels.with_advice} (nor by a small model: {quantity} is not observable: {by_model.with_advice})"
 
 
@@ -264,7 +260,7 @@ _POSES = {
 
 
 @message(example={"found": _POSES})
-def poses_of_another_convention(found: Fact) -> str:
+def poses_of_another_convention(found: Said) -> str:
     return found.with_advice
 
 
@@ -272,22 +268,22 @@ _FOUND = {"code": "gyro-gain", "values": {"gain": 1.3}}
 
 
 @message(example={"finding": _FOUND})
-def found_beforehand(finding: Fact) -> str:
+def found_beforehand(finding: Said) -> str:
     return f"{finding}; {finding.advice} ({finding.code})"
 
 
 @message(example={"finding": _FOUND})
-def stopped_by_finding(finding: Fact) -> str:
+def stopped_by_finding(finding: Said) -> str:
     return f"{finding}; {finding.advice} ({finding.code}) (--force goes on)"
 
 
 @message(example={"path": "accel.csv", "finding": {"code": "gravity-removed", "values": {"median_m_s2": 0.5}}})
-def stopped_by_file(path: str, finding: Fact) -> str:
+def stopped_by_file(path: str, finding: Said) -> str:
     return f"{path}: {finding.with_advice} (--force goes on)"
 
 
 @message(example={"finding": _FOUND})
-def forced_to_go_on(finding: Fact) -> str:
+def forced_to_go_on(finding: Said) -> str:
     return f"{finding}; forced to go on"
 
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from colmap_inertial.core.messages import message, state
+from colmap_inertial.messages import message, state
 
 _RECORD_INSTEAD = (
     "move the camera itself back and forth by 20 cm or more, in several directions and briskly, for 10 s or longer, "

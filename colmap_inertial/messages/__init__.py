@@ -18,7 +18,17 @@ import inspect
 import pkgutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
+
+
+class Said(Protocol):
+    """A fact within another one's values: its message, and what to do about it."""
+
+    @property
+    def advice(self) -> str: ...
+
+    @property
+    def with_advice(self) -> str: ...
 
 
 @dataclass(frozen=True)
@@ -110,7 +120,7 @@ def all_messages() -> Mapping[str, Message]:
 def _of(code: str) -> Message:
     _load()
     if code not in _MESSAGES:
-        raise LookupError(f"no message has the code {code}: add one to core/messages")
+        raise LookupError(f"no message has the code {code}: add one to messages")
     return _MESSAGES[code]
 
 

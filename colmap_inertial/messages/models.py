@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from colmap_inertial.core.messages import message, state
+from colmap_inertial.messages import message, state
 
 
 def _say(fact: Any) -> str:

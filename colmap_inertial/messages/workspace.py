@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from colmap_inertial.core.messages import message, state
-
-if TYPE_CHECKING:
-    from colmap_inertial.core.facts import Fact
+from colmap_inertial.messages import Said, message, state
 
 
 def _of(count: int, what: str) -> str:
@@ -15,12 +10,12 @@ def _of(count: int, what: str) -> str:
 
 
 @message(example={"found": {"code": "git-lfs-pointer", "values": {}}})
-def noted_with_advice(found: Fact) -> str:
+def noted_with_advice(found: Said) -> str:
     return found.with_advice
 
 
 @message(example={"file": "sparse/0/images.txt", "found": {"code": "zeros", "values": {}}})
-def read_all_the_same(file: str, found: Fact) -> str:
+def read_all_the_same(file: str, found: Said) -> str:
     return f"{file}: {found.with_advice}"
 
 

@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 from math import degrees
-from typing import TYPE_CHECKING
 
-from colmap_inertial.core.messages import message, state
-
-if TYPE_CHECKING:
-    from colmap_inertial.core.facts import Fact
+from colmap_inertial.messages import Said, message, state
 
 # times of a project's images
 
@@ -24,14 +20,14 @@ state("looks-like-several-frames", "looks like several frames of the video")
 
 
 @message(example={"count": 3, "images": 120, "why": "is no frame of the video", "first": "0001.jpg"})
-def images_untimed_by_video(count: int, images: int, why: Fact, first: str) -> str:
+def images_untimed_by_video(count: int, images: int, why: Said, first: str) -> str:
     return f"{count} of {images} images have no time: each {why} (first: {first})"
 
 
 @message(
     example={"video": "clip.mp4", "found": 2, "images": 120, "name": "0001.jpg", "why": "is no frame of the video"}
 )
-def video_of_other_images(video: str, found: int, images: int, name: str, why: Fact | None) -> str:
+def video_of_other_images(video: str, found: int, images: int, name: str, why: Said | None) -> str:
     return (
         f"{video}: {found} of {images} images are one of its frames beyond doubt ({name} "
         f"{why or ''}): give the video that the images were taken from, or --frame-times"
@@ -78,7 +74,7 @@ state("target-without-images", "the target was not measured: the project has no 
 
 
 @message(example={"proof": "lengths up to 0.2 m agree within the errors given here"})
-def target_proves(proof: Fact) -> str:
+def target_proves(proof: Said) -> str:
     return f"this proves that {proof}"
 
 
@@ -225,7 +221,7 @@ def target_in_one_image(name: str) -> str:
 
 
 @message(example={"spec": "checkerboard:9x6:0.025", "images": 30, "hint": "is the description right?"})
-def target_not_found(spec: str, images: int, hint: Fact) -> str:
+def target_not_found(spec: str, images: int, hint: Said) -> str:
     return f"{spec} was not found in any of the {images} images that were searched; {hint}"
 
 

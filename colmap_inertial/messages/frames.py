@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from colmap_inertial.core.messages import message, state
-
-if TYPE_CHECKING:
-    from colmap_inertial.core.facts import Fact
+from colmap_inertial.messages import Said, message, state
 
 # blur before a frame is decoded
 
@@ -123,7 +118,7 @@ def frame_blur_confirmed(support_sigmas: float) -> str:
 
 
 @message(example={"doubt": "40 pairs of frames do not tell whether the gyroscope has the right sign"})
-def curved_blur_in_doubt(doubt: Fact) -> str:
+def curved_blur_in_doubt(doubt: Said) -> str:
     return f"{doubt}, and with the other one the blur would be curved the other way"
 
 
@@ -177,7 +172,7 @@ state(
     }
 )
 def exposures_fused(
-    long: str, gain: float, by_gyro: bool, by_pixels: bool, no_gyro: Fact | None, contradicted_gain: float | None
+    long: str, gain: float, by_gyro: bool, by_pixels: bool, no_gyro: Said | None, contradicted_gain: float | None
 ) -> str:
     by = [name for name, used in (("the gyroscope", by_gyro), ("the pixels", by_pixels)) if used]
     aligned = f"aligned by {' and '.join(by)}" if by else "not aligned: no shift makes them agree better"
@@ -195,13 +190,13 @@ def pair_not_alike(long: str, correlation: float) -> str:
 
 
 @message(example={"used": "short", "gain": 6.0, "why": "0001_long.png does not show the same (correlation 0.12)"})
-def exposures_not_fused(used: str, gain: float, why: Fact) -> str:
+def exposures_not_fused(used: str, gain: float, why: Said) -> str:
     what = "the long exposure as it is" if used == "long" else f"the short exposure, {gain:.3g} times as bright"
     return f"is {what}, and not fused: {why}"
 
 
 @message(example={"no_gyro": None})
-def exposures_aligned(no_gyro: Fact | None) -> str:
+def exposures_aligned(no_gyro: Said | None) -> str:
     return "short and long exposures are fused, aligned by the " + (
         "gyroscope and the pixels" if no_gyro is None else f"pixels alone: {no_gyro}"
     )
@@ -227,7 +222,7 @@ state("global-shutter", "global shutter")
 
 
 @message(example={"why": "the pixels' motion is not observable: the video was stabilised"})
-def frames_untreated(why: Fact) -> str:
+def frames_untreated(why: Said) -> str:
     return f"frames stay as they were filmed: {why}"
 
 
@@ -258,7 +253,7 @@ _METHODS = {"deepgyro": "; the network DeepGyro undoes it", "path": "; the half-
     }
 )
 def frames_blurred(
-    blurred: int, frames: int, verdict: Fact, with_translation: int, sign_doubt: Fact | None, method: str | None
+    blurred: int, frames: int, verdict: Said, with_translation: int, sign_doubt: Said | None, method: str | None
 ) -> str:
     note = f"{blurred} of {frames} frames are blurred; {verdict}"
     if with_translation:
@@ -274,7 +269,7 @@ def keypoints_rectified(readout_s: float, source: str) -> str:
 
 
 @message(example={"planned": "left to the keypoint stages that were given", "count": 90})
-def keypoints_rectified_by_stages(planned: Fact | None, count: int) -> str:
+def keypoints_rectified_by_stages(planned: Said | None, count: int) -> str:
     return f"{planned or ''}, which rectified keypoints of {count} images"
 
 
@@ -289,7 +284,7 @@ def focal_length_guessed(focal_px: float) -> str:
 
 
 @message(example={"quantity": "clock offset", "why": "the camera hardly turns", "sigma": None})
-def quantity_not_observable(quantity: str, why: Fact | str, sigma: float | None) -> str:
+def quantity_not_observable(quantity: str, why: Said | str, sigma: float | None) -> str:
     spread = "" if sigma is None else f" (standard deviation {100 * sigma:.1f} %)"
     return f"{quantity} is not observable{spread}: {why if isinstance(why, str) else why.with_advice}"
 
@@ -310,7 +305,7 @@ def offset_of_capture(sigma_s: float) -> str:
 
 
 @message(example={"why": "clock offset is not observable: the camera hardly turns"})
-def offset_unknown_beforehand(why: Fact) -> str:
+def offset_unknown_beforehand(why: Said) -> str:
     return f"the clocks' offset is not known beforehand: {why}"
 
 
@@ -328,5 +323,5 @@ def offset_by_pixels(sigma_s: float, rate: float | None, rate_sigma: float) -> s
         "clocks": "the clocks' offset is the capture's, to 5 ms",
     }
 )
-def frames_selected(used: int, frames: int, ranked_by: tuple[str, ...], clocks: Fact) -> str:
+def frames_selected(used: int, frames: int, ranked_by: tuple[str, ...], clocks: Said) -> str:
     return f"{used} of {frames} frames, by {' and '.join(_RANKS[way] for way in ranked_by)}; {clocks}"

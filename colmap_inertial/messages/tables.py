@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from colmap_inertial.core.messages import message
+from colmap_inertial.messages import message
 
 
 @message(

@@ -6,13 +6,9 @@ Where only a description or a file is wrong, no advice says to record again.
 from __future__ import annotations
 
 from math import degrees, pi
-from typing import TYPE_CHECKING
 
-from colmap_inertial.core.messages import message, state
-from colmap_inertial.core.messages.recording import spans_and_rates
-
-if TYPE_CHECKING:
-    from colmap_inertial.core.facts import Fact
+from colmap_inertial.messages import Said, message, state
+from colmap_inertial.messages.recording import spans_and_rates
 
 _ACCELERATE = (
     "record a clip in which the camera itself speeds up and slows down: swing it back and forth by 20 cm or more, "
@@ -317,7 +313,7 @@ for _code, _longest_s in (("short-gap", 0.2), ("long-gap", 1.5)):
 # repairs: what a reader did to samples
 
 
-def _each(repairs: int, each: tuple[Fact, ...]) -> str:
+def _each(repairs: int, each: tuple[Said, ...]) -> str:
     return "; ".join(map(str, each))
 
 
@@ -360,7 +356,7 @@ def no_acceleration(acceleration_rms_m_s2: float, turning_rms_rad_s: float) -> s
 
 @message(advice=_TURN_THROUGHOUT, example={"why": {"code": "camera-hardly-rotates", "values": {}}})
 def rotation_too_little(
-    why: Fact | None = None, median_rad_s: float = 0.0, fastest_s: float = 0.0, rotation_sigma_rad: float = 0.0
+    why: Said | None = None, median_rad_s: float = 0.0, fastest_s: float = 0.0, rotation_sigma_rad: float = 0.0
 ) -> str:
     if why is not None:
         return str(why)
@@ -460,7 +456,7 @@ def untimed(detail: str) -> str:
     "a known offset goes under [calibration]",
     example={"offset_s": 12.3, "max_offset_s": 1.0, "clocks": None},
 )
-def clock_offset(offset_s: float, max_offset_s: float | None, clocks: Fact | None) -> str:
+def clock_offset(offset_s: float, max_offset_s: float | None, clocks: Said | None) -> str:
     if max_offset_s is not None:
         stated = f"which one clock (up to {max_offset_s:g} s apart) does not allow"
     else:
@@ -520,7 +516,7 @@ def stabilised(share: float | None = None, recorder_notes: str = "") -> str:
     "gyroscope's columns, axes and unit",
     example={"seconds": 20.0, "why": {"code": "no-offset-fits", "values": {"explained": 0.2}}, "clocks": None},
 )
-def imu_does_not_fit(seconds: float, why: Fact, clocks: Fact | None) -> str:
+def imu_does_not_fit(seconds: float, why: Said, clocks: Said | None) -> str:
     return f"{why}{'' if clocks is None else f'; {clocks}'}"
 
 
@@ -529,7 +525,7 @@ _TORN = {"code": "no-majority-of-cameras", "values": {"largest": 20, "judged": 6
 
 @message(advice=_MAP_AGAIN, example={"why": (_TORN,)})
 def cameras_turned(
-    why: tuple[Fact, ...],
+    why: tuple[Said, ...],
     wrong: int = 0,
     seams: int = 0,
     left_out: int = 0,
@@ -748,7 +744,7 @@ def _advise_readout(readout_s: float | None = None, direction: str = "down", **_
     advice=_advise_readout, example={"readout_s": 0.0213, "readout_sigma_s": 0.0004, "direction": "down", "pairs": 90}
 )
 def readout_unknown(
-    why: Fact | None = None,
+    why: Said | None = None,
     readout_s: float = 0.0,
     readout_sigma_s: float = 0.0,
     direction: str = "down",
