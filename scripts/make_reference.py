@@ -1,9 +1,10 @@
-"""Write the generated pages: fields of JSON files, scripts.
+"""Write the generated pages: fields of JSON files, messages, scripts.
 
     python scripts/make_reference.py            # writes docs/reference/*.md and docs/dev/scripts.md
     python scripts/make_reference.py --check    # exit code 1 where one of them is stale
 
-Fields come from ``docs/schemas/*.schema.json``, scripts from the first sentences of their docstrings.
+Fields come from ``docs/schemas/*.schema.json``, messages from ``colmap_inertial/messages``, scripts
+from the first sentences of their docstrings.
 """
 
 import ast
@@ -13,6 +14,9 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+from colmap_inertial.core.facts import Fact
+from colmap_inertial.messages import all_messages
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -120,9 +124,32 @@ def scripts_page() -> str:
     return "\n".join(lines) + "\n"
 
 
+# --- messages --------------------------------------------------------------------------------------------------------
+
+
+def messages_page() -> str:
+    """Every message by its code, with the words of its example and what to do."""
+    lines = [
+        "# Messages",
+        "",
+        NOTE,
+        "Everything that is said of a recording, a scale, a model or a workspace has a code. JSON files hold it in the",
+        "fields that end in `_details`, with the values that the sentence is made of. Values here are examples.",
+        "",
+        "| code | values | message | what to do |",
+        "|---|---|---|---|",
+    ]
+    for code, message in all_messages().items():
+        fact = Fact(code, **message.example)
+        values = ", ".join(f"`{name}`" for name in message.signature.parameters)
+        texts = (text.replace("|", "\\|").replace("\n", " ").replace("<", "&lt;") for text in (str(fact), fact.advice))
+        lines.append(f"| `{code}` | {values} | {' | '.join(texts)} |")
+    return "\n".join(lines) + "\n"
+
+
 def pages() -> dict[Path, str]:
     """Every generated page and its text."""
-    made = {DOCS / "dev" / "scripts.md": scripts_page()}
+    made = {DOCS / "dev" / "scripts.md": scripts_page(), DOCS / "reference" / "messages.md": messages_page()}
     for path in sorted(DOCS.glob("schemas/*.schema.json")):
         made[DOCS / "reference" / f"{path.name.removesuffix('.schema.json')}.md"] = reference_page(path)
     return made

@@ -22,7 +22,10 @@ from typing import Any, Protocol, TypeVar
 
 
 class Said(Protocol):
-    """A fact within another one's values: its message, and what to do about it."""
+    """A fact within another one's values: its code, its message, and what to do about it."""
+
+    @property
+    def code(self) -> str: ...
 
     @property
     def advice(self) -> str: ...

@@ -42,23 +42,12 @@ def model_left_out(folder: str) -> str:
     return f"{folder} and what was made from it is left out: its scale is refused"
 
 
-@message(example={"counts": ((".e57", 1), (".splat", 2))})
-def formats_not_transformed(counts: tuple[tuple[str, int], ...]) -> str:
-    counted = ", ".join(f"{count} {suffix}" for suffix, count in counts)
-    return f"copied in their old units, as their formats are not transformed: {counted}"
-
-
 @message(example={"folder": "sparse/0", "names": ("0001.jpg", "0002.jpg")})
 def contradicting_images_left_out(folder: str, names: tuple[str, ...]) -> str:
     return (
         f"{folder}: {len(names)} images contradict the gyroscope and were left out: "
         f"{', '.join(names[:5])}{' ...' if len(names) > 5 else ''}"
     )
-
-
-@message(example={"file": "transforms.json"})
-def cameras_elsewhere(file: str) -> str:
-    return f"{file}: copied as it is, as its cameras do not stand where those of a model do"
 
 
 @message(example={"file": "database.db", "count": 5, "kind": "pose priors"})

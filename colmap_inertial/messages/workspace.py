@@ -239,12 +239,6 @@ def recentred(offset: tuple[float, ...]) -> str:
     )
 
 
-@message(example={"offset": (432100.0, 5664700.0, 120.0)})
-def offset_node(offset: tuple[float, ...]) -> str:
-    where = ", ".join(f"{x:.9g}" for x in offset)
-    return f"the model lies far from the origin: buffers are about {where}, the translation of the node 'place'"
-
-
 @message(example={"folder": "project/masks"})
 def masks_left(folder: str) -> str:
     return f"the masks in {folder} are of the pictures before they were undistorted, and are not exported"
