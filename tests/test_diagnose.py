@@ -120,8 +120,8 @@ IMU_ALTERATIONS: list[tuple[str, str, str, Callable[[ImuRecording], ImuRecording
     ("accelerometer saturated", "saturated", "error", accel(clipped)),
     ("gyro in 8 bit", "coarse-resolution", "warning", gyro(in_8_bit)),
     ("accelerometer in 8 bit", "coarse-resolution", "warning", accel(in_8_bit)),
-    ("accelerometer 100 ms late", "sensors-offset", "error", later(0.1)),
-    ("accelerometer 100 ms early", "sensors-offset", "error", later(-0.1)),
+    ("accelerometer 250 ms late", "sensors-offset", "warning", later(0.25)),
+    ("accelerometer 250 ms early", "sensors-offset", "warning", later(-0.25)),
     ("sensors 1000 s apart", "sensors-apart", "error", later(1000.0)),
 ]
 

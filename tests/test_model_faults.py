@@ -112,7 +112,7 @@ def test_what_is_undone_is_what_was_done():
     steps = np.diff(path, axis=0) * np.exp(-0.05 * (t_s[1:] > 25.0))[:, None]
     torn = path[0] + np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     assert np.allclose(by_break.undo(t_s, torn), path)
-    earlier = replace(by_break, at_s=10.0)
+    earlier = replace(by_break, at_s=10.0, keeps_after=True)
     assert np.allclose(np.diff(earlier.undo(t_s, path), axis=0)[100:], np.diff(path, axis=0)[100:])
     strain = ShapeFault(kind="stretch", value=0.01 * rng.standard_normal(5), cov=np.eye(5), by_scale=np.zeros(5))
     assert np.trace(strain.strain) == pytest.approx(0, abs=1e-12)
@@ -123,7 +123,10 @@ def test_what_is_undone_is_what_was_done():
 def test_vibration_makes_a_break_less_sure_and_no_larger():
     """Of an information and the score of a break by 5 %."""
     of = Scores(information=np.array([[1e4]]), score=np.array([1e4 * 0.05]), by_scale=np.zeros(1))
-    calm, shaken = (find_faults([("break", 20.0)], of, shaken=vibrates)[0] for vibrates in (False, True))
+    t_s = np.arange(0.0, 40.0, 0.125)
+    calm, shaken = (
+        find_faults([("break", 20.0)], of, shaken=vibrates, t_s=t_s, taken=0.0)[0] for vibrates in (False, True)
+    )
     assert calm.value == pytest.approx(0.05) and shaken.value == pytest.approx(0.05)
     assert calm.cov == pytest.approx(1e-4) and shaken.cov > 2 * calm.cov
     assert shaken.chi2(1.0) < 0.5 * calm.chi2(1.0)

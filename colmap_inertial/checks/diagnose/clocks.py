@@ -30,7 +30,7 @@ class ClockCheckLimits:
     part_s: float = 3.0
     part_reach_s: float = 0.4
     part_step_s: float = 0.01
-    uneven_s: float = 0.05
+    uneven_s: float = 0.03
     part_explained: float = 0.6
     #: Standard deviations of a part's offset that count (five: once in 10,000 recordings of a minute, with room for
     #: errors that are not normal), how well an offset is known at best, in frames, and which share of the offset

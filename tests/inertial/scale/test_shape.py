@@ -7,20 +7,26 @@ from colmap_inertial.inertial.scale import _shape
 from colmap_inertial.inertial.scale._shape import ShapeFault
 
 
-def test_a_scale_that_breaks_is_told_by_lengths_and_undone_in_the_smaller_part(subtests):
-    for at_s, words in ((110.0, "+5.0 +- 2.0 % larger before 10 s"), (150.0, "-4.8 +- 2.0 % larger after 50 s")):
-        with subtests.test(at_s=at_s, words=words):
+def test_a_scale_that_breaks_is_told_by_lengths_and_undone_in_the_part_that_tells_less(subtests):
+    for at_s, keeps_after, words in (
+        (110.0, True, "+5.0 +- 2.0 % larger before 10 s"),
+        (110.0, False, "-4.8 +- 2.0 % larger after 10 s"),
+        (150.0, False, "-4.8 +- 2.0 % larger after 50 s"),
+    ):
+        with subtests.test(at_s=at_s, keeps_after=keeps_after, words=words):
             t_s = np.linspace(100.0, 160.0, 61)
             truth = np.stack([3 * np.sin(0.1 * t_s), 0.05 * t_s, np.cos(0.2 * t_s)], axis=1)
             # metres per unit are 5 % more behind the break, where lengths of the model are that much shorter
             longer = np.where(t_s[1:] <= at_s, 1.0, 1 / 1.05)
             model = np.concatenate([truth[:1], truth[0] + np.cumsum(np.diff(truth, axis=0) * longer[:, None], axis=0)])
             value, cov = np.array([np.log(1.05)]), np.array([[(0.02 / 1.96) ** 2]])
-            fault = ShapeFault(kind="break", value=value, cov=cov, by_scale=np.zeros(1), at_s=at_s + 0.1)
+            fault = ShapeFault(
+                kind="break", value=value, cov=cov, by_scale=np.zeros(1), at_s=at_s + 0.1, keeps_after=keeps_after
+            )
             assert words in str(fault.as_fact(t_s, 1.0))
-            # either part is as large as in the larger one
+            # either part is as large as in the one that keeps its metres
             steps = np.diff(fault.undo(t_s, model), axis=0) / np.diff(truth, axis=0)
-            assert steps == pytest.approx(np.full_like(steps, longer[-1] if at_s == 110.0 else 1.0), rel=1e-9)
+            assert steps == pytest.approx(np.full_like(steps, longer[-1] if keeps_after else 1.0), rel=1e-9)
 
 
 def test_a_drift_of_the_scale_is_undone_and_told_from_end_to_end():
