@@ -634,7 +634,7 @@ def test_parts_of_the_recording_are_judged_as_the_estimator_judges_them(full, tm
     drift["trend_log_per_s"] = 4e-3  # steady: the estimator reports it whatever the parts scatter by
     text = report_of_changed(out, result)[1].text
     assert "They differ by more than chance explains" in text and "+24.00 ±12 % a minute" in text
-    drift |= {"p_value": 1e-4, "trend_log_per_s": 0.0}
+    drift |= {"p_value": 1e-5, "trend_log_per_s": 0.0}
     assert "They differ by more than chance explains" in report_of_changed(out, result)[1].text
     drift |= {"p_value": 0.5}
     for part in drift["parts"][1:]:

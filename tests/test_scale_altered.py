@@ -184,7 +184,7 @@ def test_the_imu_of_another_recording_is_refused(attempt, shared_data):
         pytest.param(stamps((GYRO, ACCEL), lambda t: t + 1000e9), "no time in common", id="stamps-1000-s-apart"),
         pytest.param(without(begin_s=12.0, length_s=0.05), "pauses once, for 0.06 s", id="gap-0.05-s"),
         pytest.param(without(begin_s=12.0, length_s=1.0), "gyroscope pauses once, for 1.0", id="gap-1-s"),
-        pytest.param(without(begin_s=9.0, length_s=4.0, sensors=(ACCEL,)), "accelerometer pauses once", id="gap-4-s"),
+        pytest.param(without(begin_s=9.0, length_s=3.5, sensors=(ACCEL,)), "accelerometer pauses once", id="gap-3.5-s"),
         pytest.param(repeated, "repeated gyroscope rows", id="duplicates"),
         pytest.param(jumping, "poses jump at", id="pose-jumps"),
         pytest.param(broken, "poses jump at", id="path-breaks"),
@@ -245,7 +245,8 @@ def late(force: np.ndarray) -> np.ndarray:
 def test_what_is_wrong_with_the_accelerometer_is_named_and_undone(attempt, shared_data, alter, seconds, said):
     code, message, estimate = attempt(alter, "--force", seconds=seconds)
     assert code == 0, message
-    assert estimate["verdict"] == "weak" and said in " ".join(estimate["reasons"])
+    (named,) = (sentence for sentence in (*estimate["reasons"], *estimate["notes"]) if said in sentence)
+    assert estimate["verdict"] == "weak" or "this is in the interval" in named
     truth = float((shared_data / "inertial_scale" / NAME / "groundtruth.txt").read_text())
     assert estimate["ci95"][0] <= truth <= estimate["ci95"][1]
     assert estimate["ci95"][1] / estimate["ci95"][0] < 1.05
