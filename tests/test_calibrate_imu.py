@@ -91,7 +91,7 @@ def test_a_phone_is_found_out_and_its_readings_become_true():
     np.testing.assert_allclose(calibration.gyro_gain, truth.gyro_gain, atol=2e-3)
     corrected = calibration.corrected(truth.recording)
     assert corrected.calibration is calibration
-    assert "12 attitudes" in corrected.repairs[-1]
+    assert "12 attitudes" in str(corrected.repairs[-1])
     for rest, up in zip(range(12), truth.up_in_imu, strict=True):
         inside = slice(*np.searchsorted(corrected.accel_t_s, [found.rests.begin_s[rest], found.rests.end_s[rest]]))
         np.testing.assert_allclose(corrected.accel_m_s2[inside].mean(axis=0), 9.81 * up, atol=0.01)
@@ -372,4 +372,4 @@ def test_the_worst_of_three_axes_makes_a_calibration_weak(entry, sigma, said):
     assert judged() == ("good", ())
     sigmas[np.arange(len(sigmas))[IMU_CAL.ACCEL_GAIN].reshape(3, 3)[entry]] = sigma
     verdict, (why,) = judged()
-    assert verdict == "weak" and re.search(said, why)
+    assert verdict == "weak" and re.search(said, str(why))
