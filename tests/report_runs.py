@@ -12,6 +12,7 @@ import pycolmap
 from colmap_inertial.checks.report.folders import CROPS_FOLDER, DATA_FOLDER
 from colmap_inertial.checks.report.photogrammetry import photogrammetry_record, scene_record
 from colmap_inertial.checks.report.signals import signal_record
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import quat_rotate
 from colmap_inertial.core.types import Similarity
 from colmap_inertial.inertial.scale import estimate_scale
@@ -81,8 +82,7 @@ def write_run(
         "sparse": "colmap/sparse/0",
         "sparse_metric": "sparse/0" if metric else None,
         "trajectory": "trajectory.tum" if metric else None,
-        **estimate.as_json(),
-        "reasons": [*map(str, estimate.reasons), f"something about {name}"],
+        **dataclasses.replace(estimate, reasons=(*estimate.reasons, Fact.stated(f"something about {name}"))).as_json(),
         "calibration_change": None,
         "readout_translation": {"shift_px": 1.2, "before_px": 0.5, "after_px": 0.4, "accepted": True},
         "validation": _validation(name) if metric else None,

@@ -226,9 +226,9 @@ def test_a_run_reads_each_model_from_disk_twice_at_most(tmp_path, monkeypatch):
 
     read, reads = model._read_from, []
 
-    def counted(folder, suffix):
+    def counted(folder, *rest):
         reads.append(folder)
-        return read(folder, suffix)
+        return read(folder, *rest)
 
     monkeypatch.setattr(model, "_read_from", counted)
     measured, out = copy_scene(tmp_path / "capture", first=10, target=True), tmp_path / "out"
