@@ -235,7 +235,7 @@ def test_a_run_reads_each_model_from_disk_twice_at_most(tmp_path, monkeypatch):
     reconstruct(measured, out, DETERMINISTIC, frame_stages=[], keypoint_stages=[])
     counts = {folder: reads.count(folder) for folder in set(reads)}
     assert set(counts) == {out / "colmap" / "sparse" / "0", out / "sparse" / "0"} and max(counts.values()) <= 2
-    assert isinstance(read(out / "colmap" / "sparse" / "0", ".bin"), pycolmap.Reconstruction)
+    assert isinstance(read(out / "colmap" / "sparse" / "0"), pycolmap.Reconstruction)
 
 
 def test_a_killed_change_of_a_finished_run_leaves_the_earlier_result(capture, bare, tmp_path):
