@@ -36,6 +36,7 @@ from real_imu import FLOWN, HANDHELD, RECORDINGS, Motion, Window, read, reconstr
 
 from colmap_inertial.checks.diagnose import Recorded, diagnose
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.facts import sentences
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_multiply
 from colmap_inertial.core.types import CameraTrajectory, ImuRecording
 from colmap_inertial.inertial.scale import estimate_scale
@@ -622,9 +623,9 @@ REASONS = {
 }
 
 
-def reasons_of(sentences: Sequence[str]) -> list[str]:
+def reasons_of(reasons: Sequence[str]) -> list[str]:
     """Short names of reasons."""
-    return [next((name for name, words in REASONS.items() if re.search(words, said)), said) for said in sentences]
+    return [next((name for name, words in REASONS.items() if re.search(words, said)), said) for said in reasons]
 
 
 FIELDS = (
@@ -665,13 +666,13 @@ def judge(case: Case) -> dict[str, object]:
         "warnings": " ".join(of["warning"]),
         "infos": " ".join(of["info"]),
         "verdict": estimate.verdict,
-        "reasons": "; ".join(reasons_of(estimate.reasons)),
-        "notes": " | ".join(estimate.notes),
+        "reasons": "; ".join(reasons_of(sentences(estimate.reasons))),
+        "notes": " | ".join(sentences(estimate.notes)),
         "error_pct": "" if error is None else f"{100 * error:.3f}",
         "width_pct": "" if width is None else f"{width:.3f}",
         "inside": "" if inside is None else int(inside),
         "numbers": json.dumps({f.code: dict(f.numbers) for f in diagnosis.findings}),
-        "sentences": " | ".join(estimate.reasons),
+        "sentences": " | ".join(sentences(estimate.reasons)),
         "check_s": f"{checked_s - begin_s:.2f}",
         "fit_s": f"{fitted_s - checked_s:.2f}",
     }

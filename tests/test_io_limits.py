@@ -303,9 +303,9 @@ def test_a_raised_limit_lets_larger_files_in(tmp_path):
 @pytest.mark.parametrize("kind", ["tif", "webp"])
 def test_small_files_of_many_pixels_take_little_memory(tmp_path, kind):
     path = tmp_path / "a.tif"
-    image = np.zeros((8300, 8000, 3) if kind == "tif" else (90, 80, 3), np.uint16 if kind == "tif" else np.uint8)
+    image = np.zeros((8300, 8000, 3), np.uint16 if kind == "tif" else np.uint8)
     path.write_bytes(cv2.imencode(f".{kind}", image, [cv2.IMWRITE_TIFF_COMPRESSION, 5] * (kind == "tif"))[1].tobytes())
-    with pytest.raises(FormatError, match="--limits.megapixels" if kind == "tif" else "cannot be decoded"):
+    with reading_within(ReadLimits(megapixels=50)), pytest.raises(FormatError, match=r"--limits\.megapixels"):
         read_image(path)
 
 

@@ -233,7 +233,7 @@ def test_loops_are_judged_as_one_by_one(monkeypatch):
     views = TwoViews(first_from_second=rotations, covered=covered)
     monkeypatch.setattr(loops, "compare", lambda database, names: views)
     monkeypatch.setattr(loops, "localise_frames", lambda database, names, some, way: [told[pair] for pair in some])
-    sound, found = search._judge(pairs)
+    sound, _, found = search._judge(pairs)
     assert sound == {pair for pair, good in zip(pairs, verified, strict=True) if good}
     looked_at = {pair for pair, good in zip(pairs, verified & (covered >= 0.5), strict=True) if good}
     assert set(found) == expected & looked_at and len(found) > 20 and len(looked_at - expected) > 20

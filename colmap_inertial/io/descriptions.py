@@ -47,8 +47,8 @@ def describe(path: Path, found: Columns, table: Table | None = None, name: str =
         lines.append("# columns as their numbers look: check them")
     parts: tuple[tuple[Quantity, SensorColumns], ...] = (("gyro", gyro), ("accel", accel))
     for quantity, part in parts:
-        lines += [*_section(name, quantity, part, table), ""]
-    return "\n".join(lines[:-1])
+        lines += _section(name, quantity, part, table)
+    return "\n".join(lines)
 
 
 def _section(name: str, quantity: Quantity, part: SensorColumns, table: Table | None) -> list[str]:

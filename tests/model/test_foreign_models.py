@@ -230,7 +230,7 @@ def test_what_is_there_twice_is_refused(tmp_path):
     with pytest.raises(FormatError, match=r"images\.bin: 2 images have the name 'same\.png'"):
         read_model(folder)
     applied = apply_to_project(tmp_path / "p", tmp_path / "out", plain_factor(2.0))
-    assert any("2 images have the name" in note for note in applied.notes)
+    assert any("2 images have the name" in note for note in map(str, applied.notes))
     for name, what in (("images", "image 1"), ("points3D", "point"), ("cameras", "camera 1")):
         again = save(build(), tmp_path / name, text=True)
         path = again / f"{name}.txt"

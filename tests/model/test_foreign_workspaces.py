@@ -102,7 +102,7 @@ def test_points_of_transforms_are_moved_in_their_world(tmp_path):
     assert error_px(tmp_path / "out", model) < 1e-3
     want = world_of(APPLIED) @ np.append(moved(xyz_of(model)[0]), 1.0)
     np.testing.assert_allclose(ply_points(tmp_path / "out" / "sparse_pc.ply")[0], want[:3], atol=1e-5)
-    assert any(note.startswith("depths in 8 pictures") and "2.5 times" in note for note in applied.notes)
+    assert any(note.startswith("depths in 8 pictures") and "2.5 times" in note for note in map(str, applied.notes))
     assert [group.lengths for group in applied.unmoved] == ["depths"]
     undo_project(tmp_path / "out", tmp_path / "back")
     assert error_px(tmp_path / "back", model) < 1e-3
@@ -139,7 +139,7 @@ def test_cameras_elsewhere_are_left_and_named(tmp_path):
         frame["transform_matrix"][0][3] += 2.0
     write_json(tmp_path / "p" / "transforms.json", content)
     applied = apply_to_project(tmp_path / "p", tmp_path / "out", SIM3)
-    assert any("transforms.json: copied as it is" in note for note in applied.notes)
+    assert any("transforms.json: copied as it is" in note for note in map(str, applied.notes))
 
 
 def test_points_of_another_frame_are_named(tmp_path):
@@ -147,7 +147,7 @@ def test_points_of_another_frame_are_named(tmp_path):
     save(model, tmp_path / "p" / "sparse" / "0")
     ply(tmp_path / "p" / "exports" / "splat.ply", 0.1 * xyz_of(model) + [4.0, 0, 0])
     applied = apply_to_project(tmp_path / "p", tmp_path / "out", SIM3)
-    assert any("exports/splat.ply: moved with the model" in note for note in applied.notes)
+    assert any("exports/splat.ply: moved with the model" in note for note in map(str, applied.notes))
 
 
 def inria(root, model):
@@ -234,7 +234,7 @@ def test_what_may_hold_lengths_is_named_and_all_else_is_not(tmp_path):
     put(tmp_path / "p", {**NAMED, **FREE})
     applied = apply_to_project(tmp_path / "p", tmp_path / "out", SIM3)
     assert sorted(group.example for group in applied.unmoved) == sorted(NAMED)
-    text = " ".join(applied.notes)
+    text = " ".join(map(str, applied.notes))
     assert all(group.kind in text for group in applied.unmoved)
     record = json.loads((tmp_path / "out" / "transform.json").read_text())
     assert {group["example"] for group in record["unmoved"]} == set(NAMED)
@@ -267,13 +267,13 @@ def test_patterns_are_names_or_paths(tmp_path, pattern):
     if pattern == "**/old/*":
         put(tmp_path / "p", {"sub/old/mesh.ply": b"no ply"})
     applied = apply_to_project(tmp_path / "p", tmp_path / "out", SIM3, keep=[pattern])
-    assert not any("--keep" in note for note in applied.notes)
+    assert not any("--keep" in note for note in map(str, applied.notes))
 
 
 def test_patterns_of_nothing_are_told(tmp_path):
     save(build(), tmp_path / "p" / "sparse" / "0")
     applied = apply_to_project(tmp_path / "p", tmp_path / "out", SIM3, keep=["odl/*"])
-    assert any("--keep odl/* is none of the project's paths" in note for note in applied.notes)
+    assert any("--keep odl/* is none of the project's paths" in note for note in map(str, applied.notes))
 
 
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n"
@@ -364,7 +364,7 @@ def test_a_similarity_that_moves_a_far_model_away_is_told(tmp_path):
         provenance="file",
     )
     applied = apply_to_project(tmp_path / "p", tmp_path / "out", away)
-    assert any("moves by 284" in note for note in applied.notes)
+    assert any("moves by 284" in note for note in map(str, applied.notes))
 
 
 @pytest.mark.parametrize("kind", ["float", "double"])
@@ -422,12 +422,12 @@ def test_a_scale_is_that_of_its_model(tmp_path):
     save(model, tmp_path / "p" / "sparse" / "0")
     own = write_scale(tmp_path / "own.json", model)
     applied = apply_to_project(tmp_path / "p", tmp_path / "out", own)
-    assert not any("scale" in note for note in applied.notes)
+    assert not any("scale" in note for note in map(str, applied.notes))
     text = save(model, tmp_path / "text" / "sparse" / "0", text=True, old=False)
     assert apply_to_project(tmp_path / "text", tmp_path / "out_text", own).notes == ()
     assert ModelIdentity.of(read_model(text)).poses == ModelIdentity.of(model).poses
     nameless = apply_to_project(tmp_path / "p", tmp_path / "out2", write_scale(tmp_path / "nameless.json"))
-    assert any("does not say of which model" in note for note in nameless.notes)
+    assert any("does not say of which model" in note for note in map(str, nameless.notes))
 
 
 @pytest.mark.parametrize(
@@ -446,7 +446,7 @@ def test_a_scale_of_another_model_is_refused(tmp_path, other, match):
     with pytest.raises(InertialError, match=rf"of another model than sparse/0: .*{match}.*--any-model"):
         apply_to_project(tmp_path / "p", tmp_path / "out", scales)
     applied = apply_to_project(tmp_path / "p", tmp_path / "out", scales, any_model=True)
-    assert any("taken all the same" in note for note in applied.notes)
+    assert any("taken all the same" in note for note in map(str, applied.notes))
 
 
 def mapped_again(model):

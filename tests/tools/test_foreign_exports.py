@@ -97,7 +97,7 @@ def test_trainers_get_far_models_about_the_origin(far, tmp_path, program):
     root = ElementTree.parse(tmp_path / "out" / "metadata.xml").getroot()
     offset = np.array([float(value) for value in root.find("SRSOrigin").text.split(",")])
     assert json.loads((tmp_path / "out" / "export.json").read_text())["offset_in_world"] == offset.tolist()
-    assert any("SRSOrigin" in note for note in made.notes)
+    assert any("SRSOrigin" in note for note in map(str, made.notes))
     got = ply_points(tmp_path / "out" / "sparse_pc.ply")
     np.testing.assert_allclose(got + offset, xyz, atol=1e-6)
     model = pycolmap.Reconstruction()
@@ -135,8 +135,8 @@ def test_near_exports_have_no_offset(tmp_path):
     made = export_model(tmp_path / "p", tmp_path / "out", "gsplat", unscaled=True)
     assert not (tmp_path / "out" / "metadata.xml").exists()
     assert "offset_in_world" not in json.loads((tmp_path / "out" / "export.json").read_text())
-    assert any("never given a scale" in note for note in made.notes)
-    assert not any("refused" in note for note in made.notes)
+    assert any("never given a scale" in note for note in map(str, made.notes))
+    assert not any("refused" in note for note in map(str, made.notes))
 
 
 @pytest.mark.parametrize("lens", ["PINHOLE", "SIMPLE_RADIAL"])
@@ -165,7 +165,7 @@ def test_masks_are_named(tmp_path):
     write_pictures(model, tmp_path / "p" / "images")
     write_pictures(model, tmp_path / "p" / "masks")
     made = export_model(tmp_path / "p", tmp_path / "out", "gsplat", unscaled=True)
-    assert any("masks" in note and "not exported" in note for note in made.notes)
+    assert any("masks" in note and "not exported" in note for note in map(str, made.notes))
 
 
 @pytest.mark.parametrize("name", ["../images/{}", "/data/set/images/{}", "C:\\set\\images\\{}", "a/../{}", "{}"])
