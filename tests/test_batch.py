@@ -302,7 +302,7 @@ def test_processes_end_with_a_batch_that_is_killed(manifest, tmp_path):
     eventually(lambda: processes_of(out))
     batch.kill()
     batch.wait()
-    eventually(lambda: not processes_of(out), 10)
+    eventually(lambda: not processes_of(out))
 
 
 def test_a_folder_of_something_else_is_left_alone(manifest, tmp_path):
@@ -586,7 +586,7 @@ def test_a_cluster_stops_when_the_batch_does(capture, cluster, tmp_path):
     entries = [BatchCapture(name=name, path=capture[0], options=TINY) for name in ("hall", "yard")]
     with pytest.raises(KeyboardInterrupt):
         run_batch(entries, out, batch=BatchOptions(scheduler=address), watch=watch)
-    eventually(lambda: not processes_of(out), 10)
+    eventually(lambda: not processes_of(out))
     assert {row["state"] for row in table(out).values()} == {"interrupted"}
 
 
