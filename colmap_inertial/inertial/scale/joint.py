@@ -68,6 +68,10 @@ class JudgementLimits:
     unexplained: float = 0.25
     #: Shorter clips say too little about their own noise for a number to be trusted.
     shortest_s: float = 6.0
+    #: A scale that still moves by more than so many of its standard deviations in the end is none, where these are
+    #: below the second; what moves less is in the interval.
+    moves: float = 1.0
+    known_log: float = 0.15
     #: A keyframe with a robust weight below this may be in the wrong place. Where three of 30 are, they swell the noise
     #: so that their weights are .27 to .57; others keep .8 and more.
     counts_little: float = 0.6
@@ -132,7 +136,10 @@ def estimate_joint(
     try:
         timed, data, prior, fit = _fit_in_step(trajectory, timed, options)
         fit, faults = _fit_soundly(fit, data, prior, timed.imu.noise)
-        fit, shape = _fit_shapely(fit, faults.undone(data), faults.loosened(prior), timed.imu.noise, accel=accel)
+        shape = Shape()
+        # a path that was smoothed has no shape to speak of
+        if not faults.path_is_smoothed:
+            fit, shape = _fit_shapely(fit, faults.undone(data), faults.loosened(prior), timed.imu.noise, accel=accel)
     except NotObservableError as error:
         return ScaleEstimate.refused("joint", error.hint)
     except np.linalg.LinAlgError:
@@ -263,6 +270,11 @@ class Shape:
     undone: tuple[ShapeFault, ...] = ()
     said: tuple[ShapeFault, ...] = ()
 
+    @property
+    def doubtful(self) -> tuple[ShapeFault, ...]:
+        """Those that make a scale weak: a stretch that is said alone leaves lengths right on average."""
+        return (*self.undone, *(fault for fault in self.said if fault.kind != "stretch"))
+
 
 def _fit_shapely(fit: Fit, data: Data, prior: Prior, sheet: ImuNoise | None, *, accel: AccelPart) -> tuple[Fit, Shape]:
     """The fit of a model without what shows to be wrong with its shape, and what that was.
@@ -334,12 +346,12 @@ def _judged(
     if verdict == "refused":
         reasons = (*reasons, *(() if worthless else wrong))
     else:
-        bent = [fault.sentence(t_s, scale.widened) for fault in shape.undone] or _check_drift(fit.drift)
+        bent = [fault.sentence(t_s, scale.widened) for fault in shape.doubtful] or _check_drift(fit.drift)
         large, usual = _check_gains(fit, scale)
-        doubts = [*wrong, *check_clocks(clock_rate), *_check_length(t_s), *large, *bent]
+        doubts = [*wrong, *check_clocks(clock_rate), *_check_length(t_s), *_check_rest(fit), *large, *bent]
         verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, doubts)
         # what is in the interval makes nothing weak by itself; where the interval is wide, it may be why
-        counted = [*usual, *(fault.sentence(t_s, scale.widened) for fault in shape.said)]
+        counted = [*usual, *(fault.sentence(t_s, scale.widened) for fault in shape.said if fault not in shape.doubtful)]
         counted = [f"{sentence} (this is in the interval)" for sentence in counted]
         if verdict == "trusted":
             notes = tuple(counted)
@@ -442,7 +454,8 @@ def _refusals(fit: Fit, t_s: Array) -> list[str]:
     """Findings that make the number worthless, in the user's words."""
     out = []
     x = fit.estimate
-    if not fit.converged and float(fit.cov[par.SCALE, par.SCALE]) < 0.15**2:
+    sigma_log = float(fit.cov[par.SCALE, par.SCALE]) ** 0.5
+    if fit.unsettled_log > _LIMITS.moves * sigma_log and sigma_log < _LIMITS.known_log:
         out.append(
             "the fit of camera and IMU does not converge: check that stamps are those of the samples, to a "
             f"millisecond, or {_RECORD_INSTEAD}"
@@ -479,6 +492,16 @@ def _check_length(t_s: Array) -> list[str]:
     return [
         f"the clip is short ({span_s:.1f} s): it says little about its own noise; "
         f"record {_LIMITS.shortest_s:.0f} s or more"
+    ]
+
+
+def _check_rest(fit: Fit) -> list[str]:
+    """A sentence where the fit has hardly come to rest."""
+    if fit.converged:
+        return []
+    return [
+        f"the fit of camera and IMU hardly converges: the scale still moves by {100 * fit.unsettled_log:.1f} %, which "
+        "is in the interval: check that stamps are those of the samples, to a millisecond"
     ]
 
 
