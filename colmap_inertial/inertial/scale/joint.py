@@ -38,7 +38,7 @@ from colmap_inertial.inertial.scale._fit import Fit, fit_jointly
 from colmap_inertial.inertial.scale._gain import WrongGain, exceeds_usual, judge_gain
 from colmap_inertial.inertial.scale._setup import Data, prepare
 from colmap_inertial.inertial.scale._shape import LIMITS as SHAPE_LIMITS, ShapeFault, confirmed, suspect
-from colmap_inertial.inertial.scale._suspects import Faults, worst
+from colmap_inertial.inertial.scale._suspects import Faults, filter_of_lag, worst
 from colmap_inertial.inertial.scale.verdict import check_clocks, scale_drifts, student_factor, verdict_of
 
 #: So many times at most is something wrong with the accelerometer looked for, undone, and the rest fitted again.
@@ -145,12 +145,28 @@ def estimate_joint(
     except np.linalg.LinAlgError:
         return ScaleEstimate.refused("joint", f"camera and IMU do not determine a scale together: {_RECORD_INSTEAD}")
     left_open = sum(suspicion.scale_variance for suspicion in fit.suspicions if suspicion.name in faults.values)
-    fit = replace(fit, variance_parts={**fit.variance_parts, "accel_faults": left_open})
-    wrong = [*faults.sentences(), *_cut_off(data)]
+    moved_s = timed.calibration.accel_delay_s - expected_s
+    lags, taken_log = _lag(fit, moved_s) if "bandwidth" not in faults.values else ([], 0.0)
+    fit = replace(fit, variance_parts={**fit.variance_parts, "accel_faults": left_open + taken_log**2})
+    wrong = [*faults.sentences(), *lags, *_cut_off(data)]
     # what was taken from a path nobody can put back: its scale is too large by more than any interval says
     estimate = _judged(fit, data.t_s, timed.calibration, accel, wrong, shape, worthless=faults.path_is_smoothed)
-    notes = (*estimate.notes, *_out_of_step(timed.calibration.accel_delay_s - expected_s))
+    notes = (*estimate.notes, *_out_of_step(moved_s))
     return replace(estimate, notes=notes, jumped=_name_jumped(fit, data, trajectory))
+
+
+def _lag(fit: Fit, moved_s: float) -> tuple[list[str], float]:
+    """A sentence where the accelerometer lags as if it had been filtered, and what that would take from the scale."""
+    sigma_s = float(fit.cov[par.ACCEL_DELAY, par.ACCEL_DELAY]) ** 0.5
+    constant_s = filter_of_lag(fit.suspicions, -(moved_s + fit.estimate.accel_delay_s), sigma_s)
+    if constant_s == 0:
+        return [], 0.0
+    by_scale = next(one.by_scale for one in fit.suspicions if one.name == "bandwidth")
+    sentence = (
+        f"the accelerometer lags by {1e3 * constant_s:.0f} ms and lacks quick changes, as if it had been low-passed at "
+        f"about {1 / (2 * np.pi * constant_s):.2g} Hz, which is in the interval: record it unfiltered (raw)"
+    )
+    return [sentence], 0.5 * constant_s**2 * float(by_scale[0])
 
 
 def _out_of_step(moved_s: float) -> list[str]:
