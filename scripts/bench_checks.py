@@ -604,7 +604,7 @@ def print_faults(rows: Sequence[dict[str, str]]) -> None:
 #: Words of a reason by what it is about.
 REASONS = {
     "stretch": "longer along",
-    "break": r"than in the longer part",
+    "break": r"than in the longer part|than in the rest",
     "drift": r"at the end than at the beginning",
     "parts": r"in parts of",
     "gains": "seems to be off in gain",
@@ -617,6 +617,7 @@ REASONS = {
     "short": "the clip is short",
     "width": "95 % interval is|known to no better|not known at all",
     "no convergence": "does not converge",
+    "hardly converges": "hardly converges",
     "bias": "would have to be off by",
     "unexplained": "motion disagree",
     "convention": "quaternions|read as",

@@ -206,7 +206,7 @@ def test_clocks_that_part_are_both_suspected(attempt, shared_data, faster):
     for one in (estimate, camera):
         assert one["verdict"] == "weak" and "clocks of camera and IMU run" in one["reasons"][0]
         assert one["ci95"][0] <= truth <= one["ci95"][1]
-        assert one["parts"]["clocks"] == pytest.approx(2**0.5 * 0.01, rel=0.03)
+        assert one["parts"]["clocks"] == pytest.approx(2 * 0.01, rel=0.03)
 
 
 @pytest.mark.parametrize(

@@ -233,6 +233,22 @@ def counted_in_interval(found: object) -> str:
     return f"{found} (this is in the interval)"
 
 
+@message(example={"lag_s": 0.04})
+def accel_lags_as_filtered(lag_s: float) -> str:
+    return (
+        f"the accelerometer lags by {1e3 * lag_s:.0f} ms and lacks quick changes, as if it had been low-passed at "
+        f"about {1 / (2 * math.pi * lag_s):.2g} Hz, which is in the interval: record it unfiltered (raw)"
+    )
+
+
+@message(example={"moves_log": 0.012})
+def fit_hardly_converged(moves_log: float) -> str:
+    return (
+        f"the fit of camera and IMU hardly converges: the scale still moves by {100 * moves_log:.1f} %, which is in "
+        "the interval: check that stamps are those of the samples, to a millisecond"
+    )
+
+
 @message(example={"delay_s": 0.06})
 def accel_delay_undone(delay_s: float) -> str:
     return (

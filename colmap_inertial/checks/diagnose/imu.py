@@ -214,7 +214,7 @@ def check_pauses(recorded: Recorded) -> Iterator[Finding]:
         usual_s = float(np.median(step_s))
         inside = (t_s[1:] > begin_s) & (t_s[:-1] < end_s)
         pauses = step_s[inside & is_gap(t_s, _LIMITS.pause_s, steps=PAUSE_STEPS)]
-        share = float(pauses.sum() / max(min(t_s[-1], end_s) - max(t_s[0], begin_s), usual_s))
+        share = float(pauses.sum() / (t_s[-1] - t_s[0]))
         for code, some in (
             ("short-gap", pauses[pauses < _LIMITS.long_pause_s]),
             ("long-gap", pauses[pauses >= _LIMITS.long_pause_s]),

@@ -94,9 +94,9 @@ def clock_scale_sigma(clock_rate: float) -> float:
     """Standard deviation of the logarithm of the scale due to different rates of the clocks of camera and IMU.
 
     Metres go with the square of time. The scale holds where the camera's clock is right; it is off by twice the rate
-    where the IMU's is, which is as likely.
+    where the IMU's is, which is as likely, and the interval has to hold it then, too.
     """
-    return math.sqrt(2) * abs(clock_rate)
+    return 2 * abs(clock_rate)
 
 
 def is_calibrated(imu: ImuRecording) -> bool:

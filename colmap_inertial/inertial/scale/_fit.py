@@ -93,6 +93,8 @@ def scale_drift(data: Data, noise: Noise, optimum: _Optimum, inflation: float, t
 _MAX_ITERATIONS, _MAX_ROTATION_ITERATIONS = 40, 4
 #: At rest: what the scale would still move by, in its standard deviations.
 _SETTLED, _FEWEST_ITERATIONS = 0.1, 4
+#: The same at the last iteration; of so many steps the largest is what a scale that is not at rest moves by.
+_AT_REST, _LAST_STEPS = 0.2, 4
 #: A robust weight below this: five times as far off as errors usually are.
 _HARDLY = 0.35
 #: Fewer of the gains than this are never said to be determined: no surprise is made of nothing.
@@ -123,8 +125,8 @@ class Fit:
         that its variance rests on.
     expected_accel_m_s2_rthz
         The accelerometer's noise as its own stream and its data sheet have it.
-    converged
-        Whether the scale came to rest.
+    converged, unsettled_log
+        Whether the scale came to rest; else, by how much its logarithm still moved.
     drift
         Scales of parts of the recording.
     excitation_m_s2
@@ -159,6 +161,7 @@ class Fit:
     freedom: float
     expected_accel_m_s2_rthz: float
     converged: bool
+    unsettled_log: float
     drift: ScaleDrift
     excitation_m_s2: float
     pose_weight: Array
@@ -182,7 +185,7 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         When the data leave the system singular.
     """
     search = LevelSearch(expected=Expected.of(data, sheet))
-    at, converged = _find_optimum(data, prior, search)
+    at, unsettled_log = _find_optimum(data, prior, search)
     x, groups, inverse = at.estimate, at.groups, at.inverse
     cov = inverse.cov
     noise, sums = search.noise, search.sums
@@ -214,10 +217,11 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         gyro_bias_cov=np.mean(states[:, par.GYRO_BIAS], axis=0),
         gyro_bias_with_globals=z,
         sums=sums,
-        level_variance=level_variance,
+        level_variance=level_variance + unsettled_log**2,
         freedom=freedom,
         expected_accel_m_s2_rthz=search.expected.noise.accel_density_m_s2_rthz,
-        converged=converged,
+        converged=unsettled_log == 0,
+        unsettled_log=unsettled_log,
         drift=drift,
         excitation_m_s2=_excitation_m_s2(data, x),
         pose_weight=weight,
@@ -252,13 +256,12 @@ class _Optimum:
         return shape.score_columns(columns, data, noise, centre, self.inverse, self.step)
 
 
-def _find_optimum(data: Data, prior: Prior, search: LevelSearch) -> tuple[_Optimum, bool]:
-    """Gauss-Newton with the noise levels along; also whether the scale came to rest."""
+def _find_optimum(data: Data, prior: Prior, search: LevelSearch) -> tuple[_Optimum, float]:
+    """Gauss-Newton with the noise levels along; also what the scale moved by in the end, 0 where it came to rest."""
     x = _rotations_first(data, search.noise, prior)
     scale = _moment_scale(data, x)
     x = replace(x, metres_per_unit=scale, imu_in_world_m=data.groups.centre * scale)
-    converged = settled = False
-    signed = 0.0
+    settled, signed, steps = False, 0.0, [0.0]
     integrated, there = res.integrate(data, x), x
     for iteration in range(_MAX_ITERATIONS):
         if settled or not fac.still_near(there, x, data.t_s, tolerance=4.0 if iteration <= _FEWEST_ITERATIONS else 1.0):
@@ -275,7 +278,7 @@ def _find_optimum(data: Data, prior: Prior, search: LevelSearch) -> tuple[_Optim
         shrink = min(1.0, _LARGEST_STEP / max(step, 1e-12)) * (0.5 if turned else 1.0)
         x = x.moved(states[:, :, 0] * shrink, z[:, 0] * shrink, pre.rate_rad_s, data.t_s)
         sigma = float(inverse.cov[par.SCALE, par.SCALE]) ** 0.5
-        converged = step < 0.2 * sigma
+        steps.append(step)
         search.update(groups, inverse, states, z, moving=not settled)
         if settled:
             break
@@ -290,7 +293,7 @@ def _find_optimum(data: Data, prior: Prior, search: LevelSearch) -> tuple[_Optim
         inverse=inverse,
         step=(states, z),
     )
-    return optimum, converged
+    return optimum, 0.0 if step < _AT_REST * sigma else max(steps[-_LAST_STEPS:])
 
 
 #: Which part of the scale's variance priors of the globals belong to.

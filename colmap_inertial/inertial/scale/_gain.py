@@ -30,10 +30,10 @@ class SensorPriors:
     motion_sigmas: float = 2.0
     #: From this probability on, a wrong gain is said.
     said: float = 1 / 3
-    #: Gains as sensors have, which are in the interval; and the standard deviations by which a gain must be larger to
-    #: make a scale weak by itself.
+    #: Gains as sensors have, which are in the interval; and the standard deviations by which one must be larger to make
+    #: a scale weak by itself, once there is evidence that it is wrong.
     usual_gain: float = 0.02
-    sigmas: float = 4.0
+    sigmas: float = 1.0
 
 
 _PRIORS = SensorPriors()

@@ -163,6 +163,41 @@ def worst(suspicions: list[Suspicion], accel: SensorStream, known: Collection[st
     )
 
 
+@dataclass(frozen=True, kw_only=True)
+class LagLimits:
+    """Limits of a lag that looks like a filter's: too little of it shows to undo it."""
+
+    #: So late by at least, and by so many standard deviations more: working sensors are by 15 ms at most.
+    least_s: float = 0.025
+    sigmas: float = 4.0
+    #: What is missing of quick changes differs from nothing by more than so many standard deviations, and from what
+    #: such a filter takes by less.
+    missing_sigmas: float = 2.0
+
+
+_LAG = LagLimits()
+
+
+def filter_of_lag(suspicions: list[Suspicion], delay_s: float, sigma_s: float) -> float:
+    """Time constant of the filter that an accelerometer's lag looks like; 0 where it does not.
+
+    A filter of the first order makes readings late by its time constant, and takes half its square times the second
+    derivative from them: each by itself may be something else.
+
+    Parameters
+    ----------
+    delay_s, sigma_s
+        By how much the readings are late, and its standard deviation.
+    """
+    found = next((one for one in suspicions if one.name == "bandwidth"), None)
+    if found is None or delay_s - _LAG.least_s <= _LAG.sigmas * sigma_s:
+        return 0.0
+    missing, sigma = -float(found.value[0]), float(found.cov[0, 0]) ** 0.5
+    expected = 0.5 * delay_s**2
+    fits = abs(missing - expected) < _LAG.missing_sigmas * sigma < missing
+    return delay_s if fits else 0.0
+
+
 def _is_of_path(suspicion: Suspicion) -> bool:
     return suspicion.name == "bandwidth" and float(suspicion.value[0]) > 0
 

@@ -39,7 +39,7 @@ from colmap_inertial.inertial.scale._fit import Fit, fit_jointly
 from colmap_inertial.inertial.scale._gain import WrongGain, exceeds_usual, judge_gain
 from colmap_inertial.inertial.scale._setup import Data, prepare
 from colmap_inertial.inertial.scale._shape import LIMITS as SHAPE_LIMITS, ShapeFault, confirmed, suspect
-from colmap_inertial.inertial.scale._suspects import Faults, worst
+from colmap_inertial.inertial.scale._suspects import Faults, filter_of_lag, worst
 from colmap_inertial.inertial.scale.verdict import check_clocks, scale_drifts, student_factor, verdict_of
 
 #: So many times at most is something wrong with the accelerometer looked for, undone, and the rest fitted again.
@@ -65,6 +65,10 @@ class JudgementLimits:
     unexplained: float = 0.25
     #: Shorter clips say too little about their own noise for a number to be trusted.
     shortest_s: float = 6.0
+    #: A scale that still moves by more than so many of its standard deviations in the end is none, where these are
+    #: below the second; what moves less is in the interval.
+    moves: float = 1.0
+    known_log: float = 0.15
     #: A keyframe with a robust weight below this may be in the wrong place. Where three of 30 are, they swell the noise
     #: so that their weights are .27 to .57; others keep .8 and more.
     counts_little: float = 0.6
@@ -127,18 +131,33 @@ def estimate_joint(
     try:
         timed, data, prior, fit = _fit_in_step(trajectory, timed, options)
         fit, faults = _fit_soundly(fit, data, prior, timed.imu.noise)
-        fit, shape = _fit_shapely(fit, faults.undone(data), faults.loosened(prior), timed.imu.noise, accel=accel)
+        shape = Shape()
+        # a path that was smoothed has no shape to speak of
+        if not faults.path_is_smoothed:
+            fit, shape = _fit_shapely(fit, faults.undone(data), faults.loosened(prior), timed.imu.noise, accel=accel)
     except NotObservableError as error:
         return ScaleEstimate.refused("joint", error.why)
     except np.linalg.LinAlgError:
         return ScaleEstimate.refused("joint", Fact("fit-singular"))
     left_open = sum(suspicion.scale_variance for suspicion in fit.suspicions if suspicion.name in faults.values)
-    fit = replace(fit, variance_parts={**fit.variance_parts, "accel_faults": left_open})
-    wrong = [*faults.as_facts(), *_cut_off(data)]
+    moved_s = timed.calibration.accel_delay_s - expected_s
+    lags, taken_log = _find_lag(fit, moved_s) if "bandwidth" not in faults.values else ([], 0.0)
+    fit = replace(fit, variance_parts={**fit.variance_parts, "accel_faults": left_open + taken_log**2})
+    wrong = [*faults.as_facts(), *lags, *_cut_off(data)]
     # what was taken from a path nobody can put back: its scale is too large by more than any interval says
     estimate = _judged(fit, data.t_s, timed.calibration, accel, wrong, shape, worthless=faults.path_is_smoothed)
-    notes = (*estimate.notes, *_out_of_step(timed.calibration.accel_delay_s - expected_s))
+    notes = (*estimate.notes, *_out_of_step(moved_s))
     return replace(estimate, notes=notes, jumped=_name_jumped(fit, data, trajectory))
+
+
+def _find_lag(fit: Fit, moved_s: float) -> tuple[list[Fact], float]:
+    """A doubt where the accelerometer lags as if it had been filtered, and what that would take from the scale."""
+    sigma_s = float(fit.cov[par.ACCEL_DELAY, par.ACCEL_DELAY]) ** 0.5
+    constant_s = filter_of_lag(fit.suspicions, -(moved_s + fit.estimate.accel_delay_s), sigma_s)
+    if constant_s == 0:
+        return [], 0.0
+    by_scale = next(one.by_scale for one in fit.suspicions if one.name == "bandwidth")
+    return [Fact("accel-lags-as-filtered", lag_s=constant_s)], 0.5 * constant_s**2 * float(by_scale[0])
 
 
 def _out_of_step(moved_s: float) -> list[Fact]:
@@ -253,6 +272,11 @@ class Shape:
     undone: tuple[ShapeFault, ...] = ()
     said: tuple[ShapeFault, ...] = ()
 
+    @property
+    def doubtful(self) -> tuple[ShapeFault, ...]:
+        """Those that make a scale weak: a stretch that is said alone leaves lengths right on average."""
+        return (*self.undone, *(fault for fault in self.said if fault.kind != "stretch"))
+
 
 def _fit_shapely(fit: Fit, data: Data, prior: Prior, sheet: ImuNoise | None, *, accel: AccelPart) -> tuple[Fit, Shape]:
     """The fit of a model without what shows to be wrong with its shape, and what that was.
@@ -321,12 +345,13 @@ def _judged(
     if verdict == "refused":
         reasons = (*reasons, *(() if worthless else wrong))
     else:
-        bent = [fault.as_fact(t_s, scale.widened) for fault in shape.undone] or _check_drift(fit.drift)
+        bent = [fault.as_fact(t_s, scale.widened) for fault in shape.doubtful] or _check_drift(fit.drift)
         large, usual = _check_gains(fit, scale)
-        doubts = [*wrong, *check_clocks(clock_rate), *_check_length(t_s), *large, *bent]
+        doubts = [*wrong, *check_clocks(clock_rate), *_check_length(t_s), *_check_rest(fit), *large, *bent]
         verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, doubts)
         # what is in the interval makes nothing weak by itself; where the interval is wide, it may be why
-        within = [*usual, *(fault.as_fact(t_s, scale.widened) for fault in shape.said)]
+        said = [fault for fault in shape.said if fault not in shape.doubtful]
+        within = [*usual, *(fault.as_fact(t_s, scale.widened) for fault in said)]
         counted = tuple(Fact("counted-in-interval", found=one) for one in within)
         if verdict == "trusted":
             notes = counted
@@ -426,7 +451,8 @@ def _refusals(fit: Fit, t_s: Array) -> list[Fact]:
     """Findings that make the number worthless."""
     out = []
     x = fit.estimate
-    if not fit.converged and float(fit.cov[par.SCALE, par.SCALE]) < 0.15**2:
+    sigma_log = float(fit.cov[par.SCALE, par.SCALE]) ** 0.5
+    if fit.unsettled_log > _LIMITS.moves * sigma_log and sigma_log < _LIMITS.known_log:
         out.append(Fact("fit-not-converged"))
     bias = float(np.linalg.norm(x.accel_bias_m_s2))
     if bias > _LIMITS.bias_m_s2:
@@ -447,6 +473,11 @@ def _check_length(t_s: Array) -> list[Fact]:
     if span_s >= _LIMITS.shortest_s:
         return []
     return [Fact("clip-short", span_s=span_s, needed_s=_LIMITS.shortest_s)]
+
+
+def _check_rest(fit: Fit) -> list[Fact]:
+    """A doubt where the fit has hardly come to rest."""
+    return [] if fit.converged else [Fact("fit-hardly-converged", moves_log=fit.unsettled_log)]
 
 
 def _check_gains(fit: Fit, scale: FoundScale) -> tuple[list[Fact], list[Fact]]:

@@ -19,7 +19,7 @@ _WIDTHS = ("scale-unknown", "scale-interval-wide")
 _DRIFT_PROBABILITY, _DRIFT_SIGMAS = 1e-4, 3.89
 #: Clocks of camera and IMU that part faster make a scale weak: action cameras' do by .2 % (one standard deviation;
 #: none of 2,076 clean windows of other recordings does by .1), and what either makes of metres is in the interval.
-_APART_RATE = 3e-3
+_APART_RATE = 2.5e-3
 
 
 def half_width(sigma_log: float) -> float:

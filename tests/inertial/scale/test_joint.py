@@ -42,7 +42,7 @@ def test_a_fit_that_overstates_the_accelerometer_s_noise_is_corrected_by_its_sha
             # the surprise doubles the variance of the gains, and results of the device halve their standard deviation
             assert found.parts["accel_gain"] ** 2 == pytest.approx(0.5 * 1e-6, rel=0.02)
             assert found.parts["motion"] ** 2 == pytest.approx(3e-6, rel=0.02)
-            assert found.parts["clocks"] == pytest.approx(2**0.5 * 1e-3)
+            assert found.parts["clocks"] == pytest.approx(2 * 1e-3)
             assert found.sigma_log == pytest.approx(sum(part**2 for part in found.parts.values()) ** 0.5)
 
 
