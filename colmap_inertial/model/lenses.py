@@ -25,9 +25,14 @@ class Fold:
     radius_px: float
 
 
+def sees_all_around(camera: pycolmap.Camera) -> bool:
+    """Whether a camera has no focal length and no edge, as panoramas: by its name, as pycolmap before 4.1 knows no such."""
+    return bool(camera.model_name == "EQUIRECTANGULAR")
+
+
 def find_fold(camera: pycolmap.Camera) -> Fold | None:
     """The first fold of a lens in front of it; ``None`` where its radius grows as far as pinholes see."""
-    if camera.is_spherical():
+    if sees_all_around(camera):
         return None
     tangent = np.tan(_ANGLES)
     middle = np.array([camera.principal_point_x, camera.principal_point_y])

@@ -20,7 +20,7 @@ from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.sensor_yaml import CAMERA_MODELS
 from colmap_inertial.io.stand_ins import refuse_stand_in
-from colmap_inertial.model.lenses import farthest_corner_px, find_fold
+from colmap_inertial.model.lenses import farthest_corner_px, find_fold, sees_all_around
 from colmap_inertial.model.notes import take_note
 
 if TYPE_CHECKING:
@@ -179,7 +179,7 @@ def check_values(reconstruction: pycolmap.Reconstruction, folder: Path, suffix: 
 
 def _note_odd_lens(camera: pycolmap.Camera, path: Path) -> None:
     """Tell of a lens that folds within its pictures, and of a principal point outside of them."""
-    if camera.is_spherical():
+    if sees_all_around(camera):
         return
     named = {"camera": int(camera.camera_id)}
     cx, cy = float(camera.principal_point_x), float(camera.principal_point_y)

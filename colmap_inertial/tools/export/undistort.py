@@ -16,7 +16,7 @@ from colmap_inertial.core.types import CameraModel
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.rolling_shutter import grid_nodes, sampling_maps
 from colmap_inertial.model import colmap_camera
-from colmap_inertial.model.lenses import Fold, beyond, find_fold
+from colmap_inertial.model.lenses import Fold, beyond, find_fold, sees_all_around
 
 if TYPE_CHECKING:
     import pycolmap
@@ -82,7 +82,7 @@ class Undistortion:
             For a camera that sees all around.
         """
         named = f"camera {camera.camera_id} ({camera.model_name})"
-        if camera.is_spherical():
+        if sees_all_around(camera):
             raise FormatError(where, f"{named} sees all around; no pinhole does")
         fx, fy = float(camera.focal_length_x), float(camera.focal_length_y)
         if square:
