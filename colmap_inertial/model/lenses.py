@@ -26,7 +26,7 @@ class Fold:
 
 
 def sees_all_around(camera: pycolmap.Camera) -> bool:
-    """Whether a camera has no focal length and no edge, as panoramas: by its name, as pycolmap before 4.1 knows no such."""
+    """Whether a camera sees all around it, as panoramas do: by its name, as pycolmap before 4.1 has no such camera."""
     return bool(camera.model_name == "EQUIRECTANGULAR")
 
 
