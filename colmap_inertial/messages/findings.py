@@ -614,13 +614,60 @@ def gyro_mirrored(gyro: Setting | None = None) -> str:
     return "the gyroscope fits the camera's rotation better when it is mirrored"
 
 
+_ROTATIONS = {
+    "inverse": (
+        "; its inverse fits",
+        "cam_from_imu takes coordinates of the IMU to those of the camera (T_cam_imu of Kalibr): give the inverse of "
+        "the declared one, with the translation of the inverse",
+    ),
+    "order": (
+        "; with w first read as w last it fits",
+        "cam_from_imu_xyzw has w last: move the first number behind the others",
+    ),
+    "axes": (
+        "; with the camera's y and z the other way it fits",
+        "the camera's axes are x right, y down and z forward: the declared rotation is to axes with y up and z back",
+    ),
+    "": (
+        "",
+        "correct cam_from_imu under [calibration], or leave it out, and it is estimated; frames that were turned "
+        "upright are not in the sensor's orientation: cut them without (ffmpeg -noautorotate)",
+    ),
+}
+
+
 @message(
-    advice="correct cam_from_imu under [calibration]; frames that were turned upright are not in the sensor's "
-    "orientation: cut them without (ffmpeg -noautorotate)",
-    example={"angle_deg": 90.0},
+    advice=lambda likely, **_: _ROTATIONS[likely][1],
+    example={"angle_deg": 120.0, "sigma_deg": 0.6, "likely": "inverse"},
 )
-def declared_rotation(angle_deg: float) -> str:
-    return f"camera and IMU are turned by {angle_deg:.0f} deg against what is declared"
+def declared_rotation(angle_deg: float, sigma_deg: float, likely: str) -> str:
+    return (
+        f"camera and IMU are turned by {angle_deg:.{0 if angle_deg >= 10 else 1}f} deg (+-{2 * sigma_deg:.1f}) against "
+        f"the declared rotation{_ROTATIONS[likely][0]}"
+    )
+
+
+def _advise_offset(declared_s: float, likely: str, **_: float) -> str:
+    if likely == "sign":
+        return (
+            "time offsets are those of the camera's clock less the sensor's (minus timeshift_cam_imu of Kalibr): give "
+            f"{-declared_s:.9g}"
+        )
+    if likely == "milliseconds":
+        return f"time offsets are in seconds: give {1e-3 * declared_s:.9g}"
+    return "leave out gyro_time_offset_s and accel_time_offset_s, and they are estimated"
+
+
+@message(
+    advice=_advise_offset,
+    example={"declared_s": 0.0641, "found_s": -0.0705, "sigma_s": 0.002, "likely": "sign"},
+)
+def declared_offset(declared_s: float, found_s: float, sigma_s: float, likely: str) -> str:
+    other = {"sign": "; with the other sign it fits", "milliseconds": "; as milliseconds it fits"}.get(likely, "")
+    return (
+        f"the declared time offset is {declared_s:.4f} s, and the recording shows {found_s:.4f} s "
+        f"(+-{2e3 * sigma_s:.0f} ms){other}"
+    )
 
 
 @message(
