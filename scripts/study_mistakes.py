@@ -59,8 +59,11 @@ class Mistake:
     ----------
     kind, name
         What it is about, and what was done.
+    codes
+        One of which the error must have, or what it speaks of; without any, as of files that cannot be read, the message
+        is looked at.
     says
-        Pattern of what the message must hold.
+        Pattern of what the message must hold, by which a person finds the remedy.
     make
         Changes the copy.
     mend
@@ -74,6 +77,7 @@ class Mistake:
     kind: str
     name: str
     says: str
+    codes: tuple[str, ...] = ()
     make: Change = lambda scene, rng: None
     mend: Mend | None = None
     arguments: tuple[str, ...] = RECONSTRUCT
@@ -186,7 +190,7 @@ def follow_clock_rate(scene: Path, message: str) -> None:
 def follow_offset(scene: Path, message: str) -> None:
     """Leave out what a message says to leave out."""
     path = scene / "capture.toml"
-    assert "leave out shared_clock" in message
+    assert "leave out" in message
     path.write_text(re.sub(r"(shared_clock|gyro_time_offset_s|accel_time_offset_s) = .*\n", "", path.read_text()))
 
 
@@ -253,48 +257,56 @@ def units() -> Iterator[Mistake]:
     unit = partial(Mistake, kind="units")
     yield unit(
         name="gyroscope in deg/s, called rad/s",
+        codes=("gyro-in-deg",),
         make=values("gyro.csv", change=lambda w, _: np.degrees(w)),
         says=r'unit = "deg/s"',
         mend=toml('unit = "rad/s"', 'unit = "deg/s"'),
     )
     yield unit(
         name="gyroscope in rad/s, called deg/s",
+        codes=("gyro-not-in-deg",),
         make=toml('unit = "rad/s"', 'unit = "deg/s"'),
         says=r'unit = "rad/s"',
         mend=toml('unit = "deg/s"', 'unit = "rad/s"'),
     )
     yield unit(
         name="accelerometer in g, called m/s2",
+        codes=("accel-in-g",),
         make=values("accel.csv", change=lambda a, _: a / G),
         says=r'unit = "g"',
         mend=toml('unit = "m/s2"', 'unit = "g"'),
     )
     yield unit(
         name="accelerometer in m/s2, called g",
+        codes=("accel-not-in-g",),
         make=toml('unit = "m/s2"', 'unit = "g"'),
         says=r'unit = "m/s2"',
         mend=toml('unit = "g"', 'unit = "m/s2"'),
     )
     yield unit(
         name="raw counts of the gyroscope",
+        codes=("gyro-unit",),
         make=values("gyro.csv", change=lambda w, _: np.round(w * 939.65) + 12),
         says="counts_per_unit",
         mend=toml(GYRO_UNIT, f"{GYRO_UNIT}\nzero = 12\ncounts_per_unit = 939.65"),
     )
     yield unit(
         name="gyroscope with a wrong factor",
+        codes=("gyro-gain",),
         make=values("gyro.csv", change=lambda w, rng: w * rng.uniform(1.28, 1.4)),
         says="the gyroscope measures .* times the rotation",
         mend=follow_gain,
     )
     yield unit(
         name="frame times in ms, called s",
+        codes=("time-unit",),
         make=frame_times(lambda t_s: 1e3 * t_s),
         says="frames span .* in milliseconds where seconds were read",
         mend=frame_times(lambda t_ms: t_ms, "name,t_ms"),
     )
     yield unit(
         name="stamps of the IMU in ms, called s",
+        codes=("time-unit",),
         make=stamps("gyro.csv", "accel.csv", change=lambda t_s, _: 1e3 * t_s),
         says="set time_unit",
         mend=toml('time_unit = "s"', 'time_unit = "ms"'),
@@ -302,7 +314,7 @@ def units() -> Iterator[Mistake]:
 
 
 def axes() -> Iterator[Mistake]:
-    axis = partial(Mistake, kind="axes", says=r'axes = "')
+    axis = partial(Mistake, kind="axes", says=r'axes = "', codes=("axes-turned", "axes-mirrored", "gyro-mirrored"))
     yield axis(
         name="two axes of the gyroscope exchanged",
         make=values(
@@ -337,38 +349,44 @@ def clocks() -> Iterator[Mistake]:
     clock = partial(Mistake, kind="clocks")
     yield clock(
         name="clocks 565 s apart, called shared",
+        codes=("clock-offset",),
         make=toml("[timing]", "[timing]\nshared_clock = true"),
         says=r"565\.\d+ s apart.*shared_clock",
         mend=follow_offset,
     )
     yield clock(
         name="times by another frame rate",
+        codes=("frame-rate",),
         make=frame_times(lambda t_s: 1.25 * t_s),
         says="timed by another frame rate",
         mend=follow_frame_rate,
     )
     yield clock(
         name="the clock of the IMU 3 % fast",
+        codes=("clock-rate",),
         make=stamps("gyro.csv", "accel.csv", change=lambda t_s, _: 1.03 * t_s),
         says="clock runs",
         mend=follow_clock_rate,
     )
     yield clock(
         name="IMU of another recording",
+        codes=("imu-does-not-fit",),
         make=values("gyro.csv", "accel.csv", change=lambda w, _: w[::-1]),
         says="check that this IMU recording belongs to these images",
         mend=original("gyro.csv", "accel.csv"),
     )
     yield clock(
         name="IMU stopped after a fifth",
+        codes=("imu-too-short",),
         make=rows("gyro.csv", "accel.csv", change=lambda table, _: table[: len(table) // 5]),
         says="start the IMU before the video",
         mend=original("gyro.csv", "accel.csv"),
     )
     yield clock(
         name="a time offset that is wrong",
+        codes=("declared-offset",),
         make=toml("[target]", "[calibration]\ngyro_time_offset_s = 100.0\naccel_time_offset_s = 100.0\n\n[target]"),
-        says="time offset that was given",
+        says="the declared time offset is",
         mend=follow_offset,
     )
 
@@ -383,6 +401,7 @@ def columns() -> Iterator[Mistake]:
     )
     yield column(
         name="raw counts in columns named *_raw",
+        codes=("gyro-unit",),
         make=lambda scene, rng: (
             values("gyro.csv", change=lambda w, _: np.round(w * 939.65) + 12)(scene, rng),
             text("gyro.csv", "t,x,y,z", "t,x_raw,y_raw,z_raw")(scene, rng),
@@ -399,6 +418,7 @@ def columns() -> Iterator[Mistake]:
     )
     yield column(
         name="gyroscope and accelerometer exchanged",
+        codes=("sensors-exchanged",),
         make=lambda scene, rng: (
             toml('"gyro.csv"', '"other"')(scene, rng),
             toml('"accel.csv"', '"gyro.csv"')(scene, rng),
@@ -571,6 +591,11 @@ def run(arguments: list[str]) -> tuple[int, str]:
     return 0, " ".join(said.getvalue().split())
 
 
+def codes_in(said: str) -> set[str]:
+    """Codes of the facts in the JSON that a command ends with: the error's, and of what it speaks of."""
+    return set(re.findall(r'"code": "([a-z0-9-]+)"', said))
+
+
 def call(function: Call, scene: Path) -> tuple[int, str]:
     """Exit code and message of a Python call: a traceback's last line, as a person reads it."""
     try:
@@ -616,10 +641,12 @@ def try_mistake(mistake: Mistake, folder: Path, seed: int, *, mend: bool = True,
     if mistake.call is not None:
         code, message = call(mistake.call, scene)
     else:
-        code, message = run([word.format(scene=scene, out=out) for word in mistake.arguments])
+        in_json = ["--json", "-"] if mistake.codes else []
+        code, message = run([word.format(scene=scene, out=out) for word in mistake.arguments] + in_json)
     seconds = time.monotonic() - begin_s
     begun = (out / "colmap" / "database.db").exists()
-    caught = code > 0 and not begun and re.search(mistake.says, message) is not None
+    named = bool(codes_in(message) & set(mistake.codes)) if mistake.codes else bool(re.search(mistake.says, message))
+    caught = code > 0 and not begun and named
     mended, then = True, ""
     if mend:
         try:

@@ -491,8 +491,10 @@ def frame_rate(rate: float) -> str:
     advice="start the IMU before the video and stop it after; the scale rests on what both recorded",
     example={"share": 0.8, "frames_s": 20.0, "imu_s": 16.0},
 )
-def imu_too_short(share: float, frames_s: float, imu_s: float) -> str:
-    return f"the IMU runs along with {100 * share:.0f} % of {frames_s:.1f} s of frames"
+def imu_too_short(share: float, frames_s: float, imu_s: float, sensor: str = "") -> str:
+    other = {"accelerometer": "gyroscope", "gyroscope": "accelerometer"}.get(sensor)
+    alone = f"; the {other} runs along with the rest" if other else ""
+    return f"the {sensor or 'IMU'} runs along with {100 * share:.0f} % of {frames_s:.1f} s of frames{alone}"
 
 
 # camera against gyroscope
@@ -766,6 +768,14 @@ def frames_repeated(repeated: int, looked_at: int) -> str:
 
 
 @message(
+    advice="such frames get no pose and are not deblurred: leave them out, or light the scene and take off the cover",
+    example={"blank": 12, "looked_at": 300, "example": "0007.jpg"},
+)
+def frames_blank(blank: int, looked_at: int, example: str) -> str:
+    return f"{blank} of {looked_at} frames that were looked at are black or show nothing ({example})"
+
+
+@message(
     advice="film with a shorter exposure (1/200 s or less) and more light; what is blurred is deblurred",
     example={"share": 0.7, "blur_limit_of_long_side": 0.004, "median_blur_of_long_side": 0.006, "exposure_s": 0.02},
 )
@@ -775,6 +785,27 @@ def exposure_too_long(
     return (
         f"{100 * share:.0f} % of the frames are blurred by more than {100 * blur_limit_of_long_side:g} % of the "
         f"picture's long side (median {100 * median_blur_of_long_side:.2f} %, exposure {1e3 * exposure_s:.1f} ms)"
+    )
+
+
+@message(
+    advice="readout_s is the time from the first line to one past the last, readout_direction where the exposed line "
+    "moves in the stored picture: correct them under [timing], or leave both out",
+    example={
+        "declared_s": 0.0,
+        "declared_direction": "down",
+        "readout_s": 0.021,
+        "sigma_s": 0.0008,
+        "direction": "down",
+    },
+)
+def declared_readout(
+    declared_s: float, declared_direction: str, readout_s: float, sigma_s: float, direction: str
+) -> str:
+    declared = f"{1e3 * declared_s:.1f} ms, {declared_direction}" if declared_s else "0, a global shutter"
+    return (
+        f"the declared readout is {declared}, and the pictures show {1e3 * readout_s:.1f} ms "
+        f"(+-{2e3 * sigma_s:.1f}), {direction}"
     )
 
 

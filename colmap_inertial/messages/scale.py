@@ -512,11 +512,25 @@ def refined_scale_differs(difference: float, half_width: float) -> str:
     )
 
 
-@message(example={"readout_s": 0.02, "sigma_s": 0.001, "direction": "down"})
-def rolling_shutter_ignored(readout_s: float, sigma_s: float, direction: str) -> str:
+@message(example={"declared_px": 700.0, "found_px": 530.0, "sigma_px": 4.0})
+def declared_focal_length(declared_px: float, found_px: float, sigma_px: float) -> str:
     return (
-        f"the images were exposed line by line within {1e3 * readout_s:.1f} +- {1e3 * sigma_s:.1f} ms "
-        f"({direction}), which the model ignores: declare readout_s and readout_direction before mapping, or "
+        f"the declared focal length is {declared_px:.0f} px, and the images fit another better (towards {found_px:.0f} "
+        f"+-{2 * sigma_px:.0f} px), which bends the model and changes its size: leave out [camera] to let COLMAP "
+        "calibrate, or give the intrinsics of this very video mode"
+    )
+
+
+@message(example={"readout_s": 0.02, "sigma_s": 0.001, "direction": "down"})
+def rolling_shutter_ignored(readout_s: float, sigma_s: float, direction: str, declared_global: bool = False) -> str:
+    found = f"exposed line by line within {1e3 * readout_s:.1f} +- {1e3 * sigma_s:.1f} ms ({direction})"
+    if declared_global:
+        return (
+            f"the declared readout is 0, a global shutter, and the images were {found}: correct readout_s and "
+            "readout_direction, or leave them out"
+        )
+    return (
+        f"the images were {found}, which the model ignores: declare readout_s and readout_direction before mapping, or "
         "refine it (--refine inertial)"
     )
 

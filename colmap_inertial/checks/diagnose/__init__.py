@@ -45,6 +45,7 @@ CHECKS: tuple[Check, ...] = (
     frames.check_cut_from_video,
     frames.check_dropped,
     frames.check_repeated,
+    frames.check_blank,
     frames.check_exposure,
     frames.check_readout,
 )

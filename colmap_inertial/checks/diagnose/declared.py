@@ -27,6 +27,7 @@ class DeclaredLimits:
     #: Offsets known worse were not declared; what matters of others; and what an alignment looks for around them.
     known_offset_s: float = 0.1
     offset_s: float = 0.01
+    offset_by_pictures_s: float = 0.03
     searched_sigmas: float = 2.0
     searched_s: float = 0.05
 
@@ -86,7 +87,7 @@ def compare_declared(declared: CameraImuCalibration, found: CameraImuCalibration
         Whether cameras of a reconstruction were aligned, not pictures that were followed.
     """
     rotation, is_wrong_rotation = _compare_rotation(declared, found, by_poses=by_poses)
-    offset, is_wrong_offset = _compare_offset(declared, found)
+    offset, is_wrong_offset = _compare_offset(declared, found, by_poses=by_poses)
     return Contradicted(
         rotation=rotation, time_offset=offset, is_wrong_rotation=is_wrong_rotation, is_wrong_offset=is_wrong_offset
     )
@@ -124,11 +125,13 @@ def _compare_rotation(
     return fact, angle > _LIMITS.wrong_rotation_rad + 3 * max(sigmas)
 
 
-def _compare_offset(declared: CameraImuCalibration, found: CameraImuCalibration) -> tuple[Fact | None, bool]:
+def _compare_offset(
+    declared: CameraImuCalibration, found: CameraImuCalibration, *, by_poses: bool
+) -> tuple[Fact | None, bool]:
     if max(declared.clock_sigma_s, found.clock_sigma_s) > _LIMITS.known_offset_s:
         return None, False
     sigma_s = float(np.hypot(declared.clock_sigma_s, found.clock_sigma_s))
-    within_s = max(_LIMITS.offset_s, _LIMITS.sigmas * sigma_s)
+    within_s = max(_LIMITS.offset_s if by_poses else _LIMITS.offset_by_pictures_s, _LIMITS.sigmas * sigma_s)
     stated_s, found_s = declared.clock_offset_s, found.clock_offset_s
     if abs(found_s - stated_s) <= within_s:
         return None, False

@@ -216,6 +216,8 @@ class Recorded:
         Whether the frames are those of a capture, which can be described better; poses alone cannot.
     rotation
         Between consecutive frames, by their pixels.
+    looked_at, blank
+        How many pictures were looked at, and the names of those without any feature.
     trajectory, read_as
         Poses of a reconstruction; the convention that they were read by.
     camera
@@ -234,6 +236,8 @@ class Recorded:
     log: FrameLog | None = None
     is_capture: bool = False
     rotation: VisualRotation | None = None
+    looked_at: int = 0
+    blank: Sequence[str] = ()
     trajectory: CameraTrajectory | None = None
     read_as: PoseConvention = ARRAYS
     camera: CameraModel | None = None
@@ -258,10 +262,10 @@ class Recorded:
     def contradicted(self) -> Contradicted:
         """The declared rotation and time offset against an alignment without them; nothing where that is not possible.
 
-        Pictures alone tell rotations worse, and pairs of them far apart hardly at all.
+        Pictures alone tell them worse.
         """
         prior, imu = self.calibration, self.imu
-        if prior is None or imu is None or (self.trajectory is None and not self.is_dense):
+        if prior is None or imu is None or (self.trajectory is None and self.rotation is None):
             return Contradicted()
         opened = leave_out(prior)
         if opened is prior:
