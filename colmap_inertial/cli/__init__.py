@@ -271,6 +271,6 @@ def _main(args: Sequence[str] | None) -> None:
         reason = describe_environment_fault(error)
         if reason is None:
             raise
-        say(f"error: {reason}", error=True)
+        say(f"error: {reason.with_advice}", error=True)
         code = 2
     sys.exit(code)

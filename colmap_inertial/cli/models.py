@@ -312,7 +312,7 @@ class Diagnose(SourceReader):
             with self.progress() as progress:
                 diagnosis = diagnose_source(self.read_from(), json=self.json_file, progress=progress)
         except InertialError as error:
-            if report is None or not self.talks or error.fact is None or error.fact.code != "table-unclear":
+            if report is None or not self.talks or error.code != "table-unclear":
                 raise
             raise InertialError(f"{self.source}: {error.fact}; the capture.toml above describes it") from None
         self.tell(lambda: show_diagnosis(diagnosis, self.source), diagnosis.as_json(), written=True)

@@ -19,6 +19,7 @@ import numpy as np
 from colmap_inertial.colmap.depth_maps import Maker, map_file
 from colmap_inertial.core.arrays import Array, Float32Array
 from colmap_inertial.core.errors import InertialError, MissingExtraError, OutputError, advise_library
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.io.files import path_in
 from colmap_inertial.io.images import read_image
@@ -77,12 +78,11 @@ def require_mesh_maker(options: ReconstructOptions) -> None:
 
 
 def _missing_error() -> MissingExtraError:
-    return MissingExtraError("mesh", "dense_options.mesh tsdf is made by open3d")
+    return MissingExtraError("mesh", Fact("needs-open3d"))
 
 
 def _unloadable_error(why: str) -> InertialError:
-    mend = advise_library(why, "open3d")
-    return InertialError(f"open3d cannot be loaded ({why}); {mend}, or take --dense-options.mesh poisson")
+    return InertialError(Fact("open3d-not-loaded", detail=why, mend=advise_library(why, "open3d")))
 
 
 def _import_open3d() -> ModuleType:

@@ -261,7 +261,7 @@ def _read_columns(
             reason += f"; the header is: {table.header_text[:300]}"
         found = _add_other_table(path, found)
         fact = Fact("table-unclear", reason=reason, hint=describe(path, found, table))
-        raise FormatError(path, fact, code=FormatError.default_code)
+        raise FormatError(path, fact)
     recording = read_tables(make_sensor_table(path, gyro), make_sensor_table(path, accel))
     gyro_rad_s, accel_m_s2 = (
         Axes.parse(part.axes).apply(values) if part.axes else values

@@ -453,6 +453,11 @@ def cameras_registered_again(names: Sequence[str]) -> str:
     return f"registered again, and right now: {', '.join(names)}"
 
 
+@message(example={"reasons": ("the camera hardly accelerates",)})
+def scale_refused(reasons: Sequence[Any]) -> str:
+    return "; ".join(map(str, reasons))
+
+
 state("rigs-not-registered-again", "images of several cameras are not registered again")
 
 
@@ -547,6 +552,7 @@ def _list_axes(axes: Sequence[str]) -> str:
     return axes[0] if len(axes) == 1 else ", ".join(axes[:-1]) + " and " + axes[-1]
 
 
+state("no-accelerometer-for-gravity", "the recording has no accelerometer; record it along with the gyroscope")
 state("rests-without-accelerometer", "the recording has no accelerometer; record it, too")
 
 

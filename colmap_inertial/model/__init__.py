@@ -312,8 +312,7 @@ def trajectory_from_model(
     if len(timed) < 2:
         example = frames[0].images[0].name if frames else "none"
         raise TimingError(
-            Fact("names-disagree", timed=len(timed), frames=len(frames), example=example, named=timing.names[0]),
-            code=TimingError.default_code,
+            Fact("names-disagree", timed=len(timed), frames=len(frames), example=example, named=timing.names[0])
         )
     notes: tuple[Fact, ...] = ()
     if len(timed) < len(frames):

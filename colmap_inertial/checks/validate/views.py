@@ -62,7 +62,7 @@ class View:
             data = read_bytes(self.path, what="picture")
             require_modest(self.path, data)
         except FormatError as error:
-            return error.fact or Fact.stated(error.reason)
+            return error.fact
         flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
         if image is None:

@@ -9,6 +9,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import quat_conjugate, quat_multiply, quat_normalize, quat_rotate
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import (
@@ -162,7 +163,7 @@ def _require_smoothable(trajectory: CameraTrajectory, imu: ImuRecording) -> None
     if len(trajectory) < 6:
         raise NotObservableError("smooth motion", f"{len(trajectory)} poses are too few to tell motion from noise")
     if not imu.has_accel:
-        hint = "the recording has no accelerometer; record it along with the gyroscope"
+        hint = Fact("no-accelerometer-for-gravity")
         raise NotObservableError("smooth motion", hint)
 
 

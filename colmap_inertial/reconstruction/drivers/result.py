@@ -282,8 +282,8 @@ def measurement_as_json(measurement: Validation | Georeference | InertialError |
 
 
 def error_as_json(error: InertialError) -> dict[str, Any]:
-    """What an error says, and its code and values where it has them."""
-    return {"error": str(error)} | ({} if error.fact is None else {"error" + DETAILS: error.fact.as_json()})
+    """What an error says, and its code and values."""
+    return {"error": str(error), "error" + DETAILS: error.fact.as_json()}
 
 
 def _record_as_json(record: Treatment | Gap) -> dict[str, object]:

@@ -259,7 +259,8 @@ class _Batch:
             self._set(pending.result())
         except Exception as error:  # the worker was lost too often, or cannot run it, or the scheduler is gone
             known = read_status(task.status) or self._known[name]
-            text = describe_environment_fault(error) or f"{type(error).__name__}: {error}".partition("\n")[0]
+            fault = describe_environment_fault(error)
+            text = f"{type(error).__name__}: {error}".partition("\n")[0] if fault is None else fault.with_advice
             self._set(failed(known, f"no worker could finish it: {text}"))
             write_status(task.status, self._known[name])
 
