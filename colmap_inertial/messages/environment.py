@@ -74,3 +74,50 @@ state(
     advice="raise the limit (ulimit -n) and start again",
     joint=": ",
 )
+
+
+@message(
+    advice=lambda needed_bytes, **_: f"raise the limit (ulimit -v {needed_bytes >> 10})",
+    joint=": ",
+    example={"allowed_bytes": 1000000000, "needed_bytes": 2500000000},
+)
+def too_little_memory_allowed(allowed_bytes: int, needed_bytes: int) -> str:
+    return (
+        f"only {allowed_bytes / 1e9:.2g} GB of memory are allowed to a process here, and {needed_bytes / 1e9:.2g} "
+        "GB are needed"
+    )
+
+
+@message(
+    advice=lambda needed, **_: f"raise the limit (ulimit -n {needed})",
+    joint=": ",
+    example={"allowed": 16, "needed": 64},
+)
+def too_few_files_allowed(allowed: int, needed: int) -> str:
+    return f"only {allowed} files may be open at a time here, and {needed} are needed"
+
+
+# tools
+
+state("needs-pygltflib", "glTF files are written by pygltflib")
+
+state("needs-laspy", "LAS files are written by laspy, and put on the map by pyproj")
+
+state("needs-viser", "the viewer runs in a browser with viser")
+
+state(
+    "viser-not-guarded",
+    "this version of viser cannot be kept to this machine's own user",
+    advice="install viser 1.1",
+    joint=": ",
+)
+
+
+@message(example={"host": "localhost", "port": 8080, "detail": "Name or service not known"})
+def port_unusable(host: str, port: int, detail: str) -> str:
+    return f"cannot listen at {host}, port {port}: {detail}"
+
+
+@message(advice="choose another with --port", example={"port": 8080, "host": "localhost"})
+def no_port_free(port: int, host: str) -> str:
+    return f"no port from {port} on is free at {host}"

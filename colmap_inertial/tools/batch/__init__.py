@@ -21,6 +21,7 @@ from pathlib import Path
 
 from colmap_inertial.core.choices import check_kind
 from colmap_inertial.core.errors import OutputError, OutputExistsError, describe_environment_fault
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import BatchOptions, ReconstructOptions, StageNames
 from colmap_inertial.core.printing import cell
 from colmap_inertial.core.summary import prints_in_lines
@@ -181,7 +182,7 @@ def _owned(out: Path) -> Iterator[str]:
     """
     status = out / "status"
     if out.exists() and not (out.is_dir() and (status.is_dir() or not any(out.iterdir()))):
-        raise OutputExistsError(f"{out} is no batch's folder; choose a new one")
+        raise OutputExistsError(Fact("not-a-batch", out=str(out)))
     refuse_links(out)
     busy = f"another batch is at work in {out}; wait for it or choose another folder"
     with contextlib.ExitStack() as held:
@@ -189,7 +190,7 @@ def _owned(out: Path) -> Iterator[str]:
             status.mkdir(parents=True, exist_ok=True)
             held.enter_context(locked(status / "lock", busy))
         except OSError as error:
-            raise OutputError(f"{out} cannot be made: {error.strerror or error}") from error
+            raise OutputError(Fact("folder-not-made", out=str(out), detail=str(error.strerror or error))) from error
         run = uuid.uuid4().hex
         write_text(status / "run", run)
         try:

@@ -9,6 +9,7 @@ from typing import Any
 
 from colmap_inertial.core.choices import CheckedOptions
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, StageNames
 from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.io.files import StrPath, check_names, reader
@@ -113,7 +114,7 @@ def check_unique(captures: Sequence[BatchCapture], path: Path) -> None:
         other = seen.setdefault(capture.name.casefold(), capture)
         if other is not capture:
             raise FormatError(
-                path, f"two captures are called {capture.name} ({other.path}, {capture.path}): give one another name"
+                path, Fact("captures-of-one-name", name=capture.name, first=str(other.path), second=str(capture.path))
             )
 
 
@@ -122,8 +123,7 @@ def _refuse_stages(captures: Sequence[BatchCapture], path: Path) -> None:
         if capture.stages is not None and capture.stages.code:
             raise FormatError(
                 path,
-                f"[capture, number {i}] stages: names code that this batch would run ({', '.join(capture.stages.code)})"
-                "; look at it first, then allow it with --allow-stages (allow_stages=True)",
+                Fact("batch-names-code", number=i, code=capture.stages.code),
             )
 
 
