@@ -147,13 +147,10 @@ def tsdf_mesh(folder: Path, names: Sequence[str], target: Path, *, maker: Maker,
         blocks = grid.compute_unique_block_coordinates(seen, matrix, pose, *limits)
         grid.integrate(blocks, seen, shown, matrix, pose, *limits)
         if grid.hashmap().size() > SURFACE.most_blocks:
-            raise InertialError(
-                f"{target}: the surface is too large for voxels of {1000 * voxel_m:.1f} mm; shrink the pictures "
-                "(--dense-options.max-image-size), or take --dense-options.mesh poisson"
-            )
+            raise InertialError(Fact("surface-too-large", path=str(target), voxel_m=voxel_m))
     mesh = _sort_mesh(o3d, grid.extract_triangle_mesh(weight_threshold=SURFACE.least_seen))
     if not o3d.t.io.write_triangle_mesh(str(target), mesh) or not target.is_file():
-        raise OutputError(f"{target}: open3d wrote no mesh; is the disk full?")
+        raise OutputError(Fact("mesh-not-written", path=str(target)))
 
 
 def _sort_mesh(o3d: ModuleType, mesh: Any) -> Any:

@@ -35,6 +35,10 @@ def scales_refused(models: Sequence[int], reasons: Sequence[Sequence[Said]]) -> 
     return "; ".join(f"model {i}: {'; '.join(map(str, why))}" for i, why in zip(models, reasons, strict=True))
 
 
+_ROOM = "make room and start again, it continues"
+_RAISE = "raise the limit (ulimit -f) and start again, it continues"
+
+
 def _remove_or_choose(out: str, **_: object) -> str:
     return f"remove {out}, or choose another folder"
 
@@ -379,3 +383,187 @@ state(
     advice="map first (with a target or two markers), or give a COLMAP project",
     joint=": ",
 )
+
+# the folder of a run
+
+
+@message(advice="choose another output folder", example={"path": "out"})
+def output_is_a_file(path: str) -> str:
+    return f"{path} is a file"
+
+
+@message(
+    advice="choose another folder, or remove this one (view and write_report still read it)",
+    joint=": ",
+    example={"out": "out"},
+)
+def run_of_another_version(out: str) -> str:
+    return f"{out} holds a run of another version, which laid its folders out otherwise"
+
+
+@message(advice="choose another folder or remove it", example={"out": "out", "what": "capture", "named": "/data/walk"})
+def run_of_another_kind(out: str, what: str, named: object) -> str:
+    return f"{out} holds a run of another {what} ({named})"
+
+
+state("device-in-output", "is a device, a pipe or a socket in an output folder", advice="remove it", joint=": ")
+
+
+@message(advice=_RAISE, example={"folder": "out"})
+def file_would_be_too_large(folder: str) -> str:
+    return f"{folder}: a file in it would be larger than files may be"
+
+
+@message(advice=_ROOM, example={"folder": "out", "detail": "No space left on device"})
+def disk_full(folder: str, detail: str) -> str:
+    return f"the disk of {folder} is full ({detail})"
+
+
+@message(advice="choose a folder outside of it", example={"out": "images/out", "folder": "images"})
+def output_among_pictures(out: str, folder: str) -> str:
+    return f"{out} lies in {folder}, the folder of the capture's pictures"
+
+
+@message(advice=_ROOM, example={"folder": "out", "free_bytes": 1000000, "needed_bytes": 50000000})
+def disk_nearly_full(folder: str, free_bytes: int, needed_bytes: int) -> str:
+    return (
+        f"the disk of {folder} is nearly full: {free_bytes / 1e6:.0f} MB are left, COLMAP's next step may "
+        f"need {needed_bytes / 1e6:.0f} MB"
+    )
+
+
+@message(advice=_RAISE, example={"path": "database.db", "largest_bytes": 1000000, "needed_bytes": 50000000})
+def file_size_limited(path: str, largest_bytes: int, needed_bytes: int) -> str:
+    return (
+        f"{path}: COLMAP cannot write it here: a file may have {largest_bytes / 1e6:.2g} MB, and this one "
+        f"may need {max(1.0, needed_bytes / 1e6):.0f} MB"
+    )
+
+
+# frames, pairs and stages of a user
+
+
+@message(example={"detail": "no common view"})
+def apertures_apart(detail: str) -> str:
+    return f"the apertures do not fit together: {detail}"
+
+
+@message(example={"width": 640, "height": 480, "aperture": "red", "aperture_width": 1920, "aperture_height": 1080})
+def picture_unlike_its_aperture(
+    width: int, height: int, aperture: str, aperture_width: int, aperture_height: int
+) -> str:
+    return f"is {width}x{height}, but {aperture} is calibrated for {aperture_width}x{aperture_height}"
+
+
+@message(advice="write all with the same depth", example={"dtype": "uint8", "reference_dtype": "uint16"})
+def depth_unlike_the_reference(dtype: str, reference_dtype: str) -> str:
+    return f"holds {dtype} pixels, the reference {reference_dtype}"
+
+
+@message(advice="leave it out, or leave out the long ones by --exposures.no-fuse", example={"deblur": "wiener"})
+def fused_not_deblurred(deblur: str) -> str:
+    return f"--deblur {deblur}: frames of short and long exposures are fused, and not deblurred then"
+
+
+@message(example={"width": 640, "height": 480, "frame": "0007.jpg", "short_width": 1920, "short_height": 1080})
+def long_exposure_of_other_size(width: int, height: int, frame: str, short_width: int, short_height: int) -> str:
+    return f"is {width}x{height}, but its short exposure {frame} is {short_width}x{short_height}"
+
+
+@message(advice="write both alike", example={"kind": "grey", "frame": "0007.jpg", "short_kind": "in colour"})
+def long_exposure_of_other_kind(kind: str, frame: str, short_kind: str) -> str:
+    return f"is {kind}, but its short exposure {frame} is {short_kind}"
+
+
+@message(
+    advice="write both with the same depth", example={"dtype": "uint8", "frame": "0007.jpg", "short_dtype": "uint16"}
+)
+def long_exposure_of_other_depth(dtype: str, frame: str, short_dtype: str) -> str:
+    return f"holds {dtype} pixels, its short exposure {frame} {short_dtype}"
+
+
+@message(
+    advice="all pictures of a capture must have the camera's size",
+    example={"width": 640, "height": 480, "camera_width": 1920, "camera_height": 1080},
+)
+def picture_unlike_the_camera(width: int, height: int, camera_width: int, camera_height: int) -> str:
+    return f"is {width}x{height}, but the camera is {camera_width}x{camera_height}"
+
+
+@message(example={"count": 2, "of": 300})
+def frames_left_too_few(count: int, of: int) -> str:
+    return f"{count} frames are left of {of}; a model needs at least three"
+
+
+@message(example={"dtype": "uint16", "suffix": ".jpg"})
+def picture_not_writable(dtype: str, suffix: str) -> str:
+    return f"OpenCV cannot write {dtype} images as {suffix}"
+
+
+@message(
+    advice=("leave one out (--join off leaves out the default one), or name the default one in `replaces` of yours"),
+    joint=": ",
+    example={"stages": ("Join", "MyJoin")},
+)
+def two_stages_join(stages: Sequence[str]) -> str:
+    return f"two model stages join models ({' and '.join(stages)}), and only one can"
+
+
+@message(example={"stage": "mine:sharpen", "module": "mine", "name": "sharpen"})
+def stage_not_in_module(stage: str, module: str, name: str) -> str:
+    return f"stage {stage}: {module} has no {name}"
+
+
+@message(advice="name an instance of it, or a function", example={"stage": "mine:Sharpen"})
+def stage_is_a_class(stage: str) -> str:
+    return f"stage {stage}: is a class"
+
+
+@message(advice="name a function, or what can be called as one", example={"stage": "mine:three", "type": "int"})
+def stage_not_callable(stage: str, type: str) -> str:
+    return f"stage {stage}: is of type {type}"
+
+
+@message(
+    advice=lambda out, **_: f"it says what {out} is for: choose another folder, or remove this one",
+    example={"found": {"code": "not-a-result", "values": {}}, "out": "out"},
+)
+def owner_unreadable(found: Said, out: str) -> str:
+    return found.with_advice
+
+
+@message(
+    advice="start that again, it is made again",
+    joint=": ",
+    example={"found": {"code": "not-a-result", "values": {}}, "lost": "scale.json"},
+)
+def lost_since_its_run(found: Said, lost: str) -> str:
+    return f"{found.with_advice}; {lost} is missing or damaged since its run wrote it"
+
+
+@message(example={"stage": "mine:sharpen", "why": {"code": "module-of-stage-missing", "values": {"module": "mine"}}})
+def stage_not_imported(stage: str, why: Said) -> str:
+    return f"stage {stage}: {why.with_advice}"
+
+
+@message(advice="install it where the capture is worked on, or set PYTHONPATH", example={"module": "mine"})
+def module_of_stage_missing(module: str) -> str:
+    return f"there is no module {module}"
+
+
+@message(example={"module": "mine", "detail": "SyntaxError: invalid syntax"})
+def module_of_stage_failed(module: str, detail: str) -> str:
+    return f"{module} cannot be imported: {detail}"
+
+
+# shared with io
+
+
+@message(example={"detail": "Expected '=' after a key"})
+def invalid_toml(detail: str) -> str:
+    return f"not valid TOML: {detail}"
+
+
+@message(example={"detail": "width must be above 0"})
+def invalid_values(detail: str) -> str:
+    return detail

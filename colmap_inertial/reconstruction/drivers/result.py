@@ -165,7 +165,7 @@ class ReconstructResult:
     unchanged: bool = False
 
     @property
-    def waiting(self) -> tuple[str, ...]:
+    def waiting(self) -> tuple[Fact, ...]:
         """Steps that the dense reconstructions wait for; empty where nothing is left to do."""
         return tuple(model.dense.waiting for model in self.models if model.dense is not None and model.dense.waiting)
 
@@ -186,7 +186,7 @@ class ReconstructResult:
             models = tuple(model.index for model in self.models)
             raise NotObservableError("scale", Fact("scales-refused", models=models, reasons=reasons))
         if self.waiting:
-            raise InertialError("; ".join(self.waiting))
+            raise InertialError(Fact("found-together", found=self.waiting))
         checked = [model.validation for model in self.models if model.validation is not None]
         failures = [check.exit_code for check in checked if isinstance(check, InertialError)]
         outside = any(not check.within_tolerance for check in checked if isinstance(check, Validation))
