@@ -121,3 +121,8 @@ def port_unusable(host: str, port: int, detail: str) -> str:
 @message(advice="choose another with --port", example={"port": 8080, "host": "localhost"})
 def no_port_free(port: int, host: str) -> str:
     return f"no port from {port} on is free at {host}"
+
+
+# the report
+
+state("plotly-missing", "plotly is not installed, which draws the report", advice="pip install 'plotly>=6'", joint=": ")

@@ -625,3 +625,15 @@ def gravity_assumed(sigma: float) -> str:
         f"the strength of gravity is assumed, which alone makes the gains uncertain by +-{196 * sigma:.1g} %: give the "
         "latitude (and the height) of the place"
     )
+
+
+# What smoothing and comparing with targets need.
+
+state("no-result-with-target", "no result was compared with a target")
+
+state("imu-in-no-interval", "the IMU recorded during none of the frame intervals")
+
+
+@message(example={"count": 3})
+def poses_too_few_to_smooth(count: int) -> str:
+    return f"{count} poses are too few to tell motion from noise"

@@ -73,6 +73,7 @@ from typing import Any
 from colmap_inertial.checks.report.content import gather
 from colmap_inertial.checks.report.folders import DATA_FOLDER
 from colmap_inertial.core.errors import InertialError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.printing import printable_values
 from colmap_inertial.io.files import StrPath, reading, refuse_link, write_json, write_text
 
@@ -131,7 +132,7 @@ def require_plotly() -> None:
     InertialError
     """
     if find_spec("plotly") is None:
-        raise InertialError("plotly is not installed, which draws the report: pip install 'plotly>=6'")
+        raise InertialError(Fact("plotly-missing"))
 
 
 __all__ = ["require_plotly", "write_report"]
