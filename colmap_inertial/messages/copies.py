@@ -97,6 +97,15 @@ def blob_of_other_length(what: str, count: int) -> str:
     return f"damaged: a {what} is not {count} numbers"
 
 
+_UNREADABLE = "COLMAP cannot read its database; put it back as it was, or begin anew in another folder"
+state("database-unreadable", _UNREADABLE)
+
+
+@message(example={"table": "matches"})
+def record_of_other_size(table: str) -> str:
+    return f"{_UNREADABLE} (a record of {table} has another size than it states)"
+
+
 # depth maps, meshes and settings beside a model
 
 state("not-a-depth-map", "not a depth or normal map of COLMAP: it does not begin with width&height&channels&")
@@ -153,6 +162,11 @@ def unit_no_length(unit: str) -> str:
 state("not-a-vector", "a vector that is not three numbers", advice=_KEEP)
 
 # the copy of a project
+
+
+@message(example={"path": "metric"})
+def written_by_another(path: str) -> str:
+    return f"another process is writing {path}"
 
 
 @message(advice="choose another folder", example={"path": "metric"})

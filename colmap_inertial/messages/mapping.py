@@ -93,6 +93,23 @@ state(
     advice="leave out --scheduler",
 )
 
+
+@message(
+    example={
+        "program": "/usr/bin/colmap",
+        "command": "mapper",
+        "version": "3.9",
+        "exit_code": 1,
+        "output": ("no images",),
+        "log": "out/colmap.log",
+    }
+)
+def colmap_failed(program: str, command: str, version: str, exit_code: int, output: Sequence[str], log: str) -> str:
+    what = f"was killed (signal {-exit_code})" if exit_code < 0 else f"failed with exit code {exit_code}"
+    printed = " | ".join(output) or "it printed nothing"
+    return f"{program} {command} (COLMAP {version}) {what}: {printed}; all of it is in {log}"
+
+
 # COLMAP's own work
 
 state(

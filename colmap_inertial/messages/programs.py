@@ -209,6 +209,20 @@ def folders_within_each_other(folder: str, out: str) -> str:
 
 # batches and simulations
 
+state("no-folder-with-capture", "holds no folder with a capture")
+state("manifest-without-capture", "names no capture", advice="write [[capture]] tables", joint=": ")
+state("capture-not-in-tables", "write [[capture]], with two brackets, before each capture")
+
+
+@message(example={"key": "options"})
+def key_is_a_table(key: str) -> str:
+    return f"is a table, such as {key}.name = value"
+
+
+@message(example={"found": 1.5})
+def not_a_whole_number(found: float) -> str:
+    return f"must be a whole number, found {found!r}"
+
 
 @message(advice="choose a new one", example={"out": "out"})
 def not_a_batch(out: str) -> str:

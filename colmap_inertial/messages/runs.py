@@ -387,6 +387,16 @@ state(
 # the folder of a run
 
 
+@message(advice="wait for it or choose another folder", example={"folder": "out"})
+def run_at_work(folder: str) -> str:
+    return f"another run is at work in {folder}"
+
+
+@message(advice="wait for it or choose another folder", example={"folder": "out"})
+def batch_at_work(folder: str) -> str:
+    return f"another batch is at work in {folder}"
+
+
 @message(advice="choose another output folder", example={"path": "out"})
 def output_is_a_file(path: str) -> str:
     return f"{path} is a file"

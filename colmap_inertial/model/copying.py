@@ -55,7 +55,7 @@ def new_folder(target: Path, *, into_empty: bool = False) -> Iterator[Path]:
     lock = target.with_name(f".{target.name}.colmap-inertial-lock")
     with _ending_by_signal(), _convert_os_errors(target):
         target.parent.mkdir(parents=True, exist_ok=True)
-        with locked(lock, f"another process is writing {target}"):
+        with locked(lock, Fact("written-by-another", path=str(target))):
             try:
                 if partial.exists():
                     shutil.rmtree(partial)

@@ -49,7 +49,7 @@ _PAIR_CAMERAS = "".join(
     for name in ("camera1", "camera2")
 )
 #: What is said of a database that COLMAP cannot read.
-UNREADABLE = "COLMAP cannot read its database; put it back as it was, or begin anew in another folder"
+UNREADABLE = Fact("database-unreadable")
 #: Rebuilt by SQLite; a copy must not have it.
 SHARED_MEMORY = "-shm"
 
@@ -166,7 +166,7 @@ def check_records(database: Path) -> None:
             if table == "two_view_geometries" and {"camera1", "camera2"} <= columns:
                 holds += _PAIR_CAMERAS
             if opened.execute(f"SELECT 1 FROM {table} WHERE NOT ({holds}) LIMIT 1").fetchone() is not None:
-                raise FormatError(database, f"{UNREADABLE} (a record of {table} has another size than it states)")
+                raise FormatError(database, Fact("record-of-other-size", table=table))
 
 
 def copy_database(source: Path, target: Path) -> None:

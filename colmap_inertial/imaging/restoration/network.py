@@ -210,7 +210,7 @@ def _import_runtime() -> Any:
     try:
         import onnxruntime
     except ImportError:
-        raise MissingExtraError("restore", "networks run in onnxruntime") from None
+        raise MissingExtraError("restore", Fact("needs-onnxruntime")) from None
     return onnxruntime
 
 

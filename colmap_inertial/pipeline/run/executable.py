@@ -190,9 +190,8 @@ class ColmapExecutable:
                 read_line(line)
             code = process.wait()
         if code:
-            what = f"was killed (signal {-code})" if code < 0 else f"failed with exit code {code}"
-            output = " | ".join(last) or "it printed nothing"
-            raise MappingError(f"{self.path} {command} (COLMAP {self.version}) {what}: {output}; all of it is in {log}")
+            named = {"program": str(self.path), "command": command, "version": self.version}
+            raise MappingError(Fact("colmap-failed", **named, exit_code=code, output=tuple(last), log=str(log)))
 
 
 def read_executable(

@@ -202,7 +202,7 @@ class Workspace:
         OutputError
             Where the disk is full.
         """
-        busy = f"another run is at work in {self.root}; wait for it or choose another folder"
+        busy = Fact("run-at-work", folder=str(self.root))
         with full_disk_is_an_error(self.root), locked(self.lock, busy):
             yield
 

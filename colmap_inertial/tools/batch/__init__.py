@@ -184,7 +184,7 @@ def _owned(out: Path) -> Iterator[str]:
     if out.exists() and not (out.is_dir() and (status.is_dir() or not any(out.iterdir()))):
         raise OutputExistsError(Fact("not-a-batch", out=str(out)))
     refuse_links(out)
-    busy = f"another batch is at work in {out}; wait for it or choose another folder"
+    busy = Fact("batch-at-work", folder=str(out))
     with contextlib.ExitStack() as held:
         try:
             status.mkdir(parents=True, exist_ok=True)

@@ -100,9 +100,7 @@ def read_manifest(
     if not allow_stages:
         _refuse_stages(captures, path)
     if not captures:
-        raise FormatError(
-            path, "holds no folder with a capture" if path.is_dir() else "names no capture: write [[capture]] tables"
-        )
+        raise FormatError(path, Fact("no-folder-with-capture") if path.is_dir() else Fact("manifest-without-capture"))
     check_unique(captures, path)
     return captures
 
@@ -139,7 +137,7 @@ def _read_captures(path: Path, options: ReconstructOptions) -> list[BatchCapture
     if tables is None:
         return []
     if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
-        root.fail("capture", "write [[capture]], with two brackets, before each capture")
+        root.fail("capture", Fact("capture-not-in-tables"))
     text = path.read_text(encoding="utf-8-sig", errors="replace")
     return [
         _capture(path, Section(path, f"capture, number {i}", table, text), options)
@@ -164,7 +162,7 @@ def _capture(manifest: Path, table: Section, options: ReconstructOptions) -> Bat
     try:
         return BatchCapture(name=name, path=source, options=options, project=project, stages=stages)
     except ValueError as error:
-        table.fail("name", str(error))
+        table.fail("name", Fact("invalid-values", detail=str(error)))
 
 
 def _stages(table: Section) -> StageNames | None:
@@ -172,11 +170,11 @@ def _stages(table: Section) -> StageNames | None:
     try:
         return override_options(StageNames(), values, table.path) if "stages" in table else None
     except FormatError as error:
-        table.fail("stages", error.reason)
+        table.fail("stages", error.fact)
 
 
 def _table(table: Section, key: str) -> dict[str, Any]:
     values = table.raw(key)
     if values is not None and not isinstance(values, dict):
-        table.fail(key, f"is a table, such as {key}.name = value")
+        table.fail(key, Fact("key-is-a-table", key=key))
     return values or {}

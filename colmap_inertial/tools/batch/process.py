@@ -128,7 +128,7 @@ def _begin(workspace: Workspace, stages: StageNames) -> None:
         with contextlib.suppress(OutputExistsError, OSError):
             workspace.stamps.mkdir(parents=True, exist_ok=True)
             # a worker that was lost may take as long to let go of the folder
-            with locked(workspace.lock, "", wait_s=60.0):
+            with locked(workspace.lock, Fact("run-at-work", folder=str(workspace.root)), wait_s=60.0):
                 write_text(workspace.stage_names, config_as_toml(stages))
 
 
