@@ -384,6 +384,19 @@ state(
     joint=": ",
 )
 
+# notes on errors
+
+
+@message(example={"page": "out/report.html"})
+def found_on_page(page: str) -> str:
+    return f"what was found, and what to do: {page}"
+
+
+@message(example={"out": "out"})
+def earlier_result_stays(out: str) -> str:
+    return f"the earlier result in {out} stays as it was"
+
+
 # the folder of a run
 
 
