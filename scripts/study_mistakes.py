@@ -33,7 +33,7 @@ from bench_report import write_report
 from colmap_inertial.cli import main as run_command
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import InertialError
-from colmap_inertial.core.facts import sentences
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.core.types import CameraTrajectory, ImuRecording
 from colmap_inertial.inertial.scale import estimate_scale
@@ -216,7 +216,7 @@ def scale_of(change: Callable[[CameraTrajectory, ImuRecording], tuple[CameraTraj
     def estimate(scene: Path) -> None:
         found = estimate_scale(*change(*read_desk(scene)))
         if found.verdict == "refused":
-            raise InertialError("; ".join(sentences(found.reasons)))
+            raise InertialError(Fact("scale-refused", reasons=found.reasons))
 
     return estimate
 
