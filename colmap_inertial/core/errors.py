@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import errno
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from colmap_inertial.core.facts import Fact, as_fact
 
@@ -46,6 +46,10 @@ class InertialError(Exception):
         self.fact = as_fact(fact)
         super().__init__(shown or self.fact.with_advice)
 
+    def __reduce__(self) -> tuple[object, ...]:
+        # by fields: a worker's errors come to another process, and the constructors take other arguments
+        return _restore, (type(self), self.args, vars(self))
+
     @property
     def code(self) -> str:
         return self.fact.code
@@ -54,6 +58,12 @@ class InertialError(Exception):
     def why(self) -> Fact:
         """What is wrong as a fact, without the place or the quantity."""
         return self.fact
+
+
+def _restore(kind: type[InertialError], args: tuple[str, ...], fields: dict[str, Any]) -> InertialError:
+    error = kind.__new__(kind, *args)
+    vars(error).update(fields)
+    return error
 
 
 def fact_of(error: InertialError) -> Fact:

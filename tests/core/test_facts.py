@@ -1,6 +1,7 @@
 """Facts: codes with values, their words, and their way through JSON."""
 
 import ast
+import pickle
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,7 +9,14 @@ import pytest
 
 import colmap_inertial
 from colmap_inertial import messages
-from colmap_inertial.core.errors import FormatError, NotObservableError
+from colmap_inertial.core.errors import (
+    FormatError,
+    MappingError,
+    MissingExtraError,
+    NotObservableError,
+    TimingError,
+    fact_of,
+)
 from colmap_inertial.core.facts import Fact, as_fact, with_sentences
 from colmap_inertial.core.types import Action, Treatment
 from colmap_inertial.io.files import read_json, read_record, write_record
@@ -106,6 +114,30 @@ def test_errors_take_code_and_words_from_a_fact():
     refused = NotObservableError("scale", a_fact(), sigma=0.5)
     assert (refused.fact, refused.code) == (a_fact(), "tested-cameras")
     assert "standard deviation 50.0 %" in str(refused)
+
+
+def test_errors_come_whole_from_another_process():
+    errors = [
+        MappingError(a_fact()),
+        FormatError("imu.csv", a_fact(), line=7),
+        NotObservableError("scale", a_fact(), sigma=0.5),
+        MissingExtraError("mesh", a_fact()),
+        TimingError(a_fact(), shown=str(a_fact())),
+    ]
+    for error in errors:
+        again = pickle.loads(pickle.dumps(error))
+        assert (type(again), str(again), vars(again)) == (type(error), str(error), vars(error))
+
+
+def test_an_error_as_a_fact_says_what_the_error_says():
+    for error in (
+        MappingError(a_fact()),
+        FormatError("imu.csv", a_fact(), line=7),
+        FormatError("imu.csv", a_fact()),
+        NotObservableError("scale", a_fact(), sigma=0.5),
+        TimingError(a_fact(), shown=str(a_fact())),
+    ):
+        assert str(fact_of(error)) == str(error)
 
 
 def test_a_stage_of_a_user_says_words_and_no_action_of_its_own():
