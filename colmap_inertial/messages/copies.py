@@ -258,7 +258,10 @@ def field_not_of_shape(name: str, shape: Sequence[int]) -> str:
 
 state("scale-not-a-number", "scale must be a number")
 
-state("provenance-not-text", "provenance must be text")
+
+@message(example={"name": "provenance"})
+def field_not_text(name: str) -> str:
+    return f"{name} must be text"
 
 
 @message(example={"model": 0, "numbers": (1, 2)})
