@@ -18,7 +18,8 @@ from pathlib import Path
 
 from colmap_inertial.checks.report.folders import CROPS_FOLDER, DATA_FOLDER
 from colmap_inertial.core.errors import FormatError, OutputError, OutputExistsError
-from colmap_inertial.io.files import CHANGED_RECORD, locked, read_json, reading, refuse_link, write_json
+from colmap_inertial.core.facts import Fact
+from colmap_inertial.io.files import locked, read_json, reading, refuse_link, write_json
 
 log = logging.getLogger(__name__)
 
@@ -307,7 +308,7 @@ def full_disk_is_an_error(root: Path, advice: str = _MAKE_ROOM) -> Iterator[None
 
 def a_record_of_ours(path: Path) -> AbstractContextManager[None]:
     """While a record of an earlier run is taken apart: what does not fit means that it was changed since."""
-    return reading(path, CHANGED_RECORD)
+    return reading(path, Fact("changed-record"))
 
 
 def require_apart(out: Path, pictures: Sequence[Path]) -> None:
