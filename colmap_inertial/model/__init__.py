@@ -331,8 +331,11 @@ def trajectory_from_model(
 
 
 def similarity_as_json(similarity: Similarity) -> dict[str, object]:
-    """The similarity's fields in JSON types."""
-    return dict(convert_to_plain(similarity))
+    """The similarity's fields in JSON types; ``undoes`` where it takes another one back."""
+    fields = dict(convert_to_plain(similarity))
+    if similarity.undoes is None:
+        del fields["undoes"]
+    return fields
 
 
 def is_metric(folder: Path) -> bool:

@@ -16,7 +16,7 @@ from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.facts import DETAILS, Fact, read_facts, with_sentences
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.quantiles import Z95
-from colmap_inertial.core.types import DOWN_IN_WORLD, UNDOES, Similarity
+from colmap_inertial.core.types import DOWN_IN_WORLD, Similarity
 from colmap_inertial.io.files import read_json
 from colmap_inertial.model.camera_files import are_cameras_of
 from colmap_inertial.model.database import PlacedModel
@@ -156,12 +156,12 @@ def transform_export(source: Path, target: Path, similarity: Similarity) -> tupl
                 changed.append("directions")
     metres = _METRES.fullmatch(str(values.get("unit")))
     before_apply = values.get(_BEFORE)
-    if isinstance(before_apply, dict) and similarity.provenance == f"{UNDOES}{before_apply.get(_BY, '')}":
+    if isinstance(before_apply, dict) and similarity.undoes == before_apply.get(_BY, ""):
         for name in (_BEFORE, _NOTES_DETAILS):
             values.pop(name, None)
         values |= {name: value for name, value in before_apply.items() if name != _BY}
         changed.append("unit")
-    elif values.get("unit") == NOT_METRES and not similarity.provenance.startswith(UNDOES):
+    elif values.get("unit") == NOT_METRES and similarity.undoes is None:
         in_metres = _describe_metres(values, similarity)
         values.pop(_NOTES_DETAILS, None)
         values |= in_metres

@@ -16,7 +16,7 @@ from colmap_inertial.core.facts import Fact, as_fact, read_facts, with_sentences
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_from_matrix
 from colmap_inertial.core.options import WorldAxes
 from colmap_inertial.core.summary import prints_in_lines
-from colmap_inertial.core.types import UNDOES, ScaleEstimate, Similarity
+from colmap_inertial.core.types import ScaleEstimate, Similarity
 from colmap_inertial.io.files import StrPath, read_json, reader, reading
 from colmap_inertial.model import similarity_as_json
 from colmap_inertial.model.identity import ModelIdentity, identity_from_json
@@ -93,13 +93,15 @@ def similarity_from_json(path: Path, fields: Mapping[str, Any]) -> Similarity:
         if array.dtype.kind not in "fiu" or array.shape != shape:
             raise FormatError(path, f"{name} must be {' x '.join(map(str, shape))} numbers")
         arrays[name] = array.astype(np.float64)
-    scale, provenance = fields["scale"], fields.get("provenance", "")
+    scale, provenance, undoes = fields["scale"], fields.get("provenance", ""), fields.get("undoes")
     if isinstance(scale, bool) or not isinstance(scale, int | float):
         raise FormatError(path, "scale must be a number")
     if not isinstance(provenance, str):
         raise FormatError(path, "provenance must be text")
+    if not isinstance(undoes, str | None):
+        raise FormatError(path, "undoes must be text")
     try:
-        return Similarity(scale=float(scale), provenance=provenance, **arrays)
+        return Similarity(scale=float(scale), provenance=provenance, undoes=undoes, **arrays)
     except (ValueError, OverflowError) as error:
         raise FormatError(path, str(error)) from None
 
@@ -144,7 +146,8 @@ def undoing(similarity: Similarity) -> Similarity:
         rotation_xyzw=quat_conjugate(similarity.rotation_xyzw),
         translation_m=-(rotation.T @ similarity.translation_m) / similarity.scale,
         cov=np.zeros((7, 7)),
-        provenance=f"{UNDOES}{similarity.provenance}",
+        provenance=f"undoes: {similarity.provenance}",
+        undoes=similarity.provenance,
     )
 
 
@@ -157,6 +160,7 @@ def compose(move: Similarity, before: Similarity) -> Similarity:
         translation_m=move.scale * turn @ before.translation_m + move.translation_m,
         cov=np.zeros((7, 7)),
         provenance=before.provenance,
+        undoes=before.undoes,
     )
 
 

@@ -24,9 +24,6 @@ Verdict = Literal["trusted", "weak", "refused"]
 #: The direction of gravity in a metric world with these axes: ``y-down`` is COLMAP's and computer vision's habit.
 DOWN_IN_WORLD = {"z-up": np.array([0.0, 0.0, -1.0]), "y-down": np.array([0.0, 1.0, 0.0])}
 
-#: What the provenance of a similarity begins with that takes another one back.
-UNDOES = "undoes: "
-
 
 @prints_in_lines
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -292,6 +289,8 @@ class Similarity:
         (7, 7) of log scale, rotation (rad, target frame, left), translation (m).
     provenance
         Where it comes from, in words.
+    undoes
+        The provenance of the similarity that this one takes back; ``None`` where it takes none back.
     """
 
     scale: float
@@ -299,6 +298,7 @@ class Similarity:
     translation_m: Array
     cov: Array
     provenance: str = ""
+    undoes: str | None = None
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.scale) and self.scale > 0):
