@@ -31,7 +31,7 @@ from colmap_inertial.core.errors import (
     OutputExistsError,
     describe_environment_fault,
 )
-from colmap_inertial.core.facts import DETAILS, Fact, as_fact, with_sentences
+from colmap_inertial.core.facts import DETAILS, Fact, with_sentences
 from colmap_inertial.core.options import ReadLimits
 from colmap_inertial.core.printing import printable
 
@@ -72,7 +72,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 @contextmanager
-def reading(path: StrPath, fault: Fact | str | None = None) -> Iterator[None]:
+def reading(path: StrPath, fault: Fact | None = None) -> Iterator[None]:
     """The gate of all readers: whatever the content of a file causes is an error that names it.
 
     Parameters
@@ -96,9 +96,7 @@ def reading(path: StrPath, fault: Fact | str | None = None) -> Iterator[None]:
         if describe_environment_fault(error) is not None:
             raise
         reason = f"{type(error).__name__}: {error}".splitlines()[0][:300]
-        raise FormatError(
-            Path(path), Fact(DAMAGED, fault=as_fact(fault or Fact("is-damaged")), detail=reason)
-        ) from error
+        raise FormatError(Path(path), Fact(DAMAGED, fault=fault or Fact("is-damaged"), detail=reason)) from error
 
 
 def reader(what: str) -> Callable[[F], F]:
@@ -149,7 +147,7 @@ def remove_temporaries(*folders: Path) -> None:
 
 
 @contextlib.contextmanager
-def locked(path: Path, busy: Fact | str, *, wait_s: float = 0.0) -> Iterator[None]:
+def locked(path: Path, busy: Fact, *, wait_s: float = 0.0) -> Iterator[None]:
     """Hold the lock file ``path``; the system lets go of it when this process ends, whatever ends it.
 
     Raises

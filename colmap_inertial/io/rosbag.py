@@ -59,7 +59,7 @@ def read_rosbag(path: Path, units: DeclaredUnits) -> ImuRecording:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise MissingExtraError("ros", f"{path} is a ROS recording") from None
+        raise MissingExtraError("ros", Fact("ros-recording", path=str(path))) from None
     require_modest_recording(path)
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.core.facts import Fact, as_fact
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.files import require_regular
 
 
@@ -43,7 +43,7 @@ def open_foreign(
     *,
     mode: Literal["immutable=1", "mode=ro", "mode=rw"] = "immutable=1",
     source: Path | None = None,
-    fault: Fact | str | None = None,
+    fault: Fact | None = None,
 ) -> Iterator[sqlite3.Connection]:
     """Open a database that others may have written, and close it.
 
@@ -69,7 +69,7 @@ def open_foreign(
         Where the disk is full or fails.
     """
     named = path if source is None else source
-    fault = Fact("sqlite-cannot-read") if fault is None else as_fact(fault)
+    fault = fault or Fact("sqlite-cannot-read")
     require_regular(path)
     end_s = time.thread_time() + BOUNDS.seconds + path.stat().st_size / BOUNDS.bytes_per_s
     try:

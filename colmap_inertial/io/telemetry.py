@@ -150,7 +150,7 @@ def _parsed(path: Path) -> tuple[str, dict[str, dict[str, Any]]]:
     It runs in a process of its own: on damaged files it may abort, which no exception tells of.
     """
     if find_spec("telemetry_parser") is None:
-        raise MissingExtraError("devices", f"{path} is read by telemetry-parser")
+        raise MissingExtraError("devices", Fact("needs-telemetry-parser", path=str(path)))
     most_bytes = _LIMITS.memory_bytes + _LIMITS.memory_of_a_byte * path.stat().st_size
     command = [sys.executable, "-P", "-c", _PARSE, str(path.absolute()), str(most_bytes)]
     done = subprocess.run(command, capture_output=True, stdin=subprocess.DEVNULL)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.core.facts import Fact, as_fact
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.files import read_text
 
 T = TypeVar("T", bound=str)
@@ -83,11 +83,11 @@ class Section:
         """Keys in the order of the file."""
         return list(self._values)
 
-    def fail(self, key: str | None, reason: Fact | str) -> NoReturn:
+    def fail(self, key: str | None, fault: Fact) -> NoReturn:
         """Raise the :class:`FormatError` of this table (and of one of its keys)."""
         where = f"[{self.name}]" if self.name else "top level"
         entry = where if key is None else f"{where} {key}"
-        raise FormatError(self.path, Fact("wrong-entry", entry=entry, fault=as_fact(reason)), line=self._line(key))
+        raise FormatError(self.path, Fact("wrong-entry", entry=entry, fault=fault), line=self._line(key))
 
     def section(self, key: str, *, short: str | None = None) -> Section | None:
         """The table under ``key``, or ``None`` where it is absent; a text in its place is its key ``short``."""

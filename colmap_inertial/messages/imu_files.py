@@ -297,3 +297,16 @@ state("no-gyroscope-samples", "holds no gyroscope samples")
 @message(example={"sample": 3, "bytes": 8})
 def imu_sample_bytes(sample: int, bytes: int) -> str:
     return f"IMU sample {sample} has {bytes} bytes where three floats have 12"
+
+
+# what needs an extra
+
+
+@message(example={"path": "imu.bag"})
+def ros_recording(path: str) -> str:
+    return f"{path} is a ROS recording"
+
+
+@message(example={"path": "a.insv"})
+def needs_telemetry_parser(path: str) -> str:
+    return f"{path} is read by telemetry-parser"

@@ -102,7 +102,7 @@ def test_errors_take_code_and_words_from_a_fact():
     error = FormatError("imu.csv", a_fact(), line=7)
     assert (error.code, error.reason) == ("tested-cameras", a_fact().with_advice)
     assert str(error) == f"imu.csv, line 7: {a_fact().with_advice}"
-    assert FormatError("imu.csv", "no header").code == "unreadable"
+    assert error.fact == a_fact()
     refused = NotObservableError("scale", a_fact(), sigma=0.5)
     assert (refused.fact, refused.code) == (a_fact(), "tested-cameras")
     assert "standard deviation 50.0 %" in str(refused)

@@ -131,7 +131,7 @@ def require_plotly() -> None:
     InertialError
     """
     if find_spec("plotly") is None:
-        raise InertialError("plotly is not installed, which draws the report: pip install 'plotly>=6'")
+        raise InertialError(Fact("plotly-missing"))
 
 
 __all__ = ["require_plotly", "write_report"]

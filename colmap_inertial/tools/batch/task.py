@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from colmap_inertial.core.errors import FormatError, InertialError, OutputError, TargetNotFoundError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, StageNames
 from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.io.files import read_json, write_json
@@ -211,7 +212,7 @@ def read_end(status: CaptureStatus, result: Path) -> CaptureStatus:
         models = tuple(_model(model) for model in values["models"])
         frames = len(values["frames"]) or None  # an existing project counts none
     except (KeyError, TypeError, AttributeError):
-        raise FormatError(result, "is not the result of a reconstruction") from None
+        raise FormatError(result, Fact("not-a-result")) from None
     code, error = _verdict(models)
     state: State = "failed" if code else "done"
     return dataclasses.replace(
