@@ -13,6 +13,7 @@ import pytest
 from cases import loop_over
 
 from colmap_inertial.core.errors import FormatError, OutputError, OutputExistsError, describe_environment_fault
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.files import locked, read_json, reading, write_json, write_text
 
 
