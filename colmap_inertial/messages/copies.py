@@ -335,11 +335,6 @@ def records_claimed(count: int) -> str:
     return f"it claims {count} records"
 
 
-@message(example={"model": 99})
-def camera_model_number_unknown(model: int) -> str:
-    return f"camera model {model} is unknown"
-
-
 @message(example={"width": 0, "height": 480})
 def camera_without_pixels(width: int, height: int) -> str:
     return f"a camera of {width} x {height} pixels"

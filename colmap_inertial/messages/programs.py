@@ -53,7 +53,10 @@ state("gravity-is-of-rests", "gravity is for recordings of rests; with results, 
 @message(
     example={
         "source": "log.csv",
-        "found": {"code": "table-unclear", "values": {"reason": "has no header", "hint": "[imu.gyro]"}},
+        "found": {
+            "code": "table-unclear",
+            "values": {"why": {"code": "no-header-of-columns", "values": {}}, "header": None, "hint": "[imu.gyro]"},
+        },
     }
 )
 def table_described_above(source: str, found: Said) -> str:
@@ -272,16 +275,9 @@ state("mesh-truncated", "truncated, or a mesh of other faces than triangles")
 state("faces-not-triangles", "a mesh of other faces than triangles")
 
 
-@message(example={"detail": "Permission denied"})
-def file_not_readable(detail: str) -> str:
-    return f"cannot be read: {detail}"
-
-
 state("ply-not-shown", "only binary PLY files that begin with vertices can be shown")
 
 state("holds-no-points", "holds no points")
-
-state("truncated", "truncated")
 
 state("nothing-to-view", "no such folder", advice="give what reconstruct or apply wrote, or a COLMAP model")
 

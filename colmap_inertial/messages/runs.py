@@ -67,19 +67,6 @@ def project_untimed(project: str) -> str:
     return f"{project}: nothing says when its images were taken"
 
 
-# shared with the files of a capture
-
-
-@message(example={"what": "file"})
-def no_such_file(what: str) -> str:
-    return f"no such {what}"
-
-
-@message(example={"path": "out/run.json", "detail": "No space left on device"})
-def cannot_be_written(path: str, detail: str) -> str:
-    return f"{path} cannot be written: {detail}"
-
-
 # captures
 
 state("capture-has-no-frames", "has no frames", advice="add [images] or [video]", joint=": ")
@@ -577,16 +564,3 @@ def module_of_stage_missing(module: str) -> str:
 @message(example={"module": "mine", "detail": "SyntaxError: invalid syntax"})
 def module_of_stage_failed(module: str, detail: str) -> str:
     return f"{module} cannot be imported: {detail}"
-
-
-# shared with io
-
-
-@message(example={"detail": "Expected '=' after a key"})
-def invalid_toml(detail: str) -> str:
-    return f"not valid TOML: {detail}"
-
-
-@message(example={"detail": "width must be above 0"})
-def invalid_values(detail: str) -> str:
-    return detail

@@ -218,7 +218,7 @@ def _scales_of(source: str, world: WorldAxes) -> list[tuple[int | None, ModelSca
     number, equals, name = source.partition("=")
     is_numbered = bool(equals) and number.isascii() and number.isdigit() and not Path(source).exists()
     path = Path(name if is_numbered else source)
-    with reading(path, "cannot be read as a scale estimate"):
+    with reading(path, Fact("not-readable-as", what="a scale estimate")):
         content = read_json(path)
         if is_numbered or not isinstance(content.get("models"), list):
             return [(int(number) if is_numbered else None, _model_scale(path, content, world))]

@@ -79,7 +79,7 @@ def _cameras(data: mmap.mmap, count: int) -> int:
     for _ in range(count):
         _, model, width, height = _CAMERA.unpack_from(data, at)
         if not 0 <= model < len(NUM_PARAMETERS):
-            raise _Damaged(Fact("camera-model-number-unknown", model=model))
+            raise _Damaged(Fact("camera-model-unknown", model=str(model)))
         if not (0 < width < 2**31 and 0 < height < 2**31):
             raise _Damaged(Fact("camera-without-pixels", width=width, height=height))
         at += 24 + 8 * NUM_PARAMETERS[model]

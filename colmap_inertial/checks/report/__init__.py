@@ -115,8 +115,7 @@ def write_report(
     from colmap_inertial.checks.report.run_page import run_page
 
     target = out / "report.html"
-    records = "its result.json, diagnosis.json, config.toml or report_data"
-    with reading(out, f"{records} was damaged since it was written"):
+    with reading(out, Fact("changed-records", names=("result.json", "diagnosis.json", "config.toml", "report_data"))):
         content = printable_values(gather(out, result=result, stopped=stopped, capture=capture))
         page = run_page(content, out)
         write_json(out / "report.json", content, indent=None)

@@ -19,7 +19,7 @@ from pathlib import Path
 from colmap_inertial.checks.report.folders import CROPS_FOLDER, DATA_FOLDER
 from colmap_inertial.core.errors import FormatError, OutputError, OutputExistsError, fact_of
 from colmap_inertial.core.facts import Fact
-from colmap_inertial.io.files import CHANGED_RECORD, locked, read_json, reading, refuse_link, write_json
+from colmap_inertial.io.files import locked, read_json, reading, refuse_link, write_json
 
 log = logging.getLogger(__name__)
 
@@ -300,7 +300,7 @@ def full_disk_is_an_error(root: Path) -> Iterator[None]:
 
 def a_record_of_ours(path: Path) -> AbstractContextManager[None]:
     """While a record of an earlier run is taken apart: what does not fit means that it was changed since."""
-    return reading(path, CHANGED_RECORD)
+    return reading(path, Fact("changed-record"))
 
 
 def require_apart(out: Path, pictures: Sequence[Path]) -> None:

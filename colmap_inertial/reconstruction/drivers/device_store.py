@@ -158,7 +158,7 @@ def calibrate_from_results(folders: Sequence[Path], out: Path, *, device: str = 
     comparisons: dict[str, TargetComparison] = {}
     for folder in folders:
         path = folder / "result.json"
-        with reading(path, "is no result of `colmap-inertial reconstruct`"):
+        with reading(path, Fact("no-result-of-reconstruct")):
             content = read_json(path)
             capture, comparison = str(content["capture"]), _read_comparison(path, content["models"])
         if capture in comparisons:
