@@ -10,7 +10,7 @@ import errno
 from pathlib import Path
 from typing import Any, ClassVar
 
-from colmap_inertial.core.facts import Fact, as_fact
+from colmap_inertial.core.facts import Fact
 
 #: Libraries that open3d and pycolmap-cuda12 take from the system, and their packages on Debian.
 _SYSTEM_LIBRARIES = {
@@ -33,18 +33,22 @@ class InertialError(Exception):
     ----------
     fact
         What is wrong; its message is shown with its advice.
+    shown
+        What is shown in its place.
 
     Attributes
     ----------
+    fact
+        What is wrong, without the place or the quantity.
     code
         Stable name of what is wrong: the fact's.
     """
 
     exit_code: ClassVar[int] = 2
 
-    def __init__(self, fact: Fact | str = "", *, shown: str = "", code: str = "") -> None:
-        self.fact = as_fact(fact)
-        super().__init__(shown or self.fact.with_advice)
+    def __init__(self, fact: Fact, *, shown: str = "") -> None:
+        self.fact = fact
+        super().__init__(shown or fact.with_advice)
 
     def __reduce__(self) -> tuple[object, ...]:
         # by fields: a worker's errors come to another process, and the constructors take other arguments
@@ -53,11 +57,6 @@ class InertialError(Exception):
     @property
     def code(self) -> str:
         return self.fact.code
-
-    @property
-    def why(self) -> Fact:
-        """What is wrong as a fact, without the place or the quantity."""
-        return self.fact
 
 
 def _restore(kind: type[InertialError], args: tuple[str, ...], fields: dict[str, Any]) -> InertialError:
@@ -89,9 +88,9 @@ class FormatError(InertialError):
         One-based line number, where the file has lines.
     """
 
-    def __init__(self, path: Path | str, reason: Fact | str, *, line: int | None = None, code: str = "") -> None:
+    def __init__(self, path: Path | str, reason: Fact, *, line: int | None = None) -> None:
         self.path = Path(path)
-        self.reason = as_fact(reason).with_advice
+        self.reason = reason.with_advice
         self.line = line
         place = f"{path}{'' if line is None else f', line {line}'}"
         super().__init__(reason, shown=f"{place}: {self.reason}")
@@ -120,9 +119,9 @@ class MissingExtraError(InertialError):
         What needs it.
     """
 
-    def __init__(self, extra: str, what: Fact | str) -> None:
+    def __init__(self, extra: str, what: Fact) -> None:
         self.extra = extra
-        super().__init__(Fact("extra-missing", what=as_fact(what), extra=extra, packages=_list_packages(extra)))
+        super().__init__(Fact("extra-missing", what=what, extra=extra, packages=_list_packages(extra)))
 
 
 def _list_packages(extra: str) -> list[str]:
@@ -149,18 +148,13 @@ class NotObservableError(InertialError):
         Why, and what to record instead.
     sigma
         Relative standard deviation, where one was computed.
-
-    Attributes
-    ----------
-    why
-        The hint as a fact.
     """
 
     exit_code = 3
 
-    def __init__(self, quantity: str, hint: Fact | str, *, sigma: float | None = None) -> None:
+    def __init__(self, quantity: str, hint: Fact, *, sigma: float | None = None) -> None:
         self.quantity = quantity
-        self.hint = as_fact(hint).with_advice
+        self.hint = hint.with_advice
         self.sigma = sigma
         spread = "" if sigma is None else f" (standard deviation {100 * sigma:.1f} %)"
         super().__init__(hint, shown=f"{quantity} is not observable{spread}: {self.hint}")

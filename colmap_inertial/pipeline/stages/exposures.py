@@ -229,7 +229,7 @@ class ExposureStage:
         try:
             pair = bring_together(frame.image, long, gyro=times, stated_gain=stated)
         except NotObservableError as error:
-            return _alone(frame, long, None, path, error.why)
+            return _alone(frame, long, None, path, error.fact)
         measured = _measured(pair)
         if not pair.registered.alike:
             why = Fact("pair-not-alike", long=path.name, correlation=pair.registered.agreement)

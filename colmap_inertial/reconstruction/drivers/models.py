@@ -400,7 +400,7 @@ def run_validation(
             except TargetNotFoundError as error:
                 write_record(partial[0], _Checked(why_not=error.fact))
             except NotObservableError as error:
-                write_record(partial[0], _Checked(unobservable=error.quantity, why_not=error.why))
+                write_record(partial[0], _Checked(unobservable=error.quantity, why_not=error.fact))
             else:
                 write_overlays(validation, images, pictures)
                 write_record(partial[0], _Checked(found=validation))
