@@ -67,15 +67,29 @@ def test_every_message_shows_its_example():
         assert isinstance(fact.advice, str), code
 
 
-def test_every_code_that_the_package_names_has_a_message():
-    known, missing = messages.all_messages(), []
+def test_every_code_that_the_package_names_has_a_message_that_takes_its_values():
+    known, wrong = messages.all_messages(), []
     for path in PACKAGE.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Fact" and node.args:
                 code = node.args[0]
-                if isinstance(code, ast.Constant) and code.value not in known:
-                    missing.append(f"{path.relative_to(PACKAGE)}:{node.lineno} {code.value}")
-    assert missing == []
+                if not isinstance(code, ast.Constant):
+                    continue
+                place = f"{path.relative_to(PACKAGE)}:{node.lineno} {code.value}"
+                values = {keyword.arg: None for keyword in node.keywords}
+                if code.value not in known:
+                    wrong.append(place)
+                elif None not in values:
+                    try:
+                        known[code.value].signature.bind(**values)
+                    except TypeError as error:
+                        wrong.append(f"{place}: {error}")
+    assert wrong == []
+
+
+def test_every_message_is_said_somewhere():
+    said = "".join(path.read_text() for path in PACKAGE.rglob("*.py") if path.parent.name != "messages")
+    assert [code for code in messages.all_messages() if f'"{code}"' not in said and code != "tested-cameras"] == []
 
 
 @dataclass(frozen=True, kw_only=True)
