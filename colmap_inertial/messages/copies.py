@@ -82,6 +82,16 @@ def not_text(detail: str) -> str:
     return f"no text: {detail}"
 
 
+@message(example={"count": 3})
+def records_claimed(count: int) -> str:
+    return f"it claims {count} records"
+
+
+@message(example={"width": 0, "height": 480})
+def camera_without_pixels(width: int, height: int) -> str:
+    return f"a camera of {width} x {height} pixels"
+
+
 # databases
 
 state("not-sqlite", "not an SQLite database")
@@ -160,6 +170,9 @@ def unit_no_length(unit: str) -> str:
 
 
 state("not-a-vector", "a vector that is not three numbers", advice=_KEEP)
+
+
+state("not-a-transform", "a transform that is no matrix of 3 or 4 rows of 4 numbers", advice=_KEEP)
 
 # the copy of a project
 
@@ -246,6 +259,15 @@ def model_elsewhere(other: str) -> str:
 
 state("images-of-no-submodel", "its images are those of none of the sub-models", advice="leave it out with --keep")
 
+
+state("copy-disk-full", "the disk is full")
+
+
+state("copy-quota-used", "the quota is used up")
+
+
+state("copy-file-too-large", "the file is too large")
+
 # scales in files
 
 state("no-similarity", "no similarity: the field scale is missing")
@@ -325,21 +347,3 @@ def scales_of_other_submodels(project: str, numbers: Sequence[int], given: Seque
         f"{project} has the sub-models {', '.join(map(str, numbers))}, but there are scales of "
         f"{', '.join(map(str, given))}"
     )
-
-
-state("not-a-transform", "a transform that is no matrix of 3 or 4 rows of 4 numbers", advice=_KEEP)
-
-
-@message(example={"count": 3})
-def records_claimed(count: int) -> str:
-    return f"it claims {count} records"
-
-
-@message(example={"width": 0, "height": 480})
-def camera_without_pixels(width: int, height: int) -> str:
-    return f"a camera of {width} x {height} pixels"
-
-
-state("copy-disk-full", "the disk is full")
-state("copy-quota-used", "the quota is used up")
-state("copy-file-too-large", "the file is too large")

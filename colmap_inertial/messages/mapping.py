@@ -110,6 +110,11 @@ def colmap_failed(program: str, command: str, version: str, exit_code: int, outp
     return f"{program} {command} (COLMAP {version}) {what}: {printed}; all of it is in {log}"
 
 
+@message(example={"program": "/usr/bin/colmap", "why": {"code": "database-damaged", "values": {}}})
+def written_database_unusable(program: str, why: Said) -> str:
+    return f"{program}: the database that it wrote cannot be used: {why}"
+
+
 # COLMAP's own work
 
 state(
@@ -288,6 +293,11 @@ def mesh_not_written(path: str) -> str:
     return f"{path}: open3d wrote no mesh"
 
 
+@message(example={"folder": "dense/0"})
+def no_depth_maps(folder: str) -> str:
+    return f"{folder} has no depth maps: no two images see enough of the same under a fit angle"
+
+
 # rigs and the gyroscope's bias
 
 
@@ -370,6 +380,46 @@ def option_is_a_table(option: str) -> str:
     return f"{option} is a table of options"
 
 
+state("mapping-pairing-chooses", "--mapping.pairing chooses the pairs")
+
+
+state("dense-mesh-chooses", "--dense-options.mesh chooses the mesh")
+
+
+state("of-colmaps-window", "it belongs to COLMAP's own window")
+
+
+state("deterministic-decides", "--deterministic decides")
+
+
+state("seed-decides", "--seed decides")
+
+
+state("mapping-device-decides", "--mapping.device decides")
+
+
+state("mapping-features-decides", "--mapping.features decides")
+
+
+state("pairs-by-verified-matches", "pairs are judged by their verified matches")
+
+
+state("capture-says-camera", "the capture says which camera took an image")
+
+
+state("run-has-own-files", "the run has its own files")
+
+
+@message(example={"setting": "Mapper.random_seed=3", "why": {"code": "seed-decides", "values": {}}})
+def setting_not_taken(setting: str, why: Said) -> str:
+    return f"{setting}: {why}"
+
+
+@message(example={"option": "mapping.maper", "nearest": "mapping.mapper", "known": ("mapper", "pairing")})
+def unknown_option(option: str, nearest: str | None, known: Sequence[str]) -> str:
+    return f"unknown option {option}{_did_you_mean(nearest) or '; known here: ' + ', '.join(known)}"
+
+
 # workers
 
 
@@ -432,38 +482,6 @@ def worker_sees_no_output(worker: str, folder: str) -> str:
 @message(example={"work": "features 3"})
 def work_not_wanted(work: str) -> str:
     return f"{work}: not wanted any more"
-
-
-@message(example={"program": "/usr/bin/colmap", "why": {"code": "database-damaged", "values": {}}})
-def written_database_unusable(program: str, why: Said) -> str:
-    return f"{program}: the database that it wrote cannot be used: {why}"
-
-
-@message(example={"folder": "dense/0"})
-def no_depth_maps(folder: str) -> str:
-    return f"{folder} has no depth maps: no two images see enough of the same under a fit angle"
-
-
-state("mapping-pairing-chooses", "--mapping.pairing chooses the pairs")
-state("dense-mesh-chooses", "--dense-options.mesh chooses the mesh")
-state("of-colmaps-window", "it belongs to COLMAP's own window")
-state("deterministic-decides", "--deterministic decides")
-state("seed-decides", "--seed decides")
-state("mapping-device-decides", "--mapping.device decides")
-state("mapping-features-decides", "--mapping.features decides")
-state("pairs-by-verified-matches", "pairs are judged by their verified matches")
-state("capture-says-camera", "the capture says which camera took an image")
-state("run-has-own-files", "the run has its own files")
-
-
-@message(example={"setting": "Mapper.random_seed=3", "why": {"code": "seed-decides", "values": {}}})
-def setting_not_taken(setting: str, why: Said) -> str:
-    return f"{setting}: {why}"
-
-
-@message(example={"option": "mapping.maper", "nearest": "mapping.mapper", "known": ("mapper", "pairing")})
-def unknown_option(option: str, nearest: str | None, known: Sequence[str]) -> str:
-    return f"unknown option {option}{_did_you_mean(nearest) or '; known here: ' + ', '.join(known)}"
 
 
 state("work-needs-dask", "--scheduler hands work to a Dask cluster")

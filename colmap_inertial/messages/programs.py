@@ -264,6 +264,43 @@ def folder_exists(folder: str) -> str:
     return f"{folder} exists already"
 
 
+# how a capture of a batch ended
+
+
+@message(advice="remove it or choose another folder", example={"out": "out/walk", "what": "set of options"})
+def result_of_another(out: str, what: str) -> str:
+    return f"{out} holds the result of another {what}"
+
+
+@message(
+    advice="workers need the same files under the same paths",
+    joint=": ",
+    example={"worker": "host", "path": "out/walk.toml"},
+)
+def worker_sees_no_files(worker: str, path: str) -> str:
+    return f"{worker} does not see {path}"
+
+
+@message(advice=lambda log, **_: f"see {log}", example={"times": 3, "log": "out/walk.log"})
+def capture_killed(times: int, log: str) -> str:
+    return f"its process or worker was killed {times} times"
+
+
+@message(advice=lambda log, **_: f"see {log}", example={"exit_code": 1, "log": "out/walk.log"})
+def capture_process_ended(exit_code: int, log: str) -> str:
+    return f"its process ended with code {exit_code}"
+
+
+@message(example={"kind": "KeyError", "detail": "'a'", "log": "out/walk.log"})
+def unexpected_error(kind: str, detail: str, log: str) -> str:
+    return f"{kind}: {detail} (see {log})"
+
+
+@message(example={"detail": "KilledWorker: walk"})
+def no_worker_finished(detail: str) -> str:
+    return f"no worker could finish it: {detail}"
+
+
 # the viewer
 
 state("mesh-without-faces", "a mesh without faces")

@@ -11,19 +11,6 @@ _HOW_TIMES = (
     "one that the images were taken from)"
 )
 
-state("target-not-given", "--scale-from target needs the target: --target checkerboard:COLSxROWS:SQUARE_M or another")
-state(
-    "distance-not-given",
-    "--scale-from distance needs --between A B (two marker numbers, or two points as x,y,z of the model) and "
-    "--distance METRES+-SIGMA",
-)
-state("markers-not-given", "--between with markers needs what they are: --target aruco:DICT:SIDE_M")
-
-
-@message(advice="leave it out", example={"option": "--database"})
-def for_metres_of_the_imu(option: str) -> str:
-    return f"{option} goes with a capture whose metres come from the IMU"
-
 
 @message(example={"found": ("the target is bent",)})
 def found_together(found: Sequence[Said]) -> str:
@@ -41,30 +28,6 @@ _RAISE = "raise the limit (ulimit -f) and start again, it continues"
 
 def _remove_or_choose(out: str, **_: object) -> str:
     return f"remove {out}, or choose another folder"
-
-
-@message(advice=_remove_or_choose, example={"found": {"code": "not-a-result", "values": {}}, "out": "out"})
-def record_unreadable(found: Said, out: str) -> str:
-    return found.with_advice
-
-
-state("imu-missing", "the IMU recording: give --imu PATH")
-state("times-missing", "the times of its images: give --frame-times, a CSV with name,t_s")
-
-
-@message(example={"missing": ({"code": "imu-missing", "values": {}}, {"code": "times-missing", "values": {}})})
-def inputs_missing(missing: Sequence[Said]) -> str:
-    return f"needs {'; and '.join(map(str, missing))}"
-
-
-_NEEDS_IMU = "is a COLMAP project and needs the IMU recording: give --imu PATH"
-state("project-needs-imu", _NEEDS_IMU)
-state("project-needs-imu-and-times", f"{_NEEDS_IMU}; and when its images were taken: {_HOW_TIMES}")
-
-
-@message(advice=_HOW_TIMES, joint=": ", example={"project": "project"})
-def project_untimed(project: str) -> str:
-    return f"{project}: nothing says when its images were taken"
 
 
 # captures
@@ -214,6 +177,31 @@ def not_for_an_existing_model(options: Sequence[str]) -> str:
     return f"{', '.join(options)}: an existing model is not mapped again, nor its images changed"
 
 
+state("imu-missing", "the IMU recording: give --imu PATH")
+
+
+state("times-missing", "the times of its images: give --frame-times, a CSV with name,t_s")
+
+
+@message(example={"missing": ({"code": "imu-missing", "values": {}}, {"code": "times-missing", "values": {}})})
+def inputs_missing(missing: Sequence[Said]) -> str:
+    return f"needs {'; and '.join(map(str, missing))}"
+
+
+_NEEDS_IMU = "is a COLMAP project and needs the IMU recording: give --imu PATH"
+
+
+state("project-needs-imu", _NEEDS_IMU)
+
+
+state("project-needs-imu-and-times", f"{_NEEDS_IMU}; and when its images were taken: {_HOW_TIMES}")
+
+
+@message(advice=_HOW_TIMES, joint=": ", example={"project": "project"})
+def project_untimed(project: str) -> str:
+    return f"{project}: nothing says when its images were taken"
+
+
 # outputs
 
 
@@ -309,6 +297,11 @@ def metric_model_exists(path: str) -> str:
     return f"{path} exists"
 
 
+@message(advice=_remove_or_choose, example={"found": {"code": "not-a-result", "values": {}}, "out": "out"})
+def record_unreadable(found: Said, out: str) -> str:
+    return found.with_advice
+
+
 # targets, distances and markers
 
 state("apply-needs-unscaled", "--apply scales a model that claims no unit", advice="add --unscaled", joint=": ")
@@ -370,6 +363,25 @@ state(
     advice="map first (with a target or two markers), or give a COLMAP project",
     joint=": ",
 )
+
+
+state("target-not-given", "--scale-from target needs the target: --target checkerboard:COLSxROWS:SQUARE_M or another")
+
+
+state(
+    "distance-not-given",
+    "--scale-from distance needs --between A B (two marker numbers, or two points as x,y,z of the model) and "
+    "--distance METRES+-SIGMA",
+)
+
+
+state("markers-not-given", "--between with markers needs what they are: --target aruco:DICT:SIDE_M")
+
+
+@message(advice="leave it out", example={"option": "--database"})
+def for_metres_of_the_imu(option: str) -> str:
+    return f"{option} goes with a capture whose metres come from the IMU"
+
 
 # notes on errors
 
@@ -448,6 +460,23 @@ def file_size_limited(path: str, largest_bytes: int, needed_bytes: int) -> str:
         f"{path}: COLMAP cannot write it here: a file may have {largest_bytes / 1e6:.2g} MB, and this one "
         f"may need {max(1.0, needed_bytes / 1e6):.0f} MB"
     )
+
+
+@message(
+    advice=lambda out, **_: f"it says what {out} is for: choose another folder, or remove this one",
+    example={"found": {"code": "not-a-result", "values": {}}, "out": "out"},
+)
+def owner_unreadable(found: Said, out: str) -> str:
+    return found.with_advice
+
+
+@message(
+    advice="start that again, it is made again",
+    joint=": ",
+    example={"found": {"code": "not-a-result", "values": {}}, "lost": "scale.json"},
+)
+def lost_since_its_run(found: Said, lost: str) -> str:
+    return f"{found.with_advice}; {lost} is missing or damaged since its run wrote it"
 
 
 # frames, pairs and stages of a user
@@ -532,23 +561,6 @@ def stage_is_a_class(stage: str) -> str:
 @message(advice="name a function, or what can be called as one", example={"stage": "mine:three", "type": "int"})
 def stage_not_callable(stage: str, type: str) -> str:
     return f"stage {stage}: is of type {type}"
-
-
-@message(
-    advice=lambda out, **_: f"it says what {out} is for: choose another folder, or remove this one",
-    example={"found": {"code": "not-a-result", "values": {}}, "out": "out"},
-)
-def owner_unreadable(found: Said, out: str) -> str:
-    return found.with_advice
-
-
-@message(
-    advice="start that again, it is made again",
-    joint=": ",
-    example={"found": {"code": "not-a-result", "values": {}}, "lost": "scale.json"},
-)
-def lost_since_its_run(found: Said, lost: str) -> str:
-    return f"{found.with_advice}; {lost} is missing or damaged since its run wrote it"
 
 
 @message(example={"stage": "mine:sharpen", "why": {"code": "module-of-stage-missing", "values": {"module": "mine"}}})

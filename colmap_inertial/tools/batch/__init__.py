@@ -262,7 +262,7 @@ class _Batch:
             known = read_status(task.status) or self._known[name]
             fault = describe_environment_fault(error)
             text = f"{type(error).__name__}: {error}".partition("\n")[0] if fault is None else fault.with_advice
-            self._set(failed(known, f"no worker could finish it: {text}"))
+            self._set(failed(known, Fact("no-worker-finished", detail=text)))
             write_status(task.status, self._known[name])
 
     def stop(self) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from colmap_inertial.checks.diagnose import Diagnosis
-from colmap_inertial.core.errors import InertialError, OutputExistsError
+from colmap_inertial.core.errors import InertialError, OutputExistsError, fact_of
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ProjectOptions, StageNames
 from colmap_inertial.io.files import locked, reading_within, write_text
@@ -72,10 +72,10 @@ def main() -> None:
         end = read_end(status, Workspace(task.out).result)
     except InertialError as error:
         print(f"error: {error}", file=sys.stderr)
-        end = failed(status, str(error), error.exit_code)
+        end = failed(status, fact_of(error), error.exit_code)
     except Exception as error:
         traceback.print_exc()
-        end = failed(status, f"{type(error).__name__}: {error} (see {task.log})")
+        end = failed(status, Fact("unexpected-error", kind=type(error).__name__, detail=str(error), log=str(task.log)))
     write_status(task.status, end)
 
 
