@@ -42,7 +42,7 @@ from colmap_inertial.checks.diagnose import Recorded, diagnose
 from colmap_inertial.cli import main as run_command
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import InertialError
-from colmap_inertial.core.facts import sentences
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_multiply, quat_normalize
 from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.core.quantiles import Z95
@@ -234,7 +234,7 @@ def scale_of(change: Callable[[CameraTrajectory, ImuRecording], tuple[CameraTraj
     def estimate(scene: Path) -> None:
         found = estimate_scale(*change(*read_desk(scene)))
         if found.verdict == "refused":
-            raise InertialError("; ".join(sentences(found.reasons)))
+            raise InertialError(Fact("scale-refused", reasons=found.reasons))
 
     return estimate
 

@@ -294,13 +294,13 @@ def test_what_was_lost_since_a_run_is_said_with_the_error(tmp_path, monkeypatch)
     with runner.explaining_losses(space):
         pass
     with pytest.raises(FormatError, match=r"a.bin: is damaged$"), runner.explaining_losses(space):
-        raise FormatError("a.bin", "is damaged")
+        raise FormatError("a.bin", Fact.stated("is damaged"))
     lost.append("sparse/0/cameras.bin")
     with (
         pytest.raises(FormatError, match=r"out: a.bin: is damaged; sparse/0/cameras.bin is missing or damaged since"),
         runner.explaining_losses(space),
     ):
-        raise FormatError("a.bin", "is damaged")
+        raise FormatError("a.bin", Fact.stated("is damaged"))
 
 
 def cluster_of(offers, *, old):

@@ -486,6 +486,11 @@ def cameras_registered_again(names: Sequence[str]) -> str:
     return f"registered again, and right now: {', '.join(names)}"
 
 
+@message(example={"reasons": ("the camera hardly accelerates",)})
+def scale_refused(reasons: Sequence[Any]) -> str:
+    return "; ".join(map(str, reasons))
+
+
 state("rigs-not-registered-again", "images of several cameras are not registered again")
 
 
@@ -594,6 +599,7 @@ def _list_axes(axes: Sequence[str]) -> str:
     return axes[0] if len(axes) == 1 else ", ".join(axes[:-1]) + " and " + axes[-1]
 
 
+state("no-accelerometer-for-gravity", "the recording has no accelerometer; record it along with the gyroscope")
 state("rests-without-accelerometer", "the recording has no accelerometer; record it, too")
 
 
@@ -666,3 +672,15 @@ def gravity_assumed(sigma: float) -> str:
         f"the strength of gravity is assumed, which alone makes the gains uncertain by +-{196 * sigma:.1g} %: give the "
         "latitude (and the height) of the place"
     )
+
+
+# What smoothing and comparing with targets need.
+
+state("no-result-with-target", "no result was compared with a target")
+
+state("imu-in-no-interval", "the IMU recorded during none of the frame intervals")
+
+
+@message(example={"count": 3})
+def poses_too_few_to_smooth(count: int) -> str:
+    return f"{count} poses are too few to tell motion from noise"

@@ -84,7 +84,7 @@ _FAULTS_OF_STAMPS = frozenset(
 
 def unreadable(error: InertialError) -> Finding:
     """A reader's error as a finding."""
-    if error.fact is not None and error.code in _FAULTS_OF_STAMPS:
+    if error.code in _FAULTS_OF_STAMPS:
         return Finding(fact=error.fact, severity="error")
     code = "untimed" if isinstance(error, TimingError) else "unreadable"
     return Finding(fact=Fact(code, detail=str(error)), severity="error")

@@ -105,7 +105,7 @@ def check_belonging(recorded: Recorded) -> Iterator[Finding]:
         yield _unit_finding(recorded.wrong_unit)
         return
     if failed.code in _TOO_LITTLE_ROTATION:
-        yield Finding(fact=Fact("rotation-too-little", why=failed.why), severity="error")
+        yield Finding(fact=Fact("rotation-too-little", why=failed.fact), severity="error")
         return
     otherwise = _find_better_fit(recorded, imu)
     if otherwise is not None:
@@ -145,7 +145,7 @@ def check_cameras(recorded: Recorded) -> Iterator[Finding]:
     """Whether cameras of a reconstruction contradict the gyroscope."""
     consensus = recorded.consensus
     if isinstance(consensus, NotObservableError) and recorded.lacks_majority:
-        yield Finding(fact=Fact("cameras-turned", why=(consensus.why,)), severity="error")
+        yield Finding(fact=Fact("cameras-turned", why=(consensus.fact,)), severity="error")
     if isinstance(consensus, RotationConsensus) and not consensus.kept.all():
         fact = Fact(
             "cameras-turned",
@@ -167,7 +167,7 @@ def _never_fits(recorded: Recorded, turning: CameraTrajectory, failed: NotObserv
     if recorded.trajectory is None and not recorded.is_dense and len(turning) <= _LIMITS.enough_pairs:
         return Finding(fact=Fact("pictures-too-few", pairs=len(turning) - 1), severity="info")
     clocks = None if recorded.clocks is None else recorded.clocks.fact
-    return Finding(fact=Fact("imu-does-not-fit", seconds=span_s, why=failed.why, clocks=clocks), severity="error")
+    return Finding(fact=Fact("imu-does-not-fit", seconds=span_s, why=failed.fact, clocks=clocks), severity="error")
 
 
 def _find_better_fit(recorded: Recorded, imu: ImuRecording) -> Finding | None:

@@ -161,7 +161,7 @@ def check_readout(recorded: Recorded) -> Iterator[Finding]:
     try:
         readout = _readout(recorded)
     except NotObservableError as error:
-        yield Finding(fact=Fact("readout-unknown", why=error.why), severity="warning")
+        yield Finding(fact=Fact("readout-unknown", why=error.fact), severity="warning")
         return
     fact = Fact(
         "readout-unknown",

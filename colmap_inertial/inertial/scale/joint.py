@@ -141,7 +141,7 @@ def estimate_joint(
         if not faults.path_is_smoothed:
             fit, shape = _fit_shapely(fit, faults.undone(data), faults.loosened(prior), timed.imu.noise, accel=accel)
     except NotObservableError as error:
-        return ScaleEstimate.refused("joint", error.why)
+        return ScaleEstimate.refused("joint", error.fact)
     except np.linalg.LinAlgError:
         return ScaleEstimate.refused("joint", Fact("fit-singular"))
     left_open = sum(suspicion.scale_variance for suspicion in fit.suspicions if suspicion.name in faults.values)

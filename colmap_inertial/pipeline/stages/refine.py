@@ -113,7 +113,7 @@ class RefineStage(InertialStage):
             with one_blas_thread():
                 refined = self._refined(model)
         except (NotObservableError, np.linalg.LinAlgError) as error:
-            why_not = error.why if isinstance(error, NotObservableError) else Fact("refine-not-determined")
+            why_not = error.fact if isinstance(error, NotObservableError) else Fact("refine-not-determined")
             return _record(model, Fact("not-refined", why=why_not))
         log.info("model %d: the refinement took %.1f s", model.colmap_index, time.perf_counter() - begin_s)
         return refined

@@ -79,7 +79,7 @@ def check_imu(raw: RawImu, *, force: bool) -> RawImu:
             raise
         if not force:
             raise NotObservableError(
-                "scale", Fact("stopped-by-file", path=str(error.path), finding=error.why)
+                "scale", Fact("stopped-by-file", path=str(error.path), finding=error.fact)
             ) from None
     return raw
 
