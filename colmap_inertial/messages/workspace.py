@@ -158,6 +158,24 @@ def unmoved_depths(count: int, example: str, factors: tuple[float, ...]) -> str:
     return f"depths in {_of(count, 'picture')} of whole numbers ({example}) stay as they are: a step means {times}"
 
 
+@message(
+    advice="it is right where it is in metres already; else leave it out of rig_configurator",
+    example={"path": "rig_config.json"},
+)
+def rig_elsewhere(path: str) -> str:
+    return f"{path}: copied as it is, as its cameras are not as far apart as a model here has them"
+
+
+@message(example={"path": "outputs/dataparser_transforms.json"})
+def training_of_another_model(path: str) -> str:
+    return f"{path}: copied as it is, as it does not lead from a model here to where nerfstudio puts its cameras"
+
+
+@message(example={"path": "exports/splat.ply", "by": "outputs/dataparser_transforms.json"})
+def frame_of_training(path: str, by: str) -> str:
+    return f"{path}: copied as it is, as its points are in the frame of a training; {by} leads from metres to that"
+
+
 @message(example={"path": "transforms.json"})
 def cameras_elsewhere_in_file(path: str) -> str:
     return f"{path}: copied as it is, as its cameras do not stand where those of a model do"

@@ -24,6 +24,9 @@ from colmap_inertial.model.database import PlacedModel
 _MATRICES = ("transform_matrix", "transform_matrix_start", "transform_matrix_end")
 #: Depths between which a camera sees, as some programs have them.
 _RANGES = {"near", "far", "z_near", "z_far", "znear", "zfar", "near_plane", "far_plane"}
+#: What a step in pictures of depths means, and where frames name these: of instant-ngp and nerfstudio.
+_DEPTH_UNITS = ("integer_depth_scale", "depth_unit_scale_factor")
+_DEPTHS = ("depth_file_path", "depth_path")
 #: What ``export.json`` says of itself, and of its unit: metres, or so many of them.
 EXPORT_FORMAT = "colmap-inertial export"
 _METRES = re.compile(r"(?:(\d\S*) )?m")
@@ -66,11 +69,17 @@ def read_applied_transform(path: Path) -> Array | None:
     return None if values is None else _applied(path, values)
 
 
-def depth_pictures(path: Path) -> set[str]:
-    """Pictures of depths that a ``transforms.json`` names, as paths relative to it."""
+def depth_pictures(path: Path) -> tuple[set[str], bool]:
+    """Pictures of depths that a ``transforms.json`` names, as paths relative to it, and whether it has their unit."""
     values = _frames(path)
-    frames = [] if values is None else values["frames"]
-    return {str(frame["depth_file_path"]) for frame in frames if frame.get("depth_file_path")}
+    if values is None:
+        return set(), False
+    named = {str(frame[key]) for frame in values["frames"] for key in _DEPTHS if frame.get(key)}
+    return named, any(_is_number(values.get(name)) for name in _DEPTH_UNITS)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def transform_transforms(source: Path, target: Path, similarity: Similarity) -> tuple[str, ...]:
@@ -94,9 +103,13 @@ def transform_transforms(source: Path, target: Path, similarity: Similarity) -> 
     changed = ["cameras"]
     for fields in (values, *values["frames"]):
         for name in _RANGES & fields.keys():
-            if isinstance(fields[name], int | float) and not isinstance(fields[name], bool):
+            if _is_number(fields[name]):
                 fields[name] *= similarity.scale
                 changed.append("depth ranges")
+    for name in _DEPTH_UNITS:
+        if _is_number(values.get(name)):
+            values[name] *= similarity.scale
+            changed.append("unit of depths")
     for frame in values["frames"]:
         for name in _MATRICES:
             if name in frame:

@@ -361,16 +361,19 @@ class _Work:
             if kind == "database":
                 databases.append(path)
                 continue
-            if kind in CAMERA_KINDS and not worlds.is_of_a_model(path, str(kind)):
+            fitting: list[int] = []
+            if kind in CAMERA_KINDS and not (fitting := worlds.owners_of(path, str(kind))):
                 kind = None
-            owner = None if plan.one_for_all is not None or kind is None else self._owner(plan.layout, path)
+            owner = None if plan.one_for_all is not None or kind is None else self._owner(plan.layout, path, fitting)
             similarity = plan.one_for_all if owner is None else similarities[owner]
-            if kind is None and not self.is_kept(path):
+            if kind is None and not self.is_kept(path) and path not in worlds.counted:
                 self._inventory.add(path, lengths_of(source, path, worlds.depths))
-            if kind is None or similarity is None:
+            move = None
+            if kind is not None and similarity is not None:
+                move = worlds.similarity_of(path, kind, owner, similarity)
+            if kind is None or move is None:
                 jobs.append(functools.partial(copy, source, target, link=plan.link))
             else:
-                move = worlds.similarity_of(path, kind, owner, similarity)
                 doubles, place = plan.in_doubles(owner, move), (str(path), owner)
                 jobs.append(functools.partial(transform, source, target, kind, move, place, doubles=doubles))
         return databases, jobs
@@ -379,8 +382,11 @@ class _Work:
         """A path as it is in the project, also of what was read from the copy."""
         return path.relative_to(self._project) if path.is_relative_to(self._project) else path
 
-    def _owner(self, layout: Layout, path: Path) -> int:
+    def _owner(self, layout: Layout, path: Path, fitting: Sequence[int]) -> int:
+        """The sub-model in whose units a file is: by its folder, else the only one whose cameras it has."""
         owner = layout.owner(path)
+        if owner is None and len(fitting) == 1:
+            owner = fitting[0]
         if owner is None:
             raise FormatError(
                 self._project / path,
