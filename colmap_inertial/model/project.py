@@ -39,6 +39,7 @@ from colmap_inertial.model.keeping import Kept
 from colmap_inertial.model.layout import CAMERA_KINDS, Layout, kind_to_move, read_layout
 from colmap_inertial.model.notes import collecting_notes
 from colmap_inertial.model.places import Place
+from colmap_inertial.model.pose_priors import compare_priors
 from colmap_inertial.model.similarities import ModelScale, require_not_joined, similarity_from_json, undoing
 from colmap_inertial.model.soundness import check_binary_model
 from colmap_inertial.model.worlds import Worlds
@@ -456,6 +457,9 @@ class _Work:
                 changed.append(f"{moved} {what}")
             if kept:
                 self._notes.append(Fact("not-in-model-frame", file=str(path), count=kept, kind=what))
+        if not plan.is_undo:
+            models, by_model = plan.layout.placed, plan.similarities
+            self.note(compare_priors(self._project / path, str(path), models, by_model, moved=done.prior_models))
         (shutil.copymode if changed else shutil.copystat)(self._project / path, partial / path)
         if changed:
             self._changes.append(Change(path=str(path), kind="database", changed=tuple(changed), model=None))
