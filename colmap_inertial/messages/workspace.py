@@ -166,6 +166,14 @@ def rig_elsewhere(path: str) -> str:
     return f"{path}: copied as it is, as its cameras are not as far apart as a model here has them"
 
 
+@message(
+    advice="look whether they are lengths",
+    example={"path": "transforms.json", "fields": ("aabb", "scene_radius")},
+)
+def fields_unmoved(path: str, fields: tuple[str, ...]) -> str:
+    return f"{path}: {', '.join(fields)} stay as they are, as nothing is known of them"
+
+
 @message(example={"path": "outputs/dataparser_transforms.json"})
 def training_of_another_model(path: str) -> str:
     return f"{path}: copied as it is, as it does not lead from a model here to where nerfstudio puts its cameras"

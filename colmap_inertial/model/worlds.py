@@ -15,7 +15,13 @@ from colmap_inertial.core.types import Similarity
 from colmap_inertial.io.ply import sample_vertices
 from colmap_inertial.model.camera_files import CAMERAS_OF, are_cameras_of
 from colmap_inertial.model.database import PlacedModel
-from colmap_inertial.model.nerf import cameras_are_those_of, depth_pictures, is_transforms, read_applied_transform
+from colmap_inertial.model.nerf import (
+    cameras_are_those_of,
+    depth_pictures,
+    is_transforms,
+    read_applied_transform,
+    unmoved_fields,
+)
 from colmap_inertial.model.other_files import find_parsed_world, is_dataparser, is_rig_of, read_training_world
 from colmap_inertial.model.places import express_in_world, find_world, is_elsewhere
 
@@ -63,6 +69,8 @@ class Worlds:
             if has_unit and owners:
                 counted |= pictures
             self._of_models[path] = owners
+            if owners and (fields := unmoved_fields(project / path)):
+                self._note(Fact("fields-unmoved", path=str(path), fields=fields))
             if owners and not np.allclose(applied, np.eye(4)):
                 self._own[path] = applied
         for path in files:
@@ -104,12 +112,9 @@ class Worlds:
             return express_in_world(similarity, self._own[path])
         if kind != "ply":
             return similarity
-        near = {
-            name: world
-            for name, world in self._own.items()
-            if name not in self._trainings and path.is_relative_to(name.parent)
-        }
-        near |= self._trainings
+        own_worlds = {name: world for name, world in self._own.items() if name not in self._trainings}
+        near = {name: world for name, world in own_worlds.items() if path.is_relative_to(name.parent)}
+        near |= own_worlds | self._trainings
         placed = [m for m in self._placed if model is None or m.index == model]
         own = np.concatenate([m.points for m in placed]) if placed else np.empty((0, 3))
         try:

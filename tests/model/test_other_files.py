@@ -5,7 +5,7 @@ import json
 import cv2
 import numpy as np
 import pytest
-from foreign_models import HEIGHT, WIDTH, build, save, write_json, write_ply
+from foreign_models import HEIGHT, WIDTH, build, ply_points, save, write_json, write_ply
 from other_files import (
     in_order,
     into_training,
@@ -213,3 +213,43 @@ def test_files_of_several_models_go_with_the_one_whose_cameras_they_have(tmp_pat
     )
     centre = read_mvsnet(tmp_path / "out" / "mvs" / "cams" / "00000000_cam.txt")[0]
     np.testing.assert_allclose(centre, 0.5 * (TURN @ models[1].image(1).projection_center()), atol=1e-13)
+
+
+def nerf(root, model, world, **more):
+    """``transforms.json`` of a model in a world of its own."""
+    frames, scale = [], np.cbrt(np.linalg.det(world[:3, :3]))
+    for image in in_order(model):
+        pose = np.eye(4)
+        pose[:3] = image.cam_from_world().inverse().matrix()
+        pose = world @ pose
+        pose[:3, :3] /= scale
+        pose[:, 1:3] *= -1
+        frames.append({"file_path": image.name, "transform_matrix": pose.tolist()})
+    write_json(root / "transforms.json", {"frames": frames, **more})
+
+
+def test_a_world_that_was_scaled_and_points_that_lie_elsewhere_in_the_folders(project, tmp_path):
+    """``applied_scale`` of nerfstudio; points of its world outside the folder of its cameras."""
+    root, model = project
+    world = np.vstack([APPLIED, [0, 0, 0, 1]])
+    world[:3] *= 0.1
+    nerf(root / "ns", model, world, applied_transform=APPLIED.tolist(), applied_scale=0.1)
+    write_ply(root / "exports" / "cloud.ply", xyz_of(model) @ world[:3, :3].T + world[:3, 3])
+    apply_to_project(root, tmp_path / "out", SIM3)
+    want = moved(xyz_of(model)) @ world[:3, :3].T + world[:3, 3]
+    np.testing.assert_allclose(ply_points(tmp_path / "out" / "exports" / "cloud.ply"), want, atol=1e-6)
+    frames = json.loads((tmp_path / "out" / "ns" / "transforms.json").read_text())["frames"]
+    for image, frame in zip(in_order(model), frames, strict=True):
+        centre = world[:3, :3] @ moved(image.projection_center()) + world[:3, 3]
+        np.testing.assert_allclose(np.array(frame["transform_matrix"])[:3, 3], centre, atol=1e-14)
+        turn = np.array(frame["transform_matrix"])[:3, :3]
+        np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-13)
+
+
+def test_fields_of_cameras_that_nothing_is_known_of_are_named(project, tmp_path):
+    root, model = project
+    known = {"fl_x": 140.0, "w": 160, "k1": 0.1, "camera_angle_x": 0.8, "aabb_scale": 16, "camera_model": "OPENCV"}
+    nerf(root, model, np.eye(4), aabb=[[-1, -1, -1], [1, 1, 1]], scene_radius=3.0, title="hall", **known)
+    applied = apply_to_project(root, tmp_path / "out", SIM3)
+    (note,) = [note.values["found"] for note in applied.notes]
+    assert note.code == "fields-unmoved" and note.values["fields"] == ("aabb", "scene_radius")
