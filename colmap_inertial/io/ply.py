@@ -90,7 +90,7 @@ def read_ply_header(path: Path, file: BufferedReader) -> Header:
     raw = [file.readline(64)]
     if raw[0].strip() != b"ply":
         refuse_stand_in(path)
-        raise FormatError(path, "not a PLY file", line=1)
+        raise FormatError(path, "not a PLY file; apply copies it as it is with --keep", line=1)
     formats: list[str] = []
     elements: list[Element] = []
     length = 0

@@ -134,6 +134,25 @@ def odd_principal_point(camera: int, width: int, height: int, cx: float, cy: flo
 # what an applied similarity leaves as it is
 
 
+state("no-model", "no COLMAP model here (cameras, images and points3D, .bin or .txt)")
+state("file-for-folder", "is a file, not a folder", advice="give the folder that it is in")
+state(
+    "nothing-to-undo",
+    "has no transform.json: nothing was applied here",
+    advice="give the folder that apply or reconstruct wrote",
+)
+
+
+@message(example={"names": ("points3D.bin",)})
+def model_incomplete(names: tuple[str, ...]) -> str:
+    return f"no whole COLMAP model here: {', '.join(names)} {'is' if len(names) == 1 else 'are'} missing"
+
+
+@message(advice="open the folder there and have it downloaded", example={"names": ("points3D.bin",)})
+def kept_in_cloud(names: tuple[str, ...]) -> str:
+    return f"no whole COLMAP model here: {', '.join(names)} {'is' if len(names) == 1 else 'are'} in iCloud only"
+
+
 @message(example={"kinds": ("2 .las", "1 .splat")})
 def carried_lengths(kinds: tuple[str, ...]) -> str:
     return f"copied in their old units, as their formats are not transformed: {', '.join(kinds)}"

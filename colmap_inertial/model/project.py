@@ -25,6 +25,7 @@ from colmap_inertial.model import (
     model_files,
     model_formats,
     read_model,
+    require_format,
     similarity_as_json,
     transformed,
     write_files,
@@ -170,7 +171,10 @@ def undo_project(
         When ``out`` exists or cannot be written.
     """
     project, out = Path(project), Path(out)
-    record = read_json(path := project / TRANSFORM_FILE)
+    path = project / TRANSFORM_FILE
+    if project.is_dir() and not path.exists():
+        raise FormatError(project, Fact("nothing-to-undo"))
+    record = read_json(path)
     try:
         keep = [str(pattern) for pattern in record["keep"]]
         models = [(int(m["index"]), m["similarity"]) for m in record["models"]]
@@ -249,6 +253,8 @@ class _Work:
         read: Sequence[tuple[Path, Fact]],
         beside: Sequence[str] = (),
     ) -> None:
+        if project.is_file():
+            require_format(project)  # says what it is
         if not project.is_dir():
             raise FormatError(project, "no such folder")
         inner, outer = out.resolve(), project.resolve()

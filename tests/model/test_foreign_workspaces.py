@@ -622,3 +622,36 @@ def glb_points(path):
         )
     # glTF has y up, this world z
     return xyz @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), values("COLOR_0", "<u2", 4)[:, :3] / 65535
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (
+            lambda p: (p / "points3D.bin").rename(p / ".points3D.bin.icloud"),
+            "points3D.bin is in iCloud only; open",
+        ),
+        (lambda p: (p / "points3D.bin").unlink(), r"points3D\.bin is missing"),
+        (lambda p: [(p / f"{name}.bin").unlink() for name in ("images", "points3D")], "images.bin, points3D.bin are"),
+    ],
+)
+def test_what_a_model_lacks_is_said(tmp_path, change, match):
+    change(save(build(), tmp_path / "p"))
+    with pytest.raises(FormatError, match=match):
+        apply_to_project(tmp_path / "p", tmp_path / "out", SIM3)
+
+
+@pytest.mark.parametrize(
+    ("data", "match"),
+    [(b"PK\x03\x04" + bytes(60), r"is packed \(zip\)"), (b"anything", "not a folder; give the folder")],
+)
+def test_a_file_in_place_of_a_project_is_called_what_it_is(tmp_path, data, match):
+    (tmp_path / "p").write_bytes(data)
+    with pytest.raises(FormatError, match=match):
+        apply_to_project(tmp_path / "p", tmp_path / "out", SIM3)
+
+
+def test_what_was_never_applied_is_not_undone(tmp_path):
+    save(build(), tmp_path / "p" / "sparse" / "0")
+    with pytest.raises(FormatError, match="nothing was applied here"):
+        undo_project(tmp_path / "p", tmp_path / "out")
