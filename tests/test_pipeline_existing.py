@@ -471,6 +471,20 @@ def test_a_project_far_from_the_origin_is_scaled_where_it_stands(box, finished, 
     assert np.sqrt(np.diag(by @ cov @ by.T)).max() < 1
 
 
+def test_a_dense_cloud_far_from_the_origin_is_refused_before_the_work(box, tmp_path, capsys):
+    import pycolmap
+
+    project = shutil.copytree(box.root, tmp_path / "project")
+    model = read_model(project / "sparse" / "0")
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), FAR))
+    model.write_binary(str(project / "sparse" / "0"))
+    words = project, tmp_path / "out", "--imu", box.imu, "--frame-times", box.frame_times
+    code, _, err = run(capsys, "reconstruct", *words, "--dense")
+    assert code == 2
+    assert "single precision" in err and "export" in err
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_result_says_of_which_model_each_scale_is(box, finished, tmp_path, capsys):
     result = finished[1] / "result.json"
     code, shown, _ = run(capsys, "apply", box.root, tmp_path / "applied", "--scale", result)

@@ -249,6 +249,14 @@ def about_place(folder: str, pivot: tuple[float, ...]) -> str:
 
 
 @message(
+    advice="leave out --dense, and make the cloud of an export, which is about a point in its middle",
+    example={"folder": "project/sparse/0"},
+)
+def dense_far_away(folder: str) -> str:
+    return f"{folder} lies far from the origin, and dense clouds have single precision"
+
+
+@message(
     advice="a translation_m of p - s R p does that about a point p",
     example={"folder": "sparse/0", "distance": 28000.0},
 )

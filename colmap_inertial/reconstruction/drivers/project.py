@@ -61,7 +61,12 @@ from colmap_inertial.pipeline.stages.inputs import StageInputs
 from colmap_inertial.pipeline.stages.protocols import ModelStage, insert_defaults
 from colmap_inertial.reconstruction.drivers.georeference import run_georeference
 from colmap_inertial.reconstruction.drivers.models import Submodels, run_dense_models, run_models, run_validation
-from colmap_inertial.reconstruction.drivers.project_models import name_made_from, read_submodels, require_refinable
+from colmap_inertial.reconstruction.drivers.project_models import (
+    name_made_from,
+    read_submodels,
+    require_near,
+    require_refinable,
+)
 from colmap_inertial.reconstruction.drivers.project_output import place_project, require_free_names
 from colmap_inertial.reconstruction.drivers.reporting import report_result, reporting_stops, write_recording
 from colmap_inertial.reconstruction.drivers.result import Fragment, ModelResult, ReconstructResult
@@ -180,6 +185,8 @@ def _reconstruct(
     images = _images(project, source, needed=pictures or (options.georeference and not filmed))
     read = functools.cache(read_model)
     require_refinable(options, models, read)
+    if options.dense:
+        require_near(models, read)
     context, folders = RunContext.of(options, progress=progress), () if images is None else (images,)
     decides = given.source, given.capture, given.imu, given.prior, fingerprint(project), model_stages
     with (

@@ -7,11 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from colmap_inertial.core.errors import AlreadyMetricError, InertialError, OutputError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.model import is_metric
 from colmap_inertial.model.copying import list_tree
 from colmap_inertial.model.keeping import Kept
 from colmap_inertial.model.layout import Layout, find_made_from, read_layout
+from colmap_inertial.model.own_place import OwnPlace
 from colmap_inertial.model.rigs import has_rigs
 
 if TYPE_CHECKING:
@@ -62,3 +64,10 @@ def require_refinable(
             f"--refine inertial: several cameras took the images of {rigs[0]}, each with its own place beside the IMU, "
             "and models with rigs cannot be refined; leave it out"
         )
+
+
+def require_near(models: Mapping[int, Path], read: Callable[[Path], pycolmap.Reconstruction]) -> None:
+    """Raise :class:`InertialError` where a dense cloud, of single precision, would be of a model far from the origin."""
+    for folder in models.values():
+        if OwnPlace.of(read(folder)).pivot is not None:
+            raise InertialError(Fact("dense-far-away", folder=str(folder)))
