@@ -34,16 +34,13 @@ def read_submodels(project: Path, out: Path, source: ProjectOptions) -> Layout:
     """
     inner, outer = out.resolve(), project.resolve()
     if inner.is_relative_to(outer) or outer.is_relative_to(inner):
-        raise OutputError(f"{out} and {project} lie within each other; choose a folder elsewhere")
+        raise OutputError(Fact("folders-within-each-other", folder=str(out), out=str(project)))
     listed = list_tree(project, follow_links=source.follow_links)[0]
     kept = Kept(tuple(source.keep), project)
     folders = [folder for folder in listed if not kept.covers(folder)]
     for folder in (Path(), *folders):
         if is_metric(project / folder):
-            raise AlreadyMetricError(
-                f"{project / folder} already holds a metric scale; give COLMAP's own project, or leave the folder "
-                "as it is with --keep"
-            )
+            raise AlreadyMetricError(Fact("already-metric", folder=str(project / folder)))
     return read_layout(project, folders, one_for_all=False)
 
 
@@ -60,14 +57,11 @@ def require_refinable(
     """Raise :class:`InertialError` where rigs are to be refined; ``auto`` leaves them as they are."""
     rigs = [str(folder) for folder in models.values() if has_rigs(read(folder))] if options.refine == "inertial" else []
     if rigs:
-        raise InertialError(
-            f"--refine inertial: several cameras took the images of {rigs[0]}, each with its own place beside the IMU, "
-            "and models with rigs cannot be refined; leave it out"
-        )
+        raise InertialError(Fact("rigs-not-refined", model=rigs[0]))
 
 
 def require_near(models: Mapping[int, Path], read: Callable[[Path], pycolmap.Reconstruction]) -> None:
-    """Raise :class:`InertialError` where a dense cloud, of single precision, would be of a model far from the origin."""
+    """Raise :class:`InertialError` for a dense cloud, of single precision, far from the origin."""
     for folder in models.values():
         if OwnPlace.of(read(folder)).pivot is not None:
             raise InertialError(Fact("dense-far-away", folder=str(folder)))
