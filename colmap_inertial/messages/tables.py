@@ -23,6 +23,32 @@ def table_unclear(reason: str, hint: str) -> str:
     return reason
 
 
+_POINTS = {
+    "columns": "which columns hold the {}",
+    "choice": "which of several columns to take for the {}",
+    "unit": "the unit of the {}",
+    "counts": "how many counts of the {} make one unit",
+    "time": "when the {} was read",
+    "time_unit": "the unit of the times of the {}",
+    "rows": "which rows of the {} to take",
+    "axes": "the sign of the {}",
+}
+_SENSORS = {"gyro": "gyroscope", "accel": "accelerometer"}
+
+
+@message(
+    advice=lambda hint, **_: f"describe it in a capture.toml, where ? stands for what it does not say:\n{hint}",
+    example={"source": "", "open": (("gyro", "unit"), ("accel", "unit")), "header": "t,gx", "hint": "[imu.gyro]\n..."},
+)
+def table_open(source: str, open: Sequence[tuple[str, str]], header: str, hint: str) -> str:
+    points: dict[str, list[str]] = {}
+    for sensor, point in open:
+        points.setdefault(point, []).append(_SENSORS[sensor])
+    said = [_POINTS[point].format(" and ".join(sensors)) for point, sensors in points.items()]
+    begin = f"it does not say {', '.join(said)}" if said else f"it is to be confirmed that this is from {source}"
+    return begin + (f"; the header is: {header}" if header else "")
+
+
 def _arrival_advice(jitter_ms: float, hint: str, **_: object) -> str:
     return (
         f"have the driver stamp its messages, or take the times of their arrival (uneven by {jitter_ms:.2g} ms; delays "
