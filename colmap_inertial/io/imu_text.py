@@ -193,9 +193,9 @@ def _read_csv(path: Path, units: DeclaredUnits, noise: ImuNoise | None) -> ImuRe
             raise fault
         return _read_columns(path, rows, units, noise, "has rows of several sensors")
     if table.header is None:
-        return _read_columns(
-            path, find_columns(path, table), units, noise, "has no header that names its columns", table
-        )
+        found = find_columns(path, table)
+        reason = "" if found.source else "has no header that names its columns"
+        return _read_columns(path, found, units, noise, reason, table)
     place, reason = _places(table, units)
     if reason is not None:
         return _read_columns(path, find_columns(path, table), units, noise, reason, table)
