@@ -84,7 +84,11 @@ def read_name(name: str) -> Cell:
     if unit is None and len(tokens) > 2 and tokens[-1] in ("x", "y", "z"):  # gyro_rad_s.x
         before, unit = _unit_at_the_end(tokens[:-1])
         tokens = [*before, tokens[-1]]
-    if unit is None and len(tokens) == 1 and tokens[0] in words.TIME and len(tokens[0]) > 4:
+    if (
+        unit is None
+        and len(tokens) == 1
+        and ((tokens[0] in words.TIME and len(tokens[0]) > 4) or tokens[0] in ("ms", "us"))
+    ):
         unit = unit_and_scale(tokens[0])  # millis
     place = _axis_place(tokens)
     axis = None if place is None else _LETTERS[tokens[place]]
@@ -125,7 +129,7 @@ def _unit_at_the_end(tokens: list[str]) -> tuple[list[str], tuple[str, float] | 
 
 def _kind(rest: Sequence[str], axis: int | None, unit: str | None) -> str:
     have, joined = set(rest), "".join(rest)
-    if have & words.TIME or joined in words.TIME:
+    if have & words.TIME or joined in words.TIME or (joined in ("ms", "us") and axis is None):
         return "other" if axis is not None or have & (words.NO_TIME | words.OTHER - {"dt"}) else "time"
     if axis is None or have & (words.OTHER | words.WORLD):
         return "other"
@@ -166,6 +170,8 @@ def _match_words(table: Table, cells: Sequence[Cell]) -> Columns:
         if pair in words.ROS_PAIRS:
             about = "gravity is in it where this comes from sensor_msgs/Imu of ROS, and not where it is a phone's"
             accel = replace(linear, unit=None, about=about)
+        else:
+            accel = replace(accel, about="what it has is without gravity")
     sure = gyro.is_complete and accel.is_complete
     why = ["the header names the columns and their units"] if sure else []
     return Columns(gyro=gyro, accel=accel, is_sure=sure, why=tuple(why))
@@ -211,7 +217,7 @@ def _find_time(table: Table, cells: Sequence[Cell], quantity: Quantity) -> TimeC
     """The time of a sensor: its own before one of all, a clock near the sensor before a later one."""
     assert table.header is not None
     own = words.GYRO if quantity == "gyro" else words.ACCEL
-    foreign = (words.GYRO | words.ACCEL | words.OTHER | {"motion"}) - own
+    foreign = (words.GYRO | words.ACCEL | words.OTHER) - own
     scored: list[tuple[float, int, TimeColumns]] = []
     for index, cell in enumerate(cells):
         have = set(cell.words)
@@ -222,7 +228,11 @@ def _find_time(table: Table, cells: Sequence[Cell], quantity: Quantity) -> TimeC
             continue
         unit = "date" if kind == "date" else cell.unit if cell.unit in TIME_UNITS_NS else None
         score = 2.0 * bool(have & own) + (unit is not None) + 0.5 * bool(have & words.NEAR_CLOCK)
-        score -= 0.5 * bool(have & words.LATE_CLOCK) + 0.25 * (kind == "date")
+        score -= (
+            0.5 * bool(have & words.LATE_CLOCK | have & {"motion"})
+            + 0.25 * (kind == "date")
+            + 2.0 * _mostly_repeats(table, index)
+        )
         scored.append(
             (score, -index, TimeColumns(columns=(_name(table, index),), units=() if unit is None else (unit,)))
         )
@@ -234,6 +244,12 @@ def _find_time(table: Table, cells: Sequence[Cell], quantity: Quantity) -> TimeC
         return best
     rate = find_rate(table.preamble)
     return None if rate is None else TimeColumns(rate_hz=rate)
+
+
+def _mostly_repeats(table: Table, index: int) -> bool:
+    """Whether most of the first cells are those above them: a clock too coarse for an IMU."""
+    cells = [row.split(table.delimiter, index + 1)[index] for row in table.lines[:ROWS]]
+    return 2 * sum(a == b for a, b in itertools.pairwise(cells)) > len(cells)
 
 
 def _seconds_and_parts(table: Table) -> TimeColumns | None:
@@ -369,8 +385,16 @@ def _layout_time(table: Table, names: Sequence[str], part: Part) -> TimeColumns 
             columns = tuple(_name(table, p) for p in places if p is not None)
             if len(places) == 1 and column_kind(table, places[0]) == "date":  # type: ignore[arg-type]
                 return TimeColumns(columns=columns, units=("date",))
+            if times.units == ("ns",) and _has_fractions(table, places[0]):  # type: ignore[arg-type]
+                return TimeColumns(columns=columns)
             return TimeColumns(columns=columns, units=times.units, counts_per_second=times.counts_per_second)
     return None
+
+
+def _has_fractions(table: Table, index: int) -> bool:
+    """Whether the first stamps are no whole numbers."""
+    values = table.numbers([index])[:ROWS, 0]
+    return bool((np.abs(values) < 2**53).all() and (values != np.rint(values)).any())
 
 
 def _find_counts(preamble: Sequence[str], key: str) -> float | None:

@@ -14,6 +14,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.io.columns import read_name
 from colmap_inertial.io.plausible import PLAUSIBLE
 from colmap_inertial.io.sensor_columns import OPEN, ROWS, Columns, SensorColumns
 from colmap_inertial.io.stamps import TimeColumns
@@ -60,13 +61,18 @@ def _section(name: str, quantity: Quantity, part: SensorColumns, table: Table | 
         which = f"  # {part.about}" if part.where[1] == OPEN else ""
         lines.append(f"where = [{_column(part.where[0])}, {_text(part.where[1])}]{which}")
     if part.columns is None:
-        lines.append(f'columns = ["{OPEN}", "{OPEN}", "{OPEN}"]  # names, or numbers from 1, of x, y, z')
+        about = f"; {part.about}" if part.about else ""
+        lines.append(f'columns = ["{OPEN}", "{OPEN}", "{OPEN}"]  # names, or numbers from 1, of x, y, z{about}')
     else:
         names = ", ".join(map(_column, part.names or [_name(table, column) for column in part.columns]))
         other = f"  # or {', '.join(part.others)}" if part.others else ""
         lines.append(f"columns = [{names}]{other}")
     units = " or ".join(SENSOR_UNITS[quantity])
-    about = f": {part.about}" if part.about and part.where is None else ": the file does not say"
+    about = (
+        f": {part.about}"
+        if part.about and part.where is None and part.columns is not None
+        else ": the file does not say"
+    )
     lines.append(f"unit = {_text(part.unit)}" if part.unit else f'unit = "{OPEN}"  # {units}{about}')
     if part.counts_per_unit is None:
         lines.append(f'counts_per_unit = "{OPEN}"  # {part.about or "the file does not say"}')
@@ -101,7 +107,7 @@ def _time_lines(time: TimeColumns | None, table: Table | None) -> list[str]:
 
 def _likely_units(time: TimeColumns, table: Table | None) -> str:
     """Units in which the steps are those of an IMU."""
-    every = ", ".join(TIME_UNITS_NS)
+    every = f"{', '.join(TIME_UNITS_NS)}, or time_counts_per_s = ... in its place"
     if table is None:
         return f"{every}: the file does not say"
     try:
@@ -147,7 +153,12 @@ def _add_time(table: Table, part: SensorColumns) -> SensorColumns:
     if part.time is not None:
         return part
     place = _time(_values(table))
-    return part if place is None else replace(part, time=TimeColumns(columns=(_name(table, place),)))
+    if place is None:
+        return part
+    said = read_name(table.header[place]).unit if table.header is not None else None
+    return replace(
+        part, time=TimeColumns(columns=(_name(table, place),), units=(said,) if said in TIME_UNITS_NS else ())
+    )
 
 
 def _propose_columns(table: Table) -> tuple[SensorColumns, SensorColumns]:

@@ -31,7 +31,7 @@ from colmap_inertial.io.sensor_columns import Columns, SensorColumns
 from colmap_inertial.io.sensor_yaml import read_imu_noise
 from colmap_inertial.io.stamps import DateOrder, TimeColumns, read_stamps
 from colmap_inertial.io.tables import Table, parse_bytes, read_table, recognise
-from colmap_inertial.io.units import SENSOR_NAMES, SENSOR_UNITS, Axes, DeclaredUnits, Quantity, seconds
+from colmap_inertial.io.units import SENSOR_NAMES, SENSOR_UNITS, TIME_UNITS_NS, Axes, DeclaredUnits, Quantity, seconds
 
 #: What names of tables end with.
 TABLE_SUFFIXES = (".csv", ".txt", ".tsv", ".json", ".jsonl", ".ndjson", ".log", ".dat", ".asc")
@@ -115,8 +115,11 @@ def is_inertial_scale(path: Path) -> bool:
 
 
 def _names_columns(path: Path) -> bool:
-    """Whether the first lines name axes: whoever writes that states another layout than ours."""
+    """Whether the first lines name axes, or another unit of time than ours: they state another layout."""
     head = read_bytes(path, 1000).decode("utf-8-sig", errors="replace").splitlines()[:5]
+    cells = [read_name(cell.strip(' "')) for line in head for cell in re.split(r"[,;\t]", line.lstrip("# "))]
+    if any(cell.kind == "time" and cell.unit in TIME_UNITS_NS and cell.unit != "ns" for cell in cells):
+        return True
     return any(re.search(r"\b([agwr]_?|acc\w*|gyr\w*)x\b", line, re.IGNORECASE) for line in head)
 
 

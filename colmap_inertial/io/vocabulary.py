@@ -11,8 +11,9 @@ from dataclasses import dataclass, field
 
 #: Words that name a sensor by themselves, small letters, and those that do in pairs.
 GYRO = {"pqr", "gyro", "gyr", "gyros", "gyroscope", "omega", "angvel", "angularvelocity", "angularrate", "rotationrate"}
-GYRO |= {"角速度", "陀螺仪"}
+GYRO |= {"drehrate", "winkelgeschwindigkeit", "gyroskop", "角速度", "陀螺仪"}
 ACCEL = {"acc", "acce", "accel", "accels", "accelerometer", "acceleration", "accs", "specificforce", "加速度"}
+ACCEL |= {"beschleunigung"}
 GYRO_PAIRS = {("angular", "velocity"), ("angular", "rate"), ("ang", "vel"), ("rotation", "rate"), ("rot", "rate")}
 ACCEL_PAIRS = {("specific", "force"), ("g", "force")}
 #: How copies of sensor_msgs/Imu call both, whose linear acceleration holds gravity.
@@ -25,7 +26,7 @@ ROS_PAIRS = {
 SHORT_GYRO, SHORT_ACCEL = {"g", "w"}, {"a", "f"}
 
 #: Words that make an acceleration one without gravity, or gravity alone, or one in a frame that does not turn along.
-NO_GRAVITY = {"linear", "lin", "user", "free", "dynamic", "linacc", "linaccel", "freeacc", "usracc"}
+NO_GRAVITY = {"linear", "lineare", "lin", "user", "free", "dynamic", "linacc", "linaccel", "freeacc", "usracc"}
 GRAVITY = {"gravity", "grav", "gravityvector"}
 WORLD = {"world", "earth", "global", "ned", "enu", "nav"}
 #: Words that make a column something else.
@@ -55,7 +56,7 @@ LESSER = {
 TIME = {
     *("t", "time", "timestamp", "timestamps", "stamp", "ts", "elapsed", "clock", "epoch", "tick", "ticks", "utc"),
     *("sampletimefine", "timesec", "timens", "timeus", "timems", "timecode", "datetime", "millis", "micros", "date"),
-    *("时间", "片上时间"),
+    *("sensortime", "zeit", "tiempo", "tijd", "时间", "時間", "片上时间"),
 }
 NO_TIME = {"zone", "timezone", "uncertainty", "exposure", "bias", "leap", "week", "relative", "interval", "delta"}
 #: Words of clocks that are read where the sensor was, and of those that are read later.

@@ -23,6 +23,14 @@ def table_unclear(reason: str, hint: str) -> str:
     return reason
 
 
+@message(
+    advice="write an array of objects, an object on each line, or lists of one length under their names: a time, and "
+    "three numbers of each sensor"
+)
+def json_without_rows() -> str:
+    return "is JSON without rows of samples that are known here"
+
+
 _POINTS = {
     "columns": "which columns hold the {}",
     "choice": "which of several columns to take for the {}",

@@ -459,3 +459,49 @@ def test_tables_named_for_their_sensor_are_described_together(tmp_path):
     text = text.replace('time_unit = "?"', 'time_unit = "ms"')
     (folder / "capture.toml").write_text(text[text.index("[imu.gyro]") :])
     check(read_imu(folder / "capture.toml"))
+
+
+def test_a_name_s_unit_is_asked_for_where_the_stamps_are_written_otherwise(tmp_path):
+    names = "timestamp," + ",".join(f"{w}_{a}" for w in ("omega", "alpha") for a in "xyz")
+    stamps = [f"{t + 1.4e9:.3f}" for t in T_S]
+    path = write(tmp_path / "imu.csv", names, [stamps, *floats(GYRO), *floats(ACCEL)])
+    with pytest.raises(FormatError) as caught:
+        read_imu(path)
+    assert caught.value.fact.values["open"] == (("gyro", "time_unit"), ("accel", "time_unit"))
+    toml = paste(caught, path)
+    toml.write_text(toml.read_text().replace('time_unit = "?"', 'time_unit = "s"'))
+    check(read_imu(toml))
+
+
+def test_a_header_with_another_unit_of_time_is_not_our_own_layout(tmp_path):
+    for name, values in (("gyroscope", GYRO), ("accelerometer", ACCEL)):
+        write(tmp_path / f"{name}.txt", "timestamp_ms,x,y,z", [floats(1e3 * T_S[:, None])[0], *floats(values)])
+    with pytest.raises(FormatError) as caught:
+        read_imu(tmp_path)
+    assert caught.value.fact.values["open"] == (("gyro", "unit"), ("accel", "unit"))
+
+
+def test_a_clock_that_moves_with_the_rows_goes_before_a_coarse_date(tmp_path):
+    header = "datetime,ms," + ",".join(f"g{a} (rad/s)" for a in "xyz") + "," + ",".join(f"a{a} (g)" for a in "xyz")
+    dates = [f"2024-05-04 10:00:{int(t):02d}" for t in T_S]
+    columns = [dates, ints(1e3 * T_S + 70), *floats(GYRO), *floats(ACCEL / G)]
+    check(read_imu(write(tmp_path / "a.csv", header, columns)))
+
+
+def test_acceleration_without_gravity_alone_is_named(tmp_path):
+    header = "motionTimestamp_sinceReboot(s)," + ",".join(f"motionRotationRate{a}(rad/s)" for a in "XYZ")
+    header += "," + ",".join(f"motionUserAcceleration{a}(G)" for a in "XYZ")
+    columns = [floats(T_S[:, None] + 50)[0], *floats(GYRO), *floats(ACCEL / G - [0, 0, 1])]
+    with pytest.raises(FormatError) as caught:
+        read_imu(write(tmp_path / "a.csv", header, columns, form="{:.9g}"))
+    text = str(caught.value)
+    assert caught.value.fact.values["open"] == (("accel", "columns"), ("accel", "unit"))
+    assert "without gravity" in text and 'time = "motionTimestamp_sinceReboot(s)"\ntime_unit = "s"' in text
+
+
+def test_german_names_are_read(tmp_path):
+    header = "Zeit (s);" + ";".join(f"Drehrate {a} (°/s)" for a in "XYZ")
+    header += ";" + ";".join(f"Lineare Beschleunigung {a} (m/s²)" for a in "XYZ")
+    header += ";" + ";".join(f"Beschleunigung {a} (m/s²)" for a in "XYZ")
+    columns = [floats(T_S[:, None])[0], *floats(np.degrees(GYRO)), *zeros(3), *floats(ACCEL)]
+    check(read_imu(write(tmp_path / "a.csv", header, columns, ";")))
