@@ -228,11 +228,8 @@ def _find_time(table: Table, cells: Sequence[Cell], quantity: Quantity) -> TimeC
             continue
         unit = "date" if kind == "date" else cell.unit if cell.unit in TIME_UNITS_NS else None
         score = 2.0 * bool(have & own) + (unit is not None) + 0.5 * bool(have & words.NEAR_CLOCK)
-        score -= (
-            0.5 * bool(have & words.LATE_CLOCK | have & {"motion"})
-            + 0.25 * (kind == "date")
-            + 2.0 * _mostly_repeats(table, index)
-        )
+        score -= 0.5 * bool(have & words.LATE_CLOCK) + 0.25 * (kind == "date")
+        score -= 2.0 * _mostly_repeats(table, index)
         scored.append(
             (score, -index, TimeColumns(columns=(_name(table, index),), units=() if unit is None else (unit,)))
         )

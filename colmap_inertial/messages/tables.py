@@ -91,6 +91,31 @@ def bag_stamps_jump_back(path: str, topic: str, count: int, total: int, jitter_m
 
 
 @message(
+    advice=_arrival_advice,
+    example={"path": "imu.bag", "topic": "/imu", "count": 1, "jump_s": 7.0, "jitter_ms": 0.6, "hint": "[imu]\n..."},
+)
+def bag_stamps_jump_ahead(path: str, topic: str, count: int, jump_s: float, jitter_ms: float, hint: str) -> str:
+    return (
+        f"{path}: the header.stamp of {count} messages of {topic} jumps ahead, by up to {jump_s:.3g} s more than they "
+        "arrived later: the driver's clock was set"
+    )
+
+
+@message(
+    advice=_arrival_advice,
+    example={
+        "path": "imu.bag",
+        "topics": ("/gyro/sample", "/accel/sample"),
+        "apart_s": 1.7e9,
+        "jitter_ms": 0.6,
+        "hint": "[imu]\n...",
+    },
+)
+def bag_of_two_clocks(path: str, topics: Sequence[str], apart_s: float, jitter_ms: float, hint: str) -> str:
+    return f"{path}: the header.stamp of {' and '.join(topics)} are of two clocks, {apart_s:.3g} s apart"
+
+
+@message(
     advice="record one of them, or keep one by its node (rosbag filter with m._connection_header['callerid'])",
     example={"path": "imu.bag", "topic": "/imu", "nodes": ("/driver", "/filter")},
 )
