@@ -62,23 +62,8 @@ NO_TIME = {"zone", "timezone", "uncertainty", "exposure", "bias", "leap", "week"
 #: Words of clocks that are read where the sensor was, and of those that are read later.
 NEAR_CLOCK = {"sensor", "sample", "hardware", "device", "chip", "boot", "reboot", "header", "stamp", "fine", "start"}
 NEAR_CLOCK |= {"片上时间"}
-LATE_CLOCK = {
-    *(
-        "motion",
-        "app",
-        "phone",
-        "host",
-        "system",
-        "logging",
-        "arrival",
-        "received",
-        "rx",
-        "gps",
-        "utc",
-        "backend",
-        "txt",
-    ),
-}
+LATE_CLOCK = {"app", "phone", "host", "system", "logging", "arrival", "received", "rx", "gps", "utc", "backend", "txt"}
+LATE_CLOCK |= {"motion"}
 COUNTERS = {"counter", "count", "sample", "index", "frame", "row", "packet", "iteration", "seq", "number", "id", "n"}
 #: Parts of a time in two columns, by unit.
 PARTS = {
