@@ -126,7 +126,7 @@ def _names_columns(path: Path) -> bool:
 def read_inertial_scale_imu(path: Path, units: DeclaredUnits) -> ImuRecording:
     """Read ``gyroscope.txt`` and ``accelerometer.txt``: rows ``t_ns x y z``, rad/s and m/s2."""
     if not is_inertial_scale(path):
-        raise FormatError(path, "holds no gyroscope.txt and accelerometer.txt")
+        raise FormatError(path, Fact("inertial-scale-files-missing"))
     gyro, accel = (
         SensorTable(file=path / f"{name}.txt", time=1, time_unit="ns", columns=(2, 3, 4), unit=unit)
         for name, unit in (("gyroscope", units.gyro or "rad/s"), ("accelerometer", units.accel or "m/s2"))
@@ -151,10 +151,10 @@ def read_euroc(path: Path, units: DeclaredUnits) -> ImuRecording:
     """
     tables = [path] if path.is_file() else _imu_tables(path)
     if not tables:
-        raise FormatError(path, "holds no mav0/imu0/data.csv, imu0/data.csv or data.csv")
+        raise FormatError(path, Fact("euroc-files-missing"))
     if len(tables) > 1:
-        folders = ", ".join(str(table.parent.relative_to(path)) for table in tables)
-        raise FormatError(path, f"holds several IMUs ({folders}); give the folder of one")
+        folders = tuple(str(table.parent.relative_to(path)) for table in tables)
+        raise FormatError(path, Fact("several-imus", folders=folders))
     sheet = tables[0].with_name("sensor.yaml")
     return _read_csv(tables[0], units, read_imu_noise(sheet) if sheet.is_file() else None)
 
@@ -194,16 +194,14 @@ def _read_csv(path: Path, units: DeclaredUnits, noise: ImuNoise | None) -> ImuRe
         rows = find_rows_of_sensors(path)
         if rows is None:
             raise fault
-        return _read_columns(path, rows, units, noise, "has rows of several sensors")
+        return _read_columns(path, rows, units, noise, Fact("rows-of-several-sensors"))
     if table.header is None:
         found = find_columns(path, table)
-        reason = "" if found.source else "has no header that names its columns"
-        return _read_columns(path, found, units, noise, reason, table)
-    place, reason = _places(table, units)
-    if reason is not None:
-        return _read_columns(path, find_columns(path, table), units, noise, reason, table)
-    if finds_instances(table, place.values()):
-        return _read_columns(path, find_columns(path, table), units, noise, "", table)
+        why = None if found.source else Fact("no-header-of-columns")
+        return _read_columns(path, found, units, noise, why, table)
+    place, why = _places(table, units)
+    if why is not None or len(place) < 7 or finds_instances(table, place.values()):
+        return _read_columns(path, find_columns(path, table), units, noise, why, table)
 
     def unit(kind: str, declared: str | None) -> str:
         found = recognise(table.header[place[kind, 0]])  # type: ignore[index]
@@ -226,37 +224,38 @@ def find_columns(path: Path, table: Table) -> Columns:
     return leave_instance_open(table, columns)
 
 
-def _places(table: Table, units: DeclaredUnits) -> tuple[dict[tuple[str, int], int], str | None]:
-    """The columns that a plain header names, and what is wrong with it in words, empty where it names other columns;
-    ``None`` where nothing is.
-    """
+def _places(table: Table, units: DeclaredUnits) -> tuple[dict[tuple[str, int], int], Fact | None]:
+    """The columns that a plain header names, and what is wrong with what it says of them."""
     assert table.header is not None
     place: dict[tuple[str, int], int] = {}
     try:
         columns = [recognise(cell) for cell in table.header]
     except ValueError as error:
-        return place, str(error)
+        return place, Fact("invalid-values", detail=str(error))
     for index, column in enumerate(columns):
         if column is None:
             continue
         key = (column.kind, column.axis)
         if key in place:
-            twice = f'"{table.header[place[key]]}" and "{table.header[index]}"'
-            return place, f"two columns mean the same: {twice}"
+            return place, Fact("columns-alike", first=table.header[place[key]], second=table.header[index])
         place[key] = index
     wanted = [("time", 0), *((sensor, axis) for sensor in ("gyro", "accel") for axis in range(3))]
     if any(key not in place for key in wanted):
-        return place, ""
+        return place, None
     for kind, axes, declared in (("gyro", 3, units.gyro), ("accel", 3, units.accel), ("time", 1, None)):
         stated = {columns[place[kind, axis]].unit for axis in range(axes)}  # type: ignore[union-attr]
         if declared is None and (None in stated or len(stated) > 1):
-            names = ", ".join(f'"{table.header[place[kind, axis]]}"' for axis in range(axes))
-            return place, f"no single unit is given for {names}"
+            return place, Fact("no-single-unit", columns=[table.header[place[kind, axis]] for axis in range(axes)])
     return place, None
 
 
 def _read_columns(
-    path: Path, found: Columns, units: DeclaredUnits, noise: ImuNoise | None, reason: str, table: Table | None = None
+    path: Path,
+    found: Columns,
+    units: DeclaredUnits,
+    noise: ImuNoise | None,
+    why: Fact | None,
+    table: Table | None = None,
 ) -> ImuRecording:
     """Read what columns were taken for, where nothing is open.
 
@@ -272,13 +271,13 @@ def _read_columns(
     found = replace(found, gyro=gyro, accel=accel)
     if not (gyro.is_complete and accel.is_complete and (found.is_sure or not found.source)):
         found = add_other_table(path, found)
-        hint, header = describe(path, found, table), "" if table is None else table.header_text[:300]
-        if reason:
-            shown = f"; the header is: {header}" if header else ""
-            fact = Fact("table-unclear", reason=f"{reason}{shown}", hint=hint)
-        else:
-            fact = Fact("table-open", source=found.source, open=found.open_points, header=header, hint=hint)
-        raise FormatError(path, fact, code=FormatError.default_code)
+        header = None if table is None or table.header is None else table.header_text[:300]
+        hint = describe(path, found, table)
+        if why is not None:
+            raise FormatError(path, Fact("table-unclear", why=why, header=header, hint=hint))
+        raise FormatError(
+            path, Fact("table-open", source=found.source, open=found.open_points, header=header, hint=hint)
+        )
     recording = read_tables(make_sensor_table(path, gyro), make_sensor_table(path, accel))
     gyro_rad_s, accel_m_s2 = (
         Axes.parse(part.axes).apply(values) if part.axes else values
@@ -360,15 +359,15 @@ def read_separate_tables(path: Path, units: DeclaredUnits) -> ImuRecording:
     """
     found = find_separate_tables(path)
     if found is None:
-        raise FormatError(path, "holds no single table of a gyroscope and one of an accelerometer")
+        raise FormatError(path, Fact("no-separate-tables"))
     gyro, accel = (
         part if unit is None else replace(part, unit=unit)
         for part, unit in ((found.gyro, units.gyro), (found.accel, units.accel))
     )
     found = replace(found, gyro=gyro, accel=accel)
     if found.open_points:
-        fact = Fact("table-open", source="", open=found.open_points, header="", hint=describe(path, found))
-        raise FormatError(path, fact, code=FormatError.default_code)
+        hint = describe(path, found)
+        raise FormatError(path, Fact("table-open", source="", open=found.open_points, header=None, hint=hint))
     return read_tables(make_sensor_table(path / gyro.file, gyro), make_sensor_table(path / accel.file, accel))
 
 

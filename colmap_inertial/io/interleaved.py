@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.io import vocabulary as words
 from colmap_inertial.io.columns import Cell, find_sensor, read_name
 from colmap_inertial.io.dialect import decode, split_cells
@@ -48,7 +49,7 @@ def read_rows(path: Path, column: str | int, value: str) -> Table:
         return _rows_of_text(path, decode(read_bytes(path))[0], column, value)
     kept = np.array([cell == value for cell in table.text(table.column(column))])
     if not kept.any():
-        raise FormatError(path, f'no row has "{value}" in its column {column}')
+        raise FormatError(path, Fact("no-row-of-sensor", value=value, column=str(column)))
     lines = tuple(line for line, keep in zip(table.lines, kept, strict=True) if keep)
     return replace(table, lines=lines, line_numbers=table.line_numbers[kept])
 
@@ -59,7 +60,7 @@ def _rows_of_text(path: Path, text: str, column: int, value: str) -> Table:
     delimiter = _delimiter(lines)
     kept = [_cell(line, delimiter, column) == value for line in lines]
     if not any(kept):
-        raise FormatError(path, f'no row has "{value}" in its column {column}')
+        raise FormatError(path, Fact("no-row-of-sensor", value=value, column=str(column)))
     header = _header_of(lines, delimiter, value)
     body = [line.rstrip() if keep else "" for line, keep in zip(lines, kept, strict=True)]
     width = Counter(line.count(delimiter) for line in body if line).most_common(1)[0][0]

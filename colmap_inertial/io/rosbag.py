@@ -59,7 +59,7 @@ def read_rosbag(path: Path, units: DeclaredUnits) -> ImuRecording:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise MissingExtraError("ros", f"{path} is a ROS recording") from None
+        raise MissingExtraError("ros", Fact("ros-recording", path=str(path))) from None
     require_modest_recording(path)
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
@@ -67,11 +67,10 @@ def read_rosbag(path: Path, units: DeclaredUnits) -> ImuRecording:
     # the readers below raise whatever a damaged file leads them to: sqlite, struct, lz4, yaml, index errors
     except Exception as error:
         reason = str(error).strip().splitlines()
-        raise FormatError(
-            path, f"cannot be read as a ROS recording: {type(error).__name__} {reason[0][:200] if reason else ''}"
-        ) from None
+        detail = reason[0][:200] if reason else ""
+        raise FormatError(path, Fact("bag-not-readable", kind=type(error).__name__, detail=detail)) from None
     if not topics:
-        raise FormatError(path, "holds no sensor_msgs/Imu messages")
+        raise FormatError(path, Fact("bag-without-imu"))
     if units.topic is not None:
         if units.topic not in topics:
             raise FormatError(path, Fact("bag-without-topic", topic=units.topic, topics=tuple(topics)))
@@ -82,12 +81,8 @@ def read_rosbag(path: Path, units: DeclaredUnits) -> ImuRecording:
     for quantity, unit in sensors:
         with_it = {name: topic for name, topic in topics.items() if quantity in topic.parts}
         if len(with_it) > 1:
-            raise FormatError(
-                path,
-                f"holds several topics with a {SENSOR_NAMES[quantity]} ({', '.join(with_it)}); keep one: "
-                f'topic = "{next(iter(with_it))}" under [imu] in a capture.toml, or '
-                f"rosbags-convert --src {path.name} --dst one --include-topic {next(iter(with_it))}",
-            )
+            several = {"sensor": SENSOR_NAMES[quantity], "topics": tuple(with_it), "name": path.name}
+            raise FormatError(path, Fact("bag-of-several-topics", **several))
         for name, topic in with_it.items():
             taken[name] = topic
             if len(topic.publishers) > 1:
@@ -100,7 +95,7 @@ def read_rosbag(path: Path, units: DeclaredUnits) -> ImuRecording:
     if units.stamps != "arrival":
         _require_one_clock(path, taken)
     if "gyro" not in samples_of:
-        raise FormatError(path, f"none of its IMU topics ({', '.join(topics)}) has a gyroscope that moves")
+        raise FormatError(path, Fact("bag-without-moving-gyroscope", topics=tuple(topics)))
     return build_recording(samples_of["gyro"], samples_of.get("accel"))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from colmap_inertial.messages import message
+from colmap_inertial.messages import Said, message, state
 
 
 @message(
@@ -15,12 +15,27 @@ def date_order_unknown(path: str, example: str) -> str:
     return f"{path}: nothing tells the day from the month in dates such as {example}"
 
 
+state("rows-of-several-sensors", "has rows of several sensors")
+state("no-header-of-columns", "has no header that names its columns")
+
+
+@message(example={"first": "gyro x", "second": "wx"})
+def columns_alike(first: str, second: str) -> str:
+    return f'two columns mean the same: "{first}" and "{second}"'
+
+
+@message(example={"columns": ("gx", "gy", "gz")})
+def no_single_unit(columns: Sequence[str]) -> str:
+    listed = ", ".join(f'"{column}"' for column in columns)
+    return f"no single unit is given for {listed}"
+
+
 @message(
-    advice=lambda reason, hint: f"describe it in a capture.toml, where ? stands for what it does not say:\n{hint}",
-    example={"reason": "has no header", "hint": "[imu.gyro]\n..."},
+    advice=lambda why, header, hint: f"describe it in a capture.toml, where ? stands for what it does not say:\n{hint}",
+    example={"why": {"code": "no-header-of-columns", "values": {}}, "header": None, "hint": "[imu.gyro]\n..."},
 )
-def table_unclear(reason: str, hint: str) -> str:
-    return reason
+def table_unclear(why: Said, header: str | None, hint: str) -> str:
+    return str(why) if header is None else f"{why}; the header is: {header}"
 
 
 @message(
@@ -48,7 +63,7 @@ _SENSORS = {"gyro": "gyroscope", "accel": "accelerometer"}
     advice=lambda hint, **_: f"describe it in a capture.toml, where ? stands for what it does not say:\n{hint}",
     example={"source": "", "open": (("gyro", "unit"), ("accel", "unit")), "header": "t,gx", "hint": "[imu.gyro]\n..."},
 )
-def table_open(source: str, open: Sequence[tuple[str, str]], header: str, hint: str) -> str:
+def table_open(source: str, open: Sequence[tuple[str, str]], header: str | None, hint: str) -> str:
     points: dict[str, list[str]] = {}
     for sensor, point in open:
         points.setdefault(point, []).append(_SENSORS[sensor])

@@ -14,6 +14,11 @@ def noted_with_advice(found: Said) -> str:
     return found.with_advice
 
 
+@message(example={"path": "log.csv", "line": 7, "why": {"code": "zeros", "values": {}}})
+def wrong_in_file(path: str, line: int | None, why: Said) -> str:
+    return f"{path}{'' if line is None else f', line {line}'}: {why.with_advice}"
+
+
 @message(example={"file": "sparse/0/images.txt", "found": {"code": "zeros", "values": {}}})
 def read_all_the_same(file: str, found: Said) -> str:
     return f"{file}: {found.with_advice}"

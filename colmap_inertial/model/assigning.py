@@ -31,22 +31,22 @@ def assign_scales(
     """
     if isinstance(scales, Similarity):
         return {index: ModelScale(similarity=scales) for index in layout.submodels}
-    numbers = ", ".join(str(i) for i in layout.submodels)
     if None in scales:
         if len(layout.submodels) > 1:
-            raise InertialError(
-                f"{project} has the sub-models {numbers}, each with a scale of its own: "
-                "give one for each, --scale NUMBER=FILE"
-            )
+            raise InertialError(Fact("scale-for-each-submodel", project=str(project), numbers=tuple(layout.submodels)))
         scales = {next(iter(layout.submodels)): scales[None]}
     if all(scale.similarity is None for scale in scales.values()):
         raise NotObservableError(
-            "scale", "; ".join(str(reason) for scale in scales.values() for reason in scale.reasons)
+            "scale",
+            Fact("scale-refused", reasons=tuple(reason for scale in scales.values() for reason in scale.reasons)),
         )
     missing = [index for index in layout.submodels if index not in scales]
     if missing or len(scales) > len(layout.submodels):
-        given = ", ".join(str(i) for i in scales)
-        raise InertialError(f"{project} has the sub-models {numbers}, but there are scales of {given}")
+        raise InertialError(
+            Fact(
+                "scales-of-other-submodels", project=str(project), numbers=tuple(layout.submodels), given=tuple(scales)
+            )
+        )
     return {index: scales[index] for index in layout.submodels}
 
 

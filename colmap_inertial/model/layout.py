@@ -10,6 +10,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import Similarity
 from colmap_inertial.io.files import read_bytes
 from colmap_inertial.io.ply import transform_ply
@@ -142,11 +143,11 @@ def read_layout(root: Path, folders: Sequence[Path], *, one_for_all: bool) -> La
     for folder in dense:
         inside = {owners[m] for m in models if m.is_relative_to(folder / "sparse")}
         if len(inside) > 1 and folder != Path():
-            raise FormatError(root / folder, "this dense workspace holds more than one model: it cannot be told whose")
+            raise FormatError(root / folder, Fact("workspace-of-several-models"))
         if len(inside) == 1:
             workspaces[folder] = inside.pop()
         elif (root / folder / "stereo" / "depth_maps").is_dir():
-            raise FormatError(root / folder, "depth maps beside several sub-models: it cannot be told whose they are")
+            raise FormatError(root / folder, Fact("depth-maps-of-several-models"))
     return Layout(submodels=submodels, owners=owners, workspaces=workspaces, placed=list(placed.values()))
 
 
@@ -179,10 +180,7 @@ def _submodels(root: Path, models: list[Path], dense: list[Path], *, one_for_all
         return dict(sorted((int(m.name), m) for m in nearest))
     if one_for_all:
         return dict(enumerate(sorted(nearest)))
-    names = ", ".join(str(m) for m in nearest[:4])
-    raise FormatError(
-        root, f"it cannot be told which of these is COLMAP's model: {names}; leave others out with --keep"
-    )
+    raise FormatError(root, Fact("several-candidates", folders=tuple(str(m) for m in nearest[:4])))
 
 
 def _nearest_to_root(folders: list[Path]) -> list[Path]:
@@ -225,12 +223,10 @@ def _owner(root: Path, folder: Path, submodels: Mapping[Path, PlacedModel]) -> i
     if len(fits) == 1:
         return submodels[fits[0]].index
     if fits:
-        names = " and ".join(str(f) for f in fits)
-        raise FormatError(root / folder, f"it cannot be told whether this belongs to {names}")
+        raise FormatError(root / folder, Fact("belongs-to-several", folders=tuple(str(f) for f in fits)))
     if elsewhere:
         raise FormatError(
             root / folder,
-            f"its images are those of {elsewhere[0]}, but its cameras stand elsewhere: it was made from another model, "
-            "whose scale is another; leave it out with --keep",
+            Fact("model-elsewhere", other=str(elsewhere[0])),
         )
-    raise FormatError(root / folder, "its images are those of none of the sub-models; leave it out with --keep")
+    raise FormatError(root / folder, Fact("images-of-no-submodel"))

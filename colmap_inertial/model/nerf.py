@@ -16,7 +16,7 @@ from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.facts import DETAILS, Fact, read_facts, with_sentences
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.quantiles import Z95
-from colmap_inertial.core.types import DOWN_IN_WORLD, UNDOES, Similarity
+from colmap_inertial.core.types import DOWN_IN_WORLD, Similarity
 from colmap_inertial.io.files import read_json
 from colmap_inertial.model.camera_files import are_cameras_of
 from colmap_inertial.model.database import PlacedModel
@@ -114,7 +114,7 @@ def transform_transforms(source: Path, target: Path, similarity: Similarity) -> 
     if "scale" in values and "offset" in values:
         scale = values["scale"]
         if isinstance(scale, bool) or not isinstance(scale, (int, float)) or not 0 < scale < np.inf:
-            raise FormatError(source, "has a scale that is no number above 0; leave the file out with --keep")
+            raise FormatError(source, Fact("scale-not-above-zero"))
         offset = _vector(source, values["offset"])
         middle = moving[:3, :3] @ ((0.5 - offset) / scale) + moving[:3, 3]
         values["scale"] = scale / similarity.scale
@@ -156,12 +156,12 @@ def transform_export(source: Path, target: Path, similarity: Similarity) -> tupl
                 changed.append("directions")
     metres = _METRES.fullmatch(str(values.get("unit")))
     before_apply = values.get(_BEFORE)
-    if isinstance(before_apply, dict) and similarity.provenance == f"{UNDOES}{before_apply.get(_BY, '')}":
+    if isinstance(before_apply, dict) and similarity.undoes == before_apply.get(_BY, ""):
         for name in (_BEFORE, _NOTES_DETAILS):
             values.pop(name, None)
         values |= {name: value for name, value in before_apply.items() if name != _BY}
         changed.append("unit")
-    elif values.get("unit") == NOT_METRES and not similarity.provenance.startswith(UNDOES):
+    elif values.get("unit") == NOT_METRES and similarity.undoes is None:
         in_metres = _describe_metres(values, similarity)
         values.pop(_NOTES_DETAILS, None)
         values |= in_metres
@@ -170,7 +170,7 @@ def transform_export(source: Path, target: Path, similarity: Similarity) -> tupl
         try:
             length = float(metres[1] or 1) / similarity.scale
         except ValueError:
-            raise FormatError(source, f"the unit {values['unit']!r} is no length; leave it out with --keep") from None
+            raise FormatError(source, Fact("unit-no-length", unit=values["unit"])) from None
         values["unit"] = "m" if abs(length - 1) < 1e-9 else f"{length:.12g} m"
         changed.append("unit")
     target.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
@@ -235,15 +235,14 @@ def _matrix(path: Path, value: object) -> Array:
     if matrix.shape == (3, 4):
         matrix = np.concatenate([matrix, [[0.0, 0.0, 0.0, 1.0]]])
     if matrix.shape != (4, 4) or not abs(np.linalg.det(matrix)) > 0:  # not where one of them is nan
-        reason = "a transform that is no matrix of 3 or 4 rows of 4 numbers; leave the file out with --keep"
-        raise FormatError(path, reason)
+        raise FormatError(path, Fact("not-a-transform"))
     return matrix
 
 
 def _vector(path: Path, value: object) -> Array:
     vector = _array(value)
     if vector.shape != (3,):
-        raise FormatError(path, "a vector that is not three numbers; leave the file out with --keep")
+        raise FormatError(path, Fact("not-a-vector"))
     return vector
 
 

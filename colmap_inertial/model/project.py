@@ -134,8 +134,7 @@ def apply_to_project(
             if not work.is_kept(folder / TRANSFORM_FILE) and is_metric(project / folder):
                 provenance = read_json(project / folder / TRANSFORM_FILE).get("provenance", "unknown")
                 raise AlreadyMetricError(
-                    f"{project / folder} already holds a metric scale ({provenance}); apply it to COLMAP's own "
-                    "project, or take it back with --undo"
+                    Fact("metric-already-in-project", folder=str(project / folder), provenance=provenance)
                 )
         common = scales if isinstance(scales, Similarity) else None
         layout = read_layout(project, work.open_folders(), one_for_all=common is not None)
@@ -177,7 +176,7 @@ def undo_project(
         beside = [str(pattern) for pattern in record.get("beside", [])]
         require_not_joined(path, {int(m["index"]): [int(i) for i in m.get("joined_of", [])] for m in record["models"]})
     except (KeyError, TypeError, ValueError, AttributeError):
-        raise FormatError(path, "not the record of a project that colmap-inertial apply wrote") from None
+        raise FormatError(path, Fact("not-a-record-of-apply")) from None
     by_model = {
         index: ModelScale(similarity=None if fields is None else undoing(similarity_from_json(path, fields)))
         for index, fields in models
@@ -187,7 +186,7 @@ def undo_project(
         common = undoing(similarity_from_json(path, record)) if record.get("one_for_all") is True else None
         layout = read_layout(project, work.open_folders(), one_for_all=common is not None)
         if layout.submodels.keys() != by_model.keys():
-            raise FormatError(path, "the models of the project are not those that it records")
+            raise FormatError(path, Fact("models-not-as-recorded"))
         plan = _Plan(layout=layout, by_model=by_model, one_for_all=common, databases=databases, link=link, is_undo=True)
         return work.run(plan, progress)
 
@@ -249,10 +248,10 @@ class _Work:
         beside: Sequence[str] = (),
     ) -> None:
         if not project.is_dir():
-            raise FormatError(project, "no such folder")
+            raise FormatError(project, Fact("no-such-folder"))
         inner, outer = out.resolve(), project.resolve()
         if inner.is_relative_to(outer) or outer.is_relative_to(inner):
-            raise OutputError(f"{out} and {project} lie within each other; choose a folder elsewhere")
+            raise OutputError(Fact("folders-within-each-other", folder=str(out), out=str(project)))
         self._project, self._out, self._keep, self._read = project, out, Kept(tuple(keep), project), read
         tree = list_tree(project, follow_links=follow_links)
         self.folders, self._files, self._links = (
@@ -384,8 +383,7 @@ class _Work:
         if owner is None:
             raise FormatError(
                 self._project / path,
-                "it cannot be told in which sub-model's units this is; move it into its dense workspace or leave it "
-                "out with --keep",
+                Fact("owner-unknown"),
             )
         return owner
 
@@ -418,11 +416,9 @@ class _Work:
                 else:
                     again = read_model(target, suffix, unique_names=False)
                     if (again.num_reg_images(), again.num_points3D()) != counts:
-                        raise FormatError(target, "truncated")
+                        raise FormatError(target, Fact("truncated"))
             except (FormatError, ValueError, RuntimeError) as error:
-                raise OutputError(
-                    f"{self._out / folder}: COLMAP did not write the model whole; is the disk full? ({error})"
-                ) from error
+                raise OutputError(Fact("model-not-whole", folder=str(self._out / folder), detail=str(error))) from error
             self._changes.append(
                 Change(path=str(folder), kind=f"model {suffix}", changed=("cameras", "points", "rigs"), model=index)
             )

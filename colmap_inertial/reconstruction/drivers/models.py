@@ -229,7 +229,7 @@ def _run_stages(
                         yield replace(scaled, colmap_index=part.colmap_index), _after(stages[:at], part)
             else:
                 untimed.append(reason)
-                yield replace(scaled, scale=_refused(reason.fact or Fact.stated(str(reason)))), None
+                yield replace(scaled, scale=_refused(reason.fact)), None
 
     going: Iterable[_Begun] = begun()
     gaps: tuple[Gap, ...] = ()
@@ -369,7 +369,7 @@ class _Checked:
         assert self.why_not is not None
         if self.unobservable is not None:
             return NotObservableError(self.unobservable, self.why_not)
-        return TargetNotFoundError(self.why_not, code=TargetNotFoundError.default_code)
+        return TargetNotFoundError(self.why_not)
 
 
 def run_validation(
@@ -398,9 +398,9 @@ def run_validation(
                     metric, images, target, progress=lambda done, total: session.progress("validation", done, total)
                 )
             except TargetNotFoundError as error:
-                write_record(partial[0], _Checked(why_not=error.fact or Fact.stated(str(error))))
+                write_record(partial[0], _Checked(why_not=error.fact))
             except NotObservableError as error:
-                write_record(partial[0], _Checked(unobservable=error.quantity, why_not=error.why))
+                write_record(partial[0], _Checked(unobservable=error.quantity, why_not=error.fact))
             else:
                 write_overlays(validation, images, pictures)
                 write_record(partial[0], _Checked(found=validation))

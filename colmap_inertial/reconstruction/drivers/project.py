@@ -75,10 +75,6 @@ if TYPE_CHECKING:
 _LEAST_SHARE = 0.5
 #: Digits of EXIF's fraction of a second that are as good as milliseconds.
 _FINE_DIGITS = 3
-_HOW_TIMES = (
-    "give --frame-times (a CSV with name,t_s), --name-times (times in the file names), --exif-times, or --video (the "
-    "one that the images were taken from)"
-)
 
 
 def is_project(path: Path) -> bool:
@@ -105,8 +101,7 @@ def _require_model(project: Path) -> None:
     if not _has_model(project):
         raise FormatError(
             project,
-            "holds no COLMAP model (sparse/ or a model folder), and --imu and the like belong to one: leave them out "
-            "for a capture, which describes itself",
+            Fact("no-model-for-imu"),
         )
 
 
@@ -267,8 +262,8 @@ def _check_options(options: ReconstructOptions) -> None:
     named += ["--deblur"] if options.deblur not in (None, "off") else []
     named += ["--rolling-shutter"] if options.rolling_shutter not in (None, "off") else []
     if named:
-        flags = ", ".join(flag.replace("_", "-") for flag in named)
-        raise InertialError(f"{flags}: an existing model is not mapped again, nor its images changed; leave it out")
+        flags = tuple(flag.replace("_", "-") for flag in named)
+        raise InertialError(Fact("not-for-an-existing-model", options=flags))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -298,10 +293,10 @@ class _Given:
 def _require_recording(project: Path, source: ProjectOptions) -> Path:
     if source.imu is None:
         stated = (source.frame_times, source.name_times, source.video, source.exif_times or None)
-        when = "" if any(times is not None for times in stated) else f"; and when its images were taken: {_HOW_TIMES}"
-        raise FormatError(project, f"is a COLMAP project and needs the IMU recording: give --imu PATH{when}")
+        is_timed = any(times is not None for times in stated)
+        raise FormatError(project, Fact("project-needs-imu" if is_timed else "project-needs-imu-and-times"))
     if source.frame_times is not None and not source.frame_times.exists():
-        raise FormatError(source.frame_times, "no such file or folder")
+        raise FormatError(source.frame_times, Fact("no-such-file", what="file or folder"))
     return source.imu
 
 
@@ -319,7 +314,7 @@ def _read_sources(project: Path, source: ProjectOptions, options: ReconstructOpt
     if source.video is not None:
         capture = _add_video(capture, source.video, None if times in described else times)
     elif frames is None and not (times or source.name_times is not None or source.exif_times):
-        raise TimingError(f"{project}: nothing says when its images were taken: {_HOW_TIMES}")
+        raise TimingError(Fact("project-untimed", project=str(project)))
     raw = check_imu(raw, force=options.force)
     return _Given(
         source=source,
@@ -350,7 +345,7 @@ def _images(project: Path, source: ProjectOptions, *, needed: bool) -> Path | No
     if folder.is_dir():
         return folder
     if source.images is not None or needed:
-        raise FormatError(folder, "no such folder of pictures; give the project's images with --images DIR")
+        raise FormatError(folder, Fact("no-folder-of-pictures"))
     return None
 
 

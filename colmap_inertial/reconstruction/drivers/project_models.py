@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from colmap_inertial.core.errors import AlreadyMetricError, InertialError, OutputError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.model import is_metric
 from colmap_inertial.model.copying import list_tree
@@ -32,15 +33,12 @@ def read_submodels(project: Path, out: Path, source: ProjectOptions) -> Layout:
     """
     inner, outer = out.resolve(), project.resolve()
     if inner.is_relative_to(outer) or outer.is_relative_to(inner):
-        raise OutputError(f"{out} and {project} lie within each other; choose a folder elsewhere")
+        raise OutputError(Fact("folders-within-each-other", folder=str(out), out=str(project)))
     listed = list_tree(project, follow_links=source.follow_links)[0]
     folders = [folder for folder in listed if not _is_kept(folder, source.keep)]
     for folder in (Path(), *folders):
         if is_metric(project / folder):
-            raise AlreadyMetricError(
-                f"{project / folder} already holds a metric scale; give COLMAP's own project, or leave the folder "
-                "as it is with --keep"
-            )
+            raise AlreadyMetricError(Fact("already-metric", folder=str(project / folder)))
     return read_layout(project, folders, one_for_all=False)
 
 
@@ -56,10 +54,7 @@ def require_refinable(
     """Raise :class:`InertialError` where rigs are to be refined; ``auto`` leaves them as they are."""
     rigs = [str(folder) for folder in models.values() if has_rigs(read(folder))] if options.refine == "inertial" else []
     if rigs:
-        raise InertialError(
-            f"--refine inertial: several cameras took the images of {rigs[0]}, each with its own place beside the IMU, "
-            "and models with rigs cannot be refined; leave it out"
-        )
+        raise InertialError(Fact("rigs-not-refined", model=rigs[0]))
 
 
 def _is_kept(path: Path, keep: Sequence[str]) -> bool:

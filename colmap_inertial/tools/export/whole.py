@@ -59,8 +59,13 @@ class Job:
         if image.shape[:2] != (camera.height, camera.width):
             raise FormatError(
                 self.source,
-                f"has {image.shape[1]} x {image.shape[0]} pixels, its camera {camera.width} x {camera.height}: no "
-                "picture of the model",
+                Fact(
+                    "picture-of-another-size",
+                    width=image.shape[1],
+                    height=image.shape[0],
+                    camera_width=camera.width,
+                    camera_height=camera.height,
+                ),
             )
         if self.pixels is None and self.undistortion.is_same() and _is_plain(self.source, self.target, image):
             shutil.copyfile(self.source, self.target)
@@ -215,7 +220,7 @@ def export_model(
     out, folder = Path(out), Path(folder)
     inner, outer = folder.resolve(), out.resolve()
     if inner.is_relative_to(outer) or outer.is_relative_to(inner):
-        raise OutputError(f"{folder} and {out} lie within each other; choose a folder elsewhere")
+        raise OutputError(Fact("folders-within-each-other", folder=str(folder), out=str(out)))
     target = TRAINERS if program is None else TARGETS[program]
     target.require()
     source = read_source(
