@@ -25,7 +25,7 @@ from colmap_inertial.core.types import (
     ImuCalibration,
 )
 from colmap_inertial.io.device_yaml import is_yaml, read_device_yaml
-from colmap_inertial.io.files import StrPath, read_json, reader, write_json
+from colmap_inertial.io.files import StrPath, read_json, read_text, reader, write_json
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -212,7 +212,7 @@ def read_calibration(path: StrPath) -> CameraImuCalibration:
     if is_yaml(path):
         return calibration_prior(read_declared(path))
     # a file that states neither is of this kind and order
-    values = {"kind": CAMERA_IMU, "cov_parameters": list(CALIBRATION_PARAMETERS), **read_json(path)}
+    values = {"kind": CAMERA_IMU, "cov_parameters": list(CALIBRATION_PARAMETERS), **_read_values(path)}
     if values.pop("kind") != CAMERA_IMU:
         raise FormatError(path, Fact("calibration-of-another-kind"))
     return _read_fields(path, values, CameraImuCalibration, CALIBRATION_PARAMETERS, _CLOCK)
@@ -335,10 +335,17 @@ def read_imu_calibration(path: StrPath) -> ImuCalibration:
         Where it is of another kind; where a field is missing, unknown, of a wrong shape, or not finite.
     """
     path = Path(path)
-    values = read_json(path)
+    values = _read_values(path)
     if values.pop("kind", None) != IMU:
         raise FormatError(path, Fact("no-imu-calibration"))
     return _read_fields(path, values, ImuCalibration, IMU_CALIBRATION_PARAMETERS, _COMPARED)
+
+
+def _read_values(path: Path) -> dict[str, Any]:
+    """The fields of a calibration."""
+    if path.suffix.lower() != ".json" and read_text(path).lstrip()[:1] != "{":
+        raise FormatError(path, Fact("calibration-unknown"))
+    return read_json(path)
 
 
 def calibration_kind(path: StrPath) -> str:
@@ -352,7 +359,7 @@ def calibration_kind(path: StrPath) -> str:
     path = Path(path)
     if is_yaml(path):
         return CAMERA_IMU
-    kind = read_json(path).get("kind", CAMERA_IMU)
+    kind = _read_values(path).get("kind", CAMERA_IMU)
     if not isinstance(kind, str) or kind not in _WRITERS:
         known, writers = tuple(_WRITERS), tuple(_WRITERS.values())
         raise FormatError(path, Fact("calibration-kind-unknown", kind=str(kind)[:40], known=known, writers=writers))
