@@ -50,6 +50,8 @@ SETS = {"mh01_20hz": ("euroc_mh01", 1), "mh01_10hz": ("euroc_mh01", 2), "mh01_5h
 SETS |= {"room": ("handheld_room", 1)}
 #: Our steps in the columns of the table; any other is ``rest``.
 STEPS = {"features": "features", "matches": "matching", "mapping": "mapping", "metric": "metric"}
+#: All steps of a run; other stamps are of what these are made from.
+RUN_STEPS = ("imaging", "frames", *STEPS, "images")
 COLUMNS = ("features", "matching", "mapping", "metric", "rest", "processor_s")
 
 
@@ -157,13 +159,21 @@ def measure_bare(video: Video, out: Path, overlap: int) -> Figures:
     return {**json.loads(told.splitlines()[-1]), **judge(out / "sparse", video.truth)}
 
 
+def made_since(path: Path, begun: float) -> bool:
+    """Whether a file is there, and was written since a time."""
+    try:
+        return path.stat().st_mtime >= begun
+    except OSError:
+        return False
+
+
 def run_by_step(command: list[object], stamps: Path) -> tuple[float, dict[str, float]]:
     """Processor time of a process, and of its steps: which ends when its stamp appears in a folder."""
     begun, ended = time.time(), dict[str, float]()
     process = subprocess.Popen(list(map(str, command)), stdout=subprocess.DEVNULL)
     spent_s = 0.0
     while process.poll() is None:
-        made = {path.stem for path in stamps.glob("*.json") if path.stat().st_mtime >= begun}
+        made = {path.stem for path in stamps.glob("*.json") if path.stem in RUN_STEPS and made_since(path, begun)}
         ended |= dict.fromkeys(made - ended.keys(), spent_s)
         try:
             # utime, stime, and those of its children that have ended, after the name in brackets
@@ -268,10 +278,9 @@ def main() -> None:
         video = video_of(kind, args.data, args.folder / kind / "capture")
         for who in ("bare", "ours", "refined"):
             if args.only in (None, who):
-                out = args.folder / kind / who
-                shutil.rmtree(out, ignore_errors=True)
-                if who == "refined":
-                    shutil.copytree(args.folder / kind / "ours", out)
+                out = args.folder / kind / ("bare" if who == "bare" else "ours")
+                if who != "refined":
+                    shutil.rmtree(out, ignore_errors=True)
                 measured = (
                     measure_bare(video, out, args.overlap)
                     if who == "bare"
