@@ -23,8 +23,8 @@ from colmap_inertial.cli.help import options_of, print_help, print_overview
 from colmap_inertial.cli.models import Align, Apply, CalibrateImu, Diagnose, Export, Scale, Validate, View
 from colmap_inertial.cli.process import INTERRUPTED, TERMINATED, Terminated, answering_signals, require_limits
 from colmap_inertial.cli.speech import Speaker, log_on_terminal, print_json
-from colmap_inertial.core.errors import InertialError, describe_environment_fault
-from colmap_inertial.core.facts import Fact
+from colmap_inertial.core.errors import InertialError, describe_environment_fault, fact_of
+from colmap_inertial.core.facts import Fact, with_sentences
 from colmap_inertial.core.options import ProjectOptions, ReadLimits, ReconstructOptions, ReferenceOptions
 from colmap_inertial.core.printing import say
 
@@ -261,7 +261,7 @@ def _main(args: Sequence[str] | None) -> None:
     except InertialError as error:
         code = error.exit_code
         if command.answers_in_json:
-            print_json({"error": str(error), "exit_code": code})
+            print_json({**with_sentences({"error": fact_of(error)}), "error": str(error), "exit_code": code})
         say("\n".join([f"error: {error}", *getattr(error, "__notes__", ())]), error=True)
     except KeyboardInterrupt as stop:
         resumes = isinstance(command, Reconstruct | Deblur | FuseApertures | FuseExposures | Batch)

@@ -28,6 +28,7 @@ CHECKS: tuple[Check, ...] = (
     imu.check_resolution,
     imu.check_scatter,
     imu.check_delay,
+    camera.check_declared,
     camera.check_stabilisation,
     camera.check_pose_convention,
     clocks.check_time_unit,
@@ -37,7 +38,6 @@ CHECKS: tuple[Check, ...] = (
     camera.check_gyro_gain,
     clocks.check_clock_rate,
     clocks.check_coverage,
-    camera.check_declared_rotation,
     clocks.check_even_times,
     camera.check_focal_length,
     camera.check_accelerometer_sign,
@@ -45,6 +45,7 @@ CHECKS: tuple[Check, ...] = (
     frames.check_cut_from_video,
     frames.check_dropped,
     frames.check_repeated,
+    frames.check_blank,
     frames.check_exposure,
     frames.check_readout,
 )

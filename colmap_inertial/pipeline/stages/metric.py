@@ -82,6 +82,8 @@ class InertialStage:
         Of the scale estimate.
     world
         Where gravity points in the metric model.
+    keeps_intrinsics
+        Whether the models have declared intrinsics that nothing refined.
     database
         COLMAP's, of the models: its matches register images again, and tie models.
     """
@@ -90,11 +92,12 @@ class InertialStage:
     calibration: CameraImuCalibration | None
     options: ScaleOptions = field(default_factory=ScaleOptions)
     world: WorldAxes = "z-up"
+    keeps_intrinsics: bool = False
     #: a run with other matches has other models
     database: Path | None = field(default=None, compare=False)
 
-    @staticmethod
-    def fields_for(inputs: StageInputs) -> dict[str, Any]:
+    @classmethod
+    def fields_for(cls, inputs: StageInputs) -> dict[str, Any]:
         """The fields that all of these stages have, for a run."""
         recording, options = inputs.recording, inputs.options
         return {
@@ -102,6 +105,7 @@ class InertialStage:
             "calibration": recording.prior,
             "options": replace(options.scale, max_offset_s=recording.max_offset_s),
             "world": options.world,
+            "keeps_intrinsics": recording.capture.camera is not None and not cls.refines_intrinsics(inputs),
             "database": inputs.database,
         }
 
@@ -223,28 +227,36 @@ class MetricStage(InertialStage):
     def judge_shutter(self, model: Model, estimate: ScaleEstimate) -> Model:
         """A model in metres; where its images show a rolling shutter that it ignores, its scale says so.
 
-        Not looked for where a global shutter was declared, or the keypoints were rectified.
+        A declared global shutter, and declared intrinsics that were kept, are doubted where the images contradict them.
         """
         metric = self._apply(model, estimate)
-        if model.timing.readout_s == 0 or model.rectified or estimate.noise is None:
+        is_settled = model.timing.readout_s == 0 or model.rectified
+        if estimate.noise is None or (model.rectified and not self.keeps_intrinsics):
             return metric
         try:
             readout = self._find_readout(metric)
         except (NotObservableError, np.linalg.LinAlgError) as error:
             log.info("model %d: its shutter cannot be looked at: %s", model.colmap_index, error)
             readout = None
+        if readout is None and is_settled:
+            return metric
         if readout is None:
             return self._apply(model, replace(estimate, notes=(*estimate.notes, Fact("rolling-shutter-unknown"))))
-        estimate = readout.widen(estimate)
+        found = []
+        if not is_settled or (not model.rectified and readout.contradicts_global):
+            estimate = readout.widen(estimate, declared_global=is_settled)
+            found += [readout.as_fact(declared_global=is_settled)] if readout.is_found else []
         if estimate.verdict == "refused":
             return model.scaled(estimate, None)
+        if self.keeps_intrinsics and readout.focal is not None and readout.focal.contradicts:
+            found.append(readout.focal.as_fact())
+            estimate = downgraded(estimate, found[-1:])
         metric = self._apply(model, estimate)
-        if not readout.is_found:
-            return metric
-        values = {name: getattr(readout, name) for name in ("readout_s", "sigma_s", "direction")}
-        done = Treatment(stage="shutter", reason=readout.as_fact(), values=values)
-        log.info("model %d: %s", model.colmap_index, done.reason)
-        return replace(metric, treatments=(*metric.treatments, done))
+        for fact in found:
+            done = Treatment(stage="shutter", reason=fact, values=dict(fact.values))
+            log.info("model %d: %s", model.colmap_index, done.reason)
+            metric = replace(metric, treatments=(*metric.treatments, done))
+        return metric
 
     def _apply(self, model: Model, estimate: ScaleEstimate) -> Model:
         similarity = Similarity.from_scale(estimate, world=self.world, provenance=provenance(estimate))

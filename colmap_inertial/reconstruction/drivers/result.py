@@ -170,7 +170,8 @@ class ReconstructResult:
         return tuple(model.dense.waiting for model in self.models if model.dense is not None and model.dense.waiting)
 
     def exit_code(self) -> int:
-        """0; 1 where a validation is outside its tolerance; its error's code where the target could not be measured.
+        """0, also where a target could not be measured, as the scale does not rest on it; 1 where one is outside its
+        tolerance.
 
         Raises
         ------
@@ -187,12 +188,8 @@ class ReconstructResult:
             raise NotObservableError("scale", Fact("scales-refused", models=models, reasons=reasons))
         if self.waiting:
             raise InertialError(Fact("found-together", found=self.waiting))
-        checked = [model.validation for model in self.models if model.validation is not None]
-        failures = [check.exit_code for check in checked if isinstance(check, InertialError)]
-        outside = any(not check.within_tolerance for check in checked if isinstance(check, Validation))
-        if outside:
-            return 1
-        return failures[0] if len(failures) == len(checked) > 0 else 0
+        checked = [model.validation for model in self.models]
+        return int(any(not check.within_tolerance for check in checked if isinstance(check, Validation)))
 
 
 @prints_in_lines

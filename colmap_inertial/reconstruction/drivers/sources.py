@@ -297,11 +297,20 @@ def scale_source(
         recording = _begin_of(recording, first_s, limit_s)
     trajectory = recording.trajectory
     checked = dataclasses.replace(recording.checked, trajectory=trajectory, max_offset_s=limit_s)
-    diagnosis = diagnose(measure_recording(checked, silent))
+    recorded = measure_recording(checked, silent)
+    diagnosis = diagnose(recorded)
     stops = tuple(finding.reason for finding in diagnosis.stopping)
+    left_out: tuple[Fact, ...] = ()
     if stops and not force:
-        estimate = ScaleEstimate.refused("none", *stops)
+        estimate = ScaleEstimate.refused("none", *stops, Fact("force-goes-on"))
     else:
+        # what is declared says less than what was recorded
+        recording = dataclasses.replace(recording, checked=dataclasses.replace(checked, prior=recorded.believed))
+        left_out = tuple(
+            Fact("declared-left-out", finding=fact)
+            for fact in recorded.contradicted.facts
+            if fact not in [finding.fact for finding in diagnosis.stopping]
+        )
         doubts = (*stops, *(finding.reason for finding in diagnosis.doubting))
         estimate = estimate_scale(
             trajectory,
@@ -311,7 +320,7 @@ def scale_source(
             read_as=recording.checked.read_as,
         )
         estimate = downgraded(_judge_shutter(source.source, recording, options, estimate), doubts)
-    notes = (*estimate.notes, *recording.imu.repairs, *recording.notes)
+    notes = (*left_out, *estimate.notes, *recording.imu.repairs, *recording.notes)
     estimate = dataclasses.replace(estimate, notes=notes)
     if json is not None:
         write_json(json, scale_as_json(estimate, source.calibration, source.source))
