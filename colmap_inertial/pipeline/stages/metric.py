@@ -106,7 +106,10 @@ class InertialStage:
             "calibration": recording.prior,
             "options": replace(options.scale, max_offset_s=recording.max_offset_s),
             "world": options.world,
-            "keeps_intrinsics": recording.capture.camera is not None and not cls.refines_intrinsics(inputs),
+            # an existing project's models may have others than were declared
+            "keeps_intrinsics": recording.capture.camera is not None
+            and inputs.made_from is None
+            and not cls.refines_intrinsics(inputs),
             "database": inputs.database,
         }
 
