@@ -25,7 +25,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -36,7 +36,7 @@ from real_imu import FLOWN, HANDHELD, RECORDINGS, Motion, Window, read, reconstr
 
 from colmap_inertial.checks.diagnose import Recorded, diagnose
 from colmap_inertial.core.arrays import Array
-from colmap_inertial.core.facts import sentences
+from colmap_inertial.core.facts import Fact, sentences
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_multiply
 from colmap_inertial.core.types import CameraTrajectory, ImuRecording
 from colmap_inertial.inertial.scale import estimate_scale
@@ -407,10 +407,10 @@ Change = Callable[[CameraTrajectory, ImuRecording, float, float], tuple[CameraTr
 
 @dataclass(frozen=True, kw_only=True)
 class Fault:
-    """What is put into a sound recording: sizes from harmless to gross, and the codes or words that name it."""
+    """What is put into a sound recording: sizes from harmless to gross, and the codes that name it."""
 
     sizes: tuple[float, ...]
-    named: str
+    named: tuple[str, ...]
     change: Change
 
 
@@ -487,63 +487,99 @@ def jumping(poses: CameraTrajectory, truth: float, size_m: float, *, last_s: flo
 FAULTS: dict[str, Fault] = {
     "accelerometer late, s": Fault(
         sizes=(0.02, 0.06, 0.1, -0.1, 0.2, -0.4),
-        named="sensors-offset|ms off the gyroscope",
+        named=("sensors-offset", "accel-delay-undone"),
         change=lambda poses, imu, truth, size: (poses, replace(imu, accel_t_s=imu.accel_t_s + size)),
     ),
     "camera's clock fast": Fault(
-        sizes=(0.001, 0.003, 0.01, 0.02), named="clock-rate|clocks of camera", change=of_model("clock")
+        sizes=(0.001, 0.003, 0.01, 0.02), named=("clock-rate", "clocks-run-apart"), change=of_model("clock")
     ),
     "frame times wander, s": Fault(
         sizes=(0.01, 0.03, 0.06, 0.12),
-        named="frame-times-uneven",
+        named=("frame-times-uneven",),
         change=lambda poses, imu, truth, size: (wandering(poses, size), imu),
     ),
-    "accelerometer's gain": Fault(sizes=(0.01, -0.02, 0.03, 0.05, -0.1), named="gain", change=of_model("gain")),
-    "accelerometer's bias, m/s2": Fault(sizes=(0.2, 0.45, 1.0, 2.5), named="gain|bias", change=of_model("bias")),
-    "torn": Fault(sizes=(0.01, 0.03, 0.05, 0.1), named="same throughout|longer along", change=of_model("torn")),
-    "drifting": Fault(sizes=(0.01, 0.03, 0.05, 0.1), named="same throughout|longer along", change=of_model("drift")),
-    "stretched": Fault(sizes=(0.01, 0.03, 0.05, 0.1), named="longer along|same throughout", change=of_model("stretch")),
-    "accelerometer low-passed, Hz": Fault(sizes=(20.0, 8.0, 4.0, 2.0), named="low-passed", change=of_accel(low_passed)),
+    "accelerometer's gain": Fault(
+        sizes=(0.01, -0.02, 0.03, 0.05, -0.1),
+        named=("accel-gain-large", "accel-gain-doubtful", "accel-gain-impossible"),
+        change=of_model("gain"),
+    ),
+    "accelerometer's bias, m/s2": Fault(
+        sizes=(0.2, 0.45, 1.0, 2.5),
+        named=(
+            "accel-gain-large",
+            "accel-gain-doubtful",
+            "accel-gain-impossible",
+            "accel-bias-impossible",
+            "spectral-bias-large",
+        ),
+        change=of_model("bias"),
+    ),
+    "torn": Fault(
+        sizes=(0.01, 0.03, 0.05, 0.1),
+        named=("scale-breaks", "scale-grows", "scale-varies", "model-stretched"),
+        change=of_model("torn"),
+    ),
+    "drifting": Fault(
+        sizes=(0.01, 0.03, 0.05, 0.1),
+        named=("scale-breaks", "scale-grows", "scale-varies", "model-stretched"),
+        change=of_model("drift"),
+    ),
+    "stretched": Fault(
+        sizes=(0.01, 0.03, 0.05, 0.1),
+        named=("scale-breaks", "scale-grows", "scale-varies", "model-stretched"),
+        change=of_model("stretch"),
+    ),
+    "accelerometer low-passed, Hz": Fault(
+        sizes=(20.0, 8.0, 4.0, 2.0),
+        named=("accel-low-passed", "path-smoothed", "accel-lags-as-filtered"),
+        change=of_accel(low_passed),
+    ),
     "path smoothed, s": Fault(
         sizes=(0.02, 0.05, 0.1),
-        named="low-passed|not smoothed|converge|disagree",
+        named=("accel-low-passed", "path-smoothed", "fit-hardly-converged", "accel-contradicts-motion"),
         change=lambda poses, imu, truth, size: (smoothed(poses, size), imu),
     ),
     "pause, s": Fault(
         sizes=(0.05, 0.3, 2.0, 5.0),
-        named="gap|pauses",
+        named=("long-gap", "sensor-pauses"),
         change=lambda poses, imu, truth, size: (poses, paused(imu, size)),
     ),
     "accelerometer cut off": Fault(
-        sizes=(0.0005, 0.01, 0.05), named="saturated|end of its range", change=of_accel(saturated)
+        sizes=(0.0005, 0.01, 0.05),
+        named=("saturated", "readings-cut-off", "sensor-saturated"),
+        change=of_accel(saturated),
     ),
     "poses jump in the last .6 s, m": Fault(
         sizes=(0.02, 0.1, 1.0),
-        named="poses jump|left out",
+        named=("poses-jump",),
         change=lambda poses, imu, truth, size: (jumping(poses, truth, size, last_s=0.6), imu),
     ),
     "accelerometer's sign": Fault(
-        sizes=(-1.0,), named="accel-flipped|axes|sign", change=of_accel(lambda imu, size: size * imu.accel_m_s2)
+        sizes=(-1.0,),
+        named=("accel-flipped", "axes-turned", "axes-mirrored"),
+        change=of_accel(lambda imu, size: size * imu.accel_m_s2),
     ),
     "accelerometer's x mirrored": Fault(
-        sizes=(-1.0,), named="axes", change=of_accel(lambda imu, size: imu.accel_m_s2 * [size, 1, 1])
+        sizes=(-1.0,),
+        named=("axes-mirrored", "axes-turned"),
+        change=of_accel(lambda imu, size: imu.accel_m_s2 * [size, 1, 1]),
     ),
     "gyroscope's gain": Fault(
-        sizes=(1.02, 1.1, 1.3), named="gyro-gain", change=of_gyro(lambda imu, size: size * imu.gyro_rad_s)
+        sizes=(1.02, 1.1, 1.3), named=("gyro-gain",), change=of_gyro(lambda imu, size: size * imu.gyro_rad_s)
     ),
     "gyroscope in steps, rad/s": Fault(
         sizes=(0.002, 0.02, 0.2),
-        named="coarse-resolution",
+        named=("coarse-resolution",),
         change=of_gyro(lambda imu, size: size * np.round(imu.gyro_rad_s / size)),
     ),
     "accelerometer in steps, m/s2": Fault(
         sizes=(0.01, 0.1, 1.0),
-        named="coarse-resolution",
+        named=("coarse-resolution",),
         change=of_accel(lambda imu, size: size * np.round(imu.accel_m_s2 / size)),
     ),
     "IMU of another time": Fault(
         sizes=(1.0,),
-        named="imu-does-not-fit|offset-undecided",
+        named=("imu-does-not-fit", "offset-undecided"),
         change=lambda poses, imu, truth, size: (
             poses,
             replace(imu, gyro_rad_s=imu.gyro_rad_s[::-1].copy(), accel_m_s2=imu.accel_m_s2[::-1].copy()),
@@ -586,9 +622,13 @@ def print_faults(rows: Sequence[dict[str, str]]) -> None:
     for name in dict.fromkeys(names):
         of = [row for row, its in zip(rows, names, strict=True) if its == name]
         outcome = Counter(row["outcome"] for row in of)
-        words = FAULTS[name.rpartition(": ")[0]].named
+        codes = FAULTS[name.rpartition(": ")[0]].named
         said = sum(
-            bool(re.search(words, " ".join(row[key] for key in ("errors", "warnings", "infos", "sentences", "notes"))))
+            any(
+                code in row[key].split()
+                for code in codes
+                for key in ("errors", "warnings", "infos", "reasons", "notes")
+            )
             for row in of
         )
         given = [row for row in of if row["inside"] and row["outcome"] != "stopped"]
@@ -601,38 +641,17 @@ def print_faults(rows: Sequence[dict[str, str]]) -> None:
 
 # --- judging ---------------------------------------------------------------------------------------------------------
 
-#: Words of a reason by what it is about.
-REASONS = {
-    "stretch": "longer along",
-    "break": r"than in the longer part|than in the rest",
-    "drift": r"at the end than at the beginning",
-    "parts": r"in parts of",
-    "gains": "seems to be off in gain",
-    "gain": "gain may be off",
-    "filter": "low-passed",
-    "axes": "axes are not read at the same time",
-    "rate": "ppm off the gyroscope",
-    "clocks": "clocks of camera and IMU",
-    "saturated": "end of its range",
-    "short": "the clip is short",
-    "width": "95 % interval is|known to no better|not known at all",
-    "no convergence": "does not converge",
-    "hardly converges": "hardly converges",
-    "bias": "would have to be off by",
-    "unexplained": "motion disagree",
-    "convention": "quaternions|read as",
-}
-
-
-def reasons_of(reasons: Sequence[str]) -> list[str]:
-    """Short names of reasons."""
-    return [next((name for name, words in REASONS.items() if re.search(words, said)), said) for said in reasons]
-
-
 FIELDS = (
     *("key", "group", "name", "length_s", "begin_s", "by_hand", "outcome", "errors", "warnings", "infos", "verdict"),
     *("reasons", "notes", "error_pct", "width_pct", "inside", "numbers", "sentences", "check_s", "fit_s"),
 )
+
+
+def codes_of(facts: Iterable[Fact]) -> Iterator[str]:
+    """Codes of facts, and of the facts that they speak of."""
+    for fact in facts:
+        yield fact.code
+        yield from codes_of(value for value in fact.values.values() if isinstance(value, Fact))
 
 
 def judge(case: Case) -> dict[str, object]:
@@ -667,13 +686,13 @@ def judge(case: Case) -> dict[str, object]:
         "warnings": " ".join(of["warning"]),
         "infos": " ".join(of["info"]),
         "verdict": estimate.verdict,
-        "reasons": "; ".join(reasons_of(sentences(estimate.reasons))),
-        "notes": " | ".join(sentences(estimate.notes)),
+        "reasons": " ".join(codes_of(estimate.reasons)),
+        "notes": " ".join(codes_of(estimate.notes)),
         "error_pct": "" if error is None else f"{100 * error:.3f}",
         "width_pct": "" if width is None else f"{width:.3f}",
         "inside": "" if inside is None else int(inside),
         "numbers": json.dumps({f.code: dict(f.numbers) for f in diagnosis.findings}),
-        "sentences": " | ".join(sentences(estimate.reasons)),
+        "sentences": " | ".join(sentences((*estimate.reasons, *estimate.notes))),
         "check_s": f"{checked_s - begin_s:.2f}",
         "fit_s": f"{fitted_s - checked_s:.2f}",
     }
@@ -742,8 +761,8 @@ def print_tables(rows: Sequence[dict[str, str]]) -> None:
         ("reasons, all that are not trusted", [row for row in rows if row["verdict"] != "trusted"]),
         ("reasons, 20 s or more by hand", [row for row in long_by_hand if row["verdict"] != "trusted"]),
     ):
-        count = Counter(reason for row in of for reason in row["reasons"].split("; ") if reason)
-        alone = Counter(row["reasons"] for row in of if "; " not in row["reasons"])
+        count = Counter(reason for row in of for reason in row["reasons"].split())
+        alone = Counter(row["reasons"] for row in of if " " not in row["reasons"])
         print(f"{what}:")
         for reason, n in count.most_common():
             print(f"  {n:4d}  (alone {alone[reason]:3d})  {reason[:120]}")

@@ -27,6 +27,7 @@ from scipy.signal import butter, sosfiltfilt
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import matrix_from_quat, quat_rotate, slerp
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording
@@ -67,7 +68,9 @@ def estimate_linear(trajectory: CameraTrajectory, imu: ImuRecording, calibration
     accel_s = CameraTimedImu.from_recording(imu, calibration, trajectory.epoch_ns).accel_t_s
     begin_s, end_s = max(accel_s[0], trajectory.t_s[0]), min(accel_s[-1], trajectory.t_s[-1])
     if end_s - begin_s < SHORTEST_S or len(trajectory) < 6:
-        raise NotObservableError("scale", f"camera and accelerometer share less than {SHORTEST_S:g} s: record longer")
+        raise NotObservableError(
+            "scale", Fact.stated(f"camera and accelerometer share less than {SHORTEST_S:g} s: record longer")
+        )
     t_s = np.arange(begin_s, end_s, 1 / GRID_HZ)
     centre = trajectory.cam_in_world - trajectory.cam_in_world.mean(axis=0)
     world_from_cam = matrix_from_quat(slerp(trajectory.t_s, trajectory.cam_from_world_xyzw, t_s)).transpose(0, 2, 1)
@@ -85,5 +88,7 @@ def estimate_linear(trajectory: CameraTrajectory, imu: ImuRecording, calibration
     system = smooth[edge:-edge].reshape(-1, 8)
     solution = np.linalg.lstsq(system[:, :7], system[:, 7], rcond=None)[0]
     if not solution[0] > 0:
-        raise NotObservableError("scale", "the accelerometer does not feel the camera's motion: move it more briskly")
+        raise NotObservableError(
+            "scale", Fact.stated("the accelerometer does not feel the camera's motion: move it more briskly")
+        )
     return LinearScale(float(solution[0]), solution[1:4], solution[4:7])

@@ -1,6 +1,7 @@
 """Mistakes of users: what is said, when, and whether following the advice gives a run.
 
     python scripts/study_mistakes.py [--seed 0] [--kinds units axes ...] [--reconstruct] [--json mistakes.json]
+    python scripts/study_mistakes.py --declared 30
 
 Each mistake changes a copy of ``example_scenes/desk`` by a seeded draw, and starts the command or the Python call that
 a person would. It counts as caught where that ends with an error before features are extracted, and the message has the
@@ -8,6 +9,12 @@ words that lead to the remedy. Then the message is followed: numbers and setting
 After that, the check beforehand must find no error, and ``scale`` must find the metres of the true poses to 5 %; with
 ``--reconstruct``, the whole reconstruction must succeed. A call or command whose words were wrong is made again with
 the right ones. Exit code 1 where more than two mistakes are not caught or mended.
+
+``--declared`` draws so many simulated recordings of 25 s instead, and declares values of their device wrongly: the
+inverse rotation, another order or other axes, the time offset's other sign or unit, another lever arm or its inverse,
+the gains of another IMU. It counts as caught where the check stops it by its code, or the scale is weak and has the
+code among its reasons; as harmless where the interval holds the truth, or the declared value was left out and said so.
+Exit code 1 where any gives a trusted scale that is wrong, or more than one is called by another name.
 """
 
 from __future__ import annotations
@@ -22,6 +29,7 @@ import shutil
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -30,15 +38,21 @@ from pathlib import Path
 import numpy as np
 from bench_report import write_report
 
+from colmap_inertial.checks.diagnose import Recorded, diagnose
 from colmap_inertial.cli import main as run_command
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import InertialError
-from colmap_inertial.core.facts import sentences
+from colmap_inertial.core.facts import Fact
+from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_multiply, quat_normalize
 from colmap_inertial.core.options import ReconstructOptions
-from colmap_inertial.core.types import CameraTrajectory, ImuRecording
+from colmap_inertial.core.quantiles import Z95
+from colmap_inertial.core.types import CameraTrajectory, ImuCalibration, ImuRecording
+from colmap_inertial.core.types.imu import IMU_CAL
 from colmap_inertial.inertial.scale import estimate_scale
+from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.io.trajectories import read_tum
+from colmap_inertial.tools.simulate import IMU_PRESETS, MotionOptions, RecordingOptions, simulate_recording
 
 HERE = Path(__file__).resolve().parents[1]
 DESK = HERE / "example_scenes" / "desk"
@@ -59,8 +73,11 @@ class Mistake:
     ----------
     kind, name
         What it is about, and what was done.
+    codes
+        One of which the error must have, or what it speaks of; without any, as of files that cannot be read, the
+        message is looked at.
     says
-        Pattern of what the message must hold.
+        Pattern of what the message must hold, by which a person finds the remedy.
     make
         Changes the copy.
     mend
@@ -74,6 +91,7 @@ class Mistake:
     kind: str
     name: str
     says: str
+    codes: tuple[str, ...] = ()
     make: Change = lambda scene, rng: None
     mend: Mend | None = None
     arguments: tuple[str, ...] = RECONSTRUCT
@@ -186,7 +204,7 @@ def follow_clock_rate(scene: Path, message: str) -> None:
 def follow_offset(scene: Path, message: str) -> None:
     """Leave out what a message says to leave out."""
     path = scene / "capture.toml"
-    assert "leave out shared_clock" in message
+    assert "leave out" in message
     path.write_text(re.sub(r"(shared_clock|gyro_time_offset_s|accel_time_offset_s) = .*\n", "", path.read_text()))
 
 
@@ -216,7 +234,7 @@ def scale_of(change: Callable[[CameraTrajectory, ImuRecording], tuple[CameraTraj
     def estimate(scene: Path) -> None:
         found = estimate_scale(*change(*read_desk(scene)))
         if found.verdict == "refused":
-            raise InertialError("; ".join(sentences(found.reasons)))
+            raise InertialError(Fact("scale-refused", reasons=found.reasons))
 
     return estimate
 
@@ -253,48 +271,56 @@ def units() -> Iterator[Mistake]:
     unit = partial(Mistake, kind="units")
     yield unit(
         name="gyroscope in deg/s, called rad/s",
+        codes=("gyro-in-deg",),
         make=values("gyro.csv", change=lambda w, _: np.degrees(w)),
         says=r'unit = "deg/s"',
         mend=toml('unit = "rad/s"', 'unit = "deg/s"'),
     )
     yield unit(
         name="gyroscope in rad/s, called deg/s",
+        codes=("gyro-not-in-deg",),
         make=toml('unit = "rad/s"', 'unit = "deg/s"'),
         says=r'unit = "rad/s"',
         mend=toml('unit = "deg/s"', 'unit = "rad/s"'),
     )
     yield unit(
         name="accelerometer in g, called m/s2",
+        codes=("accel-in-g",),
         make=values("accel.csv", change=lambda a, _: a / G),
         says=r'unit = "g"',
         mend=toml('unit = "m/s2"', 'unit = "g"'),
     )
     yield unit(
         name="accelerometer in m/s2, called g",
+        codes=("accel-not-in-g",),
         make=toml('unit = "m/s2"', 'unit = "g"'),
         says=r'unit = "m/s2"',
         mend=toml('unit = "g"', 'unit = "m/s2"'),
     )
     yield unit(
         name="raw counts of the gyroscope",
+        codes=("gyro-unit",),
         make=values("gyro.csv", change=lambda w, _: np.round(w * 939.65) + 12),
         says="counts_per_unit",
         mend=toml(GYRO_UNIT, f"{GYRO_UNIT}\nzero = 12\ncounts_per_unit = 939.65"),
     )
     yield unit(
         name="gyroscope with a wrong factor",
+        codes=("gyro-gain",),
         make=values("gyro.csv", change=lambda w, rng: w * rng.uniform(1.28, 1.4)),
         says="the gyroscope measures .* times the rotation",
         mend=follow_gain,
     )
     yield unit(
         name="frame times in ms, called s",
+        codes=("time-unit",),
         make=frame_times(lambda t_s: 1e3 * t_s),
         says="frames span .* in milliseconds where seconds were read",
         mend=frame_times(lambda t_ms: t_ms, "name,t_ms"),
     )
     yield unit(
         name="stamps of the IMU in ms, called s",
+        codes=("time-unit",),
         make=stamps("gyro.csv", "accel.csv", change=lambda t_s, _: 1e3 * t_s),
         says="set time_unit",
         mend=toml('time_unit = "s"', 'time_unit = "ms"'),
@@ -302,7 +328,7 @@ def units() -> Iterator[Mistake]:
 
 
 def axes() -> Iterator[Mistake]:
-    axis = partial(Mistake, kind="axes", says=r'axes = "')
+    axis = partial(Mistake, kind="axes", says=r'axes = "', codes=("axes-turned", "axes-mirrored", "gyro-mirrored"))
     yield axis(
         name="two axes of the gyroscope exchanged",
         make=values(
@@ -337,38 +363,44 @@ def clocks() -> Iterator[Mistake]:
     clock = partial(Mistake, kind="clocks")
     yield clock(
         name="clocks 565 s apart, called shared",
+        codes=("clock-offset",),
         make=toml("[timing]", "[timing]\nshared_clock = true"),
         says=r"565\.\d+ s apart.*shared_clock",
         mend=follow_offset,
     )
     yield clock(
         name="times by another frame rate",
+        codes=("frame-rate",),
         make=frame_times(lambda t_s: 1.25 * t_s),
         says="timed by another frame rate",
         mend=follow_frame_rate,
     )
     yield clock(
         name="the clock of the IMU 3 % fast",
+        codes=("clock-rate",),
         make=stamps("gyro.csv", "accel.csv", change=lambda t_s, _: 1.03 * t_s),
         says="clock runs",
         mend=follow_clock_rate,
     )
     yield clock(
         name="IMU of another recording",
+        codes=("imu-does-not-fit",),
         make=values("gyro.csv", "accel.csv", change=lambda w, _: w[::-1]),
         says="check that this IMU recording belongs to these images",
         mend=original("gyro.csv", "accel.csv"),
     )
     yield clock(
         name="IMU stopped after a fifth",
+        codes=("imu-too-short",),
         make=rows("gyro.csv", "accel.csv", change=lambda table, _: table[: len(table) // 5]),
         says="start the IMU before the video",
         mend=original("gyro.csv", "accel.csv"),
     )
     yield clock(
         name="a time offset that is wrong",
+        codes=("declared-offset",),
         make=toml("[target]", "[calibration]\ngyro_time_offset_s = 100.0\naccel_time_offset_s = 100.0\n\n[target]"),
-        says="time offset that was given",
+        says="the declared time offset is",
         mend=follow_offset,
     )
 
@@ -383,6 +415,7 @@ def columns() -> Iterator[Mistake]:
     )
     yield column(
         name="raw counts in columns named *_raw",
+        codes=("gyro-unit",),
         make=lambda scene, rng: (
             values("gyro.csv", change=lambda w, _: np.round(w * 939.65) + 12)(scene, rng),
             text("gyro.csv", "t,x,y,z", "t,x_raw,y_raw,z_raw")(scene, rng),
@@ -399,6 +432,7 @@ def columns() -> Iterator[Mistake]:
     )
     yield column(
         name="gyroscope and accelerometer exchanged",
+        codes=("sensors-exchanged",),
         make=lambda scene, rng: (
             toml('"gyro.csv"', '"other"')(scene, rng),
             toml('"accel.csv"', '"gyro.csv"')(scene, rng),
@@ -571,6 +605,11 @@ def run(arguments: list[str]) -> tuple[int, str]:
     return 0, " ".join(said.getvalue().split())
 
 
+def codes_in(said: str) -> set[str]:
+    """Codes of the facts in the JSON that a command ends with: the error's, and of what it speaks of."""
+    return set(re.findall(r'"code": "([a-z0-9-]+)"', said))
+
+
 def call(function: Call, scene: Path) -> tuple[int, str]:
     """Exit code and message of a Python call: a traceback's last line, as a person reads it."""
     try:
@@ -616,10 +655,12 @@ def try_mistake(mistake: Mistake, folder: Path, seed: int, *, mend: bool = True,
     if mistake.call is not None:
         code, message = call(mistake.call, scene)
     else:
-        code, message = run([word.format(scene=scene, out=out) for word in mistake.arguments])
+        in_json = ["--json", "-"] if mistake.codes else []
+        code, message = run([word.format(scene=scene, out=out) for word in mistake.arguments] + in_json)
     seconds = time.monotonic() - begin_s
     begun = (out / "colmap" / "database.db").exists()
-    caught = code > 0 and not begun and re.search(mistake.says, message) is not None
+    named = bool(codes_in(message) & set(mistake.codes)) if mistake.codes else bool(re.search(mistake.says, message))
+    caught = code > 0 and not begun and named
     mended, then = True, ""
     if mend:
         try:
@@ -637,13 +678,110 @@ def try_mistake(mistake: Mistake, folder: Path, seed: int, *, mend: bool = True,
     return Outcome(message=message[-600:], seconds=seconds, caught=caught, mended=mended, then=then[-400:])
 
 
+# --- declared values -------------------------------------------------------------------------------------------------
+
+#: What is declared wrongly, and the codes that name it.
+DECLARED = {
+    "inverse rotation": ("declared-rotation",),
+    "w of the rotation first": ("declared-rotation",),
+    "axes of graphics": ("declared-rotation",),
+    "time offset's sign": ("declared-offset",),
+    "time offset in ms": ("declared-offset",),
+    "lever arm of the inverse": ("declared-lever-arm",),
+    "lever arm, 15 cm off": ("declared-lever-arm",),
+    "gains of another IMU, 4 %": ("calibrated-gain-contradicted",),
+}
+
+
+def draw_declared(kind: str, k: int, seed: int) -> tuple[str, str]:
+    """A recording whose device is declared wrongly: what came of it, and what is said."""
+    rng = np.random.default_rng([seed, 60, k])
+    motion = MotionOptions(kind=("orbit", "walk", "roam")[k % 3], duration_s=25.0)  # type: ignore[arg-type]
+    device = IMU_PRESETS[list(IMU_PRESETS)[k % len(IMU_PRESETS)]]
+    made = simulate_recording(RecordingOptions(motion=motion, imu=device), seed=int(rng.integers(1 << 40)))
+    true = made.truth.calibration
+    turn = quat_normalize(rng.standard_normal(4))
+    turn_matrix = matrix_from_quat(turn)
+    shift_s = float(rng.uniform(0.03, 0.3) * rng.choice([-1, 1]))
+    moved_s = true.gyro_time_offset_s - shift_s
+    imu = replace(
+        made.imu,
+        gyro_rad_s=made.imu.gyro_rad_s @ turn_matrix,
+        accel_m_s2=made.imu.accel_m_s2 @ turn_matrix,
+        gyro_t_s=made.imu.gyro_t_s + moved_s,
+        accel_t_s=made.imu.accel_t_s + moved_s,
+        noise=None,
+    )
+    rotation, arm_m = quat_multiply(true.cam_from_imu_xyzw, turn), true.imu_in_cam_m
+    values: dict[str, object] = {"cam_from_imu_xyzw": rotation, "imu_in_cam_m": arm_m, "gyro_time_offset_s": shift_s}
+    direction = rng.standard_normal(3)
+    values |= {
+        "inverse rotation": {"cam_from_imu_xyzw": quat_conjugate(rotation)},
+        "w of the rotation first": {"cam_from_imu_xyzw": np.roll(rotation, 1)},
+        "axes of graphics": {"cam_from_imu_xyzw": quat_multiply(np.array([1.0, 0.0, 0.0, 0.0]), rotation)},
+        "time offset's sign": {"gyro_time_offset_s": -shift_s},
+        "time offset in ms": {"gyro_time_offset_s": 1e3 * shift_s},
+        "lever arm of the inverse": {"imu_in_cam_m": -matrix_from_quat(rotation).T @ arm_m},
+        "lever arm, 15 cm off": {"imu_in_cam_m": arm_m + 0.15 * direction / np.linalg.norm(direction)},
+    }.get(kind, {})
+    own = None
+    if kind == "gains of another IMU, 4 %":
+        own = ImuCalibration(
+            accel_gain=np.diag(rng.choice([-0.04, 0.04], 3)),
+            accel_bias_m_s2=np.zeros(3),
+            gyro_gain=np.zeros((3, 3)),
+            gyro_bias_rad_s=np.zeros(3),
+            cov=1e-6 * np.eye(IMU_CAL.COUNT),
+            gravity_m_s2=G,
+            attitudes=12,
+        )
+    prior = calibration_prior(Declared(**values))  # type: ignore[arg-type]
+    recorded = Recorded(imu=imu, trajectory=made.trajectory, calibration=prior)
+    told = diagnose(recorded)
+    if told.stopping:
+        said = [finding.code for finding in told.stopping]
+        return ("stopped" if set(said) <= set(DECLARED[kind]) else "misnamed"), " ".join(said)
+    estimate = estimate_scale(made.trajectory, imu, calibration=recorded.believed, imu_calibration=own)
+    said = [fact.code for fact in (*recorded.contradicted.facts, *estimate.reasons)]
+    off = np.inf
+    if estimate.metres_per_unit is not None and estimate.sigma_log:
+        off = abs(float(np.log(estimate.metres_per_unit / made.truth.metres_per_unit))) / estimate.sigma_log
+    if set(said) & set(DECLARED[kind]):
+        outcome = "weak" if estimate.verdict != "trusted" else "left out" if off < Z95 else "WRONG"
+    elif estimate.verdict == "trusted":
+        outcome = "harmless" if off < Z95 else "WRONG"
+    else:
+        outcome = "misnamed" if off >= Z95 else "harmless"
+    return outcome, " ".join(said)
+
+
+def study_declared(count: int, seed: int) -> int:
+    """Draw, and print a table of what came of each kind."""
+    outcomes: dict[str, Counter[str]] = {kind: Counter() for kind in DECLARED}
+    for k in range(count):
+        kind = list(DECLARED)[k % len(DECLARED)]
+        outcome, said = draw_declared(kind, k, seed)
+        outcomes[kind][outcome] += 1
+        print(f"{k:3d} {kind:28} {outcome:9} {said}", flush=True)
+    columns = ("stopped", "weak", "left out", "harmless", "misnamed", "WRONG")
+    print(f"{'':28}{'drawn':>7}" + "".join(f"{name:>10}" for name in columns))
+    for kind, of in outcomes.items():
+        print(f"{kind:28}{sum(of.values()):7d}" + "".join(f"{of[name]:10d}" for name in columns))
+    total = sum(outcomes.values(), Counter())
+    print(f"{'all':28}{sum(total.values()):7d}" + "".join(f"{total[name]:10d}" for name in columns))
+    return int(total["WRONG"] > 0 or total["misnamed"] > 1)
+
+
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--kinds", nargs="*", default=[])
+    parser.add_argument("--declared", type=int, default=0, help="draw so many declared values instead")
     parser.add_argument("--reconstruct", action="store_true")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
+    if options.declared:
+        return study_declared(options.declared, options.seed)
     report = []
     for i, mistake in enumerate(MISTAKES):
         if options.kinds and mistake.kind not in options.kinds:
@@ -654,6 +792,10 @@ def main(arguments: list[str] | None = None) -> int:
         word = "ok    " if found.caught and found.mended else "MISSED" if not found.caught else "UNMENDED"
         print(f"{word} {mistake.kind:8} {mistake.name:46} {found.seconds:5.1f} s  {found.message[-150:]}", flush=True)
     bad = [row["name"] for row in report if not (row["caught"] and row["mended"])]
+    print(f"{'':10}{'made':>6}{'caught':>8}{'mended':>8}")
+    for kind in dict.fromkeys(row["kind"] for row in report):
+        of = [row for row in report if row["kind"] == kind]
+        print(f"{kind:10}{len(of):6d}{sum(row['caught'] for row in of):8d}{sum(row['mended'] for row in of):8d}")
     print(f"{len(report) - len(bad)} of {len(report)} mistakes were caught, and their advice helped")
     if options.json is not None:
         write_report(options.json, {"mistakes": report})

@@ -65,9 +65,9 @@ def test_advice_goes_by_the_values_of_what_was_found():
 
 
 def test_what_cannot_be_read_is_a_finding_with_the_words_of_its_error():
-    told = unreadable(FormatError("imu.csv", "holds no rows", line=3))
+    told = unreadable(FormatError("imu.csv", Fact.stated("holds no rows"), line=3))
     assert (told.code, told.evidence) == ("unreadable", "imu.csv, line 3: holds no rows")
-    assert unreadable(TimingError("frames.csv has no header")).code == "untimed"
+    assert unreadable(TimingError(Fact.stated("frames.csv has no header"))).code == "untimed"
     fact = Fact("stamps-reversed", path="imu.csv", sensor="gyroscope")
     stamps = TimingError(fact, shown=str(fact))
     assert unreadable(stamps).fact == fact and str(stamps) == str(fact)

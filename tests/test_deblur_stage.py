@@ -31,7 +31,7 @@ def treat(monkeypatch):
         def blur_field(motion, camera, shutter, *, parallax):
             seen["parallax"] = parallax
             if length == 0:
-                raise NotObservableError("motion blur", "no exposure")
+                raise NotObservableError("motion blur", Fact.stated("no exposure"))
             return field
 
         def blur_path(motion, camera, shutter, *, parallax, extent_factor=1.0):

@@ -428,12 +428,30 @@ def test_what_is_wrong_with_pictures_is_found(film: Film, filmed: Recorded) -> N
     measured = next(finding for finding in told.findings if finding.code == "readout-unknown")
     assert "readout_s = 0.0000 under" in measured.advice and measured.numbers["readout_sigma_s"] < 0.002
 
+    rolling = diagnose(replace(clean, timing=replace(film.timing, readout_s=0.02)))
+    assert found(rolling, "declared-readout") == "warning"
+    measured = next(finding for finding in rolling.findings if finding.code == "declared-readout")
+    assert measured.numbers["readout_s"] == 0 and "0.0 ms" in measured.evidence
+
     other = imu_of(FarScene.make(seed=8, duration_s=12.0, texture=np.zeros((2, 2, 3), np.float32)), seconds=12.0)
     assert found(diagnose(replace(clean, imu=other)), "imu-does-not-fit") == "error"
     faster = replace(film.imu, gyro_t_s=1.02 * film.imu.gyro_t_s, accel_t_s=1.02 * film.imu.accel_t_s)
     assert found(diagnose(replace(clean, imu=faster)), "clock-rate") == "error"
     twice = [replace(f, image=film.frames[i - (i % 3 == 2)].image) for i, f in enumerate(film.frames[:30])]
     assert found(diagnose(replace(film, frames=twice).recorded()), "frames-repeated") == "error"
+    # one picture for a while, coded anew each time
+    noise = np.random.default_rng(3)
+    frozen = list(film.frames)
+    for i in range(40, 60):
+        anew = film.frames[40].image.astype(float) + noise.normal(0, 1.0, film.frames[40].image.shape)
+        frozen[i] = replace(frozen[i], image=np.clip(np.rint(anew), 0, 255).astype(np.uint8))
+    told = diagnose(replace(film, frames=frozen).recorded())
+    assert found(told, "frames-repeated") in ("warning", "error")
+    (repeated,) = (finding for finding in told.findings if finding.code == "frames-repeated")
+    assert repeated.numbers["repeated"] == pytest.approx(19, abs=3)
+    for blank, severity in ((2, "warning"), (200, "error")):
+        few = replace(clean, looked_at=300, blank=tuple(f"{i:03}.png" for i in range(blank)))
+        assert found(diagnose(few), "frames-blank") == severity
 
 
 def test_a_calibration_that_turns_the_camera_is_found(filmed: Recorded) -> None:

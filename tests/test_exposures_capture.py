@@ -25,6 +25,7 @@ from colmap_inertial.core.errors import (
     OutputExistsError,
     TimingError,
 )
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ExposureOptions, ReconstructOptions
 from colmap_inertial.imaging.exposure_pairs import replace_departures
 from colmap_inertial.imaging.restoration import shipped
@@ -284,7 +285,7 @@ def test_colmap_is_quiet_while_it_looks_for_the_calibration(capture, tmp_path, m
 
     def look(*args, **options):
         levels.append(pycolmap.logging.minloglevel)
-        raise NotObservableError("calibration", "so")
+        raise NotObservableError("calibration", Fact.stated("so"))
 
     monkeypatch.setattr(plan, "estimate_preliminary_calibration", look)
     pycolmap.logging.minloglevel = 0
@@ -483,7 +484,7 @@ def test_a_fused_frame_is_not_deblurred_again(written, tmp_path):
 
 def test_a_missing_partner_or_network_is_said_before_the_work(capture, tmp_path, monkeypatch, capsys):
     def missing(*args, **options):
-        raise MissingExtraError("restore", "networks run in onnxruntime")
+        raise MissingExtraError("restore", Fact.stated("networks run in onnxruntime"))
 
     monkeypatch.setattr("colmap_inertial.pipeline.stages.inputs.load_network", missing)
     for command in ("reconstruct", "fuse-exposures"):

@@ -11,6 +11,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 from study_fuzz import READERS, outcome, whole_files
 
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 
 MUTANTS = 12
 
@@ -45,7 +46,7 @@ def _build(folder: Path) -> list[Path]:
 
 def test_each_outcome_is_counted_as_what_it_is(subtests, tmp_path_factory):
     for error, counted in (
-        (FormatError("a", "damaged"), "refused"),
+        (FormatError("a", Fact.stated("damaged")), "refused"),
         (KeyError("a"), "foreign"),
         (MemoryError(), "large"),
     ):

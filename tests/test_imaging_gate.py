@@ -479,3 +479,18 @@ def test_frames_that_bridge_a_gap_stay_the_least_blurred_first():
         options=GateOptions(bridge_s=10.0, bridge_deg=3.0),
     )
     assert [d.action for d in turning].count("drop") < 6
+
+
+def test_a_black_or_featureless_image_is_left_alone_whatever_the_recording_says() -> None:
+    trusted = RecordingVerdict(trusted=True, support=16.0, extent_factor=1.0, frames=9, reason=Fact.stated("others do"))
+    noise = np.random.default_rng(1).normal(0, 3.0, (HEIGHT, WIDTH, 3))
+    vector_px = np.zeros((*BlurField.nodes(WIDTH, HEIGHT, 64), 2))
+    vector_px[..., 0] = 14.0
+    blur = BlurField(width=WIDTH, height=HEIGHT, vector_px=vector_px, step_px=64)
+    darker = np.linspace(150, 90, WIDTH)[None, :, None]
+    for level in (0.0, 8.0, 120.0, darker):
+        image = np.clip(np.rint(level + noise), 0, 255).astype(np.uint8)
+        factor, why = judge_frame(image, blur, trusted, GateOptions())
+        assert factor is None and why.code == "frame-blank"
+    textured = shot(0.98, 0.2)[1]
+    assert judge_frame(textured, blur, trusted, GateOptions())[1].code != "frame-blank"

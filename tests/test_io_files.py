@@ -13,6 +13,7 @@ import pytest
 from cases import loop_over
 
 from colmap_inertial.core.errors import FormatError, OutputError, OutputExistsError, describe_environment_fault
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.files import locked, read_json, reading, write_json, write_text
 
 
@@ -127,7 +128,8 @@ def test_what_is_no_json_object_is_a_format_error(tmp_path: Path, text: str, sai
 def test_what_cannot_be_loaded_is_one_sentence(error: Exception, said: str | None) -> None:
     outer = RuntimeError("wrapped")
     outer.__cause__ = error
-    assert describe_environment_fault(outer) == said
+    found = describe_environment_fault(outer)
+    assert (None if found is None else found.with_advice) == said
 
 
 def test_a_package_that_is_missing_is_not_a_damaged_file(tmp_path: Path) -> None:
@@ -147,8 +149,9 @@ def test_a_missing_file_is_a_format_error(tmp_path: Path) -> None:
 HOLD = """
 import sys, time
 from pathlib import Path
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.files import locked
-with locked(Path(sys.argv[1]), "busy"):
+with locked(Path(sys.argv[1]), Fact.stated("busy")):
     print("held", flush=True)
     time.sleep(60)
 """
@@ -156,18 +159,18 @@ with locked(Path(sys.argv[1]), "busy"):
 
 def test_a_lock_is_held_by_one_and_let_go_of_when_its_holder_is_killed(tmp_path):
     lock = tmp_path / "lock"
-    with locked(lock, "mine"):
-        with pytest.raises(OutputExistsError, match=r"^still mine$"), locked(lock, "still mine"):
+    with locked(lock, Fact.stated("mine")):
+        with pytest.raises(OutputExistsError, match=r"^still mine$"), locked(lock, Fact.stated("still mine")):
             pass
-        with pytest.raises(OutputExistsError, match=r"^waited$"), locked(lock, "waited", wait_s=0.1):
+        with pytest.raises(OutputExistsError, match=r"^waited$"), locked(lock, Fact.stated("waited"), wait_s=0.1):
             pass
     holder = subprocess.Popen([sys.executable, "-c", HOLD, str(lock)], stdout=subprocess.PIPE, text=True)
     assert holder.stdout is not None
     with holder.stdout:
         assert holder.stdout.readline() == "held\n"
-        with pytest.raises(OutputExistsError, match="of a process"), locked(lock, "of a process"):
+        with pytest.raises(OutputExistsError, match="of a process"), locked(lock, Fact.stated("of a process")):
             pass
         holder.kill()
         holder.wait()
-    with locked(lock, "free"):
+    with locked(lock, Fact.stated("free")):
         pass

@@ -21,6 +21,7 @@ from colmap_inertial.colmap.depth_maps import MadeFrom
 from colmap_inertial.colmap.loop_closure import LoopClosure
 from colmap_inertial.colmap.mapping import MapRecord, ModelEnds
 from colmap_inertial.core.errors import AlreadyMetricError, FormatError, MappingError, OutputError, OutputExistsError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ProjectOptions
 from colmap_inertial.core.types import ScaleEstimate
 from colmap_inertial.io.calibration import calibration_prior
@@ -232,7 +233,7 @@ def test_a_run_that_stops_leaves_nothing_metric_of_an_earlier_one(workspace, col
         (workspace.root / name).touch()
     capture = Capture(path=tmp_path, calibration=calibration_prior())
     with pytest.raises(MappingError), reporting_stops(workspace, capture):
-        raise MappingError("COLMAP found no model")
+        raise MappingError(Fact.stated("COLMAP found no model"))
     left = {path.name for path in workspace.root.iterdir()}
     assert left == {"images", "colmap", "trajectory_mine.txt", "report.html", "report.json", workspace.stamps.name}
 

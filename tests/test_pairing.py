@@ -38,6 +38,7 @@ from colmap_inertial.colmap.two_views import (
     read_ray_pairs,
 )
 from colmap_inertial.core.errors import InertialError, NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import quat_from_matrix, so3_exp
 from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.core.types import CAL, CameraModel, FrameTiming, ImuRecording
@@ -510,7 +511,7 @@ def test_pairs_without_a_gyroscope_are_those_of_before(database, tmp_path, monke
     monkeypatch.setattr(pairing, "match_pairs", lambda db, pairs, context, **_: matched.extend(pairs) or 0)
 
     def refused(*_):
-        raise NotObservableError("time offset", "no")
+        raise NotObservableError("time offset", Fact.stated("no"))
 
     monkeypatch.setattr(pairing, "estimate_gyro_orientations", refused)
     timing = FrameTiming(names=("a", "b", "c"), t_s=np.arange(3.0))
@@ -528,7 +529,7 @@ def test_without_a_gyroscope_a_long_capture_matches_neighbours_only(database, tm
     monkeypatch.setattr(pairing, "match_pairs", lambda db, pairs, context, **_: matched.extend(pairs) or 0)
 
     def refused(*_):
-        raise NotObservableError("time offset", "no")
+        raise NotObservableError("time offset", Fact.stated("no"))
 
     monkeypatch.setattr(pairing, "read_rotations_rad", refused)
     none_stands(monkeypatch, 40)

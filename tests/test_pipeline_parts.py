@@ -16,6 +16,7 @@ from cases import loop_over
 from colmap_inertial.cli.terminal import show_applied
 from colmap_inertial.colmap.sparse import check_pair_names, image_pairs
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError, OutputExistsError, TimingError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import MappingOptions, ReconstructOptions
 from colmap_inertial.core.types import CameraModel, Frame, FrameTiming
 from colmap_inertial.io.calibration import calibration_prior
@@ -397,7 +398,7 @@ def test_a_stage_that_fails_for_a_reason_leaves_nothing_behind(tmp_path):
 
     def fail(partial):
         partial[0].mkdir()
-        raise InertialError("too few")
+        raise InertialError(Fact.stated("too few"))
 
     with pytest.raises(InertialError, match="too few"):
         StepRunner(workspace).run("frames", {}, [tmp_path / "images"], fail)

@@ -131,7 +131,7 @@ def test_pictures_alone_are_mapped_and_scaled(pictures, tmp_path, monkeypatch, c
 
     def cannot(self, folder):
         assert list(folder.iterdir()) == []  # no picture is copied before
-        raise InertialError("no worker sees it")
+        raise InertialError(Fact.stated("no worker sees it"))
 
     with monkeypatch.context() as patch:
         patch.setattr(Processes, "require", cannot)
@@ -139,7 +139,7 @@ def test_pictures_alone_are_mapped_and_scaled(pictures, tmp_path, monkeypatch, c
         assert code and "no worker sees it" in err and not out.exists()
 
     def nothing_found(*_, **__):
-        raise TargetNotFoundError("no marker was found")
+        raise TargetNotFoundError(Fact.stated("no marker was found"))
 
     monkeypatch.setattr(rooms, "validate_model", nothing_found)
     code, _, err = run(capsys, *args)
@@ -187,7 +187,7 @@ def test_a_mapping_that_was_changed_since_is_not_gone_on_with(pictures, tmp_path
     args = ["reconstruct", folder, tmp_path / "out", "--scale-from", "target", "--target", "aruco:DICT_4X4_50:0.1"]
 
     def nothing_found(*_, **__):
-        raise TargetNotFoundError("no marker was found")
+        raise TargetNotFoundError(Fact.stated("no marker was found"))
 
     monkeypatch.setattr(rooms, "validate_model", nothing_found)
     assert run(capsys, *args)[0] == 5

@@ -8,6 +8,7 @@ import pytest
 from test_validate_lengths import validated
 
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ReferenceOptions
 from colmap_inertial.reconstruction.drivers import reference
 from colmap_inertial.reconstruction.drivers.reference import _scale_by_distance, _scale_by_target
@@ -83,7 +84,7 @@ def test_the_model_lies_in_sparse_or_is_the_folder_itself(tmp_path, monkeypatch)
 
     def look(folder):
         asked.append(folder)
-        raise FormatError(folder, "seen")
+        raise FormatError(folder, Fact.stated("seen"))
 
     monkeypatch.setattr(reference, "only_model", look)
     known = ReferenceOptions(scale_from="distance", between=("1,2,3", "4,6,3"), distance="2.0+-0.03")

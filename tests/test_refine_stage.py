@@ -30,6 +30,7 @@ from colmap_inertial.model import Model, transformed
 from colmap_inertial.model.layout import find_made_from, read_layout
 from colmap_inertial.pipeline.run.context import Recording
 from colmap_inertial.pipeline.run.runner import canonical
+from colmap_inertial.pipeline.stages import refine as refine_stage
 from colmap_inertial.pipeline.stages.defaults import default_model_stages
 from colmap_inertial.pipeline.stages.imaging_plan import GyroView
 from colmap_inertial.pipeline.stages.inputs import StageInputs
@@ -46,10 +47,11 @@ from colmap_inertial.tools.simulate.tracks import TrackOptions
 UNKNOWN = calibration_prior()
 
 
-def adjusted(model):
+def adjusted(model, *, keeps_intrinsics=False):
     """COLMAP's bundle adjustment."""
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = options.refine_principal_point = False
+    options.refine_focal_length = options.refine_extra_params = not keeps_intrinsics
     getattr(options, "ceres", options).solver_options.num_threads = 1
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
@@ -363,10 +365,58 @@ def test_a_global_shutter_that_nobody_declared_costs_no_trust(walked):
     tracks, model = walked
     assert tracks.timing.readout_s is None and model.scale.verdict == "trusted" and model.treatments == ()
     assert 0 < model.scale.parts["rolling_shutter"] < 1e-3
-    # a declared one is not looked for
+    # a declared one is believed where nothing contradicts it
     start = Model(reconstruction=model.reconstruction, colmap_index=0, timing=replace(tracks.timing, readout_s=0.0))
     judged = MetricStage(imu=tracks.imu, calibration=UNKNOWN).judge_shutter(start, model.scale)
     assert judged.scale is model.scale
+
+
+def test_a_declared_global_shutter_that_the_images_contradict_is_named(rolled, bent):
+    tracks, _, _, _ = rolled
+    start = Model(reconstruction=bent, colmap_index=0, timing=replace(tracks.timing, readout_s=0.0))
+    model = MetricStage(imu=tracks.imu, calibration=calibration_prior(Declared(readout_s=0.0)))(start)
+    assert model.scale.verdict == "weak"
+    (found,) = (reason for reason in model.scale.reasons if reason.code == "rolling-shutter-ignored")
+    assert found.values["declared_global"] and found.values["readout_s"] == pytest.approx(0.025, rel=0.2)
+    assert model.treatments[-1].reason == found
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.9, 1.35])
+def test_a_declared_focal_length_is_compared_with_what_the_images_show(factor):
+    tracks = tracks_of(walk(16.0, points_per_m=50.0))
+    reconstruction = tracks.reconstruction()
+    true_px = {}
+    for camera in reconstruction.cameras.values():
+        for i in camera.focal_length_idxs():
+            true_px[i] = camera.params[i]
+            camera.params[i] *= factor
+    start = Model(
+        reconstruction=adjusted(reconstruction, keeps_intrinsics=True),
+        colmap_index=0,
+        timing=replace(tracks.timing, readout_s=0.0),
+    )
+    model = MetricStage(imu=tracks.imu, calibration=UNKNOWN, keeps_intrinsics=True)(start)
+    found = [reason for reason in model.scale.reasons if reason.code == "declared-focal-length"]
+    assert bool(found) == (factor != 1.0)
+    if found:
+        assert model.scale.verdict != "trusted" and model.scale.reasons[0] == found[0]
+        values, true_px = found[0].values, float(np.mean(list(true_px.values())))
+        assert values["declared_px"] == pytest.approx(factor * true_px)
+        # a few steps go most of the way
+        assert abs(values["found_px"] - true_px) < 0.5 * abs(values["declared_px"] - true_px)
+    # where the intrinsics were refined, they are COLMAP's
+    refined = MetricStage(imu=tracks.imu, calibration=UNKNOWN)(start)
+    assert "declared-focal-length" not in {reason.code for reason in refined.scale.reasons}
+
+
+def test_an_imu_that_contradicts_the_pictures_beyond_any_noise_makes_a_scale_weak(walked):
+    _, model = walked
+    for chi2, verdict in ((5.0, "trusted"), (548.0, "weak")):
+        reason = Fact("imu-contradicts-pictures", chi2=chi2)
+        doubted = refine_stage._doubt_contradicted(model, SimpleNamespace(reason=reason, chi2=chi2))
+        assert doubted.scale.verdict == verdict and (reason in doubted.scale.reasons) == (verdict == "weak")
+    other = SimpleNamespace(reason=Fact("refinement-no-better"), chi2=548.0)
+    assert refine_stage._doubt_contradicted(model, other) is model
 
 
 def test_a_shutter_that_may_roll_is_in_the_interval(walked):

@@ -30,6 +30,7 @@ from colmap_inertial.checks.report.still_axes import choose_axis, equalise
 from colmap_inertial.checks.words import outcome_of_model
 from colmap_inertial.cli import main
 from colmap_inertial.core.errors import FormatError, InertialError, MappingError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import quat_exp, quat_rotate
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.core.types import (
@@ -1048,11 +1049,11 @@ def test_a_report_that_fails_costs_no_result_and_is_told(project, tmp_path, monk
 def test_a_failing_report_of_a_stop_hides_no_reason(tmp_path, monkeypatch, report_failures):
     workspace, capture = Workspace(tmp_path), Capture(path=tmp_path, calibration=calibration_prior())
     with pytest.raises(MappingError, match="nothing matches") as stopped, reporting_stops(workspace, capture):
-        raise MappingError("nothing matches")
+        raise MappingError(Fact.stated("nothing matches"))
     assert stopped.value.__notes__ == [f"what was found, and what to do: {tmp_path / 'report.html'}"]
     monkeypatch.setattr("colmap_inertial.reconstruction.drivers.reporting.write_report", broken)
     with pytest.raises(MappingError, match="nothing matches"), reporting_stops(workspace, capture):
-        raise MappingError("nothing matches")
+        raise MappingError(Fact.stated("nothing matches"))
     assert len(report_failures) == 1
     report_failures.clear()
 

@@ -18,6 +18,7 @@ from colmap_inertial.checks.report.content import _blur
 from colmap_inertial.cli import main
 from colmap_inertial.core import threads
 from colmap_inertial.core.errors import FormatError, MissingExtraError, NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.imaging.restoration import shipped
 from colmap_inertial.io.frames import read_frames
 from colmap_inertial.pipeline.run.progress import silent
@@ -225,7 +226,7 @@ def test_asked_for_by_name_it_is_an_error_where_gyroscope_and_pixels_do_not_agre
     tmp_path, blurred, weights, method, monkeypatch
 ):
     def fails(*args, **kwargs):
-        raise NotObservableError("time offset", "so")
+        raise NotObservableError("time offset", Fact.stated("so"))
 
     monkeypatch.setattr(imaging, "estimate_preliminary_calibration", fails)
     with pytest.raises(NotObservableError):

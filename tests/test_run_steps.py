@@ -30,6 +30,7 @@ from colmap_inertial.colmap.sparse import (
     write_gravity_priors,
 )
 from colmap_inertial.core.errors import FormatError, NotObservableError, OutputError, OutputExistsError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import MappingOptions, ProjectOptions, ReconstructOptions
 from colmap_inertial.core.threads import map_in_order
 from colmap_inertial.core.types import CALIBRATION_PARAMETERS, CameraModel, FrameTiming, ImuRecording, Treatment
@@ -738,7 +739,7 @@ def test_intrinsics_are_refined_where_that_is_asked_for(features, tmp_path, monk
 
 def test_the_longest_exposure_tells_whether_anything_may_be_blurred(tmp_path, monkeypatch):
     def none(recording, context):
-        raise NotObservableError("the pixels' motion", "looked at")
+        raise NotObservableError("the pixels' motion", Fact.stated("looked at"))
 
     monkeypatch.setattr(imaging, "estimate_preliminary_calibration", none)
     capture = replace(recording().capture, camera=CAMERA)
@@ -755,7 +756,7 @@ def test_the_longest_exposure_tells_whether_anything_may_be_blurred(tmp_path, mo
 
 def test_a_quick_turn_counts_where_a_frame_may_have_been_taken(subtests, tmp_path_factory, monkeypatch):
     def none(recording, context):
-        raise NotObservableError("the pixels' motion", "looked at")
+        raise NotObservableError("the pixels' motion", Fact.stated("looked at"))
 
     monkeypatch.setattr(imaging, "estimate_preliminary_calibration", none)
     for label, offset_sigma_s, turned_at_s, looked_at in (

@@ -221,7 +221,9 @@ def test_without_json_a_scale_is_looked_at(project, capsys):
 def test_an_error_is_json_too_where_json_was_asked_for(tmp_path, capsys):
     code, out, err = run(capsys, "scale", tmp_path / "nowhere", "--json", "-")
     assert code == 2 and "no such file" in err
-    assert json.loads(out) == {"error": err.removeprefix("error: ").strip(), "exit_code": 2}
+    told = json.loads(out)
+    assert (told["error"], told["exit_code"]) == (err.removeprefix("error: ").strip(), 2)
+    assert told["error_details"]["code"]
 
 
 def test_quiet_and_verbose_are_not_given_together(subtests, capsys):

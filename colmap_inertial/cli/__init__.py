@@ -23,7 +23,8 @@ from colmap_inertial.cli.help import options_of, print_help, print_overview
 from colmap_inertial.cli.models import Align, Apply, CalibrateImu, Diagnose, Export, Scale, Validate, View
 from colmap_inertial.cli.process import INTERRUPTED, TERMINATED, Terminated, answering_signals, require_limits
 from colmap_inertial.cli.speech import Speaker, log_on_terminal, print_json
-from colmap_inertial.core.errors import InertialError, describe_environment_fault
+from colmap_inertial.core.errors import InertialError, describe_environment_fault, fact_of
+from colmap_inertial.core.facts import Fact, with_sentences
 from colmap_inertial.core.options import ProjectOptions, ReadLimits, ReconstructOptions, ReferenceOptions
 from colmap_inertial.core.printing import say
 
@@ -69,8 +70,8 @@ _COMMON: dict[str, tuple[str, ...]] = {
 _HELP, _HELP_ALL = ("-h", "--help"), "--help-all"
 #: Options that take several values, and what is said where none follows.
 _LISTS = {
-    "--calibration": "--calibration takes a file, or two: from `align --out`, from `calibrate-imu --out`",
-    "--colmap": "--colmap takes SECTION.option=value, such as Mapper.init_num_trials=100",
+    "--calibration": "calibration-takes-files",
+    "--colmap": "colmap-takes-settings",
 }
 _SETTING = re.compile(r"\w+\.\w+=")
 
@@ -111,7 +112,7 @@ def parse(args: Sequence[str]) -> Speaker:
     command: Any = Union[tuple(choices)]  # noqa: UP007 (built at run time)
     made: Speaker = tyro.cli(command, prog="colmap-inertial", description=DESCRIPTION, args=list(args), config=_CONFIG)
     if made.quiet and made.verbose:
-        raise InertialError("give one of --quiet and --verbose")
+        raise InertialError(Fact("quiet-and-verbose"))
     return made
 
 
@@ -138,7 +139,7 @@ def _expand_options(args: Sequence[str]) -> list[str]:
             last = plain.rpartition(".")[2].removeprefix("--")
             meant = [option for option in options if option.rpartition(".")[2].removeprefix("--") == last]
             if len(meant) > 1:
-                raise InertialError(f"{args[0]}: which of {' and '.join(meant)} is meant by {name}?")
+                raise InertialError(Fact("option-ambiguous", command=args[0], options=meant, name=name))
             grouped = "." in plain and "." in "".join(meant)
             word = f"{meant[0]}{equals}{value}" if meant and not grouped else word
         words.append(word)
@@ -149,17 +150,17 @@ def _require_known(args: Sequence[str]) -> None:
     """Refuse a command or an option that there is not, also where something else is missing."""
     if not args or args[0].startswith("-"):
         if args and args[0] not in (*_HELP, "--version", "--tyro-print-completion"):
-            raise InertialError(f"a command comes first, before {args[0]} (--help lists them)")
+            raise InertialError(Fact("command-comes-first", word=args[0]))
         return
     command = args[0].replace("_", "-")
     if command not in _COMMANDS:
-        raise InertialError(f"there is no command {args[0]}{_suggest_nearest(args[0], _COMMANDS)} (--help lists them)")
+        raise InertialError(Fact("no-such-command", word=args[0], nearest=_find_nearest(args[0], _COMMANDS)))
     words = [word.partition("=")[0] for word in args[1:] if word.startswith("--") and word != "--"]
     options = _options(command)
     for word in words:
         if word.replace("_", "-") not in options:
             raise InertialError(
-                f"{args[0]} has no option {word}{_suggest_nearest(word, options)} ({args[0]} --help lists them)"
+                Fact("no-such-option", command=args[0], option=word, nearest=_find_nearest(word, options))
             )
 
 
@@ -176,9 +177,9 @@ def _options(command: str) -> tuple[str, ...]:
     return tuple(options)
 
 
-def _suggest_nearest(word: str, choices: Iterable[str]) -> str:
+def _find_nearest(word: str, choices: Iterable[str]) -> str | None:
     like = difflib.get_close_matches(word, list(choices), n=1)
-    return f"; did you mean {like[0]}?" if like else ""
+    return like[0] if like else None
 
 
 def _move_lists_last(args: Sequence[str]) -> list[str]:
@@ -196,7 +197,7 @@ def _move_lists_last(args: Sequence[str]) -> list[str]:
             continue
         remaining[:1] = [value] if equals else []
         if not remaining or remaining[0].startswith("--"):
-            raise InertialError(_LISTS[word])
+            raise InertialError(Fact(_LISTS[word]))
         lists[word].append(remaining.pop(0))
         while remaining and (
             remaining[0].lower().endswith(".json") if word == "--calibration" else _SETTING.match(remaining[0])
@@ -260,7 +261,7 @@ def _main(args: Sequence[str] | None) -> None:
     except InertialError as error:
         code = error.exit_code
         if command.answers_in_json:
-            print_json({"error": str(error), "exit_code": code})
+            print_json({**with_sentences({"error": fact_of(error)}), "error": str(error), "exit_code": code})
         say("\n".join([f"error: {error}", *getattr(error, "__notes__", ())]), error=True)
     except KeyboardInterrupt as stop:
         resumes = isinstance(command, Reconstruct | Deblur | FuseApertures | FuseExposures | Batch)
@@ -271,6 +272,6 @@ def _main(args: Sequence[str] | None) -> None:
         reason = describe_environment_fault(error)
         if reason is None:
             raise
-        say(f"error: {reason}", error=True)
+        say(f"error: {reason.with_advice}", error=True)
         code = 2
     sys.exit(code)

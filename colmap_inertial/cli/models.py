@@ -23,7 +23,7 @@ from colmap_inertial.cli.terminal import (
     show_view,
 )
 from colmap_inertial.core.errors import InertialError
-from colmap_inertial.core.facts import with_sentences
+from colmap_inertial.core.facts import Fact, with_sentences
 from colmap_inertial.core.options import (
     ExportImages,
     ExportProgram,
@@ -270,7 +270,7 @@ class CalibrateImu(Reader):
         first, *others = self.recording
         compared = bool(others) or (first / "result.json").is_file()
         if compared and self.gravity != GravityOptions():
-            raise InertialError("gravity is for recordings of rests; with results, leave out the place")
+            raise InertialError(Fact("gravity-is-of-rests"))
         if compared:
             by_targets = calibrate_from_results(self.recording, self.out, device=self.remember or "")
         else:
@@ -283,6 +283,10 @@ class CalibrateImu(Reader):
             more |= {"verdict": by_rests.verdict}
             self.tell(lambda: show_imu_calibration(by_rests, first, self.out, kept), self.out, more)
         return 0
+
+
+#: Errors that a description of the table answers.
+_TABLE_CODES = ("table-unclear", "table-open")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -312,9 +316,9 @@ class Diagnose(SourceReader):
             with self.progress() as progress:
                 diagnosis = diagnose_source(self.read_from(), json=self.json_file, progress=progress)
         except InertialError as error:
-            if report is None or not self.talks or error.fact is None or error.fact.code != "table-unclear":
+            if report is None or not self.talks or error.code not in _TABLE_CODES:
                 raise
-            raise InertialError(f"{self.source}: {error.fact}; the capture.toml above describes it") from None
+            raise InertialError(Fact("table-described-above", source=self.source, found=error.fact)) from None
         self.tell(lambda: show_diagnosis(diagnosis, self.source), diagnosis.as_json(), written=True)
         return 1 if diagnosis.worst == "error" else 0
 

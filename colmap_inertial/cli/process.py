@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from types import FrameType
 
 from colmap_inertial.core.errors import InertialError
+from colmap_inertial.core.facts import Fact
 
 #: What a shell gives the end by a signal: 128 and the signal's number.
 INTERRUPTED, TERMINATED = 130, 143
@@ -115,12 +116,6 @@ def require_limits(*, to_load: bool = False) -> None:
     if to_load and (space == resource.RLIM_INFINITY or space >= loaded):
         return
     if space != resource.RLIM_INFINITY and space < least:
-        raise InertialError(
-            f"only {space / 1e9:.2g} GB of memory are allowed to a process here, and {least / 1e9:.2g} GB are needed: "
-            f"raise the limit (ulimit -v {least >> 10})"
-        )
+        raise InertialError(Fact("too-little-memory-allowed", allowed_bytes=space, needed_bytes=least))
     if files != resource.RLIM_INFINITY and files < LEAST_FILES:
-        raise InertialError(
-            f"only {files} files may be open at a time here, and {LEAST_FILES} are needed: raise the limit (ulimit -n "
-            f"{LEAST_FILES})"
-        )
+        raise InertialError(Fact("too-few-files-allowed", allowed=files, needed=LEAST_FILES))

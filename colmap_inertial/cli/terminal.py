@@ -74,7 +74,8 @@ def scale_lines(estimate: ScaleEstimate) -> list[Line]:
 
     from colmap_inertial.checks.words import half_width_pct, length_in_words, scale_facts, sensor_facts
 
-    metres = "no metres: the recording does not determine the scale"
+    stopped = any(reason.code == "force-goes-on" for reason in estimate.reasons)
+    metres = "no metres: " + ("stopped by what is wrong" if stopped else "the recording does not determine the scale")
     if estimate.metres_per_unit is not None and estimate.ci95 is not None:
         metres = length_in_words(estimate.verdict, half_width_pct(estimate.metres_per_unit, estimate.ci95))
     values = estimate.as_json()

@@ -33,6 +33,7 @@ from colmap_inertial.colmap.depth_maps import (
 from colmap_inertial.colmap.sweep_stereo import SweptWorkspace
 from colmap_inertial.colmap.tsdf import tsdf_mesh
 from colmap_inertial.core.errors import FormatError, OutputError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import DenseOptions
 from colmap_inertial.io.files import path_in, read_json, write_json
 from colmap_inertial.io.images import read_image
@@ -147,7 +148,7 @@ def _densify(
     kind, mapped = find_maps(folder, names)
     result = DenseResult(folder=folder, images=len(names), depth_maps=len(mapped), maps=maker)
     if not mapped:
-        waiting = f"{folder} has no depth maps: no two images see enough of the same under a fit angle"
+        waiting = Fact("no-depth-maps", folder=str(folder))
         log.warning("%s", waiting)
         return replace(result, waiting=waiting)
     if len(mapped) < len(names):
@@ -265,7 +266,9 @@ def _undistort(session: Session, index: int, images: Path, prepared: _Prepared) 
         pycolmap.undistort_images(str(scratch), str(model), str(images), undistort_options=undistortion)
         lost = [name for name in names if not (scratch / "images" / name).is_file()]
         if lost:
-            raise OutputError(f"{folder}: COLMAP could not undistort {len(lost)} of {len(names)} images ({lost[0]})")
+            raise OutputError(
+                Fact("images-not-undistorted", folder=str(folder), count=len(lost), of=len(names), image=lost[0])
+            )
         shutil.copyfile(model / TRANSFORM_FILE, scratch / "sparse" / TRANSFORM_FILE)
         for source, target in zip((scratch / "images", scratch / "sparse"), partial, strict=True):
             os.replace(source, target)
@@ -290,14 +293,21 @@ def _check_images(images: Path, model: Path, reconstruction: pycolmap.Reconstruc
         image = reconstruction.image(i)
         path = path_in(images, image.name, model)
         if not path.is_file():
-            raise FormatError(path, "no such picture, but the model has it; give the folder of its images")
+            raise FormatError(path, Fact("picture-of-model-missing"))
         if image.camera_id not in checked:
             checked.add(image.camera_id)
             height, width = read_image(path).shape[:2]
             camera = reconstruction.camera(image.camera_id)
             if (width, height) != (camera.width, camera.height):
                 raise FormatError(
-                    path, f"is {width}x{height}, but its camera in the model is {camera.width}x{camera.height}"
+                    path,
+                    Fact(
+                        "picture-unlike-its-camera",
+                        width=width,
+                        height=height,
+                        camera_width=camera.width,
+                        camera_height=camera.height,
+                    ),
                 )
 
 

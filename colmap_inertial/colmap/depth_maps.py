@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from colmap_inertial.core.errors import FormatError, InertialError, OutputError, OutputExistsError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import opencv_px_from_colmap
 from colmap_inertial.io.files import path_in, read_json, write_json
 from colmap_inertial.model import read_model
@@ -100,7 +101,7 @@ class DenseResult:
     mesh, faces
         Its surface (PLY); ``None`` where none was asked for, or there are no points.
     waiting
-        Why it is incomplete; empty where it is finished.
+        Why it is incomplete; ``None`` where it is finished.
     """
 
     folder: Path
@@ -112,12 +113,12 @@ class DenseResult:
     points: int = 0
     mesh: Path | None = None
     faces: int = 0
-    waiting: str = ""
+    waiting: Fact | None = None
 
     def as_json(self, root: Path) -> dict[str, object]:
         """As JSON types; paths are relative to ``root``."""
         paths = {name: str(value.relative_to(root)) for name, value in vars(self).items() if isinstance(value, Path)}
-        return vars(self) | paths | {"waiting": self.waiting or None}
+        return vars(self) | paths | {"waiting": None if self.waiting is None else str(self.waiting)}
 
 
 def has_depth_maps(folder: Path) -> bool:
@@ -173,18 +174,12 @@ def choose_maker(
     # an earlier version's record does not say: only patch-match made maps then
     maker: Maker = "plane sweep" if stated.get("maps") == "plane sweep" else "patch-match"
     if maker == "plane sweep" and any(file.name.endswith(".photometric.bin") for file in maps):
-        raise OutputExistsError(
-            f"{folder / 'stereo'} holds maps of COLMAP's patch-match, but {record} says that the plane sweep made "
-            'them; remove depth_maps and normal_maps, or, where patch-match made them all, write "maps": "patch-match" '
-            "there"
-        )
+        raise OutputExistsError(Fact("maps-of-two-makers", stereo=str(folder / "stereo"), record=str(record)))
     wanted = _plan_maps(model, max_image_size, maker, settings)
     if all(stated.get(key, default) == getattr(wanted, key) for key, default in _MADE_FROM):
         return wanted, True
     if maker == "patch-match":
-        raise OutputExistsError(
-            f"{folder / 'stereo'} holds depth maps of another model or other options; rename or remove {folder}"
-        )
+        raise OutputExistsError(Fact("maps-of-another-model", stereo=str(folder / "stereo"), folder=str(folder)))
     for file in maps:
         remove(file)
     return _plan_maps(model, max_image_size, here, settings), False
@@ -227,10 +222,7 @@ def patch_match(
     done = _run_apart(_PATCH_MATCH, folder, max_image_size or -1, *settings.of("stereo"), watch=watch)
     if done.returncode:
         message = _last_line(done)
-        raise InertialError(
-            f"{folder}: COLMAP's patch-match ended with code {done.returncode}: {message}. Started again, it continues "
-            "with the next depth map"
-        )
+        raise InertialError(Fact("patch-match-failed", folder=str(folder), exit_code=done.returncode, detail=message))
 
 
 def mesh_points(fused: Path, target: Path, *, depth: int, trim: float, context: RunContext) -> None:
@@ -259,7 +251,7 @@ def mesh_points(fused: Path, target: Path, *, depth: int, trim: float, context: 
     settings = context.colmap.of("fusion")
     done = _run_apart(_POISSON, fused, target, depth, trim, context.num_threads, *settings)
     if done.returncode or not target.is_file():
-        raise OutputError(f"{fused.parent}: COLMAP wrote no mesh ({_last_line(done)}); are disk or memory full?")
+        raise OutputError(Fact("no-mesh-written", folder=str(fused.parent), detail=_last_line(done)))
 
 
 def _run_apart(
@@ -301,7 +293,7 @@ def find_maps(folder: Path, names: Sequence[str]) -> tuple[str, list[str]]:
                     path = map_file(folder, what, name, kind)
                     sizes.append((path.stat().st_size - check_map(path, channels)) // channels)
                 if sizes[0] != sizes[1]:
-                    raise FormatError(map_file(folder, "normal", name, kind), "is not as large as its depth map")
+                    raise FormatError(map_file(folder, "normal", name, kind), Fact("normals-of-other-size"))
             return kind, mapped
     return "geometric", []
 
@@ -377,7 +369,7 @@ def fuse_maps(
     remove(scratch)
     visible = targets[0].with_name(targets[0].name + ".vis")
     if not visible.is_file():
-        raise OutputError(f"{targets[0].parent}: COLMAP did not write the fused points; is the disk full?")
+        raise OutputError(Fact("points-not-written", folder=str(targets[0].parent)))
     os.replace(visible, targets[1])
 
 

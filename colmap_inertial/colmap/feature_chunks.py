@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from colmap_inertial.colmap.parts import write_part_database
 from colmap_inertial.core.errors import FormatError, MappingError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.sqlite import open_foreign
 from colmap_inertial.pipeline.run.chunks import Chunk, Executor, do_chunks
 from colmap_inertial.pipeline.run.runner import fingerprint, remove
@@ -56,7 +57,7 @@ class _DatabaseWork:
         path = made / _MADE
         with open_foreign(path) as opened:
             if opened.execute("PRAGMA quick_check").fetchone() != ("ok",):
-                raise FormatError(path, "damaged")
+                raise FormatError(path, Fact("database-damaged"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,14 +102,14 @@ class FindFeatures(_DatabaseWork):
 
         for path in self.reader.values():
             if isinstance(path, Path) and not path.exists():
-                raise MappingError(f"{path} cannot be seen here")
+                raise MappingError(Fact("file-unseen", path=str(path)))
         new = {"existing_camera_id": pycolmap.ImageReaderOptions().existing_camera_id}
         replace(self, reader={**self.reader, **new}).find(made / _MADE, images)
         with pycolmap.Database.open(str(made / _MADE)) as opened:
             found = {image.name for image in opened.read_all_images()}
         for name in self.names:
             if name not in found:
-                raise MappingError(f"COLMAP could not read {images / name}")
+                raise MappingError(Fact("image-unread", path=str(images / name)))
             told()
 
 

@@ -24,6 +24,7 @@ from colmap_inertial.colmap.sparse import (
 )
 from colmap_inertial.colmap.two_views import Features, open_features
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import CameraModel
 from colmap_inertial.io.files import check_names
 from colmap_inertial.io.sqlite import open_foreign
@@ -76,8 +77,13 @@ class GivenDatabase:
         if strange:
             raise FormatError(
                 self.path,
-                f"{len(strange)} of its {len(self.sizes)} images are not the capture's ({strange[0]}; the capture has "
-                f"{names[0]}): give a database of the capture's images, with their names",
+                Fact(
+                    "images-of-another-capture",
+                    count=len(strange),
+                    of=len(self.sizes),
+                    image=strange[0],
+                    expected=names[0],
+                ),
             )
         return tuple(name for name in names if name in self.sizes)
 
@@ -87,8 +93,14 @@ class GivenDatabase:
         if size != (width, height):
             raise FormatError(
                 self.path,
-                f"{name} is {size[0]}x{size[1]} there and {width}x{height} in the capture: give a database of the "
-                "images in their own size",
+                Fact(
+                    "given-image-of-another-size",
+                    image=name,
+                    width=size[0],
+                    height=size[1],
+                    capture_width=width,
+                    capture_height=height,
+                ),
             )
 
 
@@ -101,9 +113,9 @@ def read_given(path: Path) -> GivenDatabase:
         For a file that is no COLMAP database, damaged or in use, and for one that has nothing to continue with.
     """
     if not path.is_file():
-        raise FormatError(path, "no such file: --database takes a COLMAP database")
+        raise FormatError(path, Fact("no-given-database"))
     if any(beside.is_file() and beside.stat().st_size for beside in _side_files(path)):
-        raise FormatError(path, "another program has it open, or ended while it wrote: close it there")
+        raise FormatError(path, Fact("database-in-use"))
     with open_foreign(path) as database:
         return _read_given(database, path)
 
@@ -115,27 +127,26 @@ def _side_files(path: Path) -> Iterator[Path]:
 def _read_given(database: sqlite3.Connection, path: Path) -> GivenDatabase:
     answer = database.execute("PRAGMA quick_check(1)").fetchone()[0]
     if answer != "ok":
-        raise FormatError(path, f"damaged: {answer}")
+        raise FormatError(path, Fact("database-check-failed", detail=answer))
     missing = _TABLES - {row[0] for row in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     if missing:
-        raise FormatError(path, f"is no COLMAP database: it has no table {min(missing)}")
+        raise FormatError(path, Fact("no-colmap-database", table=min(missing)))
     query = "SELECT name, width, height FROM images LEFT JOIN cameras USING (camera_id)"
     sizes = {name: (width, height) for name, width, height in database.execute(query)}
     check_names(sizes, path)
     if None in {width for width, _ in sizes.values()}:
-        raise FormatError(path, "damaged: an image has no camera")
+        raise FormatError(path, Fact("image-without-camera"))
     for table, wrong in _LENGTHS.items():
         (count,) = database.execute(f"SELECT COUNT(*) FROM {table} WHERE rows > 0 AND ({wrong})").fetchone()
         if count:
-            raise FormatError(path, f"damaged: {count} rows of {table} are not as long as they say")
+            raise FormatError(path, Fact("rows-of-other-length", count=count, table=table))
     (keypoints,) = database.execute("SELECT COUNT(*) FROM keypoints WHERE rows > 0").fetchone()
     if not keypoints:
-        raise FormatError(path, "holds no keypoints: extract features first, or leave --database out")
+        raise FormatError(path, Fact("no-keypoints"))
     if not any(_count(database, table) for table in ("matches", "two_view_geometries")) and not _can_match(database):
         raise FormatError(
             path,
-            "holds no matches, and descriptors that pycolmap cannot match here (it matches COLMAP's own SIFT): match "
-            "the pairs with the program that made them",
+            Fact("matches-missing"),
         )
     return GivenDatabase(path=path, sizes=sizes)
 
@@ -258,7 +269,7 @@ def _copy_matches(source: Features, target: Features, path: Path, *, with_geomet
             matches = np.array(geometry.inlier_matches, dtype=np.int64).reshape(-1, 2)
         limits = [target.database.num_keypoints_for_image(number) for number in own]
         if (matches >= limits).any():
-            raise FormatError(path, f"damaged: matches of {first} and {second} name keypoints that there are not")
+            raise FormatError(path, Fact("matches-of-missing-keypoints", first=first, second=second))
         target.database.write_matches(own[0], own[1], matches.astype(np.uint32))
         if geometry is not None and with_geometries:
             target.database.write_two_view_geometry(own[0], own[1], geometry)

@@ -18,6 +18,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import skew, so3_exp, so3_log
 from colmap_inertial.core.sampling import is_gap
 from colmap_inertial.core.threads import one_blas_thread
@@ -283,7 +284,7 @@ def estimate_bias_correction(pairs: RayPairs, start_from_cam: Array, bias_lever_
     from scipy.optimize import minimize
 
     if len(pairs.first) < _LIMITS.least_pairs:
-        raise NotObservableError("gyroscope bias", f"{len(pairs.first)} pairs of neighbouring images are too few")
+        raise NotObservableError("gyroscope bias", Fact("pairs-too-few", count=len(pairs.first)))
     before, after = start_from_cam[pairs.first], start_from_cam[pairs.second]
     rays_first = pairs.rays_first @ np.swapaxes(before, 1, 2)
     lever = bias_lever_s[pairs.second] - bias_lever_s[pairs.first]
@@ -318,11 +319,11 @@ def estimate_bias_correction(pairs: RayPairs, start_from_cam: Array, bias_lever_
     variance = max(float(np.median(least)), 1e-12)
     weight = pairs.rays_first.shape[1] / (1 + least / (_LIMITS.outlier * variance)) ** 2 / variance
     if variance > (_LIMITS.largest_px * pairs.pixel_rad) ** 2:
-        raise NotObservableError("gyroscope bias", "matches of neighbouring images suit no bias")
+        raise NotObservableError("gyroscope bias", Fact("matches-suit-no-bias"))
     information = _curvature(lambda x: float(weight @ spread(x)), change)
     values = np.linalg.eigvalsh(information)
     if values[0] <= 0:
-        raise NotObservableError("gyroscope bias", "the matches of neighbouring images suit any bias")
+        raise NotObservableError("gyroscope bias", Fact("matches-suit-any-bias"))
     return change, np.asarray(_LIMITS.looser**2 * np.linalg.inv(information))
 
 

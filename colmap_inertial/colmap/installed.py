@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from colmap_inertial.core.errors import MappingError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.model.soundness import check_binary_model
 from colmap_inertial.pipeline.run.executable import ColmapExecutable
@@ -207,7 +208,12 @@ class InstalledColmap:
                 yield first, second
         except sqlite3.Error as error:
             raise MappingError(
-                f"{self.executable.path} (COLMAP {self.executable.version}): its database cannot be used here: {error}"
+                Fact(
+                    "database-not-usable-here",
+                    program=str(self.executable.path),
+                    version=self.executable.version,
+                    detail=str(error),
+                )
             ) from error
 
 

@@ -12,6 +12,7 @@ from colmap_inertial.colmap.installed import InstalledColmap
 from colmap_inertial.colmap.loop_closure import LoopClosure, MappedCapture, close_gaps
 from colmap_inertial.colmap.submaps import join_runs, map_runs, split_capture
 from colmap_inertial.core.errors import MappingError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.io.sqlite import open_foreign
 from colmap_inertial.model import find_models
@@ -135,10 +136,7 @@ def map_images(
         find_models(folder)
         check_binary_model(folder)
     if not record.models:
-        raise MappingError(
-            "COLMAP found no model: too few matches between the frames. Film with more overlap, more texture or less "
-            "blur, or try --mapping.pairing exhaustive"
-        )
+        raise MappingError(Fact("no-model-found"))
     remove(context.scratch / CHUNKS_FOLDER)
     log.info("mapping: %s", record)
     return record

@@ -15,6 +15,7 @@ from colmap_inertial.colmap.sparse import MatchRecord, match_pairs, writing_data
 from colmap_inertial.colmap.two_views import count_verified
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import InertialError, MappingError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import (
     matrix_from_quat,
     quat_conjugate,
@@ -115,12 +116,8 @@ def _find_pose(cam_from_world: Mapping[str, Array], camera: RigCamera) -> Array:
     relative = np.array(
         [pose @ np.linalg.inv(cam_from_world[frame]) for frame, pose in others.items() if pose is not None]
     ).reshape(-1, 4, 4)
-    advice = f"give cam_from_reference under [rig.{camera.name}], or a calibration of all cameras under [rig]"
     if len(relative) < _LIMITS.least_frames:
-        raise MappingError(
-            f"[rig.{camera.name}]: COLMAP places its images and the main camera's of {len(relative)} frames in one "
-            f"model, too few to find the camera's pose; {advice}"
-        )
+        raise MappingError(Fact("rig-frames-too-few-placed", camera=camera.name, frames=len(relative)))
     quaternions = np.array([quat_from_matrix(pose[:3, :3]) for pose in relative])
     middle = quaternions[0]
     for _ in range(2):  # the first one may be far from the others
@@ -128,11 +125,7 @@ def _find_pose(cam_from_world: Mapping[str, Array], camera: RigCamera) -> Array:
     apart_deg = float(np.degrees(np.median(np.linalg.norm(_differences(quaternions, middle), axis=1))))
     log.info("rig: pose of %s by %d frames, rotations differ by %.3f deg", camera.name, len(relative), apart_deg)
     if apart_deg > _LIMITS.most_apart_deg:
-        raise MappingError(
-            f"[rig.{camera.name}]: the camera turns against the main one by {apart_deg:.2g} degrees from frame to "
-            "frame (median): cameras of a rig are fixed to each other and triggered together. Correct the times, or "
-            f"{advice}"
-        )
+        raise MappingError(Fact("rig-camera-turns", camera=camera.name, apart_deg=apart_deg))
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = matrix_from_quat(middle), np.median(relative[:, :3, 3], axis=0)
     return pose
@@ -168,7 +161,7 @@ def write_rig(database: Path, rig: Sequence[RigCamera], poses: Mapping[str, Arra
         for name, own_images in images.items():
             cameras = {image.camera_id for image in own_images.values()}
             if len(cameras) != 1:
-                raise InertialError(f"[rig]: images of {name or 'the main camera'} have {len(cameras)} COLMAP cameras")
+                raise InertialError(Fact("rig-of-several-cameras", camera=name, count=len(cameras)))
             sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, cameras.pop())
             if not name:
                 made.add_ref_sensor(sensor)

@@ -24,6 +24,7 @@ from colmap_inertial.colmap.feature_chunks import (
 from colmap_inertial.colmap.installed import InstalledColmap
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, InertialError, MappingError, OutputError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.core.types import CameraModel, Keypoints, Treatment
 from colmap_inertial.model import colmap_camera
@@ -66,10 +67,7 @@ def writing_database(database: Path) -> Iterator[None]:
     except RuntimeError as error:
         if "database factory" not in str(error):
             raise
-        raise OutputError(
-            f"{database}: COLMAP cannot write its database here: the disk is full, or a quota, a limit of file sizes "
-            "or of open files (ulimit -n) is reached; make room and start again, it continues"
-        ) from error
+        raise OutputError(Fact("database-not-written", database=str(database))) from error
 
 
 def mapping_device(options: MappingOptions, *, deterministic: bool) -> Literal["cpu", "cuda"]:
@@ -85,7 +83,7 @@ def mapping_device(options: MappingOptions, *, deterministic: bool) -> Literal["
     if options.device == "auto":
         return "cuda" if pycolmap.has_cuda and not deterministic else "cpu"
     if options.device == "cuda" and not pycolmap.has_cuda:
-        raise InertialError("--mapping.device cuda: this pycolmap has none; install pycolmap-cuda12, or leave it out")
+        raise InertialError(Fact("pycolmap-without-cuda"))
     return options.device
 
 
@@ -102,24 +100,18 @@ def require_features(context: RunContext) -> None:
     if context.features == "sift":
         return
     if not hasattr(pycolmap.FeatureExtractionOptions(), "aliked"):
-        raise InertialError(
-            "--mapping.features aliked: this pycolmap is built without ONNX, as the published wheels are; find and "
-            "match features with a COLMAP that has it, and give its database with --database"
-        )
+        raise InertialError(Fact("pycolmap-without-onnx"))
     named = dict(text.split("=", 1) for text in context.colmap.settings)
     missing = [name for name in _ALIKED_FILES if not Path(named.get(name, "")).is_file()]
     if missing:
-        files = " and ".join(f"--colmap {name}=FILE" for name in missing)
-        raise InertialError(f"--mapping.features aliked: nothing is downloaded; give the networks by {files}")
+        raise InertialError(Fact("networks-not-named", options=missing))
 
 
 def check_pair_names(names: Sequence[str]) -> None:
     """Raise ``FormatError`` for an image name that COLMAP's lists of pairs cannot hold."""
     for name in names:
         if len(name.split()) != 1 or name.startswith("#"):
-            raise FormatError(
-                Path(name), "COLMAP's lists of pairs cannot hold such a file name; rename it without spaces"
-            )
+            raise FormatError(Path(name), Fact("name-not-for-pairs"))
 
 
 def matches_every_pair(count: int, options: MappingOptions, t_s: Array | None = None) -> bool:
@@ -245,7 +237,7 @@ def register_images(
             with writing_database(database), pycolmap.Database.open(str(database)) as opened:
                 first = opened.read_image_with_name(batch[0])
                 if first is None:
-                    raise MappingError(f"COLMAP could not read {images / batch[0]}")
+                    raise MappingError(Fact("image-unread", path=str(images / batch[0])))
                 reader.existing_camera_id = first.camera_id
             done += len(batch)
     context.progress("features", done, len(cameras))

@@ -22,6 +22,7 @@ from colmap_inertial.colmap.sparse import (
 )
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, MappingError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import MappingOptions, ReconstructOptions
 from colmap_inertial.core.types import CameraModel
 from colmap_inertial.io.capture_rig import RigCamera
@@ -186,11 +187,12 @@ def _read_extracted(database: Path, names: Sequence[str], executable: ColmapExec
     try:
         given = read_given(database)
     except FormatError as error:
-        reason = error.reason.partition(":")[0]  # the rest is advice on --database
-        raise MappingError(f"{executable.path}: the database that it wrote cannot be used: {reason}") from error
+        raise MappingError(Fact("written-database-unusable", program=str(executable.path), why=error.fact)) from error
     missing = sorted(set(names) - given.sizes.keys())
     if missing:
-        raise MappingError(f"{executable.path}: no features of {missing[0]}, nor of {len(missing) - 1} other images")
+        raise MappingError(
+            Fact("features-missing", program=str(executable.path), image=missing[0], others=len(missing) - 1)
+        )
     return given
 
 

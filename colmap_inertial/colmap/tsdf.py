@@ -19,6 +19,7 @@ import numpy as np
 from colmap_inertial.colmap.depth_maps import Maker, map_file
 from colmap_inertial.core.arrays import Array, Float32Array
 from colmap_inertial.core.errors import InertialError, MissingExtraError, OutputError, advise_library
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.io.files import path_in
 from colmap_inertial.io.images import read_image
@@ -77,12 +78,11 @@ def require_mesh_maker(options: ReconstructOptions) -> None:
 
 
 def _missing_error() -> MissingExtraError:
-    return MissingExtraError("mesh", "dense_options.mesh tsdf is made by open3d")
+    return MissingExtraError("mesh", Fact("needs-open3d"))
 
 
 def _unloadable_error(why: str) -> InertialError:
-    mend = advise_library(why, "open3d")
-    return InertialError(f"open3d cannot be loaded ({why}); {mend}, or take --dense-options.mesh poisson")
+    return InertialError(Fact("open3d-not-loaded", detail=why, mend=advise_library(why, "open3d")))
 
 
 def _import_open3d() -> ModuleType:
@@ -147,13 +147,10 @@ def tsdf_mesh(folder: Path, names: Sequence[str], target: Path, *, maker: Maker,
         blocks = grid.compute_unique_block_coordinates(seen, matrix, pose, *limits)
         grid.integrate(blocks, seen, shown, matrix, pose, *limits)
         if grid.hashmap().size() > SURFACE.most_blocks:
-            raise InertialError(
-                f"{target}: the surface is too large for voxels of {1000 * voxel_m:.1f} mm; shrink the pictures "
-                "(--dense-options.max-image-size), or take --dense-options.mesh poisson"
-            )
+            raise InertialError(Fact("surface-too-large", path=str(target), voxel_m=voxel_m))
     mesh = _sort_mesh(o3d, grid.extract_triangle_mesh(weight_threshold=SURFACE.least_seen))
     if not o3d.t.io.write_triangle_mesh(str(target), mesh) or not target.is_file():
-        raise OutputError(f"{target}: open3d wrote no mesh; is the disk full?")
+        raise OutputError(Fact("mesh-not-written", path=str(target)))
 
 
 def _sort_mesh(o3d: ModuleType, mesh: Any) -> Any:

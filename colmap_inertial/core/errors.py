@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import errno
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
-from colmap_inertial.core.facts import Fact, as_fact
+from colmap_inertial.core.facts import Fact
 
 #: Libraries that open3d and pycolmap-cuda12 take from the system, and their packages on Debian.
 _SYSTEM_LIBRARIES = {
@@ -31,36 +31,48 @@ class InertialError(Exception):
 
     Parameters
     ----------
-    message
-        What is wrong and what to do: a fact, whose message is shown with its advice, or words.
+    fact
+        What is wrong; its message is shown with its advice.
+    shown
+        What is shown in its place.
+
+    Attributes
+    ----------
+    fact
+        What is wrong, without the place or the quantity.
     code
-        Stable name of what is wrong; by default that of the fact, or the class's own.
+        Stable name of what is wrong: the fact's.
     """
 
     exit_code: ClassVar[int] = 2
-    default_code: ClassVar[str] = "error"
 
-    def __init__(self, message: Fact | str = "", *, code: str = "", shown: str = "") -> None:
-        self.fact = message if isinstance(message, Fact) else None
-        self.code = code or (self.default_code if self.fact is None else self.fact.code)
-        super().__init__(shown or in_words(message))
+    def __init__(self, fact: Fact, *, shown: str = "") -> None:
+        self.fact = fact
+        super().__init__(shown or fact.with_advice)
+
+    def __reduce__(self) -> tuple[object, ...]:
+        # by fields: a worker's errors come to another process, and the constructors take other arguments
+        return _restore, (type(self), self.args, vars(self))
 
     @property
-    def why(self) -> Fact:
-        """What is wrong as a fact, without the place or the quantity; of an error in words, these."""
-        return Fact.stated(str(self)) if self.fact is None else self.fact
+    def code(self) -> str:
+        return self.fact.code
+
+
+def _restore(kind: type[InertialError], args: tuple[str, ...], fields: dict[str, Any]) -> InertialError:
+    error = kind.__new__(kind, *args)
+    vars(error).update(fields)
+    return error
 
 
 def fact_of(error: InertialError) -> Fact:
-    """An error as a fact, whose message is that of the error."""
+    """An error as a fact, whose message is that of the error: with the place, the quantity and what to do."""
+    fact = error.fact
     if isinstance(error, NotObservableError):
-        return Fact("quantity-not-observable", quantity=error.quantity, why=error.why, sigma=error.sigma)
-    return as_fact(error.fact if error.fact is not None and str(error) == str(error.fact) else str(error))
-
-
-def in_words(message: Fact | str) -> str:
-    """A fact's message with its advice; words as they are."""
-    return message.with_advice if isinstance(message, Fact) else message
+        return Fact("quantity-not-observable", quantity=error.quantity, why=fact, sigma=error.sigma)
+    if isinstance(error, FormatError):
+        return Fact("wrong-in-file", path=str(error.path), line=error.line, why=fact)
+    return Fact("noted-with-advice", found=fact) if fact.advice and str(error) != str(fact) else fact
 
 
 class FormatError(InertialError):
@@ -74,40 +86,26 @@ class FormatError(InertialError):
         What is wrong and what to do.
     line
         One-based line number, where the file has lines.
-    code
-        As of :class:`InertialError`.
     """
 
-    default_code = "unreadable"
-
-    def __init__(self, path: Path | str, reason: Fact | str, *, line: int | None = None, code: str = "") -> None:
+    def __init__(self, path: Path | str, reason: Fact, *, line: int | None = None) -> None:
         self.path = Path(path)
-        self.reason = in_words(reason)
+        self.reason = reason.with_advice
         self.line = line
         place = f"{path}{'' if line is None else f', line {line}'}"
-        super().__init__(reason, code=code, shown=f"{place}: {self.reason}")
-
-    @property
-    def why(self) -> Fact:
-        return Fact.stated(self.reason) if self.fact is None else self.fact
+        super().__init__(reason, shown=f"{place}: {self.reason}")
 
 
 class TimingError(InertialError):
     """Time stamps are missing, out of order, or do not fit together."""
 
-    default_code = "untimed"
-
 
 class OutputError(InertialError):
     """An output cannot be written where it was asked for."""
 
-    default_code = "not-writable"
-
 
 class OutputExistsError(OutputError):
     """Something that would be overwritten is already there."""
-
-    default_code = "exists"
 
 
 class MissingExtraError(InertialError):
@@ -121,12 +119,9 @@ class MissingExtraError(InertialError):
         What needs it.
     """
 
-    default_code = "extra-missing"
-
-    def __init__(self, extra: str, what: str) -> None:
+    def __init__(self, extra: str, what: Fact) -> None:
         self.extra = extra
-        needed = " ".join(f"'{package}'" for package in _list_packages(extra))
-        super().__init__(f"{what}, which needs the extra `{extra}`: pip install {needed}")
+        super().__init__(Fact("extra-missing", what=what, extra=extra, packages=_list_packages(extra)))
 
 
 def _list_packages(extra: str) -> list[str]:
@@ -141,8 +136,6 @@ def _list_packages(extra: str) -> list[str]:
 class AlreadyMetricError(InertialError):
     """A model that already holds a metric scale would be scaled again."""
 
-    default_code = "already-metric"
-
 
 class NotObservableError(InertialError):
     """The data cannot give the quantity that was asked for.
@@ -155,69 +148,59 @@ class NotObservableError(InertialError):
         Why, and what to record instead.
     sigma
         Relative standard deviation, where one was computed.
-
-    Attributes
-    ----------
-    why
-        The hint as a fact.
     """
 
     exit_code = 3
-    default_code = "not-observable"
 
-    def __init__(self, quantity: str, hint: Fact | str, *, sigma: float | None = None) -> None:
+    def __init__(self, quantity: str, hint: Fact, *, sigma: float | None = None) -> None:
         self.quantity = quantity
-        self.hint = in_words(hint)
+        self.hint = hint.with_advice
         self.sigma = sigma
         spread = "" if sigma is None else f" (standard deviation {100 * sigma:.1f} %)"
         super().__init__(hint, shown=f"{quantity} is not observable{spread}: {self.hint}")
-
-    @property
-    def why(self) -> Fact:
-        return Fact.stated(self.hint) if self.fact is None else self.fact
 
 
 class MappingError(InertialError):
     """COLMAP could not build a model from the images."""
 
     exit_code = 4
-    default_code = "not-mapped"
 
 
 class TargetNotFoundError(InertialError):
     """The calibration target was not found in the images."""
 
     exit_code = 5
-    default_code = "target-not-found"
 
 
-def describe_environment_fault(error: BaseException) -> str | None:
-    """A sentence for an exception that memory, files or a package that cannot be loaded have led to.
+def describe_environment_fault(error: BaseException) -> Fact | None:
+    """What is wrong for an exception that memory, files or a package that cannot be loaded have led to.
 
     ``None`` for any other. pycolmap says only that it cannot be imported, and how it is installed.
     """
     return _describe_exhausted(error) or _describe_unloadable(error)
 
 
-def _describe_exhausted(error: BaseException | None) -> str | None:
+def _describe_exhausted(error: BaseException | None) -> Fact | None:
     while error is not None:
         number = error.errno if isinstance(error, OSError) else None
         if isinstance(error, MemoryError) or number == errno.ENOMEM or "failed to map segment" in str(error):
-            return "the memory is used up: close other programs, or allow smaller pictures or fewer processes"
+            return Fact("memory-used-up")
         if number in (errno.EMFILE, errno.ENFILE):
-            return "too many files are open at a time: raise the limit (ulimit -n) and start again"
+            return Fact("too-many-files-open")
         error = error.__cause__ or error.__context__
     return None
 
 
-def advise_library(why: str, distribution: str) -> str:
+def advise_library(why: str, distribution: str) -> Fact:
     """What to do where a library of a package (by its name for pip) is missing, by what the loader said."""
     package = next((package for library, package in _SYSTEM_LIBRARIES.items() if library in why), None)
     # other libraries come with the package, or with those that it needs
-    return f"pip install --force-reinstall {distribution}" if package is None else f"on Debian: apt install {package}"
+    return (
+        Fact("install-again", package=distribution) if package is None else Fact("install-on-debian", package=package)
+    )
 
 
-def _describe_unloadable(error: BaseException | None) -> str | None:
+def _describe_unloadable(error: BaseException | None) -> Fact | None:
     while error is not None and not isinstance(error, ImportError):
         error = error.__cause__
     is_compiled = error is not None and str(error.path).endswith(".so")
@@ -233,5 +216,6 @@ def _describe_unloadable(error: BaseException | None) -> str | None:
     folders = Path(str(error.path)).parents if is_compiled else ()
     package = next((folder.name for folder in folders if folder.name in known), None)
     if package is None or package == "colmap_inertial":
-        return f"{error}: install that package, or colmap-inertial again with its dependencies"
-    return f"{package} cannot be loaded ({error}); {advise_library(str(error), known[package][0])}"
+        return Fact("module-missing", detail=str(error))
+    mend = advise_library(str(error), known[package][0])
+    return Fact("package-not-loaded", package=package, detail=str(error), mend=mend)

@@ -10,6 +10,7 @@ import numpy as np
 from colmap_inertial.core.arrays import AnyArray, Array, BoolArray, IndexArray
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import (
     cross,
     matrix_from_quat,
@@ -177,7 +178,7 @@ def estimate_up_in_imu(imu: ImuRecording, gyro_bias_rad_s: Array, query_s: Array
         Where the recording has no accelerometer.
     """
     if not imu.has_accel:
-        raise NotObservableError("gravity", "the recording has no accelerometer; record it along with the gyroscope")
+        raise NotObservableError("gravity", Fact("no-accelerometer-for-gravity"))
     path = GyroPath(imu.gyro_t_s, imu.gyro_rad_s, gyro_bias_rad_s)
     accel_t = imu.accel_t_s + accel_delay_s
     force_in_start = quat_rotate(path.at(accel_t)[0], imu.accel_m_s2)

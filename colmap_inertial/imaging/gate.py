@@ -20,6 +20,7 @@ from colmap_inertial.core.arrays import Array, BoolArray, Float32Array, set_fiel
 from colmap_inertial.core.facts import Fact, as_fact
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath
+from colmap_inertial.imaging.detail import is_blank
 from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence, measure_blur_share
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.imaging.psf import PredictedBlur
@@ -332,6 +333,8 @@ def judge_frame(
     """
     if recording is not None and recording.trusted is False:
         return None, recording.reason
+    if is_blank(image):
+        return None, Fact("frame-blank")
     unsure = blur.unsure_share()
     if unsure > GATE_LIMITS.most_unsure:
         return None, Fact("blur-uncertain", unsure_share=float(unsure))

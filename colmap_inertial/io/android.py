@@ -20,6 +20,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import FrameLog, ImuRecording
 from colmap_inertial.io.files import first_line
 from colmap_inertial.io.frame_times import frame_log, stamps_of_log
@@ -71,7 +72,7 @@ def read_mars(path: Path, units: DeclaredUnits) -> ImuRecording:
     """Read MARS logger's table of gyroscope and accelerometer."""
     table = _mars_table(path)
     if table is None:
-        raise FormatError(path, f"holds no {_MARS_TABLES[0]} of MARS logger")
+        raise FormatError(path, Fact("mars-table-missing", table=_MARS_TABLES[0]))
     return read_csv(table, units)
 
 
@@ -128,10 +129,8 @@ def _gyro_files(path: Path) -> list[Path]:
 def _one_gyro_file(path: Path) -> Path:
     files = _gyro_files(path)
     if len(files) != 1:
-        what = ", ".join(file.name for file in files[:5]) if files else "none"
-        raise FormatError(
-            path, f"holds {len(files)} files *gyro.csv of OpenCamera-Sensors ({what}); give the one to read"
-        )
+        names = [file.name for file in files[:5]]
+        raise FormatError(path, Fact("not-one-gyro-file", count=len(files), files=names))
     return files[0]
 
 

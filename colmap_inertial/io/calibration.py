@@ -25,7 +25,7 @@ from colmap_inertial.core.types import (
     ImuCalibration,
 )
 from colmap_inertial.io.device_yaml import is_yaml, read_device_yaml
-from colmap_inertial.io.files import StrPath, read_json, reader, write_json
+from colmap_inertial.io.files import StrPath, read_json, read_text, reader, write_json
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -215,9 +215,9 @@ def read_calibration(path: StrPath) -> CameraImuCalibration:
     if is_yaml(path):
         return calibration_prior(read_declared(path))
     # a file that states neither is of this kind and order
-    values = {"kind": CAMERA_IMU, "cov_parameters": list(CALIBRATION_PARAMETERS), **read_json(path)}
+    values = {"kind": CAMERA_IMU, "cov_parameters": list(CALIBRATION_PARAMETERS), **_read_values(path)}
     if values.pop("kind") != CAMERA_IMU:
-        raise FormatError(path, "holds no calibration of a camera and an IMU (its kind is another)")
+        raise FormatError(path, Fact("calibration-of-another-kind"))
     return _read_fields(path, values, CameraImuCalibration, CALIBRATION_PARAMETERS, _CLOCK)
 
 
@@ -262,33 +262,35 @@ def _read_fields(
         Where a field is missing (but for ``optional`` ones), unknown, of another type, or refused by the class.
     """
     if values.pop("cov_parameters", None) != list(parameters):
-        raise FormatError(path, "cov_parameters: the order of cov is not the one of this version")
+        raise FormatError(path, Fact("calibration-cov-order"))
     types = {field.name: str(field.type) for field in fields(cls)}
     missing, unknown = sorted(types.keys() - values.keys() - optional), sorted(values.keys() - types.keys())
     if missing or unknown:
-        stated = (("missing:", missing), ("unknown:", unknown))
-        what = "; ".join(f"{label} {', '.join(names)}" for label, names in stated if names)
-        raise FormatError(path, f"not the fields of such a calibration ({what})")
+        raise FormatError(path, Fact("calibration-fields", missing=missing, unknown=unknown))
     for name, value in values.items():
-        if fault := _field_fault(value, types[name]):
-            raise FormatError(path, f"{name}{fault}")
+        if fault := _field_fault(name, value, types[name]):
+            raise FormatError(path, fault)
     try:
         return cls(**values)
     except (ValueError, TypeError, OverflowError) as error:
-        raise FormatError(path, str(error)) from None
+        raise FormatError(path, Fact("invalid-values", detail=str(error))) from None
 
 
-def _field_fault(value: object, kind: str) -> str | None:
+def _field_fault(name: str, value: object, kind: str) -> Fact | None:
     """Reason why a value from JSON does not fit a field's annotation; ``None`` where it does."""
+
+    def other_type(expected: str) -> Fact:
+        return Fact("field-of-other-type", name=name, expected=expected)
+
     if kind == "str":
-        return None if isinstance(value, str) else ": expected a text"
+        return None if isinstance(value, str) else other_type("text")
     if kind == "int":
-        return None if isinstance(value, int) and not isinstance(value, bool) else ": expected a whole number"
+        return None if isinstance(value, int) and not isinstance(value, bool) else other_type("integer")
     if value is None and kind.endswith("None"):
         return None
     if not _is_numeric(value):
-        return ": expected numbers"
-    return " must be a single number" if kind.startswith("float") and isinstance(value, list) else None
+        return other_type("numbers")
+    return Fact("field-not-single", name=name) if kind.startswith("float") and isinstance(value, list) else None
 
 
 def _is_numeric(value: object) -> bool:
@@ -304,7 +306,6 @@ CalibrationFiles = StrPath | Sequence[StrPath] | None
 IMU = "imu"
 #: Who writes each kind.
 _WRITERS = {CAMERA_IMU: "align", IMU: "calibrate-imu"}
-_WORDS = {CAMERA_IMU: "how camera and IMU relate", IMU: "the IMU's own gains"}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -337,10 +338,17 @@ def read_imu_calibration(path: StrPath) -> ImuCalibration:
         Where it is of another kind; where a field is missing, unknown, of a wrong shape, or not finite.
     """
     path = Path(path)
-    values = read_json(path)
+    values = _read_values(path)
     if values.pop("kind", None) != IMU:
-        raise FormatError(path, "holds no calibration of an IMU (colmap-inertial calibrate-imu writes one)")
+        raise FormatError(path, Fact("no-imu-calibration"))
     return _read_fields(path, values, ImuCalibration, IMU_CALIBRATION_PARAMETERS, _COMPARED)
+
+
+def _read_values(path: Path) -> dict[str, Any]:
+    """The fields of a calibration."""
+    if path.suffix.lower() != ".json" and read_text(path).lstrip()[:1] != "{":
+        raise FormatError(path, Fact("calibration-unknown"))
+    return read_json(path)
 
 
 def calibration_kind(path: StrPath) -> str:
@@ -354,10 +362,10 @@ def calibration_kind(path: StrPath) -> str:
     path = Path(path)
     if is_yaml(path):
         return CAMERA_IMU
-    kind = read_json(path).get("kind", CAMERA_IMU)
+    kind = _read_values(path).get("kind", CAMERA_IMU)
     if not isinstance(kind, str) or kind not in _WRITERS:
-        known = ", ".join(f'"{name}" ({command})' for name, command in _WRITERS.items())
-        raise FormatError(path, f"kind: {str(kind)[:40]!r} is no kind of calibration; known: {known}")
+        known, writers = tuple(_WRITERS), tuple(_WRITERS.values())
+        raise FormatError(path, Fact("calibration-kind-unknown", kind=str(kind)[:40], known=known, writers=writers))
     return kind
 
 
@@ -390,7 +398,7 @@ def read_calibrations(paths: CalibrationFiles) -> Calibrations:
     for path in list_paths(paths):
         kind = calibration_kind(path)
         if kind in file_of:
-            raise FormatError(path, f"and {file_of[kind]} both say {_WORDS[kind]}; give one of them")
+            raise FormatError(path, Fact("calibrations-say-the-same", other=str(file_of[kind]), kind=kind))
         file_of[kind] = path
     return Calibrations(
         camera_imu=read_calibration(file_of[CAMERA_IMU]) if CAMERA_IMU in file_of else None,

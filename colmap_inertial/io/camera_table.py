@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import colmap_px_from_opencv
 from colmap_inertial.core.types import CameraModel
 from colmap_inertial.io import sensor_yaml
@@ -20,7 +21,10 @@ def read_camera_table(table: Section) -> tuple[CameraModel, Array | None, float 
     sheet, name = table.file("sensor_yaml"), table.text("camera")
     if sheet is not None:
         if any(key in table for key in CAMERA_KEYS[2:]):
-            table.fail("sensor_yaml", "gives the intrinsics; leave out model, width, height, params and pixel_origin")
+            table.fail(
+                "sensor_yaml",
+                Fact("sheet-gives-intrinsics", others=CAMERA_KEYS[2:]),
+            )
         if sensor_yaml.is_asl(sheet):
             return sensor_yaml.read_camera(sheet), sensor_yaml.read_body_from_sensor(sheet), None
         mounted = read_device_yaml(sheet, name)
@@ -31,24 +35,21 @@ def read_camera_table(table: Section) -> tuple[CameraModel, Array | None, float 
             mounted.clock_offset_s,
         )
     if name is not None:
-        table.fail("camera", "belongs to sensor_yaml, which is missing")
+        table.fail("camera", Fact("belongs-to-missing", key="sensor_yaml"))
     model = table.require("model", table.choice("model", CAMERA_MODELS))
     width, height = (table.require(key, table.integer(key)) for key in ("width", "height"))
     params = table.require("params", table.numbers("params"))
     count, centre = CAMERA_MODELS[model]
     if len(params) != count:
-        table.fail("params", f"{model} has {count} parameters, found {len(params)}")
+        table.fail("params", Fact("camera-params-count", model=model, count=count, found=len(params)))
     origin = table.choice("pixel_origin", ("corner", "center"))
     if origin is None:
-        table.fail(
-            None,
-            'pixel_origin is missing: "corner" if params are COLMAP\'s, "center" if they are OpenCV\'s or Kalibr\'s',
-        )
+        table.fail(None, Fact("pixel-origin-missing"))
     values = np.array(params)
     if origin == "center":
         values[centre : centre + 2] = colmap_px_from_opencv(values[centre : centre + 2])
     if (values[:centre] <= 0).any():
-        table.fail("params", "focal lengths must be above 0")
+        table.fail("params", Fact("focal-lengths-not-positive"))
     return CameraModel(model=model, width=width, height=height, params=tuple(values.tolist())), None, None
 
 
@@ -56,11 +57,11 @@ def check_transform(table: Section, key: str, rows: list[list[float]]) -> Array:
     """(4, 4) rotation and translation of a 3x3 or 4x4 matrix under a key."""
     shape = (len(rows), len(rows[0]) if rows else 0)
     if shape not in ((3, 3), (4, 4)):
-        table.fail(key, f"must be a 3x3 or 4x4 matrix, found {shape[0]}x{shape[1]}")
+        table.fail(key, Fact("not-a-pose", rows=shape[0], columns=shape[1]))
     matrix = np.eye(4)
     matrix[: shape[0], : shape[1]] = rows
     if not sensor_yaml.is_rotation(matrix[:3, :3]):
-        table.fail(key, "is not a rotation: rows must be perpendicular, of length 1, and right-handed")
+        table.fail(key, Fact("matrix-not-a-rotation"))
     if not np.allclose(matrix[3], [0, 0, 0, 1]):
-        table.fail(key, "must have 0, 0, 0, 1 as its last row")
+        table.fail(key, Fact("last-row-wrong"))
     return matrix

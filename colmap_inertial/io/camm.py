@@ -15,6 +15,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, Int64Array, UInt8Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import FrameLog, ImuRecording, PositionFixes
 from colmap_inertial.io.frame_times import frame_log
 from colmap_inertial.io.imu_text import build_recording
@@ -64,7 +65,7 @@ def read_camm(path: Path, units: DeclaredUnits) -> ImuRecording:
                 values = data.view("<f4").astype(np.float64)
             samples_of[kind] = order_samples(path, quantity, unit, t_ns, values)
     if _GYRO not in samples_of:
-        raise FormatError(path, "its CAMM track holds no gyroscope samples (type 2)")
+        raise FormatError(path, Fact("camm-without-gyroscope"))
     return build_recording(samples_of[_GYRO], samples_of.get(_ACCEL))
 
 
@@ -140,15 +141,13 @@ def _packets(movie: Movie, track: Track) -> dict[int, tuple[Int64Array, UInt8Arr
     }
     while len(at):
         if (at + 4 > end).any():
-            raise FormatError(movie.path, "is damaged: a sample of the camm track is shorter than its head")
+            raise FormatError(movie.path, Fact("camm-sample-short"))
         kind = data[at + 2].astype(np.int64) | data[at + 3].astype(np.int64) << 8
         length = lengths[kind]
         wrong = (at + 4 + np.maximum(length, 0) > end) & (length >= 0)
         if wrong.any():
             first = int(np.argmax(wrong))
-            raise FormatError(
-                movie.path, f"is damaged: packet {first + 1} of type {kind[first]} of its camm track is cut off"
-            )
+            raise FormatError(movie.path, Fact("camm-packet-cut-off", packet=first + 1, type=kind[first]))
         for wanted, packets in parts.items():
             rows = np.flatnonzero(kind == wanted)
             packets.append((t_ns[rows], data[at[rows, None] + 4 + np.arange(_LENGTHS[wanted])]))

@@ -15,6 +15,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import quat_from_matrix
 from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.types import CameraImuCalibration, CameraModel, FrameLog, ImuCalibration, ReadoutDirection
@@ -142,17 +143,13 @@ def load_capture(path: StrPath) -> Capture:
             return _read_capture_toml(path / "capture.toml")
         return _recognise_folder(path)
     if not path.exists():
-        raise FormatError(path, "no such file or folder")
+        raise FormatError(path, Fact("no-such-file", what="file or folder"))
     if path.suffix.lower() != ".toml":
         recording = find_recording(path)
         if recording is not None:
             return _describe_recording(path, recording)
         refuse_video(path)
-        raise FormatError(
-            path,
-            "a capture is described by a .toml file or a folder, unless it is a video with an IMU inside; write a "
-            "capture.toml beside it",
-        )
+        raise FormatError(path, Fact("no-capture-file"))
     return _read_capture_toml(path)
 
 
@@ -172,7 +169,7 @@ def _read_capture_toml(path: Path) -> Capture:
                 table.require_known(section.keys)
             capture = section.read(table, capture)
     if capture.frames is None and capture.imu is None:
-        raise FormatError(path, "describes neither frames ([images] or [video]) nor an IMU ([imu])")
+        raise FormatError(path, Fact("capture-of-nothing"))
     return capture
 
 
@@ -182,7 +179,7 @@ def _read_images(table: Section, capture: Capture) -> Capture:
 
 def _read_video(table: Section, capture: Capture) -> Capture:
     if capture.frames is not None:
-        table.fail(None, "a capture has [images] or [video], not both")
+        table.fail(None, Fact("tables-exclude-each-other", tables=("images", "video")))
     return replace(capture, frames=read_video(table, "file"))
 
 
@@ -237,29 +234,29 @@ def _read_camera(table: Section, capture: Capture) -> Capture:
 
 def _read_apertures(table: Section, capture: Capture) -> Capture:
     if capture.camera is not None:
-        table.fail(None, "gives the camera by its calibration; leave out [camera]")
+        table.fail(None, Fact("rig-gives-camera"))
     apertures = read_apertures_table(table, capture.image_folder)
     return replace(capture, apertures=apertures, camera=apertures.rig.reference.camera)
 
 
 def _read_exposures(table: Section, capture: Capture) -> Capture:
     if capture.apertures is not None:
-        table.fail(None, "a capture has [apertures] or [exposures], not both")
+        table.fail(None, Fact("tables-exclude-each-other", tables=("apertures", "exposures")))
     return replace(capture, exposures=read_exposures_table(table, capture.image_folder))
 
 
 def _read_rig(table: Section, capture: Capture) -> Capture:
     if capture.frames is None:
-        table.fail(None, "belongs to [images] or [video], the main camera's, which is missing")
+        table.fail(None, Fact("main-camera-missing"))
     if capture.apertures is not None or capture.exposures is not None:
-        table.fail(None, "a capture has [rig], [apertures] or [exposures], not several of them")
+        table.fail(None, Fact("tables-exclude-each-other", tables=("rig", "apertures", "exposures")))
     rig = read_rig_table(table, body_from_cam=capture.body_from_cam)
     if rig.reference is not None and capture.camera is not None:
-        table.fail("calibration", "gives the main camera, too; leave out [camera]")
+        table.fail("calibration", Fact("rig-gives-main-camera"))
     sources = [capture.frames, *(camera.frames for camera in rig.cameras)]
     for camera in rig.cameras:
         if sources.count(camera.frames) > 1:
-            table.table(camera.name).fail(None, "has the images of another camera; give its own folder or video")
+            table.table(camera.name).fail(None, Fact("images-of-other-camera"))
     return replace(capture, rig=rig.cameras, camera=rig.reference or capture.camera)
 
 
@@ -339,13 +336,8 @@ def _recognise_folder(path: Path) -> Capture:
     if recording is not None:
         return _describe_recording(path, recording)
     if (path / "recipe.toml").is_file():
-        raise FormatError(path, "holds a recipe, which `colmap-inertial simulate recipe.toml OUT` renders to a capture")
-    raise FormatError(
-        path,
-        "is no capture by itself: it holds no capture.toml, and is neither an ASL/EuRoC dataset (cam0/data.csv, "
-        "cam0/data/, imu0/data.csv) nor an InertialScale folder; describe it in a capture.toml (pictures without an "
-        "IMU: reconstruct --scale-from target or distance)",
-    )
+        raise FormatError(path, Fact("recipe-without-capture"))
+    raise FormatError(path, Fact("no-capture-folder"))
 
 
 def _describe_recording(path: Path, recording: Recording) -> Capture:

@@ -53,6 +53,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, TimingError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import quat_from_matrix
 from colmap_inertial.core.types import Aperture, ApertureRig, CameraModel, FrameTiming, SpectralRole
 from colmap_inertial.io.exif import HEAD_BYTES, exposure_of
@@ -85,7 +86,7 @@ class SubImages:
             return path_in(self.folder, name)
         old, new = self.rename
         if old not in name:
-            raise FormatError(self.folder, f'"{old}" of rename does not occur in the reference\'s file name {name!r}')
+            raise FormatError(self.folder, Fact("rename-fits-not", old=old, name=name))
         head, _, tail = name.rpartition(old)
         return path_in(self.folder, f"{head}{new}{tail}")
 
@@ -116,7 +117,7 @@ def read_rename(table: Section) -> tuple[str, str] | None:
     if texts is None:
         return None
     if not (isinstance(texts, list) and len(texts) == 2 and all(isinstance(text, str) and text for text in texts)):
-        table.fail("rename", f"must be two texts, what is replaced by what; found {texts!r}")
+        table.fail("rename", Fact("not-a-rename", found=repr(texts)))
     return texts[0], texts[1]
 
 
@@ -134,14 +135,14 @@ def read_apertures_table(table: Section, images: Path | None) -> ApertureImages:
         Where the calibration cannot be read, lacks a camera, or knows no size and there is no picture.
     """
     if images is None:
-        table.fail(None, "belongs to [images], the folder of the reference's pictures, which is missing")
+        table.fail(None, Fact("reference-pictures-missing"))
     names = [key for key in table.names() if isinstance(table.raw(key), dict)]
     table.require_known(["calibration", "unit", *names])
     calibration = table.require("calibration", table.file("calibration"))
     units: tuple[Metres, ...] = get_args(Metres)
     unit = table.choice("unit", units)
     if len(names) < 2:
-        table.fail(None, f"needs two or more apertures, each a table [apertures.NAME]; found {len(names)}")
+        table.fail(None, Fact("apertures-too-few", found=len(names)))
     known = read_rig_calibration(calibration, unit=unit)
     roles: tuple[SpectralRole, ...] = get_args(SpectralRole)
     apertures: list[Aperture] = []
@@ -154,16 +155,16 @@ def read_apertures_table(table: Section, images: Path | None) -> ApertureImages:
         folder = part.file("folder")
         rename = read_rename(part)
         if i == 0 and (rename is not None or (folder is not None and folder != images)):
-            part.fail("folder", "is that of [images] for the reference, the first aperture; leave it and rename out")
+            part.fail("folder", Fact("reference-in-other-folder"))
         source = SubImages(folder=folder or images, rename=rename)
         if i > 0 and source == sources[0]:
-            part.fail(None, "has the same pictures as the reference; give folder or rename")
+            part.fail(None, Fact("same-pictures-as-reference"))
         sources.append(source)
         apertures.append(_aperture(name, role, camera, source, names=sources[0].folder))
     try:
         rig = ApertureRig(apertures=tuple(apertures), length_unit=known.length_unit)
     except ValueError as error:
-        raise FormatError(calibration, str(error)) from None
+        raise FormatError(calibration, Fact("invalid-values", detail=str(error))) from None
     return ApertureImages(rig=rig, sources=tuple(sources))
 
 
@@ -173,7 +174,9 @@ def _aperture(name: str, role: SpectralRole, camera: MountedCamera, source: SubI
     try:
         model = CameraModel(model=camera.model, width=size[0], height=size[1], params=camera.params)
     except ValueError as error:
-        raise FormatError(source.folder, f"{name}: {error}") from None
+        raise FormatError(
+            source.folder, Fact("wrong-entry", entry=name, fault=Fact("invalid-values", detail=str(error)))
+        ) from None
     return Aperture(
         name=name,
         role=role,
@@ -190,7 +193,7 @@ def _size_of_first(source: SubImages, names: Path) -> tuple[int, int]:
         if source.rename is None or source.rename[0] in name:
             height, width = read_image(source.path(name)).shape[:2]
             return width, height
-    raise FormatError(names, "holds no picture that would give the size, which the calibration does not")
+    raise FormatError(names, Fact("no-picture-of-size"))
 
 
 #: A long exposure that starts farther from its short one is that of another, or timed by another clock.
@@ -252,9 +255,7 @@ class LongExposures:
         """
         if self.source.rename is not None and self.source.rename[0] not in name:
             raise FormatError(
-                self.source.folder,
-                f'"{self.source.rename[0]}" of rename under [exposures] does not occur in the short exposure\'s name '
-                f"{name!r}; where both kinds lie in one folder, let pattern under [images] take the short ones alone",
+                self.source.folder, Fact("short-exposure-not-renamed", old=self.source.rename[0], name=name)
             )
         wanted = self.source.path(name)
         if wanted.is_file():
@@ -262,11 +263,7 @@ class LongExposures:
         for suffix in (*SUFFIXES, *(suffix.upper() for suffix in SUFFIXES)):
             if wanted.with_suffix(suffix).is_file():
                 return wanted.with_suffix(suffix)
-        raise FormatError(
-            wanted,
-            f"no such picture: the long exposure of {name} is missing; correct folder or rename under [exposures], or "
-            "take the short one out of [images]",
-        )
+        raise FormatError(wanted, Fact("long-exposure-missing", name=name))
 
     def files(self, names: Sequence[str]) -> list[Path]:
         """The long exposures of all short ones.
@@ -297,15 +294,14 @@ class LongExposures:
         for name in short.names:
             own = self.path(name).relative_to(self.source.folder).as_posix()
             if own not in place:
-                raise TimingError(f"{self.times}: no row for {own}, the long exposure of {name}")
+                raise TimingError(Fact("long-exposure-without-time", times=str(self.times), name=own, short=name))
             rows.append(place[own])
         t_s = seconds(stamps.t_ns[rows], short.epoch_ns)
         far = np.flatnonzero(np.abs(t_s - short.t_s) > _FARTHEST_S)
         if len(far):
             i = int(far[0])
             raise TimingError(
-                f"{self.times}: the long exposure of {short.names[i]} starts {t_s[i] - short.t_s[i]:.3g} s after the "
-                "short one; both must be timed by one clock, and belong together"
+                Fact("long-exposure-far", times=str(self.times), short=short.names[i], late_s=t_s[i] - short.t_s[i])
             )
         exposure_s = None if stamps.exposure_s is None else stamps.exposure_s[rows]
         if exposure_s is None and self.exposure_s is not None:
@@ -353,17 +349,17 @@ def read_exposures_table(table: Section, images: Path | None) -> LongExposures:
         For what is missing or contradicts itself.
     """
     if images is None:
-        table.fail(None, "belongs to [images], the folder of the short exposures, which is missing")
+        table.fail(None, Fact("short-exposures-missing"))
     times = table.file("times")
     delay_s = table.number("long_delay_s", low=-_FARTHEST_S, high=_FARTHEST_S)
     exposure_s = table.positive("long_exposure_s")
     source = SubImages(folder=table.file("folder") or images, rename=read_rename(table))
     if source == SubImages(folder=images):
-        table.fail(None, "has the same pictures as [images]; give folder or rename")
+        table.fail(None, Fact("same-pictures-as-images"))
     if times is not None and delay_s is not None:
-        table.fail("long_delay_s", "stands in place of times; leave one of them out")
+        table.fail("long_delay_s", Fact("delay-beside-times"))
     if exposure_s is not None and exposure_s > 10:
-        table.fail("long_exposure_s", f"must be from 0 to 10, found {exposure_s!r}")
+        table.fail("long_exposure_s", Fact("not-in-range", low=0.0, high=10.0, found=repr(exposure_s)))
     return LongExposures(
         source=source,
         times=times,

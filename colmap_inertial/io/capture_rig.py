@@ -38,6 +38,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import CameraModel
 from colmap_inertial.io.camera_table import CAMERA_KEYS, check_transform, read_camera_table
 from colmap_inertial.io.files import path_in
@@ -117,29 +118,29 @@ def read_rig_table(table: Section, *, body_from_cam: Array | None) -> RigTable:
     names = [key for key in table.names() if isinstance(table.raw(key), dict)]
     table.require_known(["calibration", "unit", "reference", *names])
     if not names:
-        table.fail(None, "needs a table [rig.NAME] for each camera but the main one")
+        table.fail(None, Fact("rig-without-cameras"))
     path = table.file("calibration")
     units: tuple[Metres, ...] = get_args(Metres)
     unit, reference = table.choice("unit", units), table.text("reference")
     if path is None:
         for key in ("unit", "reference"):
             if key in table:
-                table.fail(key, "belongs to calibration, which is missing")
+                table.fail(key, Fact("belongs-to-missing", key="calibration"))
         cameras = tuple(_read_camera(table.table(name), name, body_from_cam) for name in names)
         unknown = [camera.name for camera in cameras if camera.cam_from_reference is None]
         if 0 < len(unknown) < len(cameras):
-            table.table(unknown[0]).fail(None, "give cam_from_reference of each camera, or of none")
+            table.table(unknown[0]).fail(None, Fact("pose-of-some-cameras"))
         return RigTable(reference=None, cameras=cameras)
     known = read_rig_calibration(path, unit=unit)
     if known.length_unit != "m":
-        table.fail("calibration", 'holds lengths without a unit; give unit = "m" or "mm"')
+        table.fail("calibration", Fact("calibration-without-unit"))
     main = known.camera(reference or next(iter(known.cameras)))
     cameras = tuple(_read_calibrated(table.table(name), name, main, known) for name in names)
     models = [table.table(name).text("camera") or name for name in names]
     for name, model in zip(names, models, strict=True):
         if models.count(model) > 1:
-            table.table(name).fail("camera", f"{model!r} is that of another camera, too; each has its own")
-    return RigTable(reference=_model(known, main, reference or "the first camera"), cameras=cameras)
+            table.table(name).fail("camera", Fact("calibrated-camera-twice", name=model))
+    return RigTable(reference=_model(known, main, reference), cameras=cameras)
 
 
 def _read_calibrated(part: Section, name: str, main: MountedCamera, known: RigCalibration) -> RigCamera:
@@ -148,7 +149,7 @@ def _read_calibrated(part: Section, name: str, main: MountedCamera, known: RigCa
     own = part.text("camera") or name
     camera = known.camera(own)
     if camera is main:
-        part.fail("camera", f"{own!r} is the main camera in the calibration; give camera, or reference under [rig]")
+        part.fail("camera", Fact("calibrated-camera-is-main", name=own))
     return RigCamera(
         name=name,
         frames=frames,
@@ -168,7 +169,7 @@ def _read_camera(part: Section, name: str, body_from_reference: Array | None) ->
     rows, pose = part.matrix("cam_from_reference"), None
     if rows is not None:
         if len(rows) != 4:
-            part.fail("cam_from_reference", "must be a 4x4 matrix, with the translation in metres")
+            part.fail("cam_from_reference", Fact("pose-not-4x4"))
         pose = check_transform(part, "cam_from_reference", rows)
     elif body_from_cam is not None and body_from_reference is not None:
         pose = np.linalg.inv(body_from_cam) @ body_from_reference
@@ -177,7 +178,7 @@ def _read_camera(part: Section, name: str, body_from_reference: Array | None) ->
 
 def _read_frames(part: Section, name: str, more: tuple[str, ...]) -> ImageFolder | Video:
     if not _NAME.fullmatch(name):
-        part.fail(None, f"the camera's name {name!r} becomes a folder: letters, digits, - and _ alone")
+        part.fail(None, Fact("camera-name-unsuited", name=name))
     if "video" in part:
         part.require_known([*_VIDEO_KEYS, *more])
         return read_video(part, "video")
@@ -185,7 +186,7 @@ def _read_frames(part: Section, name: str, more: tuple[str, ...]) -> ImageFolder
     return read_image_folder(part)
 
 
-def _model(known: RigCalibration, camera: MountedCamera, name: str) -> CameraModel:
+def _model(known: RigCalibration, camera: MountedCamera, name: str | None) -> CameraModel:
     if camera.size is None:
-        raise FormatError(known.path, f"gives no image size of {name}; describe each camera in a table of its own")
+        raise FormatError(known.path, Fact("camera-without-size", name=name))
     return CameraModel(model=camera.model, width=camera.size[0], height=camera.size[1], params=camera.params)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import quat_from_matrix
 from colmap_inertial.core.types import ImuNoise
 from colmap_inertial.io import sensor_yaml
@@ -75,7 +76,7 @@ def read_imu_table(table: Section) -> ImuPath | ImuTables:
     noise = _read_noise(table.section("noise"))
     if path is not None:
         if path.suffix.lower() == ".toml" or fmt == "capture":
-            table.fail("path", "must be a recording, not another capture.toml")
+            table.fail("path", Fact("imu-path-is-capture"))
         gyro_unit, gyro_axes = _read_correction(gyro, "gyro")
         accel_unit, accel_axes = _read_correction(accel, "accel")
         return ImuPath(
@@ -88,9 +89,9 @@ def read_imu_table(table: Section) -> ImuPath | ImuTables:
         )
     for key, value in (("format", fmt), ("stamps", stamps), ("topic", topic)):
         if value is not None:
-            table.fail(key, "belongs to path, which is missing")
+            table.fail(key, Fact("belongs-to-missing", key="path"))
     if gyro is None:
-        table.fail(None, "needs path, or [imu.gyro] (and [imu.accel], for scale and gravity) that describe tables")
+        table.fail(None, Fact("imu-table-needs-path"))
     gyro_table, gyro_axes = _read_sensor_table(gyro, "gyro")
     accel_table, accel_axes = (None, None) if accel is None else _read_sensor_table(accel, "accel")
     return ImuTables(gyro=gyro_table, accel=accel_table, gyro_axes=gyro_axes, accel_axes=accel_axes, noise=noise)
@@ -118,7 +119,7 @@ def read_calibration_table(
     """
     files = table.files("file")
     if any(key in table for key in CALIBRATION_KEYS[1:]) and not all(holds_imu_alone(file) for file in files):
-        table.fail("file", "gives the calibration; leave out the other keys of this table")
+        table.fail("file", Fact("file-gives-calibration"))
     calibrations = read_for_recording(files, shared_clock=shared_clock, readout_s=readout_s)
     if calibrations.camera_imu is not None:
         return calibrations
@@ -148,13 +149,13 @@ def _read_pose(table: Section) -> tuple[ArrayLike | None, ArrayLike | None]:
     lever = table.numbers("imu_in_cam_m", 3)
     if matrix is None:
         if xyzw is not None and abs(np.linalg.norm(xyzw) - 1) > 1e-3:
-            table.fail("cam_from_imu_xyzw", "must be a quaternion x, y, z, w of length 1")
+            table.fail("cam_from_imu_xyzw", Fact("not-a-unit-quaternion"))
         return xyzw, lever
     if xyzw is not None:
-        table.fail("cam_from_imu_xyzw", "and cam_from_imu say the same; leave one out")
+        table.fail("cam_from_imu_xyzw", Fact("said-twice", other="cam_from_imu"))
     cam_from_imu = check_transform(table, "cam_from_imu", matrix)
     if len(matrix) > 3 and lever is not None:
-        table.fail("imu_in_cam_m", "and the last column of cam_from_imu say the same; leave one out")
+        table.fail("imu_in_cam_m", Fact("translation-said-twice"))
     return quat_from_matrix(cam_from_imu[:3, :3]), cam_from_imu[:3, 3] if len(matrix) > 3 else lever
 
 
@@ -183,7 +184,7 @@ def _read_correction(table: Section | None, quantity: Quantity) -> tuple[str | N
     if table is None:
         return None, None
     if "file" in table:
-        table.fail("file", "and [imu] path say the same; leave one out")
+        table.fail("file", Fact("said-twice", other="[imu] path"))
     table.require_known(_CORRECTION_KEYS)
     return table.choice("unit", SENSOR_UNITS[quantity]), _read_axes(table)
 
@@ -195,9 +196,9 @@ def _read_sensor_table(table: Section, quantity: Quantity) -> tuple[SensorTable,
     columns = table.require("columns", table.raw("columns"))
     unit = table.require("unit", table.choice("unit", SENSOR_UNITS[quantity]))
     if not isinstance(columns, list) or len(columns) != 3 or not all(map(_is_column, columns)):
-        table.fail("columns", f"must be three names, or numbers counted from 1, of x, y and z; found {columns!r}")
+        table.fail("columns", Fact("not-three-columns", found=repr(columns)))
     if len({*stamps.columns, *columns}) != len(stamps.columns) + 3:
-        table.fail("columns", "must be three columns, none of them twice, and another than time")
+        table.fail("columns", Fact("columns-repeated"))
     x, y, z = columns
     described = SensorTable(
         file=file,
@@ -222,22 +223,21 @@ def _read_time(table: Section) -> TimeColumns:
     if rate_hz is not None:
         for key in _TIME_KEYS[:-1]:
             if key in table:
-                table.fail(key, "and rate_hz say the same; leave one out")
+                table.fail(key, Fact("said-twice", other="rate_hz"))
         return TimeColumns(rate_hz=rate_hz)
     columns = table.require("time", time) if isinstance(time, list) else [table.require("time", time)]
     if not columns or not all(map(_is_column, columns)) or len(set(columns)) != len(columns):
-        table.fail("time", f"must be a column's name, or its number counted from 1; found {time!r}")
+        table.fail("time", Fact("not-a-column", found=repr(time)))
     if counts is not None:
         if unit is not None or len(columns) > 1:
-            table.fail("time_counts_per_s", "belongs to one column of time without time_unit")
+            table.fail("time_counts_per_s", Fact("counts-need-one-column"))
         return TimeColumns(columns=tuple(columns), counts_per_second=counts)
     units = table.require("time_unit", unit) if isinstance(unit, list) else [table.require("time_unit", unit)]
     if units == ["date"]:
         return TimeColumns(columns=tuple(columns), units=("date",), date_order=table.choice("date_order", DATE_ORDERS))
     if any(name not in TIME_UNITS_NS for name in units) or len(units) != len(columns):
-        several = "" if len(columns) == 1 else f", a list with one of them for each of the {len(columns)} columns"
-        allowed = ", ".join(map(repr, (*TIME_UNITS_NS, "date")))
-        table.fail("time_unit", f"must be one of {allowed}{several}; found {unit!r}")
+        allowed = (*TIME_UNITS_NS, "date")
+        table.fail("time_unit", Fact("not-a-time-unit", units=allowed, columns=len(columns), found=repr(unit)))
     return TimeColumns(columns=tuple(columns), units=tuple(units))
 
 
@@ -247,7 +247,7 @@ def _read_where(table: Section) -> tuple[str | int, str] | None:
     if where is None:
         return None
     if not isinstance(where, list) or len(where) != 2 or not _is_column(where[0]) or isinstance(where[1], list | dict):
-        table.fail("where", f'must be a column and its value in the rows to take, as [1, "GYRO"]; found {where!r}')
+        table.fail("where", Fact("not-a-row-choice", found=repr(where)))
     return where[0], str(where[1])
 
 
@@ -261,18 +261,14 @@ def _read_axes(table: Section) -> Axes | None:
     text, mirrored = table.text("axes"), table.boolean("mirrored")
     if text is None:
         if mirrored is not None:
-            table.fail("mirrored", "belongs to axes, which is missing")
+            table.fail("mirrored", Fact("belongs-to-missing", key="axes"))
         return None
     try:
         axes = Axes.parse(text)
     except ValueError as error:
-        table.fail("axes", str(error))
+        table.fail("axes", Fact("invalid-values", detail=str(error)))
     if axes.is_mirrored and not mirrored:
-        table.fail(
-            "axes",
-            f'"{text}" turns a right-handed frame into a left-handed one; correct a sign or the order, or add '
-            "mirrored = true if the file's own axes are left-handed",
-        )
+        table.fail("axes", Fact("axes-mirror", axes=text))
     if mirrored and not axes.is_mirrored:
-        table.fail("mirrored", f'is true, but axes = "{text}" keep the handedness')
+        table.fail("mirrored", Fact("axes-do-not-mirror", axes=text))
     return axes

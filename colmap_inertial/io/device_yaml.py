@@ -74,7 +74,7 @@ class SheetCamera:
         try:
             return CameraModel(model=model, width=width, height=height, params=params)
         except ValueError as error:
-            raise self.sheet.fault(str(error)) from None
+            raise self.sheet.fault(Fact("invalid-values", detail=str(error))) from None
 
 
 def is_yaml(path: Path) -> bool:
@@ -105,7 +105,7 @@ def read_device_yaml(path: Path, camera: str | None = None) -> SheetCamera:
     if camera is None and len(cameras) > 1:
         raise FormatError(path, Fact("calibration-of-several", cameras=tuple(cameras)))
     if camera is not None and camera not in cameras:
-        raise FormatError(path, f"has no camera {camera!r}; it has {', '.join(cameras)}")
+        raise FormatError(path, Fact("no-camera-of-name", name=camera, cameras=tuple(cameras)))
     return cameras[camera or next(iter(cameras))]
 
 
@@ -171,7 +171,7 @@ def _vins(sheet: Sheet) -> SheetCamera:
         body_from_cam[:3, :3] = np.array(sheet.numbers("extrinsicRotation", 9)).reshape(3, 3)
         body_from_cam[:3, 3] = sheet.numbers("extrinsicTranslation", 3)
         if not is_rotation(body_from_cam[:3, :3]):
-            raise sheet.fault("extrinsicRotation holds no rotation")
+            raise sheet.fault(Fact("no-rotation", what="extrinsicRotation"))
     else:
         key = next(key for key in _BODY_POSES if key in values)
         body_from_cam = sheet.pose(key, key)
@@ -213,7 +213,7 @@ def _intrinsics(sheet: Sheet) -> tuple[str, tuple[float, ...], tuple[int, int]]:
             return _orb_slam(sheet, before)
     matrix = next((key for key in ("camera_matrix", "K", "k") if key in values), None)
     if matrix is None:
-        raise sheet.fault("holds no intrinsics")
+        raise sheet.fault(Fact("sheet-without-intrinsics"))
     fx, _, cx, _, fy, cy, *_ = _data(sheet, matrix, 9)
     key = next((key for key in ("distortion_coefficients", "D", "d") if key in values), None)
     coefficients = [] if key is None else _data(sheet, key)
@@ -249,7 +249,9 @@ def _camodocal(sheet: Sheet) -> tuple[str, tuple[float, ...], tuple[int, int]]:
         return _convert_to_colmap(
             sheet, "equidistant", values, [projection.numbers(f"k{i}", 1)[0] for i in (2, 3, 4, 5)], size
         )
-    raise sheet.fault(f"model_type {model!r} is not known here (PINHOLE and KANNALA_BRANDT are)")
+    raise sheet.fault(
+        Fact("value-not-known", key="model_type", found=repr(model)[:200], known=("PINHOLE", "KANNALA_BRANDT"))
+    )
 
 
 def _map(sheet: Sheet, key: str) -> dict[str, Any]:
@@ -280,10 +282,15 @@ def _convert_to_colmap(
         return "OPENCV_FISHEYE", (fx, fy, *centre, *([*coefficients, *[0.0] * 4][:4])), size
     if model not in (*_PLUMB_BOB, *_RATIONAL):
         raise sheet.fault(
-            f"distortion_model {model!r} is not known here (plumb_bob, rational_polynomial, equidistant are)"
+            Fact(
+                "value-not-known",
+                key="distortion_model",
+                found=repr(model)[:200],
+                known=("plumb_bob", "rational_polynomial", "equidistant"),
+            )
         )
     if any(coefficients[8:]):
-        raise sheet.fault("prism or tilt coefficients are not known to COLMAP's cameras")
+        raise sheet.fault(Fact("lens-model-unknown-to-colmap"))
     bent = [*coefficients, *[0.0] * 8][:8]
     full = any(bent[4:])
     return "FULL_OPENCV" if full else "OPENCV", (fx, fy, *centre, *bent[: 8 if full else 4]), size

@@ -18,6 +18,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, TimingError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import HeightDatum
 from colmap_inertial.io.files import read_bytes, reader, reading
 from colmap_inertial.io.frame_times import FrameStamps, stamps_in_order
@@ -81,16 +82,11 @@ def stamps_of_exif(folder: Path, names: Sequence[str]) -> tuple[FrameStamps, int
         texts = _texts(path)
         fraction = texts.get(_Tag.FRACTION, "").strip()
         if not re.fullmatch(r"\d{2,9}", fraction):
-            tells = "tenths of a second" if fraction.isdigit() else "whole seconds"
-            raise TimingError(
-                f"{path}: its EXIF gives the time to {tells} only (SubSecTimeOriginal, two digits or more, is "
-                "needed); a scale needs the times of its images to some milliseconds: give --frame-times, or --video "
-                "where they were taken from one"
-            )
+            raise TimingError(Fact("exif-time-coarse", path=str(path), to_tenths=fraction.isdigit()))
         try:
             local = datetime.datetime.strptime(texts.get(_Tag.DATE, "").strip(), "%Y:%m:%d %H:%M:%S")
         except ValueError:
-            raise FormatError(path, "its EXIF has no DateTimeOriginal; give --frame-times") from None
+            raise FormatError(path, Fact("exif-without-date")) from None
         seconds = (local.replace(tzinfo=datetime.UTC) - _EPOCH) // datetime.timedelta(seconds=1)
         offset = re.fullmatch(r"([+-])(\d\d):(\d\d)", texts.get(_Tag.OFFSET, "").strip())
         if offset is not None:
@@ -101,8 +97,9 @@ def stamps_of_exif(folder: Path, names: Sequence[str]) -> tuple[FrameStamps, int
         digits.append(len(fraction))
     if len(set(offsets)) > 1:
         raise TimingError(
-            f"{folder / names[offsets.index(False)]}: its EXIF does not state the offset from universal time, that of "
-            f"{names[offsets.index(True)]} does: their times cannot be compared; give --frame-times"
+            Fact(
+                "exif-offset-of-some", path=str(folder / names[offsets.index(False)]), other=names[offsets.index(True)]
+            )
         )
     return stamps_in_order(folder, list(names), np.array(t_ns, dtype=np.int64)), min(digits)
 
@@ -113,11 +110,11 @@ def _texts(path: Path) -> dict[int, str]:
     try:
         entries = _directory(head, _Tag.EXIF)
         if entries is None:
-            raise FormatError(path, "has no EXIF, which is to give its time; give --frame-times")
+            raise FormatError(path, Fact("exif-missing"))
         tiff, order, directory = entries
         return {tag: _text(tiff, order, *entry) for tag, entry in directory.items() if entry[0] == _Type.ASCII}
     except (struct.error, KeyError):
-        raise FormatError(path, "its EXIF is damaged or empty; give --frame-times") from None
+        raise FormatError(path, Fact("exif-damaged")) from None
 
 
 def _directory(head: bytes, tag: _Tag) -> tuple[bytes, str, dict[int, tuple[int, int, bytes]]] | None:

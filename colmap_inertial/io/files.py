@@ -68,14 +68,11 @@ def reading_within(limits: ReadLimits) -> Iterator[None]:
 #: The code of a :class:`FormatError` that the gate made, where a reader had no words of its own.
 DAMAGED = "damaged"
 
-#: What is said of a record of ours that somebody changed.
-CHANGED_RECORD = "was damaged since it was written; remove it and start again"
-
 F = TypeVar("F", bound=Callable[..., Any])
 
 
 @contextmanager
-def reading(path: StrPath, fault: str = "is damaged") -> Iterator[None]:
+def reading(path: StrPath, fault: Fact | None = None) -> Iterator[None]:
     """The gate of all readers: whatever the content of a file causes is an error that names it.
 
     Parameters
@@ -83,7 +80,7 @@ def reading(path: StrPath, fault: str = "is damaged") -> Iterator[None]:
     path
         What is read.
     fault
-        What the message then says of it.
+        What the message then says of it, by default that it is damaged.
 
     Raises
     ------
@@ -99,7 +96,7 @@ def reading(path: StrPath, fault: str = "is damaged") -> Iterator[None]:
         if describe_environment_fault(error) is not None:
             raise
         reason = f"{type(error).__name__}: {error}".splitlines()[0][:300]
-        raise FormatError(Path(path), f"{fault} ({reason})", code=DAMAGED) from error
+        raise FormatError(Path(path), Fact(DAMAGED, fault=fault or Fact("is-damaged"), detail=reason)) from error
 
 
 def reader(what: str) -> Callable[[F], F]:
@@ -108,7 +105,7 @@ def reader(what: str) -> Callable[[F], F]:
     def through(read: F) -> F:
         @functools.wraps(read)
         def gated(*args: Any, **kwargs: Any) -> Any:
-            with reading(args[0] if args else next(iter(kwargs.values())), f"cannot be read as {what}"):
+            with reading(args[0] if args else next(iter(kwargs.values())), Fact("not-readable-as", what=what)):
                 return read(*args, **kwargs)
 
         return typing.cast(F, gated)
@@ -135,7 +132,7 @@ def write_text(path: Path, text: str) -> None:
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except OSError as error:
-        raise OutputError(f"{path} cannot be written: {error.strerror or error}") from error
+        raise OutputError(Fact("cannot-be-written", path=str(path), detail=str(error.strerror or error))) from error
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -150,7 +147,7 @@ def remove_temporaries(*folders: Path) -> None:
 
 
 @contextlib.contextmanager
-def locked(path: Path, busy: str, *, wait_s: float = 0.0) -> Iterator[None]:
+def locked(path: Path, busy: Fact, *, wait_s: float = 0.0) -> Iterator[None]:
     """Hold the lock file ``path``; the system lets go of it when this process ends, whatever ends it.
 
     Raises
@@ -198,19 +195,23 @@ def read_yaml(path: Path, what: str, loader: Any = None) -> dict[Any, Any]:
 
     text = read_text(path)
     if len(text) > 1 << 19:  # PyYAML takes 300 bytes and 20 us for each character
-        raise FormatError(path, f"is no {what.removeprefix('a ')}: its {len(text)} characters are more than any has")
+        raise FormatError(path, Fact("too-many-characters", what=what.removeprefix("a "), count=len(text)))
     if text.startswith("%YAML:"):
         text = "#" + text
     try:
-        sheet = yaml.load(text, loader or yaml.SafeLoader)
+        sheets = [sheet for sheet in yaml.load_all(text, loader or yaml.SafeLoader) if sheet is not None]
     except yaml.MarkedYAMLError as error:
         line = None if error.problem_mark is None else error.problem_mark.line + 1
-        raise FormatError(path, f"not valid YAML: {error.problem}", line=line) from None
+        raise FormatError(path, Fact("invalid-yaml", detail=str(error.problem)), line=line) from None
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise FormatError(path, f"not valid YAML: {str(error).splitlines()[0]}") from None
-    if not isinstance(sheet, dict):
-        raise FormatError(path, f"not {what}: expected keys and values")
-    return sheet
+        raise FormatError(path, Fact("invalid-yaml", detail=str(error).splitlines()[0])) from None
+    if not sheets or not all(isinstance(sheet, dict) for sheet in sheets):
+        raise FormatError(path, Fact("no-keys-and-values", what=what))
+    # messages of ROS, one after another, differ in their headers
+    said = [{key: value for key, value in sheet.items() if key != "header"} for sheet in sheets]
+    if any(other != said[0] for other in said[1:]):
+        raise FormatError(path, Fact("documents-differ", what=what, count=len(sheets)))
+    return dict(sheets[0])
 
 
 def write_json(path: Path, value: object, *, indent: int | None = 2) -> None:
@@ -238,7 +239,7 @@ def read_json(path: Path) -> dict[str, Any]:
     """The JSON object in ``path``; a :class:`FormatError` where there is none."""
     value = read_json_value(path)
     if not isinstance(value, dict):
-        raise FormatError(path, f"expected a JSON object, found {type(value).__name__}")
+        raise FormatError(path, Fact("no-json-object", found=type(value).__name__))
     return value
 
 
@@ -248,9 +249,9 @@ def read_json_value(path: Path) -> Any:
     try:
         return json.loads(text, parse_constant=_no_constant, parse_float=_finite, parse_int=_modest)
     except json.JSONDecodeError as error:
-        raise FormatError(path, f"not valid JSON: {error.msg}", line=error.lineno) from None
+        raise FormatError(path, Fact("invalid-json", detail=str(error.msg)), line=error.lineno) from None
     except (ValueError, RecursionError) as error:
-        raise FormatError(path, f"not valid JSON: {error}") from None
+        raise FormatError(path, Fact("invalid-json", detail=str(error))) from None
 
 
 def read_text(path: Path) -> str:
@@ -277,15 +278,14 @@ def read_bytes(path: Path, size: int = -1, *, what: str = "file") -> bytes:
         with open(path, "rb") as file:
             largest_gib = read_limits().file_gib
             if size < 0 and os.fstat(file.fileno()).st_size > largest_gib * (1 << 30):
-                raise FormatError(
-                    path,
-                    f"is larger than {largest_gib:g} GiB; such a {what} is not read (raise --limits.file-gib)",
-                )
+                raise FormatError(path, Fact("file-too-large", largest_gib=largest_gib, what=what))
             return file.read(size)
     except FileNotFoundError:
-        raise FormatError(path, f"no such {what}") from None
+        raise FormatError(path, Fact("no-such-file", what=what)) from None
     except (OSError, ValueError) as error:  # the latter for a NUL in the path
-        raise FormatError(path, f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
+        raise FormatError(
+            path, Fact("file-not-readable", detail=str(getattr(error, "strerror", None) or error))
+        ) from None
 
 
 #: Files whose size the system does not know, and which may block for ever.
@@ -304,17 +304,13 @@ def require_regular(path: Path) -> None:
     """
     mode = os.stat(path).st_mode
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)) or os.path.realpath(path).startswith(_KERNEL):
-        raise FormatError(path, "is a device, a pipe or a socket, not a file; copy what it gives into one")
+        raise FormatError(path, Fact("not-a-regular-file"))
 
 
 def refuse_link(path: Path) -> None:
     """Raise :class:`FormatError` where a name in an output folder is a symbolic link."""
     if path.is_symlink():
-        raise FormatError(
-            path,
-            f"is a link to {path.readlink()}; links in an output folder are not followed: remove it, or put the file "
-            "or folder itself there",
-        )
+        raise FormatError(path, Fact("link-in-output", target=str(path.readlink())))
 
 
 def first_line(path: Path) -> str:
@@ -331,7 +327,7 @@ def convert_to_plain(value: object) -> Any:
 
 
 def _no_constant(name: str) -> float:
-    raise ValueError(f"{name[:40]} is not a number that is known here")
+    raise ValueError(Fact("not-a-known-number", text=name[:40]))
 
 
 def _finite(text: str) -> float:
@@ -388,7 +384,7 @@ def read_record(path: Path, kind: type[T]) -> T:
         Where the file was changed since.
     """
     values = read_json(path)
-    with reading(path, CHANGED_RECORD):
+    with reading(path, Fact("changed-record")):
         return structured(kind, values)
 
 
@@ -457,17 +453,14 @@ def check_names(names: Iterable[str], source: Path | str) -> None:
     for name in names:
         fault = name_fault(name)
         if fault is not None:
-            raise FormatError(source, f"names the file {name[:80]!r}, which {fault}; such names are not followed")
+            raise FormatError(source, Fact("unsafe-name", name=name[:80], fault=fault))
 
 
 def require_utf8(*paths: StrPath) -> None:
     """Raise :class:`FormatError` for a path that native libraries would end the process for, and JSON cannot hold."""
     for path in paths:
         if printable(absolute := os.path.abspath(path)) != absolute:
-            raise FormatError(
-                Path(path),
-                "its name, or a folder's above it, is no UTF-8 or holds a control character; rename it",
-            )
+            raise FormatError(Path(path), Fact("unprintable-path"))
 
 
 def path_in(folder: Path, name: str, source: Path | str | None = None) -> Path:
@@ -490,26 +483,21 @@ def path_in(folder: Path, name: str, source: Path | str | None = None) -> Path:
     root, real = os.path.realpath(folder), os.path.realpath(path)
     if os.path.commonpath((root, real)) != root or root == real:
         raise FormatError(
-            path if source is None else source,
-            f"names the file {name[:80]!r}, which a link leads out of {folder} to {real}; links are not followed: put "
-            "the file itself there",
+            path if source is None else source, Fact("link-leads-out", name=name[:80], folder=str(folder), real=real)
         )
     return path
 
 
-EMPTY, UNPRINTABLE = "is empty", "is no UTF-8, or holds a control character"
-
-
-def name_fault(name: str) -> str | None:
+def name_fault(name: str) -> Fact | None:
     """What is wrong with a name of a file in a folder; ``None`` where nothing is."""
     if not name or not name.strip("./\\ "):
-        return EMPTY
+        return Fact("is-empty")
     if name.startswith("/") or Path(name).anchor:
-        return "is absolute"
+        return Fact("name-absolute")
     parts = re.split(r"[/\\]", name)
     if ".." in parts:
-        return 'leads out of its folder by ".."'
+        return Fact("name-leads-out")
     if printable(name) != name or "\n" in name or "\t" in name:
-        return UNPRINTABLE
+        return Fact("name-unprintable")
     longest = max(len(part.encode()) for part in parts)
-    return f"is longer than {_LONGEST} bytes" if longest > _LONGEST else None
+    return Fact("name-too-long", longest=_LONGEST) if longest > _LONGEST else None

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.images import SUFFIXES
 from colmap_inertial.io.toml_section import Section
 from colmap_inertial.io.units import TIME_UNITS_NS
@@ -65,9 +66,9 @@ def read_image_folder(table: Section) -> ImageFolder:
     times: Literal["name"] | Path | None = "name" if table.text("times") == "name" else table.file("times")
     unit = table.choice("time_unit", TIME_UNITS_NS)
     if times == "name" and unit is None:
-        table.fail("times", f'"name" needs time_unit, one of {", ".join(TIME_UNITS_NS)}')
+        table.fail("times", Fact("name-times-without-unit", units=tuple(TIME_UNITS_NS)))
     if pattern is not None and (Path(pattern).is_absolute() or ".." in Path(pattern).parts):
-        table.fail("pattern", f"must stay inside folder, found {pattern!r}")
+        table.fail("pattern", Fact("pattern-outside", found=repr(pattern)))
     return ImageFolder(folder=folder, pattern=pattern, times=times, time_unit=unit, video=table.file("video"))
 
 
@@ -84,12 +85,11 @@ def read_video(table: Section, key: str) -> Video:
 def image_names(source: ImageFolder) -> list[str]:
     """Names relative to the folder, with forward slashes, as COLMAP has them."""
     if not source.folder.is_dir():
-        raise FormatError(source.folder, "no such folder of pictures")
+        raise FormatError(source.folder, Fact("no-such-file", what="folder of pictures"))
     if source.pattern is not None and (Path(source.pattern).is_absolute() or ".." in Path(source.pattern).parts):
-        raise FormatError(source.folder, f"the pattern {source.pattern!r} leads out of it")
+        raise FormatError(source.folder, Fact("pattern-leads-out", pattern=source.pattern))
     candidates = source.folder.iterdir() if source.pattern is None else source.folder.glob(source.pattern)
     paths = [path for path in candidates if path.suffix.lower() in SUFFIXES and path.is_file()]
     if not paths:
-        what = "holds no pictures" if source.pattern is None else f"holds no pictures that match {source.pattern!r}"
-        raise FormatError(source.folder, f"{what} (endings: {', '.join(SUFFIXES)})")
+        raise FormatError(source.folder, Fact("no-pictures", pattern=source.pattern, endings=SUFFIXES))
     return sorted(path.relative_to(source.folder).as_posix() for path in paths)

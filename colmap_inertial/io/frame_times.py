@@ -15,6 +15,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError, TimingError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import FrameLog, FrameTiming
 from colmap_inertial.io.files import reader
 from colmap_inertial.io.images import SUFFIXES
@@ -25,12 +26,6 @@ _NAME_COLUMNS = {"name", "filename", "file", "image", "imagename", "frame"}
 _EXPOSURE_COLUMNS = {"exposure", "exposuretime"}
 #: Images of a rig are of one moment up to here: at 1 m/s and 1 rad/s, 1 mm and 1 mrad.
 SAME_MOMENT_NS = 1_000_000
-_HOW = (
-    'give a CSV with the header "name,t_s" (or t_ms, t_us, t_ns) and one row for each frame, or put the times into the '
-    'file names and set times = "name" with time_unit under [images] in capture.toml'
-)
-
-
 #: No image stands for others.
 NO_RIGS: Mapping[str, str] = MappingProxyType({})
 
@@ -65,9 +60,12 @@ class FrameStamps:
         same = np.flatnonzero(np.diff(self.t_ns) == 0)
         if len(same):
             raise TimingError(
-                f"{self.source}: the frames {self.names[same[0]]} and {self.names[same[0] + 1]} have the same time. "
-                "Images of several cameras may share one where COLMAP's model holds the cameras as a rig; else give "
-                "the times of one camera's images"
+                Fact(
+                    "frames-at-one-time",
+                    source=str(self.source),
+                    first=self.names[same[0]],
+                    second=self.names[same[0] + 1],
+                )
             )
         exposures = self.exposure_s
         if exposures is None and exposure_s is not None:
@@ -104,9 +102,13 @@ class FrameStamps:
             apart_ns = int(self.t_ns[own[-1]] - self.t_ns[own[0]])
             if apart_ns > SAME_MOMENT_NS:
                 raise TimingError(
-                    f"{self.source}: {self.names[own[0]]} and {self.names[own[-1]]} are of one frame of a rig, but "
-                    f"their times are {apart_ns / 1e6:.3g} ms apart. COLMAP's rig has one pose for both: give them one "
-                    "time, or map cameras that are not synchronised without a rig"
+                    Fact(
+                        "rig-images-apart",
+                        source=str(self.source),
+                        first=self.names[own[0]],
+                        last=self.names[own[-1]],
+                        apart_ms=apart_ns / 1e6,
+                    )
                 )
         kept = sorted(next((p for p in own if self.names[p] == first), own[0]) for first, own in places.items())
         return FrameStamps(
@@ -133,11 +135,11 @@ def stamps_of_csv(path: Path, time_unit: str | None = None) -> FrameStamps:
     """
     table = read_table(path)
     if table.header is None:
-        raise TimingError(f"{path} has no header: {_HOW}")
+        raise TimingError(Fact("times-without-header", path=str(path)))
     flat = [re.sub(r"[\s_]", "", split_unit(cell)[0]).lower() for cell in table.header]
     name_column = next((i for i, name in enumerate(flat) if name in _NAME_COLUMNS), None)
     if name_column is None:
-        raise TimingError(f"{path} has no column of names (the header is: {table.header_text[:200]}); {_HOW}")
+        raise TimingError(Fact("times-without-names", path=str(path), header=table.header_text[:200]))
     t_ns = _time_column(table, time_unit)
     exposure_column = next((i for i, name in enumerate(flat) if name in _EXPOSURE_COLUMNS), None)
     exposure_s = None if exposure_column is None else _exposures(table, exposure_column)
@@ -165,8 +167,7 @@ def stamps_of_names(folder: Path, names: Sequence[str], unit: str) -> FrameStamp
         numbers = re.findall(r"\d+(?:\.\d+)?", Path(name).stem)
         longest = [token for token in numbers if len(token) == max(map(len, numbers))]
         if len(longest) != 1:
-            what = "no number" if not numbers else f"several numbers of one length ({', '.join(longest)})"
-            raise TimingError(f'{folder / name}: the name holds {what}; times = "name" cannot time it: {_HOW}')
+            raise TimingError(Fact("name-without-one-time", path=str(folder / name), numbers=longest))
         tokens.append(longest[0])
     return stamps_in_order(folder, list(names), stamps_ns(folder, tokens, unit))
 
@@ -192,7 +193,7 @@ def stamps_of_pattern(folder: Path, names: Sequence[str], pattern: str) -> Frame
     if within:
         names = [name for name in names if fnmatch.fnmatchcase(Path(name).parent.as_posix(), within)]
         if not names:
-            raise TimingError(f"{folder}: no image lies in a folder {within!r}, as --name-times has it")
+            raise TimingError(Fact("no-image-in-folder", path=str(folder), folder=within))
     if Path(pattern).suffix.lower() in SUFFIXES:
         pattern = pattern[: pattern.rindex(".")]
     if pattern in TIME_UNITS_NS:
@@ -204,22 +205,19 @@ def stamps_of_pattern(folder: Path, names: Sequence[str], pattern: str) -> Frame
         for name in names:
             match = re.fullmatch(rf"{before}(\d+(?:\.\d+)?){after}", Path(name).stem)
             if match is None:
-                raise TimingError(f"{folder / name}: the name does not fit {pattern!r} (without folder and ending)")
+                raise TimingError(Fact("name-fits-no-pattern", path=str(folder / name), pattern=pattern))
             tokens.append(match[1])
         return stamps_in_order(folder, list(names), stamps_ns(folder, tokens, units[0]))
     if "%f" in pattern and ("%d" in pattern or "%j" in pattern):
         return stamps_in_order(folder, list(names), np.array([_date_ns(folder / n, pattern) for n in names]))
-    raise TimingError(
-        f"{pattern!r} does not say how names hold times: give a unit ({', '.join(TIME_UNITS_NS)}), the number's place "
-        "as in 'cam0_{ns}_*', or a date with a fraction of the second as in 'PXL_%Y%m%d_%H%M%S%f'"
-    )
+    raise TimingError(Fact("pattern-without-time", pattern=pattern, units=tuple(TIME_UNITS_NS)))
 
 
 def _date_ns(path: Path, pattern: str) -> int:
     try:
         date = datetime.datetime.strptime(path.stem, pattern)
     except ValueError:
-        raise TimingError(f"{path}: the name does not fit {pattern!r} (without folder and ending)") from None
+        raise TimingError(Fact("name-fits-no-pattern", path=str(path), pattern=pattern)) from None
     since = date.replace(tzinfo=datetime.UTC) - datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
     return since // datetime.timedelta(microseconds=1) * 1000
 
@@ -234,7 +232,7 @@ def stamps_of_log(path: Path, time_unit: str | None = None) -> Int64Array:
     if table.header is not None:
         return _time_column(table, time_unit)
     if table.width != 1:
-        raise TimingError(f'{path} has {table.width} columns and no header; name the time column, for example "t_ns"')
+        raise TimingError(Fact("frame-times-without-header", path=str(path), width=table.width))
     return table.stamps_ns(0, _require_unit(path, None, time_unit))
 
 
@@ -248,7 +246,7 @@ def frame_log(path: Path, frame_ns: Int64Array, **noted: Any) -> FrameLog:
     """
     bad = np.flatnonzero(np.diff(frame_ns) <= 0)
     if len(bad):
-        raise FormatError(path, f"the time of frame {bad[0] + 2} is not after the one before")
+        raise FormatError(path, Fact("frame-time-not-after", frame=int(bad[0] + 2)))
     epoch_ns = int(frame_ns[0])
     return FrameLog(t_s=seconds(frame_ns, epoch_ns), epoch_ns=epoch_ns, shared_clock=True, **noted)
 
@@ -258,11 +256,11 @@ def _time_column(table: Table, declared: str | None) -> Int64Array:
     try:
         columns = [recognise(cell) for cell in table.header]
     except ValueError as error:
-        raise FormatError(table.path, str(error)) from None
+        raise FormatError(table.path, Fact("invalid-values", detail=str(error))) from None
     times = [i for i, column in enumerate(columns) if column is not None and column.kind == "time"]
     if len(times) != 1:
-        what = "no column" if not times else "several columns"
-        raise TimingError(f"{table.path} has {what} of times (the header is: {table.header_text[:200]}); {_HOW}")
+        header = table.header_text[:200]
+        raise TimingError(Fact("not-one-time-column", path=str(table.path), count=len(times), header=header))
     column = columns[times[0]]
     assert column is not None
     return table.stamps_ns(times[0], _require_unit(table.path, column.unit, declared))
@@ -270,10 +268,10 @@ def _time_column(table: Table, declared: str | None) -> Int64Array:
 
 def _require_unit(path: Path, written: str | None, declared: str | None) -> str:
     if written is not None and declared is not None and written != declared:
-        raise TimingError(f"{path}: the header says {written}, time_unit says {declared}; correct one of them")
+        raise TimingError(Fact("time-units-contradict", path=str(path), written=written, declared=declared))
     unit = written or declared
     if unit is None:
-        raise TimingError(f"{path} does not say the unit of its times; name the column t_s, t_ms, t_us or t_ns")
+        raise TimingError(Fact("time-unit-missing", path=str(path)))
     return unit
 
 
@@ -281,13 +279,11 @@ def _exposures(table: Table, column: int) -> Array:
     assert table.header is not None
     unit = unit_of(split_unit(table.header[column])[1] or "")
     if unit not in TIME_UNITS_NS:
-        raise FormatError(
-            table.path, f'column "{table.header[column]}" needs a unit: name it exposure_s or exposure_ns'
-        )
+        raise FormatError(table.path, Fact("exposure-without-unit", column=table.header[column]))
     values = table.numbers([column])[:, 0] * (TIME_UNITS_NS[unit] / 1e9)
     bad = np.flatnonzero(~((values >= 0) & (values < 10)))
     if len(bad):
-        raise FormatError(table.path, "an exposure must be from 0 to 10 s", line=int(table.line_numbers[bad[0]]))
+        raise FormatError(table.path, Fact("exposure-not-in-range"), line=int(table.line_numbers[bad[0]]))
     return values
 
 
@@ -303,9 +299,9 @@ def stamps_in_order(
     for i, name in enumerate(names):
         line = None if line_numbers is None else int(line_numbers[i])
         if not name:
-            raise FormatError(path, "a row has no name", line=line)
+            raise FormatError(path, Fact("row-without-name"), line=line)
         if name in seen:
-            raise FormatError(path, f"the frame {name[:80]} comes twice", line=line)
+            raise FormatError(path, Fact("frame-twice", frame=name[:80]), line=line)
         seen[name] = i
     order = np.argsort(t_ns, kind="stable")
     t_ns = t_ns[order]

@@ -10,6 +10,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import IndexArray, Int64Array, UInt8Array, UInt16Array
 from colmap_inertial.core.errors import FormatError, TimingError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import Frame, FrameLog, FrameTiming
 from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.files import StrPath, path_in, reading
@@ -49,7 +50,7 @@ def read_frames(
     if not isinstance(capture, Capture):
         capture = load_capture(capture)
     if isinstance(capture.frames, Video):
-        with reading(capture.path, "describes frames that cannot be read"):
+        with reading(capture.path, Fact("frames-not-readable")):
             stamps, source_ns = _video_frames(capture.frames, capture.frame_log)
             timing = _timing(capture, stamps)
         return timing, _decode_video(capture, capture.frames, timing, source_ns, _places(timing, only))
@@ -91,14 +92,14 @@ def read_frame_timing(capture: Capture | Path, first_of: Mapping[str, str] = NO_
     """
     if isinstance(capture, Path):
         capture = load_capture(capture)
-    with reading(capture.path, "describes frames that cannot be read"):
+    with reading(capture.path, Fact("frames-not-readable")):
         match capture.frames:
             case ImageFolder():
                 return _timing(capture, _image_stamps(capture.frames).one_per_frame(first_of))
             case Video():
                 return _timing(capture, _video_frames(capture.frames, capture.frame_log)[0])
             case None:
-                raise FormatError(capture.path, "describes no frames; add [images] or [video]")
+                raise FormatError(capture.path, Fact("capture-without-frames"))
 
 
 def read_frame_times(path: StrPath, first_of: Mapping[str, str] = NO_RIGS) -> FrameTiming:
@@ -139,24 +140,26 @@ def _timing(capture: Capture, stamps: FrameStamps) -> FrameTiming:
 def _image_stamps(source: ImageFolder) -> FrameStamps:
     names = image_names(source)
     if source.times is None:
-        raise TimingError(
-            f"{source.folder}: nothing says when its {len(names)} pictures were taken (EXIF is too coarse): set "
-            'times under [images] in capture.toml to "name" (with time_unit) or to a CSV with the header "name,t_s"'
-        )
+        raise TimingError(Fact("pictures-untimed", folder=str(source.folder), count=len(names)))
     if source.times == "name":
         return stamps_of_names(source.folder, names, str(source.time_unit))
     stamps = stamps_of_csv(source.times, source.time_unit)
     untimed = sorted(set(names) - set(stamps.names))
     if untimed:
-        raise TimingError(f"{source.times}: no row for {len(untimed)} of {len(names)} pictures (first: {untimed[0]})")
+        raise TimingError(
+            Fact(
+                "pictures-without-row",
+                times=str(source.times),
+                untimed=len(untimed),
+                count=len(names),
+                first=untimed[0],
+            )
+        )
     present = set(names)
     unread = [name for name in stamps.names if name not in present and _is_other_picture(source, name)]
     if unread:
-        raise FormatError(
-            source.times,
-            f"names {len(unread)} files that are no pictures COLMAP reads (first: {unread[0]}): convert them to PNG or "
-            f"JPEG and name those, or take their rows out (endings: {', '.join(SUFFIXES)})",
-        )
+        named = Fact("names-of-other-pictures", count=len(unread), first=unread[0], endings=SUFFIXES)
+        raise FormatError(source.times, named)
     keep = np.array([name in present for name in stamps.names])
     return FrameStamps(
         names=tuple(name for name in stamps.names if name in present),
@@ -188,18 +191,27 @@ def _video_frames(source: Video, log: FrameLog | None) -> tuple[FrameStamps, Int
     if source.frame_times is None and log is not None and recorded_ns is not None and not log.in_video_time:
         if len(recorded_ns) not in (0, len(source_ns)):
             raise TimingError(
-                f"{source.file} has {len(source_ns)} frames, its recorder noted the times of {len(recorded_ns)}; give "
-                "frame_times under [video] in a capture.toml"
+                Fact(
+                    "recorder-noted-other-count", video=str(source.file), frames=len(source_ns), noted=len(recorded_ns)
+                )
             )
         t_ns = recorded_ns if len(recorded_ns) else source_ns
     if source.frame_times is not None:
         t_ns = stamps_of_log(source.frame_times, source.time_unit)
         if len(t_ns) != len(source_ns):
             raise TimingError(
-                f"{source.frame_times} has {len(t_ns)} times, the video {source.file} has {len(source_ns)} frames"
+                Fact(
+                    "times-of-other-count",
+                    times_file=str(source.frame_times),
+                    times=len(t_ns),
+                    video=str(source.file),
+                    frames=len(source_ns),
+                )
             )
         if (np.diff(t_ns) <= 0).any():
-            raise TimingError(f"{source.frame_times}: the times do not increase at row {1 + np.argmin(np.diff(t_ns))}")
+            raise TimingError(
+                Fact("frame-times-back", times_file=str(source.frame_times), row=int(1 + np.argmin(np.diff(t_ns))))
+            )
     keep = np.arange(len(t_ns)) if source.frames_per_s is None else thin(t_ns, source.frames_per_s)
     exposure_s = None
     if log is not None and log.exposure_s is not None and len(log.exposure_s) == len(source_ns):
@@ -230,12 +242,8 @@ def _frame(capture: Capture, timing: FrameTiming, i: int, path: Path, image: UIn
     camera = capture.camera
     if camera is not None and image.shape[:2] != (camera.height, camera.width):
         height, width = image.shape[:2]
-        rotated = (height, width) == (camera.width, camera.height)
-        raise FormatError(
-            path,
-            f"is {width}x{height}, but the camera is declared as {camera.width}x{camera.height} ({capture.path})"
-            + ("; pictures stay as the sensor was read, not turned by 90 degrees for display" if rotated else ""),
-        )
+        declared = {"declared_width": camera.width, "declared_height": camera.height, "declared_in": str(capture.path)}
+        raise FormatError(path, Fact("picture-of-other-size", width=width, height=height, **declared))
     return Frame(
         name=timing.names[i],
         image=image,

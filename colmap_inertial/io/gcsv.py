@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import FrameLog, ImuRecording, ReadoutDirection
 from colmap_inertial.io.files import first_line, read_limits, read_text
 from colmap_inertial.io.imu_text import build_recording, order_rows
@@ -53,7 +54,7 @@ def read_gcsv(path: Path, units: DeclaredUnits) -> ImuRecording:
     axes = _orientation(path, header)
     t_ns = np.rint(rows.numbers([0])[:, 0] * (_number(path, header, "tscale", 1e-3) * 1e9))
     if not np.isfinite(t_ns).all() or np.abs(t_ns).max() > 4e18:
-        raise FormatError(path, "a time is not a number, or beyond 142 years; check tscale")
+        raise FormatError(path, Fact("gcsv-times-damaged"))
     stamps = t_ns.astype(np.int64)
 
     def samples(quantity: Quantity, unit: str) -> Samples:
@@ -83,11 +84,11 @@ def read_gcsv_frames(path: Path) -> FrameLog:
         readout_s = abs(_number(path, header, "frame_readout_time", 0.0)) * 1e-3
         if readout_s >= 0.5:
             raise FormatError(
-                path, f"frame_readout_time is {1e3 * readout_s:g} ms", line=header["frame_readout_time"][1]
+                path, Fact("gcsv-readout-long", readout_ms=1e3 * readout_s), line=header["frame_readout_time"][1]
             )
         text, line = header.get("frame_readout_direction", ("0", 1))
         if text.lower() not in _DIRECTIONS:
-            raise FormatError(path, f"frame_readout_direction is {text[:40]!r}; expected 0, 1, 2 or 3", line=line)
+            raise FormatError(path, Fact("gcsv-direction-unknown", text=text[:40]), line=line)
         direction = _DIRECTIONS[text.lower()]
     return FrameLog(t_s=np.zeros(0), readout_s=readout_s, readout_direction=direction)
 
@@ -96,7 +97,7 @@ def _read(path: Path) -> tuple[dict[str, tuple[str, int]], Table]:
     """The header's values with their lines, and the rows."""
     lines = read_text(path).splitlines()
     if not lines or not lines[0].strip().startswith(_FIRST_LINES):
-        raise FormatError(path, f"does not begin with {_FIRST_LINES[0]}", line=1)
+        raise FormatError(path, Fact("gcsv-first-line", expected=_FIRST_LINES[0]), line=1)
     header: dict[str, tuple[str, int]] = {}
     for number, line in enumerate(lines[1:_LONGEST_HEADER], start=2):
         if line.count(",") >= read_limits().table_columns:
@@ -105,12 +106,12 @@ def _read(path: Path) -> tuple[dict[str, tuple[str, int]], Table]:
         if cells[0].lower() in ("t", "time") and len(cells) > 3:
             names = [cell.lower() for cell in cells]
             if not all(f"g{axis}" in names for axis in "xyz"):
-                raise FormatError(path, f"names no columns gx, gy, gz: {line[:100]}", line=number)
+                raise FormatError(path, Fact("gcsv-without-columns", line=line[:100]), line=number)
             # blank lines in front keep the line numbers of messages right
             return header, parse_table(path, "\n" * (number - 1) + "\n".join(lines[number - 1 :]) + "\n")
         if len(cells) >= 2:
             header[cells[0].lower()] = (",".join(cells[1:]), number)
-    raise FormatError(path, "has no line that names its columns (t,gx,gy,gz,...)")
+    raise FormatError(path, Fact("gcsv-without-header"))
 
 
 def _number(path: Path, header: dict[str, tuple[str, int]], key: str, default: float) -> float:
@@ -120,7 +121,7 @@ def _number(path: Path, header: dict[str, tuple[str, int]], key: str, default: f
     except ValueError:
         value = math.nan
     if not math.isfinite(value) or (key != "frame_readout_time" and value == 0):
-        raise FormatError(path, f"{key} is {text[:40]!r}, not a number to multiply by", line=line)
+        raise FormatError(path, Fact("gcsv-not-a-factor", key=key, text=text[:40]), line=line)
     return value
 
 
@@ -130,6 +131,4 @@ def _orientation(path: Path, header: dict[str, tuple[str, int]]) -> Axes:
     try:
         return Axes.of_letters(text)
     except ValueError:
-        raise FormatError(
-            path, f"orientation is {text[:40]!r}; expected three letters such as YxZ", line=line
-        ) from None
+        raise FormatError(path, Fact("gcsv-orientation", text=text[:40]), line=line) from None

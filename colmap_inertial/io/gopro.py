@@ -28,6 +28,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import FrameLog, HeightDatum, ImuRecording, PositionFixes
 from colmap_inertial.io.frame_times import frame_log
 from colmap_inertial.io.gpmf import Entry, Stream, entries, read_streams
@@ -88,14 +89,12 @@ def read_gopro(path: Path, units: DeclaredUnits) -> ImuRecording:
             continue
         values = stream.values
         if values.shape[1] != 3:
-            raise FormatError(path, f"the {key} stream has {values.shape[1]} channels, not 3")
+            raise FormatError(path, Fact("gopro-channels", key=key, channels=values.shape[1]))
         values = values @ _axes(path, telemetry.movie, stream).T
         unit = getattr(units, quantity) or _unit(path, stream, quantity)
         samples_of[quantity] = order_samples(path, quantity, unit, telemetry.times_ns(key), values)
     if "gyro" not in samples_of:
-        raise FormatError(
-            path, "its telemetry holds no gyroscope (GYRO): HERO5 and later write one; older cameras have none"
-        )
+        raise FormatError(path, Fact("gopro-without-gyroscope"))
     device = _device(telemetry.movie, telemetry.streams["GYRO"])
     read = build_recording(samples_of["gyro"], samples_of.get("accel"), device=device)
     return replace(read, temperature_c=_temperature_c(telemetry.streams))
@@ -160,7 +159,7 @@ def read_gopro_positions(path: Path) -> PositionFixes | None:
         return None
     stream = telemetry.streams[key]
     if stream.values.shape[1] < (9 if key == "GPS9" else 3):
-        raise FormatError(path, f"the {key} stream has {stream.values.shape[1]} channels")
+        raise FormatError(path, Fact("gopro-positions-channels", key=key, channels=stream.values.shape[1]))
     values, t_ns = stream.values, telemetry.times_ns(key)
     if key == "GPS9":
         diluted, fix = values[:, 7], values[:, 8]
@@ -220,7 +219,7 @@ class _Telemetry:
         try:
             return self.streams[key].sample_times_ns(self.payload_ns) + self.shift_ns
         except ValueError as error:
-            raise FormatError(self.movie.path, f"the {key} stream cannot be timed: {error}") from None
+            raise FormatError(self.movie.path, Fact("gopro-stream-untimed", key=key, detail=str(error))) from None
 
     def _video_minus_stamp_ns(self) -> int:
         video, gyro = self.movie.track(handler="vide"), self.streams.get("GYRO")
@@ -255,9 +254,7 @@ def _unit(path: Path, stream: Stream, quantity: Quantity) -> str:
         return next(iter(SENSOR_UNITS[quantity]))
     unit = unit_of(text)
     if unit not in SENSOR_UNITS[quantity]:
-        raise FormatError(
-            path, f"the {stream.key} stream is in {text!r}; known here are {', '.join(SENSOR_UNITS[quantity])}"
-        )
+        raise FormatError(path, Fact("gopro-unit", key=stream.key, unit=text, known=tuple(SENSOR_UNITS[quantity])))
     return unit
 
 
@@ -272,7 +269,7 @@ def _axes(path: Path, movie: Movie, stream: Stream) -> Array:
         if into:
             return _labels(into)
     except ValueError as error:
-        raise FormatError(path, f"the {stream.key} stream's axes are damaged: {error}") from None
+        raise FormatError(path, Fact("gopro-axes-damaged", key=stream.key, detail=str(error))) from None
     name = stream.text("STNM").lower()
     if "(z,x,y)" in name.replace(" ", "") or "up/down, right/left" in name:
         return _labels("ZXY")
@@ -283,7 +280,7 @@ def _axes(path: Path, movie: Movie, stream: Stream) -> Array:
 def _labels(letters: str) -> Array:
     """(3, 3) that sorts channels, named by letters such as ``YxZ``, into x, y, z; a small letter is the opposite."""
     if len(letters) != 3:
-        raise ValueError(f"{letters!r} does not name three axes")
+        raise ValueError(Fact("not-three-axes", letters=letters))
     axes = Axes.of_letters(letters)
     # Axes reads "channel from axis"; a signed permutation's inverse is its transpose
     return np.asarray(axes.matrix.T)
@@ -306,7 +303,7 @@ def _settings(movie: Movie) -> dict[str, Entry]:
             if device.key == "DEVC":
                 settings = {**{entry.key: entry for entry in entries(device.data)}, **settings}
     except ValueError as error:
-        raise FormatError(movie.path, f"its user data (GPMF) is damaged: {error}") from None
+        raise FormatError(movie.path, Fact("gopro-settings-damaged", detail=str(error))) from None
     return settings
 
 
@@ -322,7 +319,7 @@ def _readout_s(path: Path, settings: dict[str, Entry], streams: dict[str, Stream
         else:
             return None
     except ValueError as error:
-        raise FormatError(path, f"the readout time is damaged: {error}") from None
+        raise FormatError(path, Fact("gopro-readout-damaged", detail=str(error))) from None
     readout_s = float(readout[0]) * 1e-3 if len(readout) else np.nan
     return readout_s if 0 < readout_s < 0.5 else None
 

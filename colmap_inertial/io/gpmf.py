@@ -21,6 +21,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 
 _ENTRY = struct.Struct(">4scBH")
 #: numpy's name of each type letter.
@@ -65,7 +66,7 @@ class Entry:
             return self._compound(members)
         kind = _TYPES.get(self.type)
         if kind is None or self.size % np.dtype(kind).itemsize:
-            raise ValueError(f"{self.key} holds samples of {self.size} bytes of type {self.type!r}")
+            raise ValueError(Fact("gpmf-samples-of-type", key=self.key, size=self.size, type=repr(self.type)))
         with np.errstate(invalid="ignore"):  # a damaged file may hold signalling NaNs
             values = np.frombuffer(self.data, kind).astype(np.float64).reshape(self.count, -1)
         return values / _FIXED_POINT.get(self.type, 1.0)
@@ -74,7 +75,7 @@ class Entry:
         kinds = [_TYPES.get(letter.encode("latin-1")) for letter in members]
         rows = np.dtype([(f"f{i}", kind) for i, kind in enumerate(kinds) if kind is not None])
         if not kinds or None in kinds or rows.itemsize != self.size:
-            raise ValueError(f"{self.key} holds samples of {self.size} bytes of the types {members!r}")
+            raise ValueError(Fact("gpmf-samples-of-types", key=self.key, size=self.size, types=repr(members)))
         values = np.frombuffer(self.data, rows)
         with np.errstate(invalid="ignore"):
             columns = [values[name].astype(np.float64) for name in rows.names or ()]
@@ -156,9 +157,8 @@ def entries(payload: bytes, begin: int = 0, end: int | None = None) -> Iterator[
             return
         length = size * count
         if at + 8 + length > end:
-            raise ValueError(
-                f"the entry {key!r} at byte {at} of the payload states {length} bytes; {end - at - 8} left"
-            )
+            entry = {"key": repr(key), "byte": at, "length": length, "left": end - at - 8}
+            raise ValueError(Fact("gpmf-entry-beyond-payload", **entry))
         yield Entry(key.decode("latin-1"), kind, size, count, payload[at + 8 : at + 8 + length], at + 8)
         at += 8 + (length + 3) // 4 * 4
 
@@ -186,7 +186,7 @@ def read_streams(path: Path, payloads: list[bytes], offsets: list[int], wanted: 
                     _read_device(device, index, streams, wanted)
         except ValueError as error:
             raise FormatError(
-                path, f"is damaged in telemetry payload {index + 1} at byte {offsets[index]}: {error}"
+                path, Fact("gpmf-payload-damaged", payload=index + 1, byte=offsets[index], detail=str(error))
             ) from None
     return list(streams.values())
 
@@ -218,10 +218,11 @@ def _append(stream: Stream, index: int, data: Entry, inside: dict[str, Entry]) -
     if "SCAL" in inside and data.key not in _UNSCALED:
         scale = inside["SCAL"].numbers().ravel()
         if len(scale) not in (1, values.shape[1]) or not (np.isfinite(scale) & (scale != 0)).all():
-            raise ValueError(f"{data.key} has {values.shape[1]} channels and the scale {scale.tolist()}")
+            raise ValueError(Fact("gpmf-scale", key=data.key, channels=values.shape[1], scale=scale))
         values = values / scale
     if stream.data and stream.data[-1].shape[1] != values.shape[1]:
-        raise ValueError(f"{data.key} changes from {stream.data[-1].shape[1]} to {values.shape[1]} channels")
+        old, new = stream.data[-1].shape[1], values.shape[1]
+        raise ValueError(Fact("gpmf-channels-change", key=data.key, old=old, new=new))
     stream.payload.append(index)
     stream.data.append(values)
     stream.stmp_us.append(_stamp(inside, "STMP"))
@@ -255,11 +256,11 @@ def spread(stamp_ns: Int64Array, count: Int64Array, reach: int, lost_share: floa
     """
     n = len(count)
     if n == 1:
-        raise ValueError("one payload alone: nothing says how fast its samples follow each other")
+        raise ValueError(Fact("gpmf-one-payload"))
     step_ns = np.diff(stamp_ns) / count[:-1]
     usual_ns = float(np.median(step_ns))
     if usual_ns <= 0:
-        raise ValueError("the stamps of the payloads do not increase")
+        raise ValueError(Fact("gpmf-stamps-do-not-increase"))
     breaks = np.flatnonzero(step_ns > (1 + lost_share) * usual_ns) + 1
     out = np.empty(int(count.sum()), dtype=np.int64)
     first = np.concatenate([[0], np.cumsum(count)])

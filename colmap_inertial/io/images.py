@@ -12,6 +12,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import UInt8Array, UInt16Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.files import read_bytes, read_limits, reader
 from colmap_inertial.io.stand_ins import foreign_picture, what_stands_in
 
@@ -30,7 +31,6 @@ START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 START_OF_SCAN = 0xDA
 #: Progressive ones, whose coefficients the decoder holds, all of the picture.
 _PROGRESSIVE = (0xC2, 0xC6, 0xCA, 0xCE)
-_UNREADABLE = "cannot be decoded: damaged, cut off, or no picture; take it out of the folder"
 
 
 @reader("a picture")
@@ -51,7 +51,7 @@ def read_image(path: Path) -> UInt8Array | UInt16Array:
     require_modest(path, data)
     fault = _fault(data)
     if fault is not None:
-        raise FormatError(path, f"{fault}; copy it again from its source, or take it out of the folder")
+        raise FormatError(path, fault)
     logging = getattr(cv2.utils, "logging", cv2)  # before OpenCV 4.13 it stood in cv2 itself
     level = logging.setLogLevel(0)  # nothing is logged
     try:
@@ -61,9 +61,9 @@ def read_image(path: Path) -> UInt8Array | UInt16Array:
     finally:
         logging.setLogLevel(level)
     if image is None:
-        raise FormatError(path, _UNREADABLE)
+        raise FormatError(path, Fact("picture-not-decoded"))
     if image.dtype not in (np.uint8, np.uint16):
-        raise FormatError(path, f"holds {image.dtype} pixels; 8 or 16 bit are needed")
+        raise FormatError(path, Fact("picture-depth", dtype=str(image.dtype)))
     if image.ndim == 3 and image.shape[2] in (3, 4):
         to_rgb = cv2.COLOR_BGR2RGB if image.shape[2] == 3 else cv2.COLOR_BGRA2RGB
         image = cv2.cvtColor(image, to_rgb, image if image.shape[2] == 3 else None)
@@ -73,13 +73,16 @@ def read_image(path: Path) -> UInt8Array | UInt16Array:
 
 
 def read_alpha(data: bytes) -> UInt8Array | UInt16Array | None:
-    """(H, W) alpha of a PNG or TIFF that can be decoded; ``None`` where it has none."""
+    """(H, W) alpha of a PNG, TIFF or WebP that can be decoded; ``None`` where it has none."""
     import cv2
 
     if data[:4] in TIFF_ORDERS:
         has_alpha = _tiff_number(data, TIFF_ORDERS[data[:4]], 277, 1) == 4  # samples of a pixel
+    elif data.startswith(PNG):
+        # colours of a palette may have some, too
+        has_alpha = data[25] in (4, 6) or (data[25] == 3 and b"tRNS" in data[: data.find(b"IDAT")])
     else:
-        has_alpha = data.startswith(PNG) and data[25] in (4, 6)
+        has_alpha = data.startswith(b"RIFF") and _has_webp_alpha(data)
     if not has_alpha:
         return None
     image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
@@ -99,14 +102,11 @@ def require_modest(path: Path, data: bytes) -> None:
     size, most = _read_size(data), read_limits().megapixels
     if size is None:
         found = what_stands_in(data[:512]) or foreign_picture(data[:64])
-        raise FormatError(path, "is empty" if not data else found or _UNREADABLE)
+        raise FormatError(path, found or Fact("picture-not-decoded") if data else Fact("is-empty"))
     weight = _weigh(data, size[0] * size[1])
     if size[0] * size[1] * weight > 1e6 * most:
-        raise FormatError(
-            path,
-            f"has {size[0]} x {size[1]} pixels; more than {most / weight:.3g} million are not decoded: make it "
-            "smaller, take it out of the folder, or raise --limits.megapixels",
-        )
+        too_large = Fact("picture-too-large", width=size[0], height=size[1], most_megapixels=most / weight)
+        raise FormatError(path, too_large)
 
 
 def _weigh(data: bytes, pixels: int) -> float:
@@ -182,6 +182,13 @@ def _webp_size(data: bytes) -> tuple[int, int] | None:
     return (width & 0x3FFF, height & 0x3FFF) if data[12:16] == b"VP8 " else None
 
 
+def _has_webp_alpha(data: bytes) -> bool:
+    """Whether a WebP says that it has alpha (RFC 9649)."""
+    if data[12:16] == b"VP8X":
+        return bool(data[20] & 0x10)
+    return data[12:16] == b"VP8L" and bool(data[24] & 0x10)
+
+
 def _jpeg2000_size(data: bytes) -> tuple[int, int] | None:
     """Width and height of a JPEG 2000 file, or bare code stream (ISO/IEC 15444-1)."""
     if data.startswith(b"\xff\x4f"):
@@ -210,10 +217,8 @@ def grey_8bit(image: UInt8Array | UInt16Array) -> UInt8Array:
     return np.asarray(grey if grey.dtype == np.uint8 else grey >> 8, dtype=np.uint8)
 
 
-def _fault(data: bytes) -> str | None:
+def _fault(data: bytes) -> Fact | None:
     """Fault in the bytes of a picture, where its format shows it; decoders pass over some of them."""
-    if not data:
-        return "is empty"
     if data.startswith(b"\xff\xd8"):
         return _jpeg_fault(data)
     if data.startswith(PNG):
@@ -221,27 +226,27 @@ def _fault(data: bytes) -> str | None:
     return None
 
 
-def _jpeg_fault(data: bytes) -> str | None:
+def _jpeg_fault(data: bytes) -> Fact | None:
     """Segments up to the first scan, then coded data that an EOI marker ends."""
     end = 2
     for marker, _, end in jpeg_segments(data):
         if marker == START_OF_SCAN:
-            return None if data.find(b"\xff\xd9", end) >= 0 else "is cut off (no end of image)"
+            return None if data.find(b"\xff\xd9", end) >= 0 else Fact("picture-without-end")
     if end + 4 <= len(data) and data[end] != 0xFF:
-        return "is damaged (a JPEG segment does not start with a marker)"
-    return "is cut off (no picture data)"
+        return Fact("jpeg-segment-damaged")
+    return Fact("picture-without-data")
 
 
-def _png_fault(data: bytes) -> str | None:
+def _png_fault(data: bytes) -> Fact | None:
     """Chunks with a CRC each, the last one IEND."""
     for name, chunk in png_chunks(data):
         if len(chunk) != 12 + struct.unpack_from(">I", chunk)[0]:
             break
         if zlib.crc32(memoryview(chunk)[4:-4]) != struct.unpack_from(">I", chunk, len(chunk) - 4)[0]:
-            return "is damaged (a PNG checksum is wrong)"
+            return Fact("png-checksum-wrong")
         if name == b"IEND":
             return None
-    return "is cut off (no end of image)"
+    return Fact("picture-without-end")
 
 
 def jpeg_segments(data: bytes) -> Iterator[tuple[int, int, int]]:

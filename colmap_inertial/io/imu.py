@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import FrameLog, ImuRecording
 from colmap_inertial.io import imu_text
 from colmap_inertial.io.capture import Capture, load_capture
@@ -88,20 +89,16 @@ def read_raw_capture_imu(capture: Capture) -> RawImu:
     """The inertial recording of a capture, as :func:`read_raw_imu` gives it."""
     source = capture.imu
     if source is None:
-        raise FormatError(
-            capture.path,
-            "describes no inertial recording; add [imu] with path = ..., or take the metres from a target or a known "
-            "distance (reconstruct --scale-from)",
-        )
+        raise FormatError(capture.path, Fact("capture-without-imu"))
     if isinstance(source, ImuPath):
         path = accel_path = source.path
-        with reading(path, "cannot be read as an inertial recording"):
+        with reading(path, Fact("not-readable-as", what="an inertial recording")):
             imu = find_imu_format(path, source.format).read(path, source.units)
     else:
         path = accel_path = source.gyro.file
         if source.accel is not None:
             accel_path = source.accel.file
-        with reading(path, "cannot be read as described"):
+        with reading(path, Fact("not-readable-as-described")):
             imu = imu_text.read_tables(source.gyro, source.accel)
     imu = replace(
         imu,

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from colmap_inertial.core.errors import FormatError, InertialError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import FrameLog, ImuRecording
 from colmap_inertial.io import (
     android,
@@ -104,22 +105,17 @@ def find_imu_format(path: Path, name: str = "auto") -> ImuFormat:
         Where there is none.
     """
     if not path.exists():
-        raise FormatError(path, "no such file or folder")
+        raise FormatError(path, Fact("no-such-file", what="file or folder"))
     require_regular(path)
     known = imu_formats()
     for family in known:
         if family.accepts(path) if name == "auto" else family.name == name:
             return family
     if name != "auto":
-        names = ", ".join(["auto", *(family.name for family in known), "capture"])
-        raise FormatError(path, f'unknown IMU format "{name}"; known are {names}')
+        names = ("auto", *(family.name for family in known), "capture")
+        raise FormatError(path, Fact("imu-format-unknown", name=name, known=names))
     refuse_video(path)
-    layouts = "; ".join(family.layout for family in known)
-    raise FormatError(
-        path,
-        f"not an inertial recording known here ({layouts}); describe its files under [imu.gyro] and [imu.accel] in a "
-        "capture.toml",
-    )
+    raise FormatError(path, Fact("no-known-recording", layouts=tuple(family.layout for family in known)))
 
 
 #: What names of videos end with.
@@ -137,18 +133,13 @@ def refuse_video(path: Path) -> None:
     if not path.is_file():
         return
     if is_mp4(path):
-        tracks = ", ".join(f"{track.handler} {track.entry}" for track in read_movie(path).tracks)
-        raise FormatError(
-            path,
-            f"is a video without an IMU that is known here; its tracks: {tracks or 'none'}; where the IMU was recorded "
-            "beside it, describe both in a capture.toml ([video] and [imu]); without one, a target or a known distance "
-            "gives metres (reconstruct VIDEO OUT --scale-from target)",
-        )
+        tracks = tuple(f"{track.handler} {track.entry}" for track in read_movie(path).tracks)
+        raise FormatError(path, Fact("video-without-imu", tracks=tracks))
     if path.suffix.lower() in _VIDEOS:
         begins = read_bytes(path, 16)
         text = bool(begins) and all(32 <= byte < 127 or byte in b"\t\r\n" for byte in begins)
-        what = "begins with text" if text else "is empty" if not begins else "has no index of an MP4 or QuickTime file"
-        raise FormatError(path, f"is named like a video and is none that is known here: it {what}")
+        fault = Fact("begins-with-text" if text else "no-mp4-index" if begins else "is-empty")
+        raise FormatError(path, Fact("named-like-a-video", fault=fault))
 
 
 @functools.cache
@@ -180,17 +171,17 @@ def _load(entry: EntryPoint) -> ImuFormat:
 
 def _guard(family: ImuFormat, package: str) -> ImuFormat:
     """The same family; where its functions raise what they should not, the message names the package."""
-    its = f"the IMU format {family.name} of the package {package}"
+    log_name = f"the IMU format {family.name} of the package {package}"
 
     def accepts(path: Path) -> bool:
         try:
             return bool(family.accepts(path))
         except Exception as error:
-            log.warning("%s: %s cannot tell whether it is one: %s", path, its, _reason(error))
+            log.warning("%s: %s cannot tell whether it is one: %s", path, log_name, _reason(error))
             return False
 
     def read(path: Path, units: DeclaredUnits) -> ImuRecording:
-        with _convert_errors(path, its):
+        with _convert_errors(path, family.name, package):
             recording = family.read(path, units)
             if not isinstance(recording, ImuRecording):
                 raise TypeError(f"read gives a {type(recording).__name__}, not an ImuRecording")
@@ -198,20 +189,21 @@ def _guard(family: ImuFormat, package: str) -> ImuFormat:
 
     def frames(path: Path) -> FrameLog | None:
         assert family.frames is not None
-        with _convert_errors(path, its):
+        with _convert_errors(path, family.name, package):
             return family.frames(path)
 
     return replace(family, accepts=accepts, read=read, frames=None if family.frames is None else frames)
 
 
 @contextlib.contextmanager
-def _convert_errors(path: Path, its: str) -> Iterator[None]:
+def _convert_errors(path: Path, name: str, package: str) -> Iterator[None]:
     try:
         yield
     except InertialError:
         raise
     except Exception as error:
-        raise FormatError(path, f"{its} failed: {_reason(error)}") from error
+        fact = Fact("imu-format-failed", name=name, package=package, detail=_reason(error))
+        raise FormatError(path, fact) from error
 
 
 def _reason(error: Exception) -> str:
@@ -235,13 +227,7 @@ def _read_dji(path: Path, units: DeclaredUnits) -> NoReturn:
     FormatError
         Always.
     """
-    raise FormatError(
-        path,
-        "is a DJI video: it holds orientations but no accelerometer, so it can give no scale and no gravity. What "
-        "still works: COLMAP's own reconstruction, in its arbitrary units; deblurring and the rolling shutter, with a "
-        "gyroscope log of another device in the same housing. For metres, record an IMU beside it, or film a target of "
-        "known size",
-    )
+    raise FormatError(path, Fact("dji-video"))
 
 
 _OWN: tuple[ImuFormat, ...] = (

@@ -5,8 +5,8 @@ specific force is +9.8 m/s2. Gyroscopes agree everywhere.
 
 Stray Scanner writes a folder: ``imu.csv`` (``timestamp, a_x, a_y, a_z, alpha_x, alpha_y, alpha_z``: seconds, what
 CoreMotion gave, rad/s), ``odometry.csv`` with the time of each frame of ``rgb.mp4`` on the same clock and ARKit's
-poses, ``camera_matrix.csv``. Its description says m/s2, its source writes CoreMotion's g; which one it is shows in the
-numbers (github.com/strayrobots/scanner).
+poses, ``camera_matrix.csv``. Its description says m/s2, its source writes CoreMotion's g, which is what counts
+(github.com/strayrobots/scanner, DatasetEncoder.swift).
 
 ScanCapture of the LaMAR benchmark writes ``gyroscope.txt`` and ``accelerometer.txt`` with comments ``# timestamp, rx,
 ry, rz`` and ``# timestamp, ax, ay, az``: microseconds since boot, rad/s, CoreMotion's g
@@ -30,6 +30,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import colmap_px_from_opencv
 from colmap_inertial.core.types import CameraModel, FrameLog, ImuRecording
 from colmap_inertial.io.files import first_line, read_bytes
@@ -39,10 +40,6 @@ from colmap_inertial.io.mp4 import is_mp4, read_movie
 from colmap_inertial.io.samples import Samples
 from colmap_inertial.io.tables import Table, head_of, members_of, parse_table, read_table, text_of
 from colmap_inertial.io.units import DeclaredUnits, seconds
-
-#: A median length up to this is g, above it m/s2: gravity gives 1 or 9.8.
-_G_BELOW = 3.0
-
 
 # --- Stray Scanner ---------------------------------------------------------------------------------------------------
 
@@ -60,11 +57,9 @@ def read_stray_scanner(path: Path, units: DeclaredUnits) -> ImuRecording:
     t_ns = table.stamps_ns(table.column("timestamp"), "s")
     gyro = table.numbers([table.column(f"alpha_{axis}") for axis in "xyz"])
     accel = -table.numbers([table.column(f"a_{axis}") for axis in "xyz"])
-    length = float(np.nanmedian(np.linalg.norm(accel, axis=1))) if len(accel) else 0.0
-    unit = units.accel or ("g" if length < _G_BELOW else "m/s2")
     return build_recording(
         order_rows(table, "gyro", units.gyro or "rad/s", t_ns, gyro),
-        order_rows(table, "accel", unit, t_ns, accel),
+        order_rows(table, "accel", units.accel or "g", t_ns, accel),
         device="Stray Scanner",
     )
 
@@ -87,7 +82,7 @@ def _camera_matrix(folder: Path) -> CameraModel | None:
     table = read_table(file)
     matrix = table.numbers(range(table.width))
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or (np.diagonal(matrix) <= 0).any():
-        raise FormatError(file, "is no 3x3 matrix of intrinsics")
+        raise FormatError(file, Fact("no-intrinsics-matrix"))
     track = read_movie(video).track(handler="vide")
     if track is None or min(track.width_px, track.height_px) < 1:
         return None
@@ -131,10 +126,6 @@ def read_scan_capture(path: Path, units: DeclaredUnits) -> ImuRecording:
 # --- Sensor Logger ---------------------------------------------------------------------------------------------------
 
 
-_RECORD_GRAVITY = (
-    "export TotalAcceleration.csv, Gravity.csv or AccelerometerUncalibrated.csv as well (in the app: Total "
-    "Acceleration, Gravity, or Accelerometer Uncalibrated)"
-)
 _GYROSCOPES = ("Gyroscope.csv", "GyroscopeUncalibrated.csv")
 
 
@@ -166,7 +157,7 @@ def read_sensor_logger(path: Path, units: DeclaredUnits) -> ImuRecording:
     members = members_of(path)
     name = next((n for n in _GYROSCOPES if n in members), None)
     if name is None:
-        raise FormatError(path, "holds no Gyroscope.csv of Sensor Logger")
+        raise FormatError(path, Fact("sensor-logger-table-missing"))
     table, t_ns, values = _sensor(path, members, name)
     gyro = order_rows(table, "gyro", units.gyro or "rad/s", t_ns, values)
     return build_recording(gyro, _accelerometer(path, members, units), device="Sensor Logger")
@@ -184,18 +175,18 @@ def _read_json(path: Path, units: DeclaredUnits) -> ImuRecording:
     header = table.header or ()
     column = next((name for name in ("sensor", "name") if name in header), None)
     if column is None or not {"time", "x", "y", "z"} <= set(header):
-        raise FormatError(path, "holds no rows of Sensor Logger with sensor, time, x, y, z")
+        raise FormatError(path, Fact("sensor-logger-rows-missing"))
     names = np.array([re.sub(r"[^a-z]", "", name.lower()) for name in table.text(table.column(column))])
 
     gyro_name = next((name for name in _JSON_GYRO if name in names), None)
     if gyro_name is None:
-        raise FormatError(path, "holds no gyroscope of Sensor Logger")
+        raise FormatError(path, Fact("sensor-logger-without-gyroscope"))
     part, t_ns, values = _json_rows(table, names, gyro_name)
     gyro = order_rows(part, "gyro", units.gyro or "rad/s", t_ns, values)
     whole = next((name for name in _JSON_WHOLE if name in names), None)
     if whole is None and not {"accelerometer", "gravity"} <= set(names):
         if "accelerometer" in names:
-            raise FormatError(path, f"its accelerometer is without gravity; {_RECORD_GRAVITY}")
+            raise FormatError(path, Fact("sensor-logger-without-gravity", table="accelerometer"))
         return build_recording(gyro, None, device="Sensor Logger")
     return build_recording(gyro, _json_accelerometer(path, table, names, whole, units), device="Sensor Logger")
 
@@ -227,13 +218,7 @@ def _json_platform(path: Path, table: Table, names: Any) -> tuple[bool, bool]:
         if cells[header["platform"]] in ("ios", "android"):
             standardised = cells[header["standardisation"]] == "true" if "standardisation" in header else False
             return cells[header["platform"]] == "ios", standardised
-    raise FormatError(
-        path,
-        "no row of metadata says whether this is from iOS or Android, and the accelerometer's sign differs; describe "
-        'its rows under [imu.gyro] and [imu.accel] in a capture.toml, with where = ["sensor", "Gyroscope"] '
-        '(["name", "gyroscope"] in messages), time = "time", time_unit = "ns", columns = ["x", "y", "z"], and for iOS '
-        'axes = "-x,-y,-z" with mirrored = true under [imu.accel]',
-    )
+    raise FormatError(path, Fact("sensor-logger-platform-of-rows-unknown"))
 
 
 def _at(rows: tuple[Table, Int64Array, Array], t_ns: Int64Array) -> Array:
@@ -249,10 +234,7 @@ def _accelerometer(path: Path, members: dict[str, str], units: DeclaredUnits) ->
     parts = {"Accelerometer.csv", "Gravity.csv"} <= members.keys()
     if whole is None and not parts:
         if "Accelerometer.csv" in members:
-            raise FormatError(
-                path,
-                f"its Accelerometer.csv is without gravity; {_RECORD_GRAVITY}",
-            )
+            raise FormatError(path, Fact("sensor-logger-without-gravity", table="Accelerometer.csv"))
         return None
     ios, standardised = _platform(path, members)
     if whole is not None:
@@ -274,11 +256,7 @@ def _platform(path: Path, members: dict[str, str]) -> tuple[bool, bool]:
             row = {key.strip().lower(): value.strip().lower() for key, value in zip(lines[0], lines[1], strict=False)}
             if row.get("platform") in ("ios", "android"):
                 return row["platform"] == "ios", row.get("standardisation") == "true"
-    raise FormatError(
-        path,
-        "no Metadata.csv says whether this is from iOS or Android, and the accelerometer's sign differs; add it, or "
-        "describe the tables under [imu.gyro] and [imu.accel] in a capture.toml",
-    )
+    raise FormatError(path, Fact("sensor-logger-platform-unknown"))
 
 
 def _sensor(path: Path, members: dict[str, str], name: str) -> tuple[Table, Int64Array, Array]:

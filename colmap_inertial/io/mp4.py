@@ -18,6 +18,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Int64Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.io import files
 
 #: Four letters at the start of a file of this family.
@@ -72,7 +73,7 @@ class Movie:
         """The track of a format, which holds ``what``; a :class:`FormatError` where there is none."""
         track = self.track(entry=entry)
         if track is None or len(track.size) == 0:
-            raise FormatError(self.path, f"holds no {what} (a track of format {entry})")
+            raise FormatError(self.path, Fact("track-missing", what=what, entry=entry))
         return track
 
     def frame_times_ns(self) -> Int64Array:
@@ -85,10 +86,10 @@ class Movie:
         """
         video = self.track(handler="vide")
         if video is None or len(video.t_ns) == 0:
-            raise FormatError(self.path, "holds no video")
+            raise FormatError(self.path, Fact("no-video"))
         shown = np.sort(video.t_ns)
         if (np.diff(shown) <= 0).any():
-            raise FormatError(self.path, f"two samples of its {video.entry} track have the same time")
+            raise FormatError(self.path, Fact("samples-at-one-time", entry=video.entry))
         return shown
 
     def samples(self, track: Track) -> list[bytes]:
@@ -112,10 +113,10 @@ class Movie:
         """
         length, beyond = self.path.stat().st_size, self.beyond(track)
         if len(beyond):
-            where = f"sample {beyond[0] + 1} of the {track.entry} track at byte {track.offset[beyond[0]]}"
-            raise FormatError(self.path, f"is cut off or damaged: {where} ends beyond the file's {length} bytes")
+            place = {"sample": beyond[0] + 1, "track": track.entry, "byte": track.offset[beyond[0]]}
+            raise FormatError(self.path, Fact("sample-beyond-file", **place, length=length))
         if int(track.size.sum()) > length:
-            raise FormatError(self.path, f"is damaged: the samples of the {track.entry} track overlap")
+            raise FormatError(self.path, Fact("samples-overlap", entry=track.entry))
         ends = track.offset + track.size
         runs = np.flatnonzero(np.concatenate([[True], track.offset[1:] != ends[:-1]])) if len(ends) else ends
         parts = []
@@ -161,7 +162,7 @@ def read_movie(path: Path) -> Movie:
         with open(path, "rb") as file:
             moov, start = _find_index(path, file)
     except OSError as error:
-        raise FormatError(path, f"cannot be read: {error.strerror}") from None
+        raise FormatError(path, Fact("file-not-readable", detail=str(error.strerror))) from None
     reader = _Boxes(path, moov, start)
     movie_scale, tracks, user_data = 0, [], {}
     for name, begin, end in reader.inside(0, len(moov)):
@@ -191,16 +192,16 @@ def _find_index(path: Path, file: BinaryIO) -> tuple[bytes, int]:
         elif size == 0:
             size = length - at
         if size < head:
-            raise FormatError(path, f"is damaged: the box {_shown(name)} at byte {at} states a size of {size} bytes")
+            raise FormatError(path, Fact("mp4-box-size", box=_shown(name), byte=at, size=size))
         if name == b"moov":
             if at + size > length:
-                raise FormatError(path, f"is cut off: its index at byte {at} ends beyond the file's {length} bytes")
+                raise FormatError(path, Fact("mp4-index-cut-off", byte=at, length=length))
             if size > _LARGEST_INDEX:
-                raise FormatError(path, f"is damaged: its index at byte {at} states a size of {size} bytes")
+                raise FormatError(path, Fact("mp4-index-size", byte=at, size=size))
             file.seek(at + head)
             return file.read(size - head), at + head
         at += size
-    raise FormatError(path, "holds no index (moov): the recording was not finished, or the file is cut off")
+    raise FormatError(path, Fact("mp4-without-index"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,8 +212,8 @@ class _Boxes:
     data: bytes
     start: int
 
-    def fail(self, at: int, what: str) -> FormatError:
-        return FormatError(self.path, f"is damaged at byte {self.start + at}: {what}")
+    def fail(self, at: int, fault: Fact) -> FormatError:
+        return FormatError(self.path, Fact("damaged-at-byte", byte=self.start + at, fault=fault))
 
     def inside(self, begin: int, end: int) -> Iterator[tuple[bytes, int, int]]:
         """Name, first byte and end of the contents of each box from ``begin`` to ``end``."""
@@ -226,7 +227,7 @@ class _Boxes:
                 # a closing zero is how QuickTime ends user data
                 return
             if size < head or at + size > end:
-                raise self.fail(at, f"the box {_shown(name)} states a size of {size} bytes where {end - at} are left")
+                raise self.fail(at, Fact("mp4-box-beyond", box=_shown(name), size=size, left=end - at))
             yield name, at + head, at + size
             at += size
 
@@ -237,16 +238,16 @@ class _Boxes:
                 return (b, e) if len(names) == 1 else self.find(b, e, *names[1:])
         return None
 
-    def need(self, begin: int, end: int, count: int, what: str) -> None:
+    def need(self, begin: int, end: int, count: int, box: str, rows: int | None = None) -> None:
         if begin + count > end:
-            raise self.fail(begin, f"{what} is cut off ({end - begin} bytes, {count} needed)")
+            raise self.fail(begin, Fact("mp4-box-cut-off", box=box, rows=rows, bytes=end - begin, needed=count))
 
     def timescale(self, begin: int, end: int) -> int:
         """Ticks per second that a ``mvhd`` or ``mdhd`` states."""
         self.need(begin, end, 24, "a header")
         scale = int(struct.unpack_from(">I", self.data, begin + (20 if self.data[begin] == 1 else 12))[0])
         if scale == 0:
-            raise self.fail(begin, "a timescale of 0")
+            raise self.fail(begin, Fact("mp4-timescale-zero"))
         return scale
 
     def table(self, place: tuple[int, int] | None, name: str, kind: str, columns: int, head: int = 8) -> Int64Array:
@@ -257,7 +258,7 @@ class _Boxes:
         self.need(begin, end, head, name)
         count = int(struct.unpack_from(">I", self.data, begin + head - 4)[0])
         dtype = np.dtype(kind)
-        self.need(begin, end, head + count * columns * dtype.itemsize, f"{name} with {count} rows")
+        self.need(begin, end, head + count * columns * dtype.itemsize, name, count)
         table = np.frombuffer(self.data, dtype, count * columns, begin + head)
         return table.astype(np.int64).reshape(count, columns)
 
@@ -320,16 +321,14 @@ def _sizes(reader: _Boxes, place: tuple[int, int] | None) -> Int64Array:
     if common == 0:
         return reader.table(place, "stsz", ">u4", 1, head=12)[:, 0]
     if common * count > reader.path.stat().st_size or count > _MOST_SAMPLES:
-        raise reader.fail(begin, f"stsz states {count} samples of {common} bytes, more than the file holds")
+        raise reader.fail(begin, Fact("mp4-samples-beyond", count=count, sample_bytes=common))
     return np.full(count, common, dtype=np.int64)
 
 
 def _runs(reader: _Boxes, rows: Int64Array, count: int, what: str) -> Int64Array:
     """(count,) values of a table of (how many, value)."""
     if int(rows[:, 0].sum()) != count or (rows[:, 0] < 0).any():
-        raise FormatError(
-            reader.path, f"is damaged: {what} lists {int(rows[:, 0].sum())} samples where stsz lists {count}"
-        )
+        raise FormatError(reader.path, Fact("mp4-other-count", table=what, listed=int(rows[:, 0].sum()), count=count))
     return np.repeat(rows[:, 1], rows[:, 0])
 
 
@@ -345,12 +344,10 @@ def _offsets(reader: _Boxes, boxes: dict[bytes, tuple[int, int]], size: Int64Arr
     first = rows[:, 0] - 1
     edges = np.append(first, len(chunks))
     if len(rows) == 0 or first[0] != 0 or (np.diff(edges) < 0).any():
-        raise FormatError(reader.path, "is damaged: stsc does not list its chunks in order")
+        raise FormatError(reader.path, Fact("mp4-chunks-unordered"))
     per_chunk = np.repeat(rows[:, 1], np.diff(edges))
     if int(per_chunk.sum()) != len(size):
-        raise FormatError(
-            reader.path, f"is damaged: chunks hold {int(per_chunk.sum())} samples where stsz lists {len(size)}"
-        )
+        raise FormatError(reader.path, Fact("mp4-chunks-other-count", held=int(per_chunk.sum()), count=len(size)))
     begin = np.cumsum(size) - size
     before = np.cumsum(per_chunk) - per_chunk
     # bytes of the track before each chunk, so that within a chunk only its own samples count
@@ -366,7 +363,7 @@ def _edit_ns(reader: _Boxes, place: tuple[int, int] | None, scale: int, movie_sc
     reader.need(begin, end, 8, "elst")
     version, count = reader.data[begin], int(struct.unpack_from(">I", reader.data, begin + 4)[0])
     row = ">qq4x" if version == 1 else ">ii4x"
-    reader.need(begin, end, 8 + count * struct.calcsize(row), f"elst with {count} rows")
+    reader.need(begin, end, 8 + count * struct.calcsize(row), "elst", count)
     delay_ns = 0
     for i in range(count):
         duration, media_time = struct.unpack_from(row, reader.data, begin + 8 + i * struct.calcsize(row))

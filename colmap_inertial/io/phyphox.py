@@ -13,6 +13,7 @@ from pathlib import Path
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import ImuRecording
 from colmap_inertial.io.imu_text import build_recording, order_rows
 from colmap_inertial.io.samples import Samples
@@ -53,11 +54,9 @@ def read_phyphox(path: Path, units: DeclaredUnits) -> ImuRecording:
         elif kind == "accel" and "accel" not in samples_of:
             samples_of["accel"] = _samples(path, members[name], name, "accel", _ACCEL, units.accel or "m/s2")
     if "gyro" not in samples_of:
-        raise FormatError(path, "holds no gyroscope of phyphox; record Gyroscope (and Accelerometer) in one experiment")
+        raise FormatError(path, Fact("phyphox-without-gyroscope"))
     if "accel" not in samples_of and linear:
-        raise FormatError(
-            path, "its Linear Acceleration is without gravity; record Accelerometer (acceleration with g) instead"
-        )
+        raise FormatError(path, Fact("phyphox-linear-acceleration"))
     return build_recording(samples_of["gyro"], samples_of.get("accel"), device="phyphox")
 
 
@@ -91,4 +90,4 @@ def _column(table: Table, pattern: str) -> int:
     for place, cell in enumerate(table.header or ()):
         if re.fullmatch(pattern, cell.strip().lower()):
             return place
-    raise FormatError(table.path, f"has no column like {pattern!r}; the header is: {table.header_text[:200]}")
+    raise FormatError(table.path, Fact("no-column-like", pattern=pattern, header=table.header_text[:200]))

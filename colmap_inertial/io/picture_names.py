@@ -7,7 +7,8 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.io.files import EMPTY, UNPRINTABLE, name_fault, path_in
+from colmap_inertial.core.facts import Fact
+from colmap_inertial.io.files import name_fault, path_in
 
 
 def check_image_names(names: Iterable[str], source: Path | str) -> None:
@@ -22,8 +23,8 @@ def check_image_names(names: Iterable[str], source: Path | str) -> None:
     """
     for name in names:
         fault = name_fault(name.replace("/", ""))
-        if fault in (EMPTY, UNPRINTABLE):
-            raise FormatError(source, f"names the file {name[:80]!r}, which {fault}; such names are not followed")
+        if fault is not None and fault.code in ("is-empty", "name-unprintable"):
+            raise FormatError(source, Fact("unsafe-name", name=name[:80], fault=fault))
 
 
 def picture_in(folder: Path, name: str, source: Path | str | None = None) -> Path:

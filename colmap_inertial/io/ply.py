@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.types import Similarity
 from colmap_inertial.io.files import advise
@@ -90,7 +91,7 @@ def read_ply_header(path: Path, file: BufferedReader) -> Header:
     raw = [file.readline(64)]
     if raw[0].strip() != b"ply":
         refuse_stand_in(path)
-        raise FormatError(path, "not a PLY file", line=1)
+        raise FormatError(path, Fact("not-a-ply"), line=1)
     formats: list[str] = []
     elements: list[Element] = []
     length = 0
@@ -98,19 +99,19 @@ def read_ply_header(path: Path, file: BufferedReader) -> Header:
         raw.append(file.readline(_LONGEST_LINE))
         length += len(raw[-1])
         if not raw[-1].endswith(b"\n") or length > _LONGEST_HEADER:
-            raise FormatError(path, "the PLY header does not end", line=len(raw))
+            raise FormatError(path, Fact("ply-header-endless"), line=len(raw))
         fault = _read_header_line(raw[-1].decode("latin-1").split(), formats, elements)
         if fault is not None:
             raise FormatError(path, fault, line=len(raw))
     if not formats:
-        raise FormatError(path, "the PLY header does not say its format")
+        raise FormatError(path, Fact("ply-format-missing"))
     for element in elements:
         if element.rows and not element.properties:
-            raise FormatError(path, f"element {element.name} has rows but no property")
+            raise FormatError(path, Fact("ply-rows-without-property", element=element.name))
     return Header(b"".join(raw), _BYTE_ORDERS[formats[0]], tuple(elements))
 
 
-def _read_header_line(words: list[str], formats: list[str], elements: list[Element]) -> str | None:
+def _read_header_line(words: list[str], formats: list[str], elements: list[Element]) -> Fact | None:
     """Add what a line of the header declares to the formats and elements; what is wrong with it, if anything."""
     count: str | None = None
     match words:
@@ -121,7 +122,7 @@ def _read_header_line(words: list[str], formats: list[str], elements: list[Eleme
             return None
         case ["element", name, rows] if rows.isascii() and rows.isdigit() and len(rows) < 16:
             if name in {e.name for e in elements}:
-                return f"element {name} is declared twice"
+                return Fact("ply-element-twice", element=name)
             elements.append(Element(name, int(rows), ()))
             return None
         case ["property", "list", length, kind, name] if elements and _TYPES.get(length, "f")[0] in "iu":
@@ -129,12 +130,12 @@ def _read_header_line(words: list[str], formats: list[str], elements: list[Eleme
         case ["property", kind, name] if elements:
             pass
         case _:
-            return f"not a line of a PLY header: {' '.join(words)[:60]!r}"
+            return Fact("not-a-ply-line", line=" ".join(words)[:60])
     if kind not in _TYPES:
-        return f"{kind!r} is no PLY type"
+        return Fact("not-a-ply-type", type=kind)
     last = elements[-1]
     if name in {p.name for p in last.properties}:
-        return f"property {name} of {last.name} is declared twice"
+        return Fact("ply-property-twice", property=name, element=last.name)
     new = Property(name, _TYPES[kind], count)
     elements[-1] = Element(last.name, last.rows, (*last.properties, new))
     return None
@@ -258,23 +259,21 @@ def _check_vertices(path: Path, vertices: Element) -> tuple[str, ...]:
         if not present:
             continue
         if len(present) < 3:
-            raise FormatError(path, f"of the vertices' {label} there is only {' '.join(present)}")
+            raise FormatError(path, Fact("ply-part-of-vector", label=label, present=" ".join(present)))
         for name in names:
             if kinds[name].count is not None or kinds[name].kind[0] != "f":
-                raise FormatError(path, f"the vertices' {name} is no floating-point number: it cannot be transformed")
+                raise FormatError(path, Fact("ply-field-not-float", name=name))
         changed.append(label)
     if is_splats(set(kinds)):
         fault = fault_of_splats(set(kinds))
         moved = [] if fault is not None else [kinds[name] for name in list_changed_fields(set(kinds))]
         if any(p.kind[0] != "f" or p.count is not None for p in moved):
-            fault = "are no floating-point numbers"
+            fault = Fact("splats-not-float")
         if fault is not None:
-            raise FormatError(
-                path, f"its Gaussian splats cannot be transformed, as they {fault}; leave the file out with --keep"
-            )
+            raise FormatError(path, Fact("splats-not-transformed", fault=fault))
         changed += ["sizes", "rotations", *(["colours"] if "f_rest_0" in kinds else [])]
     if changed and vertices.has_list:
-        raise FormatError(path, "vertices with a list property cannot be transformed; leave the file out with --keep")
+        raise FormatError(path, Fact("ply-lists-not-transformed"))
     return tuple(changed)
 
 
@@ -326,7 +325,7 @@ def _binary(
     for element, new in zip(header.elements, made.elements, strict=True):
         smallest = sum(np.dtype(p.count or p.kind).itemsize for p in element.properties)
         if element.rows * smallest > left:
-            raise FormatError(path, f"truncated: {element.rows} rows of {element.name} do not fit into the file")
+            raise FormatError(path, Fact("ply-rows-beyond", rows=element.rows, element=element.name))
         before = file.tell()
         if element.has_list:
             walked = _binary_lists(path, file, element, order, n_vertices)
@@ -335,12 +334,12 @@ def _binary(
         yield from walked
         left -= file.tell() - before
     if left != 0:
-        raise FormatError(path, f"damaged: {left} bytes follow the last element")
+        raise FormatError(path, Fact("ply-bytes-follow", left=left))
 
 
 def _read(path: Path, file: BufferedReader, buffer: memoryview, element: Element) -> memoryview:
     if file.readinto(buffer) < len(buffer):
-        raise FormatError(path, f"truncated within element {element.name}")
+        raise FormatError(path, Fact("ply-truncated", element=element.name))
     return buffer
 
 
@@ -396,7 +395,7 @@ def _binary_lists(
             if element.name == "face" and p.name in ("vertex_indices", "vertex_index") and p.kind[0] in "iu":
                 indices = table[f"v{i}"][:good]
                 if indices.size and (int(indices.min()) < 0 or int(indices.max()) >= n_vertices):
-                    raise FormatError(path, f"damaged: a face refers to none of the {n_vertices} vertices")
+                    raise FormatError(path, Fact("ply-damaged-face", count=n_vertices))
         file.seek(good * dtype.itemsize - len(data), 1)
         rows_left -= good
         # Rows are expected to be of one length for as long as they have been so far
@@ -413,7 +412,7 @@ def _lengths(path: Path, file: BufferedReader, element: Element, order: str) -> 
             counted = _read(path, file, memoryview(bytearray(np.dtype(p.count).itemsize)), element)
             n = int(np.frombuffer(counted, order + p.count)[0])
             if not 0 <= n <= _CHUNK_BYTES:
-                raise FormatError(path, f"damaged: a list of {n} values in element {element.name}")
+                raise FormatError(path, Fact("ply-list-length", length=n, element=element.name))
         _read(path, file, memoryview(bytearray(n * np.dtype(p.kind).itemsize)), element)
         lengths.append(n)
     return lengths
@@ -436,7 +435,7 @@ def _ascii(path: Path, file: BufferedReader, header: Header, similarity: Similar
                 number += 1
                 line = file.readline(_LONGEST_LINE)
                 if not line.strip():
-                    raise FormatError(path, f"truncated within element {element.name}", line=number)
+                    raise FormatError(path, Fact("ply-truncated", element=element.name), line=number)
                 lines.append(line)
             rows = [
                 _split_line(path, number - len(lines) + i + 1, element, line, n_vertices)
@@ -456,7 +455,7 @@ def _ascii(path: Path, file: BufferedReader, header: Header, similarity: Similar
             yield b"".join(lines)
     rest = file.read(_CHUNK_BYTES)
     if rest.strip():
-        raise FormatError(path, "damaged: text follows the last element", line=number + 1)
+        raise FormatError(path, Fact("ply-text-follows"), line=number + 1)
     yield rest
 
 
@@ -483,14 +482,16 @@ def _split_line(path: Path, number: int, element: Element, line: bytes, n_vertic
                 indices = [_integer(token, p.kind) for token in values]
                 points = element.name == "face" and p.name in ("vertex_indices", "vertex_index")
                 if points and any(not 0 <= i < n_vertices for i in indices):
-                    raise FormatError(path, f"a face refers to none of the {n_vertices} vertices", line=number)
+                    raise FormatError(path, Fact("ply-face-without-vertex", count=n_vertices), line=number)
             at += n
     except IndexError:
-        raise FormatError(path, f"too few values for element {element.name}", line=number) from None
+        raise FormatError(path, Fact("ply-too-few-values", element=element.name), line=number) from None
     except ValueError as error:
-        raise FormatError(path, f"not a value of element {element.name}: {error}", line=number) from None
+        raise FormatError(path, Fact("ply-not-a-value", element=element.name, detail=str(error)), line=number) from None
     if at != len(tokens):
-        raise FormatError(path, f"{len(tokens)} values where element {element.name} has {at}", line=number)
+        raise FormatError(
+            path, Fact("ply-other-count", count=len(tokens), element=element.name, expected=at), line=number
+        )
     return row
 
 
@@ -498,5 +499,5 @@ def _integer(token: bytes, kind: str) -> int:
     value = float(token)
     limits = np.iinfo(kind)
     if b"_" in token or not limits.min <= value <= limits.max or value != int(value):
-        raise ValueError(f"{token.decode('latin-1')} does not fit into {limits.bits} bits")
+        raise ValueError(Fact("integer-beyond-bits", text=token.decode("latin-1"), bits=limits.bits))
     return int(value)

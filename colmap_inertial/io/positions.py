@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import PositionFixes
 from colmap_inertial.io.camm import is_camm, read_camm_positions
 from colmap_inertial.io.exif import HEAD_BYTES, position_of
@@ -30,10 +31,7 @@ def positions_in_video(video: Path) -> PositionFixes:
     elif is_camm(video):
         positions = read_camm_positions(video)
     if positions is None:
-        raise FormatError(
-            video,
-            "its telemetry holds no positions (GPS5 or GPS9 of GoPro with a fix, or CAMM): nothing to georeference by",
-        )
+        raise FormatError(video, Fact("no-positions-in-telemetry"))
     return positions
 
 
@@ -52,9 +50,7 @@ def positions_in_pictures(folder: Path, names: Sequence[str]) -> PositionFixes:
             rows.append(position)
             named.append(name)
     if not rows:
-        raise FormatError(
-            folder, f"none of its {len(names)} pictures has a position in its EXIF: nothing to georeference by"
-        )
+        raise FormatError(folder, Fact("no-positions-in-exif", count=len(names)))
     latitude, longitude, height, sigma = np.array([row[:4] for row in rows]).T
     return PositionFixes(
         latitude_deg=latitude,

@@ -12,6 +12,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import colmap_px_from_opencv, matrix_from_quat
 from colmap_inertial.core.types import LengthUnit
 from colmap_inertial.io.device_yaml import read_tagged_yaml
@@ -52,7 +53,7 @@ class RigCalibration:
     def camera(self, name: str) -> MountedCamera:
         """One of them; a :class:`FormatError` that lists them where there is none of that name."""
         if name not in self.cameras:
-            raise FormatError(self.path, f"calibrates no camera {name!r}; it has {', '.join(self.cameras)}")
+            raise FormatError(self.path, Fact("camera-not-calibrated", name=name, cameras=tuple(self.cameras)))
         return self.cameras[name]
 
 
@@ -86,15 +87,11 @@ def read_rig_calibration(path: Path, *, unit: Metres | None = None) -> RigCalibr
     if path.suffix.lower() == ".json":
         return _read_rig_config(path, unit)
     if path.suffix.lower() not in (".yaml", ".yml"):
-        raise FormatError(
-            path,
-            "is no calibration of several cameras: give Kalibr's or OpenCV's YAML, COLMAP's rig_config.json, or the "
-            "folder of a COLMAP model with rigs.bin",
-        )
+        raise FormatError(path, Fact("no-rig-calibration"))
     sheet = read_tagged_yaml(path)
     if all(isinstance(entry, dict) and "intrinsics" in entry for entry in sheet.values()) and sheet:
         if unit not in (None, "m"):
-            raise FormatError(path, "Kalibr writes metres; leave out unit")
+            raise FormatError(path, Fact("kalibr-in-metres"))
         return RigCalibration(path=path, cameras=_kalibr(path, sheet), length_unit="m")
     return RigCalibration(path=path, cameras=_opencv(path, sheet, 1e-3 if unit == "mm" else 1.0), length_unit="m")
 
@@ -110,7 +107,7 @@ def _kalibr(path: Path, sheet: dict[str, Any]) -> dict[str, MountedCamera]:
         model, params, size = entry.pinhole("distortion_coeffs")
         if index > 0:
             if "T_cn_cnm1" not in entry.values:
-                raise entry.fault("T_cn_cnm1 (its pose against the camera before it) is missing")
+                raise entry.fault(Fact("kalibr-pose-missing"))
             cam_from_rig = entry.pose("T_cn_cnm1", "T_cn_cnm1") @ cam_from_rig
         cameras[name] = MountedCamera(model=model, params=params, size=size, cam_from_rig=cam_from_rig)
     return cameras
@@ -125,18 +122,14 @@ def _opencv(path: Path, sheet: dict[str, Any], metres: float) -> dict[str, Mount
         if isinstance(entry, dict) and "camera_matrix" in entry
     }
     if not cameras:
-        raise FormatError(
-            path,
-            "holds no calibration of several cameras: neither Kalibr's cam0, cam1 with intrinsics, nor OpenCV's maps "
-            "with camera_matrix, nor M1, M2",
-        )
+        raise FormatError(path, Fact("calibration-without-cameras"))
     return cameras
 
 
 def _stereo_pair(path: Path, sheet: dict[str, Any]) -> dict[str, Any]:
     """Output of OpenCV's stereo sample, as a map for each of the cameras ``1`` and ``2``."""
     if not {"R", "T"} <= sheet.keys():
-        raise FormatError(path, "R and T of the second camera are missing: put intrinsics and extrinsics in one file")
+        raise FormatError(path, Fact("pose-of-second-camera-missing"))
     shared = {key: sheet[key] for key in ("image_width", "image_height") if key in sheet}
     pair = {
         name: {"camera_matrix": sheet[f"M{name}"], "distortion_coefficients": sheet.get(f"D{name}"), **shared}
@@ -151,7 +144,7 @@ def _opencv_camera(given: Sheet, metres: float) -> MountedCamera:
     key = "distortion_coefficients"
     coefficients = [] if given.values.get(key) is None else given.numbers(key)
     if any(coefficients[8:]):
-        raise given.fault("prism or tilt coefficients are not known to COLMAP's cameras")
+        raise given.fault(Fact("lens-model-unknown-to-colmap"))
     coefficients = [*coefficients, *[0.0] * 8][:8]
     full = any(coefficients[4:])
     size = None
@@ -159,12 +152,12 @@ def _opencv_camera(given: Sheet, metres: float) -> MountedCamera:
         size = int(given.numbers("image_width", 1)[0]), int(given.numbers("image_height", 1)[0])
     pose = np.eye(4)
     if ("R" in given.values) != ("T" in given.values):
-        raise given.fault("R and T belong together; one of them is missing")
+        raise given.fault(Fact("rotation-without-translation"))
     if "R" in given.values:
         pose[:3, :3] = np.array(given.numbers("R", 9)).reshape(3, 3)
         pose[:3, 3] = metres * np.array(given.numbers("T", 3))
         if not is_rotation(pose[:3, :3]):
-            raise given.fault("R holds no rotation")
+            raise given.fault(Fact("no-rotation", what="R"))
     centre = colmap_px_from_opencv(matrix[:2, 2]).tolist()
     return MountedCamera(
         model="FULL_OPENCV" if full else "OPENCV",
@@ -180,23 +173,23 @@ def _opencv_camera(given: Sheet, metres: float) -> MountedCamera:
 def _read_rig_config(path: Path, unit: Metres | None) -> RigCalibration:
     rigs = read_json_value(path)
     if not (isinstance(rigs, list) and rigs and all(isinstance(rig, dict) for rig in rigs)):
-        raise FormatError(path, "not a rig_config.json: expected a list of rigs")
+        raise FormatError(path, Fact("not-a-rig-config"))
     if len(rigs) > 1:
-        raise FormatError(path, f"describes {len(rigs)} rigs; a multi-aperture camera is one")
+        raise FormatError(path, Fact("several-rigs-described", count=len(rigs)))
     cameras = {}
     for entry in rigs[0].get("cameras", []):
         name = str(entry.get("image_prefix", "")).rstrip("/")
         given = Sheet(path=path, values=entry, part=name)
         model = entry.get("camera_model_name")
         if model is None or "camera_params" not in entry:
-            raise given.fault("camera_model_name and camera_params are missing")
+            raise given.fault(Fact("camera-model-missing"))
         if model not in CAMERA_MODELS:
-            raise given.fault(f"camera model {model!r} is unknown")
+            raise given.fault(Fact("camera-model-unknown", model=repr(model)))
         pose = np.eye(4)
         if not entry.get("ref_sensor", False):
             quaternion = given.numbers("cam_from_rig_rotation", 4)  # w first, as COLMAP's files have it
             if abs(np.linalg.norm(quaternion) - 1) > 1e-3:
-                raise given.fault("cam_from_rig_rotation is no unit quaternion")
+                raise given.fault(Fact("cam-from-rig-not-a-quaternion"))
             pose[:3, :3] = matrix_from_quat(np.roll(quaternion, -1))
             pose[:3, 3] = _scale(unit) * np.array(given.numbers("cam_from_rig_translation", 3))
         params = tuple(given.numbers("camera_params", CAMERA_MODELS[model][0]))
@@ -209,7 +202,7 @@ def _read_model(path: Path, unit: Metres | None) -> RigCalibration:
     rigs, sheets = path / "rigs.bin", path / "cameras.bin"
     for file in (rigs, sheets):
         if not file.is_file():
-            raise FormatError(file, "is missing: the calibration must be a COLMAP model in binary format with rigs")
+            raise FormatError(file, Fact("rig-file-missing"))
     models = list(CAMERA_MODELS)
 
     def read_cameras(take: Callable[[str], tuple[Any, ...]]) -> dict[int, tuple[str, tuple[int, int], Any]]:
@@ -217,7 +210,7 @@ def _read_model(path: Path, unit: Metres | None) -> RigCalibration:
         for _ in range(take("<Q")[0]):
             number, model, width, height = take("<IiQQ")
             if not 0 <= model < len(models):
-                raise FormatError(sheets, f"camera model {model} is unknown")
+                raise FormatError(sheets, Fact("camera-model-unknown", model=str(model)))
             poses_of[number] = models[model], (width, height), take(f"<{CAMERA_MODELS[models[model]][0]}d")
         return poses_of
 
@@ -231,7 +224,7 @@ def _read_model(path: Path, unit: Metres | None) -> RigCalibration:
                 pose = np.eye(4)
                 if i > 0:
                     if not take("<B")[0]:
-                        raise FormatError(rigs, f"camera {number} has no pose in its rig")
+                        raise FormatError(rigs, Fact("camera-without-pose-in-rig", camera=number))
                     w, x, y, z, *translation = take("<7d")
                     pose[:3, :3] = matrix_from_quat(np.array([x, y, z, w]))
                     pose[:3, 3] = _scale(unit) * np.array(translation)
@@ -243,11 +236,11 @@ def _read_model(path: Path, unit: Metres | None) -> RigCalibration:
     cameras = _records(sheets, read_cameras)
     poses_of = [poses for poses in _records(rigs, read_rigs) if len(poses) > 1]
     if len(poses_of) != 1:
-        raise FormatError(rigs, f"holds {len(poses_of)} rigs of several cameras; one is needed")
+        raise FormatError(rigs, Fact("not-one-rig", count=len(poses_of)))
     mounted = {}
     for number, pose in poses_of[0].items():
         if number not in cameras:
-            raise FormatError(sheets, f"camera {number} of the rig is missing")
+            raise FormatError(sheets, Fact("camera-of-rig-missing", camera=number))
         model, size, params = cameras[number]
         mounted[str(number)] = MountedCamera(model=model, params=tuple(params), size=size, cam_from_rig=pose)
     return RigCalibration(path=path, cameras=mounted, length_unit="model" if unit is None else "m")
@@ -265,7 +258,7 @@ def _records(path: Path, read: Callable[[Callable[[str], tuple[Any, ...]]], Any]
     try:
         return read(take)
     except struct.error:
-        raise FormatError(path, "truncated") from None
+        raise FormatError(path, Fact("truncated")) from None
 
 
 def _scale(unit: Metres | None) -> float:

@@ -11,6 +11,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import IndexArray, Int64Array
 from colmap_inertial.core.errors import TimingError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import Frame, FrameTiming
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.capture_rig import RigCamera
@@ -96,17 +97,14 @@ def pair_rig_frames(capture: Capture, timing: FrameTiming) -> RigFrames:
     own_names = tuple(_find_own(capture, camera, timing) for camera in capture.rig)
     for camera, own in zip(capture.rig, own_names, strict=True):
         if len(own) < _LIMITS.least_share * len(timing.names):
-            raise TimingError(_describe_missing(capture, camera, own, timing))
+            raise TimingError(_say_missing(capture, camera, own, timing))
         taken = next((name for name in timing.names if name.startswith(f"{camera.name}/")), None)
         if taken is not None:
-            raise TimingError(f"[rig.{camera.name}]: the main camera's image {taken} lies in a folder of that name")
+            raise TimingError(Fact("main-image-in-camera-folder", camera=camera.name, image=taken))
     alone = tuple(name for name in timing.names if not all(name in own for own in own_names))
     together = len(timing.names) - len(alone)
     if together < _LIMITS.least_share * len(timing.names):
-        raise TimingError(
-            f"[rig]: {together} of the main camera's {len(timing.names)} frames have an image of every camera; "
-            "leave out a camera that ran at another time"
-        )
+        raise TimingError(Fact("rig-frames-too-few", together=together, frames=len(timing.names)))
     return RigFrames(capture=capture, own_names=own_names, alone=alone)
 
 
@@ -135,20 +133,14 @@ def _find_nearest(own: FrameTiming, timing: FrameTiming) -> tuple[IndexArray, In
     return nearest, np.abs(own_ns[nearest] - frame_ns)
 
 
-def _describe_missing(capture: Capture, camera: RigCamera, own: Mapping[str, str], timing: FrameTiming) -> str:
-    found = f"[rig.{camera.name}]: {len(own)} of the main camera's {len(timing.names)} frames have an image of it"
+def _say_missing(capture: Capture, camera: RigCamera, own: Mapping[str, str], timing: FrameTiming) -> Fact:
+    found = {"camera": camera.name, "found": len(own), "frames": len(timing.names)}
     if isinstance(camera.frames, ImageFolder) and camera.frames.times is None:
-        return (
-            f"{found} under the same name in {camera.frames.folder} (the main camera has {timing.names[0]}); give "
-            "times, or rename them"
-        )
+        return Fact("rig-names-differ", **found, folder=str(camera.frames.folder), main=timing.names[0])
     others = read_frame_timing(_capture_of(capture, camera))
     apart_ns = int(np.median(_find_nearest(others, timing)[1]))
-    return (
-        f"{found} within {SAME_MOMENT_NS / 1e6:g} ms; of its {len(others.names)} images the nearest one is "
-        f"{apart_ns / 1e6:.3g} ms away (median). Cameras of a rig are triggered together and timed by one clock: "
-        "correct the times, or reconstruct cameras that are not synchronised one by one"
-    )
+    apart = {"within_ms": SAME_MOMENT_NS / 1e6, "images": len(others.names), "apart_ms": apart_ns / 1e6}
+    return Fact("rig-times-differ", **found, **apart)
 
 
 def _decode(capture: Capture, camera: RigCamera, own: Mapping[str, str], timing: FrameTiming) -> Iterator[Frame]:

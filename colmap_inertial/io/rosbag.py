@@ -59,7 +59,7 @@ def read_rosbag(path: Path, units: DeclaredUnits) -> ImuRecording:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise MissingExtraError("ros", f"{path} is a ROS recording") from None
+        raise MissingExtraError("ros", Fact("ros-recording", path=str(path))) from None
     require_modest_recording(path)
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
@@ -67,34 +67,35 @@ def read_rosbag(path: Path, units: DeclaredUnits) -> ImuRecording:
     # the readers below raise whatever a damaged file leads them to: sqlite, struct, lz4, yaml, index errors
     except Exception as error:
         reason = str(error).strip().splitlines()
-        raise FormatError(
-            path, f"cannot be read as a ROS recording: {type(error).__name__} {reason[0][:200] if reason else ''}"
-        ) from None
+        detail = reason[0][:200] if reason else ""
+        raise FormatError(path, Fact("bag-not-readable", kind=type(error).__name__, detail=detail)) from None
     if not topics:
-        raise FormatError(path, "holds no sensor_msgs/Imu messages")
+        raise FormatError(path, Fact("bag-without-imu"))
     if units.topic is not None:
         if units.topic not in topics:
             raise FormatError(path, Fact("bag-without-topic", topic=units.topic, topics=tuple(topics)))
         topics = {units.topic: topics[units.topic]}
     sensors: tuple[tuple[Quantity, str], ...] = (("gyro", units.gyro or "rad/s"), ("accel", units.accel or "m/s2"))
     samples_of: dict[str, Samples] = {}
+    taken: dict[str, _Topic] = {}
     for quantity, unit in sensors:
         with_it = {name: topic for name, topic in topics.items() if quantity in topic.parts}
         if len(with_it) > 1:
-            raise FormatError(
-                path,
-                f"holds several topics with a {SENSOR_NAMES[quantity]} ({', '.join(with_it)}); keep one: "
-                f'topic = "{next(iter(with_it))}" under [imu] in a capture.toml, or '
-                f"rosbags-convert --src {path.name} --dst one --include-topic {next(iter(with_it))}",
-            )
+            several = {"sensor": SENSOR_NAMES[quantity], "topics": tuple(with_it), "name": path.name}
+            raise FormatError(path, Fact("bag-of-several-topics", **several))
         for name, topic in with_it.items():
+            taken[name] = topic
+            if len(topic.publishers) > 1:
+                raise TimingError(Fact("bag-of-two-drivers", path=str(path), topic=name, nodes=topic.publishers))
             t_ns = topic.arrival_ns
             if units.stamps != "arrival":
                 t_ns = topic.stamp_ns
                 _check_stamps(path, name, topic)
             samples_of[quantity] = order_samples(path, quantity, unit, t_ns, topic.parts[quantity])
+    if units.stamps != "arrival":
+        _require_one_clock(path, taken)
     if "gyro" not in samples_of:
-        raise FormatError(path, f"none of its IMU topics ({', '.join(topics)}) has a gyroscope that moves")
+        raise FormatError(path, Fact("bag-without-moving-gyroscope", topics=tuple(topics)))
     return build_recording(samples_of["gyro"], samples_of.get("accel"))
 
 
@@ -124,13 +125,11 @@ def _check_stamps(path: Path, name: str, topic: _Topic) -> None:
     Raises
     ------
     TimingError
-        For empty or repeated ones, and those of several drivers.
+        For empty or repeated ones, and those of a clock that was set.
     """
     stamps, count = topic.stamp_ns, len(topic.stamp_ns)
     hint = f"[imu]\npath = {json.dumps(path.name, ensure_ascii=False)}\n"
     jitter = _jitter_ms(topic.arrival_ns)
-    if len(topic.publishers) > 1:
-        raise TimingError(Fact("bag-of-two-drivers", path=str(path), topic=name, nodes=topic.publishers))
     arrival = {"jitter_ms": jitter, "hint": hint + 'stamps = "arrival"'}
     empty = int((stamps == 0).sum())
     if empty > LIMITS.harmless_share * count or len(np.unique(stamps)) < 2:
@@ -144,6 +143,37 @@ def _check_stamps(path: Path, name: str, topic: _Topic) -> None:
     back = int((late > LIMITS.latest_arrival_ns).sum())
     if back:
         raise TimingError(Fact("bag-stamps-jump-back", path=str(path), topic=name, count=back, total=count, **arrival))
+    ahead = np.diff(stamps) - np.diff(topic.arrival_ns)  # a gap of the sensor is one of arrival as well
+    jumps = int((ahead > LIMITS.latest_arrival_ns).sum())
+    if jumps:
+        raise TimingError(
+            Fact("bag-stamps-jump-ahead", path=str(path), topic=name, count=jumps, jump_s=ahead.max() * 1e-9, **arrival)
+        )
+
+
+def _require_one_clock(path: Path, topics: dict[str, _Topic]) -> None:
+    """Refuse topics whose header stamps are of clocks with different zeros, by how far they are from arrival.
+
+    Raises
+    ------
+    TimingError
+        Where they are.
+    """
+    late_ns = {name: float(np.median(topic.arrival_ns - topic.stamp_ns)) for name, topic in topics.items()}
+    apart_s = (max(late_ns.values()) - min(late_ns.values())) * 1e-9 if late_ns else 0.0
+    if apart_s > LIMITS.latest_arrival_ns * 1e-9:
+        hint = f'[imu]\npath = {json.dumps(path.name, ensure_ascii=False)}\nstamps = "arrival"'
+        jitter_ms = max(_jitter_ms(topic.arrival_ns) for topic in topics.values())
+        raise TimingError(
+            Fact(
+                "bag-of-two-clocks",
+                path=str(path),
+                topics=tuple(late_ns),
+                apart_s=apart_s,
+                jitter_ms=jitter_ms,
+                hint=hint,
+            )
+        )
 
 
 def _jitter_ms(arrival_ns: Int64Array) -> float:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.files import read_yaml, reading
 from colmap_inertial.io.sqlite import open_foreign
 
@@ -59,14 +60,14 @@ def require_modest_recording(path: Path) -> None:
         For one that does, that holds bytes more than once, that is damaged, or an SQLite database as of
         :func:`~colmap_inertial.io.sqlite.open_foreign`.
     """
-    with reading(path, "cannot be read as a ROS recording"):
+    with reading(path, Fact("not-readable-as", what="a ROS recording")):
         if not path.is_dir():
             _check_file(path, "")
             return
         about = read_yaml(path / "metadata.yaml", "a ROS recording").get("rosbag2_bagfile_information")
         mode = str((about if isinstance(about, dict) else {}).get("compression_mode") or "").lower()
         if mode == "file":
-            raise FormatError(path, "its files are packed whole; unpack them (zstd -d) and say so in metadata.yaml")
+            raise FormatError(path, Fact("bag-files-packed"))
         for file in sorted(path.iterdir()):
             if file.suffix in (".db3", ".mcap"):
                 _check_file(file, mode)
@@ -79,7 +80,7 @@ def _check_file(path: Path, mode: str) -> None:
             _check_database(path, size, mode)
         elif head.startswith(_MCAP):
             if mode == "message":
-                raise FormatError(path, "its messages are packed one by one; convert it with rosbags-convert")
+                raise FormatError(path, Fact("bag-messages-packed"))
             known: dict[_Packed, int] = {}
             for chunks in (_read_indexed_chunks(file, size), _read_chunks_in_order(file, size)):
                 _check_chunks(path, file, size, chunks, known)
@@ -101,7 +102,7 @@ def _check_chunks(path: Path, file: IO[bytes], size: int, chunks: Iterator[_Pack
     for chunk in chunks:
         passed += chunk.size + chunk.beside
         if passed > size:
-            raise FormatError(path, "is damaged: its index names parts of it more than once")
+            raise FormatError(path, Fact("bag-index-repeats"))
         if chunk not in known:
             file.seek(chunk.begin)
             packed = b"" if chunk.compression in _NOT_PACKED else file.read(chunk.size)
@@ -115,11 +116,7 @@ def _most(size: int) -> int:
 
 def _add(path: Path, size: int, held: int, more: int) -> int:
     if held + more > _most(size):
-        raise FormatError(
-            path,
-            f"unpacks to more than {_most(size) >> 20} MB, out of proportion to its {size} bytes; if it is meant, "
-            "convert it with rosbags-convert, without compression and with its IMU topics only",
-        )
+        raise FormatError(path, Fact("bag-out-of-proportion", most_mb=_most(size) >> 20, size=size))
     return held + more
 
 
@@ -137,14 +134,14 @@ def _unpacked(path: Path, packed: bytes, compression: str, most: int) -> int:
     """Number of bytes after unpacking, or more than ``most``."""
     made = _decompressors().get(compression)
     if made is None:
-        raise FormatError(path, f"is packed by {compression[:40]!r}, which is not read")
+        raise FormatError(path, Fact("bag-compression-unknown", compression=compression[:40]))
     unpacker, size = made(), 0
     part = unpacker.decompress(packed, _BOUNDS.step)
     while part and size <= most:
         size += len(part)
         part = b"" if unpacker.eof else unpacker.decompress(b"", _BOUNDS.step)
     if size <= most and unpacker.eof and unpacker.unused_data:
-        raise FormatError(path, "is damaged: bytes follow where a chunk ends")
+        raise FormatError(path, Fact("bag-chunk-followed"))
     return size
 
 

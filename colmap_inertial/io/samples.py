@@ -135,11 +135,11 @@ def _drop_incomplete(rows: _Rows) -> _Rows:
     if not finite.all():
         missing, first = int((~finite).sum()), int(rows.numbers[np.argmin(finite)])
         if missing > LIMITS.harmless_share * len(finite):
-            lacking = f"{missing} of {len(finite)} {rows.what} rows lack a value (NaN or empty)"
+            lacking = Fact("rows-lack-values", count=missing, rows=len(finite), sensor=rows.what)
             raise FormatError(rows.path, lacking, line=first if rows.counted == "line" else None)
         rows = rows.taken(finite).repaired("rows-without-value", count=missing, counted=rows.counted, first=first)
     if len(rows.t_ns) < 2:
-        raise FormatError(rows.path, f"holds {len(rows.t_ns)} {rows.what} samples; at least two are needed")
+        raise FormatError(rows.path, Fact("too-few-samples", count=len(rows.t_ns), sensor=rows.what))
     return rows
 
 
@@ -169,7 +169,7 @@ def _merge(rows: _Rows) -> _Rows:
     group = np.concatenate([[0], np.cumsum(~same)])
     first = np.concatenate([[0], np.flatnonzero(~same) + 1])
     if len(first) < 2:
-        raise TimingError(f"{rows.path}: all {rows.what} samples have one stamp; this is not the time column")
+        raise TimingError(Fact("one-stamp-for-all", path=str(rows.path), sensor=rows.what))
     values = rows.values[first]
     mixed = np.unique(group[1:][differs])
     if len(mixed):

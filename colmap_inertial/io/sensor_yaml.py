@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import colmap_px_from_opencv
 from colmap_inertial.core.types import CameraModel, ImuNoise
 from colmap_inertial.io.files import read_text, read_yaml
@@ -58,30 +59,34 @@ class Sheet:
     values: Mapping[str, Any]
     part: str = ""
 
-    def fault(self, reason: str) -> FormatError:
-        """Reason why the value is wrong."""
-        return FormatError(self.path, f"{self.part}: {reason}"[:400] if self.part else reason[:400])
+    def fault(self, reason: Fact) -> FormatError:
+        """The error for what is wrong with a value."""
+        return FormatError(self.path, Fact("wrong-entry", entry=self.part, fault=reason) if self.part else reason)
+
+    def unknown(self, key: str, known: Iterable[str]) -> FormatError:
+        """The error for a value that is none of those known here."""
+        return self.fault(Fact("value-not-known", key=key, found=repr(self.values.get(key))[:200], known=tuple(known)))
 
     def numbers(self, key: str, count: int | None = None) -> list[float]:
         """The finite numbers under a key: one, a list, or lists of them; ``count`` of them."""
         if self.values.get(key) is None:
-            raise self.fault(f"{key} is missing")
+            raise self.fault(Fact("key-missing", key=key))
         value = self.values[key]
         try:
             numbers: list[float] = np.asarray(value, dtype=np.float64).ravel().tolist()
         except (TypeError, ValueError):
-            raise self.fault(f"{key}: {value!r} is not a list of numbers") from None
+            raise self.fault(Fact("key-not-numbers", key=key, found=repr(value)[:300])) from None
         if not np.isfinite(numbers).all():
-            raise self.fault(f"{key}: numbers must be finite")
+            raise self.fault(Fact("key-not-finite", key=key))
         if count is not None and len(numbers) != count:
-            raise self.fault(f"{key} must hold {count} numbers, found {len(numbers)}")
+            raise self.fault(Fact("key-of-other-count", key=key, count=count, found=len(numbers)))
         return numbers
 
     def pose(self, key: str, what: str) -> Array:
         """A (4, 4) matrix that moves and rotates."""
         matrix = np.array(self.numbers(key, 16)).reshape(4, 4)
         if not is_rotation(matrix[:3, :3]):
-            raise self.fault(f"{what} holds no rotation")
+            raise self.fault(Fact("no-rotation", what=what))
         return matrix
 
     def pinhole(self, coefficients: str) -> tuple[str, tuple[float, ...], tuple[int, int]]:
@@ -91,11 +96,10 @@ class Sheet:
         principal point is moved by half a pixel from OpenCV's origin to COLMAP's.
         """
         if self.values.get("camera_model") != "pinhole":
-            raise self.fault(f"camera_model {self.values.get('camera_model')!r} is not known here (pinhole is)")
+            raise self.unknown("camera_model", ("pinhole",))
         distortion = self.values.get("distortion_model")
         if distortion not in _COLMAP_MODELS:
-            known = ", ".join(_COLMAP_MODELS)
-            raise self.fault(f"distortion_model {distortion!r} is not known here ({known} are)")
+            raise self.unknown("distortion_model", _COLMAP_MODELS)
         fx, fy, *centre = self.numbers("intrinsics", 4)
         more = [] if distortion == "none" else self.numbers(coefficients, 4)
         width, height = self.numbers("resolution", 2)
@@ -135,7 +139,7 @@ def read_imu_noise(path: Path) -> ImuNoise | None:
     try:
         return ImuNoise(**values)
     except ValueError as error:
-        raise FormatError(path, str(error)) from None
+        raise FormatError(path, Fact("invalid-values", detail=str(error))) from None
 
 
 def read_camera(path: Path) -> CameraModel:
@@ -144,12 +148,14 @@ def read_camera(path: Path) -> CameraModel:
     try:
         return CameraModel(model=model, width=width, height=height, params=params)
     except ValueError as error:
-        raise FormatError(path, f"resolution: {error}") from None
+        raise FormatError(
+            path, Fact("wrong-entry", entry="resolution", fault=Fact("invalid-values", detail=str(error)))
+        ) from None
 
 
 def read_body_from_sensor(path: Path) -> Array:
     """(4, 4) ``T_BS``: body frame from sensor frame, metres."""
     entry = _read(path).values.get("T_BS")
     if not isinstance(entry, dict):
-        raise FormatError(path, "holds no T_BS with rows, cols and data")
+        raise FormatError(path, Fact("no-body-pose"))
     return Sheet(path=path, values=entry).pose("data", "T_BS")

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import matrix_from_quat, quat_multiply
 from colmap_inertial.core.types import Similarity
 
@@ -80,15 +81,15 @@ def sh_rotation(rotation: Array, degree: int) -> Array:
     return np.asarray(rotation_of_sh)
 
 
-def fault_of_splats(names: set[str]) -> str | None:
+def fault_of_splats(names: set[str]) -> Fact | None:
     """Why the splats of a file with these fields cannot be moved; ``None`` where they can."""
     rest = _num_rest(names)
     if not names.issuperset(SPLAT):
-        return f"lack {', '.join(sorted(SPLAT - names))}"
+        return Fact("splats-lack-fields", names=sorted(SPLAT - names))
     if not names.issuperset(_POSITION):
-        return "have no position"
+        return Fact("splats-without-position")
     if rest not in _REST or not names.issuperset(f"f_rest_{i}" for i in range(rest)):
-        return f"have {rest} fields f_rest, not those of harmonics of degree 0 to 3"
+        return Fact("splats-without-harmonics", count=rest)
     return None
 
 

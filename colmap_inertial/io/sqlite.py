@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import Literal
 
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.files import require_regular
-
-_SQLITE = "SQLite cannot read it"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +43,7 @@ def open_foreign(
     *,
     mode: Literal["immutable=1", "mode=ro", "mode=rw"] = "immutable=1",
     source: Path | None = None,
-    fault: str = _SQLITE,
+    fault: Fact | None = None,
 ) -> Iterator[sqlite3.Connection]:
     """Open a database that others may have written, and close it.
 
@@ -60,7 +59,7 @@ def open_foreign(
     source
         What the file is a copy of, for messages.
     fault
-        What messages say of it.
+        What messages say of it, by default that SQLite cannot read it.
 
     Raises
     ------
@@ -70,6 +69,7 @@ def open_foreign(
         Where the disk is full or fails.
     """
     named = path if source is None else source
+    fault = fault or Fact("sqlite-cannot-read")
     require_regular(path)
     end_s = time.thread_time() + BOUNDS.seconds + path.stat().st_size / BOUNDS.bytes_per_s
     try:
@@ -83,19 +83,16 @@ def open_foreign(
         if code in (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR):
             number = errno.ENOSPC if code == sqlite3.SQLITE_FULL else errno.EIO
             raise OSError(number, os.strerror(number), str(named)) from None
-        reason = "it takes longer than its size explains" if code == sqlite3.SQLITE_INTERRUPT else str(error)
-        raise FormatError(named, f"{fault}: {reason}") from None
+        if code == sqlite3.SQLITE_INTERRUPT:
+            raise FormatError(named, Fact("database-takes-long", fault=fault)) from None
+        raise FormatError(named, Fact("database-not-readable", fault=fault, detail=str(error))) from None
 
 
-def _refuse_code(database: sqlite3.Connection, named: Path, fault: str) -> None:
+def _refuse_code(database: sqlite3.Connection, named: Path, fault: Fact) -> None:
     query = (
         "SELECT type, name FROM sqlite_master WHERE type NOT IN ('table', 'index') OR (type = 'table' AND rootpage = 0)"
     )
     row = database.execute(query).fetchone()
     if row is not None:
         kind = "virtual table" if row[0] == "table" else row[0]
-        raise FormatError(
-            named,
-            f"{fault}: it holds the {kind} {str(row[1])[:80]!r}, which is not run; drop it "
-            f"(DROP {kind.split()[-1].upper()})",
-        )
+        raise FormatError(named, Fact("code-in-database", fault=fault, kind=kind, name=str(row[1])[:80]))

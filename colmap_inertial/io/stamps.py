@@ -84,7 +84,7 @@ def read_stamps(table: Table, time: TimeColumns) -> tuple[Int64Array, tuple[Fact
     elif time.counts_per_second is not None:
         counts = table.numbers(places[:1])[:, 0]
         if not (np.abs(counts) < 2**53).all():
-            raise FormatError(table.path, f'column "{time.columns[0]}" holds what is no count')
+            raise FormatError(table.path, Fact("no-counts", column=time.columns[0]))
         t_ns = np.rint(counts * (1e9 / time.counts_per_second)).astype(np.int64)
         periods = [round(period * (1e9 / time.counts_per_second)) for period in _COUNTS]
     else:
@@ -130,7 +130,7 @@ def _dates_ns(table: Table, places: Sequence[int], stated: DateOrder | None) -> 
     wrong = next((i for i, match in enumerate(matches) if match is None or match["hour"] is None), None)
     if wrong is not None:
         line = int(table.line_numbers[wrong])
-        raise FormatError(table.path, f"{texts[wrong][:40]!r} is no date with a time", line=line)
+        raise FormatError(table.path, Fact("no-date-with-time", text=texts[wrong][:40]), line=line)
     known = [match for match in matches if match is not None]
     order = stated or _order(table, known)
     out = np.empty(len(known), dtype=np.int64)
@@ -139,7 +139,9 @@ def _dates_ns(table: Table, places: Sequence[int], stated: DateOrder | None) -> 
             out[i] = _stamp_ns(match, order)
         except ValueError as error:
             line = int(table.line_numbers[i])
-            raise FormatError(table.path, f"{texts[i][:40]!r} is no date ({error})", line=line) from None
+            raise FormatError(
+                table.path, Fact("not-a-date", text=texts[i][:40], detail=str(error)), line=line
+            ) from None
     return out
 
 
@@ -166,7 +168,7 @@ def _stamp_ns(match: re.Match[str], order: DateOrder) -> int:
         hour = hour % 12 + (12 if match["half"][0] in "Pp" else 0)
     second = int(match["second_"] or 0)
     if hour > 24 or int(match["minute"]) > 59 or second > 60:
-        raise ValueError("no time of day")
+        raise ValueError(Fact("no-time-of-day"))
     part = match["part"] or ""
     if match["dot"] in (":", "_") and len(part) <= 3:
         below = int(part or 0) * 1_000_000  # milliseconds, which some do not fill up with zeros

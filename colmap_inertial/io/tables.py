@@ -20,7 +20,7 @@ from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.dialect import decode, plain_text
 from colmap_inertial.io.files import first_line, read_bytes, read_limits, reading
-from colmap_inertial.io.json_rows import rows_of_json
+from colmap_inertial.io.json_rows import is_json, rows_of_json
 from colmap_inertial.io.units import SENSOR_UNITS, TIME_UNITS_NS, Quantity, stamps_ns, unit_of
 
 #: A delimiter that stands for any white space.
@@ -69,7 +69,9 @@ class Table:
     def require_width(self, layout: str) -> None:
         """Raise :class:`FormatError` unless there are as many columns as the layout has words."""
         if self.width != len(layout.split()):
-            raise FormatError(self.path, f"{self.width} columns; expected {layout}", line=int(self.line_numbers[0]))
+            raise FormatError(
+                self.path, Fact("other-columns", width=self.width, layout=layout), line=int(self.line_numbers[0])
+            )
 
     def column(self, name: str | int) -> int:
         """The zero-based index of a column, by its name in the header or its number counted from 1.
@@ -81,12 +83,12 @@ class Table:
         """
         if isinstance(name, int):
             if not 1 <= name <= self.width:
-                raise FormatError(self.path, f"there is no column {name}: columns count from 1 to {self.width}")
+                raise FormatError(self.path, Fact("no-column-number", number=name, width=self.width))
             return name - 1
         if self.header is None:
-            raise FormatError(self.path, f'has no header, so no column "{name}"; give its number, counted from 1')
+            raise FormatError(self.path, Fact("no-header-for-column", name=name))
         if name not in self.header:
-            raise FormatError(self.path, f'has no column "{name}"; the header is: {self.header_text[:300]}')
+            raise FormatError(self.path, Fact("no-column", name=name, header=self.header_text[:300]))
         return self.header.index(name)
 
     def text(self, column: int) -> list[str]:
@@ -125,7 +127,7 @@ class Table:
                 if number is None:
                     raise FormatError(
                         self.path,
-                        f"{cell[:40]!r} in column {column + 1} is not a number",
+                        Fact("cell-not-a-number", cell=cell[:40], column=column + 1),
                         line=int(self.line_numbers[row]),
                     )
         return out
@@ -169,6 +171,8 @@ def parse_text(path: Path, text: str) -> Table:
     rows = rows_of_json(text)
     if rows is not None:
         return replace(parse_table(path, rows, ","), found=("JSON",))
+    if is_json(text):
+        raise FormatError(path, Fact("json-without-rows"))
     plain = plain_text(text)
     table = parse_table(path, plain.text, plain.delimiter)
     return replace(table, preamble=plain.preamble or table.preamble, found=plain.found)
@@ -194,14 +198,14 @@ def parse_table(path: Path, text: str, delimiter: str = "") -> Table:
     candidates = [lines[0]] if has_header else comments[::-1]
     lines, numbers = lines[has_header:], numbers[has_header:]
     if not lines:
-        raise FormatError(path, "holds a header and no rows")
+        raise FormatError(path, Fact("header-alone"))
     width = len(lines[0].split(between))
     candidates = [line.strip() for line in candidates if _width(line, between, most) <= most]
     header_text = next((line for line in candidates if len(_header_cells(line, between)) == width), None)
     if has_header and header_text is None:
         cells = len(_header_cells(candidates[0], between))
-        reason = f"{width} cells under a header of {cells}: {candidates[0][:200]}"
-        raise FormatError(path, reason, line=int(numbers[0]))
+        other = Fact("cells-unlike-header", count=width, header_count=cells, header=candidates[0][:200])
+        raise FormatError(path, other, line=int(numbers[0]))
     if not text.endswith("\n") and len(lines) > 1 and _is_cut_off(lines[-1], lines[-2], between, width):
         repairs.append(Fact("last-line-cut-off", file=path.name, line=numbers[-1]))
         lines, numbers = lines[:-1], numbers[:-1]
@@ -224,7 +228,7 @@ def _split_lines(path: Path, body: str) -> tuple[list[str], Int64Array, list[str
     raw = body.split("\n")
     first = next((i for i, line in enumerate(raw) if line.strip() and not _is_comment(line)), None)
     if first is None:
-        raise FormatError(path, "holds no rows of numbers")
+        raise FormatError(path, Fact("no-rows-of-numbers"))
     comments = [line for line in raw[:first] if _is_comment(line)]
     lines, numbers = raw[first:], np.arange(first + 1, len(raw) + 1)
     repairs = list[Fact]()
@@ -242,15 +246,15 @@ def _require_one_width(path: Path, lines: list[str], numbers: Int64Array, delimi
     widths = [_width(line, delimiter, most) for line in lines]
     if widths.count(width) != len(widths):
         wrong = next(i for i, width_i in enumerate(widths) if width_i != width)
-        reason = f"{widths[wrong]} cells where the other lines have {width}"
-        raise FormatError(path, reason, line=int(numbers[wrong]))
+        raise FormatError(
+            path, Fact("cells-unlike-others", count=widths[wrong], others=width), line=int(numbers[wrong])
+        )
 
 
 def too_wide(path: Path, line: int) -> FormatError:
     """The error for a table of more columns than the limits allow."""
     most = read_limits().table_columns
-    reason = f"has more than {most} columns; such a table is not read (raise --limits.table-columns)"
-    return FormatError(path, reason, line=line)
+    return FormatError(path, Fact("too-many-columns", most=most), line=line)
 
 
 def _width(line: str, delimiter: str | None, most: int) -> int:
@@ -352,7 +356,7 @@ def _unit(cell: str, text: str | None, allowed: tuple[str, ...]) -> str | None:
         return None
     unit = unit_of(text)
     if unit not in allowed:
-        raise ValueError(f'column "{cell}" has the unit [{text}]; known here are {", ".join(allowed)}')
+        raise ValueError(Fact("column-of-unknown-unit", column=cell, unit=text, known=allowed))
     return unit
 
 
@@ -413,12 +417,10 @@ def text_of(path: Path, member: str) -> str:
             size += len(part)
             memory += len(part) + _PACKING.line * part.count(b"\n")
             if size > largest_gib * (1 << 30):
-                raise FormatError(path, f"its {member} unpacks to more than {largest_gib:g} GiB (--limits.file-gib)")
+                raise FormatError(path, Fact("member-too-large", member=member, largest_gib=largest_gib))
             if memory > _PACKING.memory_anyway + _PACKING.memory * packed:
                 raise FormatError(
-                    path,
-                    f"its {member} unpacks to {size >> 20} MB and more, out of proportion to {packed} packed bytes; if "
-                    "it is meant, unpack it and give the folder",
+                    path, Fact("member-out-of-proportion", member=member, size_mb=size >> 20, packed=packed)
                 )
         return decode(b"".join(parts))[0]
 
@@ -426,12 +428,10 @@ def text_of(path: Path, member: str) -> str:
 @contextmanager
 def _unpacking(path: Path, member: str) -> Iterator[tuple[IO[bytes], int]]:
     """A member of a zip, opened, and the bytes that it takes there."""
-    with reading(path, f"its {member} cannot be unpacked"), zipfile.ZipFile(path) as archive:
+    with reading(path, Fact("member-not-unpacked", member=member)), zipfile.ZipFile(path) as archive:
         info = archive.getinfo(member)
         if info.compress_type not in _METHODS:
             method = info.compress_type
-            raise FormatError(
-                path, f"its {member} is packed by method {method}, not by deflate; unpack it and give the folder"
-            )
+            raise FormatError(path, Fact("member-packed-otherwise", member=member, method=method))
         with archive.open(info) as file:
             yield file, min(info.compress_size, path.stat().st_size)

@@ -24,6 +24,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, MissingExtraError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import FrameLog, ImuRecording
 from colmap_inertial.io.files import first_line
 from colmap_inertial.io.imu_text import build_recording, order_rows
@@ -106,7 +107,7 @@ def read_telemetry(path: Path, units: DeclaredUnits) -> ImuRecording:
     camera, groups = _parsed(path)
     gyro = _samples(path, groups, "gyro", units.gyro)
     if gyro is None:
-        raise FormatError(path, f"holds no gyroscope; {camera} writes one where gyro data is switched on")
+        raise FormatError(path, Fact("telemetry-without-gyroscope", camera=camera))
     return build_recording(gyro, _samples(path, groups, "accel", units.accel), device=camera)
 
 
@@ -117,7 +118,7 @@ def _read_counts(path: Path, units: DeclaredUnits) -> ImuRecording:
     known = [camera for begin, camera in _CAMERAS.items() if path.name.lower().startswith(begin)]
     name, range_deg_s, letters = _MOBIUS_CAMERA if header == _MOBIUS or not known else known[0]
     if table.width < 4:
-        raise FormatError(path, "holds no gyroscope; its camera writes one where gyro data is switched on")
+        raise FormatError(path, Fact("counts-without-gyroscope"))
     t_ns = table.stamps_ns(0, "ms")
     axes = Axes.of_letters(letters)
     rates = axes.apply(table.numbers([1, 2, 3]) * (range_deg_s / 32768.0))
@@ -149,14 +150,15 @@ def _parsed(path: Path) -> tuple[str, dict[str, dict[str, Any]]]:
     It runs in a process of its own: on damaged files it may abort, which no exception tells of.
     """
     if find_spec("telemetry_parser") is None:
-        raise MissingExtraError("devices", f"{path} is read by telemetry-parser")
+        raise MissingExtraError("devices", Fact("needs-telemetry-parser", path=str(path)))
     most_bytes = _LIMITS.memory_bytes + _LIMITS.memory_of_a_byte * path.stat().st_size
     command = [sys.executable, "-P", "-c", _PARSE, str(path.absolute()), str(most_bytes)]
     done = subprocess.run(command, capture_output=True, stdin=subprocess.DEVNULL)
     if done.returncode:
         lines = done.stderr.decode("utf-8", "replace").strip().splitlines()
-        ended = f"it ended with {'signal' if done.returncode < 0 else 'exit code'} {abs(done.returncode)}"
-        raise FormatError(path, f"telemetry-parser cannot read it: {lines[-1] if lines else ended}")
+        last_words, code = lines[-1] if lines else "", done.returncode
+        ended = {"signal": -code if code < 0 else None, "exit_code": code if code > 0 else None}
+        raise FormatError(path, Fact("telemetry-parser-failed", last_words=last_words, **ended))
     camera, model, parts = json.loads(done.stdout)
     groups: dict[str, dict[str, Any]] = {}
     for part in parts:
@@ -178,7 +180,7 @@ def _samples(path: Path, groups: dict[str, dict[str, Any]], quantity: Quantity, 
         axes = Axes.of_letters(tags["Orientation"])
     except (KeyError, TypeError, ValueError) as error:
         what = SENSOR_NAMES[quantity]
-        raise FormatError(path, f"telemetry-parser gives a {what} that is not understood here: {error}") from None
+        raise FormatError(path, Fact("telemetry-not-understood", sensor=what, detail=str(error))) from None
     # a damaged stamp stays one: the checks of samples name it
     t_ns = np.rint(np.nan_to_num(np.clip(t_s, -4e9, 4e9), nan=4e9) * 1e9).astype(np.int64)
     return order_samples(path, quantity, declared or unit, t_ns, axes.apply(values / (scale or 1.0)))

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.files import read_text
 
 T = TypeVar("T", bound=str)
@@ -49,15 +50,15 @@ def parse_toml(path: Path, text: str) -> dict[str, Any]:
         Where it is not TOML, or much longer or deeper than any of ours.
     """
     if len(text) > _MOST_CHARACTERS:
-        raise FormatError(path, f"has {len(text)} characters; such a file has at most {_MOST_CHARACTERS}")
+        raise FormatError(path, Fact("toml-too-long", count=len(text), most=_MOST_CHARACTERS))
     keys = _DOTTED.findall(_TEXT.sub(_replace_by_word, text))
     if any(key.count(".") >= _MOST_PARTS for key in keys):
-        raise FormatError(path, f"has a key of more than {_MOST_PARTS} parts with dots between them")
+        raise FormatError(path, Fact("toml-key-too-deep", most=_MOST_PARTS))
     try:
         return tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
         line = re.search(r"at line (\d+)", str(error))
-        raise FormatError(path, f"not valid TOML: {error}", line=int(line[1]) if line else None) from None
+        raise FormatError(path, Fact("invalid-toml", detail=str(error)), line=int(line[1]) if line else None) from None
 
 
 def _replace_by_word(match: re.Match[str]) -> str:
@@ -82,10 +83,11 @@ class Section:
         """Keys in the order of the file."""
         return list(self._values)
 
-    def fail(self, key: str | None, reason: str) -> NoReturn:
+    def fail(self, key: str | None, fault: Fact) -> NoReturn:
         """Raise the :class:`FormatError` of this table (and of one of its keys)."""
         where = f"[{self.name}]" if self.name else "top level"
-        raise FormatError(self.path, f"{where}{'' if key is None else ' ' + key}: {reason}", line=self._line(key))
+        entry = where if key is None else f"{where} {key}"
+        raise FormatError(self.path, Fact("wrong-entry", entry=entry, fault=fault), line=self._line(key))
 
     def section(self, key: str, *, short: str | None = None) -> Section | None:
         """The table under ``key``, or ``None`` where it is absent; a text in its place is its key ``short``."""
@@ -96,7 +98,7 @@ class Section:
         if short is not None and isinstance(value, str):
             value = {short: value}
         if not isinstance(value, dict):
-            self.fail(key, f"must be a table: write [{name}] on a line of its own")
+            self.fail(key, Fact("not-a-table", name=name))
         return Section(self.path, name, value, self._text)
 
     def table(self, key: str) -> Section:
@@ -108,7 +110,7 @@ class Section:
         """A text, not empty."""
         value = self._take(key)
         if value is not None and (not isinstance(value, str) or not value.strip()):
-            self.fail(key, f"must be a text in quotes, found {value!r}")
+            self.fail(key, Fact("not-a-text", found=repr(value)))
         return value
 
     def choice(self, key: str, allowed: Iterable[T]) -> T | None:
@@ -116,14 +118,14 @@ class Section:
         value = self._take(key)
         names = list(allowed)
         if value is not None and value not in names:
-            self.fail(key, f"must be one of {', '.join(map(repr, names))}; found {value!r}")
+            self.fail(key, Fact("not-one-of", allowed=tuple(names), found=repr(value)))
         return value
 
     def file(self, key: str) -> Path | None:
         """A path; a relative one counts from the TOML file's folder."""
         value = self.text(key)
         if value is not None and "\0" in value:
-            self.fail(key, "holds a NUL character")
+            self.fail(key, Fact("nul-character"))
         return None if value is None else self.path.parent / value
 
     def files(self, key: str) -> tuple[Path, ...]:
@@ -133,14 +135,14 @@ class Section:
             path = self.file(key)
             return () if path is None else (path,)
         if not value or any(not isinstance(item, str) or not item.strip() or "\0" in item for item in value):
-            self.fail(key, f"must be a path in quotes, or a list of them, found {value!r}"[:300])
+            self.fail(key, Fact("not-paths", found=repr(value)[:249]))
         return tuple(self.path.parent / item for item in value)
 
     def boolean(self, key: str) -> bool | None:
         """``true`` or ``false``."""
         value = self._take(key)
         if value is not None and not isinstance(value, bool):
-            self.fail(key, f"must be true or false, found {value!r}")
+            self.fail(key, Fact("not-a-boolean", found=repr(value)))
         return value
 
     def number(self, key: str, *, low: float = -math.inf, high: float = math.inf) -> float | None:
@@ -150,21 +152,21 @@ class Section:
             return None
         number = self._number(key, value)
         if not low <= number <= high:
-            self.fail(key, f"must be from {low:g} to {high:g}, found {value!r}")
+            self.fail(key, Fact("not-in-range", low=low, high=high, found=repr(value)))
         return number
 
     def positive(self, key: str) -> float | None:
         """A finite number above zero."""
         value = self.number(key)
         if value is not None and value <= 0:
-            self.fail(key, f"must be above 0, found {value!r}")
+            self.fail(key, Fact("not-above-zero", found=repr(value)))
         return value
 
     def integer(self, key: str) -> int | None:
         """A positive whole number."""
         value = self._take(key)
         if value is not None and (not isinstance(value, int) or isinstance(value, bool) or not 0 < value < 10**9):
-            self.fail(key, f"must be a whole number above 0, found {value!r}")
+            self.fail(key, Fact("not-a-positive-integer", found=repr(value)))
         return value
 
     def numbers(self, key: str, count: int | None = None) -> tuple[float, ...] | None:
@@ -173,7 +175,7 @@ class Section:
         if value is None:
             return None
         if not isinstance(value, list) or (count is not None and len(value) != count):
-            self.fail(key, f"must be a list of {'' if count is None else f'{count} '}numbers, found {value!r}")
+            self.fail(key, Fact("not-numbers", count=count, found=repr(value)))
         return tuple(self._number(key, item) for item in value)
 
     def matrix(self, key: str) -> list[list[float]] | None:
@@ -182,7 +184,7 @@ class Section:
         if value is None:
             return None
         if not isinstance(value, list) or not all(isinstance(r, list) and len(r) == len(value[0]) for r in value):
-            self.fail(key, "must be a matrix: a list of rows, each a list of numbers")
+            self.fail(key, Fact("not-a-matrix"))
         return [[self._number(key, item) for item in row] for row in value]
 
     def raw(self, key: str) -> Any:
@@ -192,7 +194,7 @@ class Section:
     def require(self, key: str, value: Any) -> Any:
         """``value``, or a complaint that the key is missing."""
         if value is None:
-            self.fail(None, f"{key} is missing")
+            self.fail(None, Fact("key-missing", key=key))
         return value
 
     def require_known(self, known: Sequence[str]) -> None:
@@ -200,8 +202,7 @@ class Section:
         for key in self._values:
             if key not in known:
                 near = difflib.get_close_matches(key, known, n=1, cutoff=0.0)
-                hint = f'; did you mean "{near[0]}"?' if near else ""
-                self.fail(key, f"unknown key{hint} (known here: {', '.join(known)})")
+                self.fail(key, Fact("unknown-key", near=near, known=known))
 
     def finish(self) -> None:
         """Complain about keys that nobody asked for."""
@@ -214,13 +215,13 @@ class Section:
 
     def _number(self, key: str, value: object) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float):
-            self.fail(key, f"must be a number, found {value!r}")
+            self.fail(key, Fact("not-a-number", found=repr(value)))
         try:
             number = float(value)
         except OverflowError:
             number = math.inf
         if not math.isfinite(number):
-            self.fail(key, f"must be finite, found {value!r}"[:200])
+            self.fail(key, Fact("not-finite", found=repr(value)[:178]))
         return number
 
     def _line(self, key: str | None) -> int | None:

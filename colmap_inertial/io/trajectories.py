@@ -9,6 +9,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray
 from colmap_inertial.core.errors import FormatError, TimingError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import quat_conjugate, quat_normalize
 from colmap_inertial.core.types import CameraTrajectory, ImuRecording, SmoothedTrajectory
 from colmap_inertial.io.files import reader, write_text
@@ -46,7 +47,8 @@ def write_tum(path: Path, trajectory: CameraTrajectory | SmoothedTrajectory) -> 
         total = trajectory.epoch_ns + stamp
         whole, rest = divmod(abs(total), 1_000_000_000)
         time = f"{'-' if total < 0 else ''}{whole}.{rest:09d}"
-        lines.append(" ".join([time, *(f"{value:.12g}" for value in (*centre, *xyzw))]))
+        # of places on a map, millimetres stand in the tenth digit
+        lines.append(" ".join([time, *(f"{value:.15g}" for value in centre), *(f"{value:.12g}" for value in xyzw)]))
     write_text(Path(path), "\n".join(lines) + "\n")
 
 
@@ -81,22 +83,20 @@ def _read_poses(path: Path, layout: str, time_unit: str, cam_from_world: Callabl
     table = read_table(path)
     table.require_width(layout)
     if len(table) < 2:
-        raise FormatError(path, "holds one pose; a trajectory needs at least two")
+        raise FormatError(path, Fact("one-pose"))
     numbers = table.numbers([layout.split().index(name) for name in ["x", "y", "z", "qx", "qy", "qz", "qw"]])
-    _require_rows(
-        table, np.asarray(np.isfinite(numbers).all(axis=1)), lambda row: "a pose has a value that is not finite"
-    )
+    _require_rows(table, np.asarray(np.isfinite(numbers).all(axis=1)), lambda row: Fact("pose-not-finite"))
     t_ns = table.stamps_ns(0, time_unit)
     late = np.flatnonzero(np.diff(t_ns) <= 0)
     if len(late):
         line = int(table.line_numbers[late[0] + 1])
-        raise TimingError(f"{path}, line {line}: the time does not increase; poses must be in order of time")
+        raise TimingError(Fact("pose-times-back", path=str(path), line=line))
     xyzw = numbers[:, 3:]
     norm = np.linalg.norm(xyzw, axis=1)
     _require_rows(
         table,
         np.abs(norm - 1) <= 1e-2,
-        lambda row: f"the quaternion has length {norm[row]:.4g}, not 1; are these the columns of a rotation?",
+        lambda row: Fact("quaternion-of-other-length", length=norm[row]),
     )
     return CameraTrajectory(
         names=tuple(map(str, range(len(t_ns)))),
@@ -107,7 +107,7 @@ def _read_poses(path: Path, layout: str, time_unit: str, cam_from_world: Callabl
     )
 
 
-def _require_rows(table: Table, is_good: BoolArray, reason: Callable[[int], str]) -> None:
+def _require_rows(table: Table, is_good: BoolArray, reason: Callable[[int], Fact]) -> None:
     """Refuse the first pose that is not good; ``reason`` of its row."""
     if not is_good.all():
         row = int(np.argmin(is_good))

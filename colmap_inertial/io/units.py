@@ -14,6 +14,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError, TimingError
+from colmap_inertial.core.facts import Fact
 
 Quantity = Literal["gyro", "accel"]
 
@@ -130,7 +131,7 @@ class Axes:
             if match:
                 matrix[row, "xyz".index(match[2])] = -1.0 if match[1] == "-" else 1.0
         if len(parts) != 3 or not np.array_equal(np.abs(matrix).sum(axis=0), np.ones(3)):
-            raise ValueError(f'"{text}" must name x, y and z once each, with optional signs, like "y,-x,z"')
+            raise ValueError(Fact("not-axes", text=text))
         return cls(matrix=matrix)
 
     @classmethod
@@ -195,11 +196,9 @@ def stamps_ns(
                 values.append(int(exact.to_integral_value()) if abs(exact) < _LARGEST_STAMP_NS else _LARGEST_STAMP_NS)
             except (DecimalException, ValueError):
                 line = None if line_numbers is None else int(line_numbers[i])
-                raise FormatError(path, f"time stamp {token[:40]!r} is not a number", line=line) from None
+                raise FormatError(path, Fact("stamp-not-a-number", stamp=token[:40]), line=line) from None
     if values and not -_LARGEST_STAMP_NS < min(values) <= max(values) < _LARGEST_STAMP_NS:
         bad = next(i for i, value in enumerate(values) if not -_LARGEST_STAMP_NS < value < _LARGEST_STAMP_NS)
-        where = "" if line_numbers is None else f", line {line_numbers[bad]}"
-        raise TimingError(
-            f"{path}{where}: time stamp {tokens[bad][:40]} {unit} is beyond 142 years; check the time unit"
-        )
+        line = None if line_numbers is None else int(line_numbers[bad])
+        raise TimingError(Fact("stamp-too-far", path=str(path), line=line, stamp=tokens[bad][:40], unit=unit))
     return np.array(values, dtype=np.int64)

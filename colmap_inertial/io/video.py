@@ -23,6 +23,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Int64Array, UInt8Array, UInt16Array
 from colmap_inertial.core.errors import FormatError, InertialError, TimingError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.files import require_regular
 from colmap_inertial.io.mp4 import is_mp4, read_movie
 
@@ -61,29 +62,24 @@ def video_stamps_ns(path: Path) -> Int64Array:
     t_ns = np.zeros(0, dtype=np.int64)
     if time_base is not None:
         t_ns = np.array(sorted(_ns(stamp, time_base.numerator, time_base.denominator) for stamp in known), np.int64)
-    last = f", the last at {t_ns[-1] * 1e-9:.3f} s" if len(t_ns) else ""
+    last_s = t_ns[-1] * 1e-9 if len(t_ns) else None
     if len(packet_stamps) < listed:
         missing = _count_lost(path, kind, listed, listed - len(packet_stamps))
         if missing:
-            held = f"it holds {listed - missing} of the {listed} frames that its index lists"
-            raise FormatError(path, f"is cut off: {held}{last}")
+            raise FormatError(path, Fact("video-lacks-frames", held=listed - missing, listed=listed, last_s=last_s))
     if not stamps:
-        raise FormatError(path, "holds no video frames")
+        raise FormatError(path, Fact("no-video-frames"))
     if time_base is None or len(known) < len(stamps):
-        raise TimingError(
-            f"{path}: frames carry no presentation stamps; give frame_times under [video] in capture.toml"
-        )
+        raise TimingError(Fact("frames-without-stamps", path=str(path)))
     steps = np.diff(t_ns)
     same = np.flatnonzero(steps == 0)
     if len(same):
-        raise TimingError(
-            f"{path}: two frames have the presentation stamp {t_ns[same[0]] * 1e-9:.6f} s; give frame_times under "
-            "[video] in capture.toml"
-        )
+        raise TimingError(Fact("frames-of-one-stamp", path=str(path), stamp_s=t_ns[same[0]] * 1e-9))
     # the last frame may stand as long as any other did
     longest_s = 1e-9 * float(steps.max(initial=0))
     if duration_s is not None and t_ns[-1] * 1e-9 + 2 * longest_s + 0.1 < duration_s:
-        raise FormatError(path, f"is cut off: it states {duration_s:.3f} s, but holds {len(t_ns)} frames{last}")
+        early = Fact("video-ends-early", duration_s=duration_s, frames=len(t_ns), last_s=last_s)
+        raise FormatError(path, early)
     return t_ns
 
 
@@ -165,20 +161,19 @@ def _decode_wanted(path: Path, wanted_ns: Int64Array) -> Iterator[tuple[int, av.
             t_ns = _ns(frame.pts, frame.time_base.numerator, frame.time_base.denominator)
             if frame.is_corrupt and t_ns >= first_ns:
                 # whether wanted or not: others are made from it
-                raise FormatError(path, f"is damaged: the frame at {t_ns * 1e-9:.3f} s cannot be decoded whole")
+                raise FormatError(path, Fact("frame-damaged", frame_s=t_ns * 1e-9))
             if t_ns not in missing:
                 continue
             missing.discard(t_ns)
             size = size or (frame.width, frame.height)
             if (frame.width, frame.height) != size:
-                change = f"from {size[0]}x{size[1]} to {frame.width}x{frame.height}"
-                raise FormatError(path, f"changes its size {change} at {t_ns * 1e-9:.3f} s")
+                other = (frame.width, frame.height)
+                raise FormatError(path, Fact("frame-size-changes", old=size, new=other, frame_s=t_ns * 1e-9))
             yield t_ns, frame
             if not missing:
                 return
     raise FormatError(
-        path,
-        f"{len(missing)} of {len(wanted_ns)} frames cannot be decoded (first: at {min(missing) * 1e-9:.6f} s)",
+        path, Fact("frames-not-decoded", missing=len(missing), wanted=len(wanted_ns), first_s=min(missing) * 1e-9)
     )
 
 
@@ -250,19 +245,17 @@ def _open(path: Path) -> tuple[InputContainer, VideoStream]:
     try:
         import av
     except ImportError:
-        raise InertialError(
-            f"{path} is a video, which PyAV decodes, and that is not installed: pip install av"
-        ) from None
+        raise InertialError(Fact("pyav-missing", path=str(path))) from None
     if not path.is_file():
         if path.exists():
             require_regular(path)
-        raise FormatError(path, "no such video")
+        raise FormatError(path, Fact("no-such-file", what="video"))
     try:
         container = av.open(str(path))
     except (av.FFmpegError, OSError, ValueError) as error:
         if is_mp4(path):
             read_movie(path)  # knows better what is wrong with its index
-        raise FormatError(path, f"is no video that FFmpeg reads: {_reason(error)}") from None
+        raise FormatError(path, Fact("not-read-by-ffmpeg", detail=_reason(error))) from None
     try:
         return container, _find_filmed(path, container)
     except FormatError:
@@ -277,15 +270,12 @@ def _find_filmed(path: Path, container: InputContainer) -> VideoStream:
     accompanying = Disposition.attached_pic | Disposition.timed_thumbnails
     streams = [stream for stream in container.streams.video if not stream.disposition & accompanying]
     if not streams:
-        what = "only a cover picture, no video stream" if container.streams.video else "no video stream"
-        raise FormatError(path, f"holds {what}")
+        raise FormatError(path, Fact("cover-picture-alone" if container.streams.video else "no-video-stream"))
     largest = max(_area(stream) for stream in streams)
     streams = [stream for stream in streams if _area(stream) == largest]
     if len(streams) > 1:
         raise FormatError(
-            path,
-            f"holds {len(streams)} video streams of {streams[0].width}x{streams[0].height}; write the one to use into "
-            "a file of its own (ffmpeg -i IN -map 0:v:0 -c copy OUT)",
+            path, Fact("several-video-streams", count=len(streams), width=streams[0].width, height=streams[0].height)
         )
     return streams[0]
 
@@ -339,15 +329,14 @@ def _convert_errors(path: Path, items: Iterator[T]) -> Iterator[T]:
     """The same items; FFmpeg's complaint about a damaged file becomes ours."""
     import av
 
-    shown = ""
+    after_s: float | None = None
     try:
         for item in items:
             time_s = getattr(item, "time", None)  # of a frame; packets have none
-            if time_s is not None:
-                shown = f" after the frame at {time_s:.3f} s"
+            after_s = after_s if time_s is None else time_s
             yield item
     except (av.FFmpegError, OSError) as error:
-        raise FormatError(path, f"is damaged or cut off{shown}: {_reason(error)}") from None
+        raise FormatError(path, Fact("video-damaged", after_s=after_s, detail=_reason(error))) from None
 
 
 def _reason(error: Exception) -> str:

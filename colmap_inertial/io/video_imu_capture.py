@@ -19,6 +19,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import FrameLog, ImuRecording
 from colmap_inertial.io.files import read_bytes
 from colmap_inertial.io.frame_times import frame_log
@@ -55,7 +56,7 @@ def read_video_imu_capture(path: Path, units: DeclaredUnits) -> ImuRecording:
             elif number in parts and isinstance(value, tuple):
                 parts[number] += data[value[0] : value[1]]
             elif number in parts:
-                raise _damaged(file, at, "a sample that is not three numbers")
+                raise _damaged(file, at, Fact("sample-not-three-numbers"))
         t_ns.append(_signed(stamp))
         rows["gyro"].append(parts[2])
         rows["accel"].append(parts[4])
@@ -63,7 +64,7 @@ def read_video_imu_capture(path: Path, units: DeclaredUnits) -> ImuRecording:
     gyro = _samples(file, stamps, rows["gyro"], "gyro", units.gyro or "rad/s")
     accel = _samples(file, stamps, rows["accel"], "accel", units.accel or "m/s2")
     if gyro is None:
-        raise FormatError(file, "holds no gyroscope samples")
+        raise FormatError(file, Fact("no-gyroscope-samples"))
     return build_recording(gyro, accel)
 
 
@@ -88,13 +89,13 @@ def read_video_imu_capture_frames(path: Path) -> FrameLog:
             if number not in wanted:
                 continue
             if isinstance(value, tuple):
-                raise _damaged(file, at, "a frame's number that is none")
+                raise _damaged(file, at, Fact("frame-number-not-one"))
             row[wanted[number]] = _float32(value) if number == 8 else float(_signed(value))
             if number == 1:
                 t_ns.append(_signed(value))
         rows.append(row)
     if len(t_ns) != len(rows) or not rows:
-        raise FormatError(file, "holds no frames" if not rows else "a frame has no time")
+        raise FormatError(file, Fact("frame-without-time" if rows else "no-frames"))
 
     def column(name: str, factor: float, high: float) -> Array | None:
         values = np.array([row.get(name, np.nan) for row in rows]) * factor
@@ -130,7 +131,7 @@ def _samples(file: Path, t_ns: Int64Array, rows: list[bytes], quantity: Quantity
         return None
     wrong = next((i for i, row in enumerate(rows) if len(row) not in (0, 12)), None)
     if wrong is not None:
-        raise FormatError(file, f"IMU sample {wrong + 1} has {len(rows[wrong])} bytes where three floats have 12")
+        raise FormatError(file, Fact("imu-sample-bytes", sample=wrong + 1, bytes=len(rows[wrong])))
     with np.errstate(invalid="ignore"):  # a damaged file may hold signalling NaNs
         values = np.frombuffer(b"".join(rows), "<f4").astype(np.float64).reshape(-1, 3)
     return order_samples(file, quantity, unit, t_ns[has], values)
@@ -162,9 +163,9 @@ def _fields(file: Path, data: bytes, begin: int, end: int) -> Iterator[tuple[int
         elif kind in (1, 5):
             length = 8 if kind == 1 else 4
         else:
-            raise _damaged(file, start, f"wire type {kind}")
+            raise _damaged(file, start, Fact("wire-type", type=kind))
         if at + length > end:
-            raise _damaged(file, start, f"a field of {length} bytes where {end - at} are left")
+            raise _damaged(file, start, Fact("field-beyond-message", length=length, left=end - at))
         yield key >> 3, (at, at + length) if kind == 2 else int.from_bytes(data[at : at + length], "little"), start
         at += length
 
@@ -179,7 +180,7 @@ def _varint(file: Path, data: bytes, at: int, end: int) -> tuple[int, int]:
         if byte < 0x80:
             return value & (_WRAP - 1), at
         shift += 7
-    raise _damaged(file, start, "a number that does not end")
+    raise _damaged(file, start, Fact("number-without-end"))
 
 
 def _signed(value: int) -> int:
@@ -190,8 +191,8 @@ def _float32(bits: int) -> float:
     return float(np.array([bits & 0xFFFFFFFF], dtype=np.uint32).view(np.float32)[0])
 
 
-def _damaged(file: Path, at: int, what: str) -> FormatError:
-    return FormatError(file, f"is damaged at byte {at}: {what}")
+def _damaged(file: Path, at: int, fault: Fact) -> FormatError:
+    return FormatError(file, Fact("damaged-at-byte", byte=at, fault=fault))
 
 
 def _file(path: Path) -> Path:

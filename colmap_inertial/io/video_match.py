@@ -136,7 +136,7 @@ def match_to_video(
             candidates.offer(t_ns, grey)
         progress(seen)
     if not turns:
-        raise FormatError(video, "holds no video frames")
+        raise FormatError(video, Fact("no-video-frames"))
     nearest = {turn: np.median(np.minimum(c.distance[:, 0], 1.0)) for turn, c in turns.items()}
     turn = min(nearest, key=lambda t: nearest[t])
     time_of, doubtful = _decide(turns[turn], names)

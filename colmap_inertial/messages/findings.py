@@ -491,8 +491,10 @@ def frame_rate(rate: float) -> str:
     advice="start the IMU before the video and stop it after; the scale rests on what both recorded",
     example={"share": 0.8, "frames_s": 20.0, "imu_s": 16.0},
 )
-def imu_too_short(share: float, frames_s: float, imu_s: float) -> str:
-    return f"the IMU runs along with {100 * share:.0f} % of {frames_s:.1f} s of frames"
+def imu_too_short(share: float, frames_s: float, imu_s: float, sensor: str = "") -> str:
+    other = {"accelerometer": "gyroscope", "gyroscope": "accelerometer"}.get(sensor)
+    alone = f"; the {other} runs along with the rest" if other else ""
+    return f"the {sensor or 'IMU'} runs along with {100 * share:.0f} % of {frames_s:.1f} s of frames{alone}"
 
 
 # camera against gyroscope
@@ -614,13 +616,60 @@ def gyro_mirrored(gyro: Setting | None = None) -> str:
     return "the gyroscope fits the camera's rotation better when it is mirrored"
 
 
+_ROTATIONS = {
+    "inverse": (
+        "; its inverse fits",
+        "cam_from_imu takes coordinates of the IMU to those of the camera (T_cam_imu of Kalibr): give the inverse of "
+        "the declared one, with the translation of the inverse",
+    ),
+    "order": (
+        "; with w first read as w last it fits",
+        "cam_from_imu_xyzw has w last: move the first number behind the others",
+    ),
+    "axes": (
+        "; with the camera's y and z the other way it fits",
+        "the camera's axes are x right, y down and z forward: the declared rotation is to axes with y up and z back",
+    ),
+    "": (
+        "",
+        "correct cam_from_imu under [calibration], or leave it out, and it is estimated; frames that were turned "
+        "upright are not in the sensor's orientation: cut them without (ffmpeg -noautorotate)",
+    ),
+}
+
+
 @message(
-    advice="correct cam_from_imu under [calibration]; frames that were turned upright are not in the sensor's "
-    "orientation: cut them without (ffmpeg -noautorotate)",
-    example={"angle_deg": 90.0},
+    advice=lambda likely, **_: _ROTATIONS[likely][1],
+    example={"angle_deg": 120.0, "sigma_deg": 0.6, "likely": "inverse"},
 )
-def declared_rotation(angle_deg: float) -> str:
-    return f"camera and IMU are turned by {angle_deg:.0f} deg against what is declared"
+def declared_rotation(angle_deg: float, sigma_deg: float, likely: str) -> str:
+    return (
+        f"camera and IMU are turned by {angle_deg:.{0 if angle_deg >= 10 else 1}f} deg (+-{2 * sigma_deg:.1f}) against "
+        f"the declared rotation{_ROTATIONS[likely][0]}"
+    )
+
+
+def _advise_offset(declared_s: float, likely: str, **_: float) -> str:
+    if likely == "sign":
+        return (
+            "time offsets are those of the camera's clock less the sensor's (minus timeshift_cam_imu of Kalibr): give "
+            f"{-declared_s:.9g}"
+        )
+    if likely == "milliseconds":
+        return f"time offsets are in seconds: give {1e-3 * declared_s:.9g}"
+    return "leave out gyro_time_offset_s and accel_time_offset_s, and they are estimated"
+
+
+@message(
+    advice=_advise_offset,
+    example={"declared_s": 0.0641, "found_s": -0.0705, "sigma_s": 0.002, "likely": "sign"},
+)
+def declared_offset(declared_s: float, found_s: float, sigma_s: float, likely: str) -> str:
+    other = {"sign": "; with the other sign it fits", "milliseconds": "; as milliseconds it fits"}.get(likely, "")
+    return (
+        f"the declared time offset is {declared_s:.4f} s, and the recording shows {found_s:.4f} s "
+        f"(+-{2e3 * sigma_s:.0f} ms){other}"
+    )
 
 
 @message(
@@ -719,6 +768,14 @@ def frames_repeated(repeated: int, looked_at: int) -> str:
 
 
 @message(
+    advice="such frames get no pose and are not deblurred: leave them out, or light the scene and take off the cover",
+    example={"blank": 12, "looked_at": 300, "example": "0007.jpg"},
+)
+def frames_blank(blank: int, looked_at: int, example: str) -> str:
+    return f"{blank} of {looked_at} frames that were looked at are black or show nothing ({example})"
+
+
+@message(
     advice="film with a shorter exposure (1/200 s or less) and more light; what is blurred is deblurred",
     example={"share": 0.7, "blur_limit_of_long_side": 0.004, "median_blur_of_long_side": 0.006, "exposure_s": 0.02},
 )
@@ -728,6 +785,27 @@ def exposure_too_long(
     return (
         f"{100 * share:.0f} % of the frames are blurred by more than {100 * blur_limit_of_long_side:g} % of the "
         f"picture's long side (median {100 * median_blur_of_long_side:.2f} %, exposure {1e3 * exposure_s:.1f} ms)"
+    )
+
+
+@message(
+    advice="readout_s is the time from the first line to one past the last, readout_direction where the exposed line "
+    "moves in the stored picture: correct them under [timing], or leave both out",
+    example={
+        "declared_s": 0.0,
+        "declared_direction": "down",
+        "readout_s": 0.021,
+        "sigma_s": 0.0008,
+        "direction": "down",
+    },
+)
+def declared_readout(
+    declared_s: float, declared_direction: str, readout_s: float, sigma_s: float, direction: str
+) -> str:
+    declared = f"{1e3 * declared_s:.1f} ms, {declared_direction}" if declared_s else "0, a global shutter"
+    return (
+        f"the declared readout is {declared}, and the pictures show {1e3 * readout_s:.1f} ms "
+        f"(+-{2e3 * sigma_s:.1f}), {direction}"
     )
 
 

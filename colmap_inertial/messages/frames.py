@@ -97,6 +97,7 @@ state(
     "frame-sharp-along-blur",
     "the image has as much detail along the predicted blur as across it, though other frames lack it",
 )
+state("frame-blank", "the image is black or shows nothing: there is nothing to deblur")
 state("frame-without-blur", "the image does not show the blur that the gyroscope predicts, though other frames do")
 state("frame-not-telling", "too little texture or blur to check the gyroscope's prediction against")
 

@@ -265,6 +265,9 @@ def poses_of_another_convention(found: Said) -> str:
 
 
 _FOUND = {"code": "gyro-gain", "values": {"gain": 1.3}}
+_OFFSET = {"declared_s": 0.01, "found_s": -0.0141, "sigma_s": 0.002, "likely": "sign"}
+#: How to go on after a stop, and what that means.
+_WAY_ON = "--force goes on, and metres are then weak at most and may be wrong"
 
 
 @message(example={"finding": _FOUND})
@@ -274,12 +277,20 @@ def found_beforehand(finding: Said) -> str:
 
 @message(example={"finding": _FOUND})
 def stopped_by_finding(finding: Said) -> str:
-    return f"{finding}; {finding.advice} ({finding.code}) (--force goes on)"
+    return f"{finding}; {finding.advice} ({finding.code}); {_WAY_ON}"
+
+
+state("force-goes-on", f"stopped before the scale was estimated: {_WAY_ON}")
+
+
+@message(example={"finding": {"code": "declared-offset", "values": _OFFSET}})
+def declared_left_out(finding: Said) -> str:
+    return f"{finding}; it is left out; {finding.advice} ({finding.code})"
 
 
 @message(example={"path": "accel.csv", "finding": {"code": "gravity-removed", "values": {"median_m_s2": 0.5}}})
 def stopped_by_file(path: str, finding: Said) -> str:
-    return f"{path}: {finding.with_advice} (--force goes on)"
+    return f"{path}: {finding.with_advice}; --force goes on without metres: the gyroscope still serves"
 
 
 @message(example={"finding": _FOUND})

@@ -219,6 +219,39 @@ def accel_gain_large(gains: Sequence[float]) -> str:
     )
 
 
+@message(example={"gains": (0.02, 0.03, -0.02)})
+def calibrated_gain_contradicted(gains: Sequence[float]) -> str:
+    return (
+        "the motion contradicts the IMU's calibration: by it the accelerometer is still off in gain by "
+        f"{', '.join(f'{100 * gain:+.1f}' for gain in gains)} % along x, y, z: "
+        "calibrate it again (calibrate-imu), or leave its calibration out"
+    )
+
+
+_LEVERS = {
+    "inverse": "that of the inverse fits: imu_in_cam_m, and the last column of cam_from_imu, is the IMU in the "
+    "camera's frame (T_cam_imu)",
+    "sign": "with the other sign it fits: imu_in_cam_m points from the camera to the IMU",
+    "": "correct it, or leave it out, and it is estimated",
+}
+
+
+@message(
+    example={
+        "declared_m": (0.006, 0.0, 0.024),
+        "found_m": (0.025, 0.005, 0.001),
+        "sigma_m": 0.004,
+        "likely": "inverse",
+    },
+)
+def declared_lever_arm(declared_m: Sequence[float], found_m: Sequence[float], sigma_m: float, likely: str) -> str:
+    declared, found = ("(" + ", ".join(f"{1e3 * value:.0f}" for value in arm) + ")" for arm in (declared_m, found_m))
+    return (
+        f"the declared lever arm is {declared} mm, and the recording shows {found} mm (+-{2e3 * sigma_m:.0f}), by "
+        f"which the scale is estimated: {_LEVERS[likely]}"
+    )
+
+
 @message(example={"gain": 0.02, "excess": 0.015})
 def accel_gain_doubtful(gain: float, excess: float) -> str:
     return (
@@ -453,6 +486,11 @@ def cameras_registered_again(names: Sequence[str]) -> str:
     return f"registered again, and right now: {', '.join(names)}"
 
 
+@message(example={"reasons": ("the camera hardly accelerates",)})
+def scale_refused(reasons: Sequence[Any]) -> str:
+    return "; ".join(map(str, reasons))
+
+
 state("rigs-not-registered-again", "images of several cameras are not registered again")
 
 
@@ -479,11 +517,25 @@ def refined_scale_differs(difference: float, half_width: float) -> str:
     )
 
 
-@message(example={"readout_s": 0.02, "sigma_s": 0.001, "direction": "down"})
-def rolling_shutter_ignored(readout_s: float, sigma_s: float, direction: str) -> str:
+@message(example={"declared_px": 700.0, "found_px": 530.0, "sigma_px": 4.0})
+def declared_focal_length(declared_px: float, found_px: float, sigma_px: float) -> str:
     return (
-        f"the images were exposed line by line within {1e3 * readout_s:.1f} +- {1e3 * sigma_s:.1f} ms "
-        f"({direction}), which the model ignores: declare readout_s and readout_direction before mapping, or "
+        f"the declared focal length is {declared_px:.0f} px, and the images fit another better (towards {found_px:.0f} "
+        f"+-{2 * sigma_px:.0f} px), which bends the model and changes its size: leave out [camera] to let COLMAP "
+        "calibrate, or give the intrinsics of this very video mode"
+    )
+
+
+@message(example={"readout_s": 0.02, "sigma_s": 0.001, "direction": "down"})
+def rolling_shutter_ignored(readout_s: float, sigma_s: float, direction: str, declared_global: bool = False) -> str:
+    found = f"exposed line by line within {1e3 * readout_s:.1f} +- {1e3 * sigma_s:.1f} ms ({direction})"
+    if declared_global:
+        return (
+            f"the declared readout is 0, a global shutter, and the images were {found}: correct readout_s and "
+            "readout_direction, or leave them out"
+        )
+    return (
+        f"the images were {found}, which the model ignores: declare readout_s and readout_direction before mapping, or "
         "refine it (--refine inertial)"
     )
 
@@ -547,6 +599,7 @@ def _list_axes(axes: Sequence[str]) -> str:
     return axes[0] if len(axes) == 1 else ", ".join(axes[:-1]) + " and " + axes[-1]
 
 
+state("no-accelerometer-for-gravity", "the recording has no accelerometer; record it along with the gyroscope")
 state("rests-without-accelerometer", "the recording has no accelerometer; record it, too")
 
 
@@ -619,3 +672,15 @@ def gravity_assumed(sigma: float) -> str:
         f"the strength of gravity is assumed, which alone makes the gains uncertain by +-{196 * sigma:.1g} %: give the "
         "latitude (and the height) of the place"
     )
+
+
+# What smoothing and comparing with targets need.
+
+state("no-result-with-target", "no result was compared with a target")
+
+state("imu-in-no-interval", "the IMU recorded during none of the frame intervals")
+
+
+@message(example={"count": 3})
+def poses_too_few_to_smooth(count: int) -> str:
+    return f"{count} poses are too few to tell motion from noise"

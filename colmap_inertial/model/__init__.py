@@ -32,6 +32,7 @@ from colmap_inertial.core.types import (
 )
 from colmap_inertial.io.files import StrPath, convert_to_plain, read_json, reader, write_json
 from colmap_inertial.io.picture_names import check_image_names
+from colmap_inertial.io.stand_ins import what_stands_in
 from colmap_inertial.model.pose_covariances import pose_covariances
 from colmap_inertial.model.references import check_references
 from colmap_inertial.model.rigs import list_posed_frames
@@ -115,8 +116,7 @@ class Model:
         """
         if self.similarity is not None:
             raise AlreadyMetricError(
-                f"model {self.colmap_index} was scaled by a stage before ({self.similarity.provenance}); one of them "
-                "must go"
+                Fact("scaled-before", model=self.colmap_index, provenance=self.similarity.provenance)
             )
         reconstruction = self.reconstruction if similarity is None else transformed(self.reconstruction, similarity)
         return replace(
@@ -149,8 +149,22 @@ def require_format(folder: Path) -> str:
     """:func:`model_format`; a :class:`FormatError` where the folder holds no model."""
     suffix = model_format(folder)
     if suffix is None:
-        raise FormatError(folder, "no COLMAP model here (cameras, images and points3D, .bin or .txt)")
+        raise FormatError(folder, _why_no_model(folder))
     return suffix
+
+
+def _why_no_model(folder: Path) -> Fact:
+    """What is missing in a folder, and whether a cloud drive keeps it."""
+    if folder.is_file():
+        with open(folder, "rb") as file:
+            return what_stands_in(file.read(512)) or Fact("file-for-folder")
+    for suffix in (".bin", ".txt"):
+        missing = [name + suffix for name in _MODEL_FILES if not (folder / (name + suffix)).is_file()]
+        if any((folder / f".{name}.icloud").is_file() for name in missing):
+            return Fact("kept-in-cloud", names=missing)
+        if len(missing) < len(_MODEL_FILES):
+            return Fact("model-incomplete", names=missing)
+    return Fact("no-model-here")
 
 
 def model_formats(folder: Path) -> list[str]:
@@ -234,9 +248,9 @@ def read_model(folder: StrPath, suffix: str | None = None, *, unique_names: bool
         else:
             reconstruction = _read_files({**files, **sound.changed})
     except (ValueError, RuntimeError, IndexError, MemoryError) as error:
-        raise FormatError(folder, f"COLMAP cannot read this model: {error}") from error
+        raise FormatError(folder, Fact("model-not-read", detail=str(error))) from error
     if reconstruction.num_reg_images() == 0:
-        raise FormatError(folder, "the model has no registered image")
+        raise FormatError(folder, Fact("no-registered-image"))
     check_values(reconstruction, folder, suffix)
     check_image_names((image.name for image in reconstruction.images.values()), folder / f"images{suffix}")
     add_tracks(reconstruction, sound.untracked, folder / f"points3D{suffix}")
@@ -312,8 +326,7 @@ def trajectory_from_model(
     if len(timed) < 2:
         example = frames[0].images[0].name if frames else "none"
         raise TimingError(
-            Fact("names-disagree", timed=len(timed), frames=len(frames), example=example, named=timing.names[0]),
-            code=TimingError.default_code,
+            Fact("names-disagree", timed=len(timed), frames=len(frames), example=example, named=timing.names[0])
         )
     notes: tuple[Fact, ...] = ()
     if len(timed) < len(frames):
@@ -331,8 +344,11 @@ def trajectory_from_model(
 
 
 def similarity_as_json(similarity: Similarity) -> dict[str, object]:
-    """The similarity's fields in JSON types."""
-    return dict(convert_to_plain(similarity))
+    """The similarity's fields in JSON types; ``undoes`` where it takes another one back."""
+    fields = dict(convert_to_plain(similarity))
+    if similarity.undoes is None:
+        del fields["undoes"]
+    return fields
 
 
 def is_metric(folder: Path) -> bool:
@@ -372,11 +388,9 @@ def apply_similarity(source: StrPath, target: StrPath, similarity: Similarity) -
     source, target = Path(source), Path(target)
     if is_metric(source):
         provenance = read_json(source / TRANSFORM_FILE).get("provenance", "unknown")
-        raise AlreadyMetricError(
-            f"{source} already holds a metric scale ({provenance}); apply it to COLMAP's own model"
-        )
+        raise AlreadyMetricError(Fact("metric-already", folder=str(source), provenance=provenance))
     if target.exists():
-        raise OutputExistsError(f"{target} exists already; choose another folder or remove it")
+        raise OutputExistsError(Fact("target-exists", path=str(target)))
     write_model(transformed(read_model(source), similarity), target, similarity, suffix=model_format(source))
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Float32Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.types import Similarity
 from colmap_inertial.io.files import advise
@@ -40,16 +41,25 @@ def check_map(path: Path, channels: int) -> int:
         head = file.read(64)
     match = re.match(rb"(\d{1,9})&(\d{1,9})&(\d{1,3})&", head)
     if match is None:
-        raise FormatError(path, "not a depth or normal map of COLMAP: it does not begin with width&height&channels&")
+        raise FormatError(path, Fact("not-a-depth-map"))
     width, height, channel_count = (int(text) for text in match.groups())
     if channel_count != channels:
-        raise FormatError(path, f"its header says {channel_count} channels instead of {channels}")
+        raise FormatError(path, Fact("map-of-other-channels", found=channel_count, expected=channels))
     if width == 0 or height == 0:
-        raise FormatError(path, f"its header says {width} x {height} pixels")
+        raise FormatError(path, Fact("map-of-no-size", width=width, height=height))
     size, expected = path.stat().st_size, match.end() + 4 * width * height * channels
     if size != expected:
-        state = "truncated" if size < expected else "damaged"
-        raise FormatError(path, f"{state}: {size} bytes instead of {expected} for {width} x {height} x {channels}")
+        raise FormatError(
+            path,
+            Fact(
+                "map-of-other-length",
+                size_bytes=size,
+                expected_bytes=expected,
+                width=width,
+                height=height,
+                channels=channels,
+            ),
+        )
     return match.end()
 
 
@@ -65,7 +75,7 @@ def transform_depth_map(source: Path, target: Path, similarity: Similarity) -> t
         out.write(file.read(header))
         while n := file.readinto(view):
             if n % 4:
-                raise FormatError(source, "truncated while it was read")
+                raise FormatError(source, Fact("truncated-while-read"))
             part = values[: n // 4]
             with np.errstate(over="ignore", invalid="ignore"):
                 np.multiply(part, scale, out=part)
@@ -95,14 +105,12 @@ def transform_options(source: Path, target: Path, similarity: Similarity) -> tup
             key = match[2].decode("latin-1").rpartition(".")
             where, name = key[0] or section, key[2]
             if name in _BOX_KEYS and match[3]:
-                raise FormatError(
-                    source, f"{name}: a bounding box cannot be transformed; leave the file out with --keep", line=number
-                )
+                raise FormatError(source, Fact("bounding-box", key=name), line=number)
             if name in _DEPTH_KEYS and where.startswith("PatchMatch"):
                 try:
                     value = float(match[3])
                 except ValueError:
-                    raise FormatError(source, f"{name} is no number", line=number) from None
+                    raise FormatError(source, Fact("setting-no-number", key=name), line=number) from None
                 if value > 0:
                     line = match[1] + repr(value * similarity.scale).encode() + match[4]
                     changed.append(f"{where}.{name}")
@@ -129,13 +137,13 @@ def transform_obj(source: Path, target: Path, similarity: Similarity) -> tuple[s
                 try:
                     xyz = np.array([float(match[i]) for i in (3, 5, 7)])
                 except ValueError:
-                    raise FormatError(source, f"not three numbers: {line[:60]!r}", line=number) from None
+                    raise FormatError(source, Fact("not-three-numbers", text=repr(line[:60])), line=number) from None
                 matrix, offset = parts[match[2]]
                 x, y, z = (repr(value).encode() for value in (matrix @ xyz + offset).tolist())
                 line = b"".join((match[1], x, match[4], y, match[6], z, match[8]))
                 changed.add(match[2])
             elif line.split(maxsplit=1)[:1] in ([b"v"], [b"vn"]):
-                raise FormatError(source, "a vertex or normal without three numbers", line=number)
+                raise FormatError(source, Fact("vertex-incomplete"), line=number)
             out.write(line)
     return tuple(name for key, name in ((b"v", "positions"), (b"vn", "normals")) if key in changed)
 
@@ -143,7 +151,7 @@ def transform_obj(source: Path, target: Path, similarity: Similarity) -> tuple[s
 def _lines(path: Path, file: BufferedReader) -> Iterator[bytes]:
     for number, line in enumerate(iter(lambda: file.readline(_LONGEST_LINE), b""), start=1):
         if len(line) == _LONGEST_LINE:
-            raise FormatError(path, "a line without end", line=number)
+            raise FormatError(path, Fact("line-without-end"), line=number)
         yield line
 
 
@@ -164,7 +172,7 @@ def read_map(path: Path, channels: int = 1) -> Float32Array:
     width, height = (int(text) for text in data[:start].split(b"&")[:2])
     values = np.frombuffer(data, "<f4", offset=start)
     if len(values) != width * height * channels:
-        raise FormatError(path, "was changed while it was read")
+        raise FormatError(path, Fact("changed-while-read"))
     planes = values.reshape(channels, height, width)
     return np.asarray(planes[0] if channels == 1 else np.moveaxis(planes, 0, -1), dtype=np.float32)
 

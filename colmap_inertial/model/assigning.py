@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import Similarity
@@ -31,22 +32,22 @@ def assign_scales(
     """
     if isinstance(scales, Similarity):
         return {index: ModelScale(similarity=scales) for index in layout.submodels}
-    numbers = ", ".join(str(i) for i in layout.submodels)
     if None in scales:
         if len(layout.submodels) > 1:
-            raise InertialError(
-                f"{project} has the sub-models {numbers}, each with a scale of its own: "
-                "give one for each, --scale NUMBER=FILE"
-            )
+            raise InertialError(Fact("scale-for-each-submodel", project=str(project), numbers=tuple(layout.submodels)))
         scales = {next(iter(layout.submodels)): scales[None]}
     if all(scale.similarity is None for scale in scales.values()):
         raise NotObservableError(
-            "scale", "; ".join(str(reason) for scale in scales.values() for reason in scale.reasons)
+            "scale",
+            Fact("scale-refused", reasons=tuple(reason for scale in scales.values() for reason in scale.reasons)),
         )
     missing = [index for index in layout.submodels if index not in scales]
     if missing or len(scales) > len(layout.submodels):
-        given = ", ".join(str(i) for i in scales)
-        raise InertialError(f"{project} has the sub-models {numbers}, but there are scales of {given}")
+        raise InertialError(
+            Fact(
+                "scales-of-other-submodels", project=str(project), numbers=tuple(layout.submodels), given=tuple(scales)
+            )
+        )
     return {index: scales[index] for index in layout.submodels}
 
 
@@ -100,7 +101,7 @@ def put_about_places(
         The scales, and what the user is told.
     """
     scales, facts = dict(by_model), []
-    pivot: np.ndarray | None = None
+    pivot: Array | None = None
     for model in layout.placed:
         place, similarity = Place.of(model.shown()), scales[model.index].similarity
         if place is None or similarity is None or not place.is_far:

@@ -14,12 +14,13 @@ from pathlib import Path
 from types import FrameType
 
 from colmap_inertial.core.errors import FormatError, OutputError, OutputExistsError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.files import advise, locked
 from colmap_inertial.model import load_pycolmap
 
 #: Linux: share the blocks of another file (Btrfs, XFS, bcachefs, ...).
 _FICLONE = 0x40049409
-_FULL = {errno.ENOSPC: "the disk is full", errno.EDQUOT: "the quota is used up", errno.EFBIG: "the file is too large"}
+_FULL = {errno.ENOSPC: "copy-disk-full", errno.EDQUOT: "copy-quota-used", errno.EFBIG: "copy-file-too-large"}
 #: What a file system answers that cannot copy within the kernel.
 _NO_OFFLOAD = {errno.EXDEV, errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP, errno.ETXTBSY, errno.EPERM, errno.EIO}
 
@@ -49,12 +50,12 @@ def new_folder(target: Path, *, into_empty: bool = False) -> Iterator[Path]:
         When it cannot be written; says so when the disk is full.
     """
     if _is_taken(target, into_empty):
-        raise OutputExistsError(f"{target} exists already; choose another folder or remove it")
+        raise OutputExistsError(Fact("target-exists", path=str(target)))
     partial = target.with_name(f".{target.name}.colmap-inertial-partial")
     lock = target.with_name(f".{target.name}.colmap-inertial-lock")
     with _ending_by_signal(), _convert_os_errors(target):
         target.parent.mkdir(parents=True, exist_ok=True)
-        with locked(lock, f"another process is writing {target}"):
+        with locked(lock, Fact("written-by-another", path=str(target))):
             try:
                 if partial.exists():
                     shutil.rmtree(partial)
@@ -62,7 +63,7 @@ def new_folder(target: Path, *, into_empty: bool = False) -> Iterator[Path]:
                 yield partial
                 _flush(partial)
                 if _is_taken(target, into_empty):
-                    raise OutputExistsError(f"{target} appeared in the meantime; choose another folder")
+                    raise OutputExistsError(Fact("target-appeared", path=str(target)))
                 if os.path.lexists(target):
                     target.rmdir()
                 os.rename(partial, target)
@@ -114,9 +115,11 @@ def _convert_os_errors(target: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        where = f" ({error.filename})" if error.filename else ""
-        why = _FULL.get(error.errno or 0, error.strerror or str(error))
-        raise OutputError(f"{target} cannot be written: {why}{where}; nothing was left behind") from error
+        code = _FULL.get(error.errno or 0)
+        why = Fact.stated(error.strerror or str(error)) if code is None else Fact(code)
+        raise OutputError(
+            Fact("copy-not-written", path=str(target), why=why, name=str(error.filename) if error.filename else None)
+        ) from error
 
 
 @contextlib.contextmanager
@@ -231,11 +234,11 @@ def list_tree(root: Path, *, follow_links: bool = False) -> tuple[list[Path], li
     def visit(folder: Path, above: frozenset[Path]) -> None:
         real = (root / folder).resolve()
         if real in above:
-            raise FormatError(root / folder, "this link leads back to a folder above it")
+            raise FormatError(root / folder, Fact("link-leads-back"))
         try:
             entries = sorted(os.scandir(root / folder), key=lambda entry: entry.name)
         except OSError as error:
-            raise FormatError(root / folder, f"cannot be read: {error.strerror}") from None
+            raise FormatError(root / folder, Fact("file-not-readable", detail=str(error.strerror))) from None
         for entry in entries:
             path = folder / entry.name
             if entry.is_symlink() and _is_kept(root, path):
@@ -246,8 +249,7 @@ def list_tree(root: Path, *, follow_links: bool = False) -> tuple[list[Path], li
                 if not real_target.is_relative_to(inside):
                     raise FormatError(
                         root / path,
-                        f"is a link out of the project, to {real_target}; --follow-links (follow_links=True) takes "
-                        "what it leads to into the copy",
+                        Fact("link-out-not-followed", target=str(real_target)),
                     )
             if entry.is_dir():
                 folders.append(path)
@@ -255,7 +257,7 @@ def list_tree(root: Path, *, follow_links: bool = False) -> tuple[list[Path], li
             elif entry.is_file():
                 files.append(path)
             else:
-                raise FormatError(root / path, "neither a file nor a folder; move it out of the project")
+                raise FormatError(root / path, Fact("neither-file-nor-folder"))
 
     visit(Path(), frozenset())
     return folders, files, links

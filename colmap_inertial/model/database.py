@@ -18,6 +18,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.types import Similarity
 from colmap_inertial.io.files import reading
@@ -48,7 +49,7 @@ _PAIR_CAMERAS = "".join(
     for name in ("camera1", "camera2")
 )
 #: What is said of a database that COLMAP cannot read.
-UNREADABLE = "COLMAP cannot read its database; put it back as it was, or begin anew in another folder"
+UNREADABLE = Fact("database-unreadable")
 #: Rebuilt by SQLite; a copy must not have it.
 SHARED_MEMORY = "-shm"
 
@@ -165,7 +166,7 @@ def check_records(database: Path) -> None:
             if table == "two_view_geometries" and {"camera1", "camera2"} <= columns:
                 holds += _PAIR_CAMERAS
             if opened.execute(f"SELECT 1 FROM {table} WHERE NOT ({holds}) LIMIT 1").fetchone() is not None:
-                raise FormatError(database, f"{UNREADABLE} (a record of {table} has another size than it states)")
+                raise FormatError(database, Fact("record-of-other-size", table=table))
 
 
 def copy_database(source: Path, target: Path) -> None:
@@ -182,11 +183,11 @@ def copy_database(source: Path, target: Path) -> None:
     alone = not any(source.with_name(source.name + suffix).exists() for suffix in SIDE_FILES)
     refuse_stand_in(source, head)
     if size and (len(head) < 100 or not head.startswith(b"SQLite format 3\0")):
-        raise FormatError(source, "not an SQLite database")
+        raise FormatError(source, Fact("not-sqlite"))
     page = int.from_bytes(head[16:18], "big")
     pages = int.from_bytes(head[28:32], "big")
     if size and alone and head[24:28] == head[92:96] and pages * (65536 if page == 1 else page) > size:
-        raise FormatError(source, f"truncated: {size} bytes instead of {pages} pages of {page}")
+        raise FormatError(source, Fact("database-truncated", size_bytes=size, pages=pages, page_bytes=page))
     for suffix in ("", *SIDE_FILES):
         beside = source.with_name(source.name + suffix)
         if beside.exists():
@@ -242,8 +243,9 @@ def _transform(
     for table in tables & {"pose_priors", "rig_sensors", "images"}:
         answer = database.execute(f"PRAGMA quick_check({table})").fetchone()[0]
         if answer != "ok":
-            raise FormatError(path, f"damaged: {answer}")
+            raise FormatError(path, Fact("database-check-failed", detail=answer))
     priors = list(_priors(database, path)) if {"pose_priors", "images"} <= tables else []
+    priors = [prior for prior in priors if not prior.in_degrees]
     rigs = list(_rigs(database, path)) if "rig_sensors" in tables else []
     moved_priors: set[int] = set()
     moved_rigs: set[int] = set()
@@ -271,12 +273,13 @@ def _transform(
 
 @dataclass(frozen=True, eq=False)
 class _Prior:
-    """A pose prior of the image ``key``, at (3,) ``place``."""
+    """A pose prior of the image ``key``, at (3,) ``place``: latitude, longitude, height where it is ``in_degrees``."""
 
     rowid: int
     key: str
     place: Array
     covariance: Array | None
+    in_degrees: bool
 
     def moved(self, similarity: Similarity) -> dict[str, Array]:
         """The columns that change."""
@@ -328,12 +331,12 @@ def _doubles(path: Path, what: str, blob: object, count: int) -> Array | None:
     if blob is None:
         return None
     if not isinstance(blob, bytes) or len(blob) != 8 * count:
-        raise FormatError(path, f"damaged: a {what} is not {count} numbers")
+        raise FormatError(path, Fact("blob-of-other-length", what=what, count=count))
     return np.frombuffer(blob, "<f8")
 
 
 def _priors(database: sqlite3.Connection, path: Path) -> Iterator[_Prior]:
-    """Cartesian priors of images; COLMAP 3 keeps them by image, 4 by sensor and datum."""
+    """Priors of images; COLMAP 3 keeps them by image, 4 by sensor and datum."""
     columns = {row[1] for row in database.execute("PRAGMA table_info(pose_priors)")}
     join = "p.image_id = i.image_id"
     if "corr_data_id" in columns:
@@ -346,9 +349,23 @@ def _priors(database: sqlite3.Connection, path: Path) -> Iterator[_Prior]:
     for rowid, name, blob, cov, system in database.execute(query):
         position = _doubles(path, "prior's position", blob, 3)
         spread = _doubles(path, "prior's covariance", cov, 9)
-        if position is None or system == _WGS84 or not np.isfinite(position).all():
+        if position is None or not np.isfinite(position[: 2 if system == _WGS84 else 3]).all():
             continue
-        yield _Prior(rowid, name, position, None if spread is None else spread.reshape(3, 3))
+        yield _Prior(rowid, name, position, None if spread is None else spread.reshape(3, 3), system == _WGS84)
+
+
+def read_priors(database: Path) -> dict[bool, dict[str, Array]]:
+    """(3,) pose priors by image; those in degrees (latitude, longitude, height) under ``True``, others under ``False``.
+
+    Raises
+    ------
+    FormatError
+        For a damaged database.
+    """
+    with open_read_only(database) as opened:
+        tables = {row[0] for row in opened.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        priors = list(_priors(opened, database)) if {"pose_priors", "images"} <= tables else []
+    return {kind: {p.key: p.place for p in priors if p.in_degrees == kind} for kind in (True, False)}
 
 
 def _rigs(database: sqlite3.Connection, path: Path) -> Iterator[_Rig]:

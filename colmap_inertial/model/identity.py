@@ -12,6 +12,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.model.database import PlacedModel
 
 if TYPE_CHECKING:
@@ -90,7 +91,7 @@ def identity_from_json(path: Path, fields: Any) -> ModelIdentity | None:
             size=float(fields["size"]),
         )
     except (KeyError, TypeError, ValueError):
-        raise FormatError(path, "of_model does not say which model the scale is of") from None
+        raise FormatError(path, Fact("of-model-unreadable")) from None
 
 
 def _identify(centres: Mapping[str, Array], points: int) -> ModelIdentity:

@@ -10,6 +10,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import Similarity
 from colmap_inertial.io.files import read_bytes
 from colmap_inertial.io.ply import transform_ply
@@ -27,11 +28,22 @@ from colmap_inertial.model.camera_files import (
 from colmap_inertial.model.database import PlacedModel, is_database
 from colmap_inertial.model.inventory import lengths_of
 from colmap_inertial.model.nerf import is_export, is_transforms, transform_export, transform_transforms
+from colmap_inertial.model.other_files import (
+    is_dataparser,
+    is_rig_configuration,
+    mvsnet_cameras,
+    transform_dataparser,
+    transform_mvsnet_camera,
+    transform_rig_configuration,
+)
 
 #: Kinds of files that have the shape of the model that they were made from.
-_SHAPED = ("depth map", "ply", "obj", "transforms", "export", "splat cameras", "poses and bounds", "depth parameters")
-#: Kinds of files whose cameras tell whether they are of a model here.
-CAMERA_KINDS = ("transforms", "splat cameras", "poses and bounds")
+_SHAPED = (
+    *("depth map", "ply", "obj", "transforms", "export", "splat cameras", "poses and bounds", "depth parameters"),
+    *("MVSNet camera", "dataparser"),
+)
+#: Kinds of files that tell themselves whether they are of a model here.
+CAMERA_KINDS = ("transforms", "splat cameras", "poses and bounds", "MVSNet camera", "rig configuration", "dataparser")
 
 
 def kind_to_move(file: Path, path: Path) -> str | None:
@@ -63,6 +75,12 @@ def kind_of(file: Path, path: Path) -> str | None:
         return "poses and bounds"
     if is_depth_params(file):
         return "depth parameters"
+    if suffix == ".txt" and mvsnet_cameras(file):
+        return "MVSNet camera"
+    if is_dataparser(file):
+        return "dataparser"
+    if is_rig_configuration(file):
+        return "rig configuration"
     return {".ply": "ply", ".ini": "options"}.get(suffix) or ("database" if is_database(file) else None)
 
 
@@ -76,6 +94,9 @@ WRITERS: dict[str, Callable[[Path, Path, Similarity], tuple[str, ...]]] = {
     "splat cameras": transform_splat_cameras,
     "poses and bounds": transform_bounds,
     "depth parameters": transform_depth_params,
+    "MVSNet camera": transform_mvsnet_camera,
+    "rig configuration": transform_rig_configuration,
+    "dataparser": transform_dataparser,
 }
 
 
@@ -142,11 +163,11 @@ def read_layout(root: Path, folders: Sequence[Path], *, one_for_all: bool) -> La
     for folder in dense:
         inside = {owners[m] for m in models if m.is_relative_to(folder / "sparse")}
         if len(inside) > 1 and folder != Path():
-            raise FormatError(root / folder, "this dense workspace holds more than one model: it cannot be told whose")
+            raise FormatError(root / folder, Fact("workspace-of-several-models"))
         if len(inside) == 1:
             workspaces[folder] = inside.pop()
         elif (root / folder / "stereo" / "depth_maps").is_dir():
-            raise FormatError(root / folder, "depth maps beside several sub-models: it cannot be told whose they are")
+            raise FormatError(root / folder, Fact("depth-maps-of-several-models"))
     return Layout(submodels=submodels, owners=owners, workspaces=workspaces, placed=list(placed.values()))
 
 
@@ -179,10 +200,7 @@ def _submodels(root: Path, models: list[Path], dense: list[Path], *, one_for_all
         return dict(sorted((int(m.name), m) for m in nearest))
     if one_for_all:
         return dict(enumerate(sorted(nearest)))
-    names = ", ".join(str(m) for m in nearest[:4])
-    raise FormatError(
-        root, f"it cannot be told which of these is COLMAP's model: {names}; leave others out with --keep"
-    )
+    raise FormatError(root, Fact("several-candidates", folders=tuple(str(m) for m in nearest[:4])))
 
 
 def _nearest_to_root(folders: list[Path]) -> list[Path]:
@@ -225,12 +243,10 @@ def _owner(root: Path, folder: Path, submodels: Mapping[Path, PlacedModel]) -> i
     if len(fits) == 1:
         return submodels[fits[0]].index
     if fits:
-        names = " and ".join(str(f) for f in fits)
-        raise FormatError(root / folder, f"it cannot be told whether this belongs to {names}")
+        raise FormatError(root / folder, Fact("belongs-to-several", folders=tuple(str(f) for f in fits)))
     if elsewhere:
         raise FormatError(
             root / folder,
-            f"its images are those of {elsewhere[0]}, but its cameras stand elsewhere: it was made from another model, "
-            "whose scale is another; leave it out with --keep",
+            Fact("model-elsewhere", other=str(elsewhere[0])),
         )
-    raise FormatError(root / folder, "its images are those of none of the sub-models; leave it out with --keep")
+    raise FormatError(root / folder, Fact("images-of-no-submodel"))

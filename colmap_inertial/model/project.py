@@ -25,6 +25,7 @@ from colmap_inertial.model import (
     model_files,
     model_formats,
     read_model,
+    require_format,
     similarity_as_json,
     transformed,
     write_files,
@@ -39,6 +40,7 @@ from colmap_inertial.model.keeping import Kept
 from colmap_inertial.model.layout import CAMERA_KINDS, Layout, kind_to_move, read_layout
 from colmap_inertial.model.notes import collecting_notes
 from colmap_inertial.model.places import Place
+from colmap_inertial.model.pose_priors import compare_priors
 from colmap_inertial.model.similarities import ModelScale, require_not_joined, similarity_from_json, undoing
 from colmap_inertial.model.soundness import check_binary_model
 from colmap_inertial.model.worlds import Worlds
@@ -134,8 +136,7 @@ def apply_to_project(
             if not work.is_kept(folder / TRANSFORM_FILE) and is_metric(project / folder):
                 provenance = read_json(project / folder / TRANSFORM_FILE).get("provenance", "unknown")
                 raise AlreadyMetricError(
-                    f"{project / folder} already holds a metric scale ({provenance}); apply it to COLMAP's own "
-                    "project, or take it back with --undo"
+                    Fact("metric-already-in-project", folder=str(project / folder), provenance=provenance)
                 )
         common = scales if isinstance(scales, Similarity) else None
         layout = read_layout(project, work.open_folders(), one_for_all=common is not None)
@@ -169,7 +170,10 @@ def undo_project(
         When ``out`` exists or cannot be written.
     """
     project, out = Path(project), Path(out)
-    record = read_json(path := project / TRANSFORM_FILE)
+    path = project / TRANSFORM_FILE
+    if project.is_dir() and not path.exists():
+        raise FormatError(project, Fact("nothing-to-undo"))
+    record = read_json(path)
     try:
         keep = [str(pattern) for pattern in record["keep"]]
         models = [(int(m["index"]), m["similarity"]) for m in record["models"]]
@@ -177,7 +181,7 @@ def undo_project(
         beside = [str(pattern) for pattern in record.get("beside", [])]
         require_not_joined(path, {int(m["index"]): [int(i) for i in m.get("joined_of", [])] for m in record["models"]})
     except (KeyError, TypeError, ValueError, AttributeError):
-        raise FormatError(path, "not the record of a project that colmap-inertial apply wrote") from None
+        raise FormatError(path, Fact("not-a-record-of-apply")) from None
     by_model = {
         index: ModelScale(similarity=None if fields is None else undoing(similarity_from_json(path, fields)))
         for index, fields in models
@@ -187,7 +191,7 @@ def undo_project(
         common = undoing(similarity_from_json(path, record)) if record.get("one_for_all") is True else None
         layout = read_layout(project, work.open_folders(), one_for_all=common is not None)
         if layout.submodels.keys() != by_model.keys():
-            raise FormatError(path, "the models of the project are not those that it records")
+            raise FormatError(path, Fact("models-not-as-recorded"))
         plan = _Plan(layout=layout, by_model=by_model, one_for_all=common, databases=databases, link=link, is_undo=True)
         return work.run(plan, progress)
 
@@ -248,11 +252,13 @@ class _Work:
         read: Sequence[tuple[Path, Fact]],
         beside: Sequence[str] = (),
     ) -> None:
+        if project.is_file():
+            require_format(project)  # says what it is
         if not project.is_dir():
-            raise FormatError(project, "no such folder")
+            raise FormatError(project, Fact("no-such-folder"))
         inner, outer = out.resolve(), project.resolve()
         if inner.is_relative_to(outer) or outer.is_relative_to(inner):
-            raise OutputError(f"{out} and {project} lie within each other; choose a folder elsewhere")
+            raise OutputError(Fact("folders-within-each-other", folder=str(out), out=str(project)))
         self._project, self._out, self._keep, self._read = project, out, Kept(tuple(keep), project), read
         tree = list_tree(project, follow_links=follow_links)
         self.folders, self._files, self._links = (
@@ -361,16 +367,19 @@ class _Work:
             if kind == "database":
                 databases.append(path)
                 continue
-            if kind in CAMERA_KINDS and not worlds.is_of_a_model(path, str(kind)):
+            fitting: list[int] = []
+            if kind in CAMERA_KINDS and not (fitting := worlds.owners_of(path, str(kind))):
                 kind = None
-            owner = None if plan.one_for_all is not None or kind is None else self._owner(plan.layout, path)
+            owner = None if plan.one_for_all is not None or kind is None else self._owner(plan.layout, path, fitting)
             similarity = plan.one_for_all if owner is None else similarities[owner]
-            if kind is None and not self.is_kept(path):
+            if kind is None and not self.is_kept(path) and path not in worlds.counted:
                 self._inventory.add(path, lengths_of(source, path, worlds.depths))
-            if kind is None or similarity is None:
+            move = None
+            if kind is not None and similarity is not None:
+                move = worlds.similarity_of(path, kind, owner, similarity)
+            if kind is None or move is None:
                 jobs.append(functools.partial(copy, source, target, link=plan.link))
             else:
-                move = worlds.similarity_of(path, kind, owner, similarity)
                 doubles, place = plan.in_doubles(owner, move), (str(path), owner)
                 jobs.append(functools.partial(transform, source, target, kind, move, place, doubles=doubles))
         return databases, jobs
@@ -379,13 +388,15 @@ class _Work:
         """A path as it is in the project, also of what was read from the copy."""
         return path.relative_to(self._project) if path.is_relative_to(self._project) else path
 
-    def _owner(self, layout: Layout, path: Path) -> int:
+    def _owner(self, layout: Layout, path: Path, fitting: Sequence[int]) -> int:
+        """The sub-model in whose units a file is: by its folder, else the only one whose cameras it has."""
         owner = layout.owner(path)
+        if owner is None and len(fitting) == 1:
+            owner = fitting[0]
         if owner is None:
             raise FormatError(
                 self._project / path,
-                "it cannot be told in which sub-model's units this is; move it into its dense workspace or leave it "
-                "out with --keep",
+                Fact("owner-unknown"),
             )
         return owner
 
@@ -418,11 +429,9 @@ class _Work:
                 else:
                     again = read_model(target, suffix, unique_names=False)
                     if (again.num_reg_images(), again.num_points3D()) != counts:
-                        raise FormatError(target, "truncated")
+                        raise FormatError(target, Fact("truncated"))
             except (FormatError, ValueError, RuntimeError) as error:
-                raise OutputError(
-                    f"{self._out / folder}: COLMAP did not write the model whole; is the disk full? ({error})"
-                ) from error
+                raise OutputError(Fact("model-not-whole", folder=str(self._out / folder), detail=str(error))) from error
             self._changes.append(
                 Change(path=str(folder), kind=f"model {suffix}", changed=("cameras", "points", "rigs"), model=index)
             )
@@ -450,6 +459,9 @@ class _Work:
                 changed.append(f"{moved} {what}")
             if kept:
                 self._notes.append(Fact("not-in-model-frame", file=str(path), count=kept, kind=what))
+        if not plan.is_undo:
+            models, by_model = plan.layout.placed, plan.similarities
+            self.note(compare_priors(self._project / path, str(path), models, by_model, moved=done.prior_models))
         (shutil.copymode if changed else shutil.copystat)(self._project / path, partial / path)
         if changed:
             self._changes.append(Change(path=str(path), kind="database", changed=tuple(changed), model=None))

@@ -16,7 +16,7 @@ from colmap_inertial.core.facts import Fact, as_fact, read_facts, with_sentences
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_from_matrix
 from colmap_inertial.core.options import WorldAxes
 from colmap_inertial.core.summary import prints_in_lines
-from colmap_inertial.core.types import UNDOES, ScaleEstimate, Similarity
+from colmap_inertial.core.types import ScaleEstimate, Similarity
 from colmap_inertial.io.files import StrPath, read_json, reader, reading
 from colmap_inertial.model import similarity_as_json
 from colmap_inertial.model.identity import ModelIdentity, identity_from_json
@@ -78,7 +78,7 @@ def similarity_from_json(path: Path, fields: Mapping[str, Any]) -> Similarity:
         For a field that is missing, of another type, or not finite.
     """
     if "scale" not in fields:
-        raise FormatError(path, "no similarity: the field scale is missing")
+        raise FormatError(path, Fact("no-similarity"))
     arrays = {}
     for name, shape, default in (
         ("rotation_xyzw", (4,), [0.0, 0.0, 0.0, 1.0]),
@@ -91,17 +91,19 @@ def similarity_from_json(path: Path, fields: Mapping[str, Any]) -> Similarity:
         except ValueError:
             array = np.array(None)
         if array.dtype.kind not in "fiu" or array.shape != shape:
-            raise FormatError(path, f"{name} must be {' x '.join(map(str, shape))} numbers")
+            raise FormatError(path, Fact("field-not-of-shape", name=name, shape=shape))
         arrays[name] = array.astype(np.float64)
-    scale, provenance = fields["scale"], fields.get("provenance", "")
+    scale, provenance, undoes = fields["scale"], fields.get("provenance", ""), fields.get("undoes")
     if isinstance(scale, bool) or not isinstance(scale, int | float):
-        raise FormatError(path, "scale must be a number")
+        raise FormatError(path, Fact("scale-not-a-number"))
     if not isinstance(provenance, str):
-        raise FormatError(path, "provenance must be text")
+        raise FormatError(path, Fact("field-not-text", name="provenance"))
+    if not isinstance(undoes, str | None):
+        raise FormatError(path, Fact("field-not-text", name="undoes"))
     try:
-        return Similarity(scale=float(scale), provenance=provenance, **arrays)
+        return Similarity(scale=float(scale), provenance=provenance, undoes=undoes, **arrays)
     except (ValueError, OverflowError) as error:
-        raise FormatError(path, str(error)) from None
+        raise FormatError(path, Fact("invalid-values", detail=str(error))) from None
 
 
 @reader("a similarity")
@@ -144,7 +146,8 @@ def undoing(similarity: Similarity) -> Similarity:
         rotation_xyzw=quat_conjugate(similarity.rotation_xyzw),
         translation_m=-(rotation.T @ similarity.translation_m) / similarity.scale,
         cov=np.zeros((7, 7)),
-        provenance=f"{UNDOES}{similarity.provenance}",
+        provenance=f"undoes: {similarity.provenance}",
+        undoes=similarity.provenance,
     )
 
 
@@ -157,6 +160,7 @@ def compose(move: Similarity, before: Similarity) -> Similarity:
         translation_m=move.scale * turn @ before.translation_m + move.translation_m,
         cov=np.zeros((7, 7)),
         provenance=before.provenance,
+        undoes=before.undoes,
     )
 
 
@@ -166,8 +170,7 @@ def require_not_joined(path: Path, parts: Mapping[int, Sequence[int]]) -> None:
         if numbers:
             raise FormatError(
                 path,
-                f"model {index} was joined of the models {', '.join(map(str, numbers))}, which cannot be taken apart "
-                "again: the project that it was made from is as it was; --join off keeps its models apart",
+                Fact("joined-of-models", model=index, numbers=tuple(numbers)),
             )
 
 
@@ -200,11 +203,12 @@ def read_scales(sources: Sequence[str], *, world: WorldAxes = "z-up") -> dict[in
     for source in sources:
         for key, scale in _scales_of(source, world):
             if key in scales or (None in scales) != (key is None and bool(scales)):
-                raise InertialError(f"{source}: two scales for one model; give each as NUMBER=FILE")
+                raise InertialError(Fact("two-scales-for-one-model", source=source))
             scales[key] = scale
     if scales and all(scale.similarity is None for scale in scales.values()):
         raise NotObservableError(
-            "scale", "; ".join(str(reason) for scale in scales.values() for reason in scale.reasons)
+            "scale",
+            Fact("scale-refused", reasons=tuple(reason for scale in scales.values() for reason in scale.reasons)),
         )
     return scales
 
@@ -214,13 +218,13 @@ def _scales_of(source: str, world: WorldAxes) -> list[tuple[int | None, ModelSca
     number, equals, name = source.partition("=")
     is_numbered = bool(equals) and number.isascii() and number.isdigit() and not Path(source).exists()
     path = Path(name if is_numbered else source)
-    with reading(path, "cannot be read as a scale estimate"):
+    with reading(path, Fact("not-readable-as", what="a scale estimate")):
         content = read_json(path)
         if is_numbered or not isinstance(content.get("models"), list):
             return [(int(number) if is_numbered else None, _model_scale(path, content, world))]
         entries = [(_colmap_index(model), model) for model in content["models"]]
         if not all(isinstance(i, int) for i, _ in entries):
-            raise FormatError(path, "models: each needs an index")
+            raise FormatError(path, Fact("models-without-index"))
         fragments = _fragments(path, content.get("fragments") or [])
         return [*fragments, *((i, _model_scale(path, model, world)) for i, model in entries)]
 
@@ -234,22 +238,22 @@ def _fragments(path: Path, entries: Any) -> list[tuple[int | None, ModelScale]]:
     """Models that a result left out, which keep their own units."""
     numbers = [_colmap_index(entry) for entry in entries] if isinstance(entries, list) else [None]
     if not all(isinstance(number, int) for number in numbers):
-        raise FormatError(path, "fragments: each needs a colmap_index")
+        raise FormatError(path, Fact("fragments-without-index"))
     left_out = ModelScale(similarity=None, verdict="refused", reasons=(Fact("fragment"),))
     return [(number, left_out) for number in numbers]
 
 
 def _model_scale(path: Path, fields: Any, world: WorldAxes) -> ModelScale:
     if not isinstance(fields, dict) or not {"metres_per_unit", "verdict"} <= fields.keys():
-        raise FormatError(path, "not a scale estimate (as colmap-inertial scale --json writes it)")
+        raise FormatError(path, Fact("not-a-scale-estimate"))
     numbers = ("metres_per_unit", "sigma_log")
     if any(isinstance(fields.get(name), bool | str | list | dict) for name in numbers):
-        raise FormatError(path, f"{' and '.join(numbers)} must be numbers or null")
+        raise FormatError(path, Fact("fields-not-numbers", names=numbers))
     reasons = fields.get("reasons")
     if not isinstance(reasons, list) or not all(isinstance(reason, str) for reason in reasons):
-        raise FormatError(path, "reasons must be a list of texts")
+        raise FormatError(path, Fact("reasons-not-texts"))
     if fields["verdict"] not in ("trusted", "weak", "refused"):
-        raise FormatError(path, f"unknown verdict {fields['verdict']!r}")
+        raise FormatError(path, Fact("verdict-unknown", verdict=fields["verdict"]))
     try:
         estimate = ScaleEstimate(
             metres_per_unit=fields["metres_per_unit"],
@@ -262,11 +266,11 @@ def _model_scale(path: Path, fields: Any, world: WorldAxes) -> ModelScale:
             cov=fields.get("cov"),
         )
     except (ValueError, TypeError) as error:
-        raise FormatError(path, f"not a valid scale estimate: {error}") from None
+        raise FormatError(path, Fact("scale-estimate-invalid", detail=str(error))) from None
     similarity = None
     if estimate.verdict != "refused":
         if estimate.gravity_in_world_m_s2 is None:
-            raise FormatError(path, "gravity_in_world_m_s2 is missing: give the number with --factor to scale alone")
+            raise FormatError(path, Fact("gravity-of-scale-missing"))
         provenance = f"inertial scale, method {estimate.method}, {estimate.verdict}, from {path.name}"
         similarity = Similarity.from_scale(estimate, world=world, provenance=provenance)
     left_out = () if similarity is None else _read_left_out(path, fields.get("rotations"))
@@ -290,5 +294,5 @@ def _read_left_out(path: Path, rotations: Any) -> tuple[str, ...]:
     fields = rotations if isinstance(rotations, dict) else {}
     names = [fields.get("left_out"), fields.get("registered_again", []), fields.get("joined", [])]
     if not all(isinstance(some, list) and all(isinstance(name, str) for name in some) for some in names):
-        raise FormatError(path, "rotations: left_out, registered_again and joined must be lists of image names")
+        raise FormatError(path, Fact("rotations-not-names"))
     return tuple(name for some in names for name in some)

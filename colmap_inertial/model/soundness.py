@@ -37,7 +37,9 @@ _POINT = struct.Struct("<Qddd11xQ")
 
 
 class _Damaged(Exception):
-    pass
+    def __init__(self, why: Fact) -> None:
+        super().__init__(str(why))
+        self.why = why
 
 
 def check_binary_model(folder: Path) -> None:
@@ -55,21 +57,21 @@ def check_binary_model(folder: Path) -> None:
         size = path.stat().st_size
         refuse_stand_in(path)
         if size < _U64.size:
-            raise FormatError(path, "truncated")
+            raise FormatError(path, Fact("truncated"))
         with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
             try:
                 count = _U64.unpack_from(data)[0]
                 if count > size:
-                    raise _Damaged(f"it claims {count} records")
+                    raise _Damaged(Fact("records-claimed", count=count))
                 end = walk(data, count)
             except (struct.error, IndexError, OverflowError):
-                raise FormatError(path, "truncated") from None
+                raise FormatError(path, Fact("truncated")) from None
             except _Damaged as error:
-                raise FormatError(path, f"damaged: {error}") from None
+                raise FormatError(path, Fact("damaged-model-file", why=error.why)) from None
         if end > size:
-            raise FormatError(path, "truncated")
+            raise FormatError(path, Fact("truncated"))
         if end < size:
-            raise FormatError(path, f"damaged: {size - end} bytes follow the last record")
+            raise FormatError(path, Fact("bytes-after-last-record", count=size - end))
 
 
 def _cameras(data: mmap.mmap, count: int) -> int:
@@ -77,9 +79,9 @@ def _cameras(data: mmap.mmap, count: int) -> int:
     for _ in range(count):
         _, model, width, height = _CAMERA.unpack_from(data, at)
         if not 0 <= model < len(NUM_PARAMETERS):
-            raise _Damaged(f"camera model {model} is unknown")
+            raise _Damaged(Fact("camera-model-unknown", model=str(model)))
         if not (0 < width < 2**31 and 0 < height < 2**31):
-            raise _Damaged(f"a camera of {width} x {height} pixels")
+            raise _Damaged(Fact("camera-without-pixels", width=width, height=height))
         at += 24 + 8 * NUM_PARAMETERS[model]
     return at
 
@@ -99,7 +101,7 @@ def _points(data: mmap.mmap, count: int) -> int:
     for _ in range(count):
         number, x, y, z, length = read(data, at)
         if not (abs(x) < LARGEST and abs(y) < LARGEST and abs(z) < LARGEST):
-            raise _Damaged(f"point {number} lies at {x:g}, {y:g}, {z:g}")
+            raise _Damaged(Fact("point-impossible", point=number, xyz=(x, y, z)))
         at += 51 + 8 * length
     return at
 
@@ -154,11 +156,20 @@ def check_values(reconstruction: pycolmap.Reconstruction, folder: Path, suffix: 
     for camera_id, camera in reconstruction.cameras.items():
         path, params = folder / f"cameras{suffix}", np.asarray(camera.params, dtype=np.float64)
         if not (0 < camera.width < 2**31 and 0 < camera.height < 2**31):
-            raise FormatError(path, f"camera {camera_id} has {camera.width} x {camera.height} pixels")
+            raise FormatError(
+                path, Fact("camera-size-impossible", camera=camera_id, width=camera.width, height=camera.height)
+            )
         focal = params[list(camera.focal_length_idxs())]
         if not _sane(params) or (focal < _LEAST_FOCAL_PX).any():
             raise FormatError(
-                path, f"camera {camera_id} ({camera.model.name}) cannot be: {camera.params_info} = {_listed(params)}"
+                path,
+                Fact(
+                    "camera-impossible",
+                    camera=camera_id,
+                    model=camera.model.name,
+                    names=camera.params_info,
+                    params=tuple(params.tolist()),
+                ),
             )
         _note_odd_lens(camera, path)
     for image_id in reconstruction.reg_image_ids():
@@ -166,15 +177,19 @@ def check_values(reconstruction: pycolmap.Reconstruction, folder: Path, suffix: 
         pose = image.cam_from_world()
         numbers = np.concatenate([pose.rotation.quat, pose.translation])
         if not _sane(numbers) or not np.linalg.norm(pose.rotation.quat) > 0.5:
-            raise FormatError(folder / f"images{suffix}", f"the pose of {image.name!r} cannot be: {_listed(numbers)}")
+            raise FormatError(
+                folder / f"images{suffix}", Fact("pose-impossible", image=image.name, numbers=tuple(numbers.tolist()))
+            )
     for rig_id, rig in reconstruction.rigs.items():
         for sensor, mounted in rig.non_ref_sensors.items():
             if mounted is not None and not _sane(np.concatenate([mounted.rotation.quat, mounted.translation])):
-                raise FormatError(folder / f"rigs{suffix}", f"rig {rig_id}: the pose of sensor {sensor.id} cannot be")
+                raise FormatError(folder / f"rigs{suffix}", Fact("rig-pose-impossible", rig=rig_id, sensor=sensor.id))
     if suffix == ".txt":
         for point_id, point in reconstruction.points3D.items():
             if not _sane(point.xyz):
-                raise FormatError(folder / "points3D.txt", f"point {point_id} lies at {_listed(point.xyz)}")
+                raise FormatError(
+                    folder / "points3D.txt", Fact("point-impossible", point=point_id, xyz=tuple(point.xyz.tolist()))
+                )
 
 
 def _note_odd_lens(camera: pycolmap.Camera, path: Path) -> None:
@@ -236,7 +251,3 @@ def add_tracks(reconstruction: pycolmap.Reconstruction, observations: NDArray[np
 
 def _sane(numbers: Array) -> bool:
     return bool((np.abs(numbers) < LARGEST).all())  # not where one of them is NaN
-
-
-def _listed(numbers: Array) -> str:
-    return ", ".join(f"{number:g}" for number in numbers.tolist())

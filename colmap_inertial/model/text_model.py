@@ -46,7 +46,7 @@ class _Lines:
         try:
             text = data.decode(coding, errors="surrogateescape")
         except UnicodeDecodeError as error:
-            raise FormatError(path, f"no text: {error.reason}") from None
+            raise FormatError(path, Fact("not-text", detail=error.reason)) from None
         self.lines = [line.strip() for line in re.split(r"\r\n|\n|\r", text)]
         self.with_commas = 0
 

@@ -1,6 +1,7 @@
 """Facts: codes with values, their words, and their way through JSON."""
 
 import ast
+import pickle
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,7 +9,14 @@ import pytest
 
 import colmap_inertial
 from colmap_inertial import messages
-from colmap_inertial.core.errors import FormatError, NotObservableError
+from colmap_inertial.core.errors import (
+    FormatError,
+    MappingError,
+    MissingExtraError,
+    NotObservableError,
+    TimingError,
+    fact_of,
+)
 from colmap_inertial.core.facts import Fact, as_fact, with_sentences
 from colmap_inertial.core.types import Action, Treatment
 from colmap_inertial.io.files import read_json, read_record, write_record
@@ -59,15 +67,29 @@ def test_every_message_shows_its_example():
         assert isinstance(fact.advice, str), code
 
 
-def test_every_code_that_the_package_names_has_a_message():
-    known, missing = messages.all_messages(), []
+def test_every_code_that_the_package_names_has_a_message_that_takes_its_values():
+    known, wrong = messages.all_messages(), []
     for path in PACKAGE.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Fact" and node.args:
                 code = node.args[0]
-                if isinstance(code, ast.Constant) and code.value not in known:
-                    missing.append(f"{path.relative_to(PACKAGE)}:{node.lineno} {code.value}")
-    assert missing == []
+                if not isinstance(code, ast.Constant):
+                    continue
+                place = f"{path.relative_to(PACKAGE)}:{node.lineno} {code.value}"
+                values = {keyword.arg: None for keyword in node.keywords}
+                if code.value not in known:
+                    wrong.append(place)
+                elif None not in values:
+                    try:
+                        known[code.value].signature.bind(**values)
+                    except TypeError as error:
+                        wrong.append(f"{place}: {error}")
+    assert wrong == []
+
+
+def test_every_message_is_said_somewhere():
+    said = "".join(path.read_text() for path in PACKAGE.rglob("*.py") if path.parent.name != "messages")
+    assert [code for code in messages.all_messages() if f'"{code}"' not in said and code != "tested-cameras"] == []
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,10 +124,34 @@ def test_errors_take_code_and_words_from_a_fact():
     error = FormatError("imu.csv", a_fact(), line=7)
     assert (error.code, error.reason) == ("tested-cameras", a_fact().with_advice)
     assert str(error) == f"imu.csv, line 7: {a_fact().with_advice}"
-    assert FormatError("imu.csv", "no header").code == "unreadable"
+    assert error.fact == a_fact()
     refused = NotObservableError("scale", a_fact(), sigma=0.5)
     assert (refused.fact, refused.code) == (a_fact(), "tested-cameras")
     assert "standard deviation 50.0 %" in str(refused)
+
+
+def test_errors_come_whole_from_another_process():
+    errors = [
+        MappingError(a_fact()),
+        FormatError("imu.csv", a_fact(), line=7),
+        NotObservableError("scale", a_fact(), sigma=0.5),
+        MissingExtraError("mesh", a_fact()),
+        TimingError(a_fact(), shown=str(a_fact())),
+    ]
+    for error in errors:
+        again = pickle.loads(pickle.dumps(error))
+        assert (type(again), str(again), vars(again)) == (type(error), str(error), vars(error))
+
+
+def test_an_error_as_a_fact_says_what_the_error_says():
+    for error in (
+        MappingError(a_fact()),
+        FormatError("imu.csv", a_fact(), line=7),
+        FormatError("imu.csv", a_fact()),
+        NotObservableError("scale", a_fact(), sigma=0.5),
+        TimingError(a_fact(), shown=str(a_fact())),
+    ):
+        assert str(fact_of(error)) == str(error)
 
 
 def test_a_stage_of_a_user_says_words_and_no_action_of_its_own():

@@ -28,6 +28,7 @@ CHECKS: tuple[Check, ...] = (
     imu.check_resolution,
     imu.check_scatter,
     imu.check_delay,
+    camera.check_declared,
     camera.check_stabilisation,
     camera.check_pose_convention,
     clocks.check_time_unit,
@@ -37,7 +38,6 @@ CHECKS: tuple[Check, ...] = (
     camera.check_gyro_gain,
     clocks.check_clock_rate,
     clocks.check_coverage,
-    camera.check_declared_rotation,
     clocks.check_even_times,
     camera.check_focal_length,
     camera.check_accelerometer_sign,
@@ -45,6 +45,7 @@ CHECKS: tuple[Check, ...] = (
     frames.check_cut_from_video,
     frames.check_dropped,
     frames.check_repeated,
+    frames.check_blank,
     frames.check_exposure,
     frames.check_readout,
 )
@@ -83,7 +84,7 @@ _FAULTS_OF_STAMPS = frozenset(
 
 def unreadable(error: InertialError) -> Finding:
     """A reader's error as a finding."""
-    if error.fact is not None and error.code in _FAULTS_OF_STAMPS:
+    if error.code in _FAULTS_OF_STAMPS:
         return Finding(fact=error.fact, severity="error")
     code = "untimed" if isinstance(error, TimingError) else "unreadable"
     return Finding(fact=Fact(code, detail=str(error)), severity="error")

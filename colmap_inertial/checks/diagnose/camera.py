@@ -16,7 +16,6 @@ from colmap_inertial.checks.diagnose.clocks import (
 from colmap_inertial.checks.diagnose.findings import UNIT_FACTORS, Finding, Recorded
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.facts import Fact, as_fact
-from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply
 from colmap_inertial.core.sampling import subtract_running_mean
 from colmap_inertial.core.types import CameraTrajectory, ImuRecording, RotationConsensus
 from colmap_inertial.imaging.gyro_camera import GyroCamera
@@ -51,9 +50,6 @@ class CameraCheckLimits:
     still_rad_s: float = 0.02
     turned_within_s: float = 1.0
     fewest_seconds: int = 5
-    #: A camera-IMU rotation known better than the first, and off by more than the second, is declared wrongly.
-    known_rotation_rad: float = 0.2
-    other_rotation_rad: float = 0.35
     #: Quick rotation in the picture per rotation measured; translation is slow against it, and makes it a little less
     #: (0.92 to 0.95 in rendered orbits about a desk, 1.00 before a far wall). A standard deviation above the third
     #: tells nothing.
@@ -109,7 +105,7 @@ def check_belonging(recorded: Recorded) -> Iterator[Finding]:
         yield _unit_finding(recorded.wrong_unit)
         return
     if failed.code in _TOO_LITTLE_ROTATION:
-        yield Finding(fact=Fact("rotation-too-little", why=failed.why), severity="error")
+        yield Finding(fact=Fact("rotation-too-little", why=failed.fact), severity="error")
         return
     otherwise = _find_better_fit(recorded, imu)
     if otherwise is not None:
@@ -149,7 +145,7 @@ def check_cameras(recorded: Recorded) -> Iterator[Finding]:
     """Whether cameras of a reconstruction contradict the gyroscope."""
     consensus = recorded.consensus
     if isinstance(consensus, NotObservableError) and recorded.lacks_majority:
-        yield Finding(fact=Fact("cameras-turned", why=(consensus.why,)), severity="error")
+        yield Finding(fact=Fact("cameras-turned", why=(consensus.fact,)), severity="error")
     if isinstance(consensus, RotationConsensus) and not consensus.kept.all():
         fact = Fact(
             "cameras-turned",
@@ -171,7 +167,7 @@ def _never_fits(recorded: Recorded, turning: CameraTrajectory, failed: NotObserv
     if recorded.trajectory is None and not recorded.is_dense and len(turning) <= _LIMITS.enough_pairs:
         return Finding(fact=Fact("pictures-too-few", pairs=len(turning) - 1), severity="info")
     clocks = None if recorded.clocks is None else recorded.clocks.fact
-    return Finding(fact=Fact("imu-does-not-fit", seconds=span_s, why=failed.why, clocks=clocks), severity="error")
+    return Finding(fact=Fact("imu-does-not-fit", seconds=span_s, why=failed.fact, clocks=clocks), severity="error")
 
 
 def _find_better_fit(recorded: Recorded, imu: ImuRecording) -> Finding | None:
@@ -275,18 +271,13 @@ def check_stabilisation(recorded: Recorded) -> Iterator[Finding]:
         yield Finding(fact=Fact("stabilised", share=stabilisation.share), severity="error")
 
 
-def check_declared_rotation(recorded: Recorded) -> Iterator[Finding]:
-    """The declared rotation between camera and IMU against the one that the pictures show."""
-    aligned, prior = recorded.aligned, recorded.calibration
-    if not isinstance(aligned, Alignment) or prior is None:
-        return
-    sigmas = [c.rotation_sigma_rad for c in (prior, aligned.calibration)]
-    if max(sigmas) > _LIMITS.known_rotation_rad:
-        return
-    turn = quat_multiply(aligned.calibration.cam_from_imu_xyzw, quat_conjugate(prior.cam_from_imu_xyzw))
-    angle = float(np.linalg.norm(quat_log(turn)))
-    if angle > _LIMITS.other_rotation_rad + 3 * max(sigmas):
-        yield Finding(fact=Fact("declared-rotation", angle_deg=np.degrees(angle)), severity="error")
+def check_declared(recorded: Recorded) -> Iterator[Finding]:
+    """The declared rotation and time offset of camera and IMU against what the recording shows without them."""
+    wrong = recorded.contradicted
+    if wrong.rotation is not None:
+        yield Finding(fact=wrong.rotation, severity="error" if wrong.is_wrong_rotation else "warning")
+    if wrong.time_offset is not None:
+        yield Finding(fact=wrong.time_offset, severity="error" if wrong.is_wrong_offset else "warning")
 
 
 def check_focal_length(recorded: Recorded) -> Iterator[Finding]:

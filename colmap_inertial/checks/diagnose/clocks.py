@@ -89,20 +89,26 @@ def check_coverage(recorded: Recorded) -> Iterator[Finding]:
     frames = recorded.trajectory or recorded.timing
     if imu is None or frames is None or len(frames.t_s) < 3 or wrong_time_unit(recorded):
         return
-    sensors = [imu.gyro_t_s, imu.accel_t_s] if imu.has_accel else [imu.gyro_t_s]
-    begin_s, end_s = max(t_s[0] for t_s in sensors), min(t_s[-1] for t_s in sensors)
+    sensors = {"gyroscope": imu.gyro_t_s} | ({"accelerometer": imu.accel_t_s} if imu.has_accel else {})
     span_s = float(frames.t_s[-1] - frames.t_s[0])
     slack_s = max(_LIMITS.slack_frames * float(np.median(np.diff(frames.t_s))), _LIMITS.slack_share * span_s)
     shift_s = recorded.offset_s(frames.epoch_ns)
-    if shift_s is not None:
-        missed_s = max(begin_s + shift_s - frames.t_s[0], 0) + max(frames.t_s[-1] - end_s - shift_s, 0)
-    else:
-        missed_s = span_s - (end_s - begin_s)
-    if missed_s <= slack_s:
+
+    def missed_s(begin_s: float, end_s: float) -> float:
+        """What of the frames a sensor missed that ran from when to when."""
+        if shift_s is None:
+            return span_s - (end_s - begin_s)
+        return float(max(begin_s + shift_s - frames.t_s[0], 0) + max(frames.t_s[-1] - end_s - shift_s, 0))
+
+    begin_s, end_s = max(t_s[0] for t_s in sensors.values()), min(t_s[-1] for t_s in sensors.values())
+    both_s = missed_s(begin_s, end_s)
+    if both_s <= slack_s:
         return
-    share = float(np.clip(1 - missed_s / span_s, 0, 1))
+    short = [name for name, t_s in sensors.items() if missed_s(t_s[0], t_s[-1]) > slack_s]
+    share = float(np.clip(1 - both_s / span_s, 0, 1))
+    alone = {"sensor": short[0]} if len(short) == 1 and len(sensors) == 2 else {}
     yield Finding(
-        fact=Fact("imu-too-short", share=share, frames_s=span_s, imu_s=end_s - begin_s),
+        fact=Fact("imu-too-short", share=share, frames_s=span_s, imu_s=end_s - begin_s, **alone),
         severity="error" if share < _LIMITS.least_covered else "warning",
     )
 

@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from colmap_inertial.checks.diagnose.declared import Contradicted, compare_declared, leave_out
 from colmap_inertial.core.arrays import Int64Array
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError
@@ -215,6 +216,8 @@ class Recorded:
         Whether the frames are those of a capture, which can be described better; poses alone cannot.
     rotation
         Between consecutive frames, by their pixels.
+    looked_at, blank
+        How many pictures were looked at, and the names of those without any feature.
     trajectory, read_as
         Poses of a reconstruction; the convention that they were read by.
     camera
@@ -233,6 +236,8 @@ class Recorded:
     log: FrameLog | None = None
     is_capture: bool = False
     rotation: VisualRotation | None = None
+    looked_at: int = 0
+    blank: Sequence[str] = ()
     trajectory: CameraTrajectory | None = None
     read_as: PoseConvention = ARRAYS
     camera: CameraModel | None = None
@@ -254,13 +259,47 @@ class Recorded:
         return self.rotation is not None and len(self.rotation.t_s) > 1 and self.rotation.step_s <= FOLLOWED_S
 
     @cached_property
+    def contradicted(self) -> Contradicted:
+        """The declared rotation and time offset against an alignment without them; nothing where that is not possible.
+
+        Pictures alone tell them worse.
+        """
+        prior, imu = self.calibration, self.imu
+        if prior is None or imu is None or (self.trajectory is None and self.rotation is None):
+            return Contradicted()
+        opened = leave_out(prior)
+        if opened is prior:
+            return Contradicted()
+        try:
+            if self.trajectory is not None:
+                options = AlignOptions(max_offset_s=self.max_offset_s)
+                found = align_by_consensus(self.trajectory, imu, prior=opened, options=options)[0]
+            else:
+                assert self.rotation is not None
+                options = AlignOptions(max_offset_s=self.max_offset_s, min_explained=PIXELS_EXPLAINED)
+                found = align_clocks(self.rotation.trajectory(), imu, prior=opened, options=options)
+        except NotObservableError:
+            return Contradicted()
+        return compare_declared(prior, found.calibration, by_poses=self.trajectory is not None)
+
+    @cached_property
+    def believed(self) -> CameraImuCalibration | None:
+        """What is known of camera and IMU beforehand, without what the recording contradicts."""
+        wrong = self.contradicted
+        if self.calibration is None or not wrong.facts:
+            return self.calibration
+        return leave_out(
+            self.calibration, rotation=wrong.rotation is not None, time_offset=wrong.time_offset is not None
+        )
+
+    @cached_property
     def consensus(self) -> RotationConsensus | NotObservableError | None:
         """Agreement of a reconstruction's cameras with the gyroscope; ``None`` where either is missing."""
         if self.imu is None or self.trajectory is None:
             return None
         options = AlignOptions(max_offset_s=self.max_offset_s)
         try:
-            return align_by_consensus(self.trajectory, self.imu, prior=self.calibration, options=options)[1]
+            return align_by_consensus(self.trajectory, self.imu, prior=self.believed, options=options)[1]
         except NotObservableError as error:
             return error
 
@@ -282,7 +321,7 @@ class Recorded:
             and isinstance(consensus, RotationConsensus)
             and not consensus.kept.all()
         ):
-            together = self._align(poses, imu, self.calibration, self.max_offset_s)
+            together = self._align(poses, imu, self.believed, self.max_offset_s)
             return poses if isinstance(together, Alignment) else poses.select(consensus.kept)
         if self.trajectory is not None or self.rotation is None:
             return self.trajectory
@@ -332,7 +371,7 @@ class Recorded:
         if self.imu is None or self.trajectory is None or self.turning is None:
             return None
         options = AlignOptions(max_offset_s=self.max_offset_s)
-        return likely_convention(self.turning, self.imu, read_as=self.read_as, prior=self.calibration, options=options)
+        return likely_convention(self.turning, self.imu, read_as=self.read_as, prior=self.believed, options=options)
 
     def offset_s(self, camera_epoch_ns: int) -> float | None:
         """Camera time since that epoch = gyroscope time since its own + this; ``None`` where it was not found."""
@@ -348,7 +387,7 @@ class Recorded:
         if self.clocks is not None and (self.clocks.unit_factor or 0) > 1:
             # hours of offsets to search, for frames that mostly have no gyroscope beside them
             return NotObservableError("time offset", self.clocks.fact)
-        prior = self.calibration
+        prior = self.believed
         if any_offset and prior is not None:
             prior = reset_for_recording(prior)
         return self._align(self.turning, imu, prior, None if any_offset else self.max_offset_s)

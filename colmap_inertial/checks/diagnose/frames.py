@@ -8,9 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from colmap_inertial.checks.diagnose.findings import Finding, Recorded, Severity
+from colmap_inertial.core.arrays import BoolArray
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.facts import Fact
+from colmap_inertial.core.types import ReadoutDirection
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.motion.align import Alignment
 from colmap_inertial.motion.shutter import ReadoutEstimate, estimate_readout
@@ -30,6 +32,17 @@ class FrameCheckLimits:
     same_rad: float = 1e-7
     repeated: int = 2
     repeated_share: float = 0.05
+    #: Pictures that show less than this share of what the gyroscope turned, so many pairs in a row, where it turned by
+    #: more than this and than so many standard deviations of what pictures show.
+    frozen_share: float = 0.1
+    frozen_pairs: int = 3
+    frozen_rad: float = 2e-3
+    frozen_sigmas: float = 5.0
+    #: A declared readout that is off by more than this, and so many standard deviations of what pictures show.
+    readout_s: float = 4e-3
+    readout_sigmas: float = 5.0
+    #: More pictures without any feature leave too few.
+    blank_share: float = 0.5
     #: Blur, as a share of the picture's long side, beyond which features suffer; and the frames that may have it.
     blur_share: float = 0.004
     blurred_frames: float = 0.5
@@ -62,7 +75,8 @@ def check_repeated(recorded: Recorded) -> Iterator[Finding]:
     """Frames that are the one before, at a time of their own."""
     if recorded.rotation is not None:
         turn = recorded.rotation.turn_rad
-        same = np.linalg.norm(turn[np.isfinite(turn).all(axis=1)], axis=1) < _LIMITS.same_rad
+        same = np.linalg.norm(turn, axis=1) < _LIMITS.same_rad
+        same = (same | _are_frozen(recorded))[np.isfinite(turn).all(axis=1)]
     elif recorded.trajectory is not None:
         poses = recorded.trajectory
         same = (np.diff(poses.cam_in_world, axis=0) == 0).all(axis=1)
@@ -73,6 +87,37 @@ def check_repeated(recorded: Recorded) -> Iterator[Finding]:
     if count > _LIMITS.repeated:
         severity: Severity = "error" if count > _LIMITS.repeated_share * len(same) else "warning"
         yield Finding(fact=Fact("frames-repeated", repeated=count, looked_at=len(same)), severity=severity)
+
+
+def _are_frozen(recorded: Recorded) -> BoolArray:
+    """Between which pictures nothing turned while the gyroscope did: one picture again, coded anew."""
+    rotation, aligned, imu = recorded.rotation, recorded.aligned, recorded.imu
+    assert rotation is not None
+    none = np.zeros(len(rotation.turn_rad), dtype=np.bool_)
+    stabilised = recorded.stabilisation is not None and recorded.stabilisation.stabilised
+    if imu is None or not isinstance(aligned, Alignment) or not recorded.is_dense or stabilised:
+        return none
+    motion = GyroCamera.of(imu, aligned.calibration, camera_epoch_ns=rotation.epoch_ns)
+    covered = motion.covers(rotation.t_s[:-1], rotation.t_s[1:])
+    shown, turned = (np.linalg.norm(turn, axis=1) for turn in (rotation.turn_rad, motion.turn_rad(rotation.t_s)))
+    least_rad = np.maximum(_LIMITS.frozen_rad, _LIMITS.frozen_sigmas * rotation.sigma_rad)
+    with np.errstate(invalid="ignore"):
+        still = covered & (turned > least_rad) & (shown < _LIMITS.frozen_share * turned)
+    # by chance where both turn back, once; not in a row
+    runs = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]])))
+    for begin, end in zip(runs[::2].tolist(), runs[1::2].tolist(), strict=True):
+        none[begin:end] = end - begin >= _LIMITS.frozen_pairs
+    return none
+
+
+def check_blank(recorded: Recorded) -> Iterator[Finding]:
+    """Pictures that are black or show nothing: no features, no pose."""
+    count = len(recorded.blank)
+    if count == 0:
+        return
+    fact = Fact("frames-blank", blank=count, looked_at=recorded.looked_at, example=recorded.blank[0])
+    most = count > _LIMITS.blank_share * recorded.looked_at
+    yield Finding(fact=fact, severity="error" if most else "warning")
 
 
 def check_exposure(recorded: Recorded) -> Iterator[Finding]:
@@ -107,13 +152,16 @@ def check_exposure(recorded: Recorded) -> Iterator[Finding]:
 
 
 def check_readout(recorded: Recorded) -> Iterator[Finding]:
-    """A capture that does not say how its shutter runs; where the pictures show it, how long it takes."""
-    if not recorded.is_capture or recorded.timing is None or recorded.timing.readout_s is not None:
+    """A capture that does not say how its shutter runs, or otherwise than its pictures show."""
+    if not recorded.is_capture or recorded.timing is None:
+        return
+    if recorded.timing.readout_s is not None:
+        yield from _compare_readout(recorded, recorded.timing.readout_s, recorded.timing.readout_direction)
         return
     try:
         readout = _readout(recorded)
     except NotObservableError as error:
-        yield Finding(fact=Fact("readout-unknown", why=error.why), severity="warning")
+        yield Finding(fact=Fact("readout-unknown", why=error.fact), severity="warning")
         return
     fact = Fact(
         "readout-unknown",
@@ -123,6 +171,28 @@ def check_readout(recorded: Recorded) -> Iterator[Finding]:
         pairs=readout.pairs,
     )
     yield Finding(fact=fact, severity="warning")
+
+
+def _compare_readout(recorded: Recorded, declared_s: float, direction: ReadoutDirection) -> Iterator[Finding]:
+    """A declared readout against one that is estimated without it."""
+    try:
+        found = _readout(recorded)
+    except NotObservableError:
+        return
+    opposite = {direction, found.direction} in ({"down", "up"}, {"right", "left"})
+    along_s = -found.readout_s if opposite else found.readout_s
+    across = not opposite and direction != found.direction
+    off_s = max(declared_s, found.readout_s) if across else abs(declared_s - along_s)
+    if off_s > max(_LIMITS.readout_s, _LIMITS.readout_sigmas * found.sigma_s):
+        fact = Fact(
+            "declared-readout",
+            declared_s=declared_s,
+            declared_direction=direction,
+            readout_s=found.readout_s,
+            sigma_s=found.sigma_s,
+            direction=found.direction,
+        )
+        yield Finding(fact=fact, severity="warning")
 
 
 def _readout(recorded: Recorded) -> ReadoutEstimate:

@@ -161,7 +161,7 @@ _MOVING = {"gyroscope": 0.1, "accelerometer": 0.2}
 def check_plausibility(recorded: Recorded) -> Iterator[Finding]:
     """Units, gravity, dead axes, exchanged sensors, axes that do not match: what a reader would refuse first."""
     for problem in recorded.implausible:
-        yield Finding(fact=problem.why, severity="error")
+        yield Finding(fact=problem.fact, severity="error")
 
 
 def check_axes(recorded: Recorded) -> Iterator[Finding]:
@@ -173,7 +173,7 @@ def check_axes(recorded: Recorded) -> Iterator[Finding]:
     try:
         check_consistent(raw, confirmed=True)
     except FormatError as error:
-        yield Finding(fact=error.why, severity="error")
+        yield Finding(fact=error.fact, severity="error")
 
 
 def check_accelerometer(recorded: Recorded) -> Iterator[Finding]:

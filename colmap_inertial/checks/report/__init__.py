@@ -73,6 +73,7 @@ from typing import Any
 from colmap_inertial.checks.report.content import gather
 from colmap_inertial.checks.report.folders import DATA_FOLDER
 from colmap_inertial.core.errors import InertialError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.printing import printable_values
 from colmap_inertial.io.files import StrPath, reading, refuse_link, write_json, write_text
 
@@ -114,8 +115,7 @@ def write_report(
     from colmap_inertial.checks.report.run_page import run_page
 
     target = out / "report.html"
-    records = "its result.json, diagnosis.json, config.toml or report_data"
-    with reading(out, f"{records} was damaged since it was written"):
+    with reading(out, Fact("changed-records", names=("result.json", "diagnosis.json", "config.toml", "report_data"))):
         content = printable_values(gather(out, result=result, stopped=stopped, capture=capture))
         page = run_page(content, out)
         write_json(out / "report.json", content, indent=None)
@@ -131,7 +131,7 @@ def require_plotly() -> None:
     InertialError
     """
     if find_spec("plotly") is None:
-        raise InertialError("plotly is not installed, which draws the report: pip install 'plotly>=6'")
+        raise InertialError(Fact("plotly-missing"))
 
 
 __all__ = ["require_plotly", "write_report"]

@@ -19,6 +19,7 @@ import numpy as np
 from colmap_inertial.checks.validate.observations import Observations, Placement, linearise
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import skew, so3_exp
 
 
@@ -105,7 +106,7 @@ def _derivatives(obs: Observations, at: Placement) -> tuple[Array, Array, Array,
     """
     residual, in_cam, jac = linearise(obs, at)
     if not np.isfinite(residual).all():
-        raise NotObservableError("scale", "the target was placed behind a camera that saw it")
+        raise NotObservableError("scale", Fact("target-behind-camera"))
     parts = len(at.rotation)
     rotated = np.exp(at.log_scale) * np.einsum("mij,mj->mi", at.rotation[obs.part], obs.target_m)
     jac_world = jac @ obs.cam_from_world[obs.view]
@@ -322,7 +323,7 @@ def fit_scale(obs: Observations, start: Placement, *, noise: NoiseModel | None =
     at, ratio = start, np.zeros(len(POSE_ERRORS)) if noise is None else noise.pose_ratio
     unknowns = 1 + 6 * len(start.rotation)
     if 2 * len(obs) <= unknowns:
-        raise NotObservableError("scale", f"{len(obs)} corner observations are too few for {unknowns} unknowns")
+        raise NotObservableError("scale", Fact("corners-too-few", count=len(obs), unknowns=unknowns))
     at = settle(obs, at, pose_ratio=ratio)
     if noise is None:
         for _ in range(2):  # the weights move the fit by a fraction of its error, and that moves the weights less
@@ -392,7 +393,7 @@ def settle(
             step = 0.5 * step
         at = _apply_step(at, step)
         equations = _equations(obs, at, ratio)
-    raise NotObservableError("scale", "the fit of the target does not settle; the views may be too close together")
+    raise NotObservableError("scale", Fact("target-fit-unsettled"))
 
 
 def _equations(obs: Observations, at: Placement, ratio: Array | None) -> tuple[Array, Array, float]:

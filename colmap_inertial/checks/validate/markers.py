@@ -13,6 +13,7 @@ from colmap_inertial.checks.validate.fit import FIT
 from colmap_inertial.checks.validate.result import CheckPoint, CheckPoints, ScaleBar, TargetDistance, Validation
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.files import read_text
 
 
@@ -39,7 +40,7 @@ def add_bars(validation: Validation, path: Path) -> Validation:
         a, b = (_find_marker(centres, row[key], path, line) for key in ("marker_a", "marker_b"))
         known_m = _read_number(row, "length_m", path, line)
         if not known_m > 0:
-            raise FormatError(path, f"length_m must be positive, not {known_m:g}", line=line)
+            raise FormatError(path, Fact("bar-not-positive", length_m=known_m), line=line)
         measured = float(np.linalg.norm(centres[a] - centres[b]))
         sigma_m = _read_number(row, "sigma_m", path, line) if row.get("sigma_m") else None
         error_m = measured * to_metres - known_m
@@ -70,7 +71,8 @@ def add_check_points(validation: Validation, path: Path) -> Validation:
             sigmas.append(_read_number(row, "sigma_m", path, line))
     if len(names) < FIT.least_points:
         raise NotObservableError(
-            "accuracy of points", f"{path} has {len(names)} check points; {FIT.least_points} are needed, apart in space"
+            "accuracy of points",
+            Fact("check-points-too-few", path=str(path), count=len(names), needed=FIT.least_points),
         )
     residual = _move_onto(np.array(measured), np.array(stated)) - np.array(stated)
     sigma_m = float(np.sqrt(np.mean(np.square(sigmas)))) if len(sigmas) == len(names) else None
@@ -122,7 +124,7 @@ def middle_of(validation: Validation) -> Array:
     drawn = np.array([places[corner.name] for corner in validation.corners]).reshape(-1, 3)
     seen = np.array([corner.in_model for corner in validation.corners]).reshape(-1, 3)
     if len(drawn) < FIT.least_points or np.linalg.matrix_rank(drawn - drawn.mean(axis=0), tol=1e-9) < 2:
-        raise NotObservableError("distance", f"too few corners of {target.spec} were measured to tell its middle")
+        raise NotObservableError("distance", Fact("corners-of-target-too-few", target=target.spec))
     units = float(np.sqrt(np.sum((seen - seen.mean(axis=0)) ** 2) / np.sum((drawn - drawn.mean(axis=0)) ** 2)))
     return _move_onto(np.vstack([drawn * units, np.zeros((1, 3))]), seen)[-1]
 
@@ -138,7 +140,9 @@ def distance_between(validation: Validation, a: int, b: int) -> float:
     centres = marker_centres(validation)
     for marker in (a, b):
         if marker not in centres:
-            raise NotObservableError("distance", f"marker {marker} was not measured; {_list_measured(centres)}")
+            raise NotObservableError(
+                "distance", Fact("marker-of-distance-not-measured", marker=marker, measured=sorted(centres))
+            )
     return float(np.linalg.norm(centres[a] - centres[b]))
 
 
@@ -161,7 +165,7 @@ def _read_rows(path: Path, needed: Sequence[str]) -> list[tuple[int, dict[str, s
     reader = csv.DictReader(read_text(path).splitlines(), skipinitialspace=True)
     missing = [name for name in needed if name not in (reader.fieldnames or ())]
     if missing:
-        raise FormatError(path, f"has no column {missing[0]}; expected {','.join(needed)} and, where known, sigma_m")
+        raise FormatError(path, Fact("column-of-table-missing", column=missing[0], needed=needed))
     return [(reader.line_num, {k: v or "" for k, v in row.items() if isinstance(k, str)}) for row in reader]
 
 
@@ -171,15 +175,11 @@ def _read_number(row: Mapping[str, str], key: str, path: Path, line: int) -> flo
     except ValueError:
         value = float("nan")
     if not np.isfinite(value):
-        raise FormatError(path, f'{key} is "{row[key]}", not a number', line=line)
+        raise FormatError(path, Fact("cell-of-table-not-a-number", column=key, text=row[key]), line=line)
     return value
 
 
 def _find_marker(centres: Mapping[int, Array], text: str, path: Path, line: int) -> int:
     if not text.isdecimal() or int(text) not in centres:
-        raise FormatError(path, f"marker {text} was not measured in the model; {_list_measured(centres)}", line=line)
+        raise FormatError(path, Fact("marker-of-table-not-measured", marker=text, measured=sorted(centres)), line=line)
     return int(text)
-
-
-def _list_measured(centres: Mapping[int, Array]) -> str:
-    return f"those that were: {', '.join(map(str, sorted(centres)))}" if centres else "no marker was"

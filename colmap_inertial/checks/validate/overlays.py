@@ -11,6 +11,7 @@ import numpy as np
 from colmap_inertial.checks.validate.result import Validation, ViewResiduals
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import opencv_px_from_colmap
 
 #: Residuals are drawn this many times longer than they are.
@@ -64,7 +65,7 @@ def _write_frame(view: ViewResiduals, source: Path, path: Path) -> None:
 
     image = cv2.imread(str(source), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
-        raise FormatError(source, "the image cannot be read any more")
+        raise FormatError(source, Fact("image-gone"))
     size = max(image.shape[:2]) / 1000
     line, radius = max(1, round(1.2 * size)), max(3, round(5 * size))
     seen, expected = opencv_px_from_colmap(view.observed_px), opencv_px_from_colmap(view.projected_px)
@@ -85,7 +86,7 @@ def _write_frame(view: ViewResiduals, source: Path, path: Path) -> None:
     image[bottom - height - 6 :] = image[bottom - height - 6 :] // 3
     cv2.putText(image, words, (8, bottom), cv2.FONT_HERSHEY_SIMPLEX, scale, _WHITE, line, cv2.LINE_AA)
     if not cv2.imwrite(str(path), image, [cv2.IMWRITE_JPEG_QUALITY, 90]):
-        raise FormatError(path, "the picture cannot be written")
+        raise FormatError(path, Fact("picture-not-written"))
 
 
 _SHIFT = 4

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 from colmap_inertial.core.errors import InertialError
+from colmap_inertial.core.facts import Fact
 
 Kind = Literal["checkerboard", "charuco", "aprilgrid", "aruco"]
 
@@ -32,17 +33,11 @@ DICTIONARIES = {
 #: The tag family of Kalibr's AprilGrid.
 APRILGRID_DICTIONARY = "APRILTAG_36H11"
 
-_FORMS: dict[str, tuple[str, str]] = {
-    "checkerboard": ("checkerboard:COLSxROWS:SQUARE_M", "COLSxROWS counts inner corners, as in checkerboard:9x6:0.025"),
-    "charuco": (
-        "charuco:COLSxROWS:SQUARE_M:MARKER_M:DICT",
-        "COLSxROWS counts squares, as in charuco:7x5:0.04:0.03:DICT_4X4_50",
-    ),
-    "aprilgrid": (
-        "aprilgrid:COLSxROWS:TAG_M:GAP",
-        "COLSxROWS counts tags, GAP is the gap between tags divided by the tag's side, as in aprilgrid:6x6:0.088:0.3",
-    ),
-    "aruco": ("aruco:DICT:SIDE_M", "SIDE_M is the side of the black square, as in aruco:DICT_4X4_50:0.1"),
+_FORMS = {
+    "checkerboard": "checkerboard:COLSxROWS:SQUARE_M",
+    "charuco": "charuco:COLSxROWS:SQUARE_M:MARKER_M:DICT",
+    "aprilgrid": "aprilgrid:COLSxROWS:TAG_M:GAP",
+    "aruco": "aruco:DICT:SIDE_M",
 }
 _LONGEST_M = 10.0
 
@@ -58,13 +53,12 @@ class TargetSpecError(InertialError):
         What is wrong with it.
     """
 
-    def __init__(self, spec: str, reason: str) -> None:
+    def __init__(self, spec: str, reason: Fact) -> None:
         self.spec = spec
         kind = spec.split(":", 1)[0].strip().lower()
-        forms = [_FORMS[kind]] if kind in _FORMS else list(_FORMS.values())
-        expected = " or ".join(form for form, _ in forms)
-        note = f" ({forms[0][1]})" if len(forms) == 1 else ""
-        super().__init__(f'target "{spec}": {reason}; expected {expected}{note}')
+        known = kind if kind in _FORMS else None
+        forms = tuple(_FORMS.values()) if known is None else (_FORMS[known],)
+        super().__init__(Fact("target-unreadable", spec=spec, why=reason, kind=known, forms=forms))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -203,10 +197,10 @@ def parse_target(text: str) -> Target:
     kind, *fields = (field.strip() for field in text.split(":"))
     kind = kind.lower()
     if kind not in _FORMS:
-        raise TargetSpecError(text, f'unknown kind of target "{kind}"')
-    wanted = _FORMS[kind][0].split(":")[1:]
+        raise TargetSpecError(text, Fact("target-kind-unknown", kind=kind))
+    wanted = _FORMS[kind].split(":")[1:]
     if len(fields) != len(wanted):
-        raise TargetSpecError(text, f"{len(fields)} fields after {kind}, not {len(wanted)}")
+        raise TargetSpecError(text, Fact("target-fields", found=len(fields), kind=kind, wanted=len(wanted)))
     if kind == "checkerboard":
         columns, rows = _parse_size(text, fields[0], least=3)
         return _make_grid(text, "checkerboard", columns, rows, _parse_length(text, "SQUARE_M", fields[1]))
@@ -214,7 +208,7 @@ def parse_target(text: str) -> Target:
         columns, rows = _parse_size(text, fields[0], least=3)
         square_m, marker_m = _parse_length(text, "SQUARE_M", fields[1]), _parse_length(text, "MARKER_M", fields[2])
         if marker_m >= square_m:
-            raise TargetSpecError(text, f"the marker ({marker_m} m) must be smaller than the square ({square_m} m)")
+            raise TargetSpecError(text, Fact("marker-larger-than-square", marker_m=marker_m, square_m=square_m))
         dictionary = _parse_dictionary(text, fields[3], columns * rows // 2)
         board = _make_grid(text, "charuco", columns, rows, square_m)
         return replace(board, marker_m=marker_m, dictionary=dictionary)
@@ -222,7 +216,7 @@ def parse_target(text: str) -> Target:
         columns, rows = _parse_size(text, fields[0], least=1)
         gap = _parse_number(text, "GAP", fields[2])
         if not 0 < gap <= 1:
-            raise TargetSpecError(text, f"GAP is {gap}: the gap divided by the tag's side lies between 0 and 1")
+            raise TargetSpecError(text, Fact("gap-out-of-range", gap=gap))
         _parse_dictionary(text, APRILGRID_DICTIONARY, columns * rows)
         return _make_aprilgrid(text, columns, rows, _parse_length(text, "TAG_M", fields[1]), gap)
     dictionary = _parse_dictionary(text, fields[0], 1)
@@ -237,9 +231,9 @@ def _parse_with_sigma(text: str) -> Target:
     sigma_m = _parse_length(text, "what follows +-", number)
     length = before.rpartition(":")[2].strip()
     if float(length) != target.length_m:
-        raise TargetSpecError(text, "+- belongs to the side of a square, tag or marker")
+        raise TargetSpecError(text, Fact("sigma-of-another-length"))
     if sigma_m > 0.2 * target.length_m:
-        raise TargetSpecError(text, f"+- {sigma_m:g} m is more than a fifth of the length")
+        raise TargetSpecError(text, Fact("sigma-too-large", sigma_m=sigma_m))
     return replace(target, spec=text, sigma_m=sigma_m)
 
 
@@ -247,34 +241,34 @@ def _parse_number(spec: str, name: str, text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise TargetSpecError(spec, f'{name} is "{text}", not a number') from None
+        raise TargetSpecError(spec, Fact("not-a-number-in-target", name=name, text=text)) from None
 
 
 def _parse_length(spec: str, name: str, text: str) -> float:
     value = _parse_number(spec, name, text)
     if not (np.isfinite(value) and value > 0):
-        raise TargetSpecError(spec, f"{name} is {text}: a length must be positive")
+        raise TargetSpecError(spec, Fact("length-not-positive", name=name, text=text))
     if value > _LONGEST_M:
-        raise TargetSpecError(spec, f"{name} is {text}: lengths are metres, so {text} mm is {value / 1000:g}")
+        raise TargetSpecError(spec, Fact("length-in-millimetres", name=name, text=text, value=value))
     return value
 
 
 def _parse_size(spec: str, text: str, *, least: int) -> tuple[int, int]:
     match = re.fullmatch(r"(\d+)[xX](\d+)", text)
     if match is None:
-        raise TargetSpecError(spec, f'COLSxROWS is "{text}", not two whole numbers with an x between them')
+        raise TargetSpecError(spec, Fact("board-size-unreadable", text=text))
     columns, rows = int(match[1]), int(match[2])
     if min(columns, rows) < least or max(columns, rows) > 100:
-        raise TargetSpecError(spec, f"COLSxROWS is {text}: each must be from {least} to 100")
+        raise TargetSpecError(spec, Fact("board-size-out-of-range", text=text, least=least))
     return columns, rows
 
 
 def _parse_dictionary(spec: str, text: str, markers: int) -> str:
     name = text.upper().removeprefix("DICT_")
     if name not in DICTIONARIES:
-        raise TargetSpecError(spec, f'unknown dictionary "{text}" (known: {", ".join(DICTIONARIES)})')
+        raise TargetSpecError(spec, Fact("dictionary-unknown", text=text, known=tuple(DICTIONARIES)))
     if markers > DICTIONARIES[name]:
-        raise TargetSpecError(spec, f"needs {markers} markers, and {name} has {DICTIONARIES[name]}")
+        raise TargetSpecError(spec, Fact("dictionary-too-small", markers=markers, name=name, has=DICTIONARIES[name]))
     return name
 
 

@@ -62,7 +62,7 @@ class View:
             data = read_bytes(self.path, what="picture")
             require_modest(self.path, data)
         except FormatError as error:
-            return error.fact or Fact.stated(error.reason)
+            return error.fact
         flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
         if image is None:
@@ -132,15 +132,15 @@ def load_views(model: Path | pycolmap.Reconstruction, images: Path) -> tuple[lis
     if isinstance(model, Path):
         others = [] if model_format(model) else sorted(p.name for p in model.glob("*") if model_format(p))
         if others:
-            raise FormatError(model, f"holds models in its folders {', '.join(others)}: give one of them")
+            raise FormatError(model, Fact("models-in-folders", folders=others))
         reconstruction = read_model(model)
     else:
         reconstruction = model
     if not images.is_dir():
-        raise FormatError(images, "not a folder: give the folder with the model's images")
+        raise FormatError(images, Fact("not-a-folder-of-images"))
     posed = sorted((i for i in reconstruction.images.values() if i.has_pose), key=lambda image: image.name)
     if not posed:
-        raise FormatError(model if isinstance(model, Path) else "model", "holds no image with a pose")
+        raise FormatError(model if isinstance(model, Path) else "model", Fact("no-image-with-pose"))
     middle = np.median([image.projection_center() for image in posed], axis=0)
     views, missing = [], dict[str, Fact]()
     for image in posed:
@@ -163,7 +163,7 @@ def load_views(model: Path | pycolmap.Reconstruction, images: Path) -> tuple[lis
     if not views:
         raise FormatError(
             images,
-            f"holds none of the model's {len(posed)} images (the first would be {posed[0].name}); names must match",
+            Fact("images-of-model-missing", count=len(posed), first=posed[0].name),
         )
     return views, missing
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 from colmap_inertial.core.types.consensus import RotationConsensus, Seam, WrongCamera
 from colmap_inertial.core.types.estimated import (
     DOWN_IN_WORLD,
-    UNDOES,
     AcceptedScale,
     CameraMotion,
     Gap,
@@ -59,7 +58,6 @@ __all__ = [
     "CAL",
     "CALIBRATION_PARAMETERS",
     "DOWN_IN_WORLD",
-    "UNDOES",
     "IMU_CAL",
     "IMU_CALIBRATION_PARAMETERS",
     "JOINT_GYRO_WALK_RAD_S_RTS",

@@ -11,7 +11,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, check_field, check_fields, check_increasing, set_fields
 from colmap_inertial.core.errors import NotObservableError
-from colmap_inertial.core.facts import Fact, as_fact, sentences, with_sentences
+from colmap_inertial.core.facts import Fact, as_fact, with_sentences
 from colmap_inertial.core.geometry import matrix_from_quat, rotation_between, skew
 from colmap_inertial.core.options import WorldAxes
 from colmap_inertial.core.summary import prints_in_lines
@@ -23,9 +23,6 @@ Verdict = Literal["trusted", "weak", "refused"]
 
 #: The direction of gravity in a metric world with these axes: ``y-down`` is COLMAP's and computer vision's habit.
 DOWN_IN_WORLD = {"z-up": np.array([0.0, 0.0, -1.0]), "y-down": np.array([0.0, 1.0, 0.0])}
-
-#: What the provenance of a similarity begins with that takes another one back.
-UNDOES = "undoes: "
 
 
 @prints_in_lines
@@ -245,7 +242,7 @@ class ScaleEstimate:
             When it was refused.
         """
         if self.metres_per_unit is None or self.sigma_log is None or self.ci95 is None:
-            raise NotObservableError("scale", "; ".join(sentences(self.reasons)))
+            raise NotObservableError("scale", Fact("scale-refused", reasons=self.reasons))
         return AcceptedScale(metres_per_unit=self.metres_per_unit, sigma_log=self.sigma_log, ci95=self.ci95)
 
     def as_json(self) -> dict[str, object]:
@@ -292,6 +289,8 @@ class Similarity:
         (7, 7) of log scale, rotation (rad, target frame, left), translation (m).
     provenance
         Where it comes from, in words.
+    undoes
+        The provenance of the similarity that this one takes back; ``None`` where it takes none back.
     """
 
     scale: float
@@ -299,6 +298,7 @@ class Similarity:
     translation_m: Array
     cov: Array
     provenance: str = ""
+    undoes: str | None = None
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.scale) and self.scale > 0):
@@ -315,7 +315,7 @@ class Similarity:
             When the scale was refused.
         """
         if estimate.metres_per_unit is None or estimate.gravity_in_world_m_s2 is None:
-            raise NotObservableError("scale", "; ".join(sentences(estimate.reasons)))
+            raise NotObservableError("scale", Fact("scale-refused", reasons=estimate.reasons))
         down = DOWN_IN_WORLD[world]
         gravity = estimate.gravity_in_world_m_s2
         rotation = rotation_between(gravity, down)

@@ -298,7 +298,7 @@ def bring_together(
         try:
             shift = gyro_shift(gyro.motion, gyro.camera, gyro.short, gyro.long)
         except NotObservableError as error:
-            note = error.why
+            note = error.fact
     height, width = short.shape[:2]
     top = np.iinfo(long.dtype).max
     clipped = long >= np.ceil(BRIGHTNESS_LIMITS.clipped * top)

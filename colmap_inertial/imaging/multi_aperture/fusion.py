@@ -9,6 +9,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import AnyArray, BoolArray, Float32Array
 from colmap_inertial.core.errors import InertialError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ApertureOptions
 from colmap_inertial.core.types import ApertureRig, SpectralRole
 from colmap_inertial.imaging.multi_aperture._fill import fill_hidden
@@ -69,8 +70,7 @@ def require_colours(rig: ApertureRig) -> None:
     missing = [role for role in COLOURS if role not in roles]
     if missing:
         raise InertialError(
-            f"fused pictures need a red, a green and a blue aperture; {', '.join(missing)} is missing among "
-            f"{', '.join(f'{a.name} ({a.role})' for a in rig.apertures)}"
+            Fact("colours-missing", missing=missing, apertures=tuple(f"{a.name} ({a.role})" for a in rig.apertures))
         )
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from colmap_inertial.core.arrays import AnyArray, Float32Array
 from colmap_inertial.core.errors import FormatError, InertialError, MissingExtraError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.threads import usable_processors
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath
@@ -29,10 +30,6 @@ _CUDA, _CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
 _INPUTS = ("picture", "aid", "blur")
 _BLUR_CHANNELS: dict[NetworkName, int] = {"deepgyro": 5, "lsd2": 3}
 _OUTPUT = "restored"
-_MORE_MEMORY = {
-    "cuda": "if memory is short, close what else uses the GPU, or hide it (CUDA_VISIBLE_DEVICES=) to use the processor",
-    "cpu": "if memory is short, make room: each picture in work takes about half a gigabyte",
-}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -137,8 +134,7 @@ class Network:
                 (restored,) = self._session.run([_OUTPUT], feeds)
             except Exception as error:  # as in _start_session
                 raise InertialError(
-                    f"the network {self.name} failed on {self.device} ({_first_line(error)}); "
-                    + _MORE_MEMORY[self.device]
+                    Fact("network-failed", network=self.name, device=self.device, detail=_first_line(error))
                 ) from None
             _tiles.put(result, np.asarray(restored, dtype=np.float32)[0], row, column)
         return result
@@ -214,7 +210,7 @@ def _import_runtime() -> Any:
     try:
         import onnxruntime
     except ImportError:
-        raise MissingExtraError("restore", "networks run in onnxruntime") from None
+        raise MissingExtraError("restore", Fact("needs-onnxruntime")) from None
     return onnxruntime
 
 
@@ -222,16 +218,14 @@ def _choose_device(device: Device) -> Literal["cpu", "cuda"]:
     """Devices to try, in order."""
     available = _CUDA in _import_runtime().get_available_providers()
     if device == "cuda" and not available:
-        raise InertialError(
-            "this onnxruntime has no CUDA: install onnxruntime-gpu in place of onnxruntime, or use the processor"
-        )
+        raise InertialError(Fact("onnxruntime-without-cuda"))
     return "cuda" if available and device != "cpu" else "cpu"
 
 
 def _require_device(network: Network, device: Device) -> None:
     """Raise where a device was asked for by name, and onnxruntime could not start on it."""
     if device == "cuda" and network.device != "cuda":
-        raise InertialError(f"{network.name} cannot run on CUDA: onnxruntime found no device, or lacks CUDA or cuDNN")
+        raise InertialError(Fact("cuda-not-usable", network=network.name))
 
 
 def _start_session(
@@ -251,7 +245,7 @@ def _start_session(
         return runtime.InferenceSession(model, options, providers=[*cuda, _CPU])
     # onnxruntime has an exception of its own for each of its codes, without a common base
     except Exception as error:
-        raise FormatError(source, f"onnxruntime cannot read it as a network ({_first_line(error)})") from None
+        raise FormatError(source, Fact("not-a-network", detail=_first_line(error))) from None
 
 
 def _require_contract(session: onnxruntime.InferenceSession, source: str, blur_channels: int) -> None:
@@ -261,8 +255,13 @@ def _require_contract(session: onnxruntime.InferenceSession, source: str, blur_c
     if inputs != dict.fromkeys(_INPUTS, "tensor(float)") or _OUTPUT not in outputs:
         raise FormatError(
             source,
-            f"takes {', '.join(f'{k} {v}' for k, v in inputs.items())} and gives {', '.join(outputs)}; a network that "
-            f"restores pictures takes {', '.join(_INPUTS)}, all tensor(float), and gives {_OUTPUT}",
+            Fact(
+                "wrong-network",
+                takes=tuple(f"{k} {v}" for k, v in inputs.items()),
+                gives=outputs,
+                wanted_takes=_INPUTS,
+                wanted_gives=_OUTPUT,
+            ),
         )
     for height, width in ((32, 48), (48, 32)):
         image = np.zeros((1, 3, height, width), dtype=np.float32)
@@ -270,10 +269,12 @@ def _require_contract(session: onnxruntime.InferenceSession, source: str, blur_c
         try:
             (restored,) = session.run([_OUTPUT], {"picture": image, "aid": image, "blur": blur})
         except Exception as error:  # as above
-            raise FormatError(source, f"does not run on {width} x {height} px ({_first_line(error)})") from None
+            raise FormatError(
+                source, Fact("network-does-not-run", width=width, height=height, detail=_first_line(error))
+            ) from None
         shape = np.shape(restored)
         if shape != image.shape:
-            raise FormatError(source, f"makes {shape} of {image.shape}; a picture must keep its size")
+            raise FormatError(source, Fact("network-changes-size", made=shape, given=image.shape))
 
 
 def _first_line(error: Exception) -> str:

@@ -9,10 +9,9 @@ from importlib.resources.abc import Traversable
 from typing import Literal
 
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 
 NetworkName = Literal["deepgyro", "lsd2"]
-
-_AGAIN = "install colmap-inertial again"
 
 
 def folder() -> Traversable:
@@ -37,11 +36,11 @@ def checksum(name: NetworkName) -> str:
     try:
         expected = json.loads(file.read_bytes())[f"{name}.onnx"]
     except FileNotFoundError:
-        raise FormatError(str(file), f"is missing, and with it the network {name}; {_AGAIN}") from None
+        raise FormatError(str(file), Fact("checksums-missing", network=name)) from None
     except (ValueError, LookupError, TypeError):
-        raise FormatError(str(file), f"does not name the network {name}; {_AGAIN}") from None
+        raise FormatError(str(file), Fact("checksum-unstated", network=name)) from None
     if not isinstance(expected, str):
-        raise FormatError(str(file), f"does not name the network {name}; {_AGAIN}")
+        raise FormatError(str(file), Fact("checksum-unstated", network=name))
     return expected
 
 
@@ -58,7 +57,7 @@ def read_model(name: NetworkName) -> bytes:
     try:
         model = file.read_bytes()
     except FileNotFoundError:
-        raise FormatError(str(file), f"is missing; {_AGAIN}") from None
+        raise FormatError(str(file), Fact("network-missing")) from None
     if hashlib.sha256(model).hexdigest() != expected:
-        raise FormatError(str(file), f"is damaged ({len(model)} bytes, not those of its checksum); {_AGAIN}")
+        raise FormatError(str(file), Fact("network-damaged", size_bytes=len(model)))
     return model

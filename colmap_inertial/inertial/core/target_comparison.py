@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import IMU_CAL, ImuCalibration
 from colmap_inertial.inertial.core.priors import PRIORS
 
@@ -66,7 +67,7 @@ def calibrate_by_targets(
         Without a comparison.
     """
     if not comparisons:
-        raise NotObservableError("IMU calibration", "no result was compared with a target")
+        raise NotObservableError("IMU calibration", Fact("no-result-with-target"))
     error = np.array([one.error_log for one in comparisons])
     accel = np.array([one.accel_sigma_log for one in comparisons])
     of_target = np.array([[one.target == other.target for other in comparisons] for one in comparisons])

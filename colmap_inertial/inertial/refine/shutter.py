@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import FrameTiming, ImuRecording, ReadoutDirection, ScaleEstimate
 from colmap_inertial.inertial.refine._residuals import derivatives, project
@@ -22,7 +23,7 @@ from colmap_inertial.inertial.refine.pictures import (
 )
 from colmap_inertial.inertial.refine.setup import Known, Seen, make_problem
 from colmap_inertial.inertial.refine.solve import factored, solve
-from colmap_inertial.inertial.refine.values import READOUT
+from colmap_inertial.inertial.refine.values import FIRST_INTRINSIC, READOUT, Estimate, Problem
 from colmap_inertial.inertial.scale.verdict import finite, half_width, verdict_of, without_width
 from colmap_inertial.model import colmap_camera
 
@@ -44,6 +45,11 @@ class ShutterLimits:
     most: int = 15_000
     #: Steps of the refinement: from a global shutter, three come within 3 to 11 % of 20 ms (``study_refine_real.py``).
     steps: int = 3
+    #: A declared global shutter is contradicted by a readout of at least so many standard deviations and this length; a
+    #: declared focal length by one that is as surely another, and by this share.
+    contradicts_sigmas: float = 5.0
+    contradicts_s: float = 3e-3
+    contradicts_focal: float = 0.03
     #: One that is found is followed on, so many times as far, until it moves by less than this share of its deviation.
     rounds: int = 5
     settled_sigma: float = 0.2
@@ -54,6 +60,32 @@ class ShutterLimits:
 SHUTTER_LIMITS = ShutterLimits()
 #: The code of what is wrong with the scale of a model that ignores a rolling shutter.
 SHUTTER_IGNORED = "rolling-shutter-ignored"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeenFocal:
+    """Focal length of the camera with the most observations, by these.
+
+    Attributes
+    ----------
+    model_px, found_px, sigma_px
+        Of the model; by a few steps with the intrinsics free, and its standard deviation.
+    """
+
+    model_px: float
+    found_px: float
+    sigma_px: float
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether it is another than the model's, and by how much matters."""
+        off_px = abs(self.found_px - self.model_px)
+        limits = SHUTTER_LIMITS
+        return off_px > max(limits.contradicts_focal * self.model_px, limits.contradicts_sigmas * self.sigma_px)
+
+    def as_fact(self) -> Fact:
+        """What is wrong with a model whose intrinsics were declared."""
+        return Fact("declared-focal-length", declared_px=self.model_px, found_px=self.found_px, sigma_px=self.sigma_px)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,35 +101,47 @@ class SeenReadout:
     rate_hz
         How fast images move, in focal lengths, root mean square of their medians: times the readout, what they are
         stretched by.
+    focal
+        What was found of the camera on the way; ``None`` where its intrinsics were not free.
     """
 
     readout_s: float
     sigma_s: float
     direction: ReadoutDirection
     rate_hz: float
+    focal: SeenFocal | None = None
 
     @property
     def is_found(self) -> bool:
         """Whether lines were exposed one after the other, as surely as the refinement asks for."""
         return self.readout_s >= max(SHUTTER_LIMITS.least_s, SHUTTER_LIMITS.sure_sigma * self.sigma_s)
 
-    def as_fact(self) -> Fact:
+    @property
+    def contradicts_global(self) -> bool:
+        """Whether lines were exposed one after the other though a global shutter was declared."""
+        limits = SHUTTER_LIMITS
+        return self.readout_s >= max(limits.contradicts_s, limits.contradicts_sigmas * self.sigma_s)
+
+    def as_fact(self, *, declared_global: bool = False) -> Fact:
         """What is wrong with the model's scale then."""
-        return Fact(SHUTTER_IGNORED, readout_s=self.readout_s, sigma_s=self.sigma_s, direction=self.direction)
+        declared = {"declared_global": True} if declared_global else {}
+        return Fact(
+            SHUTTER_IGNORED, readout_s=self.readout_s, sigma_s=self.sigma_s, direction=self.direction, **declared
+        )
 
     def _unknown(self, sigma_log: float) -> Fact:
         """Why a scale is refused that a shutter leaves open."""
         longest_s = self.readout_s + 2 * self.sigma_s
         return Fact("rolling-shutter-possible", readout_s=longest_s, half_width=finite(half_width(sigma_log)))
 
-    def widen(self, estimate: ScaleEstimate) -> ScaleEstimate:
+    def widen(self, estimate: ScaleEstimate, *, declared_global: bool = False) -> ScaleEstimate:
         """A scale as uncertain as such a shutter makes it; weak where it was found, as the refinement takes it in."""
         assert estimate.parts is not None and estimate.cov is not None
         accepted = estimate.accepted
         sigma = float(np.hypot(self.readout_s, self.sigma_s)) * self.rate_hz
         checks = without_width(estimate.reasons)
         if self.is_found:
-            checks.append(self.as_fact())
+            checks.append(self.as_fact(declared_global=declared_global))
         sigma_log = float(np.hypot(accepted.sigma_log, sigma))
         verdict, ci95, reasons = verdict_of(accepted.metres_per_unit, sigma_log, checks)
         if verdict == "refused":
@@ -163,7 +207,8 @@ def _measure(seen: Seen, timing: FrameTiming, imu: ImuRecording, known: Known, r
     for _ in range(rounds):
         before_s = x.readout_s
         x = solve(problem, x, most_steps=SHUTTER_LIMITS.steps).estimate
-        variance = float(factored(problem, x, damping=SHUTTER_LIMITS.damping).shared_cov()[READOUT, READOUT])
+        cov = factored(problem, x, damping=SHUTTER_LIMITS.damping).shared_cov()
+        variance = float(cov[READOUT, READOUT])
         if abs(x.readout_s - before_s) < SHUTTER_LIMITS.settled_sigma * variance**0.5:
             break
     observations = problem.observations
@@ -180,4 +225,24 @@ def _measure(seen: Seen, timing: FrameTiming, imu: ImuRecording, known: Known, r
         sigma_s=float(np.hypot(variance**0.5, SHUTTER_LIMITS.cut_share * x.readout_s)),
         direction=timing.readout_direction if x.readout_s >= 0 else _OPPOSITE[timing.readout_direction],
         rate_hz=float(np.sqrt(np.mean(np.square(of_images)))) / focal_px,
+        focal=_focal_of(problem, start, x, cov),
+    )
+
+
+def _focal_of(problem: Problem, start: Estimate, x: Estimate, cov: Array) -> SeenFocal | None:
+    """Mean focal length of the camera with the most observations."""
+    of_camera = np.bincount(problem.camera_of[problem.observations.frame], minlength=len(problem.cameras))
+    number = int(np.argmax(of_camera))
+    before = sum(len(camera.free) for camera in problem.cameras[:number])
+    camera = problem.cameras[number]
+    focal = [i for i, place in enumerate(camera.free) if place in colmap_camera(camera.model).focal_length_idxs()]
+    if not focal:
+        return None
+    at = before + np.array(focal)
+    mean = np.zeros(len(cov))
+    mean[FIRST_INTRINSIC + at] = 1 / len(at)
+    return SeenFocal(
+        model_px=float(start.intrinsics[at].mean()),
+        found_px=float(x.intrinsics[at].mean()),
+        sigma_px=float(mean @ cov @ mean) ** 0.5,
     )

@@ -279,7 +279,7 @@ def _estimate_or_refuse(
             notes=(*estimate.notes, *stretched, *describe_consensus(consensus), *find_remarks(trajectory, timed)),
         )
     except NotObservableError as error:
-        return ScaleEstimate.refused(options.method, Fact("not-observable", quantity=error.quantity, why=error.why))
+        return ScaleEstimate.refused(options.method, Fact("not-observable", quantity=error.quantity, why=error.fact))
 
 
 def _estimate_without_moved(

@@ -35,6 +35,7 @@ from colmap_inertial.core.types import (
 from colmap_inertial.inertial.core import parameters as par
 from colmap_inertial.inertial.core.parameters import Prior
 from colmap_inertial.inertial.core.priors import PRIORS, AccelPart, accel_part, clock_scale_sigma
+from colmap_inertial.inertial.scale._declared import find_contradicted_lever, open_lever
 from colmap_inertial.inertial.scale._fit import Fit, fit_jointly
 from colmap_inertial.inertial.scale._gain import WrongGain, exceeds_usual, judge_gain
 from colmap_inertial.inertial.scale._setup import Data, prepare
@@ -130,20 +131,25 @@ def estimate_joint(
     accel, expected_s = accel_part(timed.imu), timed.calibration.accel_delay_s
     try:
         timed, data, prior, fit = _fit_in_step(trajectory, timed, options)
+        lever = find_contradicted_lever(fit, prior)
+        if lever is not None:
+            prior = open_lever(prior)
+            fit = fit_jointly(data, prior, timed.imu.noise)
         fit, faults = _fit_soundly(fit, data, prior, timed.imu.noise)
         shape = Shape()
         # a path that was smoothed has no shape to speak of
         if not faults.path_is_smoothed:
             fit, shape = _fit_shapely(fit, faults.undone(data), faults.loosened(prior), timed.imu.noise, accel=accel)
     except NotObservableError as error:
-        return ScaleEstimate.refused("joint", error.why)
+        return ScaleEstimate.refused("joint", error.fact)
     except np.linalg.LinAlgError:
         return ScaleEstimate.refused("joint", Fact("fit-singular"))
     left_open = sum(suspicion.scale_variance for suspicion in fit.suspicions if suspicion.name in faults.values)
     moved_s = timed.calibration.accel_delay_s - expected_s
     lags, taken_log = _find_lag(fit, moved_s) if "bandwidth" not in faults.values else ([], 0.0)
     fit = replace(fit, variance_parts={**fit.variance_parts, "accel_faults": left_open + taken_log**2})
-    wrong = [*faults.as_facts(), *lags, *_cut_off(data)]
+    declared = [] if lever is None else [lever]
+    wrong = [*declared, *faults.as_facts(), *lags, *_cut_off(data)]
     # what was taken from a path nobody can put back: its scale is too large by more than any interval says
     estimate = _judged(fit, data.t_s, timed.calibration, accel, wrong, shape, worthless=faults.path_is_smoothed)
     notes = (*estimate.notes, *_out_of_step(moved_s))
@@ -346,7 +352,7 @@ def _judged(
         reasons = (*reasons, *(() if worthless else wrong))
     else:
         bent = [fault.as_fact(t_s, scale.widened) for fault in shape.doubtful] or _check_drift(fit.drift)
-        large, usual = _check_gains(fit, scale)
+        large, usual = _check_gains(fit, scale, accel)
         doubts = [*wrong, *check_clocks(clock_rate), *_check_length(t_s), *_check_rest(fit), *large, *bent]
         verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, doubts)
         # what is in the interval makes nothing weak by itself; where the interval is wide, it may be why
@@ -480,9 +486,14 @@ def _check_rest(fit: Fit) -> list[Fact]:
     return [] if fit.converged else [Fact("fit-hardly-converged", moves_log=fit.unsettled_log)]
 
 
-def _check_gains(fit: Fit, scale: FoundScale) -> tuple[list[Fact], list[Fact]]:
-    """Gains of the accelerometer: larger than any sensor's, and others that are worth a word."""
+def _check_gains(fit: Fit, scale: FoundScale, accel: AccelPart) -> tuple[list[Fact], list[Fact]]:
+    """Gains of the accelerometer: larger than any sensor's, and others that are worth a word.
+
+    Of a calibrated one they are zero, and others contradict the calibration.
+    """
     gains, wrong_gain = fit.estimate.accel_gain, scale.wrong_gain
+    if fit.gain_chi2 > par.LARGEST_GAIN_CHI2 and accel.calibrated:
+        return [Fact("calibrated-gain-contradicted", gains=-np.diagonal(gains))], []
     if fit.gain_chi2 > par.LARGEST_GAIN_CHI2:
         sigma = np.sqrt(scale.widened * np.diagonal(fit.cov[par.ACCEL_GAIN, par.ACCEL_GAIN])).reshape(3, 3)
         found = Fact("accel-gain-large", gains=-np.diagonal(gains))

@@ -332,7 +332,7 @@ def estimate_spectral(
             raise NotObservableError("scale", Fact("never-covered", needed_s=SHORTEST_S))
         fit = fit_spectra(signals.spectra(options.highest_hz), calibration, options.gravity_m_s2)
     except NotObservableError as error:
-        return ScaleEstimate.refused("spectral", error.why, calibration=calibration)
+        return ScaleEstimate.refused("spectral", error.fact, calibration=calibration)
     checks, refusals = _checks(signals, calibration, options, fit)
     verdict, ci95, reasons = verdict_of(fit.metres_per_unit, fit.sigma_log, checks, refusals=refusals)
     if verdict == "refused":

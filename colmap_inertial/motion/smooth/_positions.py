@@ -16,6 +16,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import CameraTrajectory, SmoothedTrajectory
 
 
@@ -332,7 +333,7 @@ class PositionSmoother:
         options = options or SmoothOptions()
         count = len(trajectory)
         if count < 6:
-            raise NotObservableError("smooth motion", f"{count} poses are too few to tell motion from noise")
+            raise NotObservableError("smooth motion", Fact("poses-too-few-to-smooth", count=count))
         centre = trajectory.cam_in_world - trajectory.cam_in_world.mean(axis=0)
         size = float(np.sqrt(np.mean(centre**2))) or 1.0
         step_s = float(np.median(np.diff(trajectory.t_s)))

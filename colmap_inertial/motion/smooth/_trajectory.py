@@ -9,6 +9,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import quat_conjugate, quat_multiply, quat_normalize, quat_rotate
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import (
@@ -113,7 +114,7 @@ def smooth_trajectory(
     )
     t_s, silent = trajectory.t_s, ~inertial.covers(trajectory.t_s)
     if silent.all():
-        raise NotObservableError("smoothed trajectory", "the IMU recorded during none of the frame intervals")
+        raise NotObservableError("smoothed trajectory", Fact("imu-in-no-interval"))
 
     world_from_imu, _ = attitude.at(t_s)
     imu_from_cam = quat_conjugate(calibration.cam_from_imu_xyzw)
@@ -160,10 +161,9 @@ def _require_smoothable(trajectory: CameraTrajectory, imu: ImuRecording) -> None
     if trajectory.length_unit != "m":
         raise ValueError("smooth_trajectory needs a metric trajectory")
     if len(trajectory) < 6:
-        raise NotObservableError("smooth motion", f"{len(trajectory)} poses are too few to tell motion from noise")
+        raise NotObservableError("smooth motion", Fact("poses-too-few-to-smooth", count=len(trajectory)))
     if not imu.has_accel:
-        hint = "the recording has no accelerometer; record it along with the gyroscope"
-        raise NotObservableError("smooth motion", hint)
+        raise NotObservableError("smooth motion", Fact("no-accelerometer-for-gravity"))
 
 
 def _insert_instants(model: _Model, inertial: WorldAcceleration, also_at_s: Array) -> _Model:

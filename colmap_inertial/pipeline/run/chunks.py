@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import ClassVar, Protocol
 
 from colmap_inertial.core.errors import FormatError, InertialError, MappingError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.pipeline.run.runner import remove
 
 log = logging.getLogger(__name__)
@@ -216,17 +217,17 @@ def _watch(process: subprocess.Popen[bytes], number: int, events: queue.SimpleQu
     events.put(number)
 
 
-def require_success(process: subprocess.Popen[bytes], chunk: Chunk, *, if_short: str = "give fewer --workers") -> None:
+def require_success(process: subprocess.Popen[bytes], chunk: Chunk, *, on_worker: bool = False) -> None:
     """Wait for the end of a chunk's process; a ``MappingError`` where it failed or was killed.
 
-    ``if_short`` says what to do where memory is short.
+    ``on_worker`` says whether it ran on a worker of Dask, which decides what to do where memory is short.
     """
     code = end_process(process)
     if code < 0:
-        raise MappingError(f"{chunk.name}: the process was killed (signal {-code}); where memory is short, {if_short}")
+        raise MappingError(Fact("process-killed", work=chunk.name, signal=-code, on_worker=on_worker))
     if code:
         lines = (chunk.folder / "log.txt").read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        raise MappingError(f"{chunk.name} failed: {lines[-1] if lines else f'exit code {code}'}")
+        raise MappingError(Fact("process-failed", work=chunk.name, exit_code=code, detail=lines[-1] if lines else None))
 
 
 def end_process(process: subprocess.Popen[bytes]) -> int:

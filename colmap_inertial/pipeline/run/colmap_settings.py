@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from colmap_inertial.core.errors import FormatError, InertialError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.files import read_text
 from colmap_inertial.model import load_pycolmap
 from colmap_inertial.pipeline.run.runner import fingerprint
@@ -86,28 +87,28 @@ _UNUSED = {
             for way in ("Exhaustive", "Sequential", "VocabTree", "Spatial", "Transitive", "ImagePairs", "Imported")
             for what in ("Matching", "Pairing")
         ],
-        "--mapping.pairing chooses the pairs",
+        "mapping-pairing-chooses",
     ),
-    "DelaunayMeshing": "--dense-options.mesh chooses the mesh",
-    "Render": "it belongs to COLMAP's own window",
+    "DelaunayMeshing": "dense-mesh-chooses",
+    "Render": "of-colmaps-window",
 }
 #: Options of any section that are not COLMAP's to decide here, and what decides in their place.
 _DECIDED = {
-    "num_threads": "--deterministic decides",
-    "random_seed": "--seed decides",
-    "use_gpu": "--mapping.device decides",
-    "type": "--mapping.features decides",
-    "skip_geometric_verification": "pairs are judged by their verified matches",
+    "num_threads": "deterministic-decides",
+    "random_seed": "seed-decides",
+    "use_gpu": "mapping-device-decides",
+    "type": "mapping-features-decides",
+    "skip_geometric_verification": "pairs-by-verified-matches",
     **dict.fromkeys(
         ("single_camera", "single_camera_per_folder", "single_camera_per_image", "existing_camera_id"),
-        "the capture says which camera took an image",
+        "capture-says-camera",
     ),
     **dict.fromkeys(
         (
             *("image_path", "image_names", "image_list_path", "match_list_path", "snapshot_path"),
             *("snapshot_frames_freq", "constant_rig_list_path", "constant_camera_list_path"),
         ),
-        "the run has its own files",
+        "run-has-own-files",
     ),
 }
 
@@ -173,7 +174,7 @@ def read_settings(given: tuple[str, ...], project: Path | None) -> ColmapSetting
         try:
             _check(text)
         except InertialError as error:
-            raise InertialError(f"--colmap {error}") from error
+            raise InertialError(Fact("colmap-setting-wrong", why=error.fact)) from error
     kept = {text.partition("=")[0]: text for text in (*of_file, *given)}
     return ColmapSettings(tuple(kept[name] for name in sorted(kept)))
 
@@ -184,8 +185,8 @@ def _read_project(path: Path) -> Iterator[str]:
     try:
         parser.read_string("[project]\n" + read_text(path), source=str(path))
     except configparser.Error as error:
-        raise FormatError(path, f"is no project.ini of COLMAP: {error.message}") from error
-    wrong = []
+        raise FormatError(path, Fact("no-project-ini", detail=error.message)) from error
+    wrong: list[Fact] = []
     for section in parser.sections()[1:]:
         if section in _UNUSED:
             continue
@@ -198,9 +199,9 @@ def _read_project(path: Path) -> Iterator[str]:
                     log.info("%s: %s", path.name, text)
                     yield text
             except InertialError as error:
-                wrong.append(str(error))
+                wrong.append(error.fact)
     if wrong:
-        raise FormatError(path, "; ".join(wrong))
+        raise FormatError(path, Fact("found-together", found=wrong))
 
 
 def _absolute(value: str, folder: Path) -> str:
@@ -214,13 +215,13 @@ def _check(text: str) -> bool:
     name, equals, _ = text.partition("=")
     section, dot, option = name.partition(".")
     if not (equals and dot):
-        raise InertialError(f"{text}: write SECTION.option=value, as in Mapper.init_num_trials=100")
+        raise InertialError(Fact("setting-unreadable", setting=text))
     if section in _UNUSED:
-        raise InertialError(f"{text}: {_UNUSED[section]}")
+        raise InertialError(Fact("setting-not-taken", setting=text, why=Fact(_UNUSED[section])))
     if section not in _SECTIONS:
-        raise InertialError(f"{text}: COLMAP has no such section{_nearest(section, _SECTIONS)}")
+        raise InertialError(Fact("no-section-of-colmap", setting=text, nearest=_nearest(section, _SECTIONS)))
     if option in _DECIDED:
-        raise InertialError(f"{text}: {_DECIDED[option]}")
+        raise InertialError(Fact("setting-not-taken", setting=text, why=Fact(_DECIDED[option])))
     options = _defaults(section)
     holder, attribute = _find(options, name)
     before = getattr(holder, attribute)
@@ -232,7 +233,7 @@ def _check(text: str) -> bool:
         except ValueError:
             refused = True
         if refused:
-            raise InertialError(f"{text}: COLMAP refuses this value (its default is {_spell(before)})")
+            raise InertialError(Fact("value-refused", setting=text, default=_spell(before)))
     return bool(getattr(holder, attribute) != before)
 
 
@@ -247,7 +248,9 @@ def _set(options: object, text: str) -> None:
     try:
         setattr(holder, attribute, _parse(value.strip(), before))
     except (ValueError, KeyError, TypeError) as error:
-        raise InertialError(f"{text}: {value!r} is no value of {name}, as {_spell(before)} is") from error
+        raise InertialError(
+            Fact("value-of-other-type", setting=text, value=value, name=name, default=_spell(before))
+        ) from error
 
 
 def _find(options: object, name: str) -> tuple[Any, str]:
@@ -260,7 +263,7 @@ def _find(options: object, name: str) -> tuple[Any, str]:
             return holder, option.removeprefix(prefix)
         known += [f"{section}.{prefix}{key}" for key in plain]
     if not known:
-        raise InertialError(f"{name}: the installed pycolmap has no {section}")
+        raise InertialError(Fact("section-not-installed", name=name, section=section))
     # versions of COLMAP moved options between the sections of a step
     steps = [other for other, kind in _SECTIONS.items() if kind.step == _SECTIONS[section].step]
     moved = [
@@ -269,7 +272,7 @@ def _find(options: object, name: str) -> tuple[Any, str]:
         for _, holder in _holders(_defaults(other), other)
         if option in _plain_names(holder)
     ]
-    raise InertialError(f"{name}: COLMAP has no such option{_nearest(name, moved or known)}")
+    raise InertialError(Fact("no-such-setting", name=name, nearest=_nearest(name, moved or known)))
 
 
 def _defaults(section: str) -> object:
@@ -308,6 +311,6 @@ def _spell(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) else str(getattr(value, "name", value))
 
 
-def _nearest(word: str, known: Iterable[str]) -> str:
+def _nearest(word: str, known: Iterable[str]) -> str | None:
     like = difflib.get_close_matches(word, list(known), n=1, cutoff=0.4)
-    return f"; did you mean {like[0]}?" if like else ""
+    return like[0] if like else None

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 from colmap_inertial.core.choices import check_value
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.files import StrPath, read_bytes, reader
 from colmap_inertial.io.toml_section import parse_toml
 
@@ -59,7 +60,7 @@ def read_values(path: Path) -> dict[str, Any]:
     try:
         return parse_toml(path, read_bytes(path).decode())
     except UnicodeDecodeError as error:
-        raise FormatError(path, f"not valid TOML: {error}") from error
+        raise FormatError(path, Fact("invalid-toml", detail=str(error))) from error
 
 
 def override_options(options: Options, values: Mapping[str, Any], path: Path) -> Options:
@@ -112,16 +113,23 @@ def _build(path: Path, cls: type[Options], values: Mapping[str, Any], prefix: st
     for key, value in values.items():
         if key not in known:
             near = difflib.get_close_matches(key, known, n=1)
-            hint = f"; did you mean {prefix}{near[0]}?" if near else f"; known here: {', '.join(known)}"
-            raise FormatError(path, f"unknown option {prefix}{key}{hint}")
+            raise FormatError(
+                path,
+                Fact(
+                    "unknown-option",
+                    option=f"{prefix}{key}",
+                    nearest=f"{prefix}{near[0]}" if near else None,
+                    known=known,
+                ),
+            )
         hint_type = hints[key]
         if dataclasses.is_dataclass(hint_type):
             if not isinstance(value, Mapping):
-                raise FormatError(path, f"{prefix}{key} is a table of options")
+                raise FormatError(path, Fact("option-is-a-table", option=f"{prefix}{key}"))
             built[key] = _build(path, typing.cast(type, hint_type), value, f"{prefix}{key}.")
         else:
             built[key] = value
     try:
         return cls(**{key: check_value(f"{prefix}{key}", value, hints[key]) for key, value in built.items()})
     except ValueError as error:
-        raise FormatError(path, str(error)) from error
+        raise FormatError(path, Fact("invalid-values", detail=str(error))) from error

@@ -153,9 +153,7 @@ class RunContext:
         executable = None
         if options.colmap_executable is not None:
             if get_executor().remote:
-                raise InertialError(
-                    "--colmap-executable: an installed COLMAP works on this machine alone; leave out --scheduler"
-                )
+                raise InertialError(Fact("executable-with-scheduler"))
             executable = read_executable(
                 options.colmap_executable, options.mapping, settings, deterministic=options.deterministic
             )

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Literal
 
 from colmap_inertial.core.errors import FormatError, InertialError, MappingError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.core.printing import printable
 from colmap_inertial.pipeline.run.colmap_settings import ColmapSettings, Step
@@ -136,8 +137,15 @@ class ColmapExecutable:
             there = name if name in known else self._find(command, name.partition(".")[2])
             if there is None:
                 near = difflib.get_close_matches(name, known, n=1)
-                hint = f"; did you mean {near[0]}?" if near else ""
-                raise InertialError(f"--colmap {text}: COLMAP {self.version} ({self.path}) has no such option{hint}")
+                raise InertialError(
+                    Fact(
+                        "not-an-option-of-colmap",
+                        setting=text,
+                        version=self.version,
+                        program=str(self.path),
+                        nearest=next(iter(near), None),
+                    )
+                )
             named[there] = value
         return named
 
@@ -182,9 +190,8 @@ class ColmapExecutable:
                 read_line(line)
             code = process.wait()
         if code:
-            what = f"was killed (signal {-code})" if code < 0 else f"failed with exit code {code}"
-            output = " | ".join(last) or "it printed nothing"
-            raise MappingError(f"{self.path} {command} (COLMAP {self.version}) {what}: {output}; all of it is in {log}")
+            named = {"program": str(self.path), "command": command, "version": self.version}
+            raise MappingError(Fact("colmap-failed", **named, exit_code=code, output=tuple(last), log=str(log)))
 
 
 def read_executable(
@@ -201,32 +208,26 @@ def read_executable(
     """
     path = Path(os.path.abspath(path))
     if not path.is_file():
-        raise FormatError(path, "no such file: --colmap-executable takes the path of COLMAP's program (`which colmap`)")
+        raise FormatError(path, Fact("colmap-executable-missing"))
     if not os.access(path, os.X_OK):
-        raise FormatError(path, "may not be run: make it executable (chmod +x), or give COLMAP's program")
+        raise FormatError(path, Fact("colmap-executable-not-to-run"))
     if deterministic:
-        raise InertialError(
-            "--deterministic goes with pycolmap alone: an installed COLMAP may find other features and matches each "
-            "time (3.8 does); leave --colmap-executable out"
-        )
+        raise InertialError(Fact("deterministic-without-pycolmap"))
     if mapping.features != "sift":
-        raise InertialError(
-            f"--mapping.features {mapping.features} goes with pycolmap alone: leave --colmap-executable out, or find "
-            "and match features with it yourself, and give its database with --database"
-        )
+        raise InertialError(Fact("features-without-pycolmap", features=mapping.features))
     about = _ask(path, "help")
     version = _VERSION.search(about)
     if version is None:
         lines = about.strip().splitlines() or ["nothing"]
-        raise FormatError(path, f"is not COLMAP: `help` prints {lines[0][:80]!r}")
+        raise FormatError(path, Fact("not-colmap", printed=lines[0][:80]))
     has_cuda = re.search(r"\bwith CUDA\b", about) is not None
     if mapping.device == "cuda" and not has_cuda:
-        raise InertialError(f"--mapping.device cuda: {path} is built without CUDA; leave it out")
+        raise InertialError(Fact("colmap-without-cuda", program=str(path)))
     options = {name: frozenset(_OPTION.findall(_ask(path, name, "-h"))) for name in _COMMANDS}
     for name, command in _COMMANDS.items():
         missing = [f"--{option}" for option in command.needs if option not in options[name]]
         if missing:
-            raise FormatError(path, f"COLMAP {version[1]}: its {name} has no {', '.join(missing)}, needed here")
+            raise FormatError(path, Fact("colmap-lacks-options", version=version[1], command=name, options=missing))
     device: Device = "cuda" if has_cuda and mapping.device != "cpu" else "cpu"
     executable = ColmapExecutable(path=path, version=version[1], device=device, options=options, settings=settings)
     for name in _COMMANDS:
@@ -266,7 +267,7 @@ def _started(words: Sequence[str]) -> Iterator[subprocess.Popen[bytes]]:
             preexec_fn=_end_with_parent(),
         )
     except OSError as error:
-        raise FormatError(words[0], f"cannot be run: {error.strerror}; give COLMAP's program") from error
+        raise FormatError(words[0], Fact("program-not-run", detail=error.strerror)) from error
     with process:
         try:
             yield process

@@ -21,7 +21,8 @@ from pathlib import Path
 import numpy as np
 
 from colmap_inertial import __version__
-from colmap_inertial.core.errors import FormatError, InertialError
+from colmap_inertial.core.errors import FormatError, InertialError, fact_of
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.files import read_record, write_record
 from colmap_inertial.pipeline.run.progress import HearsSteps, Progress, silent, tell
 from colmap_inertial.pipeline.run.workspace import Workspace
@@ -115,7 +116,7 @@ def fingerprint(path: Path) -> list[object]:
     try:
         stats = [(file, file.stat()) for file in files]
     except FileNotFoundError as error:
-        raise FormatError(error.filename, "no such file") from None
+        raise FormatError(error.filename, Fact("no-such-file", what="file")) from None
     return [[str(file.resolve()), stat.st_size, stat.st_mtime_ns, _content(file, stat)] for file, stat in stats]
 
 
@@ -138,7 +139,7 @@ def _digest(path: Path, size: int, _mtime_ns: int, _ctime_ns: int) -> str:
                     piece = piece[:24] + piece[28:92] + piece[100:]
                 digest.update(piece)
     except OSError as error:
-        raise FormatError(path, f"cannot be read: {error.strerror or error}") from None
+        raise FormatError(path, Fact("file-not-readable", detail=str(error.strerror or error))) from None
     return digest.hexdigest()
 
 
@@ -223,8 +224,7 @@ def explaining_losses(workspace: Workspace) -> Iterator[None]:
         lost = find_loss(workspace, (path.stem for path in workspace.stamps.glob("*.json")))
         if not lost:
             raise
-        advice = f"{error}; {lost} is missing or damaged since its run wrote it: start that again, it is made again"
-        raise FormatError(workspace.root, advice) from None
+        raise FormatError(workspace.root, Fact("lost-since-its-run", found=fact_of(error), lost=lost)) from None
 
 
 def find_change(workspace: Workspace, paths: Iterable[Path]) -> Path | None:

@@ -12,6 +12,7 @@ from typing import TypeVar
 
 from colmap_inertial import __version__
 from colmap_inertial.core.errors import FormatError, InertialError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.printing import PrintableFormatter
 from colmap_inertial.io.files import (
     convert_to_plain,
@@ -175,7 +176,7 @@ def _earlier_result_stays(out: Path) -> Iterator[None]:
     try:
         yield
     except InertialError as error:
-        error.add_note(f"the earlier result in {out} stays as it was")
+        error.add_note(str(Fact("earlier-result-stays", out=str(out))))
         raise
 
 

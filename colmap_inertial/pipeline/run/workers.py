@@ -17,6 +17,7 @@ from typing import Any, ClassVar
 
 from colmap_inertial import __version__
 from colmap_inertial.core.errors import InertialError, MappingError, MissingExtraError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.threads import usable_processors
 from colmap_inertial.io.files import write_text
 from colmap_inertial.pipeline.run.chunks import (
@@ -61,7 +62,7 @@ def using_workers(workers: int | None = None, *, scheduler: str | None = None) -
     with contextlib.ExitStack() as stack:
         executor: Executor = Processes(number=workers or usable_processors())
         if scheduler is not None:
-            client = stack.enter_context(connect(scheduler, "--scheduler hands work to a Dask cluster"))
+            client = stack.enter_context(connect(scheduler, Fact("work-needs-dask")))
             executor = Cluster(address=scheduler, client=client)
         token = _EXECUTOR.set(executor)
         try:
@@ -76,7 +77,7 @@ def get_executor() -> Executor:
     return Processes(number=usable_processors()) if executor is None else executor
 
 
-def connect(address: str, what: str) -> Any:
+def connect(address: str, what: Fact) -> Any:
     """A Dask client; closes where its context ends.
 
     Raises
@@ -92,12 +93,10 @@ def connect(address: str, what: str) -> Any:
         raise MissingExtraError("cluster", what) from None
     try:
         if address.startswith("tls:") and Security().get_connection_args("client")["ssl_context"] is None:
-            raise InertialError(
-                f"{address} needs certificates: name them in Dask's own configuration (distributed.comm.tls)"
-            )
+            raise InertialError(Fact("scheduler-needs-certificates", address=address))
         return Client(address, timeout=10, set_as_default=False)
     except (OSError, ValueError) as error:
-        raise InertialError(f"no Dask scheduler answers at {address}: {error}") from error
+        raise InertialError(Fact("no-scheduler-answers", address=address, detail=str(error))) from error
 
 
 def warn_without_gpu(client: Any, what: str) -> None:
@@ -167,12 +166,10 @@ class Cluster:
         finally:
             remove(probe)
         if not answers:
-            raise InertialError(f"{self.address} has no worker: start one (dask worker {self.address})")
+            raise InertialError(Fact("scheduler-without-worker", address=self.address))
         for worker, answer in answers.items():
             if isinstance(answer, BaseException):
-                raise InertialError(
-                    f"worker {worker} cannot use colmap-inertial {__version__}: {answer}; install it there"
-                )
+                raise InertialError(Fact("worker-without-us", worker=worker, version=__version__, detail=str(answer)))
             versions, seen = answer
             _require_versions(worker, versions, describe_versions())
             if seen != token:
@@ -186,7 +183,7 @@ def _result(future: Any, chunk: Chunk) -> dict[str, bytes]:
         raise
     except (Exception, asyncio.CancelledError) as error:  # its workers were lost too often, or the scheduler is
         text = f"{type(error).__name__}: {error}".partition("\n")[0]
-        raise MappingError(f"{chunk.name}: no worker could finish it: {text}; started again, it continues") from error
+        raise MappingError(Fact("work-not-finished", work=chunk.name, detail=text)) from error
     return files
 
 
@@ -207,13 +204,11 @@ def describe_worker(probe: Path) -> tuple[str, str]:
 
 def _require_versions(worker: str, versions: str, wanted: str) -> None:
     if versions != wanted:
-        raise InertialError(f"worker {worker} has {versions}; here is {wanted}: install the same there")
+        raise InertialError(Fact("worker-of-another-version", worker=worker, versions=versions, wanted=wanted))
 
 
 def _unseen(worker: str, folder: Path) -> InertialError:
-    return InertialError(
-        f"worker {worker} does not see {folder}: the output must lie on a path that all machines share"
-    )
+    return InertialError(Fact("worker-sees-no-output", worker=worker, folder=str(folder)))
 
 
 def _is_wanted(chunk: Chunk, by: str) -> bool:
@@ -243,8 +238,8 @@ def do_for_another(chunk: Chunk, versions: str, by: str) -> dict[str, bytes]:
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     process.wait(timeout=_WANTED_S)
                 if not _is_wanted(chunk, by):
-                    raise MappingError(f"{chunk.name}: not wanted any more")
-            require_success(process, own, if_short="give workers more of it, or one thread each (--nthreads 1)")
+                    raise MappingError(Fact("work-not-wanted", work=chunk.name))
+            require_success(process, own, on_worker=True)
         finally:
             process.kill()
             end_process(process)

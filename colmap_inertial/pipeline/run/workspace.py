@@ -17,8 +17,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from colmap_inertial.checks.report.folders import CROPS_FOLDER, DATA_FOLDER
-from colmap_inertial.core.errors import FormatError, OutputError, OutputExistsError
-from colmap_inertial.io.files import CHANGED_RECORD, locked, read_json, reading, refuse_link, write_json
+from colmap_inertial.core.errors import FormatError, OutputError, OutputExistsError, fact_of
+from colmap_inertial.core.facts import Fact
+from colmap_inertial.io.files import locked, read_json, reading, refuse_link, write_json
 
 log = logging.getLogger(__name__)
 
@@ -154,7 +155,7 @@ class Workspace:
             As :meth:`open`.
         """
         if self.root.exists() and not self.root.is_dir():
-            raise OutputExistsError(f"{self.root} is a file; choose another output folder")
+            raise OutputExistsError(Fact("output-is-a-file", path=str(self.root)))
         if not os.path.lexists(self.owner):  # whose links are none of ours to speak of
             self._require_empty()
         refuse_links(self.root)
@@ -163,32 +164,28 @@ class Workspace:
             try:
                 known = read_json(self.owner)
             except FormatError as error:
-                raise OutputExistsError(
-                    f"{error}; it says what {self.root} is for: choose another folder, or remove this one"
-                ) from None
+                raise OutputExistsError(Fact("owner-unreadable", found=fact_of(error), out=str(self.root))) from None
             if known.get("layout") != _LAYOUT:
-                raise OutputExistsError(
-                    f"{self.root} holds a run of another version, which laid its folders out otherwise: choose another "
-                    "folder, or remove this one (view and write_report still read it)"
-                )
+                raise OutputExistsError(Fact("run-of-another-version", out=str(self.root)))
             for what in ("capture", "command"):
                 if known.get(what) != identity[what]:
                     raise OutputExistsError(
-                        f"{self.root} holds a run of another {what} ({known.get(what)}); choose another folder or "
-                        "remove it"
+                        Fact("run-of-another-kind", out=str(self.root), what=what, named=known.get(what))
                     )
         else:
             self._require_empty()
         try:
             self.stamps.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise OutputError(f"{self.root} cannot be made: {error.strerror or error}") from error
+            raise OutputError(
+                Fact("folder-not-made", out=str(self.root), detail=str(error.strerror or error))
+            ) from error
         return identity
 
     def _require_empty(self) -> None:
         """Raise :class:`OutputExistsError` where a folder that is not ours holds anything."""
         if self.root.is_dir() and any(p.name != self.stamps.name for p in self.root.iterdir()):
-            raise OutputExistsError(f"{self.root} is not empty; choose another output folder")
+            raise OutputExistsError(Fact("output-not-empty", path=str(self.root)))
 
     def unfinish(self) -> None:
         """Something is made again: what the result says no longer stands."""
@@ -205,7 +202,7 @@ class Workspace:
         OutputError
             Where the disk is full.
         """
-        busy = f"another run is at work in {self.root}; wait for it or choose another folder"
+        busy = Fact("run-at-work", folder=str(self.root))
         with full_disk_is_an_error(self.root), locked(self.lock, busy):
             yield
 
@@ -231,7 +228,7 @@ def refuse_links(root: Path) -> None:
             if stat.S_ISDIR(mode) or stat.S_ISREG(mode):
                 continue
             if not stat.S_ISLNK(mode):
-                raise FormatError(path, "is a device, a pipe or a socket in an output folder: remove it")
+                raise FormatError(path, Fact("device-in-output"))
             inside = os.path.commonpath((top, os.path.realpath(path))) == top
             if not inside or not any(path.is_relative_to(place) for place in _places_of_links(workspace)):
                 refuse_link(path)
@@ -288,12 +285,8 @@ def places_of(root: Path) -> Places:
     )
 
 
-_MAKE_ROOM = "make room and start again, it continues"
-_RAISE_LIMIT = "raise the limit (ulimit -f) and start again, it continues"
-
-
 @contextlib.contextmanager
-def full_disk_is_an_error(root: Path, advice: str = _MAKE_ROOM) -> Iterator[None]:
+def full_disk_is_an_error(root: Path) -> Iterator[None]:
     """Turn the system's complaint about a full disk (or a quota, or a limit of file sizes) into one of ours."""
     try:
         yield
@@ -301,13 +294,13 @@ def full_disk_is_an_error(root: Path, advice: str = _MAKE_ROOM) -> Iterator[None
         if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
             raise
         if error.errno == errno.EFBIG:
-            raise OutputError(f"{root}: a file in it would be larger than files may be; {_RAISE_LIMIT}") from error
-        raise OutputError(f"the disk of {root} is full ({error.strerror}); {advice}") from error
+            raise OutputError(Fact("file-would-be-too-large", folder=str(root))) from error
+        raise OutputError(Fact("disk-full", folder=str(root), detail=error.strerror)) from error
 
 
 def a_record_of_ours(path: Path) -> AbstractContextManager[None]:
     """While a record of an earlier run is taken apart: what does not fit means that it was changed since."""
-    return reading(path, CHANGED_RECORD)
+    return reading(path, Fact("changed-record"))
 
 
 def require_apart(out: Path, pictures: Sequence[Path]) -> None:
@@ -317,9 +310,7 @@ def require_apart(out: Path, pictures: Sequence[Path]) -> None:
     """
     for folder in pictures:
         if out.resolve().is_relative_to(folder.resolve()):
-            raise OutputError(
-                f"{out} lies in {folder}, the folder of the capture's pictures; choose a folder outside of it"
-            )
+            raise OutputError(Fact("output-among-pictures", out=str(out), folder=str(folder)))
 
 
 def require_room(file: Path, num_bytes: int, *, copies: int = 1) -> None:
@@ -331,14 +322,12 @@ def require_room(file: Path, num_bytes: int, *, copies: int = 1) -> None:
     free = shutil.disk_usage(file.parent).free
     if free < copies * num_bytes:
         raise OutputError(
-            f"the disk of {file.parent} is nearly full: {free / 1e6:.0f} MB are left, COLMAP's next step may need "
-            f"{copies * num_bytes / 1e6:.0f} MB; {_MAKE_ROOM}"
+            Fact("disk-nearly-full", folder=str(file.parent), free_bytes=free, needed_bytes=copies * num_bytes)
         )
     largest, size = _largest_file_bytes(), file.stat().st_size if file.is_file() else 0
     if largest < size + num_bytes:
         raise OutputError(
-            f"{file}: COLMAP cannot write it here: a file may have {largest / 1e6:.2g} MB, and this one may need "
-            f"{max(1.0, (size + num_bytes) / 1e6):.0f} MB; {_RAISE_LIMIT}"
+            Fact("file-size-limited", path=str(file), largest_bytes=largest, needed_bytes=size + num_bytes)
         )
 
 

@@ -83,7 +83,7 @@ class ApertureStage:
             try:
                 self._canvas.append(rectify(rig, [colmap_camera(aperture.camera) for aperture in rig.apertures]))
             except ValueError as error:
-                raise InertialError(f"the apertures do not fit together: {error}") from None
+                raise InertialError(Fact("apertures-apart", detail=str(error))) from None
         return self._canvas[0]
 
     def fused(self, name: str, reference: AnyArray) -> Fused:
@@ -95,11 +95,20 @@ class ApertureStage:
             camera, (height, width) = aperture.camera, image.shape[:2]
             if (width, height) != (camera.width, camera.height):
                 raise FormatError(
-                    path, f"is {width}x{height}, but {aperture.name} is calibrated for {camera.width}x{camera.height}"
+                    path,
+                    Fact(
+                        "picture-unlike-its-aperture",
+                        width=width,
+                        height=height,
+                        aperture=aperture.name,
+                        aperture_width=camera.width,
+                        aperture_height=camera.height,
+                    ),
                 )
             if image.dtype != images[0].dtype:
                 raise FormatError(
-                    path, f"holds {image.dtype} pixels, the reference {images[0].dtype}; write all with the same depth"
+                    path,
+                    Fact("depth-unlike-the-reference", dtype=str(image.dtype), reference_dtype=str(images[0].dtype)),
                 )
         planes = [plane_of(image, aperture.role) for image, aperture in zip(images, rig.apertures, strict=True)]
         return fuse_apertures(planes, rig, self.canvas(), self.options)

@@ -217,7 +217,7 @@ class DeblurStage:
         try:
             blur = blur_field(motion, camera, shutter, parallax=parallax)
         except NotObservableError as error:
-            return said(error.why)
+            return said(error.fact)
         if float(np.abs(blur.vector_px).max()) * 1.5 > LONGEST_PX:
             return said(Fact("blur-not-undone", blur_px=decision.blur_px))
         image: Any = frame.image  # either of two types of pixel, which the checker would keep apart

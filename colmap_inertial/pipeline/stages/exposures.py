@@ -50,10 +50,7 @@ def fuses_pairs(capture: Capture, options: ExposureOptions, *, deblur: str | Non
     if capture.exposures is None or not options.fuse:
         return False
     if deblur not in (None, "off"):
-        raise InertialError(
-            f"--deblur {deblur}: frames of short and long exposures are fused, and not deblurred then; leave it out, "
-            "or leave out the long ones by --exposures.no-fuse"
-        )
+        raise InertialError(Fact("fused-not-deblurred", deblur=deblur))
     assert isinstance(capture.frames, ImageFolder)
     capture.exposures.files(image_names(capture.frames))
     return True
@@ -232,7 +229,7 @@ class ExposureStage:
         try:
             pair = bring_together(frame.image, long, gyro=times, stated_gain=stated)
         except NotObservableError as error:
-            return _alone(frame, long, None, path, error.why)
+            return _alone(frame, long, None, path, error.fact)
         measured = _measured(pair)
         if not pair.registered.alike:
             why = Fact("pair-not-alike", long=path.name, correlation=pair.registered.agreement)
@@ -275,16 +272,30 @@ def _require_alike(frame: Frame, path: Path, long: AnyArray) -> None:
     height, width = frame.image.shape[:2]
     if long.shape[:2] != (height, width):
         raise FormatError(
-            path, f"is {long.shape[1]}x{long.shape[0]}, but its short exposure {frame.name} is {width}x{height}"
+            path,
+            Fact(
+                "long-exposure-of-other-size",
+                width=long.shape[1],
+                height=long.shape[0],
+                frame=frame.name,
+                short_width=width,
+                short_height=height,
+            ),
         )
     if long.shape != frame.image.shape:
         kinds = ["grey" if image.ndim == 2 else "in colour" for image in (long, frame.image)]
-        raise FormatError(path, f"is {kinds[0]}, but its short exposure {frame.name} is {kinds[1]}; write both alike")
+        raise FormatError(
+            path, Fact("long-exposure-of-other-kind", kind=kinds[0], frame=frame.name, short_kind=kinds[1])
+        )
     if long.dtype != frame.image.dtype:
         raise FormatError(
             path,
-            f"holds {long.dtype} pixels, its short exposure {frame.name} {frame.image.dtype}; write both with the same "
-            "depth",
+            Fact(
+                "long-exposure-of-other-depth",
+                dtype=str(long.dtype),
+                frame=frame.name,
+                short_dtype=str(frame.image.dtype),
+            ),
         )
 
 
@@ -293,8 +304,13 @@ def _require_size(path: Path, frame: Frame, shutter: FrameShutter) -> None:
     if (width, height) != (shutter.width, shutter.height):
         raise FormatError(
             path,
-            f"is {width}x{height}, but the camera is {shutter.width}x{shutter.height}; all pictures of a capture must "
-            "have the camera's size",
+            Fact(
+                "picture-unlike-the-camera",
+                width=width,
+                height=height,
+                camera_width=shutter.width,
+                camera_height=shutter.height,
+            ),
         )
 
 

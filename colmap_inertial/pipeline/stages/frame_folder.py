@@ -236,7 +236,7 @@ def smooth_for_colmap(frame: Frame) -> AnyArray:
 def require_frames(count: int, *, of: int, least: int = 3) -> None:
     """Raise ``InertialError`` where there are too few frames for a model."""
     if count < least:
-        raise InertialError(f"{count} frames are left of {of}; a model needs at least three")
+        raise InertialError(Fact("frames-left-too-few", count=count, of=of))
 
 
 def _same_memory(a: AnyArray, b: AnyArray) -> bool:
@@ -274,7 +274,7 @@ def encode_image(
     # Through memory: cv2.imwrite reports a full disk as success.
     ok, data = cv2.imencode(target.suffix, bgr, options)
     if not ok:
-        raise FormatError(target, f"OpenCV cannot write {image.dtype} images as {target.suffix}")
+        raise FormatError(target, Fact("picture-not-writable", dtype=str(image.dtype), suffix=target.suffix))
     encoded = data.tobytes()
     target.write_bytes(encoded if before is None else carry_metadata(before, encoded))
 

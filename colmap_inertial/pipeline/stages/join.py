@@ -78,8 +78,7 @@ class JoinStage(InertialStage):
             try:
                 parts.append(self.part(model))
             except (NotObservableError, TimingError) as error:
-                why = error.why if isinstance(error, NotObservableError) else error.fact
-                why_not[model.colmap_index] = Fact("model-apart", why=why or Fact.stated(str(error)))
+                why_not[model.colmap_index] = Fact("model-apart", why=error.fact)
             else:
                 of_part.append(model)
         placed = self._found(of_part)

@@ -41,6 +41,7 @@ from colmap_inertial.io.files import write_record
 from colmap_inertial.io.trajectories import write_tum
 from colmap_inertial.model import Model, downgraded, trajectory_from_model
 from colmap_inertial.model.deregistration import deregister_images
+from colmap_inertial.model.own_place import OwnPlace
 from colmap_inertial.model.rigs import has_rigs
 from colmap_inertial.model.submodels.registration import register_again
 from colmap_inertial.motion.align.consensus import describe_consensus, without_consensus
@@ -82,6 +83,8 @@ class InertialStage:
         Of the scale estimate.
     world
         Where gravity points in the metric model.
+    keeps_intrinsics
+        Whether the models have declared intrinsics that nothing refined.
     database
         COLMAP's, of the models: its matches register images again, and tie models.
     """
@@ -90,11 +93,12 @@ class InertialStage:
     calibration: CameraImuCalibration | None
     options: ScaleOptions = field(default_factory=ScaleOptions)
     world: WorldAxes = "z-up"
+    keeps_intrinsics: bool = False
     #: a run with other matches has other models
     database: Path | None = field(default=None, compare=False)
 
-    @staticmethod
-    def fields_for(inputs: StageInputs) -> dict[str, Any]:
+    @classmethod
+    def fields_for(cls, inputs: StageInputs) -> dict[str, Any]:
         """The fields that all of these stages have, for a run."""
         recording, options = inputs.recording, inputs.options
         return {
@@ -102,6 +106,10 @@ class InertialStage:
             "calibration": recording.prior,
             "options": replace(options.scale, max_offset_s=recording.max_offset_s),
             "world": options.world,
+            # an existing project's models may have others than were declared
+            "keeps_intrinsics": recording.capture.camera is not None
+            and inputs.made_from is None
+            and not cls.refines_intrinsics(inputs),
             "database": inputs.database,
         }
 
@@ -223,28 +231,36 @@ class MetricStage(InertialStage):
     def judge_shutter(self, model: Model, estimate: ScaleEstimate) -> Model:
         """A model in metres; where its images show a rolling shutter that it ignores, its scale says so.
 
-        Not looked for where a global shutter was declared, or the keypoints were rectified.
+        A declared global shutter, and declared intrinsics that were kept, are doubted where the images contradict them.
         """
         metric = self._apply(model, estimate)
-        if model.timing.readout_s == 0 or model.rectified or estimate.noise is None:
+        is_settled = model.timing.readout_s == 0 or model.rectified
+        if estimate.noise is None or (model.rectified and not self.keeps_intrinsics):
             return metric
         try:
             readout = self._find_readout(metric)
         except (NotObservableError, np.linalg.LinAlgError) as error:
             log.info("model %d: its shutter cannot be looked at: %s", model.colmap_index, error)
             readout = None
+        if readout is None and is_settled:
+            return metric
         if readout is None:
             return self._apply(model, replace(estimate, notes=(*estimate.notes, Fact("rolling-shutter-unknown"))))
-        estimate = readout.widen(estimate)
+        found = []
+        if not is_settled or (not model.rectified and readout.contradicts_global):
+            estimate = readout.widen(estimate, declared_global=is_settled)
+            found += [readout.as_fact(declared_global=is_settled)] if readout.is_found else []
         if estimate.verdict == "refused":
             return model.scaled(estimate, None)
+        if self.keeps_intrinsics and readout.focal is not None and readout.focal.contradicts:
+            found.append(readout.focal.as_fact())
+            estimate = downgraded(estimate, found[-1:])
         metric = self._apply(model, estimate)
-        if not readout.is_found:
-            return metric
-        values = {name: getattr(readout, name) for name in ("readout_s", "sigma_s", "direction")}
-        done = Treatment(stage="shutter", reason=readout.as_fact(), values=values)
-        log.info("model %d: %s", model.colmap_index, done.reason)
-        return replace(metric, treatments=(*metric.treatments, done))
+        for fact in found:
+            done = Treatment(stage="shutter", reason=fact, values=dict(fact.values))
+            log.info("model %d: %s", model.colmap_index, done.reason)
+            metric = replace(metric, treatments=(*metric.treatments, done))
+        return metric
 
     def _apply(self, model: Model, estimate: ScaleEstimate) -> Model:
         similarity = Similarity.from_scale(estimate, world=self.world, provenance=provenance(estimate))
@@ -315,7 +331,9 @@ def gravity_in_model(model: Model) -> Array | None:
     return quat_rotate(model.similarity.rotation_xyzw, gravity)
 
 
-def write_trajectory(path: Path, model: Model, trajectory: CameraTrajectory, imu: ImuRecording) -> None:
+def write_trajectory(
+    path: Path, model: Model, trajectory: CameraTrajectory, imu: ImuRecording, place: OwnPlace | None = None
+) -> None:
     """Write the metric camera path of a model as TUM text, its covariance and motion beside it.
 
     It is smoothed by the IMU; where a stage solved for the motion already, it is what that stage found.
@@ -333,15 +351,17 @@ def write_trajectory(path: Path, model: Model, trajectory: CameraTrajectory, imu
         Its poses, in metres.
     imu
         The IMU recording.
+    place
+        Where the model's coordinates count from, if not from the origin; those in the file do.
     """
-    estimate, gravity = model.scale, gravity_in_model(model)
+    estimate, gravity, place = model.scale, gravity_in_model(model), place or OwnPlace()
     if estimate is None or model.similarity is None or estimate.calibration is None or gravity is None:
         raise ValueError("only a metric model has a metric trajectory")
     target = path.with_name(f"{path.stem}_cov.npz")
     if model.motion is not None:
         # these poses contain the IMU already: smoothing them again would be worse and overconfident
         solved = model.motion.of(trajectory.names, trajectory.cam_in_world)
-        write_tum(path, trajectory)
+        write_tum(path, place.leave_path(trajectory))
         with_cov = [i for i, name in enumerate(trajectory.names) if name in solved.cov]
         cov = np.array([solved.cov[trajectory.names[i]] for i in with_cov]).reshape(-1, 9, 9)
         _write_covariance(target, trajectory.t_s[with_cov] + trajectory.epoch_ns * 1e-9, cov[:, :6, :6], cov[:, 6:, 6:])
@@ -349,7 +369,7 @@ def write_trajectory(path: Path, model: Model, trajectory: CameraTrajectory, imu
         velocity = np.array([solved.velocity_in_world.get(name, unknown) for name in trajectory.names])
     else:
         smoothed = smooth_path(trajectory, imu, estimate, gravity)
-        write_tum(path, smoothed)
+        write_tum(path, place.leave_path(smoothed))
         velocity = smoothed.velocity_in_world
         cov, rotation = _add_drift(model, smoothed, gravity)
         if model.parts and rotation is None:

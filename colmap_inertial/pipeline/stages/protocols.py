@@ -27,6 +27,7 @@ from typing import Any, Protocol, TypeGuard, TypeVar
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import InertialError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import DEFAULT_STAGES, StageNames
 from colmap_inertial.core.types import CameraImuCalibration, CameraModel, Frame, Gap, Keypoints
 from colmap_inertial.model import Model
@@ -95,10 +96,7 @@ def insert_defaults(stages: Sequence[Stage | EllipsisType], defaults: Iterable[S
             every.append(stage)
     joining = [type(stage).__name__ for stage in every if joins_models(stage)]
     if len(joining) > 1:
-        raise InertialError(
-            f"two model stages join models ({' and '.join(joining[:2])}), and only one can: leave one out (--join off "
-            "leaves out the default one), or name the default one in `replaces` of yours"
-        )
+        raise InertialError(Fact("two-stages-join", stages=joining[:2]))
     return every
 
 
@@ -170,19 +168,17 @@ def _load(name: str) -> Any:
     except (Exception, SystemExit) as error:  # whatever the code of a stranger's module does
         missing = error.name if isinstance(error, ModuleNotFoundError) else None
         if missing is not None and f"{module_name}.".startswith(f"{missing}."):
-            reason = f"there is no module {missing}; install it where the capture is worked on, or set PYTHONPATH"
+            why = Fact("module-of-stage-missing", module=missing)
         else:
             text = str(error).partition("\n")[0]
-            reason = f"{module_name} cannot be imported: {type(error).__name__}: {text}"
-        raise InertialError(f"stage {name}: {reason}") from error
+            why = Fact("module-of-stage-failed", module=module_name, detail=f"{type(error).__name__}: {text}")
+        raise InertialError(Fact("stage-not-imported", stage=name, why=why)) from error
     try:
         stage = operator.attrgetter(path)(module)
     except AttributeError:
-        raise InertialError(f"stage {name}: {module_name} has no {path}") from None
+        raise InertialError(Fact("stage-not-in-module", stage=name, module=module_name, name=path)) from None
     if isinstance(stage, type):
-        raise InertialError(f"stage {name}: is a class; name an instance of it, or a function")
+        raise InertialError(Fact("stage-is-a-class", stage=name))
     if not callable(stage):
-        raise InertialError(
-            f"stage {name}: is of type {type(stage).__name__}; name a function, or what can be called as one"
-        )
+        raise InertialError(Fact("stage-not-callable", stage=name, type=type(stage).__name__))
     return stage

@@ -33,7 +33,7 @@ from colmap_inertial.inertial.refine.setup import (
 from colmap_inertial.inertial.refine.shutter import SHUTTER_IGNORED
 from colmap_inertial.inertial.refine.values import FIRST_INTRINSIC, LEVER, OFFSET, READOUT, ROTATION, Estimate, Problem
 from colmap_inertial.inertial.refine.world import size_of, state_scale
-from colmap_inertial.model import Model
+from colmap_inertial.model import Model, downgraded
 from colmap_inertial.model.rigs import has_rigs
 from colmap_inertial.model.similarities import compose
 from colmap_inertial.pipeline.stages.inputs import StageInputs
@@ -49,6 +49,9 @@ log = logging.getLogger(__name__)
 #: 3: the refinement's own scale; covariances of rotations.
 _WRITES = 3
 _FEWEST_IMAGES, _FEWEST_POINTS = 10, 50
+#: Squares of what the IMU and the pictures disagree by, over those that its noise explains, from which on one of them
+#: is wrong: five standard deviations between all images.
+_GROSS_CHI2 = 25.0
 #: One camera comes back to settings that it had before in fewer of its images than this.
 _MOST_RETURNS = 0.1
 #: Where each image has a camera of its own: between focal lengths of two devices, no other lies within this share.
@@ -110,7 +113,7 @@ class RefineStage(InertialStage):
             with one_blas_thread():
                 refined = self._refined(model)
         except (NotObservableError, np.linalg.LinAlgError) as error:
-            why_not = error.why if isinstance(error, NotObservableError) else Fact("refine-not-determined")
+            why_not = error.fact if isinstance(error, NotObservableError) else Fact("refine-not-determined")
             return _record(model, Fact("not-refined", why=why_not))
         log.info("model %d: the refinement took %.1f s", model.colmap_index, time.perf_counter() - begin_s)
         return refined
@@ -149,6 +152,7 @@ class RefineStage(InertialStage):
         judged = refine(problem, start, seen.observations.xy_px, seen.t_s, readout_declared=declared)
         figures, evidence = _state_figures(judged) | _worth_figures(worth), _state_evidence(judged, worth)
         if not judged.accepted:
+            model = _doubt_contradicted(model, judged)
             return _record(model, Fact("refinement-rejected", why=judged.reason, evidence=evidence), **figures)
         x = judged.estimate
         figures |= {"drift": [asdict(part) for part in judged.drift]} | _calibration_figures(judged)
@@ -194,6 +198,14 @@ class RefineStage(InertialStage):
             xy_px = np.array([p.xy for p in points]).reshape(-1, 2) if mapped is None else mapped
             keypoints[name] = self.shutter.as_exposed(name, xy_px)
         return keypoints_of(seen, keypoints)
+
+
+def _doubt_contradicted(model: Model, judged: Judged) -> Model:
+    """The model with a doubt about its scale where the IMU contradicts its pictures beyond any noise."""
+    reason, scale = judged.reason, model.scale
+    if reason is None or reason.code != "imu-contradicts-pictures" or judged.chi2 <= _GROSS_CHI2 or scale is None:
+        return model
+    return replace(model, scale=downgraded(scale, (reason,)))
 
 
 def _ignores_shutter(model: Model) -> bool:

@@ -20,6 +20,7 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.choices import check_kind
 from colmap_inertial.core.errors import FormatError, InertialError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.gyro import gravity_in_cam
 from colmap_inertial.core.options import BlurRemover, ReconstructOptions
 from colmap_inertial.core.types import Frame, PositionFixes
@@ -177,7 +178,7 @@ def _read(path: Path, options: ReconstructOptions, stages: Stages) -> _Given:
     require_method(options.deblur)
     capture = load_capture(path)
     if capture.frames is None:
-        raise FormatError(capture.path, "has no frames: add [images] or [video]")
+        raise FormatError(capture.path, Fact("capture-has-no-frames"))
     pairs = ... in stages.frame and fuses_pairs(capture, options.exposures, deblur=options.deblur)
     fuser = lsd2_fuser(options.exposures) if pairs else None
     capture = capture if pairs else replace(capture, exposures=None)
@@ -233,7 +234,7 @@ def _refuse_with_rig(capture: Capture, options: ReconstructOptions) -> None:
     }
     refused = [name for name, is_asked in asked.items() if is_asked]
     if refused:
-        raise InertialError(f"{refused[0]}: not done for cameras of a rig; leave it out, or take [rig] out")
+        raise InertialError(Fact("not-for-rigs", option=refused[0]))
 
 
 def _reconstruct(
@@ -331,11 +332,7 @@ def _run(session: Session, given: _Given, options: ReconstructOptions, stages: S
 def _require_known_images(options: ReconstructOptions, stages: Sequence[KeypointStage]) -> None:
     """Ask which images a given database describes, where keypoints are corrected."""
     if options.database is not None and stages and options.database_images is None:
-        raise InertialError(
-            "--database: the rolling shutter is corrected here. Say --database-images filmed where its keypoints were "
-            "found in images as filmed, rectified where in those of `deblur --rectify`; or leave the correction out "
-            "with --rolling-shutter off"
-        )
+        raise InertialError(Fact("database-of-which-images"))
 
 
 def _gravity_priors(recording: Recording, options: ReconstructOptions) -> Mapping[str, Array]:
@@ -343,14 +340,9 @@ def _gravity_priors(recording: Recording, options: ReconstructOptions) -> Mappin
     if not options.mapping.gravity_priors:
         return {}
     if options.mapping.mapper != "global":
-        raise InertialError(
-            "--mapping.gravity-priors needs --mapping.mapper global: the incremental mapper ignores them"
-        )
+        raise InertialError(Fact("gravity-priors-need-global"))
     calibration = recording.prior
     if calibration.sigma("rotation_x_rad") > _GRAVITY_ROTATION_RAD or calibration.clock_sigma_s > 1:
-        raise InertialError(
-            "--mapping.gravity-priors needs the rotation between camera and IMU and their time offset beforehand: give "
-            "[calibration] in capture.toml or --calibration FILE, and shared_clock or a time offset"
-        )
+        raise InertialError(Fact("gravity-priors-need-calibration"))
     timed = CameraTimedImu.from_recording(recording.imu, calibration, recording.timing.epoch_ns)
     return gravity_in_cam(timed, recording.timing)

@@ -16,7 +16,7 @@ from colmap_inertial.checks.report import require_plotly
 from colmap_inertial.checks.report.imu_calibration import calibration_page
 from colmap_inertial.checks.validate import parse_target
 from colmap_inertial.core.errors import FormatError, InertialError, OutputError, OutputExistsError
-from colmap_inertial.core.facts import Fact, sentences
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import GravityOptions
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import ImuCalibration
@@ -91,12 +91,14 @@ def remember(device: str, calibration: Path) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(f"{folder} cannot be created: {error.strerror or error}") from error
+        raise OutputError(
+            Fact("folder-not-created", folder=str(folder), detail=str(error.strerror or error))
+        ) from error
     kind = calibration_kind(calibration)
     target = folder / f"{kind}.json"
     by_targets = kind == IMU and read_imu_calibration(calibration).attitudes == 0
     if by_targets and target.is_file() and read_imu_calibration(target).attitudes > 0:
-        raise OutputError(f"{target} is a calibration by rests, which says more than targets: remove it first")
+        raise OutputError(Fact("calibrated-by-rests", path=str(target)))
     write_text(target, read_text(calibration))
     return target
 
@@ -156,11 +158,11 @@ def calibrate_from_results(folders: Sequence[Path], out: Path, *, device: str = 
     comparisons: dict[str, TargetComparison] = {}
     for folder in folders:
         path = folder / "result.json"
-        with reading(path, "is no result of `colmap-inertial reconstruct`"):
+        with reading(path, Fact("no-result-of-reconstruct")):
             content = read_json(path)
             capture, comparison = str(content["capture"]), _read_comparison(path, content["models"])
         if capture in comparisons:
-            raise FormatError(path, f"is of {capture}, as another of these results; give one result of each recording")
+            raise FormatError(path, Fact("result-of-same-capture", capture=str(capture)))
         comparisons[capture] = comparison
     calibration = calibrate_by_targets(list(comparisons.values()), gravity_m_s2=gravity_m_s2, device=device)
     write_imu_calibration(out, calibration)
@@ -175,23 +177,21 @@ def _read_comparison(path: Path, models: Sequence[Mapping[str, Any]]) -> TargetC
         if (model.get("validation") or {}).get("scale_error_pct") is not None and model["verdict"] != "refused"
     ]
     if not measured:
-        raise FormatError(path, "has no scale with a measured target; name the target under [target] of the capture")
+        raise FormatError(path, Fact("result-without-target"))
     model = max(measured, key=lambda one: int(one["registered_images"]))
     check = model["validation"]
     if model["imu_calibration"] is not None:
-        raise FormatError(path, "a calibration of the IMU went into its scale; run it without one (--no-remembered)")
+        raise FormatError(path, Fact("result-with-calibration"))
     if doubts := check.get("doubts", () if check["within_tolerance"] else check["reasons"]):  # earlier versions
         raise FormatError(path, Fact("target-doubtful", doubts=doubts))
     target = parse_target(check["target"])
     if target.sigma_m is None:
-        raise FormatError(
-            path, f"how well the size of {target.spec} is known is not stated; measure it, and add +- to the target"
-        )
+        raise FormatError(path, Fact("target-size-unstated", target=target.spec))
     low, high = (math.log1p(0.01 * float(pct)) for pct in check["ci95_pct"])
     target_sigma = target.sigma_m / target.length_m
     of_check = max(0.0, ((high - low) / (2 * Z95)) ** 2 - target_sigma**2)
     if "accel_gain" not in (model["parts"] or {}):
-        raise FormatError(path, "its scale is not that of the joint method")
+        raise FormatError(path, Fact("scale-of-another-method"))
     accel = float(model["parts"]["accel_gain"])
     return TargetComparison(
         error_log=math.log1p(0.01 * float(check["scale_error_pct"])),
@@ -213,7 +213,7 @@ def _folder(device: str) -> Path:
     """A device's folder: its name as far as a file may have it, and a mark that tells like ones apart."""
     name = " ".join(device.split())
     if not name:
-        raise OutputError("a device needs a name to be remembered by")
+        raise OutputError(Fact("device-without-name"))
     readable = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")[:_LONGEST]
     mark = hashlib.sha256(name.lower().encode("utf-8", "surrogatepass")).hexdigest()[:8]
     return configuration_folder() / "devices" / f"{readable}-{mark}".lstrip("-")
@@ -246,9 +246,9 @@ def calibrate_source(
     check_output(out, [recording])
     page = out.with_suffix(".html")
     if page == out:
-        raise OutputError(f"{out}: the calibration is a JSON file; name it so, as the page beside it ends in .html")
+        raise OutputError(Fact("calibration-is-json", out=str(out)))
     if page.exists() and not out.exists():
-        raise OutputExistsError(f"{page} exists, where the calibration's page goes; choose another name or remove it")
+        raise OutputExistsError(Fact("calibration-page-exists", page=str(page)))
     raw = read_raw_imu(recording)
     imu = raw.imu
     if imu.has_accel:
@@ -256,7 +256,7 @@ def calibrate_source(
         check_alive(imu.accel_m_s2, "accel", raw.accel_path or raw.path)
         problems = check_units(imu)
         if problems:
-            raise FormatError(raw.path, "; ".join(sentences(problems)))
+            raise FormatError(raw.path, Fact("found-together", found=problems))
     gravity_m_s2, sigma = strength_of_gravity(gravity or GravityOptions())
     calibration = calibrate_imu(imu, gravity_m_s2=gravity_m_s2, gravity_sigma_m_s2=sigma, device=device)
     write_imu_calibration(out, calibration.calibration)

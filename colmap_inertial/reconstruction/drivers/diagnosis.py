@@ -6,6 +6,7 @@ from pathlib import Path
 
 from colmap_inertial.checks.diagnose import Diagnosis, Recorded, diagnose, unreadable
 from colmap_inertial.core.errors import FormatError, OutputExistsError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.calibration import CalibrationFiles, largest_offset_s
 from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.files import write_json, write_text
@@ -67,9 +68,9 @@ def describe_table(source: ScaleSource, capture: Path | None = None) -> TableRep
     report = report_table(source.source, None if capture is None else capture.parent)
     if capture is not None:
         if report is None:
-            raise FormatError(source.source, "is no table of samples: --capture is for one")
+            raise FormatError(source.source, Fact("no-table-of-samples"))
         if capture.exists():
-            raise OutputExistsError(f"{capture} exists; choose another name or remove it")
+            raise OutputExistsError(Fact("output-exists", path=str(capture)))
         write_text(capture, report.toml)
     return report
 

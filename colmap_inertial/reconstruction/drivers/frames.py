@@ -11,6 +11,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import AnyArray, UInt8Array
 from colmap_inertial.core.errors import OutputError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import CameraModel, Frame
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.gate import Decision
@@ -104,7 +105,7 @@ def write_contact_sheet(path: Path, capture: Capture, plan: ImagingPlan, images:
     try:
         path.write_bytes(data.tobytes())
     except OSError as error:
-        raise OutputError(f"{path} cannot be written: {error.strerror or error}") from error
+        raise OutputError(Fact("cannot-be-written", path=str(path), detail=str(error.strerror or error))) from error
 
 
 def _write_label(text: str, width: int) -> UInt8Array:

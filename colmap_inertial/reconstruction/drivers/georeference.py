@@ -68,7 +68,7 @@ def run_georeference(
             try:
                 georeference = georeference_path(fixes, path, -DOWN_IN_WORLD[world])
             except NotObservableError as error:
-                outcomes.append(_Outcome(index=index, unobservable=error.quantity, why=error.why))
+                outcomes.append(_Outcome(index=index, unobservable=error.quantity, why=error.fact))
                 written.append({"model": index, **error_as_json(error)})
             else:
                 outcomes.append(_Outcome(index=index, found=georeference))

@@ -107,9 +107,9 @@ def _load_frames(path: Path) -> Capture:
     """A capture whose frames can be deblurred: of short and long exposures, the short ones alone."""
     loaded = replace(load_capture(path), exposures=None)
     if loaded.frames is None:
-        raise FormatError(path, "has no frames: add [images] or [video]")
+        raise FormatError(path, Fact("capture-has-no-frames"))
     if loaded.rig:
-        raise FormatError(path, "frames of a rig's cameras are not deblurred: take [rig] out")
+        raise FormatError(path, Fact("frames-of-rig-not-deblurred"))
     return loaded
 
 
@@ -209,11 +209,11 @@ def _require_free_sheet(sheet: Path, out: Path) -> None:
     with contextlib.suppress(FormatError):
         ours = read_json(record).get("sheet") == str(sheet.resolve())
     if sheet.exists() and not ours:
-        raise OutputExistsError(f"{sheet} exists; choose another name for the contact sheet")
+        raise OutputExistsError(Fact("contact-sheet-exists", path=str(sheet)))
     if not sheet.parent.is_dir():
-        raise OutputError(f"{sheet.parent} is no folder; create it first")
+        raise OutputError(Fact("no-parent-folder", folder=str(sheet.parent)))
     if sheet.suffix.lower() != ".png":
-        raise InertialError(f"{sheet}: the contact sheet is a PNG; name it so")
+        raise InertialError(Fact("contact-sheet-is-png", path=str(sheet)))
 
 
 def _shown(records: Sequence[FrameRecord]) -> list[str]:
@@ -257,7 +257,7 @@ def fuse_captured(
     options = options or FuseAperturesOptions()
     loaded = load_capture(Path(capture))
     if loaded.apertures is None or not isinstance(loaded.frames, ImageFolder):
-        raise FormatError(loaded.path, "describes no multi-aperture camera: add [images] and [apertures]")
+        raise FormatError(loaded.path, Fact("no-multi-aperture-camera"))
     names, folder = image_names(loaded.frames), loaded.frames.folder
     stage = ApertureStage(pictures=loaded.apertures, options=options.fusion)
     require_colours(loaded.apertures.rig)
@@ -337,7 +337,7 @@ def fuse_exposures_captured(
     options = options or ExposureOptions()
     loaded = load_capture(Path(capture))
     if loaded.exposures is None or not isinstance(loaded.frames, ImageFolder):
-        raise FormatError(loaded.path, "describes no pairs of exposures: add [images] and [exposures]")
+        raise FormatError(loaded.path, Fact("no-pairs-of-exposures"))
     folder, names, timing = loaded.frames.folder, image_names(loaded.frames), None
     prior = prior_calibration(loaded, calibration)
     fuser = fuser or lsd2_fuser(options)

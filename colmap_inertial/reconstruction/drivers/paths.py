@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from colmap_inertial.core.errors import FormatError, OutputError, OutputExistsError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.files import read_json
 from colmap_inertial.model import find_models
 
@@ -24,11 +25,9 @@ def only_model(path: Path) -> Path:
         if not (path / "sparse").is_dir():
             raise
         inside = next(iter(find_models(path / "sparse").values()))
-        raise FormatError(path, f"is a whole project: give one of its models, {inside}") from None
+        raise FormatError(path, Fact("is-a-project", model=str(inside))) from None
     if len(models) > 1:
-        raise FormatError(
-            path, f"holds {len(models)} models; give one of them, for example {next(iter(models.values()))}"
-        )
+        raise FormatError(path, Fact("holds-several-models", count=len(models), model=str(next(iter(models.values())))))
     return next(iter(models.values()))
 
 
@@ -44,17 +43,17 @@ def check_output(path: Path, inputs: Sequence[Path | None]) -> None:
     OutputError
     """
     if not path.parent.is_dir():
-        raise OutputError(f"{path.parent} is no folder; create it first")
+        raise OutputError(Fact("no-parent-folder", folder=str(path.parent)))
     if path.is_dir():
-        raise OutputError(f"{path} is a folder; name a file in it")
+        raise OutputError(Fact("output-is-a-folder", path=str(path)))
     target = path.resolve()
     for known in inputs:
         if known is not None and target == known.resolve():
-            raise OutputExistsError(f"{path} is an input; choose another name for the result")
+            raise OutputExistsError(Fact("output-is-an-input", path=str(path)))
     if path.exists():
         try:
             keys = set(read_json(path))
         except FormatError:
             keys = set()
         if not keys & _OURS:
-            raise OutputExistsError(f"{path} exists and is no earlier result; choose another name or remove it")
+            raise OutputExistsError(Fact("output-is-foreign", path=str(path)))

@@ -16,7 +16,7 @@ from colmap_inertial.checks.validate import parse_target
 from colmap_inertial.colmap.tsdf import require_mesh_maker
 from colmap_inertial.core.choices import check_kind
 from colmap_inertial.core.errors import FormatError, InertialError, TimingError
-from colmap_inertial.core.facts import Fact, as_fact
+from colmap_inertial.core.facts import Fact, as_fact, read_facts
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.core.types import (
     CameraImuCalibration,
@@ -28,7 +28,7 @@ from colmap_inertial.core.types import (
 from colmap_inertial.io.calibration import calibration_prior, describe_files
 from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.exif import read_exposures_s, stamps_of_exif
-from colmap_inertial.io.files import StrPath, read_record, reading_within, write_record
+from colmap_inertial.io.files import StrPath, read_json, read_record, reading_within, write_record
 from colmap_inertial.io.frame_sources import Video
 from colmap_inertial.io.frame_times import FrameStamps, stamps_of_pattern
 from colmap_inertial.io.frames import read_frame_times, read_frame_timing
@@ -61,7 +61,12 @@ from colmap_inertial.pipeline.stages.inputs import StageInputs
 from colmap_inertial.pipeline.stages.protocols import ModelStage, insert_defaults
 from colmap_inertial.reconstruction.drivers.georeference import run_georeference
 from colmap_inertial.reconstruction.drivers.models import Submodels, run_dense_models, run_models, run_validation
-from colmap_inertial.reconstruction.drivers.project_models import name_made_from, read_submodels, require_refinable
+from colmap_inertial.reconstruction.drivers.project_models import (
+    name_made_from,
+    read_submodels,
+    require_near,
+    require_refinable,
+)
 from colmap_inertial.reconstruction.drivers.project_output import place_project, require_free_names
 from colmap_inertial.reconstruction.drivers.reporting import report_result, reporting_stops, write_recording
 from colmap_inertial.reconstruction.drivers.result import Fragment, ModelResult, ReconstructResult
@@ -75,10 +80,6 @@ if TYPE_CHECKING:
 _LEAST_SHARE = 0.5
 #: Digits of EXIF's fraction of a second that are as good as milliseconds.
 _FINE_DIGITS = 3
-_HOW_TIMES = (
-    "give --frame-times (a CSV with name,t_s), --name-times (times in the file names), --exif-times, or --video (the "
-    "one that the images were taken from)"
-)
 
 
 def is_project(path: Path) -> bool:
@@ -105,8 +106,7 @@ def _require_model(project: Path) -> None:
     if not _has_model(project):
         raise FormatError(
             project,
-            "holds no COLMAP model (sparse/ or a model folder), and --imu and the like belong to one: leave them out "
-            "for a capture, which describes itself",
+            Fact("no-model-for-imu"),
         )
 
 
@@ -180,6 +180,8 @@ def _reconstruct(
     images = _images(project, source, needed=pictures or (options.georeference and not filmed))
     read = functools.cache(read_model)
     require_refinable(options, models, read)
+    if options.dense:
+        require_near(models, read)
     context, folders = RunContext.of(options, progress=progress), () if images is None else (images,)
     decides = given.source, given.capture, given.imu, given.prior, fingerprint(project), model_stages
     with (
@@ -206,6 +208,7 @@ def _reconstruct(
         results = run_validation(session, results, target, images)
         results = run_georeference(session, results, fixes, timing, options.world)
         metric = place_project(session, project, source, models, _scales(results, fragments))
+        results = _told_of_files(results, metric)
         if options.dense and images is not None:
             results = run_dense_models(session, results, images, options.dense_options)
         result = ReconstructResult(
@@ -267,8 +270,8 @@ def _check_options(options: ReconstructOptions) -> None:
     named += ["--deblur"] if options.deblur not in (None, "off") else []
     named += ["--rolling-shutter"] if options.rolling_shutter not in (None, "off") else []
     if named:
-        flags = ", ".join(flag.replace("_", "-") for flag in named)
-        raise InertialError(f"{flags}: an existing model is not mapped again, nor its images changed; leave it out")
+        flags = tuple(flag.replace("_", "-") for flag in named)
+        raise InertialError(Fact("not-for-an-existing-model", options=flags))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -298,10 +301,10 @@ class _Given:
 def _require_recording(project: Path, source: ProjectOptions) -> Path:
     if source.imu is None:
         stated = (source.frame_times, source.name_times, source.video, source.exif_times or None)
-        when = "" if any(times is not None for times in stated) else f"; and when its images were taken: {_HOW_TIMES}"
-        raise FormatError(project, f"is a COLMAP project and needs the IMU recording: give --imu PATH{when}")
+        is_timed = any(times is not None for times in stated)
+        raise FormatError(project, Fact("project-needs-imu" if is_timed else "project-needs-imu-and-times"))
     if source.frame_times is not None and not source.frame_times.exists():
-        raise FormatError(source.frame_times, "no such file or folder")
+        raise FormatError(source.frame_times, Fact("no-such-file", what="file or folder"))
     return source.imu
 
 
@@ -319,7 +322,7 @@ def _read_sources(project: Path, source: ProjectOptions, options: ReconstructOpt
     if source.video is not None:
         capture = _add_video(capture, source.video, None if times in described else times)
     elif frames is None and not (times or source.name_times is not None or source.exif_times):
-        raise TimingError(f"{project}: nothing says when its images were taken: {_HOW_TIMES}")
+        raise TimingError(Fact("project-untimed", project=str(project)))
     raw = check_imu(raw, force=options.force)
     return _Given(
         source=source,
@@ -350,7 +353,7 @@ def _images(project: Path, source: ProjectOptions, *, needed: bool) -> Path | No
     if folder.is_dir():
         return folder
     if source.images is not None or needed:
-        raise FormatError(folder, "no such folder of pictures; give the project's images with --images DIR")
+        raise FormatError(folder, Fact("no-folder-of-pictures"))
     return None
 
 
@@ -469,6 +472,15 @@ def _video_times(
 def _noted(result: ModelResult, notes: Sequence[Fact]) -> ModelResult:
     scale = result.scale
     return dataclasses.replace(result, scale=dataclasses.replace(scale, notes=(*scale.notes, *map(as_fact, notes))))
+
+
+def _told_of_files(results: tuple[ModelResult, ...], metric: Path | None) -> tuple[ModelResult, ...]:
+    """The results, the first in metres with what is to be said of the project's other files."""
+    at = next((i for i, result in enumerate(results) if result.sparse_metric is not None), None)
+    if metric is None or at is None:
+        return results
+    notes = read_facts(read_json(metric / TRANSFORM_FILE), "notes")
+    return (*results[:at], _noted(results[at], notes), *results[at + 1 :])
 
 
 def _scales(results: Sequence[ModelResult], fragments: Sequence[Fragment]) -> dict[int | None, ModelScale]:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import fnmatch
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from colmap_inertial.core.errors import AlreadyMetricError, InertialError, OutputError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.model import is_metric
 from colmap_inertial.model.copying import list_tree
+from colmap_inertial.model.keeping import Kept
 from colmap_inertial.model.layout import Layout, find_made_from, read_layout
+from colmap_inertial.model.own_place import OwnPlace
 from colmap_inertial.model.rigs import has_rigs
 
 if TYPE_CHECKING:
@@ -32,21 +34,20 @@ def read_submodels(project: Path, out: Path, source: ProjectOptions) -> Layout:
     """
     inner, outer = out.resolve(), project.resolve()
     if inner.is_relative_to(outer) or outer.is_relative_to(inner):
-        raise OutputError(f"{out} and {project} lie within each other; choose a folder elsewhere")
+        raise OutputError(Fact("folders-within-each-other", folder=str(out), out=str(project)))
     listed = list_tree(project, follow_links=source.follow_links)[0]
-    folders = [folder for folder in listed if not _is_kept(folder, source.keep)]
+    kept = Kept(tuple(source.keep), project)
+    folders = [folder for folder in listed if not kept.covers(folder)]
     for folder in (Path(), *folders):
         if is_metric(project / folder):
-            raise AlreadyMetricError(
-                f"{project / folder} already holds a metric scale; give COLMAP's own project, or leave the folder "
-                "as it is with --keep"
-            )
+            raise AlreadyMetricError(Fact("already-metric", folder=str(project / folder)))
     return read_layout(project, folders, one_for_all=False)
 
 
 def name_made_from(project: Path, layout: Layout, files: Sequence[Path], keep: Sequence[str]) -> str:
     """A file of the project that was made from its models and is not to be kept as it is; empty without one."""
-    made = find_made_from(project, layout, [path for path in files if not _is_kept(path, keep)])
+    kept = Kept(tuple(keep), project)
+    made = find_made_from(project, layout, [path for path in files if not kept.covers(path)])
     return "" if made is None else str(made)
 
 
@@ -56,12 +57,11 @@ def require_refinable(
     """Raise :class:`InertialError` where rigs are to be refined; ``auto`` leaves them as they are."""
     rigs = [str(folder) for folder in models.values() if has_rigs(read(folder))] if options.refine == "inertial" else []
     if rigs:
-        raise InertialError(
-            f"--refine inertial: several cameras took the images of {rigs[0]}, each with its own place beside the IMU, "
-            "and models with rigs cannot be refined; leave it out"
-        )
+        raise InertialError(Fact("rigs-not-refined", model=rigs[0]))
 
 
-def _is_kept(path: Path, keep: Sequence[str]) -> bool:
-    """Whether a path of a project stays as it is, or a folder above it does."""
-    return any(fnmatch.fnmatch(str(part), pattern) for part in (path, *path.parents[:-1]) for pattern in keep)
+def require_near(models: Mapping[int, Path], read: Callable[[Path], pycolmap.Reconstruction]) -> None:
+    """Raise :class:`InertialError` for a dense cloud, of single precision, far from the origin."""
+    for folder in models.values():
+        if OwnPlace.of(read(folder)).pivot is not None:
+            raise InertialError(Fact("dense-far-away", folder=str(folder)))

@@ -10,6 +10,7 @@ from pathlib import Path, PurePosixPath
 
 from colmap_inertial.colmap.depth_maps import digest_of_model, has_depth_maps, model_of
 from colmap_inertial.core.errors import OutputError, OutputExistsError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ProjectOptions
 from colmap_inertial.io.files import check_names, path_in, read_json, read_record, write_json, write_record
 from colmap_inertial.model import TRANSFORM_FILE, model_files, model_format, model_formats, read_model, write_files
@@ -33,15 +34,9 @@ def require_free_names(project: Path, workspace: Workspace, *, dense: bool) -> N
     """Raise :class:`OutputError` where something of a project would lie where the run writes, too."""
     for path in sorted(project.iterdir()):
         if workspace.is_own(path.name):
-            raise OutputError(
-                f"{path} has a name that the output folder needs for itself: rename it, or go in two steps, scale and "
-                "apply"
-            )
+            raise OutputError(Fact("name-needed-by-output", path=str(path)))
     if dense and (project / workspace.dense.name).exists():
-        raise OutputError(
-            f"{project / workspace.dense.name} comes along in metres: leave out --dense, or rename it to have another "
-            "one made"
-        )
+        raise OutputError(Fact("dense-comes-along", folder=str(project / workspace.dense.name)))
 
 
 def place_project(
@@ -87,7 +82,7 @@ def place_project(
         remove_placed(workspace)
         for target in moves:
             if os.path.lexists(target):
-                raise OutputExistsError(f"{target} stands where the project's is to come; rename or remove it")
+                raise OutputExistsError(Fact("place-taken", path=str(target)))
         paths = [target.relative_to(workspace.root).as_posix() for target in moves]
         write_record(workspace.placed, _Placed(paths=tuple(paths)))
         for target, moved in moves.items():

@@ -23,8 +23,8 @@ from colmap_inertial.colmap.sparse import (
     require_features,
 )
 from colmap_inertial.core.arrays import Array
-from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError, OutputExistsError
-from colmap_inertial.core.facts import Fact, sentences, with_sentences
+from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError, OutputExistsError, fact_of
+from colmap_inertial.core.facts import Fact, with_sentences
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, ReferenceOptions, ValidateOptions
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.io.calibration import calibration_prior
@@ -49,12 +49,6 @@ from colmap_inertial.reconstruction.drivers.validation import scaling
 
 #: What the folder keeps beside the project: where its metres come from.
 REFERENCE_FILE = "scale.json"
-_NO_TARGET = "--scale-from target needs the target: --target checkerboard:COLSxROWS:SQUARE_M or another"
-_NO_DISTANCE = (
-    "--scale-from distance needs --between A B (two marker numbers, or two points as x,y,z of the model) and "
-    "--distance METRES+-SIGMA"
-)
-_NO_MARKERS = "--between with markers needs what they are: --target aruco:DICT:SIDE_M"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -126,7 +120,7 @@ def scale_project_by(
     if reference.target is not None:
         images = project / "images" if source.images is None else source.images
         if not images.is_dir():
-            raise FormatError(images, "no such folder of pictures; give the project's images with --images DIR")
+            raise FormatError(images, Fact("no-folder-of-pictures"))
         validation = validate_model(
             model,
             images,
@@ -135,7 +129,7 @@ def scale_project_by(
             progress=lambda done, total: progress("validation", done, total),
         )
         if validation.doubts and reference.scale_from == "target":
-            raise NotObservableError("scale", "; ".join(sentences(validation.doubts)))
+            raise NotObservableError("scale", Fact("found-together", found=validation.doubts))
     if reference.scale_from == "distance":
         scale, sigma_log, made_of = _scale_by_distance(reference, validation)
     else:
@@ -178,20 +172,20 @@ def check_reference(reference: ReferenceOptions) -> None:
         With all that is missing.
     """
     if reference.scale_from == "target" and reference.target is None:
-        raise InertialError(_NO_TARGET)
+        raise InertialError(Fact("target-not-given"))
     if reference.scale_from == "distance":
         if reference.between is None or reference.distance is None:
-            raise InertialError(_NO_DISTANCE)
+            raise InertialError(Fact("distance-not-given"))
         _length(reference.distance)
         if reference.target is None and not all("," in end for end in reference.between):
-            raise InertialError(_NO_MARKERS)
+            raise InertialError(Fact("markers-not-given"))
     if reference.target is not None:
         parse_target(reference.target)
 
 
 def _scale_by_target(validation: Validation | None) -> tuple[float, float, str]:
     if validation is None:
-        raise InertialError(_NO_TARGET)
+        raise InertialError(Fact("target-not-given"))
     # by half of its corners, so that the others can tell how right that is
     control = validation.control
     scale = validation.metres_per_unit if control is None else control.metres_per_unit
@@ -203,12 +197,12 @@ def _scale_by_target(validation: Validation | None) -> tuple[float, float, str]:
 def _scale_by_distance(reference: ReferenceOptions, validation: Validation | None) -> tuple[float, float, str]:
     between, distance = reference.between, reference.distance
     if between is None or distance is None:
-        raise InertialError(_NO_DISTANCE)
+        raise InertialError(Fact("distance-not-given"))
     metres, sigma_m = _length(distance)
     places, noise = zip(*(_place(text, validation) for text in between), strict=True)
     measured = float(np.linalg.norm(places[0] - places[1]))
     if not measured > 0:
-        raise NotObservableError("scale", f"{between[0]} and {between[1]} are the same place")
+        raise NotObservableError("scale", Fact("one-place", first=between[0], second=between[1]))
     sigma_log = float(np.hypot(sigma_m / metres, np.hypot(*noise) / measured))
     return metres / measured, sigma_log, f"distance of {distance} m between {between[0]} and {between[1]}"
 
@@ -219,7 +213,7 @@ def _length(text: str) -> tuple[float, float]:
     except ValueError:
         metres = sigma_m = float("nan")
     if not (0 < sigma_m < metres < float("inf")):
-        raise InertialError(f'--distance "{text}": write metres and how well they are known, as in 4.20+-0.01')
+        raise InertialError(Fact("distance-unreadable", text=text))
     return metres, sigma_m
 
 
@@ -232,16 +226,15 @@ def _place(text: str, validation: Validation | None) -> tuple[Array, float]:
         except ValueError:
             place = np.full(3, np.nan)
         if not np.isfinite(place).all():
-            raise InertialError(f'--between "{text}": a point is x,y,z in the units of the model')
+            raise InertialError(Fact("point-unreadable", text=text))
         return place, 0.0
     if not text.isdecimal() or len(text) > 9:
-        raise InertialError(f'--between "{text}": write the number of a marker, or a point as x,y,z')
+        raise InertialError(Fact("marker-unreadable", text=text))
     if validation is None or validation.target.kind != "aruco":
-        raise InertialError(_NO_MARKERS)
+        raise InertialError(Fact("markers-not-given"))
     centres = marker_centres(validation)
     if int(text) not in centres:
-        seen = ", ".join(map(str, sorted(centres))) or "none"
-        raise NotObservableError("distance", f"marker {text} was not measured in the model; measured: {seen}")
+        raise NotObservableError("distance", Fact("marker-not-measured", marker=text, measured=sorted(centres)))
     return centres[int(text)], _noise(validation, int(text))
 
 
@@ -296,17 +289,14 @@ def reconstruct_by(
     capture, out = Path(capture), Path(out)
     check_reference(reference)
     if out.is_dir() and any(out.iterdir()) and not (out / "colmap" / _MADE_FROM).exists():
-        raise OutputExistsError(f"{out} is not empty; choose another output folder")
+        raise OutputExistsError(Fact("output-not-empty", path=str(out)))
     refuse_links(out)
     if options.colmap_executable is not None:
-        raise InertialError("--colmap-executable goes with a capture whose metres come from the IMU; leave it out")
+        raise InertialError(Fact("for-metres-of-the-imu", option="--colmap-executable"))
     if options.database is not None:
-        raise InertialError("--database goes with a capture whose metres come from the IMU; leave it out")
+        raise InertialError(Fact("for-metres-of-the-imu", option="--database"))
     if any("," in end for end in reference.between or ()):
-        raise InertialError(
-            "--between with points needs the model that they are of: map first (with a target or two markers), or give "
-            "a COLMAP project"
-        )
+        raise InertialError(Fact("points-need-a-model"))
     pictures = _pictures(capture)
     names = _names(pictures)
     made_from = {"capture": str(capture.resolve()), "pictures": len(names), **dataclasses.asdict(options.mapping)}
@@ -343,19 +333,18 @@ def _is_mapped(out: Path, made_from: dict[str, object]) -> bool:
     shutil.rmtree(out / "metric", ignore_errors=True)
     if {path.name for path in out.iterdir()} != {"colmap"}:
         return False
-    again = f"remove {out}, or choose another folder"
     try:
         with a_record_of_ours(record):
             known = read_json(record)
             list(map(int, known["left_out"]))
             kept = dict(known["files"])
     except FormatError as error:
-        raise OutputExistsError(f"{error}; {again}") from None
+        raise OutputExistsError(Fact("record-unreadable", found=fact_of(error), out=str(out))) from None
     if any(known.get(key) != value for key, value in made_from.items()):
-        raise OutputExistsError(f"{out} holds a model of other pictures or options; choose another folder or remove it")
+        raise OutputExistsError(Fact("output-of-another-run", path=str(out)))
     contents = _contents(record.parent)
     if changed := sorted(name for name in kept | contents if kept.get(name) != contents.get(name)):
-        raise OutputExistsError(f"{record.parent / changed[0]} is missing or was changed since it was made; {again}")
+        raise OutputExistsError(Fact("output-changed", path=str(record.parent / changed[0]), out=str(out)))
     return True
 
 
@@ -370,7 +359,7 @@ def _contents(project: Path) -> dict[str, list[object]]:
 def _pictures(path: Path) -> Capture:
     """A capture, a folder of pictures, or a video."""
     if not path.exists():
-        raise FormatError(path, "no such file or folder")
+        raise FormatError(path, Fact("no-such-file", what="file or folder"))
     frames: ImageFolder | Video
     if path.is_file() and is_mp4(path):
         frames = Video(file=path, frames_per_s=_FRAMES_PER_S)
@@ -380,11 +369,11 @@ def _pictures(path: Path) -> Capture:
         return Capture(path=path, frames=frames, calibration=calibration_prior())
     capture = load_capture(path)
     if capture.frames is None:
-        raise FormatError(path, "has no pictures: add [images] or [video]")
+        raise FormatError(path, Fact("capture-has-no-pictures"))
     if capture.apertures is not None or capture.exposures is not None:
-        raise FormatError(path, "--scale-from target or distance takes plain pictures: fuse them first")
+        raise FormatError(path, Fact("scale-from-plain-pictures"))
     if capture.rig:
-        raise FormatError(path, "--scale-from target or distance takes one camera: take [rig] out")
+        raise FormatError(path, Fact("scale-from-one-camera"))
     if isinstance(capture.frames, Video) and capture.frames.frames_per_s is None:
         capture = dataclasses.replace(capture, frames=dataclasses.replace(capture.frames, frames_per_s=_FRAMES_PER_S))
     return capture

@@ -24,6 +24,7 @@ from colmap_inertial.checks.report.series import rounded, strided
 from colmap_inertial.checks.report.signals import signal_record
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import MappingError, NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ProjectOptions
 from colmap_inertial.core.threads import usable_processors
 from colmap_inertial.core.types import CameraTrajectory, ImuRecording, Keypoints
@@ -208,7 +209,7 @@ def reporting_stops(workspace: Workspace, capture: Capture) -> Iterator[None]:
         withdraw(workspace)
         with _failures_logged("the report of the stop"):
             page = write_report(workspace.root, stopped=str(error), capture=str(capture.path.resolve()))
-            error.add_note(f"what was found, and what to do: {page}")
+            error.add_note(str(Fact("found-on-page", page=str(page))))
         raise
 
 

@@ -15,14 +15,16 @@ from colmap_inertial.colmap.depth_maps import DenseResult
 from colmap_inertial.colmap.mapping import MapRecord
 from colmap_inertial.colmap.sparse import KeypointRecords, MatchRecord
 from colmap_inertial.core.errors import InertialError, NotObservableError
-from colmap_inertial.core.facts import DETAILS, Fact, sentences, with_sentences
+from colmap_inertial.core.facts import DETAILS, Fact, with_sentences
 from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply
 from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.types import Action, CameraImuCalibration, Gap, JoinedPart, ScaleEstimate, Treatment
 from colmap_inertial.inertial.georeference import Georeference
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.model import similarity_as_json
+from colmap_inertial.model.identity import ModelIdentity
 from colmap_inertial.model.rigs import RigSensor
+from colmap_inertial.model.similarities import OF_MODEL
 from colmap_inertial.pipeline.run.workspace import Workspace
 from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
 from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan, note_as_json
@@ -54,6 +56,8 @@ class ScaledModel:
         What it was joined of; empty where it is one of COLMAP's models.
     rig
         Where the cameras of rigs are, in metres; empty without rigs.
+    identity
+        Of COLMAP's model that the scale is of; ``None`` where it is of a part of one.
     """
 
     index: int
@@ -66,6 +70,7 @@ class ScaledModel:
     treatments: tuple[Treatment, ...] = ()
     parts: tuple[JoinedPart, ...] = ()
     rig: tuple[RigSensor, ...] = ()
+    identity: ModelIdentity | None = None
 
 
 @prints_in_lines
@@ -165,12 +170,13 @@ class ReconstructResult:
     unchanged: bool = False
 
     @property
-    def waiting(self) -> tuple[str, ...]:
+    def waiting(self) -> tuple[Fact, ...]:
         """Steps that the dense reconstructions wait for; empty where nothing is left to do."""
         return tuple(model.dense.waiting for model in self.models if model.dense is not None and model.dense.waiting)
 
     def exit_code(self) -> int:
-        """0; 1 where a validation is outside its tolerance; its error's code where the target could not be measured.
+        """0, also where a target could not be measured, as the scale does not rest on it; 1 where one is outside its
+        tolerance.
 
         Raises
         ------
@@ -180,21 +186,15 @@ class ReconstructResult:
             When a dense reconstruction was asked for and waits for depth maps.
         """
         if all(model.sparse_metric is None for model in self.models):
-            reasons = {model.index: "; ".join(sentences(model.scale.reasons)) for model in self.models}
-            raise NotObservableError(
-                "scale",
-                next(iter(reasons.values()))
-                if len(reasons) == 1
-                else "; ".join(f"model {i}: {text}" for i, text in reasons.items()),
-            )
+            reasons = tuple(model.scale.reasons for model in self.models)
+            if len(reasons) == 1:
+                raise NotObservableError("scale", Fact("scale-refused", reasons=reasons[0]))
+            models = tuple(model.index for model in self.models)
+            raise NotObservableError("scale", Fact("scales-refused", models=models, reasons=reasons))
         if self.waiting:
-            raise InertialError("; ".join(self.waiting))
-        checked = [model.validation for model in self.models if model.validation is not None]
-        failures = [check.exit_code for check in checked if isinstance(check, InertialError)]
-        outside = any(not check.within_tolerance for check in checked if isinstance(check, Validation))
-        if outside:
-            return 1
-        return failures[0] if len(failures) == len(checked) > 0 else 0
+            raise InertialError(Fact("found-together", found=self.waiting))
+        checked = [model.validation for model in self.models]
+        return int(any(not check.within_tolerance for check in checked if isinstance(check, Validation)))
 
 
 @prints_in_lines
@@ -282,8 +282,8 @@ def measurement_as_json(measurement: Validation | Georeference | InertialError |
 
 
 def error_as_json(error: InertialError) -> dict[str, Any]:
-    """What an error says, and its code and values where it has them."""
-    return {"error": str(error)} | ({} if error.fact is None else {"error" + DETAILS: error.fact.as_json()})
+    """What an error says, and its code and values."""
+    return {"error": str(error), "error" + DETAILS: error.fact.as_json()}
 
 
 def _record_as_json(record: Treatment | Gap) -> dict[str, object]:
@@ -320,6 +320,7 @@ def result_as_json(result: ReconstructResult, capture: Capture) -> dict[str, obj
                 "sparse_metric": relative(model.sparse_metric),
                 "trajectory": relative(model.trajectory),
                 **model.scale.as_json(),
+                **({} if model.identity is None else {OF_MODEL: model.identity.as_json()}),
                 "calibration_change": None
                 if plan.view is None
                 else _change(plan.view.calibration, model.scale.calibration),

@@ -103,7 +103,7 @@ def brings_imu(source: ScaleSource) -> bool:
     """
     path = source.source
     if not path.exists():
-        raise FormatError(path, "no such file or folder")
+        raise FormatError(path, Fact("no-such-file", what="file or folder"))
     refuse_links_around(path)
     return path.is_dir() and is_inertial_scale(path)
 
@@ -153,7 +153,7 @@ def read_source(source: ScaleSource) -> tuple[CheckInputs, Sequence[Fact]]:
         read_as = COLMAP
         folder, times = only_model(path), _find_times(source)
         if times is None:
-            raise FormatError(path, "a COLMAP model has no frame times: give --frame-times, a CSV with name,t_s")
+            raise FormatError(path, Fact("model-without-times"))
         capture = next(iter(_captures(source)), None)
         model = reader.attempt(lambda: read_model(folder))
         rigs = NO_RIGS if model is None else frames_of_rigs([model])
@@ -210,15 +210,15 @@ def _find_times(source: ScaleSource) -> Path | None:
 
 def _require_all(source: ScaleSource) -> None:
     """Refuse a model or trajectory without its recording or times, naming all that is missing at once."""
-    path, missing = source.source, []
+    path, missing = source.source, list[Fact]()
     if path.is_dir():
         only_model(path)
     if source.imu is None:
-        missing.append("the IMU recording: give --imu PATH")
+        missing.append(Fact("imu-missing"))
     if path.is_dir() and _find_times(source) is None:
-        missing.append("the times of its images: give --frame-times, a CSV with name,t_s")
+        missing.append(Fact("times-missing"))
     if missing:
-        raise FormatError(path, f"needs {'; and '.join(missing)}")
+        raise FormatError(path, Fact("inputs-missing", missing=missing))
 
 
 def align_source(source: ScaleSource, out: Path) -> CameraImuCalibration:
@@ -297,11 +297,20 @@ def scale_source(
         recording = _begin_of(recording, first_s, limit_s)
     trajectory = recording.trajectory
     checked = dataclasses.replace(recording.checked, trajectory=trajectory, max_offset_s=limit_s)
-    diagnosis = diagnose(measure_recording(checked, silent))
+    recorded = measure_recording(checked, silent)
+    diagnosis = diagnose(recorded)
     stops = tuple(finding.reason for finding in diagnosis.stopping)
+    left_out: tuple[Fact, ...] = ()
     if stops and not force:
-        estimate = ScaleEstimate.refused("none", *stops)
+        estimate = ScaleEstimate.refused("none", *stops, Fact("force-goes-on"))
     else:
+        # what is declared says less than what was recorded
+        recording = dataclasses.replace(recording, checked=dataclasses.replace(checked, prior=recorded.believed))
+        left_out = tuple(
+            Fact("declared-left-out", finding=fact)
+            for fact in recorded.contradicted.facts
+            if fact not in [finding.fact for finding in diagnosis.stopping]
+        )
         doubts = (*stops, *(finding.reason for finding in diagnosis.doubting))
         estimate = estimate_scale(
             trajectory,
@@ -311,7 +320,7 @@ def scale_source(
             read_as=recording.checked.read_as,
         )
         estimate = downgraded(_judge_shutter(source.source, recording, options, estimate), doubts)
-    notes = (*estimate.notes, *recording.imu.repairs, *recording.notes)
+    notes = (*left_out, *estimate.notes, *recording.imu.repairs, *recording.notes)
     estimate = dataclasses.replace(estimate, notes=notes)
     if json is not None:
         write_json(json, scale_as_json(estimate, source.calibration, source.source))

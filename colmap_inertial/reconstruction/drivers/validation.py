@@ -18,6 +18,7 @@ from colmap_inertial.checks.validate import (
     write_overlays,
 )
 from colmap_inertial.core.errors import InertialError, OutputExistsError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ValidateOptions
 from colmap_inertial.core.types import Similarity
 from colmap_inertial.io.files import write_json
@@ -48,11 +49,11 @@ class ValidationOutputs:
             check_output(self.json, [model])
         folder = self.pictures
         if folder is not None and folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
-            raise OutputExistsError(f"{folder} exists; name a new folder for the pictures")
+            raise OutputExistsError(Fact("pictures-exist", path=str(folder)))
         if self.apply is not None and self.apply.exists():
-            raise OutputExistsError(f"{self.apply} exists; name a new folder for the metric model")
+            raise OutputExistsError(Fact("metric-model-exists", path=str(self.apply)))
         if self.apply is not None and not unscaled:
-            raise InertialError("--apply scales a model that claims no unit: add --unscaled")
+            raise InertialError(Fact("apply-needs-unscaled"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,17 +82,15 @@ class KnownLengths:
             Where the kinds of the targets do not go with what is known.
         """
         if (self.bars is not None or self.check_points is not None) and first.kind != "aruco":
-            raise InertialError(
-                "--bars and --check-points name markers: give a target of markers, as aruco:DICT:SIDE_M"
-            )
+            raise InertialError(Fact("markers-needed"))
         if self.other is None:
             return None
         second = parse_target(self.other[0])
         metres, sigma_m = _metres_apart(self.other[1])
         if "aruco" in (first.kind, second.kind):
-            raise InertialError("--other-target is for two boards; distances between single markers go into --bars")
+            raise InertialError(Fact("other-target-of-markers"))
         if second.spec == first.spec:
-            raise InertialError("--other-target must be another board than --target: nobody could tell them apart")
+            raise InertialError(Fact("other-target-the-same"))
         return second, metres, sigma_m
 
 
@@ -135,7 +134,7 @@ def validate_source(
         result = add_check_points(result, known.check_points)
     if outputs.apply is not None:
         if result.control is None:
-            raise InertialError("too few corners to keep control and check distances apart; --apply needs more views")
+            raise InertialError(Fact("corners-too-few-to-keep-apart"))
         low, high = result.control.ci95
         sigma_log = np.log(high / low) / (2 * 1.96)
         provenance = f"control distances of {parsed.spec}"
@@ -165,5 +164,5 @@ def _metres_apart(text: str) -> tuple[float, float | None]:
     except ValueError:
         metres, sigma_m = float("nan"), None
     if not 0 < metres < float("inf") or (sigma_m is not None and not 0 < sigma_m < metres):
-        raise InertialError(f'--other-target ... "{text}": write metres between the two middles, as in 4.03+-0.002')
+        raise InertialError(Fact("other-target-length", text=text))
     return metres, sigma_m

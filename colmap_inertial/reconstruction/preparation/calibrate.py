@@ -230,7 +230,7 @@ def _calibrate_by_pixels(
         view = _aligned(rotation.trajectory(), recording, camera, "pixels")
     except NotObservableError as error:
         why = Fact(
-            "neither-by-pixels-nor-model", by_pixels=error.why, quantity=instead_of.quantity, by_model=instead_of.why
+            "neither-by-pixels-nor-model", by_pixels=error.fact, quantity=instead_of.quantity, by_model=instead_of.fact
         )
         return NotObservableError(error.quantity, why)
     # what translation does to pixels looks like a bias of the gyroscope

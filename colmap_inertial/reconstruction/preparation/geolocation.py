@@ -9,6 +9,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import CameraTrajectory, PositionFixes
 from colmap_inertial.inertial.georeference import Georeference, georeference, georeference_of_json
 from colmap_inertial.io.capture import Capture
@@ -43,13 +44,11 @@ def positions_of(capture: Capture, names: Sequence[str], images: Path | None = N
     frames = capture.frames
     if isinstance(frames, Video):
         if frames.frame_times is not None:
-            raise FormatError(
-                frames.frame_times, "puts the frames on another clock than the video's, which its positions are on"
-            )
+            raise FormatError(frames.frame_times, Fact("frames-on-another-clock"))
         return positions_in_video(frames.file)
     folder = images if images is not None else frames.folder if isinstance(frames, ImageFolder) else None
     if folder is None:
-        raise FormatError(capture.path, "has neither a video nor pictures that could hold positions")
+        raise FormatError(capture.path, Fact("nothing-with-positions"))
     return positions_in_pictures(folder, names)
 
 
@@ -118,7 +117,7 @@ def read_georeference(path: Path, index: int) -> Georeference | None:
         if entry is None:
             return None
         if "error" in entry:
-            raise NotObservableError("heading", str(entry["error"]))
+            raise NotObservableError("heading", Fact.stated(str(entry["error"])))
         return georeference_of_json(entry)
 
 

@@ -158,10 +158,7 @@ def plan_imaging(recording: Recording, context: RunContext, asked: Treatments) -
     """
     capture, timing = recording.capture, recording.timing
     if asked.rolling_shutter == "rectify" and timing.readout_s is None:
-        raise InertialError(
-            f"{capture.path}: undoing the rolling shutter needs readout_s under [timing], the time from the first row "
-            "to the last"
-        )
+        raise InertialError(Fact("readout-needed", path=str(capture.path)))
     why_not = _no_deblurring(recording, asked, context.progress)
     no_rectifying = _no_rectifying(recording, asked)
     plan = ImagingPlan(

@@ -13,7 +13,8 @@ from colmap_inertial.checks.diagnose import Diagnosis, FramesInVideo, Recorded, 
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError, TimingError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, FrameTiming
+from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, Frame, FrameTiming
+from colmap_inertial.imaging.detail import is_blank
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import write_json
 from colmap_inertial.io.frame_sources import ImageFolder
@@ -31,6 +32,7 @@ from colmap_inertial.reconstruction.preparation.sampling import (
     guess_camera,
     measure_sampled_rotation,
     sample_beginning,
+    show_frames,
     some_frames,
 )
 
@@ -77,7 +79,7 @@ def check_imu(raw: RawImu, *, force: bool) -> RawImu:
             raise
         if not force:
             raise NotObservableError(
-                "scale", Fact("stopped-by-file", path=str(error.path), finding=error.why)
+                "scale", Fact("stopped-by-file", path=str(error.path), finding=error.fact)
             ) from None
     return raw
 
@@ -137,10 +139,15 @@ def measure_recording(inputs: CheckInputs, progress: Progress) -> Recorded:
     capture, timing, poses, raw = inputs.capture, inputs.timing, inputs.trajectory, inputs.raw
     log_ = None if capture is None else capture.frame_log
     rotation = in_video = None
+    looked: dict[str, bool] = {}
+
+    def look(frame: Frame) -> None:
+        looked[frame.name] = is_blank(frame.image)
+
     if poses is None and capture is not None and timing is not None:
         # turns in pictures that the camera stabilised are not the camera's
         if log_ is None or not log_.stabilised:
-            rotation = reader.attempt(lambda: measure_images(capture, timing, progress))
+            rotation = reader.attempt(lambda: measure_images(capture, timing, progress, look))
         in_video = reader.attempt(lambda: find_in_video(capture, timing, progress))
     return Recorded(
         refused=tuple(reader.refused),
@@ -151,6 +158,8 @@ def measure_recording(inputs: CheckInputs, progress: Progress) -> Recorded:
         log=log_,
         is_capture=capture is not None and poses is None,
         rotation=rotation,
+        looked_at=len(looked),
+        blank=tuple(name for name, is_one in looked.items() if is_one),
         camera=None if capture is None else capture.camera,
         calibration=inputs.prior,
         trajectory=None if isinstance(poses, str) else poses,
@@ -216,18 +225,25 @@ def stop_or_doubt(diagnosis: Diagnosis, *, force: bool) -> tuple[Fact, ...]:
     return (*(Fact("forced-to-go-on", finding=finding.fact) for finding in stopping), *doubts)
 
 
-def measure_images(capture: Capture, timing: FrameTiming, progress: Progress) -> VisualRotation | None:
-    """The rotation between images: those of a video are followed, those further apart compared; ``None`` for few."""
+def measure_images(
+    capture: Capture, timing: FrameTiming, progress: Progress, look: Callable[[Frame], None] | None = None
+) -> VisualRotation | None:
+    """The rotation between images: those of a video are followed, those further apart compared; ``None`` for few.
+
+    Each is shown to ``look``.
+    """
     if len(timing.t_s) > 1 and float(np.median(np.diff(timing.t_s))) <= _EFFORT.video_step_s:
         indices = sample_beginning(timing, _EFFORT.frame_spacing_s, _EFFORT.frames)
         return measure_sampled_rotation(
-            capture, timing, guess_camera(capture, timing), indices, progress, stage="check"
+            capture, timing, guess_camera(capture, timing), indices, progress, stage="check", look=look
         )
     if len(timing.t_s) < 5:
         return None
     first = max(0, (len(timing.t_s) - _EFFORT.compared) // 2)
     few = range(first, min(first + _EFFORT.compared, len(timing.t_s)))
     frames = counted(some_frames(capture, timing, few), len(few), "check", progress)
+    if look is not None:
+        frames = show_frames(frames, look)
     camera = colmap_camera(guess_camera(capture, timing))
     with one_blas_thread():
         return measure_two_view_rotations(frames, camera, timing)

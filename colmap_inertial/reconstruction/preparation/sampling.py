@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,6 +80,13 @@ def sample_beginning(timing: FrameTiming, spacing_s: float, most: int) -> list[i
     return kept[first : first + most]
 
 
+def show_frames(frames: Iterable[Frame], look: Callable[[Frame], None]) -> Iterator[Frame]:
+    """The same frames, each shown to ``look`` first."""
+    for frame in frames:
+        look(frame)
+        yield frame
+
+
 def measure_sampled_rotation(
     capture: Capture,
     timing: FrameTiming,
@@ -88,8 +95,14 @@ def measure_sampled_rotation(
     progress: Progress,
     *,
     stage: str = "motion",
+    look: Callable[[Frame], None] | None = None,
 ) -> VisualRotation:
-    """The rotation between some frames, by their pixels; progress under the name of ``stage``."""
+    """The rotation between some frames, by their pixels; progress under the name of ``stage``.
+
+    Each frame is shown to ``look``.
+    """
     frames = counted(some_frames(capture, timing, indices), len(indices), stage, progress)
+    if look is not None:
+        frames = show_frames(frames, look)
     with one_blas_thread():
         return measure_rotation(frames, colmap_camera(camera), timing, FlowOptions())

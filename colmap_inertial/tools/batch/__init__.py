@@ -21,6 +21,7 @@ from pathlib import Path
 
 from colmap_inertial.core.choices import check_kind
 from colmap_inertial.core.errors import OutputError, OutputExistsError, describe_environment_fault
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import BatchOptions, ReconstructOptions, StageNames
 from colmap_inertial.core.printing import cell
 from colmap_inertial.core.summary import prints_in_lines
@@ -181,15 +182,15 @@ def _owned(out: Path) -> Iterator[str]:
     """
     status = out / "status"
     if out.exists() and not (out.is_dir() and (status.is_dir() or not any(out.iterdir()))):
-        raise OutputExistsError(f"{out} is no batch's folder; choose a new one")
+        raise OutputExistsError(Fact("not-a-batch", out=str(out)))
     refuse_links(out)
-    busy = f"another batch is at work in {out}; wait for it or choose another folder"
+    busy = Fact("batch-at-work", folder=str(out))
     with contextlib.ExitStack() as held:
         try:
             status.mkdir(parents=True, exist_ok=True)
             held.enter_context(locked(status / "lock", busy))
         except OSError as error:
-            raise OutputError(f"{out} cannot be made: {error.strerror or error}") from error
+            raise OutputError(Fact("folder-not-made", out=str(out), detail=str(error.strerror or error))) from error
         run = uuid.uuid4().hex
         write_text(status / "run", run)
         try:
@@ -259,8 +260,9 @@ class _Batch:
             self._set(pending.result())
         except Exception as error:  # the worker was lost too often, or cannot run it, or the scheduler is gone
             known = read_status(task.status) or self._known[name]
-            text = describe_environment_fault(error) or f"{type(error).__name__}: {error}".partition("\n")[0]
-            self._set(failed(known, f"no worker could finish it: {text}"))
+            fault = describe_environment_fault(error)
+            text = f"{type(error).__name__}: {error}".partition("\n")[0] if fault is None else fault.with_advice
+            self._set(failed(known, Fact("no-worker-finished", detail=text)))
             write_status(task.status, self._known[name])
 
     def stop(self) -> None:

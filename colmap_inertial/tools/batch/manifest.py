@@ -9,6 +9,7 @@ from typing import Any
 
 from colmap_inertial.core.choices import CheckedOptions
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, StageNames
 from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.io.files import StrPath, check_names, reader
@@ -99,9 +100,7 @@ def read_manifest(
     if not allow_stages:
         _refuse_stages(captures, path)
     if not captures:
-        raise FormatError(
-            path, "holds no folder with a capture" if path.is_dir() else "names no capture: write [[capture]] tables"
-        )
+        raise FormatError(path, Fact("no-folder-with-capture") if path.is_dir() else Fact("manifest-without-capture"))
     check_unique(captures, path)
     return captures
 
@@ -113,7 +112,7 @@ def check_unique(captures: Sequence[BatchCapture], path: Path) -> None:
         other = seen.setdefault(capture.name.casefold(), capture)
         if other is not capture:
             raise FormatError(
-                path, f"two captures are called {capture.name} ({other.path}, {capture.path}): give one another name"
+                path, Fact("captures-of-one-name", name=capture.name, first=str(other.path), second=str(capture.path))
             )
 
 
@@ -122,8 +121,7 @@ def _refuse_stages(captures: Sequence[BatchCapture], path: Path) -> None:
         if capture.stages is not None and capture.stages.code:
             raise FormatError(
                 path,
-                f"[capture, number {i}] stages: names code that this batch would run ({', '.join(capture.stages.code)})"
-                "; look at it first, then allow it with --allow-stages (allow_stages=True)",
+                Fact("batch-names-code", number=i, code=capture.stages.code),
             )
 
 
@@ -139,7 +137,7 @@ def _read_captures(path: Path, options: ReconstructOptions) -> list[BatchCapture
     if tables is None:
         return []
     if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
-        root.fail("capture", "write [[capture]], with two brackets, before each capture")
+        root.fail("capture", Fact("capture-not-in-tables"))
     text = path.read_text(encoding="utf-8-sig", errors="replace")
     return [
         _capture(path, Section(path, f"capture, number {i}", table, text), options)
@@ -164,7 +162,7 @@ def _capture(manifest: Path, table: Section, options: ReconstructOptions) -> Bat
     try:
         return BatchCapture(name=name, path=source, options=options, project=project, stages=stages)
     except ValueError as error:
-        table.fail("name", str(error))
+        table.fail("name", Fact("invalid-values", detail=str(error)))
 
 
 def _stages(table: Section) -> StageNames | None:
@@ -172,11 +170,11 @@ def _stages(table: Section) -> StageNames | None:
     try:
         return override_options(StageNames(), values, table.path) if "stages" in table else None
     except FormatError as error:
-        table.fail("stages", error.reason)
+        table.fail("stages", error.fact)
 
 
 def _table(table: Section, key: str) -> dict[str, Any]:
     values = table.raw(key)
     if values is not None and not isinstance(values, dict):
-        table.fail(key, f"is a table, such as {key}.name = value")
+        table.fail(key, Fact("key-is-a-table", key=key))
     return values or {}

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.threads import usable_cores
 from colmap_inertial.pipeline.run.workers import connect, warn_without_gpu
 from colmap_inertial.tools.batch.task import CaptureStatus, CaptureTask, run_capture
@@ -114,7 +115,7 @@ def dask_pool(address: str) -> Iterator[Submit]:
 
     Errors are those of :func:`~colmap_inertial.pipeline.run.workers.connect`.
     """
-    client = connect(address, "--scheduler hands captures to a Dask cluster")
+    client = connect(address, Fact("captures-need-dask"))
     submitted: list[Any] = []
     warn_once = functools.cache(lambda: warn_without_gpu(client, "dense captures"))
 

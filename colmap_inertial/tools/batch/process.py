@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from colmap_inertial.checks.diagnose import Diagnosis
-from colmap_inertial.core.errors import InertialError, OutputExistsError
+from colmap_inertial.core.errors import InertialError, OutputExistsError, fact_of
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ProjectOptions, StageNames
 from colmap_inertial.io.files import locked, reading_within, write_text
 from colmap_inertial.pipeline.run.config import config_as_toml, read_config
@@ -71,10 +72,10 @@ def main() -> None:
         end = read_end(status, Workspace(task.out).result)
     except InertialError as error:
         print(f"error: {error}", file=sys.stderr)
-        end = failed(status, str(error), error.exit_code)
+        end = failed(status, fact_of(error), error.exit_code)
     except Exception as error:
         traceback.print_exc()
-        end = failed(status, f"{type(error).__name__}: {error} (see {task.log})")
+        end = failed(status, Fact("unexpected-error", kind=type(error).__name__, detail=str(error), log=str(task.log)))
     write_status(task.status, end)
 
 
@@ -83,10 +84,7 @@ def _reconstruct(task: CaptureTask, progress: Progress, findings: Callable[[Diag
     with reading_within(job.options.limits):
         existing = job.project != ProjectOptions() or is_project(task.capture)
     if existing and job.stages != StageNames(model=job.stages.model):
-        raise InertialError(
-            "stages.frame and stages.keypoint: an existing model is not mapped again, nor its images changed; give "
-            "this capture stages of its own without them"
-        )
+        raise InertialError(Fact("stages-before-a-model"))
     stages = load_stages(job.stages)
     _begin(Workspace(task.out), job.stages)
     if existing:
@@ -130,7 +128,7 @@ def _begin(workspace: Workspace, stages: StageNames) -> None:
         with contextlib.suppress(OutputExistsError, OSError):
             workspace.stamps.mkdir(parents=True, exist_ok=True)
             # a worker that was lost may take as long to let go of the folder
-            with locked(workspace.lock, "", wait_s=60.0):
+            with locked(workspace.lock, Fact("run-at-work", folder=str(workspace.root)), wait_s=60.0):
                 write_text(workspace.stage_names, config_as_toml(stages))
 
 

@@ -20,7 +20,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from colmap_inertial.core.errors import FormatError, InertialError, OutputError, TargetNotFoundError
+from colmap_inertial.core.errors import FormatError, InertialError, OutputError, fact_of
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, StageNames
 from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.io.files import read_json, write_json
@@ -155,9 +156,9 @@ def write_status(path: Path, status: CaptureStatus) -> None:
         write_json(path, status)
 
 
-def failed(status: CaptureStatus, error: str, exit_code: int = 1) -> CaptureStatus:
+def failed(status: CaptureStatus, why: Fact, exit_code: int = 1) -> CaptureStatus:
     """The status of a capture that ended with an error."""
-    return dataclasses.replace(status, state="failed", exit_code=exit_code, error=error, stage="")
+    return dataclasses.replace(status, state="failed", exit_code=exit_code, error=why.with_advice, stage="")
 
 
 def find_earlier_end(task: CaptureTask) -> CaptureStatus | None:
@@ -173,7 +174,7 @@ def find_earlier_end(task: CaptureTask) -> CaptureStatus | None:
     try:
         job = read_config(task.config, Job)
     except FormatError as error:
-        return failed(status, str(error), error.exit_code)
+        return failed(status, fact_of(error), error.exit_code)
     try:
         result, may_go = read_json(workspace.result), (workspace.images, workspace.colmap)
         if result.get("waiting") or find_loss(workspace, [*result.get("seconds", ()), "report"], but=may_go):
@@ -188,8 +189,7 @@ def find_earlier_end(task: CaptureTask) -> CaptureStatus | None:
         }
         other = next((name for name, differ in differs.items() if differ), None)
         if other is not None:
-            text = f"{task.out} holds the result of another {other}; remove it or choose another folder"
-            return failed(status, text, FormatError.exit_code)
+            return failed(status, Fact("result-of-another", out=str(task.out), what=other), FormatError.exit_code)
         return read_end(status, workspace.result)
     except FormatError:
         return None  # damaged: the run makes it again, or says what to do
@@ -211,7 +211,7 @@ def read_end(status: CaptureStatus, result: Path) -> CaptureStatus:
         models = tuple(_model(model) for model in values["models"])
         frames = len(values["frames"]) or None  # an existing project counts none
     except (KeyError, TypeError, AttributeError):
-        raise FormatError(result, "is not the result of a reconstruction") from None
+        raise FormatError(result, Fact("not-a-result")) from None
     code, error = _verdict(models)
     state: State = "failed" if code else "done"
     return dataclasses.replace(
@@ -240,10 +240,7 @@ def _verdict(models: Sequence[Mapping[str, Any]]) -> tuple[int, str | None]:
     outside = [model for model in models if model["within_tolerance"] is False]
     if outside:
         return 1, f"the target is outside its tolerance: scale error {outside[0]['scale_error_pct']:+.2f} %"
-    checked = [model for model in models if model["within_tolerance"] is not None or model["validation_error"]]
-    errors = [model["validation_error"] for model in checked if model["validation_error"]]
-    if checked and len(errors) == len(checked):
-        return TargetNotFoundError.exit_code, errors[0]
+    # a target that could not be measured leaves a scale as good as it was: the summary says so
     return 0, None
 
 
@@ -262,7 +259,7 @@ def run_capture(task: CaptureTask, cores: Sequence[int] = ()) -> CaptureStatus:
     host = socket.gethostname()
     status = CaptureStatus(name=task.name, host=host, run=task.run)
     if not task.config.is_file():
-        return failed(status, f"{host} does not see {task.config}: workers need the same files under the same paths", 2)
+        return failed(status, Fact("worker-sees-no-files", worker=host, path=str(task.config)), 2)
     earlier = find_earlier_end(task)
     if earlier is not None:
         write_status(task.status, earlier)
@@ -273,7 +270,7 @@ def run_capture(task: CaptureTask, cores: Sequence[int] = ()) -> CaptureStatus:
     start = time.monotonic() - status.seconds
     while True:
         if status.attempts >= task.attempts:
-            status = failed(status, f"its process or worker was killed {status.attempts} times; see {task.log}")
+            status = failed(status, Fact("capture-killed", times=status.attempts, log=str(task.log)))
             break
         status = dataclasses.replace(status, state="running", attempts=status.attempts + 1, stage="")
         write_status(task.status, status)
@@ -288,7 +285,7 @@ def run_capture(task: CaptureTask, cores: Sequence[int] = ()) -> CaptureStatus:
         if status.finished:
             break
         if code >= 0:
-            status = failed(status, f"its process ended with code {code}; see {task.log}")
+            status = failed(status, Fact("capture-process-ended", exit_code=code, log=str(task.log)))
             break
     write_status(task.status, status)
     return status

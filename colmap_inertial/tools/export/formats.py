@@ -12,6 +12,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import AnyArray, Array, UInt8Array, UInt16Array
 from colmap_inertial.core.errors import FormatError, MissingExtraError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_from_matrix, rotation_between
 from colmap_inertial.core.printing import cell
 from colmap_inertial.core.types import CameraMotion, CameraTrajectory
@@ -57,9 +58,7 @@ def smooth_path(trajectory: Path | None, model: Path) -> CameraTrajectory:
         Where there is none.
     """
     if trajectory is None or not trajectory.is_file():
-        raise FormatError(
-            model, "has no smoothed path: only a run of reconstruct with a scale makes one; csv needs none"
-        )
+        raise FormatError(model, Fact("no-smoothed-path"))
     return read_tum(trajectory)
 
 
@@ -101,7 +100,7 @@ def require_pygltflib() -> None:
     try:
         import pygltflib  # noqa: F401
     except ImportError:
-        raise MissingExtraError("gltf", "glTF files are written by pygltflib") from None
+        raise MissingExtraError("gltf", Fact("needs-pygltflib")) from None
 
 
 def write_gltf(
@@ -281,7 +280,7 @@ def require_laspy() -> None:
         import laspy  # noqa: F401
         import pyproj  # noqa: F401
     except ImportError:
-        raise MissingExtraError("las", "LAS files are written by laspy, and put on the map by pyproj") from None
+        raise MissingExtraError("las", Fact("needs-laspy")) from None
 
 
 def utm_epsg(latitude_deg: float, longitude_deg: float) -> int:

@@ -132,13 +132,11 @@ class ExportSource:
         filmed = {}
         if capture is not None:
             if capture.apertures is not None or capture.exposures is not None:
-                raise FormatError(capture.path, "its frames are made of several pictures each: there is no original")
+                raise FormatError(capture.path, Fact("frames-of-several-pictures"))
             known = set(read_frame_timing(capture).names) if capture.frames is not None else set()
             lost = next((name for name in changed if name not in known), None)
             if lost is not None:
-                raise FormatError(
-                    capture.path, f"has no frame {lost!r}: it is not the capture that the run was made of"
-                )
+                raise FormatError(capture.path, Fact("frame-not-in-capture", frame=lost))
             for name in changed:
                 bent = self.treated[name].rectified
                 filmed[name] = Picture(path=capture.path, filmed=True, agrees=not bent)
@@ -147,8 +145,7 @@ class ExportSource:
         if changed_since is not None:
             raise FormatError(
                 changed_since,
-                "is not as its run wrote it: start that again, it makes it again; or say where the pictures are: "
-                "--image-folder",
+                Fact("changed-since-its-run"),
             )
         return picture_of
 
@@ -156,10 +153,10 @@ class ExportSource:
         paths = (picture_in(folder, name, self.found.folder) for folder in folders if folder.is_dir())
         path = next((path for path in paths if path.is_file()), None)
         if path is None:
-            looked = ", ".join(str(folder) for folder in folders if folder.is_dir()) or "no folder of images"
+            looked = tuple(str(folder) for folder in folders if folder.is_dir())
             raise FormatError(
                 self.found.folder,
-                f"the picture of its image {name!r} is missing (in {looked}); say where: --image-folder",
+                Fact("picture-missing", image=name, folders=looked),
             )
         treated = self.treated.get(name, TreatedFrame())
         moved = treated.rectified and path.resolve().is_relative_to(rectified.resolve())
@@ -192,8 +189,9 @@ def read_source(
     with explaining_losses(Workspace(out)):
         source = find_source(out, model, images=image_folder)
         if source.scale.unit != "m" and not unscaled:
-            why = "; ".join(map(str, source.scale.reasons or (Fact("never-scaled"),)))
-            raise NotObservableError("scale", f"{why}; --unscaled exports it in its own units")
+            raise NotObservableError(
+                "scale", Fact("export-without-scale", reasons=source.scale.reasons or (Fact("never-scaled"),))
+            )
         reconstruction = read_model(source.folder)
         down, motion = source.down_in_world, None
         if source.scale.unit == "m" and source.trajectory is not None and motion_file(source.trajectory).is_file():
@@ -219,7 +217,7 @@ def find_georeference(out: Path, source: ExportSource, capture: Capture | None) 
         Where they leave the heading open, or the model is not metric.
     """
     if source.found.scale.unit != "m" or source.up_in_world is None:
-        raise NotObservableError("heading", "only a model in metres, with gravity known, stands anywhere on Earth")
+        raise NotObservableError("heading", Fact("nowhere-on-earth"))
     known = read_georeference(Workspace(out).georeference, source.found.index)
     if known is not None:
         return known
@@ -230,9 +228,9 @@ def find_georeference(out: Path, source: ExportSource, capture: Capture | None) 
     elif folder is not None:
         fixes = positions_in_pictures(folder, path.names)
     else:
-        raise FormatError(source.found.folder, "its pictures are not beside it: give --capture or --image-folder")
+        raise FormatError(source.found.folder, Fact("pictures-not-beside"))
     if fixes.names is None and source.motion is None:
-        raise FormatError(source.found.folder, "the run kept no times of its images, which positions in a video go by")
+        raise FormatError(source.found.folder, Fact("times-of-images-lost"))
     return georeference_path(fixes, path, source.up_in_world, timed=bool(_times(source)))
 
 

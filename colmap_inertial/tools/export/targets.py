@@ -96,7 +96,7 @@ def exposures_of(
             late_s=left_s * late,
         )
     if not exposures:
-        raise NotObservableError("camera motion", "none of the model's images has a velocity")
+        raise NotObservableError("camera motion", Fact("no-velocities"))
     if motion.exposure_s is not None and len({exposure.exposure_s for exposure in exposures.values()}) > 1:
         notes.append(Fact("one-exposure-for-all"))
     return exposures
@@ -107,15 +107,13 @@ def _require_motion(motion: CameraMotion | None, pictures: Mapping[str, Picture]
     if motion is None or not motion.names:
         raise NotObservableError(
             "camera motion",
-            "the run kept no velocities: its model has no scale, its gyroscope was silent, or an earlier version made "
-            "it (then start reconstruct again with the same arguments, it adds them)",
+            Fact("velocities-not-kept"),
         )
     as_filmed = any(not picture.rectified for picture in pictures.values())
     if as_filmed and (motion.readout_s or 0.0) > 0 and motion.readout_direction != "down":
         raise NotObservableError(
             "rolling shutter",
-            f"these pictures are read out {motion.readout_direction}, which the program cannot be told; export the "
-            "rectified ones, or turn the pictures",
+            Fact("readout-not-told", direction=motion.readout_direction),
         )
     return motion
 

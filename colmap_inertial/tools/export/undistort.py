@@ -11,6 +11,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, UInt8Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import colmap_px_from_opencv
 from colmap_inertial.core.types import CameraModel
 from colmap_inertial.imaging.blur_field import BlurField
@@ -81,9 +82,8 @@ class Undistortion:
         FormatError
             For a camera that sees all around.
         """
-        named = f"camera {camera.camera_id} ({camera.model_name})"
         if sees_all_around(camera):
-            raise FormatError(where, f"{named} sees all around; no pinhole does")
+            raise FormatError(where, Fact("sees-all-around", camera=camera.camera_id, model=camera.model_name))
         fx, fy = float(camera.focal_length_x), float(camera.focal_length_y)
         if square:
             fx = fy = 0.5 * (fx + fy)
@@ -104,7 +104,7 @@ class Undistortion:
             if undistortion.is_inside():
                 return undistortion
             half = half * (1 - _LIMITS.shrink)
-        raise FormatError(where, f"{named}: its lens cannot be undistorted")
+        raise FormatError(where, Fact("not-undistorted", camera=camera.camera_id, model=camera.model_name))
 
     def is_inside(self) -> bool:
         """Whether all of the new picture comes from the old one."""

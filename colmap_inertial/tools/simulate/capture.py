@@ -18,6 +18,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, UInt8Array
 from colmap_inertial.core.errors import OutputExistsError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_multiply, quat_normalize
 from colmap_inertial.core.types import CameraModel
 from colmap_inertial.io.files import write_json, write_text
@@ -115,7 +116,7 @@ def write_capture(
         Where the folder holds something already.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise OutputExistsError(f"{folder} exists already; name a new folder")
+        raise OutputExistsError(Fact("folder-exists", folder=str(folder)))
     with new_folder(folder, into_empty=True) as partial_folder:
         _write_capture(recipe, partial_folder, workers, progress)
     return folder / "capture.toml"

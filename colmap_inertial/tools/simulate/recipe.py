@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import CameraModel, ReadoutDirection
 from colmap_inertial.io.files import reader
 from colmap_inertial.io.toml_section import Section, read_toml
@@ -118,7 +119,7 @@ def _read(table: Section, default: T, known: Mapping[str, Any] | None = None) ->
     try:
         return replace(default, **values)
     except ValueError as error:
-        table.fail(None, str(error))
+        table.fail(None, Fact("invalid-values", detail=str(error)))
 
 
 def _value(table: Section, key: str, default: object) -> object:
@@ -129,7 +130,7 @@ def _value(table: Section, key: str, default: object) -> object:
     if isinstance(default, int):
         value = table.number(key)
         if value is not None and value != int(value):
-            table.fail(key, f"must be a whole number, found {value!r}")
+            table.fail(key, Fact("not-a-whole-number", found=value))
         return None if value is None else int(value)
     if isinstance(default, tuple):
         return table.numbers(key, len(default))

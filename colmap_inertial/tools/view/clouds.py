@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from colmap_inertial.checks.report.series import strided
 from colmap_inertial.core.arrays import Array, Float32Array, UInt8Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.files import reader
 from colmap_inertial.io.ply import Element, read_ply_header
 
@@ -91,8 +92,10 @@ def sparse_cloud(reconstruction: pycolmap.Reconstruction, most: int) -> Cloud:
 
 
 @reader("points")
-def dense_cloud(path: Path, most: int) -> Cloud:
+def dense_cloud(path: Path, most: int, origin: Array | None = None) -> Cloud:
     """At most ``most`` points of a PLY file, evenly chosen; only these are read, and shown where they are finite.
+
+    Coordinates count from (3,) ``origin``.
 
     Raises
     ------
@@ -101,7 +104,7 @@ def dense_cloud(path: Path, most: int) -> Cloud:
     """
     table, _ = _vertices(path)
     some = np.asarray(table[strided(len(table), most)])
-    xyz = _positions(some)
+    xyz = _positions(some, origin)
     finite = np.isfinite(xyz).all(axis=1)
     some, xyz = some[finite], xyz[finite]
     rgb = _colours(some)
@@ -110,8 +113,10 @@ def dense_cloud(path: Path, most: int) -> Cloud:
 
 
 @reader("a mesh")
-def read_mesh(path: Path, most_faces: int) -> Mesh | None:
+def read_mesh(path: Path, most_faces: int, origin: Array | None = None) -> Mesh | None:
     """A PLY file of triangles; ``None`` where it has more than ``most_faces``, or none. Without what is not finite.
+
+    Coordinates count from (3,) ``origin``.
 
     Raises
     ------
@@ -120,13 +125,13 @@ def read_mesh(path: Path, most_faces: int) -> Mesh | None:
     """
     table, rest = _vertices(path)
     if rest is None:
-        raise FormatError(path, "a mesh without faces")
+        raise FormatError(path, Fact("mesh-without-faces"))
     element, offset, order = rest
     if not 0 < element.rows <= most_faces:
         return None
     lists = [p for p in element.properties if p.count is not None]
     if len(lists) != 1:
-        raise FormatError(path, "the faces of this mesh are not a list of vertices alone")
+        raise FormatError(path, Fact("faces-with-more"))
     fields: list[Any] = []
     for p in element.properties:
         if p.count is None:
@@ -135,11 +140,11 @@ def read_mesh(path: Path, most_faces: int) -> Mesh | None:
             fields += [("count", order + p.count), ("index", order + p.kind, (3,))]
     dtype = np.dtype(fields)
     if path.stat().st_size < offset + element.rows * dtype.itemsize:
-        raise FormatError(path, "truncated, or a mesh of other faces than triangles")
+        raise FormatError(path, Fact("mesh-truncated"))
     faces = np.memmap(path, dtype, "r", offset, (element.rows,))
     if not (faces["count"] == 3).all() or faces["index"].max() >= len(table):
-        raise FormatError(path, "a mesh of other faces than triangles")
-    vertices, index, rgb = _positions(table), faces["index"].astype(np.uint32), _colours(table)
+        raise FormatError(path, Fact("faces-not-triangles"))
+    vertices, index, rgb = _positions(table, origin), faces["index"].astype(np.uint32), _colours(table)
     finite = np.asarray(np.isfinite(vertices).all(axis=1))
     if not finite.all():
         renumbered = (np.cumsum(finite) - 1).astype(np.uint32)
@@ -155,25 +160,26 @@ def _vertices(path: Path) -> tuple[Any, tuple[Element, int, str] | None]:
             header = read_ply_header(path, file)
             offset = file.tell()
     except OSError as error:
-        raise FormatError(path, f"cannot be read: {error.strerror or error}") from None
+        raise FormatError(path, Fact("file-not-readable", detail=str(error.strerror or error))) from None
     order, elements = header.order, header.elements
     if order is None or not elements or elements[0].name != "vertex" or elements[0].has_list:
-        raise FormatError(path, "only binary PLY files that begin with vertices can be shown")
+        raise FormatError(path, Fact("ply-not-shown"))
     first = elements[0]
     dtype = first.dtype(order)
     if not {"x", "y", "z"} <= set(dtype.names or ()) or first.rows == 0:
-        raise FormatError(path, "holds no points")
+        raise FormatError(path, Fact("holds-no-points"))
     end = offset + first.rows * dtype.itemsize
     if path.stat().st_size < end:
-        raise FormatError(path, "truncated")
+        raise FormatError(path, Fact("truncated"))
     table = np.memmap(path, dtype, "r", offset, (first.rows,))
     faces = elements[1] if len(elements) > 1 and elements[1].name == "face" else None
     return table, None if faces is None else (faces, end, order)
 
 
-def _positions(table: Any) -> Float32Array:
-    with np.errstate(over="ignore"):  # what float32 cannot hold is not finite, and left out like the rest of it
-        return np.stack([table[name] for name in "xyz"], axis=1).astype(np.float32)
+def _positions(table: Any, origin: Array | None) -> Float32Array:
+    xyz = np.stack([table[name] for name in "xyz"], axis=1)
+    with np.errstate(over="ignore", invalid="ignore"):  # what float32 cannot hold is not finite, and left out
+        return (xyz if origin is None else xyz.astype(np.float64) - origin).astype(np.float32)
 
 
 def _colours(table: Any) -> UInt8Array | None:

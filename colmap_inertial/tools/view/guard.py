@@ -23,6 +23,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from colmap_inertial.core.errors import OutputError
+from colmap_inertial.core.facts import Fact
 
 log = logging.getLogger(__name__)
 log.addHandler(logging.NullHandler())  # what strangers send is no news for the terminal
@@ -183,7 +184,7 @@ def guarding(guard: Guard) -> Iterator[None]:
         finally:
             server.serve = serve  # type: ignore[misc]
     if not started:
-        raise OutputError("this version of viser cannot be kept to this machine's own user: install viser 1.1")
+        raise OutputError(Fact("viser-not-guarded"))
 
 
 def _quiet(handler: Callable[..., Any]) -> Callable[..., Any]:

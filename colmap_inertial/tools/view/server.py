@@ -17,6 +17,7 @@ import numpy as np
 from colmap_inertial.checks.report.series import strided
 from colmap_inertial.core.arrays import Array, UInt8Array
 from colmap_inertial.core.errors import MissingExtraError, OutputError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import quat_rotate
 from colmap_inertial.tools.view import panel
 from colmap_inertial.tools.view.drawing import RED, Drawing
@@ -300,7 +301,7 @@ def require_viser() -> None:
     from importlib.util import find_spec
 
     if find_spec("viser") is None:
-        raise MissingExtraError("view", "the viewer runs in a browser with viser")
+        raise MissingExtraError("view", Fact("needs-viser"))
 
 
 def _start_server(guard: Guard, port: int, label: str) -> viser.ViserServer:
@@ -337,5 +338,5 @@ def _free_port(host: str, port: int) -> int:
                     continue
                 return int(probe.getsockname()[1])
     except (OSError, OverflowError) as error:
-        raise OutputError(f"cannot listen at {host}, port {port}: {error}") from error
-    raise OutputError(f"no port from {port} on is free at {host}; choose another with --port")
+        raise OutputError(Fact("port-unusable", host=host, port=port, detail=str(error))) from error
+    raise OutputError(Fact("no-port-free", port=port, host=host))

@@ -151,9 +151,9 @@ def find_source(out: Path, index: int | None = None, *, images: Path | None = No
         Where there is no such model, or the run that makes it is not finished.
     """
     if not out.is_dir():
-        raise FormatError(out, "no such folder; give what reconstruct or apply wrote, or a COLMAP model")
+        raise FormatError(out, Fact("nothing-to-view"))
     if images is not None and not images.is_dir():
-        raise FormatError(images, "no such folder of images")
+        raise FormatError(images, Fact("no-folder-of-images"))
     given = () if images is None else (images,)
     workspace = Workspace(out)
     if workspace.result.is_file() or workspace.stamps.is_dir():
@@ -161,9 +161,7 @@ def find_source(out: Path, index: int | None = None, *, images: Path | None = No
     if workspace.result.is_file() and model_format(out) is None:
         return _find_in_result(workspace, index, given)
     if workspace.stamps.is_dir():
-        raise FormatError(
-            out, "the run that writes this folder is not finished; start it again with the same arguments, it continues"
-        )
+        raise FormatError(out, Fact("run-not-finished"))
     return _find_in_project(out, index, given)
 
 
@@ -172,22 +170,18 @@ def _find_in_result(workspace: Workspace, index: int | None, given: tuple[Path, 
     try:
         record = read_json(workspace.result)
     except FormatError as error:
-        raise FormatError(
-            root, f"its result is damaged ({error}); start its run again, which writes it again"
-        ) from None
+        raise FormatError(root, Fact("result-damaged", detail=str(error))) from None
     with a_record_of_ours(workspace.result):
         models = {int(m["index"]): m for m in record.get("models", [])}
         if not models:
-            raise FormatError(root, "its result holds no model to show")
+            raise FormatError(root, Fact("result-without-model"))
         sizes = {i: int(m["registered_images"]) for i, m in models.items()}
         chosen = _choose(root, sizes, index)
         fields = models[chosen]
         metric = fields["sparse_metric"] is not None
         place = str(fields["sparse_metric"] if metric else fields["sparse"])
         if Path(place).is_absolute():
-            raise FormatError(
-                root, f"has no model of its own, as its scale was refused: give the project that it is of ({place})"
-            )
+            raise FormatError(root, Fact("result-without-own-model", project=place))
         folder = path_in(root, place, workspace.result)
         scale = _estimated(fields, "m" if metric else "model")
         gravity = fields["gravity_in_world_m_s2"]
@@ -230,7 +224,7 @@ def _find_in_project(out: Path, index: int | None, given: tuple[Path, ...]) -> V
         except FormatError:
             continue
     else:
-        raise FormatError(out, "no result of ours and no COLMAP model here (cameras, images, points3D, .bin or .txt)")
+        raise FormatError(out, Fact("neither-result-nor-model"))
     # the file's size stands for the number of registered images: no model is read
     sizes = {i: (folder / f"images{model_format(folder)}").stat().st_size for i, folder in models.items()}
     chosen = _choose(out, sizes, index)
@@ -247,9 +241,7 @@ def _find_in_project(out: Path, index: int | None, given: tuple[Path, ...]) -> V
     single, beside = len(models) == 1, _image_folders(folder)
     linked = [candidate for candidate in beside if _leads_out(out, candidate)]
     if linked and not given:
-        raise FormatError(
-            linked[0], f"is a link out of the project; give {linked[0].resolve()} as --images (export: --image-folder)"
-        )
+        raise FormatError(linked[0], Fact("link-out-of-project", target=str(linked[0].resolve())))
     return ViewSource(
         folder=folder,
         index=chosen,
@@ -266,8 +258,7 @@ def _choose(out: Path, sizes: Mapping[int, int], index: int | None) -> int:
     if index is None:
         return max(sizes, key=lambda i: (sizes[i], -i))
     if index not in sizes:
-        there = ", ".join(map(str, sorted(sizes)))
-        raise FormatError(out, f"no model {index} here; --model takes one of {there}")
+        raise FormatError(out, Fact("no-such-model", number=index, numbers=sorted(sizes)))
     return index
 
 

@@ -38,6 +38,23 @@ def test_an_imu_that_misses_frames_at_either_end_is_reported(subtests):
                 assert finding.numbers["share"] == pytest.approx(share)
 
 
+@pytest.mark.parametrize("short", ["gyroscope", "accelerometer", ""])
+def test_the_sensor_that_alone_is_short_is_named(short):
+    timing = FrameTiming(names=tuple(map(str, range(201))), t_s=np.linspace(0.0, 20.0, 201))
+    whole_s, part_s = np.linspace(-1.0, 21.0, 500), np.linspace(-1.0, 12.0, 300)
+    gyro_s, accel_s = (part_s if short in (name, "") else whole_s for name in ("gyroscope", "accelerometer"))
+    imu = ImuRecording(
+        gyro_t_s=gyro_s,
+        gyro_rad_s=np.zeros((len(gyro_s), 3)),
+        accel_t_s=accel_s,
+        accel_m_s2=np.zeros((len(accel_s), 3)),
+    )
+    recorded = SimpleNamespace(imu=imu, timing=timing, trajectory=None, clocks=None, offset_s=lambda _: 0.0)
+    (finding,) = check_coverage(recorded)
+    assert finding.fact.values.get("sensor", "") == short
+    assert finding.numbers["share"] == pytest.approx(0.6) and (short or "IMU") in finding.evidence
+
+
 def test_frames_that_are_stamped_late_need_a_later_offset(subtests):
     """The camera is the IMU: rates of a sum of sines, attitudes multiplied by SciPy."""
     step_s = 0.005
