@@ -63,6 +63,12 @@ class Video:
     truth: dict[str, Array]
 
 
+def copy_once(source: str | Path, target: str | Path) -> None:
+    """Copy a file, unless it is there: a run goes on where its frames are as they were."""
+    if not Path(target).exists():
+        shutil.copyfile(source, target)
+
+
 def euroc_video(dataset: Path, folder: Path, every: int) -> Video:
     """Every so many frames of EuRoC's left camera."""
     mav = dataset.resolve() / "mav0"
@@ -72,10 +78,9 @@ def euroc_video(dataset: Path, folder: Path, every: int) -> Video:
     names = [name for name, at in zip(names, place.tolist(), strict=True) if at % every == 0]
     (folder / "frames").mkdir(parents=True, exist_ok=True)
     for name in names:
-        shutil.copyfile(mav / "cam0" / "data" / name, folder / "frames" / name)
-    (folder / "frames.csv").write_text(
-        "\n".join(["name,t_ns", *(f"{name},{Path(name).stem}" for name in names)]) + "\n"
-    )
+        copy_once(mav / "cam0" / "data" / name, folder / "frames" / name)
+    times = folder / "frames.csv"
+    times.write_text("\n".join(["name,t_ns", *(f"{name},{Path(name).stem}" for name in names)]) + "\n")
     lines = ["[images]", 'folder = "frames"', 'times = "frames.csv"', "[timing]", "readout_s = 0"]
     lines += ["shared_clock = true", "[camera]", f'sensor_yaml = "{mav / "cam0" / "sensor.yaml"}"']
     lines += ["[imu]", f'path = "{mav / "imu0"}"']
@@ -94,7 +99,7 @@ def video_of(kind: str, data: Path, folder: Path) -> Video:
     name, every = SETS[kind]
     if name == "euroc_mh01":
         return euroc_video(data / name, folder, every)
-    shutil.copytree(data / name, folder, dirs_exist_ok=True, copy_function=shutil.copyfile)
+    shutil.copytree(data / name, folder, dirs_exist_ok=True, copy_function=copy_once)
     return Video(capture=folder / "capture.toml", truth={})
 
 
