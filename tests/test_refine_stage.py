@@ -30,6 +30,7 @@ from colmap_inertial.model import Model, transformed
 from colmap_inertial.model.layout import find_made_from, read_layout
 from colmap_inertial.pipeline.run.context import Recording
 from colmap_inertial.pipeline.run.runner import canonical
+from colmap_inertial.pipeline.stages import refine as refine_stage
 from colmap_inertial.pipeline.stages.defaults import default_model_stages
 from colmap_inertial.pipeline.stages.imaging_plan import GyroView
 from colmap_inertial.pipeline.stages.inputs import StageInputs
@@ -406,6 +407,16 @@ def test_a_declared_focal_length_is_compared_with_what_the_images_show(factor):
     # where the intrinsics were refined, they are COLMAP's
     refined = MetricStage(imu=tracks.imu, calibration=UNKNOWN)(start)
     assert "declared-focal-length" not in {reason.code for reason in refined.scale.reasons}
+
+
+def test_an_imu_that_contradicts_the_pictures_beyond_any_noise_makes_a_scale_weak(walked):
+    _, model = walked
+    for chi2, verdict in ((5.0, "trusted"), (548.0, "weak")):
+        reason = Fact("imu-contradicts-pictures", chi2=chi2)
+        doubted = refine_stage._doubt_contradicted(model, SimpleNamespace(reason=reason, chi2=chi2))
+        assert doubted.scale.verdict == verdict and (reason in doubted.scale.reasons) == (verdict == "weak")
+    other = SimpleNamespace(reason=Fact("refinement-no-better"), chi2=548.0)
+    assert refine_stage._doubt_contradicted(model, other) is model
 
 
 def test_a_shutter_that_may_roll_is_in_the_interval(walked):

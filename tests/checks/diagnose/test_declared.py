@@ -1,15 +1,19 @@
 """Declared rotation, time offset and lever arm against recordings that show others: which is named, and what it is."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from colmap_inertial.checks.diagnose import Diagnosis, Recorded, diagnose
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_exp, quat_multiply
-from colmap_inertial.core.types import CameraImuCalibration, ScaleEstimate
+from colmap_inertial.core.options import ScaleOptions
+from colmap_inertial.core.types import CameraImuCalibration, ImuCalibration, ScaleEstimate
+from colmap_inertial.core.types.imu import IMU_CAL
 from colmap_inertial.inertial.scale import estimate_scale
 from colmap_inertial.io.calibration import Declared, calibration_prior
+from colmap_inertial.reconstruction.drivers.sources import ScaleSource, scale_source
 from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, SimulatedRecording, simulate_recording
 
 #: No rotation by half a turn or none, which are their own inverses.
@@ -119,3 +123,55 @@ def test_a_wrong_lever_arm_is_named_and_left_out(device: Device) -> None:
     assert wrong.metres_per_unit == pytest.approx(alone.metres_per_unit, rel=1e-3)
     truth = device.made.truth.metres_per_unit
     assert abs(np.log(wrong.metres_per_unit / truth)) < 1.96 * wrong.sigma_log
+
+
+def test_gains_of_another_imu_are_named(device: Device) -> None:
+    assert device.recorded.trajectory is not None and device.recorded.imu is not None
+    other = ImuCalibration(
+        accel_gain=np.diag([0.04, 0.04, 0.04]),
+        accel_bias_m_s2=np.zeros(3),
+        gyro_gain=np.zeros((3, 3)),
+        gyro_bias_rad_s=np.zeros(3),
+        cov=1e-6 * np.eye(IMU_CAL.COUNT),
+        gravity_m_s2=9.80665,
+        attitudes=12,
+    )
+    estimate = estimate_scale(device.recorded.trajectory, device.recorded.imu, imu_calibration=other)
+    assert estimate.verdict == "weak"
+    (reason,) = (reason for reason in estimate.reasons if reason.code == "calibrated-gain-contradicted")
+    # what it makes too long
+    assert np.mean(reason.values["gains"]) == pytest.approx(0.04, abs=0.015)
+
+
+# --- pasted from other programs --------------------------------------------------------------------------------------
+
+PASTED = Path(__file__).parents[4] / "shared/cases/recordings/c20_kalibr_vins_yaml"
+
+
+@pytest.mark.skipif(not PASTED.is_dir(), reason="needs the shared cases")
+@pytest.mark.parametrize(
+    ("declared", "code", "likely"),
+    [
+        ("right", None, None),
+        ("inverse", "declared-rotation", "inverse"),
+        ("sign", "declared-offset", "sign"),
+        ("sign10", "declared-offset", "sign"),
+        ("lever", "declared-lever-arm", "inverse"),
+    ],
+)
+def test_what_is_pasted_from_kalibr_is_named_by_its_cause(declared: str, code: str | None, likely: str | None) -> None:
+    source = ScaleSource(source=PASTED / "traj.tum", imu=PASTED / f"{declared}.toml")
+    estimate = scale_source(source, ScaleOptions())
+    stated = [fact for fact in (*estimate.reasons, *estimate.notes) if fact.code != "force-goes-on"]
+    facts = [fact.values.get("finding", fact) for fact in stated]
+    named = [fact for fact in facts if fact.code.startswith("declared")]
+    assert [fact.code for fact in named] == ([code] if code else [])
+    assert [fact.values["likely"] for fact in named] == ([likely] if likely else [])
+    # named first, and no wrong number
+    assert not named or facts[0] == named[0]
+    if declared in ("inverse", "sign"):
+        assert estimate.metres_per_unit is None and estimate.reasons[-1].code == "force-goes-on"
+        return
+    assert estimate.metres_per_unit is not None and estimate.sigma_log is not None
+    # by the data set's ground truth
+    assert abs(np.log(estimate.metres_per_unit / 0.02572)) < 1.96 * estimate.sigma_log < 0.03
