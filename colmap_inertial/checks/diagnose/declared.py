@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -99,7 +100,7 @@ def _compare_rotation(
     sigmas = [each.rotation_sigma_rad for each in (declared, found)]
     if max(sigmas) > _LIMITS.known_rotation_rad:
         return None, False
-    sigma = float(np.hypot(*sigmas))
+    sigma = math.hypot(*sigmas)
     within = max(_LIMITS.rotation_rad if by_poses else _LIMITS.wrong_rotation_rad, _LIMITS.sigmas * sigma)
     stated = declared.cam_from_imu_xyzw
 
