@@ -23,10 +23,10 @@ import numpy as np
 from bench_report import write_report
 
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.earth import ecef_from_enu, ecef_of_geodetic, geodetic_of_ecef
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import PositionFixes
-from colmap_inertial.inertial.earth import ecef_from_enu, ecef_of_geodetic, geodetic_of_ecef
 from colmap_inertial.inertial.georeference import Georeference, georeference
 
 SECONDS, FINE_S, WHITE_M, LONGEST_DELAY_S = 90, 0.1, 0.5, 1.0

@@ -1,10 +1,12 @@
 """Readout estimation on points filmed with a rolling shutter: error and coverage.
 
     python scripts/study_readout.py [--motions orbit roam walk pure_rotation] [--readouts-ms 0 10 20 33] [--seeds 3]
-                                    [--first-seed 0] [--seconds 5] [--direction down] [--json study.json]
+                                    [--first-seed 0] [--seconds 5] [--hz 30] [--direction down]
+                                    [--axes-sigma-deg 0.6] [--distortion 0] [--json study.json]
 
 The simulator's motion, a desk or a room of points, corners to a fifth of a pixel of 640, one in twenty of them wrong; a
-gyroscope of 200 Hz with noise, bias and gain, axes and clock as an alignment leaves them. Prints errors in
+gyroscope of 200 Hz with noise, bias and gain, axes and clock as an alignment leaves them (where a camera moves as much
+as it turns: ``--axes-sigma-deg 8``). ``--distortion`` of the lens is not known to the estimate. Prints errors in
 milliseconds and in the standard deviations that were stated.
 """
 
@@ -31,7 +33,7 @@ from colmap_inertial.tools.simulate.motion import MotionKind
 
 #: Focal length as a share of the width, height as one; corners of a pair, and how well they are seen.
 FOCAL, ASPECT, CORNERS, CORNER_PX, LONG_SIDE_PX, WRONG, WRONG_PX = 0.8, 0.75, 60, 0.2, 640, 0.05, 5.0
-POINTS, FRAMES_HZ, GYRO_HZ = 1500, 30.0, 200.0
+POINTS, GYRO_HZ = 1500, 200.0
 CAM_FROM_IMU = quat_exp(np.array([0.3, -2.1, 0.8]))
 
 
@@ -43,8 +45,12 @@ class Film:
     readout_s: float
     seed: int
     seconds: float = 5.0
+    frames_hz: float = 30.0
     vigour: float = 1.0
     direction: ReadoutDirection = "down"
+    axes_sigma_deg: float = 0.6
+    #: Radial distortion that nobody knows of.
+    distortion: float = 0.0
 
     def run(self) -> ReadoutEstimate:
         return estimate_readout(*self.seen())
@@ -56,7 +62,7 @@ class Film:
         points = world(self.motion, rng)
         if self.motion == "pure_rotation":
             points = points + motion.cam_in_world_m(np.array([1.0]))
-        t_s = np.arange(0.3, self.seconds - 0.3, 1 / FRAMES_HZ)
+        t_s = np.arange(0.3, self.seconds - 0.3, 1 / self.frames_hz)
         noise = CORNER_PX / LONG_SIDE_PX / FOCAL
         tracks: list[Tracks] = []
         before = self.picture(motion, points, t_s[0])
@@ -81,7 +87,7 @@ class Film:
         gyro_s = np.arange(-1, self.seconds + 1, 1 / GYRO_HZ)
         rate = 1.003 * motion.rate_in_cam_rad_s(gyro_s) @ matrix_from_quat(CAM_FROM_IMU)
         rate = rate + 0.003 * (rng.standard_normal(3) + rng.standard_normal(rate.shape))
-        turned = quat_multiply(quat_exp(0.01 * rng.standard_normal(3)), CAM_FROM_IMU)
+        turned = quat_multiply(quat_exp(np.radians(self.axes_sigma_deg) * rng.standard_normal(3)), CAM_FROM_IMU)
         path = GyroPath(gyro_s, rate, np.zeros(3))
         return rotation, GyroCamera(path=path, cam_from_imu_xyzw=turned, offset_s=0.003 * rng.standard_normal())
 
@@ -95,7 +101,8 @@ class Film:
             place = rays * FOCAL / [1, ASPECT]
             line = place[:, int(self.direction in ("down", "up"))] * (1 if self.direction in ("down", "right") else -1)
             at_s = t_s + self.readout_s * np.clip(np.nan_to_num(line, nan=9.0), -0.7, 0.7)
-        return np.where((np.abs(place) < 0.5).all(axis=1, keepdims=True), rays, np.nan)
+        bent = rays * (1 + self.distortion * np.sum(rays**2, axis=1, keepdims=True))
+        return np.where((np.abs(place) < 0.5).all(axis=1, keepdims=True), bent, np.nan)
 
 
 def world(motion: MotionKind, rng: np.random.Generator) -> Array:
@@ -118,7 +125,10 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=5.0)
+    parser.add_argument("--hz", type=float, default=30.0, help="frames a second")
     parser.add_argument("--direction", choices=get_args(ReadoutDirection), default="down")
+    parser.add_argument("--axes-sigma-deg", type=float, default=0.6)
+    parser.add_argument("--distortion", type=float, default=0.0)
     parser.add_argument("--json", type=Path)
     asked = parser.parse_args()
     rows = []
@@ -132,7 +142,10 @@ def main() -> None:
                     readout_s=1e-3 * readout_ms,
                     seed=seed,
                     seconds=asked.seconds,
+                    frames_hz=asked.hz,
                     direction=asked.direction,
+                    axes_sigma_deg=asked.axes_sigma_deg,
+                    distortion=asked.distortion,
                 )
                 try:
                     found = film.run()

@@ -37,7 +37,7 @@ def spoil(trajectory: CameraTrajectory, wrong: float, rng: np.random.Generator) 
 
 def judge(poses: CameraTrajectory, imu: ImuRecording, about_s: float | None) -> tuple[float, float | None] | None:
     """The lead of the best offset, and this offset where it is accepted; ``None`` where none is possible."""
-    declared = Declared() if about_s is None else Declared(gyro_time_offset_s=about_s, time_offset_sigma_s=0.5)
+    declared = Declared() if about_s is None else Declared(gyro_time_offset_s=about_s, time_offset_sigma_s=0.1)
     search = _search(poses, imu, calibration_prior(declared), None)
     spaced = intervals_of(poses, TRIMMED.spacing_s)
     fits = search_offsets(spaced, search.path, search.offsets_s, min_overlap=0.25, share=None)

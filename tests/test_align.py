@@ -24,7 +24,8 @@ from colmap_inertial.core.types import CameraTrajectory, ImuRecording
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.io.trajectories import read_inertial_scale
-from colmap_inertial.motion.align import AlignOptions, _fit as fit, align_camera_imu, align_clocks
+from colmap_inertial.motion.align import AlignOptions, _fit as fit, _search, align_camera_imu, align_clocks
+from colmap_inertial.motion.align._clock_search import ClockFit
 from colmap_inertial.tools.simulate import ImuOptions, MotionOptions, RecordingOptions, SfmOptions, simulate_recording
 
 RECORDINGS = ("D1", "D3", "D5", "D7", "D9", "D11", "D13", "D15")
@@ -404,6 +405,32 @@ def test_a_shared_clock_excludes_other_offsets():
     wrong = replace(trajectory, t_s=trajectory.t_s - 110.0)
     with pytest.raises(NotObservableError):
         align_camera_imu(wrong, imu, options=AlignOptions(max_offset_s=1.0))
+
+
+def test_what_is_known_of_an_offset_counts_beside_the_rotations(subtests):
+    trajectory, imu = slow_turns([0, 1, 2])
+    # a delay of 50 ms against one of 0.7 s that fits a little better, and against one that fits far better
+    for likelier, known, offset_s, lead in (
+        (32.0, False, 0.7, 2.0),
+        (32.0, True, 0.05, 30 - 0.5 * 0.5**2 - (32 - 12)),
+        (300.0, True, 0.7, 300 - 12 - (30 - 0.5 * 0.5**2)),
+    ):
+        with subtests.test(likelier=likelier, known=known):
+            prior = calibration_prior(shared_clock=True) if known else calibration_prior()
+            # both recordings begin at their epochs
+            search = _search(replace(trajectory, t_s=trajectory.t_s - 123), imu, prior, AlignOptions())
+            fits = [
+                ClockFit(
+                    offset_s=at_s,
+                    log_likelihood=log_likelihood,
+                    explained=1.0,
+                    cam_from_imu_xyzw=np.array([0.0, 0, 0, 1]),
+                    gyro_bias_rad_s=np.zeros(3),
+                )
+                for at_s, log_likelihood in ((0.7, likelier), (0.05, 30.0))
+            ]
+            best, ahead = search._best(fits)
+            assert best.offset_s == offset_s and ahead == pytest.approx(lead)
 
 
 # --- refusals

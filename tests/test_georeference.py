@@ -19,10 +19,10 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 from study_georeference import measure
 
 from colmap_inertial.checks.words import place_facts
+from colmap_inertial.core.earth import ecef_from_enu, ecef_of_geodetic, geodetic_of_ecef
 from colmap_inertial.core.errors import FormatError, NotObservableError
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.core.types import CameraTrajectory, PositionFixes
-from colmap_inertial.inertial.earth import ecef_from_enu, ecef_of_geodetic, geodetic_of_ecef
 from colmap_inertial.inertial.georeference import Georeference, georeference, georeference_of_json
 from colmap_inertial.io.positions import positions_in_pictures, positions_in_video
 from colmap_inertial.model import read_model

@@ -372,7 +372,7 @@ def test_euroc_sheets_give_camera_and_calibration(shared_data: Path, tmp_path: P
         @ [-0.0216401454975, -0.064676986768, 0.00981073058949],
         atol=1e-9,
     )
-    assert capture.calibration.sigma("gyro_time_offset_s") == pytest.approx(1.0)
+    assert capture.calibration.sigma("gyro_time_offset_s") == pytest.approx(0.1)
     assert isinstance(capture.imu, ImuPath) and read_imu(tmp_path).noise is not None
 
 

@@ -370,6 +370,19 @@ def test_sensor_logger_without_its_platform_or_gravity_is_refused(tmp_path: Path
         read_imu(folder)
 
 
+def test_the_unit_of_stray_scanner_is_its_recorder_s_and_not_that_of_a_size(tmp_path: Path, one_clock) -> None:
+    folder = imu_files.write_stray_scanner(tmp_path, one_clock, FRAME_NS)
+    lines = (folder / "imu.csv").read_text().splitlines()
+    rows = [line.split(", ") for line in lines[1:]]
+    in_m_s2 = [", ".join([t, *(repr(9.80665 * float(a)) for a in row[:3]), *row[3:]]) for t, *row in rows]
+    (folder / "imu.csv").write_text("\n".join([lines[0], *in_m_s2]) + "\n")
+    with pytest.raises(FormatError, match="m/s2"):
+        read_imu(folder)
+    toml = tmp_path / "capture.toml"
+    toml.write_text('[imu]\npath = "imu.csv"\n[imu.accel]\nunit = "m/s2"\n')
+    np.testing.assert_allclose(read_imu(toml).accel_m_s2, one_clock.accel_m_s2, atol=1e-9)
+
+
 def test_a_rosbag_without_rosbags_names_the_extra(tmp_path: Path, monkeypatch, one_clock: ImuRecording) -> None:
     path = imu_files.write_rosbag(tmp_path / "a.bag", one_clock)
     real = builtins.__import__

@@ -13,10 +13,11 @@ import cv2
 import numpy as np
 import pytest
 from box_project import build, pictures, with_exif, write_model, write_video
+from foreign_models import ply_points, write_ply
 
 from colmap_inertial.cli import main
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError, TimingError
-from colmap_inertial.core.geometry import matrix_from_quat
+from colmap_inertial.core.geometry import matrix_from_quat, skew
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.io import sensor_yaml, video_match
 from colmap_inertial.io.exif import stamps_of_exif
@@ -25,6 +26,7 @@ from colmap_inertial.io.trajectories import read_tum
 from colmap_inertial.io.video import decode_grey
 from colmap_inertial.io.video_match import match_to_video
 from colmap_inertial.model import read_model
+from colmap_inertial.model.identity import ModelIdentity
 from colmap_inertial.model.project import apply_to_project
 from colmap_inertial.model.similarities import read_similarity
 from colmap_inertial.reconstruction.drivers.project import is_project, reconstruct_project
@@ -420,6 +422,91 @@ def test_each_sub_model_has_its_own_scale(box, tmp_path):
     assert np.linalg.norm(spans[0]) == pytest.approx(np.linalg.norm(spans[1]), rel=1e-3)
     assert (out / "trajectory.tum").is_file()
     assert (out / "trajectory_1.tum").is_file()
+
+
+#: Metres from the origin, as in UTM.
+FAR = np.array([432_100.25, 5_664_733.5, 120.0])
+
+
+def test_a_project_far_from_the_origin_is_scaled_where_it_stands(box, finished, tmp_path):
+    import pycolmap
+
+    project = shutil.copytree(box.root, tmp_path / "project")
+    model = read_model(project / "sparse" / "0")
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), FAR))
+    model.write_binary(str(project / "sparse" / "0"))
+    write_ply(project / "cloud.ply", xyz := np.array([point.xyz for point in model.points3D.values()]))
+    (project / "scan.las").write_bytes(b"LASF")
+    out = tmp_path / "out"
+    source = ProjectOptions(imu=box.imu, frame_times=box.frame_times)
+    reconstruct_project(project, out, source, NOT_REFINED)
+    near = read_model(finished[1] / "sparse" / "0")
+    far = read_model(out / "sparse" / "0")
+    similarity = json.loads((out / "sparse" / "0" / "transform.json").read_text())
+    scale, turn = similarity["scale"], matrix_from_quat(np.array(similarity["rotation_xyzw"]))
+    # what was found is what is found at the origin, and the model stays where it is
+    (there,) = json.loads((finished[1] / "result.json").read_text())["models"]
+    (here,) = json.loads((out / "result.json").read_text())["models"]
+    for name in ("metres_per_unit", "sigma_log", "verdict"):
+        assert here[name] == (there[name] if name == "verdict" else pytest.approx(there[name], rel=1e-6))
+    # what apply says of other files is said here, too
+    assert any("1 .las" in note for note in here["notes"])
+    assert here["of_model"]["poses"] == ModelIdentity.of(model).poses
+    shift = far.image(1).projection_center() - near.image(1).projection_center()
+    for number in far.reg_image_ids():
+        centre = far.image(number).projection_center()
+        np.testing.assert_allclose(centre, near.image(number).projection_center() + shift, atol=1e-6)
+        was = model.image(number).projection_center()
+        np.testing.assert_allclose(centre, scale * turn @ was + similarity["translation_m"], atol=1e-7)
+        assert np.linalg.norm(centre - was) < 20
+    np.testing.assert_allclose(
+        read_tum(out / "trajectory.tum").cam_in_world,
+        read_tum(finished[1] / "trajectory.tum").cam_in_world + shift,
+        atol=1e-6,
+    )
+    # what is moved along: half a metre of the cloud's single precision is the project's own
+    want = scale * ply_points(project / "cloud.ply") @ turn.T + similarity["translation_m"]
+    assert np.abs(ply_points(project / "cloud.ply") - xyz).max() < 0.5
+    np.testing.assert_allclose(ply_points(out / "cloud.ply"), want, atol=1e-7)
+    # errors of scale and up are about the model, not about an origin thousands of kilometres away
+    cov, place = np.array(similarity["cov"]), np.mean([i.projection_center() for i in far.images.values()], axis=0)
+    arm = place - similarity["translation_m"]
+    by = np.concatenate([arm[:, None], -skew(arm), np.eye(3)], axis=1)
+    assert np.sqrt(np.diag(by @ cov @ by.T)).max() < 1
+
+
+def test_a_dense_cloud_far_from_the_origin_is_refused_before_the_work(box, tmp_path, capsys):
+    import pycolmap
+
+    project = shutil.copytree(box.root, tmp_path / "project")
+    model = read_model(project / "sparse" / "0")
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), FAR))
+    model.write_binary(str(project / "sparse" / "0"))
+    words = project, tmp_path / "out", "--imu", box.imu, "--frame-times", box.frame_times
+    code, _, err = run(capsys, "reconstruct", *words, "--dense")
+    assert code == 2
+    assert "single precision" in err and "export" in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_result_says_of_which_model_each_scale_is(box, finished, tmp_path, capsys):
+    result = finished[1] / "result.json"
+    code, shown, _ = run(capsys, "apply", box.root, tmp_path / "applied", "--scale", result)
+    assert code == 0
+    assert "of which model" not in shown
+    other = read_model(box.root / "sparse" / "0")
+    other.deregister_frame(other.image(3).frame_id)
+    (tmp_path / "other" / "sparse" / "0").mkdir(parents=True)
+    other.write_binary(str(tmp_path / "other" / "sparse" / "0"))
+    code, _, err = run(capsys, "apply", tmp_path / "other", tmp_path / "no", "--scale", result)
+    assert code == 2
+    assert "images instead of" in err
+    content = json.loads(result.read_text())
+    del content["models"][0]["of_model"]
+    (tmp_path / "old.json").write_text(json.dumps(content))
+    code, shown, _ = run(capsys, "apply", tmp_path / "other", tmp_path / "yes", "--scale", tmp_path / "old.json")
+    assert code == 0
+    assert "of which model" in shown
 
 
 def test_an_interrupted_run_continues(box, finished, tmp_path):

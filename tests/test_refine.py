@@ -17,7 +17,7 @@ from colmap_inertial.inertial.refine._residuals import moving
 from colmap_inertial.inertial.refine._system import System
 from colmap_inertial.inertial.refine.motion import find_motion_covs
 from colmap_inertial.inertial.refine.solve import _evaluate, _plausible, _weighted, evaluate_held_out, factored, solve
-from colmap_inertial.inertial.refine.values import FreeCamera
+from colmap_inertial.inertial.refine.values import Distances, FreeCamera
 
 
 def steps_of(x, kind, column):
@@ -128,7 +128,7 @@ def test_derivatives_of_the_imu_are_those_of_finite_differences(subtests, small)
 
 def dense(problem, at, by, residual):
     """The whole system without taking points out: (information, right-hand side)."""
-    x, observations = at.estimate, problem.observations
+    x, observations = at.estimate, problem.rows
     frames, points, shared = len(x.velocity_m_s), len(x.points_m), x.columns.count
     n = 15 * frames
     rows = []
@@ -175,9 +175,9 @@ def test_the_compiled_step_and_covariance_are_those_of_the_whole_system(subtests
                         np.random.default_rng(0).permutation(count), 15, *np.indices((count, count)).reshape(2, -1)
                     )
                 prior = (problem.prior.info, -problem.prior.info @ at.offset)
-                system = System.build(layout, problem.observations, by, residual, at.rows, prior, damping=0.0)
+                system = System.build(layout, problem.rows, by, residual, at.rows, prior, damping=0.0)
                 solved = system.factored()
-                step = solved.step(system, problem.observations, by)
+                step = solved.step(system, problem.rows, by)
                 states, shared, points = step.states, step.shared, step.points
                 info, rhs = dense(problem, at, by, residual)
                 unit = 1 / np.sqrt(np.diagonal(info))
@@ -519,15 +519,18 @@ def test_what_a_small_step_promises_is_what_it_gives(subtests, small):
             by, residual = _weighted(problem, at)
             layout = Layout.of(problem.observations, len(start.velocity_m_s))
             system = solver._built(problem, layout, at, by, residual, 1e-4)
-            step = solver._step(system, problem.observations, by)
+            step = solver._step(system, problem.rows, by)
             step = replace(step, **{field.name: share * getattr(step, field.name) for field in fields(step)})
             promised = solver._promised(problem, at, residual, step)
-            gained = at.cost - _evaluate(problem, step.taken(at.estimate), problem.observations).cost
+            gained = (
+                at.cost - _evaluate(problem, step.taken(at.estimate, 1.0, problem.distances), problem.observations).cost
+            )
             assert np.sign(promised) == np.sign(share) and gained == pytest.approx(promised, rel=0.01)
 
 
 def test_observations_that_tell_more_pull_as_much_and_hold_so_many_times_as_firmly(small):
     _, problem, start, _ = small
+    problem = replace(problem, distances=None)
     at = _evaluate(problem, nudged(start, np.random.default_rng(12), 3e-4), problem.observations)
     plain, firm = _weighted(problem, at), _weighted(problem, at, 4.0)
 
@@ -538,6 +541,47 @@ def test_observations_that_tell_more_pull_as_much_and_hold_so_many_times_as_firm
     (held, pull), (firmly, pull_firm) = sums(*plain), sums(*firm)
     np.testing.assert_allclose(firmly, 4.0 * held, rtol=1e-9)
     np.testing.assert_allclose(pull_firm, pull, rtol=1e-9)
+
+
+def test_what_is_known_of_distances_and_its_derivatives():
+    rng = np.random.default_rng(13)
+    known = Distances(camera_in_world_m=rng.normal(0, 1, (6, 3)), distance_m=rng.uniform(1, 5, 6))
+    points = known.camera_in_world_m + rng.normal(0, 4, (6, 3))
+    step = 1e-6 * rng.standard_normal((6, 3))
+    residual, by_point = known.residuals(points)
+    far_m = np.linalg.norm(points - known.camera_in_world_m, axis=1)
+    np.testing.assert_allclose(np.exp(2.0 * residual) * known.distance_m, far_m)
+    np.testing.assert_allclose(known.residuals(points + step)[0] - residual, np.sum(by_point * step, axis=1), rtol=1e-4)
+    # a short step is the step; of a long one towards the camera and beyond, the point stays before it
+    np.testing.assert_allclose(known.after(points, step) - points, step, atol=1e-11)
+    away = points - known.camera_in_world_m
+    for share in (-3.0, 100.0):
+        ahead = known.after(points, share * away) - known.camera_in_world_m
+        np.testing.assert_allclose(ahead / np.linalg.norm(ahead, axis=1)[:, None], away / far_m[:, None])
+
+
+def test_a_point_whose_rays_part_does_not_keep_a_solution_from_rest(small):
+    """Of false matches rays may not meet before the cameras, and the likeliest point is at infinity."""
+    _, problem, start, _ = small
+    observations = problem.observations
+    assert problem.distances is not None
+    lengths = np.diff(observations.first)
+    false = np.flatnonzero(lengths >= 4)[:3]
+    away = start.points_m - problem.distances.camera_in_world_m
+    infinite = replace(start, points_m=problem.distances.camera_in_world_m + 1e7 * away)
+    at_infinity = observations.xy_px + _residuals.project(problem, infinite, observations).residual
+    mine = np.isin(observations.point, false)
+    parted = np.where(mine[:, None], 2 * at_infinity - observations.xy_px, observations.xy_px)
+    problem = replace(problem, observations=replace(observations, xy_px=parted))
+    solution = solve(problem, start)
+    assert solution.converged and solution.steps < 30
+    far = np.linalg.norm(solution.estimate.points_m - problem.distances.camera_in_world_m, axis=1)
+    assert (far[false] > 3 * problem.distances.distance_m[false]).all() and far.max() < 1e4
+    away = np.sum((solution.estimate.points_m - problem.distances.camera_in_world_m) * away, axis=1)
+    assert (away > 0).all()
+    without = solve(replace(problem, distances=None), start).estimate.points_m - problem.distances.camera_in_world_m
+    # where nothing is known of distances, they are still on their way
+    assert (np.linalg.norm(without, axis=1)[false] > 4 * far[false]).all()
 
 
 def test_weights_are_the_slope_of_the_robust_cost(subtests):

@@ -18,6 +18,7 @@ import numpy as np
 import pycolmap
 import pytest
 from chromium import Page, chromium_or_skip
+from foreign_models import build, save
 from markdown_it import MarkdownIt
 from report_runs import HOSTILE
 
@@ -804,3 +805,21 @@ def lonely_points(scene, width, height):
     apart = np.linalg.norm(px[:, None] - px, axis=2) + 1e9 * np.eye(len(px))
     order = np.argsort(np.where(inside, -apart.min(axis=1), 0))
     return places[order[0]], places[order[1]]
+
+
+def test_a_model_far_from_the_origin_is_drawn_about_a_point_in_its_middle(tmp_path):
+    """Single precision holds such coordinates to half a metre."""
+    far = np.array([432_100.25, 5_664_733.5, 120.0])
+    model = build(offset=far)
+    save(model, tmp_path / "p" / "sparse" / "0")
+    scene = load_scene(tmp_path / "p")
+    true = np.array([point.xyz for point in model.points3D.values()])
+    np.testing.assert_allclose(
+        sorted((scene.cloud.xyz.astype(float) + scene.offset_in_world).tolist()), sorted(true.tolist()), atol=1e-5
+    )
+    assert scene.cloud.xyz.dtype == np.float32 and scene.reach < 10
+    names = {image.name: image.projection_center() for image in model.images.values()}
+    for i, name in enumerate(scene.cameras.names):
+        np.testing.assert_allclose(scene.cameras.cam_in_world[i] + scene.offset_in_world, names[name], atol=1e-7)
+    x, y, z = names[scene.cameras.names[0]]
+    assert f"{x:.3f}, {y:.3f}, {z:.3f}" in camera_text(scene, 0)

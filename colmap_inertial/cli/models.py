@@ -285,6 +285,10 @@ class CalibrateImu(Reader):
         return 0
 
 
+#: Errors that a description of the table answers.
+_TABLE_CODES = ("table-unclear", "table-open")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Diagnose(SourceReader):
     """Find problems of a recording, before any reconstruction.
@@ -312,7 +316,7 @@ class Diagnose(SourceReader):
             with self.progress() as progress:
                 diagnosis = diagnose_source(self.read_from(), json=self.json_file, progress=progress)
         except InertialError as error:
-            if report is None or not self.talks or error.code != "table-unclear":
+            if report is None or not self.talks or error.code not in _TABLE_CODES:
                 raise
             raise InertialError(Fact("table-described-above", source=self.source, found=error.fact)) from None
         self.tell(lambda: show_diagnosis(diagnosis, self.source), diagnosis.as_json(), written=True)

@@ -21,12 +21,12 @@ from typing import Any
 import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray, ComplexArray, check_array
+from colmap_inertial.core.earth import ecef_from_enu, ecef_of_geodetic, geodetic_of_ecef
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.facts import Fact, read_facts, with_sentences
 from colmap_inertial.core.geometry import matrix_from_quat, rotation_between
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import HeightDatum, PositionFixes
-from colmap_inertial.inertial.earth import ecef_from_enu, ecef_of_geodetic, geodetic_of_ecef
 
 
 @dataclass(frozen=True, kw_only=True)

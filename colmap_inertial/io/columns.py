@@ -13,13 +13,13 @@ import numpy as np
 
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.io import vocabulary as words
-from colmap_inertial.io.sensor_columns import ROWS, Columns, SensorColumns
+from colmap_inertial.io.sensor_columns import OPEN, ROWS, Columns, SensorColumns
 from colmap_inertial.io.stamps import TimeColumns, is_date
 from colmap_inertial.io.tables import Table, split_unit
 from colmap_inertial.io.units import SENSOR_UNITS, TIME_UNITS_NS, Quantity, unit_and_scale
 from colmap_inertial.io.vocabulary import LAYOUTS, ROS2_ECHO, Bare, Layout, Part
 
-_WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W\d_]+")
+_WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[\u3400-\u9fff]+|[^\W\d_]+")
 _LETTERS = {**{letter: i for i, letter in enumerate("xyz")}, **{str(i): i for i in range(3)}}
 
 
@@ -66,17 +66,29 @@ def recognise_columns(table: Table) -> Columns:
 # --- names ------------------------------------------------------------------------------------------------------------
 
 
+def name_words(name: str) -> list[str]:
+    """The words of a name in small letters: ``gyroX_Raw`` is ``gyro``, ``x``, ``raw``."""
+    return [token.lower() for token in _WORD.findall(name)]
+
+
 def read_name(name: str) -> Cell:
     """What one name in a header says."""
     bare, unit_text = split_unit(name)
     if unit_text is not None and unit_text.isdigit():  # gyroADC[0]
         bare, unit_text = f"{bare} {unit_text}", None
-    tokens = [token.lower() for token in _WORD.findall(bare.lstrip("%#"))]
+    tokens = name_words(bare.lstrip("%#"))
     tokens = [part for token in tokens for part in _split_axis(token)]
     unit = None if unit_text is None else unit_and_scale(unit_text)
     if unit is None:
         tokens, unit = _unit_at_the_end(tokens)
-    if unit is None and len(tokens) == 1 and tokens[0] in words.TIME and len(tokens[0]) > 4:
+    if unit is None and len(tokens) > 2 and tokens[-1] in ("x", "y", "z"):  # gyro_rad_s.x
+        before, unit = _unit_at_the_end(tokens[:-1])
+        tokens = [*before, tokens[-1]]
+    if (
+        unit is None
+        and len(tokens) == 1
+        and ((tokens[0] in words.TIME and len(tokens[0]) > 4) or tokens[0] in ("ms", "us"))
+    ):
         unit = unit_and_scale(tokens[0])  # millis
     place = _axis_place(tokens)
     axis = None if place is None else _LETTERS[tokens[place]]
@@ -96,8 +108,10 @@ def _axis_place(tokens: Sequence[str]) -> int | None:
 
 
 def _split_axis(token: str) -> list[str]:
-    """``accx`` is ``acc`` and ``x``."""
+    """``accx`` is ``acc`` and ``x``, as is ``xacc``."""
     stems = words.GYRO | words.ACCEL | words.SHORT_GYRO | words.SHORT_ACCEL
+    if len(token) > 1 and token[0] in "xyz" and token[1:] in words.GYRO | words.ACCEL:
+        return [token[1:], token[0]]
     return [token[:-1], token[-1]] if len(token) > 1 and token[-1] in "xyz" and token[:-1] in stems else [token]
 
 
@@ -115,7 +129,7 @@ def _unit_at_the_end(tokens: list[str]) -> tuple[list[str], tuple[str, float] | 
 
 def _kind(rest: Sequence[str], axis: int | None, unit: str | None) -> str:
     have, joined = set(rest), "".join(rest)
-    if have & words.TIME or joined in words.TIME:
+    if have & words.TIME or joined in words.TIME or (joined in ("ms", "us") and axis is None):
         return "other" if axis is not None or have & (words.NO_TIME | words.OTHER - {"dt"}) else "time"
     if axis is None or have & (words.OTHER | words.WORLD):
         return "other"
@@ -151,11 +165,13 @@ def _match_words(table: Table, cells: Sequence[Cell]) -> Columns:
         proposed = replace(unsaid, about="the file does not say what these columns are")
         gyro, accel = (proposed, accel) if gyro.columns is None else (gyro, proposed)
     linear = find_sensor(table, cells, "accel", ("linear",))
-    if accel.columns is None and linear.columns is not None and gyro.columns is not None and table.header is not None:
-        pair = {cells[gyro.columns[0]].words[-2:], cells[linear.columns[0]].words[-2:]}
-        if pair == {("angular", "velocity"), ("linear", "acceleration")}:
+    if accel.columns is None and linear.columns is not None and gyro.columns is not None:
+        pair = cells[gyro.columns[0]].words[-2:], cells[linear.columns[0]].words[-2:]
+        if pair in words.ROS_PAIRS:
             about = "gravity is in it where this comes from sensor_msgs/Imu of ROS, and not where it is a phone's"
             accel = replace(linear, unit=None, about=about)
+        else:
+            accel = replace(accel, about="what it has is without gravity")
     sure = gyro.is_complete and accel.is_complete
     why = ["the header names the columns and their units"] if sure else []
     return Columns(gyro=gyro, accel=accel, is_sure=sure, why=tuple(why))
@@ -201,7 +217,7 @@ def _find_time(table: Table, cells: Sequence[Cell], quantity: Quantity) -> TimeC
     """The time of a sensor: its own before one of all, a clock near the sensor before a later one."""
     assert table.header is not None
     own = words.GYRO if quantity == "gyro" else words.ACCEL
-    foreign = (words.GYRO | words.ACCEL | words.OTHER | {"motion"}) - own
+    foreign = (words.GYRO | words.ACCEL | words.OTHER) - own
     scored: list[tuple[float, int, TimeColumns]] = []
     for index, cell in enumerate(cells):
         have = set(cell.words)
@@ -213,6 +229,7 @@ def _find_time(table: Table, cells: Sequence[Cell], quantity: Quantity) -> TimeC
         unit = "date" if kind == "date" else cell.unit if cell.unit in TIME_UNITS_NS else None
         score = 2.0 * bool(have & own) + (unit is not None) + 0.5 * bool(have & words.NEAR_CLOCK)
         score -= 0.5 * bool(have & words.LATE_CLOCK) + 0.25 * (kind == "date")
+        score -= 2.0 * _mostly_repeats(table, index)
         scored.append(
             (score, -index, TimeColumns(columns=(_name(table, index),), units=() if unit is None else (unit,)))
         )
@@ -226,11 +243,17 @@ def _find_time(table: Table, cells: Sequence[Cell], quantity: Quantity) -> TimeC
     return None if rate is None else TimeColumns(rate_hz=rate)
 
 
+def _mostly_repeats(table: Table, index: int) -> bool:
+    """Whether most of the first cells are those above them: a clock too coarse for an IMU."""
+    cells = [row.split(table.delimiter, index + 1)[index] for row in table.lines[:ROWS]]
+    return 2 * sum(a == b for a, b in itertools.pairwise(cells)) > len(cells)
+
+
 def _seconds_and_parts(table: Table) -> TimeColumns | None:
     """Whole seconds and what is below them, in two columns of otherwise equal names."""
     found: dict[tuple[str, ...], dict[str, int]] = {}
     for index, name in enumerate(table.header or ()):
-        tokens = tuple(token.lower() for token in _WORD.findall(split_unit(name)[0]))
+        tokens = tuple(name_words(split_unit(name)[0]))
         for part, spelled in words.PARTS.items():
             if tokens and tokens[-1] in spelled and not set(tokens) & words.OTHER:
                 found.setdefault(tokens[:-1], {}).setdefault(part, index)
@@ -269,7 +292,11 @@ def column_kind(table: Table, index: int) -> str:
     try:
         values = np.array([float(cell) for cell in filled])
     except ValueError:
-        return "date" if all(is_date(cell) and ":" in cell for cell in filled[:50]) else "other"
+        if not all(is_date(cell) and ":" in cell for cell in filled[:50]):
+            return "other"
+        return "date" if len(set(filled)) > 1 else "constant"
+    if not np.isfinite(values).any():
+        return "constant"
     steps = np.diff(values)
     if not np.isfinite(values).all() or not (steps > 0).any():
         return "constant" if not steps.any() else "other"
@@ -326,6 +353,7 @@ def _match_part(table: Table, names: Sequence[str], layout: Layout, part: Part) 
     time = _layout_time(table, names, part)
     if time is None and not part.times and (rate := find_rate(table.preamble)) is not None:
         time = TimeColumns(rate_hz=rate)
+    is_dated = part.are_dated_otherwise and time is not None and time.units == ("date",)
     counts = part.counts_per_unit
     if counts is None:
         counts = _find_counts(table.preamble, layout.preamble_counts)
@@ -333,9 +361,9 @@ def _match_part(table: Table, names: Sequence[str], layout: Layout, part: Part) 
         columns=(places[0], places[1], places[2]),  # type: ignore[arg-type]
         unit=part.unit,
         counts_per_unit=counts,
-        axes=part.axes,
+        axes=OPEN if is_dated else part.axes,
         time=time,
-        about=part.about if part.unit is None or counts is None else "",
+        about=part.about if part.unit is None or counts is None or is_dated else "",
     )
 
 
@@ -352,8 +380,18 @@ def _layout_time(table: Table, names: Sequence[str], part: Part) -> TimeColumns 
             column_kind(table, p) != "constant" or len(places) > 1 for p in places if p is not None
         ):
             columns = tuple(_name(table, p) for p in places if p is not None)
+            if len(places) == 1 and column_kind(table, places[0]) == "date":  # type: ignore[arg-type]
+                return TimeColumns(columns=columns, units=("date",))
+            if times.units == ("ns",) and _has_fractions(table, places[0]):  # type: ignore[arg-type]
+                return TimeColumns(columns=columns)
             return TimeColumns(columns=columns, units=times.units, counts_per_second=times.counts_per_second)
     return None
+
+
+def _has_fractions(table: Table, index: int) -> bool:
+    """Whether the first stamps are no whole numbers."""
+    values = table.numbers([index])[:ROWS, 0]
+    return bool((np.abs(values) < 2**53).all() and (values != np.rint(values)).any())
 
 
 def _find_counts(preamble: Sequence[str], key: str) -> float | None:
@@ -378,13 +416,14 @@ def _bare(table: Table) -> Columns | None:
     whole = (values[:, :2] == np.floor(values[:, :2])).all() and (nanoseconds >= 0).all() and (nanoseconds < 1e9).all()
     turned = values[:, 2:6]
     unit = np.abs(np.linalg.norm(turned, axis=1) - 1) < 1e-2
+    moves = bool(np.diff(values[:, :2], axis=0).any())
     if not (
         whole
         and (np.diff(seconds) >= 0).mean() > 0.9
         and (unit.all() or (values[:, 6] == -1).all() or not turned.any())
     ):
         return None
-    time = TimeColumns(columns=kind.time, units=kind.units)
+    time = TimeColumns(columns=kind.time, units=kind.units) if moves else None
 
     def sensor(columns: tuple[int, int, int], unit: str) -> SensorColumns:
         x, y, z = columns
@@ -394,6 +433,6 @@ def _bare(table: Table) -> Columns | None:
         gyro=sensor(kind.gyro, kind.gyro_unit),
         accel=sensor(kind.accel, kind.accel_unit),
         source=kind.name,
-        is_sure=True,
+        is_sure=moves,
         why=(f"{kind.width} columns as {kind.name} writes them: seconds, nanoseconds, a unit quaternion",),
     )

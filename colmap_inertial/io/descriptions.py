@@ -14,8 +14,9 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.io.columns import read_name
 from colmap_inertial.io.plausible import PLAUSIBLE
-from colmap_inertial.io.sensor_columns import ROWS, Columns, SensorColumns
+from colmap_inertial.io.sensor_columns import OPEN, ROWS, Columns, SensorColumns
 from colmap_inertial.io.stamps import TimeColumns
 from colmap_inertial.io.units import SENSOR_UNITS, STANDARD_GRAVITY_M_S2, TIME_UNITS_NS, Axes, Quantity
 
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
 
 #: Steps between readings of an IMU, in seconds.
 _STEP_S = (2.5e-4, 0.2)
-_OPEN = "?"
 
 
 def describe(path: Path, found: Columns, table: Table | None = None, name: str = "") -> str:
@@ -58,22 +58,29 @@ def _section(name: str, quantity: Quantity, part: SensorColumns, table: Table | 
         *_time_lines(part.time, None if part.file else table),
     ]
     if part.where is not None:
-        which = f"  # {part.about}" if part.where[1] == _OPEN else ""
+        which = f"  # {part.about}" if part.where[1] == OPEN else ""
         lines.append(f"where = [{_column(part.where[0])}, {_text(part.where[1])}]{which}")
     if part.columns is None:
-        lines.append(f'columns = ["{_OPEN}", "{_OPEN}", "{_OPEN}"]  # names, or numbers from 1, of x, y, z')
+        about = f"; {part.about}" if part.about else ""
+        lines.append(f'columns = ["{OPEN}", "{OPEN}", "{OPEN}"]  # names, or numbers from 1, of x, y, z{about}')
     else:
         names = ", ".join(map(_column, part.names or [_name(table, column) for column in part.columns]))
         other = f"  # or {', '.join(part.others)}" if part.others else ""
         lines.append(f"columns = [{names}]{other}")
     units = " or ".join(SENSOR_UNITS[quantity])
-    about = f": {part.about}" if part.about and part.where is None else ": the file does not say"
-    lines.append(f"unit = {_text(part.unit)}" if part.unit else f'unit = "{_OPEN}"  # {units}{about}')
+    about = (
+        f": {part.about}"
+        if part.about and part.where is None and part.columns is not None
+        else ": the file does not say"
+    )
+    lines.append(f"unit = {_text(part.unit)}" if part.unit else f'unit = "{OPEN}"  # {units}{about}')
     if part.counts_per_unit is None:
-        lines.append(f'counts_per_unit = "{_OPEN}"  # {part.about or "the file does not say"}')
+        lines.append(f'counts_per_unit = "{OPEN}"  # {part.about or "the file does not say"}')
     elif part.counts_per_unit != 1:
         lines.append(f"counts_per_unit = {part.counts_per_unit:g}")
-    if part.axes:
+    if part.axes == OPEN:
+        lines.append(f'axes = "{OPEN}"  # {part.about}')
+    elif part.axes:
         lines.append(f"axes = {_text(part.axes)}")
         if Axes.parse(part.axes).is_mirrored:
             lines.append("mirrored = true")
@@ -83,8 +90,8 @@ def _section(name: str, quantity: Quantity, part: SensorColumns, table: Table | 
 def _time_lines(time: TimeColumns | None, table: Table | None) -> list[str]:
     if time is None:
         return [
-            f'time = "{_OPEN}"  # name or number of a column; or rate_hz = ... in place of time and time_unit',
-            f'time_unit = "{_OPEN}"  # {", ".join(TIME_UNITS_NS)}, or date',
+            f'time = "{OPEN}"  # name or number of a column; or rate_hz = ... in place of time and time_unit',
+            f'time_unit = "{OPEN}"  # {", ".join(TIME_UNITS_NS)}, or date',
         ]
     if time.rate_hz is not None:
         return [f"rate_hz = {time.rate_hz:g}"]
@@ -93,14 +100,14 @@ def _time_lines(time: TimeColumns | None, table: Table | None) -> list[str]:
     if time.counts_per_second is not None:
         return [*lines, f"time_counts_per_s = {time.counts_per_second:g}"]
     if not time.units:
-        return [*lines, f'time_unit = "{_OPEN}"  # {_likely_units(time, table)}']
+        return [*lines, f'time_unit = "{OPEN}"  # {_likely_units(time, table)}']
     units = ", ".join(map(_text, time.units))
     return [*lines, f"time_unit = {units if len(time.units) == 1 else f'[{units}]'}"]
 
 
 def _likely_units(time: TimeColumns, table: Table | None) -> str:
     """Units in which the steps are those of an IMU."""
-    every = ", ".join(TIME_UNITS_NS)
+    every = f"{', '.join(TIME_UNITS_NS)}, or time_counts_per_s = ... in its place"
     if table is None:
         return f"{every}: the file does not say"
     try:
@@ -146,7 +153,12 @@ def _add_time(table: Table, part: SensorColumns) -> SensorColumns:
     if part.time is not None:
         return part
     place = _time(_values(table))
-    return part if place is None else replace(part, time=TimeColumns(columns=(_name(table, place),)))
+    if place is None:
+        return part
+    said = read_name(table.header[place]).unit if table.header is not None else None
+    return replace(
+        part, time=TimeColumns(columns=(_name(table, place),), units=(said,) if said in TIME_UNITS_NS else ())
+    )
 
 
 def _propose_columns(table: Table) -> tuple[SensorColumns, SensorColumns]:

@@ -83,10 +83,10 @@ class PlainText:
 def decode(data: bytes) -> tuple[str, str]:
     """The text of a file and the name of its encoding: UTF-8, UTF-16, GB 18030 or Windows-1252.
 
-    Bytes that are wrong in it become U+FFFD, so that a reader can name their line.
+    Bytes that are wrong in it become U+FFFD, so that a reader can name their line. A long minus becomes a plain one.
     """
     encoding = _encoding(data)
-    text = data.decode(encoding, errors="replace")
+    text = data.decode(encoding, errors="replace").replace("\u2212", "-")
     return text.removeprefix("\ufeff"), "utf-8" if encoding == "utf-8-sig" else encoding
 
 

@@ -199,15 +199,19 @@ def read_yaml(path: Path, what: str, loader: Any = None) -> dict[Any, Any]:
     if text.startswith("%YAML:"):
         text = "#" + text
     try:
-        sheet = yaml.load(text, loader or yaml.SafeLoader)
+        sheets = [sheet for sheet in yaml.load_all(text, loader or yaml.SafeLoader) if sheet is not None]
     except yaml.MarkedYAMLError as error:
         line = None if error.problem_mark is None else error.problem_mark.line + 1
         raise FormatError(path, Fact("invalid-yaml", detail=str(error.problem)), line=line) from None
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise FormatError(path, Fact("invalid-yaml", detail=str(error).splitlines()[0])) from None
-    if not isinstance(sheet, dict):
+    if not sheets or not all(isinstance(sheet, dict) for sheet in sheets):
         raise FormatError(path, Fact("no-keys-and-values", what=what))
-    return sheet
+    # messages of ROS, one after another, differ in their headers
+    said = [{key: value for key, value in sheet.items() if key != "header"} for sheet in sheets]
+    if any(other != said[0] for other in said[1:]):
+        raise FormatError(path, Fact("documents-differ", what=what, count=len(sheets)))
+    return dict(sheets[0])
 
 
 def write_json(path: Path, value: object, *, indent: int | None = 2) -> None:

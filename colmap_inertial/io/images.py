@@ -73,13 +73,16 @@ def read_image(path: Path) -> UInt8Array | UInt16Array:
 
 
 def read_alpha(data: bytes) -> UInt8Array | UInt16Array | None:
-    """(H, W) alpha of a PNG or TIFF that can be decoded; ``None`` where it has none."""
+    """(H, W) alpha of a PNG, TIFF or WebP that can be decoded; ``None`` where it has none."""
     import cv2
 
     if data[:4] in TIFF_ORDERS:
         has_alpha = _tiff_number(data, TIFF_ORDERS[data[:4]], 277, 1) == 4  # samples of a pixel
+    elif data.startswith(PNG):
+        # colours of a palette may have some, too
+        has_alpha = data[25] in (4, 6) or (data[25] == 3 and b"tRNS" in data[: data.find(b"IDAT")])
     else:
-        has_alpha = data.startswith(PNG) and data[25] in (4, 6)
+        has_alpha = data.startswith(b"RIFF") and _has_webp_alpha(data)
     if not has_alpha:
         return None
     image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
@@ -177,6 +180,13 @@ def _webp_size(data: bytes) -> tuple[int, int] | None:
         return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
     width, height = struct.unpack_from("<HH", data, 26)
     return (width & 0x3FFF, height & 0x3FFF) if data[12:16] == b"VP8 " else None
+
+
+def _has_webp_alpha(data: bytes) -> bool:
+    """Whether a WebP says that it has alpha (RFC 9649)."""
+    if data[12:16] == b"VP8X":
+        return bool(data[20] & 0x10)
+    return data[12:16] == b"VP8L" and bool(data[24] & 0x10)
 
 
 def _jpeg2000_size(data: bytes) -> tuple[int, int] | None:

@@ -16,20 +16,28 @@ from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import ImuNoise, ImuRecording
-from colmap_inertial.io.columns import recognise_columns
+from colmap_inertial.io.columns import find_sensor, name_words, read_name, recognise_columns
 from colmap_inertial.io.descriptions import describe
 from colmap_inertial.io.files import first_line, read_bytes
-from colmap_inertial.io.interleaved import find_numbered_rows, find_rows_of_sensors, read_rows
+from colmap_inertial.io.interleaved import (
+    find_numbered_rows,
+    find_rows_of_sensors,
+    finds_instances,
+    leave_instance_open,
+    read_rows,
+)
 from colmap_inertial.io.samples import Samples, order_samples
 from colmap_inertial.io.sensor_columns import Columns, SensorColumns
 from colmap_inertial.io.sensor_yaml import read_imu_noise
 from colmap_inertial.io.stamps import DateOrder, TimeColumns, read_stamps
 from colmap_inertial.io.tables import Table, parse_bytes, read_table, recognise
-from colmap_inertial.io.units import SENSOR_NAMES, SENSOR_UNITS, Axes, DeclaredUnits, Quantity, seconds
+from colmap_inertial.io.units import SENSOR_NAMES, SENSOR_UNITS, TIME_UNITS_NS, Axes, DeclaredUnits, Quantity, seconds
 
 #: What names of tables end with.
 TABLE_SUFFIXES = (".csv", ".txt", ".tsv", ".json", ".jsonl", ".ndjson", ".log", ".dat", ".asc")
 
+#: Beginnings of words in names of tables that hold no specific force, or an uncalibrated one beside another.
+_OTHER_TABLES = ("linear", "linacc", "grav", "uncal", "user")
 #: Tables of a folder that are looked into.
 MOST_TABLES = 40
 
@@ -107,8 +115,11 @@ def is_inertial_scale(path: Path) -> bool:
 
 
 def _names_columns(path: Path) -> bool:
-    """Whether the first lines name axes: whoever writes that states another layout than ours."""
+    """Whether the first lines name axes, or another unit of time than ours: they state another layout."""
     head = read_bytes(path, 1000).decode("utf-8-sig", errors="replace").splitlines()[:5]
+    cells = [read_name(cell.strip(' "')) for line in head for cell in re.split(r"[,;\t]", line.lstrip("# "))]
+    if any(cell.kind == "time" and cell.unit in TIME_UNITS_NS and cell.unit != "ns" for cell in cells):
+        return True
     return any(re.search(r"\b([agwr]_?|acc\w*|gyr\w*)x\b", line, re.IGNORECASE) for line in head)
 
 
@@ -185,10 +196,12 @@ def _read_csv(path: Path, units: DeclaredUnits, noise: ImuNoise | None) -> ImuRe
             raise fault
         return _read_columns(path, rows, units, noise, Fact("rows-of-several-sensors"))
     if table.header is None:
-        return _read_columns(path, _columns(path, table), units, noise, Fact("no-header-of-columns"), table)
+        found = find_columns(path, table)
+        why = None if found.source else Fact("no-header-of-columns")
+        return _read_columns(path, found, units, noise, why, table)
     place, why = _places(table, units)
-    if why is not None:
-        return _read_columns(path, _columns(path, table), units, noise, why, table)
+    if why is not None or len(place) < 7 or finds_instances(table, place.values()):
+        return _read_columns(path, find_columns(path, table), units, noise, why, table)
 
     def unit(kind: str, declared: str | None) -> str:
         found = recognise(table.header[place[kind, 0]])  # type: ignore[index]
@@ -203,16 +216,16 @@ def _read_csv(path: Path, units: DeclaredUnits, noise: ImuNoise | None) -> ImuRe
     return build_recording(gyro, order_rows(table, "accel", accel_unit, t_ns, numbers[:, 3:]), noise=noise)
 
 
-def _columns(path: Path, table: Table) -> Columns:
-    """What a table's columns hold, whether or not its rows are of several sensors."""
+def find_columns(path: Path, table: Table) -> Columns:
+    """What a table's columns hold, whether or not its rows are of several sensors or devices."""
     columns = find_rows_of_sensors(path) or recognise_columns(table)
     if columns.gyro.columns is None and columns.accel.columns is None:
         return find_numbered_rows(table) or columns
-    return columns
+    return leave_instance_open(table, columns)
 
 
 def _places(table: Table, units: DeclaredUnits) -> tuple[dict[tuple[str, int], int], Fact | None]:
-    """The columns that a plain header names, and what it lacks."""
+    """The columns that a plain header names, and what is wrong with what it says of them."""
     assert table.header is not None
     place: dict[tuple[str, int], int] = {}
     try:
@@ -227,11 +240,8 @@ def _places(table: Table, units: DeclaredUnits) -> tuple[dict[tuple[str, int], i
             return place, Fact("columns-alike", first=table.header[place[key]], second=table.header[index])
         place[key] = index
     wanted = [("time", 0), *((sensor, axis) for sensor in ("gyro", "accel") for axis in range(3))]
-    missing = [
-        kind if kind == "time" else f"{kind}_{'xyz'[axis]}" for kind, axis in wanted if (kind, axis) not in place
-    ]
-    if missing:
-        return place, Fact("columns-not-recognised", missing=missing)
+    if any(key not in place for key in wanted):
+        return place, None
     for kind, axes, declared in (("gyro", 3, units.gyro), ("accel", 3, units.accel), ("time", 1, None)):
         stated = {columns[place[kind, axis]].unit for axis in range(axes)}  # type: ignore[union-attr]
         if declared is None and (None in stated or len(stated) > 1):
@@ -240,7 +250,12 @@ def _places(table: Table, units: DeclaredUnits) -> tuple[dict[tuple[str, int], i
 
 
 def _read_columns(
-    path: Path, found: Columns, units: DeclaredUnits, noise: ImuNoise | None, why: Fact, table: Table | None = None
+    path: Path,
+    found: Columns,
+    units: DeclaredUnits,
+    noise: ImuNoise | None,
+    why: Fact | None,
+    table: Table | None = None,
 ) -> ImuRecording:
     """Read what columns were taken for, where nothing is open.
 
@@ -255,9 +270,14 @@ def _read_columns(
     )
     found = replace(found, gyro=gyro, accel=accel)
     if not (gyro.is_complete and accel.is_complete and (found.is_sure or not found.source)):
+        found = add_other_table(path, found)
         header = None if table is None or table.header is None else table.header_text[:300]
-        found = _add_other_table(path, found)
-        raise FormatError(path, Fact("table-unclear", why=why, header=header, hint=describe(path, found, table)))
+        hint = describe(path, found, table)
+        if why is not None:
+            raise FormatError(path, Fact("table-unclear", why=why, header=header, hint=hint))
+        raise FormatError(
+            path, Fact("table-open", source=found.source, open=found.open_points, header=header, hint=hint)
+        )
     recording = read_tables(make_sensor_table(path, gyro), make_sensor_table(path, accel))
     gyro_rad_s, accel_m_s2 = (
         Axes.parse(part.axes).apply(values) if part.axes else values
@@ -267,12 +287,17 @@ def _read_columns(
     return replace(recording, noise=noise, device=device, gyro_rad_s=gyro_rad_s, accel_m_s2=accel_m_s2)
 
 
-def _add_other_table(path: Path, found: Columns) -> Columns:
+def add_other_table(path: Path, found: Columns) -> Columns:
     """The columns of one sensor, with those of the other in the one table beside it that has them."""
-    for name, part, other in (("gyro", found.gyro, found.accel), ("accel", found.accel, found.gyro)):
+    sensors: tuple[tuple[Quantity, SensorColumns, SensorColumns], ...] = (
+        ("gyro", found.gyro, found.accel),
+        ("accel", found.accel, found.gyro),
+    )
+    for name, part, other in sensors:
         if part.columns is None and other.is_complete and other.where is None:
             beside = [file for file in _tables_in(path.parent) if file != path]
             parts = [(file, own) for file in beside if (own := _one_sensor(file, name)) is not None]
+            parts = [(file, own) for file, own in parts if own.is_complete]
             if len(parts) == 1:
                 file, own = parts[0]
                 own = replace(own, file=file.name)
@@ -285,9 +310,12 @@ def _tables_in(folder: Path) -> list[Path]:
     return sorted(files) if len(files) <= MOST_TABLES else []
 
 
-def _one_sensor(path: Path, wanted: str) -> SensorColumns | None:
-    """The columns of a sensor in a table that has nothing of the other."""
-    if re.search(r"lin|grav|uncal|user", path.name, re.IGNORECASE):
+def _one_sensor(path: Path, wanted: Quantity) -> SensorColumns | None:
+    """The columns of a sensor in a table that has nothing of the other; where its header names no sensor, the name of
+    the table does.
+    """
+    name = name_words(path.stem)
+    if any(word.startswith(_OTHER_TABLES) or word == "lin" for word in name):
         return None
     try:
         table = parse_bytes(path, _head(path))
@@ -295,7 +323,11 @@ def _one_sensor(path: Path, wanted: str) -> SensorColumns | None:
     except FormatError:
         return None
     own, other = (columns.gyro, columns.accel) if wanted == "gyro" else (columns.accel, columns.gyro)
-    if other.columns is not None or not own.is_complete or own.columns is None:
+    if other.columns is not None:
+        return None
+    if own.columns is None and table.header is not None and read_name(f"{path.stem} x").kind == wanted:
+        own = find_sensor(table, [read_name(cell) for cell in table.header], wanted, ("axis",))
+    if own.columns is None:
         return None
     x, y, z = (_header_name(table, column) for column in own.columns)
     return replace(own, names=(x, y, z))
@@ -313,8 +345,8 @@ def _head(path: Path) -> bytes:
 
 
 def has_separate_tables(path: Path) -> bool:
-    """Whether a folder has one table of a gyroscope and one of an accelerometer, whose headers say all."""
-    return _separate_tables(path) is not None
+    """Whether a folder has one table of a gyroscope and one of an accelerometer."""
+    return find_separate_tables(path) is not None
 
 
 def read_separate_tables(path: Path, units: DeclaredUnits) -> ImuRecording:
@@ -323,28 +355,39 @@ def read_separate_tables(path: Path, units: DeclaredUnits) -> ImuRecording:
     Raises
     ------
     FormatError
-        Where there are not just two.
+        Where there are not just two, or their headers leave something open.
     """
-    found = _separate_tables(path)
+    found = find_separate_tables(path)
     if found is None:
         raise FormatError(path, Fact("no-separate-tables"))
-    tables = [
-        make_sensor_table(file, part if unit is None else replace(part, unit=unit))
-        for (file, part), unit in zip(found, (units.gyro, units.accel), strict=True)
-    ]
-    return read_tables(tables[0], tables[1])
+    gyro, accel = (
+        part if unit is None else replace(part, unit=unit)
+        for part, unit in ((found.gyro, units.gyro), (found.accel, units.accel))
+    )
+    found = replace(found, gyro=gyro, accel=accel)
+    if found.open_points:
+        hint = describe(path, found)
+        raise FormatError(path, Fact("table-open", source="", open=found.open_points, header=None, hint=hint))
+    return read_tables(make_sensor_table(path / gyro.file, gyro), make_sensor_table(path / accel.file, accel))
 
 
-def _separate_tables(folder: Path) -> list[tuple[Path, SensorColumns]] | None:
+def find_separate_tables(folder: Path) -> Columns | None:
+    """The columns of the one table of a gyroscope and the one of an accelerometer in a folder; those that say all
+    before others.
+    """
     if not folder.is_dir():
         return None
-    found = []
-    for name in ("gyro", "accel"):
-        parts = [(file, part) for file in _tables_in(folder) if (part := _one_sensor(file, name)) is not None]
+    found: dict[Quantity, SensorColumns] = {}
+    quantities: tuple[Quantity, ...] = ("gyro", "accel")
+    for quantity in quantities:
+        parts = [(file, part) for file in _tables_in(folder) if (part := _one_sensor(file, quantity)) is not None]
+        whole = [(file, part) for file, part in parts if part.is_complete]
+        parts = whole or parts
         if len(parts) != 1:
             return None
-        found += parts
-    return found
+        file, part = parts[0]
+        found[quantity] = replace(part, file=file.name)
+    return Columns(gyro=found["gyro"], accel=found["accel"])
 
 
 def make_sensor_table(path: Path, part: SensorColumns) -> SensorTable:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,12 +14,12 @@ import numpy as np
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.io import vocabulary as words
-from colmap_inertial.io.columns import find_sensor, read_name
+from colmap_inertial.io.columns import Cell, find_sensor, read_name
 from colmap_inertial.io.dialect import decode, split_cells
 from colmap_inertial.io.files import read_bytes
-from colmap_inertial.io.sensor_columns import Columns, SensorColumns
+from colmap_inertial.io.sensor_columns import OPEN, Columns, SensorColumns
 from colmap_inertial.io.stamps import TimeColumns
-from colmap_inertial.io.tables import Table, parse_table, read_table
+from colmap_inertial.io.tables import Table, parse_table, read_table, split_unit
 from colmap_inertial.io.units import Quantity
 
 #: Where the column of sensors is looked for, in how many lines, and how many sensors a phone has at most.
@@ -107,8 +107,8 @@ def find_rows_of_sensors(path: Path) -> Columns | None:
         if len(said) > _SENSORS:
             continue
         named = {name: re.sub(r"[^a-z0-9]", "", name.lower()) for name in said if said[name] > 2}
-        gyro = _best(named, words.GYRO_ROWS)
-        accel = _best(named, words.ACCEL_ROWS)
+        gyro = _best(named, words.GYRO_ROWS) or _named(named, "gyro")
+        accel = _best(named, words.ACCEL_ROWS) or _named(named, "accel")
         if gyro is not None and accel is not None:
             parts = [_sensor(path, column, gyro, "gyro"), _sensor(path, column, accel, "accel")]
             sure = all(part.is_complete for part in parts)
@@ -151,12 +151,55 @@ def _numbered(table: Table, column: int, counts: Counter[str]) -> SensorColumns 
     each = []
     for value, count in counts.items():
         each.append(f"{value} ({count} rows, mean length {lengths[said == value].mean():.3g})")
-    return SensorColumns(columns=columns, time=time, where=(column + 1, "?"), about=f"sensors: {', '.join(each)}")
+    return SensorColumns(columns=columns, time=time, where=(column + 1, OPEN), about=f"sensors: {', '.join(each)}")
+
+
+def finds_instances(table: Table, taken: Iterable[int]) -> bool:
+    """Whether rows of several devices come in turn; ``taken`` are the columns of sensors and time."""
+    return _instances(table, taken) is not None
+
+
+def leave_instance_open(table: Table, found: Columns) -> Columns:
+    """The same, with the choice of a device left open, where rows of several come in turn."""
+    parts = (found.gyro, found.accel)
+    instances = _instances(table, [index for part in parts for index in part.columns or ()])
+    if instances is None or found.gyro.where is not None:
+        return found
+    name, counts = instances
+    about = ", ".join(f"{value} ({count} rows)" for value, count in counts.items())
+    gyro, accel = (replace(part, where=(name, OPEN), about=about) for part in parts)
+    why = (*found.why, f"{name} tells the rows of {len(counts)} devices apart")
+    return replace(found, gyro=gyro, accel=accel, is_sure=False, why=why)
+
+
+def _instances(table: Table, taken: Iterable[int]) -> tuple[str, Counter[str]] | None:
+    """The column that tells devices apart, and how many rows each has."""
+    for column, name in enumerate(table.header or ()):
+        if column in taken or re.sub(r"[\W_]", "", name.lower()) not in words.INSTANCES:
+            continue
+        cells = table.text(column)
+        counts = Counter(cells)
+        changes = sum(a != b for a, b in itertools.pairwise(cells))
+        if 1 < len(counts) <= _NUMBERS and changes > 4 * len(counts) and min(counts.values()) > 2:
+            return name, counts
+    return None
 
 
 def _best(named: dict[str, str], known: set[str]) -> str | None:
     found = [name for name, flat in named.items() if flat in known]
     return min(found, key=lambda name: ("uncal" in named[name], name)) if found else None
+
+
+def _named(names: Iterable[str], quantity: Quantity) -> str | None:
+    """The one name that says a sensor and its unit: ``gyro_dps``."""
+    found = [name for name in names if (cell := _read_row_name(name)).kind == quantity and cell.unit is not None]
+    return found[0] if len(found) == 1 else None
+
+
+def _read_row_name(name: str) -> Cell:
+    """What a name of rows says, as if it stood over one of their columns."""
+    bare, unit = split_unit(name)
+    return read_name(f"{bare} x" if unit is None else f"{bare} x [{unit}]")
 
 
 def _sensor(path: Path, column: int, value: str, quantity: Quantity) -> SensorColumns:
@@ -167,4 +210,7 @@ def _sensor(path: Path, column: int, value: str, quantity: Quantity) -> SensorCo
     part = find_sensor(table, cells, quantity)
     if part.columns is None:
         part = find_sensor(table, cells, quantity, (quantity, "axis"))
+    said = _read_row_name(value)
+    if part.unit is None and said.kind == quantity and said.unit is not None:
+        part = replace(part, unit=said.unit, counts_per_unit=said.scale)
     return replace(part, where=(column, value))

@@ -5,8 +5,8 @@ specific force is +9.8 m/s2. Gyroscopes agree everywhere.
 
 Stray Scanner writes a folder: ``imu.csv`` (``timestamp, a_x, a_y, a_z, alpha_x, alpha_y, alpha_z``: seconds, what
 CoreMotion gave, rad/s), ``odometry.csv`` with the time of each frame of ``rgb.mp4`` on the same clock and ARKit's
-poses, ``camera_matrix.csv``. Its description says m/s2, its source writes CoreMotion's g; which one it is shows in the
-numbers (github.com/strayrobots/scanner).
+poses, ``camera_matrix.csv``. Its description says m/s2, its source writes CoreMotion's g, which is what counts
+(github.com/strayrobots/scanner, DatasetEncoder.swift).
 
 ScanCapture of the LaMAR benchmark writes ``gyroscope.txt`` and ``accelerometer.txt`` with comments ``# timestamp, rx,
 ry, rz`` and ``# timestamp, ax, ay, az``: microseconds since boot, rad/s, CoreMotion's g
@@ -41,10 +41,6 @@ from colmap_inertial.io.samples import Samples
 from colmap_inertial.io.tables import Table, head_of, members_of, parse_table, read_table, text_of
 from colmap_inertial.io.units import DeclaredUnits, seconds
 
-#: A median length up to this is g, above it m/s2: gravity gives 1 or 9.8.
-_G_BELOW = 3.0
-
-
 # --- Stray Scanner ---------------------------------------------------------------------------------------------------
 
 
@@ -61,11 +57,9 @@ def read_stray_scanner(path: Path, units: DeclaredUnits) -> ImuRecording:
     t_ns = table.stamps_ns(table.column("timestamp"), "s")
     gyro = table.numbers([table.column(f"alpha_{axis}") for axis in "xyz"])
     accel = -table.numbers([table.column(f"a_{axis}") for axis in "xyz"])
-    length = float(np.nanmedian(np.linalg.norm(accel, axis=1))) if len(accel) else 0.0
-    unit = units.accel or ("g" if length < _G_BELOW else "m/s2")
     return build_recording(
         order_rows(table, "gyro", units.gyro or "rad/s", t_ns, gyro),
-        order_rows(table, "accel", unit, t_ns, accel),
+        order_rows(table, "accel", units.accel or "g", t_ns, accel),
         device="Stray Scanner",
     )
 

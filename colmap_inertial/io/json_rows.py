@@ -24,6 +24,8 @@ def rows_of_json(text: str) -> str | None:
     if start not in ("[", "{"):
         return None
     try:
+        if start == "{" and (split := _split(next(objects_of_json(text), {}))) is not None:
+            return split
         first = list(itertools.islice(_flat_rows(text), _FIRST))
         if len(first) == 1 and (columns := _columns(first[0])) is not None:
             return columns
@@ -35,6 +37,18 @@ def rows_of_json(text: str) -> str | None:
     except (ValueError, RecursionError):
         return None
     return "\n".join(lines) + "\n"
+
+
+def is_json(text: str) -> bool:
+    """Whether a text begins with a JSON object or array."""
+    start = text.lstrip()
+    if start[:1] not in ("[", "{"):
+        return False
+    try:
+        json.JSONDecoder().raw_decode(start)
+    except (ValueError, RecursionError):
+        return False
+    return True
 
 
 def objects_of_json(text: str) -> Iterator[dict[str, Any]]:
@@ -76,6 +90,16 @@ def _flat(row: dict[str, Any], before: str = "") -> dict[str, Any]:
         else:
             out[name] = value
     return out
+
+
+def _split(value: dict[str, Any]) -> str | None:
+    """Rows under a list of names."""
+    names, rows = value.get("columns"), value.get("data")
+    if not (isinstance(names, list) and isinstance(rows, list) and len(rows) > 1):
+        return None
+    if not all(isinstance(row, list) and len(row) == len(names) for row in rows):
+        return None
+    return "\n".join(",".join(map(_cell, row)) for row in (names, *rows)) + "\n"
 
 
 def _columns(row: dict[str, Any]) -> str | None:

@@ -77,17 +77,23 @@ def read_rosbag(path: Path, units: DeclaredUnits) -> ImuRecording:
         topics = {units.topic: topics[units.topic]}
     sensors: tuple[tuple[Quantity, str], ...] = (("gyro", units.gyro or "rad/s"), ("accel", units.accel or "m/s2"))
     samples_of: dict[str, Samples] = {}
+    taken: dict[str, _Topic] = {}
     for quantity, unit in sensors:
         with_it = {name: topic for name, topic in topics.items() if quantity in topic.parts}
         if len(with_it) > 1:
             several = {"sensor": SENSOR_NAMES[quantity], "topics": tuple(with_it), "name": path.name}
             raise FormatError(path, Fact("bag-of-several-topics", **several))
         for name, topic in with_it.items():
+            taken[name] = topic
+            if len(topic.publishers) > 1:
+                raise TimingError(Fact("bag-of-two-drivers", path=str(path), topic=name, nodes=topic.publishers))
             t_ns = topic.arrival_ns
             if units.stamps != "arrival":
                 t_ns = topic.stamp_ns
                 _check_stamps(path, name, topic)
             samples_of[quantity] = order_samples(path, quantity, unit, t_ns, topic.parts[quantity])
+    if units.stamps != "arrival":
+        _require_one_clock(path, taken)
     if "gyro" not in samples_of:
         raise FormatError(path, Fact("bag-without-moving-gyroscope", topics=tuple(topics)))
     return build_recording(samples_of["gyro"], samples_of.get("accel"))
@@ -119,13 +125,11 @@ def _check_stamps(path: Path, name: str, topic: _Topic) -> None:
     Raises
     ------
     TimingError
-        For empty or repeated ones, and those of several drivers.
+        For empty or repeated ones, and those of a clock that was set.
     """
     stamps, count = topic.stamp_ns, len(topic.stamp_ns)
     hint = f"[imu]\npath = {json.dumps(path.name, ensure_ascii=False)}\n"
     jitter = _jitter_ms(topic.arrival_ns)
-    if len(topic.publishers) > 1:
-        raise TimingError(Fact("bag-of-two-drivers", path=str(path), topic=name, nodes=topic.publishers))
     arrival = {"jitter_ms": jitter, "hint": hint + 'stamps = "arrival"'}
     empty = int((stamps == 0).sum())
     if empty > LIMITS.harmless_share * count or len(np.unique(stamps)) < 2:
@@ -139,6 +143,37 @@ def _check_stamps(path: Path, name: str, topic: _Topic) -> None:
     back = int((late > LIMITS.latest_arrival_ns).sum())
     if back:
         raise TimingError(Fact("bag-stamps-jump-back", path=str(path), topic=name, count=back, total=count, **arrival))
+    ahead = np.diff(stamps) - np.diff(topic.arrival_ns)  # a gap of the sensor is one of arrival as well
+    jumps = int((ahead > LIMITS.latest_arrival_ns).sum())
+    if jumps:
+        raise TimingError(
+            Fact("bag-stamps-jump-ahead", path=str(path), topic=name, count=jumps, jump_s=ahead.max() * 1e-9, **arrival)
+        )
+
+
+def _require_one_clock(path: Path, topics: dict[str, _Topic]) -> None:
+    """Refuse topics whose header stamps are of clocks with different zeros, by how far they are from arrival.
+
+    Raises
+    ------
+    TimingError
+        Where they are.
+    """
+    late_ns = {name: float(np.median(topic.arrival_ns - topic.stamp_ns)) for name, topic in topics.items()}
+    apart_s = (max(late_ns.values()) - min(late_ns.values())) * 1e-9 if late_ns else 0.0
+    if apart_s > LIMITS.latest_arrival_ns * 1e-9:
+        hint = f'[imu]\npath = {json.dumps(path.name, ensure_ascii=False)}\nstamps = "arrival"'
+        jitter_ms = max(_jitter_ms(topic.arrival_ns) for topic in topics.values())
+        raise TimingError(
+            Fact(
+                "bag-of-two-clocks",
+                path=str(path),
+                topics=tuple(late_ns),
+                apart_s=apart_s,
+                jitter_ms=jitter_ms,
+                hint=hint,
+            )
+        )
 
 
 def _jitter_ms(arrival_ns: Int64Array) -> float:

@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from colmap_inertial.io.stamps import TimeColumns
+from colmap_inertial.io.units import Quantity
+
+OpenPoint = Literal["columns", "choice", "unit", "counts", "time", "time_unit", "rows", "axes"]
 
 #: Rows that are looked at.
 ROWS = 2000
+#: What stands for a value that is to be filled in.
+OPEN = "?"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,7 +29,7 @@ class SensorColumns:
     counts_per_unit
         ``None`` where it is unknown.
     axes
-        As in a capture.toml; empty where they are the file's.
+        As in a capture.toml; empty where they are the file's, ``"?"`` where they are open.
     time
         ``None`` where it is unknown; units are empty where they are.
     about
@@ -52,9 +58,23 @@ class SensorColumns:
     @property
     def is_complete(self) -> bool:
         """Whether nothing is open."""
+        return not self.open_points
+
+    @property
+    def open_points(self) -> tuple[OpenPoint, ...]:
+        """What is open."""
         time = self.time
-        timed = time is not None and bool(time.units or time.rate_hz or time.counts_per_second)
-        return self.columns is not None and None not in (self.unit, self.counts_per_unit) and timed and not self.others
+        points: dict[OpenPoint, bool] = {
+            "columns": self.columns is None,
+            "choice": bool(self.others),
+            "unit": self.unit is None,
+            "counts": self.counts_per_unit is None,
+            "time": time is None,
+            "time_unit": time is not None and not (time.units or time.rate_hz or time.counts_per_second),
+            "axes": self.axes == OPEN,
+            "rows": self.where is not None and self.where[1] == OPEN,
+        }
+        return tuple(point for point, is_open in points.items() if is_open)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,3 +101,9 @@ class Columns:
     is_sure: bool = False
     why: tuple[str, ...] = ()
     kinds: tuple[str, ...] = ()
+
+    @property
+    def open_points(self) -> tuple[tuple[Quantity, OpenPoint], ...]:
+        """What is open, by sensor."""
+        parts: tuple[tuple[Quantity, SensorColumns], ...] = (("gyro", self.gyro), ("accel", self.accel))
+        return tuple((quantity, point) for quantity, part in parts for point in part.open_points)

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from colmap_inertial.core.errors import FormatError, InertialError, TimingError
-from colmap_inertial.io.columns import read_name, recognise_columns
+from colmap_inertial.io.columns import read_name
 from colmap_inertial.io.descriptions import describe
 from colmap_inertial.io.imu_formats import find_imu_format
-from colmap_inertial.io.imu_text import TABLE_SUFFIXES, is_csv
+from colmap_inertial.io.imu_text import TABLE_SUFFIXES, add_other_table, find_columns, find_separate_tables, is_csv
 from colmap_inertial.io.interleaved import find_rows_of_sensors, read_rows
-from colmap_inertial.io.sensor_columns import Columns, SensorColumns
+from colmap_inertial.io.sensor_columns import OPEN, Columns, SensorColumns
 from colmap_inertial.io.stamps import TimeColumns, read_stamps
 from colmap_inertial.io.tables import Table, read_table
 
@@ -83,6 +83,8 @@ def report_table(path: Path, folder: Path | None = None) -> TableReport | None:
     folder
         Where the capture.toml is to lie; beside the table if not given.
     """
+    if path.is_dir():
+        return _report_folder(path, folder)
     if not path.is_file() or path.suffix.lower() not in TABLE_SUFFIXES:
         return None
     try:
@@ -92,13 +94,13 @@ def report_table(path: Path, folder: Path | None = None) -> TableReport | None:
     except InertialError:
         table = None
     try:
-        found = find_rows_of_sensors(path)
-        if found is None and table is None:
+        found = find_rows_of_sensors(path) if table is None else find_columns(path, table)
+        if found is None:
             return None
-        found = found or recognise_columns(table)  # type: ignore[arg-type]
         columns = tuple(_columns(path, found, table))
     except (FormatError, TimingError):
         return None
+    described = _seen_from(folder, path, add_other_table(path, found))
     named = path.name if folder is None else os.path.relpath(path, folder)
     plain = table if found.gyro.where is None else None
     return TableReport(
@@ -106,13 +108,57 @@ def report_table(path: Path, folder: Path | None = None) -> TableReport | None:
         found=() if table is None else table.found,
         columns=columns,
         why=found.why,
-        is_open=not (found.gyro.is_complete and found.accel.is_complete),
-        toml=describe(path, found, plain, named) + "\n",
+        is_open=bool(described.open_points),
+        toml=describe(path, described, plain, named) + "\n",
     )
 
 
+def _report_folder(path: Path, folder: Path | None) -> TableReport | None:
+    """The report of a folder in which each sensor has a table of its own, where these leave something open."""
+    try:
+        if find_imu_format(path).name != "tables":
+            return None
+    except FormatError:
+        return None
+    found = find_separate_tables(path)
+    if found is None:
+        return None
+    columns: list[ColumnReport] = []
+    try:
+        for part, alone in (
+            (found.gyro, replace(found, accel=SensorColumns())),
+            (found.accel, replace(found, gyro=SensorColumns())),
+        ):
+            table = read_table(path / part.file)
+            kinds = tuple(read_name(name).kind for name in table.header or ())
+            columns += _report_columns(replace(alone, kinds=kinds), table)
+    except (FormatError, TimingError):
+        return None
+    described = _seen_from(folder or path, path / found.gyro.file, found)
+    return TableReport(
+        path=path,
+        found=(),
+        columns=tuple(columns),
+        why=(),
+        is_open=bool(found.open_points),
+        toml=describe(path, described) + "\n",
+    )
+
+
+def _seen_from(folder: Path | None, path: Path, found: Columns) -> Columns:
+    """The same, with the other table's path from the folder of the capture.toml."""
+    if folder is None:
+        return found
+    gyro, accel = (
+        replace(part, file=os.path.relpath(path.parent / part.file, folder)) if part.file else part
+        for part in (found.gyro, found.accel)
+    )
+    return replace(found, gyro=gyro, accel=accel)
+
+
 def _columns(path: Path, found: Columns, table: Table | None) -> Iterator[ColumnReport]:
-    if found.gyro.where is None and table is not None:
+    open_rows = found.gyro.where is not None and found.gyro.where[1] == OPEN
+    if (found.gyro.where is None or open_rows) and table is not None:
         yield from _report_columns(found, table)
         return
     for kind, part in (("gyro", found.gyro), ("accel", found.accel)):

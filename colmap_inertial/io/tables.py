@@ -20,7 +20,7 @@ from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.dialect import decode, plain_text
 from colmap_inertial.io.files import first_line, read_bytes, read_limits, reading
-from colmap_inertial.io.json_rows import rows_of_json
+from colmap_inertial.io.json_rows import is_json, rows_of_json
 from colmap_inertial.io.units import SENSOR_UNITS, TIME_UNITS_NS, Quantity, stamps_ns, unit_of
 
 #: A delimiter that stands for any white space.
@@ -171,6 +171,8 @@ def parse_text(path: Path, text: str) -> Table:
     rows = rows_of_json(text)
     if rows is not None:
         return replace(parse_table(path, rows, ","), found=("JSON",))
+    if is_json(text):
+        raise FormatError(path, Fact("json-without-rows"))
     plain = plain_text(text)
     table = parse_table(path, plain.text, plain.delimiter)
     return replace(table, preamble=plain.preamble or table.preamble, found=plain.found)

@@ -135,7 +135,7 @@ class Section:
             path = self.file(key)
             return () if path is None else (path,)
         if not value or any(not isinstance(item, str) or not item.strip() or "\0" in item for item in value):
-            self.fail(key, Fact("not-paths", found=repr(value)[:260]))
+            self.fail(key, Fact("not-paths", found=repr(value)[:249]))
         return tuple(self.path.parent / item for item in value)
 
     def boolean(self, key: str) -> bool | None:
@@ -221,7 +221,7 @@ class Section:
         except OverflowError:
             number = math.inf
         if not math.isfinite(number):
-            self.fail(key, Fact("not-finite", found=repr(value)[:180]))
+            self.fail(key, Fact("not-finite", found=repr(value)[:178]))
         return number
 
     def _line(self, key: str | None) -> int | None:

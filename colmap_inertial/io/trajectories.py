@@ -47,7 +47,8 @@ def write_tum(path: Path, trajectory: CameraTrajectory | SmoothedTrajectory) -> 
         total = trajectory.epoch_ns + stamp
         whole, rest = divmod(abs(total), 1_000_000_000)
         time = f"{'-' if total < 0 else ''}{whole}.{rest:09d}"
-        lines.append(" ".join([time, *(f"{value:.12g}" for value in (*centre, *xyzw))]))
+        # of places on a map, millimetres stand in the tenth digit
+        lines.append(" ".join([time, *(f"{value:.15g}" for value in centre), *(f"{value:.12g}" for value in xyzw)]))
     write_text(Path(path), "\n".join(lines) + "\n")
 
 

@@ -11,14 +11,22 @@ from dataclasses import dataclass, field
 
 #: Words that name a sensor by themselves, small letters, and those that do in pairs.
 GYRO = {"pqr", "gyro", "gyr", "gyros", "gyroscope", "omega", "angvel", "angularvelocity", "angularrate", "rotationrate"}
-ACCEL = {"acc", "acce", "accel", "accels", "accelerometer", "acceleration", "accs", "specificforce"}
+GYRO |= {"drehrate", "winkelgeschwindigkeit", "gyroskop", "角速度", "陀螺仪"}
+ACCEL = {"acc", "acce", "accel", "accels", "accelerometer", "acceleration", "accs", "specificforce", "加速度"}
+ACCEL |= {"beschleunigung"}
 GYRO_PAIRS = {("angular", "velocity"), ("angular", "rate"), ("ang", "vel"), ("rotation", "rate"), ("rot", "rate")}
 ACCEL_PAIRS = {("specific", "force"), ("g", "force")}
+#: How copies of sensor_msgs/Imu call both, whose linear acceleration holds gravity.
+ROS_PAIRS = {
+    (("angular", "velocity"), ("linear", "acceleration")),
+    (("ang", "vel"), ("lin", "acc")),
+    (("ang", "vel"), ("lin", "accel")),
+}
 #: Letters that do where nothing but an axis stands beside them.
 SHORT_GYRO, SHORT_ACCEL = {"g", "w"}, {"a", "f"}
 
 #: Words that make an acceleration one without gravity, or gravity alone, or one in a frame that does not turn along.
-NO_GRAVITY = {"linear", "lin", "user", "free", "dynamic", "linacc", "linaccel", "freeacc", "usracc"}
+NO_GRAVITY = {"linear", "lineare", "lin", "user", "free", "dynamic", "linacc", "linaccel", "freeacc", "usracc"}
 GRAVITY = {"gravity", "grav", "gravityvector"}
 WORLD = {"world", "earth", "global", "ned", "enu", "nav"}
 #: Words that make a column something else.
@@ -48,11 +56,14 @@ LESSER = {
 TIME = {
     *("t", "time", "timestamp", "timestamps", "stamp", "ts", "elapsed", "clock", "epoch", "tick", "ticks", "utc"),
     *("sampletimefine", "timesec", "timens", "timeus", "timems", "timecode", "datetime", "millis", "micros", "date"),
+    *("sensortime", "zeit", "tiempo", "tijd", "时间", "時間", "片上时间"),
 }
 NO_TIME = {"zone", "timezone", "uncertainty", "exposure", "bias", "leap", "week", "relative", "interval", "delta"}
 #: Words of clocks that are read where the sensor was, and of those that are read later.
 NEAR_CLOCK = {"sensor", "sample", "hardware", "device", "chip", "boot", "reboot", "header", "stamp", "fine", "start"}
+NEAR_CLOCK |= {"片上时间"}
 LATE_CLOCK = {"app", "phone", "host", "system", "logging", "arrival", "received", "rx", "gps", "utc", "backend", "txt"}
+LATE_CLOCK |= {"motion"}
 COUNTERS = {"counter", "count", "sample", "index", "frame", "row", "packet", "iteration", "seq", "number", "id", "n"}
 #: Parts of a time in two columns, by unit.
 PARTS = {
@@ -67,6 +78,12 @@ VALUES = ("measurement", "value", "values", "data", "reading", "v")
 #: What rows of several sensors in one table are called in their column of sensors, small letters and digits alone.
 GYRO_ROWS = {"gyro", "gyr", "gyroscope", "uncalgyro", "gyroscopeuncalibrated", "androidsensorgyroscope"}
 ACCEL_ROWS = {"accel", "acce", "acc", "accelerometer", "uncalaccel", "accelerometeruncalibrated", "totalacceleration"}
+
+#: Names of columns that tell one device's rows from another's, where a table holds several.
+INSTANCES = {
+    *("i", "instance", "imu", "imuid", "sensor", "sensorid", "device", "deviceid", "devicename", "address", "mac"),
+    *("node", "nodename", "设备名称"),
+}
 
 #: A sampling rate that lines before the header state.
 RATE = r"(?:rate|freq\w*|odr|sampling|\bat)\b\W{0,3}(?:\w+\W{1,3}){0,2}?(\d+(?:\.\d+)?)\s*(?:Hz|samples/s|sps)\b"
@@ -100,6 +117,8 @@ class Part:
         ``None`` where only the recording knows.
     axes
         As in a capture.toml.
+    are_dated_otherwise
+        Whether exports whose stamps are dates may have other axes, which stay open.
     about
         What the recording does not say, in words.
     """
@@ -109,6 +128,7 @@ class Part:
     times: tuple[Times, ...]
     counts_per_unit: float | None = 1.0
     axes: str = ""
+    are_dated_otherwise: bool = False
     about: str = ""
 
 
@@ -231,6 +251,18 @@ LAYOUTS = (
             times=(Times(columns=("accelerometertimestamp_sincereboot(s)",), units=("s",)),),
         ),
     ),
+    Layout(  # in JSON
+        name="SensorLog",
+        gyro=Part(
+            columns="gyrorotation{}", unit="rad/s", times=(Times(columns=("gyrotimestamp_sincereboot",), units=("s",)),)
+        ),
+        accel=Part(
+            columns="accelerometeracceleration{}",
+            unit="g",
+            axes="-x,-y,-z",
+            times=(Times(columns=("accelerometertimestamp_sincereboot",), units=("s",)),),
+        ),
+    ),
     Layout(
         name="Movella DOT",
         preamble=r"DeviceTag|Movella|Xsens DOT|Measurement Mode",
@@ -257,7 +289,13 @@ LAYOUTS = (
     Layout(
         name="Physics Toolbox",
         gyro=Part(columns="w{}", unit="rad/s", times=(Times(columns=("time",), units=("s",)),)),
-        accel=Part(columns="gf{}", unit="g", times=(Times(columns=("time",), units=("s",)),)),
+        accel=Part(
+            columns="gf{}",
+            unit="g",
+            times=(Times(columns=("time",), units=("s",)),),
+            are_dated_otherwise=True,
+            about="x,y,z of Android; -x,-y,-z, with mirrored = true, of iOS, whose sign is that of gravity",
+        ),
         is_defined=False,
     ),
     Layout(

@@ -64,6 +64,11 @@ def no_keys_and_values(what: str) -> str:
     return f"not {what}: expected keys and values"
 
 
+@message(advice="keep one of them", example={"what": "a calibration", "count": 2})
+def documents_differ(what: str, count: int) -> str:
+    return f"not {what}: its {count} documents differ"
+
+
 @message(example={"found": "list"})
 def no_json_object(found: str) -> str:
     return f"expected a JSON object, found {found}"

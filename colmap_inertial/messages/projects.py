@@ -55,6 +55,33 @@ def not_in_model_frame(file: str, count: int, kind: str) -> str:
     return f"{file}: {count} {kind} are not in a model's frame and stay as they are"
 
 
+def _priors_stay(file: str, count: int, kind: str) -> str:
+    return f"{file}: {count} pose {'prior' if count == 1 else 'priors'} {kind} stay as they are"
+
+
+_PRIORS = {"file": "database.db", "count": 120, "kind": "in degrees (WGS84)"}
+
+
+@message(example={**_PRIORS, "ratio": 1.01, "sigma": 0.02})
+def priors_agree(file: str, count: int, kind: str, ratio: float, sigma: float) -> str:
+    apart = f"they are {ratio:.3f} +- {sigma:.2g} times as far apart as the model is now"
+    return f"{_priors_stay(file, count, kind)}, and agree with its metres: {apart}"
+
+
+@message(
+    advice="the scale or the positions are wrong, or these are no metres; do not give both to one adjustment",
+    example={**_PRIORS, "ratio": 3.2, "sigma": 0.1},
+)
+def priors_contradict(file: str, count: int, kind: str, ratio: float, sigma: float) -> str:
+    apart = f"they are {ratio:.3f} +- {sigma:.2g} times as far apart as the model is now"
+    return f"{_priors_stay(file, count, kind)}, and contradict its metres: {apart}"
+
+
+@message(example=_PRIORS)
+def priors_say_little(file: str, count: int, kind: str) -> str:
+    return f"{_priors_stay(file, count, kind)}; they are too few, or scatter too much, to compare their metres"
+
+
 # a scale without an IMU
 
 state("up-unknown-without-imu", "which way is up is not known: no IMU was used")

@@ -24,11 +24,6 @@ def columns_alike(first: str, second: str) -> str:
     return f'two columns mean the same: "{first}" and "{second}"'
 
 
-@message(example={"missing": ("time", "accel_x")})
-def columns_not_recognised(missing: Sequence[str]) -> str:
-    return f"no column for {', '.join(missing)} was recognised"
-
-
 @message(example={"columns": ("gx", "gy", "gz")})
 def no_single_unit(columns: Sequence[str]) -> str:
     listed = ", ".join(f'"{column}"' for column in columns)
@@ -41,6 +36,46 @@ def no_single_unit(columns: Sequence[str]) -> str:
 )
 def table_unclear(why: Said, header: str | None, hint: str) -> str:
     return str(why) if header is None else f"{why}; the header is: {header}"
+
+
+@message(
+    advice="write an array of objects, an object on each line, or lists of one length under their names: a time, and "
+    "three numbers of each sensor"
+)
+def json_without_rows() -> str:
+    return "is JSON without rows of samples that are known here"
+
+
+_POINTS = {
+    "columns": "which columns hold the {}",
+    "choice": "which of several columns to take for the {}",
+    "unit": "the unit of the {}",
+    "counts": "how many counts of the {} make one unit",
+    "time": "when the {} was read",
+    "time_unit": "the unit of the times of the {}",
+    "rows": "which rows of the {} to take",
+    "axes": "the sign of the {}",
+}
+_SENSORS = {"gyro": "gyroscope", "accel": "accelerometer"}
+
+
+@message(
+    advice=lambda hint, **_: f"describe it in a capture.toml, where ? stands for what it does not say:\n{hint}",
+    example={"source": "", "open": (("gyro", "unit"), ("accel", "unit")), "header": "t,gx", "hint": "[imu.gyro]\n..."},
+)
+def table_open(source: str, open: Sequence[tuple[str, str]], header: str | None, hint: str) -> str:
+    points: dict[str, list[str]] = {}
+    for sensor, point in open:
+        points.setdefault(point, []).append(_SENSORS[sensor])
+    said = [_POINTS[point].format(" and ".join(sensors)) for point, sensors in points.items()]
+    begin = f"it does not say {', '.join(said)}"
+    if not said:
+        begin = (
+            f"it is to be confirmed that this is from {source}"
+            if source
+            else "holds one sensor, a table beside it the other"
+        )
+    return begin + (f"; the header is: {header}" if header else "")
 
 
 def _arrival_advice(jitter_ms: float, hint: str, **_: object) -> str:
@@ -74,6 +109,31 @@ def bag_stamps_jump_back(path: str, topic: str, count: int, total: int, jitter_m
         f"{path}: the header.stamp of {count} of {total} messages of {topic} lies more than half a second behind one "
         "before it: the driver's clock was set, or drivers with two clocks publish on the topic"
     )
+
+
+@message(
+    advice=_arrival_advice,
+    example={"path": "imu.bag", "topic": "/imu", "count": 1, "jump_s": 7.0, "jitter_ms": 0.6, "hint": "[imu]\n..."},
+)
+def bag_stamps_jump_ahead(path: str, topic: str, count: int, jump_s: float, jitter_ms: float, hint: str) -> str:
+    return (
+        f"{path}: the header.stamp of {count} messages of {topic} jumps ahead, by up to {jump_s:.3g} s more than they "
+        "arrived later: the driver's clock was set"
+    )
+
+
+@message(
+    advice=_arrival_advice,
+    example={
+        "path": "imu.bag",
+        "topics": ("/gyro/sample", "/accel/sample"),
+        "apart_s": 1.7e9,
+        "jitter_ms": 0.6,
+        "hint": "[imu]\n...",
+    },
+)
+def bag_of_two_clocks(path: str, topics: Sequence[str], apart_s: float, jitter_ms: float, hint: str) -> str:
+    return f"{path}: the header.stamp of {' and '.join(topics)} are of two clocks, {apart_s:.3g} s apart"
 
 
 @message(

@@ -139,6 +139,24 @@ def odd_principal_point(camera: int, width: int, height: int, cx: float, cy: flo
 # what an applied similarity leaves as it is
 
 
+state("file-for-folder", "is a file, not a folder", advice="give the folder that it is in")
+state(
+    "nothing-to-undo",
+    "has no transform.json: nothing was applied here",
+    advice="give the folder that apply or reconstruct wrote",
+)
+
+
+@message(example={"names": ("points3D.bin",)})
+def model_incomplete(names: tuple[str, ...]) -> str:
+    return f"no whole COLMAP model here: {', '.join(names)} {'is' if len(names) == 1 else 'are'} missing"
+
+
+@message(advice="open the folder there and have it downloaded", example={"names": ("points3D.bin",)})
+def kept_in_cloud(names: tuple[str, ...]) -> str:
+    return f"no whole COLMAP model here: {', '.join(names)} {'is' if len(names) == 1 else 'are'} in iCloud only"
+
+
 @message(example={"kinds": ("2 .las", "1 .splat")})
 def carried_lengths(kinds: tuple[str, ...]) -> str:
     return f"copied in their old units, as their formats are not transformed: {', '.join(kinds)}"
@@ -161,6 +179,34 @@ def unmoved_depths(count: int, example: str, factors: tuple[float, ...]) -> str:
         f"{factors[0]:.9g} times as much as before" if len(factors) == 1 else "as much more as its model's scale says"
     )
     return f"depths in {_of(count, 'picture')} of whole numbers ({example}) stay as they are: a step means {times}"
+
+
+@message(
+    advice="it is right where it is in metres already",
+    example={"path": "rig_config.json", "ratio": 2.5},
+)
+def rig_elsewhere(path: str, ratio: float | None) -> str:
+    if ratio is None:
+        return f"{path}: copied as it is, as no model here has images of its cameras"
+    return f"{path}: copied as it is, as its cameras are {ratio:.4g} times as far apart as a model had them"
+
+
+@message(
+    advice="look whether they are lengths",
+    example={"path": "transforms.json", "fields": ("aabb", "scene_radius")},
+)
+def fields_unmoved(path: str, fields: tuple[str, ...]) -> str:
+    return f"{path}: {', '.join(fields)} stay as they are, as nothing is known of them"
+
+
+@message(example={"path": "outputs/dataparser_transforms.json"})
+def training_of_another_model(path: str) -> str:
+    return f"{path}: copied as it is, as it does not lead from a model here to where nerfstudio puts its cameras"
+
+
+@message(example={"path": "exports/splat.ply", "by": "outputs/dataparser_transforms.json"})
+def frame_of_training(path: str, by: str) -> str:
+    return f"{path}: copied as it is, as its points are in the frame of a training; {by} leads from metres to that"
 
 
 @message(example={"path": "transforms.json"})
@@ -206,6 +252,14 @@ def about_place(folder: str, pivot: tuple[float, ...]) -> str:
         f"{folder} lies far from the origin: it is turned and scaled about {', '.join(f'{x:.9g}' for x in pivot)}, "
         "which stays where it is"
     )
+
+
+@message(
+    advice="leave out --dense, and make the cloud of an export, which is about a point in its middle",
+    example={"folder": "project/sparse/0"},
+)
+def dense_far_away(folder: str) -> str:
+    return f"{folder} lies far from the origin, and dense clouds have single precision"
 
 
 @message(

@@ -32,6 +32,7 @@ from colmap_inertial.core.types import (
 )
 from colmap_inertial.io.files import StrPath, convert_to_plain, read_json, reader, write_json
 from colmap_inertial.io.picture_names import check_image_names
+from colmap_inertial.io.stand_ins import what_stands_in
 from colmap_inertial.model.pose_covariances import pose_covariances
 from colmap_inertial.model.references import check_references
 from colmap_inertial.model.rigs import list_posed_frames
@@ -148,8 +149,22 @@ def require_format(folder: Path) -> str:
     """:func:`model_format`; a :class:`FormatError` where the folder holds no model."""
     suffix = model_format(folder)
     if suffix is None:
-        raise FormatError(folder, Fact("no-model-here"))
+        raise FormatError(folder, _why_no_model(folder))
     return suffix
+
+
+def _why_no_model(folder: Path) -> Fact:
+    """What is missing in a folder, and whether a cloud drive keeps it."""
+    if folder.is_file():
+        with open(folder, "rb") as file:
+            return what_stands_in(file.read(512)) or Fact("file-for-folder")
+    for suffix in (".bin", ".txt"):
+        missing = [name + suffix for name in _MODEL_FILES if not (folder / (name + suffix)).is_file()]
+        if any((folder / f".{name}.icloud").is_file() for name in missing):
+            return Fact("kept-in-cloud", names=missing)
+        if len(missing) < len(_MODEL_FILES):
+            return Fact("model-incomplete", names=missing)
+    return Fact("no-model-here")
 
 
 def model_formats(folder: Path) -> list[str]:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import Similarity
@@ -100,7 +101,7 @@ def put_about_places(
         The scales, and what the user is told.
     """
     scales, facts = dict(by_model), []
-    pivot: np.ndarray | None = None
+    pivot: Array | None = None
     for model in layout.placed:
         place, similarity = Place.of(model.shown()), scales[model.index].similarity
         if place is None or similarity is None or not place.is_far:

@@ -18,6 +18,7 @@ from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.types import Similarity
 from colmap_inertial.io.files import read_json_value
 from colmap_inertial.model.database import PlacedModel
+from colmap_inertial.model.other_files import mvsnet_cameras
 
 #: Cameras of a file that are not named as the model's are the same within this share of the cameras' extent.
 _SAME_PLACE = 1e-3
@@ -178,4 +179,8 @@ def _array(value: object) -> Array:
 
 
 #: By kind, what reads a file's cameras.
-CAMERAS_OF: Mapping[str, Any] = {"splat cameras": splat_cameras, "poses and bounds": bounds_cameras}
+CAMERAS_OF: Mapping[str, Any] = {
+    "splat cameras": splat_cameras,
+    "poses and bounds": bounds_cameras,
+    "MVSNet camera": mvsnet_cameras,
+}

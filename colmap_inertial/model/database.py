@@ -245,6 +245,7 @@ def _transform(
         if answer != "ok":
             raise FormatError(path, Fact("database-check-failed", detail=answer))
     priors = list(_priors(database, path)) if {"pose_priors", "images"} <= tables else []
+    priors = [prior for prior in priors if not prior.in_degrees]
     rigs = list(_rigs(database, path)) if "rig_sensors" in tables else []
     moved_priors: set[int] = set()
     moved_rigs: set[int] = set()
@@ -272,12 +273,13 @@ def _transform(
 
 @dataclass(frozen=True, eq=False)
 class _Prior:
-    """A pose prior of the image ``key``, at (3,) ``place``."""
+    """A pose prior of the image ``key``, at (3,) ``place``: latitude, longitude, height where it is ``in_degrees``."""
 
     rowid: int
     key: str
     place: Array
     covariance: Array | None
+    in_degrees: bool
 
     def moved(self, similarity: Similarity) -> dict[str, Array]:
         """The columns that change."""
@@ -334,7 +336,7 @@ def _doubles(path: Path, what: str, blob: object, count: int) -> Array | None:
 
 
 def _priors(database: sqlite3.Connection, path: Path) -> Iterator[_Prior]:
-    """Cartesian priors of images; COLMAP 3 keeps them by image, 4 by sensor and datum."""
+    """Priors of images; COLMAP 3 keeps them by image, 4 by sensor and datum."""
     columns = {row[1] for row in database.execute("PRAGMA table_info(pose_priors)")}
     join = "p.image_id = i.image_id"
     if "corr_data_id" in columns:
@@ -347,9 +349,23 @@ def _priors(database: sqlite3.Connection, path: Path) -> Iterator[_Prior]:
     for rowid, name, blob, cov, system in database.execute(query):
         position = _doubles(path, "prior's position", blob, 3)
         spread = _doubles(path, "prior's covariance", cov, 9)
-        if position is None or system == _WGS84 or not np.isfinite(position).all():
+        if position is None or not np.isfinite(position[: 2 if system == _WGS84 else 3]).all():
             continue
-        yield _Prior(rowid, name, position, None if spread is None else spread.reshape(3, 3))
+        yield _Prior(rowid, name, position, None if spread is None else spread.reshape(3, 3), system == _WGS84)
+
+
+def read_priors(database: Path) -> dict[bool, dict[str, Array]]:
+    """(3,) pose priors by image; those in degrees (latitude, longitude, height) under ``True``, others under ``False``.
+
+    Raises
+    ------
+    FormatError
+        For a damaged database.
+    """
+    with open_read_only(database) as opened:
+        tables = {row[0] for row in opened.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        priors = list(_priors(opened, database)) if {"pose_priors", "images"} <= tables else []
+    return {kind: {p.key: p.place for p in priors if p.in_degrees == kind} for kind in (True, False)}
 
 
 def _rigs(database: sqlite3.Connection, path: Path) -> Iterator[_Rig]:

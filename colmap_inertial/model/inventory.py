@@ -17,6 +17,7 @@ from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.files import read_bytes
 from colmap_inertial.io.images import PNG, TIFF_ORDERS, tiff_entries
 from colmap_inertial.io.stand_ins import is_apple_double, is_pointer
+from colmap_inertial.model.other_files import is_rig_in_one_place
 
 Lengths = Literal["carried", "possible", "depths"]
 
@@ -40,7 +41,16 @@ _FREE = {
 }
 _FREE_NAMES = {
     *("patch-match.cfg", "fusion.cfg", ".ds_store", "thumbs.db", "desktop.ini", ".gitignore", ".gitattributes"),
-    *("license", "readme", "makefile", "run-colmap-geometric.sh", "run-colmap-photometric.sh", ".nojekyll", ".gitkeep"),
+    *(
+        "license",
+        "readme",
+        "makefile",
+        "pair.txt",
+        "run-colmap-geometric.sh",
+        "run-colmap-photometric.sh",
+        ".nojekyll",
+        ".gitkeep",
+    ),
 }
 #: Folders of COLMAP's maps without lengths; patch matching's own check of normal maps is in ``layout``.
 _FREE_FOLDERS = ("normal_maps", "consistency_graphs")
@@ -87,7 +97,7 @@ def lengths_of(file: Path, path: Path, depths: frozenset[Path] = frozenset()) ->
         return suffix, "carried"
     if path in depths or suffix in _PICTURES:
         return (f"depths ({suffix})", "depths") if path in depths or _is_deep(file, path) else None
-    is_free = _is_free_by_name(path) or _is_free_by_content(_head(file), suffix)
+    is_free = _is_free_by_name(path) or _is_free_by_content(_head(file), suffix) or is_rig_in_one_place(file)
     return None if is_free else (suffix or path.name, "possible")
 
 

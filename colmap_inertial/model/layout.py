@@ -28,11 +28,22 @@ from colmap_inertial.model.camera_files import (
 from colmap_inertial.model.database import PlacedModel, is_database
 from colmap_inertial.model.inventory import lengths_of
 from colmap_inertial.model.nerf import is_export, is_transforms, transform_export, transform_transforms
+from colmap_inertial.model.other_files import (
+    is_dataparser,
+    is_rig_configuration,
+    mvsnet_cameras,
+    transform_dataparser,
+    transform_mvsnet_camera,
+    transform_rig_configuration,
+)
 
 #: Kinds of files that have the shape of the model that they were made from.
-_SHAPED = ("depth map", "ply", "obj", "transforms", "export", "splat cameras", "poses and bounds", "depth parameters")
-#: Kinds of files whose cameras tell whether they are of a model here.
-CAMERA_KINDS = ("transforms", "splat cameras", "poses and bounds")
+_SHAPED = (
+    *("depth map", "ply", "obj", "transforms", "export", "splat cameras", "poses and bounds", "depth parameters"),
+    *("MVSNet camera", "dataparser"),
+)
+#: Kinds of files that tell themselves whether they are of a model here.
+CAMERA_KINDS = ("transforms", "splat cameras", "poses and bounds", "MVSNet camera", "rig configuration", "dataparser")
 
 
 def kind_to_move(file: Path, path: Path) -> str | None:
@@ -64,6 +75,12 @@ def kind_of(file: Path, path: Path) -> str | None:
         return "poses and bounds"
     if is_depth_params(file):
         return "depth parameters"
+    if suffix == ".txt" and mvsnet_cameras(file):
+        return "MVSNet camera"
+    if is_dataparser(file):
+        return "dataparser"
+    if is_rig_configuration(file):
+        return "rig configuration"
     return {".ply": "ply", ".ini": "options"}.get(suffix) or ("database" if is_database(file) else None)
 
 
@@ -77,6 +94,9 @@ WRITERS: dict[str, Callable[[Path, Path, Similarity], tuple[str, ...]]] = {
     "splat cameras": transform_splat_cameras,
     "poses and bounds": transform_bounds,
     "depth parameters": transform_depth_params,
+    "MVSNet camera": transform_mvsnet_camera,
+    "rig configuration": transform_rig_configuration,
+    "dataparser": transform_dataparser,
 }
 
 

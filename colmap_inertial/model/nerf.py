@@ -24,6 +24,16 @@ from colmap_inertial.model.database import PlacedModel
 _MATRICES = ("transform_matrix", "transform_matrix_start", "transform_matrix_end")
 #: Depths between which a camera sees, as some programs have them.
 _RANGES = {"near", "far", "z_near", "z_far", "znear", "zfar", "near_plane", "far_plane"}
+#: Fields without lengths: lenses, sizes of pictures, times, numbers of images, and what is done to the world.
+_FREE_FIELD = re.compile(
+    r"(?i)fl_?[xy]|f[xy]|c[xy]|[wh]|width|height|k\d*|p[12]|k[1-6]|camera_angle_[xy]|[xy]?_?fov(_?[xy])?|aabb_scale|"
+    r"applied_(transform|scale)|.*(exposure|time|stamp|iso|sharpness|angular_velocity|readout|shutter|index|_id).*|id|"
+    r"n_frames|distortion.*|is_fisheye|rolling_.*|colmap_im_id|camera_id|white_.*|colou?r.*|orientation_override|"
+    r"integer_.*levels|fps|frame_rate|rotation|bit_depth|version|.*class.*"
+)
+#: What a step in pictures of depths means, and where frames name these: of instant-ngp and nerfstudio.
+_DEPTH_UNITS = ("integer_depth_scale", "depth_unit_scale_factor")
+_DEPTHS = ("depth_file_path", "depth_path")
 #: What ``export.json`` says of itself, and of its unit: metres, or so many of them.
 EXPORT_FORMAT = "colmap-inertial export"
 _METRES = re.compile(r"(?:(\d\S*) )?m")
@@ -66,11 +76,34 @@ def read_applied_transform(path: Path) -> Array | None:
     return None if values is None else _applied(path, values)
 
 
-def depth_pictures(path: Path) -> set[str]:
-    """Pictures of depths that a ``transforms.json`` names, as paths relative to it."""
+def depth_pictures(path: Path) -> tuple[set[str], bool]:
+    """Pictures of depths that a ``transforms.json`` names, as paths relative to it, and whether it has their unit."""
     values = _frames(path)
-    frames = [] if values is None else values["frames"]
-    return {str(frame["depth_file_path"]) for frame in frames if frame.get("depth_file_path")}
+    if values is None:
+        return set(), False
+    named = {str(frame[key]) for frame in values["frames"] for key in _DEPTHS if frame.get(key)}
+    return named, any(_is_number(values.get(name)) for name in _DEPTH_UNITS)
+
+
+def unmoved_fields(path: Path) -> tuple[str, ...]:
+    """Fields of a ``transforms.json`` with numbers that are neither moved nor known to be free of lengths."""
+    values = _frames(path)
+    if values is None:
+        return ()
+    moved = {*_MATRICES, *_RANGES, *_DEPTH_UNITS, "frames", "camera_linear_velocity", "up"}
+    moved |= {"scale", "offset"} if {"scale", "offset"} <= values.keys() else set()
+    found = {name for fields in (values, *values["frames"]) for name, value in fields.items() if _has_numbers(value)}
+    return tuple(sorted(name for name in found - moved if not _FREE_FIELD.fullmatch(name)))
+
+
+def _has_numbers(value: object) -> bool:
+    if isinstance(value, Mapping):
+        return any(map(_has_numbers, value.values()))
+    return any(map(_has_numbers, value)) if isinstance(value, list) else _is_number(value)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def transform_transforms(source: Path, target: Path, similarity: Similarity) -> tuple[str, ...]:
@@ -94,9 +127,13 @@ def transform_transforms(source: Path, target: Path, similarity: Similarity) -> 
     changed = ["cameras"]
     for fields in (values, *values["frames"]):
         for name in _RANGES & fields.keys():
-            if isinstance(fields[name], int | float) and not isinstance(fields[name], bool):
+            if _is_number(fields[name]):
                 fields[name] *= similarity.scale
                 changed.append("depth ranges")
+    for name in _DEPTH_UNITS:
+        if _is_number(values.get(name)):
+            values[name] *= similarity.scale
+            changed.append("unit of depths")
     for frame in values["frames"]:
         for name in _MATRICES:
             if name in frame:
@@ -224,9 +261,13 @@ def _frames(path: Path) -> dict[str, Any] | None:
 
 
 def _applied(path: Path, values: Mapping[str, Any]) -> Array:
-    """(4, 4) what was done to the model's world before the cameras were written."""
+    """(4, 4) what was done to the model's world before the cameras were written: nerfstudio scales last."""
     given = values.get("applied_transform")
-    return np.eye(4) if given is None else _matrix(path, given)
+    scale: Any = values.get("applied_scale")
+    applied = np.eye(4) if given is None else _matrix(path, given)
+    if _is_number(scale) and 0 < scale < math.inf:
+        applied[:3] *= scale
+    return applied
 
 
 def _matrix(path: Path, value: object) -> Array:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
-from colmap_inertial.core.geometry import matrix_from_quat, quat_from_matrix
+from colmap_inertial.core.geometry import matrix_from_quat, quat_from_matrix, skew
 from colmap_inertial.core.types import Similarity
 
 #: A model is far from the origin at so many times its own size: single precision then keeps fewer than 1e-5 of it.
@@ -56,10 +56,30 @@ class Place:
         return np.asarray(step * np.round(self.middle / step))
 
 
+def find_pivot(shown: Array) -> Array | None:
+    """A point in the middle of (N, 3) what a model shows, where that lies far from the origin; else ``None``."""
+    place = Place.of(shown)
+    return None if place is None or not place.is_far else place.pivot()
+
+
 def about(similarity: Similarity, pivot: Array) -> Similarity:
     """The same turn and scale about another point than the origin: ``x' = s R (x - p) + p``."""
-    turn = matrix_from_quat(similarity.rotation_xyzw)
-    return replace(similarity, translation_m=similarity.translation_m + pivot - similarity.scale * turn @ pivot)
+    return between(similarity, pivot, pivot)
+
+
+def between(similarity: Similarity, before: Array, after: Array) -> Similarity:
+    """A similarity of coordinates that count from points ``before`` and ``after`` it, of those from the origin.
+
+    Its errors stay those about these points.
+    """
+    arm = similarity.scale * matrix_from_quat(similarity.rotation_xyzw) @ before
+    by_errors = np.eye(7)
+    by_errors[4:, 0], by_errors[4:, 1:4] = -arm, skew(arm)
+    return replace(
+        similarity,
+        translation_m=similarity.translation_m + after - arm,
+        cov=by_errors @ similarity.cov @ by_errors.T,
+    )
 
 
 def express_in_world(similarity: Similarity, applied: Array) -> Similarity | None:

@@ -25,6 +25,7 @@ from colmap_inertial.model import (
     model_files,
     model_formats,
     read_model,
+    require_format,
     similarity_as_json,
     transformed,
     write_files,
@@ -39,6 +40,7 @@ from colmap_inertial.model.keeping import Kept
 from colmap_inertial.model.layout import CAMERA_KINDS, Layout, kind_to_move, read_layout
 from colmap_inertial.model.notes import collecting_notes
 from colmap_inertial.model.places import Place
+from colmap_inertial.model.pose_priors import compare_priors
 from colmap_inertial.model.similarities import ModelScale, require_not_joined, similarity_from_json, undoing
 from colmap_inertial.model.soundness import check_binary_model
 from colmap_inertial.model.worlds import Worlds
@@ -168,7 +170,10 @@ def undo_project(
         When ``out`` exists or cannot be written.
     """
     project, out = Path(project), Path(out)
-    record = read_json(path := project / TRANSFORM_FILE)
+    path = project / TRANSFORM_FILE
+    if project.is_dir() and not path.exists():
+        raise FormatError(project, Fact("nothing-to-undo"))
+    record = read_json(path)
     try:
         keep = [str(pattern) for pattern in record["keep"]]
         models = [(int(m["index"]), m["similarity"]) for m in record["models"]]
@@ -247,6 +252,8 @@ class _Work:
         read: Sequence[tuple[Path, Fact]],
         beside: Sequence[str] = (),
     ) -> None:
+        if project.is_file():
+            require_format(project)  # says what it is
         if not project.is_dir():
             raise FormatError(project, Fact("no-such-folder"))
         inner, outer = out.resolve(), project.resolve()
@@ -360,16 +367,19 @@ class _Work:
             if kind == "database":
                 databases.append(path)
                 continue
-            if kind in CAMERA_KINDS and not worlds.is_of_a_model(path, str(kind)):
+            fitting: list[int] = []
+            if kind in CAMERA_KINDS and not (fitting := worlds.owners_of(path, str(kind))):
                 kind = None
-            owner = None if plan.one_for_all is not None or kind is None else self._owner(plan.layout, path)
+            owner = None if plan.one_for_all is not None or kind is None else self._owner(plan.layout, path, fitting)
             similarity = plan.one_for_all if owner is None else similarities[owner]
-            if kind is None and not self.is_kept(path):
+            if kind is None and not self.is_kept(path) and path not in worlds.counted:
                 self._inventory.add(path, lengths_of(source, path, worlds.depths))
-            if kind is None or similarity is None:
+            move = None
+            if kind is not None and similarity is not None:
+                move = worlds.similarity_of(path, kind, owner, similarity)
+            if kind is None or move is None:
                 jobs.append(functools.partial(copy, source, target, link=plan.link))
             else:
-                move = worlds.similarity_of(path, kind, owner, similarity)
                 doubles, place = plan.in_doubles(owner, move), (str(path), owner)
                 jobs.append(functools.partial(transform, source, target, kind, move, place, doubles=doubles))
         return databases, jobs
@@ -378,8 +388,11 @@ class _Work:
         """A path as it is in the project, also of what was read from the copy."""
         return path.relative_to(self._project) if path.is_relative_to(self._project) else path
 
-    def _owner(self, layout: Layout, path: Path) -> int:
+    def _owner(self, layout: Layout, path: Path, fitting: Sequence[int]) -> int:
+        """The sub-model in whose units a file is: by its folder, else the only one whose cameras it has."""
         owner = layout.owner(path)
+        if owner is None and len(fitting) == 1:
+            owner = fitting[0]
         if owner is None:
             raise FormatError(
                 self._project / path,
@@ -446,6 +459,9 @@ class _Work:
                 changed.append(f"{moved} {what}")
             if kept:
                 self._notes.append(Fact("not-in-model-frame", file=str(path), count=kept, kind=what))
+        if not plan.is_undo:
+            models, by_model = plan.layout.placed, plan.similarities
+            self.note(compare_priors(self._project / path, str(path), models, by_model, moved=done.prior_models))
         (shutil.copymode if changed else shutil.copystat)(self._project / path, partial / path)
         if changed:
             self._changes.append(Change(path=str(path), kind="database", changed=tuple(changed), model=None))

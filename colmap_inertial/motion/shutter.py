@@ -10,14 +10,14 @@ without (Karpenko et al., "Digital Video Stabilization and Rolling Shutter Corre
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from colmap_inertial.core.arrays import Array, IndexArray
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.facts import Fact
-from colmap_inertial.core.geometry import cross
+from colmap_inertial.core.geometry import cross, quat_exp, quat_multiply
 from colmap_inertial.core.types import ReadoutDirection
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.imaging.rolling_shutter import append_unit_depth
@@ -43,8 +43,8 @@ class ReadoutLimits:
     readout_sigma_s: float = 0.1
     #: clock offset,
     offset_sigma_s: float = 0.05
-    #: axes,
-    axes_sigma_rad: float = 0.05
+    #: axes: where cameras move as much as they turn, rotations of pairs align them to ten degrees only,
+    axes_sigma_rad: float = 0.3
     #: bias,
     bias_sigma_rad_s: float = 0.02
     #: focal length,
@@ -61,10 +61,11 @@ class ReadoutLimits:
     change_by_noise: float = 8.0
     #: Rounds of least squares, at most.
     most_rounds: int = 25
-    #: Change of the readout at which they end.
+    #: Change of the readout, and of the axes, at which they end.
     settled_s: float = 1e-5
-    #: A readout is told where it is known to this,
-    most_sigma_s: float = 0.002
+    settled_rad: float = 1e-4
+    #: A readout is told where it is known to this, a tenth of a slow one,
+    most_sigma_s: float = 0.003
     #: and clear of nothing by so many standard deviations;
     clear_sigmas: float = 3.0
     #: one that is seen the other way, too, must be clear and this share of it.
@@ -123,7 +124,9 @@ def estimate_readout(rotation: VisualRotation, motion: GyroCamera) -> ReadoutEst
     params, cov = _fit_readout(seen, motion)
     sigma = np.sqrt(np.diagonal(cov)[:2] + _LIMITS.floor_s**2 + (_LIMITS.floor_share * params[:2]) ** 2)
     along, beside = (0, 1) if abs(params[0]) >= abs(params[1]) else (1, 0)
-    readout_s, sigma_s = float(params[along]), float(sigma[along])
+    # no shutter takes time along its lines: what is seen there, a lens' or the depths' doing, is in both
+    unmodelled = max(0.0, float(params[beside] ** 2 - sigma[beside] ** 2))
+    readout_s, sigma_s = float(params[along]), float(np.hypot(sigma[along], unmodelled**0.5))
     if abs(readout_s) < _LIMITS.clear_sigmas * sigma_s:
         # of a shutter that is not seen nobody knows how its lines run
         readout_s, sigma_s, along, beside = 0.0, float(sigma.max()), 0, 1
@@ -240,7 +243,9 @@ def _fit_readout(seen: _Corners, motion: GyroCamera) -> tuple[Array, Array]:
         step = np.linalg.solve(information, scores.sum(axis=0) - prior @ params)
         moved = moved + np.linalg.solve(square, (own - mixed @ step)[..., None])[..., 0]
         params = params + step
-        if np.abs(step[:2]).max() < _LIMITS.settled_s:
+        # axes may be off by more than what is linear: the gyroscope is turned, and the next step starts from there
+        motion = replace(motion, cam_from_imu_xyzw=quat_multiply(quat_exp(step[3:6]), motion.cam_from_imu_xyzw))
+        if np.abs(step[:2]).max() < _LIMITS.settled_s and np.abs(step[3:6]).max() < _LIMITS.settled_rad:
             break
     cov = np.linalg.inv(information)
     parts = min(_LIMITS.parts, len(scores) // _LIMITS.pairs_of_part)
@@ -250,8 +255,11 @@ def _fit_readout(seen: _Corners, motion: GyroCamera) -> tuple[Array, Array]:
 
 
 def _compute_residuals(seen: _Corners, motion: GyroCamera, params: Array, moved: Array) -> tuple[Array, Array, Array]:
-    """(N, 2) what the second ray is off, its change with the parameters (N, 2, 10) and the translation (N, 2, 3)."""
-    lines, offset_s, axes, bias, focal = params[:2], params[2], params[3:6], params[6:9], np.exp(params[9])
+    """(N, 2) what the second ray is off, its change with the parameters (N, 2, 10) and the translation (N, 2, 3).
+
+    ``motion`` has the axes of ``params``.
+    """
+    lines, offset_s, bias, focal = params[:2], params[2], params[6:9], np.exp(params[9])
     since_s = seen.place @ lines
     at_s = seen.t_s + since_s - offset_s
     looking = motion.start_from_cam(at_s)
@@ -262,8 +270,8 @@ def _compute_residuals(seen: _Corners, motion: GyroCamera, params: Array, moved:
     rays = seen.rays * focal
     ahead = append_unit_depth(rays[:, 0])
     turned = np.einsum("nij,nj->ni", now_from_before, ahead)
-    # a little of axes and bias turns it further
-    turned = turned + cross(span_s * (bias - cross(np.broadcast_to(axes, middle_rate.shape), middle_rate)), turned)
+    # a little bias turns it further; the axes are in the motion
+    turned = turned + cross(span_s * bias, turned)
     seen_at = turned[:, :2] / turned[:, 2:]
     now, before = rate[:, 1], np.einsum("nij,nj->ni", now_from_before, rate[:, 0])
     turns = np.zeros((len(rays), 3, 9))

@@ -1,5 +1,8 @@
 """What the columns of exports hold: small tables made from the loggers' documentation."""
 
+import json
+import re
+
 import numpy as np
 import pytest
 
@@ -351,3 +354,154 @@ def test_numbers_of_sensors_are_blanks_with_what_they_measure(tmp_path):
     ]
     (tmp_path / "capture.toml").write_text("[imu.accel]".join(filled))
     check(read_imu(tmp_path / "capture.toml"))
+
+
+def test_rows_of_several_devices_are_a_blank_with_their_names(tmp_path):
+    twice = [v for t in T_S for v in (t, t)]
+    both = [np.repeat(values, 2, axis=0) for values in (GYRO, ACCEL)]
+    both[0][1::2] += 1  # the other device turns otherwise
+    names = [["left", "right"][i % 2] for i in range(2 * COUNT)]
+    header = "Time (s),DeviceName," + ",".join(f"Gyro {a} (rad/s)" for a in "XYZ")
+    header += "," + ",".join(f"Acc {a} (m/s2)" for a in "XYZ")
+    path = write(tmp_path / "two.csv", header, [twice, names, *floats(both[0]), *floats(both[1])])
+    with pytest.raises(FormatError) as caught:
+        read_imu(path)
+    assert f'where = ["DeviceName", "?"]  # left ({COUNT} rows), right ({COUNT} rows)' in str(caught.value)
+    toml = paste(caught, path)
+    toml.write_text(toml.read_text().replace('"DeviceName", "?"', '"DeviceName", "left"'))
+    check(read_imu(toml))
+    flags = [3 if i % 7 else 2 for i in range(2 * COUNT)]  # a status that flickers is no device
+    path = write(tmp_path / "one.csv", header.replace("DeviceName", "status"), [twice, flags, *floats(both[0])])
+    with pytest.raises(FormatError) as caught:
+        read_imu(path)
+    assert "where" not in str(caught.value)
+
+
+def test_rows_and_columns_name_units_within(tmp_path):
+    t_ms = ints(1e3 * T_S)
+    rows = [f"{t},gyro_dps,{x:.5f},{y:.5f},{z:.5f}" for t, (x, y, z) in zip(t_ms, np.degrees(GYRO), strict=True)]
+    rows += [f"{t},accel_g,{x:.6f},{y:.6f},{z:.6f}" for t, (x, y, z) in zip(t_ms, ACCEL / G, strict=True)]
+    path = tmp_path / "rows.csv"
+    path.write_text("epoch_ms,sensor,x,y,z\n" + "\n".join(sorted(rows, key=lambda row: int(row.split(",")[0]))) + "\n")
+    check(read_imu(path))
+    objects = [
+        {
+            "t_ns": t * 10**6,
+            "acc_m_s2": dict(zip("xyz", a, strict=True)),
+            "gyro_rad_s": dict(zip("xyz", g, strict=True)),
+        }
+        for t, a, g in zip(t_ms, ACCEL.tolist(), GYRO.tolist(), strict=True)
+    ]
+    (tmp_path / "rows.jsonl").write_text("\n".join(map(json.dumps, objects)) + "\n")
+    check(read_imu(tmp_path / "rows.jsonl"))
+
+
+def test_chinese_names_and_the_axis_in_front(tmp_path):
+    stamps = [f"2024-05-04 10:00:{t:06.3f}" for t in T_S]
+    header = "时间\t设备名称\t" + "\t".join(f"加速度{a}(g)" for a in "XYZ")
+    header += "\t" + "\t".join(f"角速度{a}(°/s)" for a in "XYZ") + "\t角度X(°)"
+    columns = [stamps, ["WT(1)"] * COUNT, *floats(ACCEL / G), *floats(np.degrees(GYRO)), *zeros(1)]
+    path = write(tmp_path / "wit.txt", header, columns, "\t")
+    path.write_bytes(path.read_text().encode("gb18030"))
+    check(read_imu(path))
+    header = "time_s," + ",".join(f"{a}gyro_rad_s" for a in "xyz") + "," + ",".join(f"{a}acc_g" for a in "xyz")
+    check(read_imu(write(tmp_path / "mav.csv", header, [floats(T_S[:, None])[0], *floats(GYRO), *floats(ACCEL / G)])))
+
+
+def test_a_clock_that_stands_still_is_no_time(tmp_path):
+    header = "Time(s)\tChipTime\tax(g)\tay(g)\taz(g)\twx(deg/s)\twy(deg/s)\twz(deg/s)"
+    columns = [floats(T_S[:, None])[0], ["2024-05-04 10:00:00.000"] * COUNT]
+    check(read_imu(write(tmp_path / "a.txt", header, [*columns, *floats(ACCEL / G), *floats(np.degrees(GYRO))], "\t")))
+    nine = zeros(9)
+    columns = [[0] * COUNT, [0] * COUNT, ["imu"] * COUNT, *zeros(3), [1.0] * COUNT]
+    path = write(tmp_path / "echo.csv", "", [*columns, *nine, *floats(GYRO), *nine, *floats(ACCEL), *nine])
+    with pytest.raises(FormatError) as caught:
+        read_imu(path)
+    assert caught.value.fact.values["open"] == (("gyro", "time"), ("accel", "time"))
+    toml = paste(caught, path)
+    rate = re.sub(r'time = "\?".*\ntime_unit = "\?".*', "rate_hz = 100", toml.read_text())
+    toml.write_text(rate)
+    check(read_imu(toml))
+
+
+def test_dates_open_the_sign_of_an_app_of_two_systems(tmp_path):
+    header, values = "time,gFx,gFy,gFz,wx,wy,wz", [*floats(-ACCEL / G), *floats(GYRO)]
+    stamps = [f"2024-05-04 10:00:{t:07.4f}" for t in T_S]
+    path = write(tmp_path / "ios.csv", header, [stamps, *values])
+    with pytest.raises(FormatError) as caught:
+        read_imu(path)
+    assert caught.value.fact.values["open"] == (("accel", "axes"),)
+    toml = paste(caught, path)
+    toml.write_text(toml.read_text().replace('axes = "?"', 'axes = "-x,-y,-z"\nmirrored = true'))
+    check(read_imu(toml))
+
+
+def test_minus_signs_of_typesetters_are_read(tmp_path):
+    header = "t (s);" + ";".join(f"gyro {a} (rad/s)" for a in "xyz") + ";" + ";".join(f"acc {a} (m/s2)" for a in "xyz")
+    path = write(
+        tmp_path / "a.csv", header, [floats(T_S[:, None])[0], *floats(GYRO), *floats(ACCEL)], ";", form="{:.6f}"
+    )
+    path.write_text(path.read_text().replace(".", ",").replace("-", "\u2212"))
+    check(read_imu(path))
+
+
+def test_tables_named_for_their_sensor_are_described_together(tmp_path):
+    folder = tmp_path / "berlin_user"
+    folder.mkdir()
+    for name, values in (("gyro", GYRO), ("accel", ACCEL), ("linear_accel", ACCEL - ACCEL.mean(0))):
+        write(folder / f"{name}.csv", "timestamp,x,y,z", [floats(1e3 * T_S[:, None])[0], *floats(values)])
+    with pytest.raises(FormatError) as caught:
+        read_imu(folder)
+    text = str(caught.value)
+    assert 'file = "gyro.csv"' in text and 'file = "accel.csv"' in text and "linear" not in text
+    for unit in ("rad/s", "m/s2"):
+        text = text.replace('unit = "?"  # ' + unit, f'unit = "{unit}"  # ' + unit)
+    text = text.replace('time_unit = "?"', 'time_unit = "ms"')
+    (folder / "capture.toml").write_text(text[text.index("[imu.gyro]") :])
+    check(read_imu(folder / "capture.toml"))
+
+
+def test_a_name_s_unit_is_asked_for_where_the_stamps_are_written_otherwise(tmp_path):
+    names = "timestamp," + ",".join(f"{w}_{a}" for w in ("omega", "alpha") for a in "xyz")
+    stamps = [f"{t + 1.4e9:.3f}" for t in T_S]
+    path = write(tmp_path / "imu.csv", names, [stamps, *floats(GYRO), *floats(ACCEL)])
+    with pytest.raises(FormatError) as caught:
+        read_imu(path)
+    assert caught.value.fact.values["open"] == (("gyro", "time_unit"), ("accel", "time_unit"))
+    toml = paste(caught, path)
+    toml.write_text(toml.read_text().replace('time_unit = "?"', 'time_unit = "s"'))
+    check(read_imu(toml))
+
+
+def test_a_header_with_another_unit_of_time_is_not_our_own_layout(tmp_path):
+    for name, values in (("gyroscope", GYRO), ("accelerometer", ACCEL)):
+        write(tmp_path / f"{name}.txt", "timestamp_ms,x,y,z", [floats(1e3 * T_S[:, None])[0], *floats(values)])
+    with pytest.raises(FormatError) as caught:
+        read_imu(tmp_path)
+    assert caught.value.fact.values["open"] == (("gyro", "unit"), ("accel", "unit"))
+
+
+def test_a_clock_that_moves_with_the_rows_goes_before_a_coarse_date(tmp_path):
+    header = "datetime,ms," + ",".join(f"g{a} (rad/s)" for a in "xyz") + "," + ",".join(f"a{a} (g)" for a in "xyz")
+    dates = [f"2024-05-04 10:00:{int(t):02d}" for t in T_S]
+    columns = [dates, ints(1e3 * T_S + 70), *floats(GYRO), *floats(ACCEL / G)]
+    check(read_imu(write(tmp_path / "a.csv", header, columns)))
+
+
+def test_acceleration_without_gravity_alone_is_named(tmp_path):
+    header = "motionTimestamp_sinceReboot(s)," + ",".join(f"motionRotationRate{a}(rad/s)" for a in "XYZ")
+    header += "," + ",".join(f"motionUserAcceleration{a}(G)" for a in "XYZ")
+    columns = [floats(T_S[:, None] + 50)[0], *floats(GYRO), *floats(ACCEL / G - [0, 0, 1])]
+    with pytest.raises(FormatError) as caught:
+        read_imu(write(tmp_path / "a.csv", header, columns, form="{:.9g}"))
+    text = str(caught.value)
+    assert caught.value.fact.values["open"] == (("accel", "columns"), ("accel", "unit"))
+    assert "without gravity" in text and 'time = "motionTimestamp_sinceReboot(s)"\ntime_unit = "s"' in text
+
+
+def test_german_names_are_read(tmp_path):
+    header = "Zeit (s);" + ";".join(f"Drehrate {a} (°/s)" for a in "XYZ")
+    header += ";" + ";".join(f"Lineare Beschleunigung {a} (m/s²)" for a in "XYZ")
+    header += ";" + ";".join(f"Beschleunigung {a} (m/s²)" for a in "XYZ")
+    columns = [floats(T_S[:, None])[0], *floats(np.degrees(GYRO)), *zeros(3), *floats(ACCEL)]
+    check(read_imu(write(tmp_path / "a.csv", header, columns, ";")))

@@ -108,3 +108,22 @@ def test_other_sheets_are_refused(tmp_path, text):
     path.write_text(text)
     with pytest.raises(FormatError):
         read_calibration(path)
+
+
+def test_messages_one_after_another_are_one_sheet(tmp_path):
+    info = "width: 640\nheight: 480\ndistortion_model: plumb_bob\nd: [0.1, 0.2, 0.0, 0.0, 0.0]\n"
+    info += "k: [500.0, 0.0, 319.5, 0.0, 501.0, 239.5, 0.0, 0.0, 1.0]\n---\n"
+    path = tmp_path / "echo.yaml"
+    path.write_text(f"header: {{frame_id: a, stamp: 1}}\n{info}header: {{frame_id: a, stamp: 2}}\n{info}")
+    assert read_device_yaml(path).camera().params[:4] == (500.0, 501.0, 320.0, 240.0)
+    path.write_text(info + info.replace("500.0", "510.0"))
+    with pytest.raises(FormatError, match="2 documents differ"):
+        read_device_yaml(path)
+
+
+def test_a_report_is_no_calibration(tmp_path):
+    path = tmp_path / "results-imucam.txt"
+    path.write_text("Calibration results\n===================\nT_ci:  (imu0 to cam0):\n[[ 0.0 -1.0 0.0 0.03]\n")
+    with pytest.raises(FormatError) as caught:
+        read_calibration(path)
+    assert caught.value.fact.code == "calibration-unknown"

@@ -9,6 +9,7 @@ from test_columns import ACCEL, COUNT, GYRO, T_S, G, check
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.io.json_rows import rows_of_json
+from colmap_inertial.io.tables import read_table
 
 
 def rows_of(values, name):
@@ -83,3 +84,17 @@ def test_objects_and_lists_are_tables(tmp_path):
 @pytest.mark.parametrize("text", ["", "{", "[1,2]", '{"a": 1}', "[" * 100_000, '{"a": [1, 2]}', '[{"a": 1}, x]', "x"])
 def test_what_is_no_json_of_rows_is_none(text):
     assert rows_of_json(text) is None
+
+
+def test_rows_under_a_list_of_names():
+    rows = {"columns": ["t_s", "gx"], "data": [[0.01 * i, i] for i in range(6)]}
+    assert rows_of_json(json.dumps(rows)).splitlines()[:2] == ["t_s,gx", "0.0,0"]
+
+
+def test_json_without_rows_says_so(tmp_path):
+    broken = '{"columns": ["t", "x"], "data": [[1], [2], [3]]}'
+    for text in ('{"version": 3, "files": ["a"]}', "[1, 2, 3]", broken):
+        (tmp_path / "a.json").write_text(text)
+        with pytest.raises(FormatError) as caught:
+            read_table(tmp_path / "a.json")
+        assert caught.value.fact.code == "json-without-rows"

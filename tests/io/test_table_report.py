@@ -48,3 +48,25 @@ def test_an_open_table_is_shown_and_refused(tmp_path, capsys):
     assert run("diagnose", str(path)) == 2
     said = capsys.readouterr()
     assert 'unit = "?"' in said.out and "the capture.toml above describes it" in said.err
+
+
+def test_the_hint_names_the_table_of_the_other_sensor(tmp_path, capsys):
+    t = floats(T_S[:, None])[0]
+    (tmp_path / "log").mkdir()
+    gyro = write(tmp_path / "log" / "berlin_1.csv", "t (s),x (rad/s),y (rad/s),z (rad/s)", [t, *floats(GYRO)])
+    write(tmp_path / "log" / "berlin_2.csv", "t (s),x (m/s2),y (m/s2),z (m/s2)", [t, *floats(ACCEL)])
+    run("diagnose", str(gyro), "--capture", str(tmp_path / "capture.toml"))
+    assert "a table beside it the other" in capsys.readouterr().err
+    check(read_imu(tmp_path / "capture.toml"))
+
+
+def test_a_folder_of_open_tables_is_described(tmp_path, capsys):
+    (tmp_path / "log").mkdir()
+    for name, values in (("Gyroscope", GYRO), ("Accelerometer", ACCEL)):
+        write(tmp_path / "log" / f"{name}.csv", "t_s,x,y,z", [floats(T_S[:, None])[0], *floats(values)])
+    assert run("diagnose", str(tmp_path / "log"), "--capture", str(tmp_path / "capture.toml")) == 2
+    assert "accelerometer" in capsys.readouterr().out
+    text = (tmp_path / "capture.toml").read_text()
+    text = text.replace('"?"  # rad/s', '"rad/s"  #').replace('"?"  # m/s2', '"m/s2"  #')
+    (tmp_path / "capture.toml").write_text(text)
+    check(read_imu(tmp_path / "capture.toml"))

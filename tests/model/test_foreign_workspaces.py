@@ -1,6 +1,7 @@
 """Workspaces of other programs under a similarity: each file is moved, free of lengths, or named."""
 
 import json
+import struct
 
 import cv2
 import numpy as np
@@ -16,9 +17,9 @@ from foreign_models import (
     points,
     save,
     write_json,
-    write_pictures,
     write_ply as ply,
 )
+from other_files import in_order, into_training, read_mvsnet, read_rig, training_of, write_mvsnet, write_rig
 
 from colmap_inertial.cli import main
 from colmap_inertial.core.errors import AlreadyMetricError, FormatError, InertialError
@@ -28,6 +29,7 @@ from colmap_inertial.model import read_model
 from colmap_inertial.model.identity import ModelIdentity
 from colmap_inertial.model.project import apply_to_project, undo_project
 from colmap_inertial.model.similarities import plain_factor, read_scales
+from colmap_inertial.tools.export.whole import export_model
 
 QUAT = np.array([0.5, -0.1, 0.3, 0.8062257748298549])
 SIM3 = Similarity(
@@ -150,7 +152,7 @@ def test_points_of_another_frame_are_named(tmp_path):
     assert any("exports/splat.ply: moved with the model" in note for note in map(str, applied.notes))
 
 
-def inria(root, model):
+def inria(root, model, sparse=None):
     """What 3D Gaussian Splatting writes, and what LLFF does."""
     rows, bounds = [], []
     for i, image in enumerate(model.images.values()):
@@ -162,7 +164,7 @@ def inria(root, model):
     write_json(root / "output" / "cameras.json", rows)
     np.save(root / "poses_bounds.npy", np.array(bounds))
     params = {image.name: {"scale": 0.8, "offset": 0.02} for image in model.images.values()}
-    write_json(root / "sparse" / "0" / "depth_params.json", params)
+    write_json((sparse or root / "sparse" / "0") / "depth_params.json", params)
     return rows, np.array(bounds), params
 
 
@@ -463,49 +465,193 @@ def turned(model):
     return model
 
 
-def test_everything_at_once_moves_and_comes_back(tmp_path):
-    """Frames, files with lengths and files that are none, in one workspace: each by a reader of this test's own."""
-    root = tmp_path / "p"
-    model = nerfstudio(root)
-    write_pictures(model, root / "images")
-    rows, bounds, _ = inria(root, model)
-    (root / "sparse" / "0" / "depth_params.json").unlink()
-    (root / "sparse" / "0").rmdir()
-    (root / "sparse").rmdir()
-    put(root, {**NAMED, **FREE})
+#: As an exporter of another program wrote it: a colour, a position, a length in each.
+OTHERS = {
+    "outputs/hall/splatfacto/1/nerfstudio_models/step-000029999.ckpt": b"\x80\x02model",
+    "outputs/hall/splatfacto/1/config.yml": b"scene_scale: 2.0\n",
+    "scene.wrl": b"#VRML V2.0 utf8\nShape { geometry PointSet { coord Coordinate { point [ 1 2 3 ] } } }\n",
+    "viewer/scene.glb": b"glTF\x02\x00\x00\x00 with COLOR_0",
+    "rig_of_another_unit.json": b'[{"cameras": [{"image_prefix": "cam0/", "ref_sensor": true}, '
+    b'{"image_prefix": "cam1/", "cam_from_rig_translation": [0.011, 0, 0]}]}]',
+}
+
+
+def write_workspace(root):
+    """One workspace of many programs, of a model in ``colmap/sparse/0`` whose images have the same names in folders."""
+    names = [f"cam{i % 4}/{i // 4:05}.png" for i in range(COUNT)]
+    model = nerfstudio(root, names=names)
+    picture = np.full((HEIGHT, WIDTH, 4), 90, np.uint8)
+    picture[..., 3] = np.where(np.arange(WIDTH) < WIDTH // 2, 0, 255)
+    for name in names:
+        for folder, content in (("images", picture), ("masks", picture[..., 3])):
+            (root / folder / name).parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(root / folder / name), content)
+    made = inria(root, model, sparse=root / "colmap" / "sparse" / "0")
+    write_mvsnet(root / "mvs", model)
+    rig = write_rig(root / "rig_config.json", model, [f"cam{i}/" for i in range(4)])
+    training = training_of(model, APPLIED)
+    write_json(root / "outputs" / "hall" / "splatfacto" / "1" / "dataparser_transforms.json", training)
+    ply(root / "exports" / "splat.ply", into_training(training, xyz_of(model)))
     mesh = xyz_of(model)[:30]
     ply(root / "dense" / "mesh.ply", mesh)
     (root / "dense" / "mesh.obj").write_text("".join(f"v {x!r} {y!r} {z!r}\n" for x, y, z in mesh.tolist()))
     write_json(root / "assets" / "transform.json", {"frames": []})
+    put(root, {**OTHERS, **FREE})
+    return model, made, rig, training
+
+
+def assert_lengths(folder, model, made, rig, training, at, off):
+    """All lengths of the workspace, where ``at`` moves points to, times the scale of that; to ``off`` in doubles."""
+    rows, bounds, params = made
+    sparse = folder / "colmap" / "sparse" / "0"
+    scale = np.linalg.norm(at(np.array([1.0, 0, 0])) - at(np.zeros(3)))
+    turn = np.stack([(at(axis) - at(np.zeros(3))) / scale for axis in np.eye(3)], axis=1)
+    for image in model.images.values():
+        np.testing.assert_allclose(centres(sparse)[image.name], at(image.projection_center()), atol=10 * off)
+    found = points(sparse)
+    for number, point in model.points3D.items():
+        np.testing.assert_allclose(found[number], at(point.xyz), atol=off)
+    # in the world of transforms.json, by what its cameras see
+    assert error_px(folder, model) < 1e-3
+    world = world_of(APPLIED)
+    want = at(xyz_of(model)) @ world[:3, :3].T + world[:3, 3]
+    np.testing.assert_allclose(ply_points(folder / "sparse_pc.ply"), want, atol=2e-6)
+    for new, old in zip(json.loads((folder / "output" / "cameras.json").read_text()), rows, strict=True):
+        np.testing.assert_allclose(new["position"], at(old["position"]), atol=off)
+        np.testing.assert_allclose(new["rotation"], turn @ np.array(old["rotation"]), atol=off)
+    new = np.load(folder / "poses_bounds.npy")
+    np.testing.assert_allclose(new[:, [3, 8, 13]], at(bounds[:, [3, 8, 13]]), atol=off)
+    np.testing.assert_allclose(new[:, 15:], scale * bounds[:, 15:], atol=10 * off)
+    inverse = json.loads((sparse / "depth_params.json").read_text())
+    for name, fields in params.items():
+        np.testing.assert_allclose(inverse[name]["scale"] * scale, fields["scale"], rtol=off)
+        np.testing.assert_allclose(inverse[name]["offset"] * scale, fields["offset"], rtol=off)
+    for i, image in enumerate(in_order(model)):
+        centre, _, _, depths = read_mvsnet(folder / "mvs" / "cams" / f"{i:08}_cam.txt")
+        np.testing.assert_allclose(centre, at(image.projection_center()), atol=10 * off)
+        np.testing.assert_allclose(depths, np.array([0.5, 0.0125, 192 / scale, 2.9]) * scale, rtol=10 * off)
+    for new, camera in zip(read_rig(folder / "rig_config.json"), rig[1:], strict=True):
+        np.testing.assert_allclose(new, scale * np.array(camera["cam_from_rig_translation"]), atol=off)
+    after = json.loads((folder / "outputs" / "hall" / "splatfacto" / "1" / "dataparser_transforms.json").read_text())
+    there = into_training(training, xyz_of(model))
+    np.testing.assert_allclose(into_training(after, at(xyz_of(model))), there, atol=10 * off)
+    np.testing.assert_allclose(ply_points(folder / "exports" / "splat.ply"), there, atol=1e-7)
+    np.testing.assert_allclose(ply_points(folder / "dense" / "mesh.ply"), at(xyz_of(model)[:30]), atol=2e-6)
+    lines = (folder / "dense" / "mesh.obj").read_text().splitlines()
+    np.testing.assert_allclose(
+        [[float(w) for w in line.split()[1:]] for line in lines], at(xyz_of(model)[:30]), atol=off
+    )
+
+
+def test_everything_at_once_moves_and_comes_back(tmp_path):
+    """Each length of a workspace of many programs by a reader of this test's own; what has none is as it was."""
+    root, out, back = tmp_path / "p", tmp_path / "out", tmp_path / "back"
+    given = write_workspace(root)
+    assert_lengths(root, *given, lambda xyz: np.asarray(xyz), 1e-14)
     before = {path.relative_to(root): path.read_bytes() for path in root.rglob("*") if path.is_file()}
-    applied = apply_to_project(root, tmp_path / "out", SIM3)
-    out = tmp_path / "out"
-    for name, centre in centres(root / "colmap" / "sparse" / "0").items():
-        np.testing.assert_allclose(centres(out / "colmap" / "sparse" / "0")[name], moved(centre), atol=1e-14 * 10)
-    for number, xyz in points(root / "colmap" / "sparse" / "0").items():
-        np.testing.assert_allclose(points(out / "colmap" / "sparse" / "0")[number], moved(xyz), atol=1e-14)
-    assert error_px(out, model) < 1e-3
-    np.testing.assert_allclose(ply_points(out / "dense" / "mesh.ply"), moved(mesh), atol=1e-6)
-    vertices = [list(map(float, line.split()[1:])) for line in (out / "dense" / "mesh.obj").read_text().splitlines()]
-    np.testing.assert_allclose(vertices, moved(mesh), atol=1e-14)
-    after = json.loads((out / "output" / "cameras.json").read_text())
-    for old, new in zip(rows, after, strict=True):
-        np.testing.assert_allclose(new["position"], moved(old["position"]), atol=1e-13)
-    changed = {change.path for change in applied.changes}
+    applied = apply_to_project(root, out, SIM3)
+    assert_lengths(out, *given, moved, 1e-13)
+    # what did not change is free of lengths, in the frame of a training, or named
     named = {group.kind for group in applied.unmoved}
-    untouched = {p for p in before if (out / p).read_bytes() == before[p]}
-    # what did not change is free of lengths, or named
-    for path in untouched:
-        free = str(path) in FREE or (path.suffix == ".png" and "depth" not in path.parts)
-        group = "depths (.png)" if path.parts[0] == "depth" and path.suffix == ".png" else path.suffix
-        model_file = path.parts[0] == "colmap" and path.name == "cameras.bin"
-        assert free or model_file or {group, path.name} & named, path
-    assert {"sparse_pc.ply", "transforms.json", "poses_bounds.npy", "output/cameras.json"} <= changed
-    undo_project(out, tmp_path / "back")
-    back = tmp_path / "back"
-    made = {path.relative_to(back) for path in back.rglob("*") if path.is_file()} - set(before)
-    assert {path.name for path in made} <= {"rigs.bin", "frames.bin"}  # which COLMAP of today writes
-    for number, xyz in points(root / "colmap" / "sparse" / "0").items():
-        np.testing.assert_allclose(points(back / "colmap" / "sparse" / "0")[number], xyz, atol=4e-15)
-    np.testing.assert_allclose(np.load(back / "poses_bounds.npy"), bounds, atol=4e-15)
-    assert error_px(back, model) < 1e-3
+    of_kind = {path.rpartition(".")[2] for path in OTHERS} | {"png"}
+    assert {group.example.rpartition(".")[2] for group in applied.unmoved} == of_kind
+    for path in before:
+        if (out / path).read_bytes() != before[path]:
+            continue
+        is_free = str(path) in FREE or path.parts[0] in ("images", "masks") or path.name in ("pair.txt", "cameras.bin")
+        assert is_free or {path.suffix, f"depths ({path.suffix})"} & named or path.parts[0] == "exports", path
+    notes = " ".join(map(str, applied.notes))
+    assert "depths in 8 pictures" in notes and "2.5 times as large" in notes
+    assert "exports/splat.ply: copied as it is" in notes and "rig_of_another_unit.json: copied as it is" in notes
+    undo_project(out, back)
+    assert_lengths(back, *given, lambda xyz: np.asarray(xyz), 1e-14)
+    made = {path.relative_to(back) for path in back.rglob("*") if path.is_file()}
+    assert {path.name for path in made - set(before)} <= {"rigs.bin", "frames.bin"}  # which COLMAP of today writes
+    assert set(before) <= made
+
+
+def test_what_is_exported_of_it_has_its_lengths_colours_and_alpha(tmp_path):
+    """Point 8: linear colours in glTF, alpha in pictures, masks by name."""
+    root, out = tmp_path / "p", tmp_path / "out"
+    model, *_ = write_workspace(root)
+    apply_to_project(root, out, SIM3)
+    sparse = out / "colmap" / "sparse" / "0"
+    made = export_model(sparse, tmp_path / "splat", "gsplat", images=out / "images", unscaled=True)
+    for path in (tmp_path / "splat" / "images").iterdir():
+        shown = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        assert shown.shape == (HEIGHT, WIDTH, 4) and set(np.unique(shown[..., 3])) == {0, 255}
+    assert len(list((tmp_path / "splat" / "images").iterdir())) == COUNT
+    assert any("masks" in str(note) for note in made.notes)
+    np.testing.assert_allclose(
+        sorted(ply_points(tmp_path / "splat" / "sparse_pc.ply").tolist()),
+        sorted(moved(xyz_of(model)).tolist()),
+        atol=1e-5,
+    )
+    pytest.importorskip("pygltflib")
+    export_model(sparse, tmp_path / "gltf", "gltf", unscaled=True)
+    xyz, rgb = glb_points(tmp_path / "gltf" / "scene.glb")
+    order = np.lexsort(np.round(xyz, 4).T)
+    want = moved(xyz_of(model))
+    colours = np.array([model.points3D[i].color for i in sorted(model.points3D)]) / 255
+    linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
+    by = np.lexsort(np.round(want, 4).T)
+    np.testing.assert_allclose(xyz[order], want[by], atol=1e-5)
+    np.testing.assert_allclose(rgb[order], linear[by], atol=1e-4)
+
+
+def glb_points(path):
+    """Positions in the world, and linear colours, of the node ``points``."""
+    data = path.read_bytes()
+    (length,) = struct.unpack_from("<I", data, 12)
+    content, buffer = json.loads(data[20 : 20 + length]), data[28 + length :]
+    nodes = content["nodes"]
+    number = next(i for i, node in enumerate(nodes) if node.get("name") == "points")
+    attributes = content["meshes"][nodes[number]["mesh"]]["primitives"][0]["attributes"]
+
+    def values(name, kind, columns):
+        accessor = content["accessors"][attributes[name]]
+        start = content["bufferViews"][accessor["bufferView"]].get("byteOffset", 0)
+        return np.frombuffer(buffer, kind, columns * accessor["count"], start).reshape(-1, columns).astype(float)
+
+    xyz, above = values("POSITION", "<f4", 3), number
+    while (above := next((i for i, n in enumerate(nodes) if above in n.get("children", [])), None)) is not None:
+        node = nodes[above]
+        assert "matrix" not in node and "scale" not in node
+        xyz = xyz @ matrix_from_quat(np.array(node.get("rotation", [0, 0, 0, 1.0]))).T + node.get(
+            "translation", [0, 0, 0]
+        )
+    # glTF has y up, this world z
+    return xyz @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), values("COLOR_0", "<u2", 4)[:, :3] / 65535
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (
+            lambda p: (p / "points3D.bin").rename(p / ".points3D.bin.icloud"),
+            "points3D.bin is in iCloud only; open",
+        ),
+        (lambda p: (p / "points3D.bin").unlink(), r"points3D\.bin is missing"),
+        (lambda p: [(p / f"{name}.bin").unlink() for name in ("images", "points3D")], "images.bin, points3D.bin are"),
+    ],
+)
+def test_what_a_model_lacks_is_said(tmp_path, change, match):
+    change(save(build(), tmp_path / "p"))
+    with pytest.raises(FormatError, match=match):
+        apply_to_project(tmp_path / "p", tmp_path / "out", SIM3)
+
+
+@pytest.mark.parametrize(
+    ("data", "match"),
+    [(b"PK\x03\x04" + bytes(60), r"is packed \(zip\)"), (b"anything", "not a folder; give the folder")],
+)
+def test_a_file_in_place_of_a_project_is_called_what_it_is(tmp_path, data, match):
+    (tmp_path / "p").write_bytes(data)
+    with pytest.raises(FormatError, match=match):
+        apply_to_project(tmp_path / "p", tmp_path / "out", SIM3)
+
+
+def test_what_was_never_applied_is_not_undone(tmp_path):
+    save(build(), tmp_path / "p" / "sparse" / "0")
+    with pytest.raises(FormatError, match="nothing was applied here"):
+        undo_project(tmp_path / "p", tmp_path / "out")

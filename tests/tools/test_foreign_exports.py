@@ -159,13 +159,60 @@ def test_alpha_is_kept_whether_pictures_are_resampled_or_not(tmp_path, lens, end
         assert (shown[:, : middle - 4, 3] == 0).all() and (shown[:, middle + 4 :, 3] == 255).all()
 
 
-def test_masks_are_named(tmp_path):
+@pytest.mark.parametrize(
+    "mask", ["masks/{}", "mask/{}.png", "images_masks/{}", "segmentation/{}", "mattes/{}", "images/{}.mask.png"]
+)
+def test_masks_are_named(tmp_path, mask):
     model = build()
     save(model, tmp_path / "p" / "sparse" / "0")
     write_pictures(model, tmp_path / "p" / "images")
-    write_pictures(model, tmp_path / "p" / "masks")
+    for image in model.images.values():
+        path = tmp_path / "p" / mask.format(image.name)
+        path.parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(path), np.full((HEIGHT, WIDTH), 255, np.uint8))
     made = export_model(tmp_path / "p", tmp_path / "out", "gsplat", unscaled=True)
-    assert any("masks" in note and "not exported" in note for note in map(str, made.notes))
+    (note,) = [note for note in map(str, made.notes) if "masks" in note]
+    assert "not exported" in note and str(tmp_path / "p" / mask.partition("/")[0]) in note
+
+
+def test_pictures_whose_names_say_mask_are_no_masks(tmp_path):
+    model = build([f"mask_{i}.png" for i in range(8)])
+    save(model, tmp_path / "p" / "sparse" / "0")
+    write_pictures(model, tmp_path / "p" / "images")
+    made = export_model(tmp_path / "p", tmp_path / "out", "gsplat", unscaled=True)
+    assert not any("masks" in note for note in map(str, made.notes))
+
+
+@pytest.mark.parametrize("kind", ["palette", "grey", "lossless", "lossy"])
+def test_alpha_of_other_formats_is_kept(tmp_path, kind):
+    """Colours of a palette of which one is transparent, grey with alpha, WebP."""
+    from PIL import Image
+
+    grey = np.full((HEIGHT, WIDTH), 90, np.uint8)
+    seen = np.where(np.arange(WIDTH) < WIDTH // 2, 0, 255).astype(np.uint8) * np.ones((HEIGHT, 1), np.uint8)
+    ending = "webp" if kind.startswith("loss") else "png"
+    camera = pycolmap.Camera(camera_id=1, model="SIMPLE_RADIAL", width=WIDTH, height=HEIGHT, params=[140, 80, 60, 0.02])
+    model = build([f"{i}.{ending}" for i in range(8)], camera=camera)
+    save(model, tmp_path / "p" / "sparse" / "0")
+    (tmp_path / "p" / "images").mkdir()
+    if kind == "palette":
+        picture = Image.fromarray((seen // 255).astype(np.uint8)).convert("P")
+        picture.putpalette([255, 0, 0, 90, 90, 90] + [0] * 762)
+        more = {"transparency": 0}
+    elif kind == "grey":
+        picture, more = Image.merge("LA", (Image.fromarray(grey), Image.fromarray(seen))), {}
+    else:
+        channels = [Image.fromarray(grey)] * 3
+        picture, more = Image.merge("RGBA", [*channels, Image.fromarray(seen)]), {"lossless": kind == "lossless"}
+    for image in model.images.values():
+        picture.save(tmp_path / "p" / "images" / image.name, **more)
+    export_model(tmp_path / "p", tmp_path / "out", "gsplat", unscaled=True)
+    for path in (tmp_path / "out" / "images").iterdir():
+        shown = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        assert shown.shape[2] == 4
+        middle = shown.shape[1] // 2
+        assert (shown[:, : middle - 4, 3] == 0).all() and (shown[:, middle + 4 :, 3] == 255).all()
+        assert np.abs(shown[:, middle + 4 :, :3].astype(int) - 90).max() <= 3
 
 
 @pytest.mark.parametrize("name", ["../images/{}", "/data/set/images/{}", "C:\\set\\images\\{}", "a/../{}", "{}"])

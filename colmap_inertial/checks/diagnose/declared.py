@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -97,10 +96,10 @@ def compare_declared(declared: CameraImuCalibration, found: CameraImuCalibration
 def _compare_rotation(
     declared: CameraImuCalibration, found: CameraImuCalibration, *, by_poses: bool
 ) -> tuple[Fact | None, bool]:
-    sigmas = [each.rotation_sigma_rad for each in (declared, found)]
-    if max(sigmas) > _LIMITS.known_rotation_rad:
+    larger_sigma = max(declared.rotation_sigma_rad, found.rotation_sigma_rad)
+    if larger_sigma > _LIMITS.known_rotation_rad:
         return None, False
-    sigma = math.hypot(*sigmas)
+    sigma = float(np.hypot(declared.rotation_sigma_rad, found.rotation_sigma_rad))
     within = max(_LIMITS.rotation_rad if by_poses else _LIMITS.wrong_rotation_rad, _LIMITS.sigmas * sigma)
     stated = declared.cam_from_imu_xyzw
 
@@ -123,7 +122,7 @@ def _compare_rotation(
         sigma_deg=np.degrees(sigma),
         likely=likely if angle_to(others[likely]) <= within else "",
     )
-    return fact, angle > _LIMITS.wrong_rotation_rad + 3 * max(sigmas)
+    return fact, angle > _LIMITS.wrong_rotation_rad + 3 * larger_sigma
 
 
 def _compare_offset(

@@ -7,7 +7,7 @@ both look right.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -48,7 +48,8 @@ _SIGMAS, _LEAST = 4.0, 4
 def find_contradictions(
     target: Target, distances: Sequence[Distance], views: Sequence[SeenView], tolerance_pct: float
 ) -> list[Fact]:
-    """Kinds of lengths, by size and direction on the board, whose mean is off against their own length.
+    """Kinds of lengths, by size and direction on the board, whose mean is off against their own length; else a board
+    that is stretched in one direction.
 
     Parameters
     ----------
@@ -85,9 +86,9 @@ def find_contradictions(
         limit_m = max(tolerance_pct / 100 * known_m, _EDGE_PX * pixel_m, _SIGMAS * spread_m / np.sqrt(len(group)))
         if len(group) >= _LEAST and abs(mean_m) > limit_m:
             off.append((abs(mean_m) / known_m, known_m, mean_m, along))
-    if not off:
+    worst = sorted(off, reverse=True)[:2] or _find_stretch(kinds, tolerance_pct)
+    if not worst:
         return []
-    worst = sorted(off, reverse=True)[:2]
     return [
         Fact(
             "lengths-contradict",
@@ -99,6 +100,33 @@ def find_contradictions(
             likely_gap=_likely_gap(target, distances, index),
         )
     ]
+
+
+def _find_stretch(
+    kinds: Mapping[tuple[int, str], Sequence[Distance]], tolerance_pct: float
+) -> list[tuple[float, float, float, str]]:
+    """Longest lengths in both directions of a board that is longer in one of them than it should be.
+
+    A scale from all lengths lies between both, and each may look right against it. By the slope of errors over length:
+    edges that are found beside where they are lengthen or shorten all alike.
+    """
+    slopes, longest = {}, []
+    for way in ("row", "column"):
+        groups = [group for (_, along), group in kinds.items() if along == way]
+        known_m = np.array([distance.known_m for group in groups for distance in group])
+        residual_m = np.array([distance.residual_m for group in groups for distance in group])
+        if len(groups) < 2 or len(known_m) < _LEAST + 2:
+            return []
+        by = np.stack([np.ones_like(known_m), known_m], axis=1)
+        fit = np.linalg.lstsq(by, residual_m, rcond=None)[0]
+        variance = float(np.sum((residual_m - by @ fit) ** 2)) / (len(known_m) - 2)
+        slopes[way] = float(fit[1]), variance * float(np.linalg.inv(by.T @ by)[1, 1])
+        group = max(groups, key=lambda group: group[0].known_m)
+        mean_m = float(np.mean([distance.residual_m for distance in group]))
+        longest.append((abs(mean_m) / group[0].known_m, group[0].known_m, mean_m, way))
+    (row, row_variance), (column, column_variance) = slopes["row"], slopes["column"]
+    limit = max(tolerance_pct / 100, _SIGMAS * (row_variance + column_variance) ** 0.5)
+    return longest if abs(row - column) > limit else []
 
 
 def _pixel_on_target(target: Target, views: Sequence[SeenView]) -> float | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from colmap_inertial._kernels import _inertial
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.inertial.refine._panels import Layout, PanelFactor
 from colmap_inertial.inertial.refine._residuals import Derivatives, Moving, Rows
-from colmap_inertial.inertial.refine.values import N_SEEN, N_STATE, Estimate, Observations
+from colmap_inertial.inertial.refine.values import N_SEEN, N_STATE, Distances, Estimate, Observations
 
 
 @dataclass(eq=False, kw_only=True)
@@ -161,9 +161,12 @@ class Step:
     points: Array
     change: Array
 
-    def taken(self, x: Estimate, length: float = 1.0) -> Estimate:
+    def taken(self, x: Estimate, length: float, distances: Distances | None) -> Estimate:
         """The estimate after so many times the step."""
-        return x.moved(length * self.states, length * self.shared, length * self.points)
+        moved = x.moved(length * self.states, length * self.shared, length * self.points)
+        if distances is None:
+            return moved
+        return replace(moved, points_m=distances.after(x.points_m, length * self.points))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -48,7 +48,8 @@ def draw_points(observations: Observations, frames: int) -> BoolArray | None:
 
 def select_points(problem: Problem, points: BoolArray) -> Problem:
     """The problem of a mask of points."""
-    return replace(problem, observations=problem.observations.select_points(points))
+    distances = None if problem.distances is None else problem.distances.select_points(points)
+    return replace(problem, observations=problem.observations.select_points(points), distances=distances)
 
 
 def restore_points(whole: Problem, judging: Problem) -> Problem:
@@ -56,7 +57,7 @@ def restore_points(whole: Problem, judging: Problem) -> Problem:
     observations = whole.observations
     if not np.any(judging.observations.line):
         observations = replace(observations, line=np.zeros_like(observations.line))
-    return replace(judging, observations=observations)
+    return replace(judging, observations=observations, distances=whole.distances)
 
 
 def carry_points(observations: Observations, before: Estimate, found: Estimate) -> Estimate:

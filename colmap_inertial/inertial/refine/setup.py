@@ -26,6 +26,7 @@ from colmap_inertial.inertial.refine.values import (
     OFFSET,
     READOUT,
     ROTATION,
+    Distances,
     Estimate,
     FreeCamera,
     Inertial,
@@ -257,8 +258,15 @@ def make_problem(
             accel_bias_sigma_m_s2=PRIORS.accel_bias_m_s2,
         ),
         sigma_px=1.0,
+        distances=_distances(seen),
     )
     return problem, start
+
+
+def _distances(seen: Seen) -> Distances:
+    """How far points are from the first camera that sees each, in the model."""
+    camera = seen.cam_in_world[seen.observations.frame[seen.observations.first[:-1]]]
+    return Distances(camera_in_world_m=camera, distance_m=np.linalg.norm(seen.points - camera, axis=1))
 
 
 def _expected(start: Estimate, known: Known) -> Estimate:

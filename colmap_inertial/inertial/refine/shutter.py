@@ -50,6 +50,9 @@ class ShutterLimits:
     contradicts_sigmas: float = 5.0
     contradicts_s: float = 3e-3
     contradicts_focal: float = 0.03
+    #: One that is found is followed on, so many times as far, until it moves by less than this share of its deviation.
+    rounds: int = 5
+    settled_sigma: float = 0.2
     #: Share by which the information is raised: points far away hardly have any along their rays.
     damping: float = 1e-6
 
@@ -185,20 +188,29 @@ def find_readout(seen: Seen, timing: FrameTiming, imu: ImuRecording, known: Know
         _measure(seen, replace(timing, readout_s=None, readout_direction=direction), imu, known)
         for direction in directions
     ]
-    return max(found, key=lambda one: one.readout_s / one.sigma_s)
+    likelier = max(found, key=lambda one: one.readout_s / one.sigma_s)
+    if not likelier.is_found:
+        return likelier
+    timing = replace(timing, readout_s=None, readout_direction=likelier.direction)
+    return _measure(seen, timing, imu, known, rounds=SHUTTER_LIMITS.rounds)
 
 
 _OPPOSITE: dict[ReadoutDirection, ReadoutDirection] = {"down": "up", "up": "down", "right": "left", "left": "right"}
 
 
-def _measure(seen: Seen, timing: FrameTiming, imu: ImuRecording, known: Known) -> SeenReadout:
+def _measure(seen: Seen, timing: FrameTiming, imu: ImuRecording, known: Known, rounds: int = 1) -> SeenReadout:
     """The readout with lines that run as the timing says, or the other way."""
     at_once_px = seen.observations.xy_px
     problem, start = make_problem(seen, timing, imu, known, at_once_px)
     problem = apply_noise(problem, measure_picture_noise(pictures_alone(problem, at_once_px), start))
-    x = solve(problem, start, most_steps=SHUTTER_LIMITS.steps).estimate
-    cov = factored(problem, x, damping=SHUTTER_LIMITS.damping).shared_cov()
-    variance = float(cov[READOUT, READOUT])
+    x = start
+    for _ in range(rounds):
+        before_s = x.readout_s
+        x = solve(problem, x, most_steps=SHUTTER_LIMITS.steps).estimate
+        cov = factored(problem, x, damping=SHUTTER_LIMITS.damping).shared_cov()
+        variance = float(cov[READOUT, READOUT])
+        if abs(x.readout_s - before_s) < SHUTTER_LIMITS.settled_sigma * variance**0.5:
+            break
     observations = problem.observations
     alike = np.ones(len(observations.frame))
     by = derivatives(problem, x, observations, project(problem, x, observations), alike).by_shared[:, :, READOUT]

@@ -26,9 +26,11 @@ from colmap_inertial.inertial.refine.values import N_STATE, Estimate, Observatio
 class SolveLimits:
     """Limits of the steps by Levenberg and Marquardt."""
 
-    steps: int = 40
-    #: Where a step promises less of the squares' sum (in variances), it is at rest.
+    steps: int = 100
+    #: Where a step of frames, and of what they share, promises less of the squares' sum (in variances), it is at rest,
     settled: float = 0.1
+    #: and where their points by themselves promise no more than so much each: a false one may creep on for ever.
+    settled_point: float = 2e-4
     #: Damping of the first step, of the diagonal, and its range.
     first_damping: float = 1e-4
     least_damping: float = 1e-9
@@ -95,28 +97,44 @@ def _evaluate(problem: Problem, x: Estimate, observations: Observations) -> _Poi
     # a point that a step brings behind the camera must not look like a gain
     cost += float(np.sum(~projected.seen)) * (problem.robust_px / problem.sigma_px) ** 2 * 5
     cost += 0.5 * float(offset @ problem.prior.info @ offset)
+    if problem.distances is not None:
+        cost += 0.5 * float(np.sum(problem.distances.residuals(x.points_m)[0] ** 2))
     return _Point(estimate=x, projected=projected, rows=rows, offset=offset, cost=cost)
 
 
 def _weighted(problem: Problem, at: _Point, informs: float = 1.0) -> tuple[Derivatives, Array]:
-    """Derivatives and residuals over their standard deviations, times the roots of their robust weights.
+    """Derivatives and residuals of a problem's rows over their standard deviations, times the roots of their robust
+    weights.
 
-    With ``informs``, derivatives tell as much more; what residuals pull with stays.
+    With ``informs``, derivatives of observations tell as much more; what residuals pull with stays.
     """
     squares = np.sum(at.projected.residual**2, axis=1)
     root = 1 / (problem.sigma_px * np.sqrt(1 + squares / problem.robust_px**2))
     by = derivatives(problem, at.estimate, problem.observations, at.projected, root * informs**0.5)
-    return by, at.projected.residual * (root / informs**0.5)[:, None]
+    residual = at.projected.residual * (root / informs**0.5)[:, None]
+    if problem.distances is None:
+        return by, residual
+    # of two numbers as any observation, the second one always zero
+    ends = problem.observations.first[1:]
+    away, by_away = (
+        np.stack([one, np.zeros_like(one)], axis=1) for one in problem.distances.residuals(at.estimate.points_m)
+    )
+    by = Derivatives(
+        by_frame=np.insert(by.by_frame, ends, 0.0, axis=0),
+        by_shared=np.insert(by.by_shared, ends, 0.0, axis=0),
+        by_point=np.insert(by.by_point, ends, by_away, axis=0),
+    )
+    return by, np.insert(residual, ends, away, axis=0)
 
 
 def _built(problem: Problem, layout: Layout, at: _Point, by: Derivatives, residual: Array, damping: float) -> System:
     info = problem.prior.info
-    return System.build(layout, problem.observations, by, residual, at.rows, (info, -info @ at.offset), damping=damping)
+    return System.build(layout, problem.rows, by, residual, at.rows, (info, -info @ at.offset), damping=damping)
 
 
 def solve(problem: Problem, start: Estimate, *, most_steps: int = SOLVE.steps) -> Solution:
     """Refine an estimate."""
-    observations = problem.observations
+    observations, rows = problem.observations, problem.rows
     layout = Layout.of(observations, len(start.velocity_m_s))
     at, damping, growth = _evaluate(problem, start, observations), SOLVE.first_damping, 2.0
     converged, steps, stretch = False, 0, 1.0
@@ -125,21 +143,23 @@ def solve(problem: Problem, start: Estimate, *, most_steps: int = SOLVE.steps) -
         gained = pushed = False
         while not gained and damping < SOLVE.most_damping:
             system = _built(problem, layout, at, by, residual, damping)
-            step = _step(system, observations, by)
+            step = _step(system, rows, by)
             if step is None:
                 damping, growth = damping * growth, 2 * growth
                 continue
-            if not _plausible(start, step.taken(at.estimate, stretch)):
+            if not _plausible(start, step.taken(at.estimate, stretch, problem.distances)):
                 damping, growth = damping * growth, 2 * growth
                 continue
             promised = _promised(problem, at, residual, step)
-            if promised < SOLVE.settled:
+            of_points = 0.5 * float(np.einsum("pi,pij,pj->", system.pull, system.inverse, system.pull))
+            of_points = min(of_points, SOLVE.settled_point * len(system.pull))
+            if promised - of_points < SOLVE.settled:
                 if damping <= SOLVE.rest_damping or pushed:
                     return _solution(at, steps, converged=damping <= SOLVE.rest_damping)
                 damping, growth, pushed = SOLVE.rest_damping, 2.0, True
                 continue
             for length in (stretch, 1.0) if stretch > 1 else (1.0,):
-                tried = _evaluate(problem, step.taken(at.estimate, length), observations)
+                tried = _evaluate(problem, step.taken(at.estimate, length, problem.distances), observations)
                 ratio = (at.cost - tried.cost) / promised
                 gained = ratio > 1e-4
                 if gained:
@@ -203,7 +223,7 @@ def factored(problem: Problem, x: Estimate, *, damping: float = 0.0) -> Factored
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Linearised:
-    """Observations at an estimate: what is solved for again and again with other noise of the IMU."""
+    """Rows of observations at an estimate: what is solved for again and again with other noise of the IMU."""
 
     layout: Layout
     projected: Projected
@@ -213,7 +233,7 @@ class Linearised:
 
     def solved(self, problem: Problem) -> tuple[Factored, Array, Array]:
         """The information, and the steps (F, 15) and (Q,) to the solution with a problem's noise."""
-        x, observations = self.estimate, problem.observations
+        x = self.estimate
         at = _Point(
             estimate=x,
             projected=self.projected,
@@ -223,7 +243,7 @@ class Linearised:
         )
         system = _built(problem, self.layout, at, self.by, self.residual, 0.0)
         solved = system.factored()
-        step = solved.step(system, observations, self.by)
+        step = solved.step(system, problem.rows, self.by)
         return solved, step.states, step.shared
 
 

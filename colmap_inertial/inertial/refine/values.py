@@ -88,10 +88,63 @@ class Observations:
             self, frame=self.frame[keep], point=self.point[keep], xy_px=self.xy_px[keep], line=self.line[keep]
         )
 
+    def with_row_for_each_point(self) -> Observations:
+        """With one more, of the first frame that sees it, after those of each point."""
+        ends, firsts = self.first[1:], self.first[:-1]
+        return Observations(
+            frame=np.insert(self.frame, ends, self.frame[firsts]),
+            point=np.insert(self.point, ends, self.point[firsts]),
+            xy_px=np.insert(self.xy_px, ends, 0.0, axis=0),
+            line=np.insert(self.line, ends, 0.0),
+        )
+
     def select_points(self, kept: BoolArray) -> Observations:
         """Those of a mask of points, which are numbered anew."""
         mine = kept[self.point]
         return replace(self.select(mine), point=np.cumsum(kept)[self.point[mine]] - 1)
+
+
+#: Standard deviation of the logarithm of a point's distance beforehand: COLMAP's points are seen under 1.5 degrees or
+#: more, a tenth or better, so that only false ones notice, which would go to infinity for ever.
+DISTANCE_SIGMA_LOG = 2.0
+#: Longest step of such a logarithm.
+_LONGEST_LOG = 2.0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Distances:
+    """What is known beforehand of how far points are from a camera that sees them.
+
+    Attributes
+    ----------
+    camera_in_world_m
+        (P, 3) where that camera was at first.
+    distance_m
+        (P,) from there.
+    """
+
+    camera_in_world_m: Array
+    distance_m: Array
+
+    def select_points(self, kept: BoolArray) -> Distances:
+        """Those of a mask of points."""
+        return Distances(camera_in_world_m=self.camera_in_world_m[kept], distance_m=self.distance_m[kept])
+
+    def residuals(self, points_m: Array) -> tuple[Array, Array]:
+        """(P,) residuals of points (P, 3), over their standard deviation, and (P, 3) derivatives."""
+        away = points_m - self.camera_in_world_m
+        far_m = np.linalg.norm(away, axis=1)
+        by_point = away / (DISTANCE_SIGMA_LOG * far_m**2)[:, None]
+        return np.log(far_m / self.distance_m) / DISTANCE_SIGMA_LOG, by_point
+
+    def after(self, points_m: Array, step_m: Array) -> Array:
+        """Points (P, 3) after steps (P, 3): along rays by the distance's logarithm, so that none turns up behind."""
+        away = points_m - self.camera_in_world_m
+        far_m = np.linalg.norm(away, axis=1, keepdims=True)
+        along = np.sum(step_m * away, axis=1, keepdims=True) / far_m**2
+        turned = away + step_m - along * away
+        turned *= far_m / np.linalg.norm(turned, axis=1, keepdims=True)
+        return np.asarray(self.camera_in_world_m + np.exp(np.clip(along, -_LONGEST_LOG, _LONGEST_LOG)) * turned)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -296,6 +349,8 @@ class Problem:
         Scale of Cauchy's loss: of an error this long half the weight is left.
     informs
         What observations tell, over what their weights in the loss say that they do: for covariances.
+    distances
+        Of the points; ``None`` where nothing is known of them.
     """
 
     observations: Observations
@@ -306,3 +361,9 @@ class Problem:
     sigma_px: float
     robust_px: float = 1.0
     informs: float = 1.0
+    distances: Distances | None = None
+
+    @property
+    def rows(self) -> Observations:
+        """The observations, and after those of each point a row for its distance."""
+        return self.observations if self.distances is None else self.observations.with_row_for_each_point()

@@ -45,6 +45,10 @@ _PART_S, _PARTS, _FASTEST_DRIFT, _UNSTEADY_S = 15.0, 8, 0.02, 0.2
 #: nats) at most.
 _LEAST_SOUND, _GAIN_WITHIN, _MOST_MIRRORED = 0.5, 1.5, 3.0
 
+#: Offsets are searched within so many standard deviations of a known one; it counts at most so many nats: what is known
+#: may be wrong six times in a million, as often as an offset that is accepted.
+_REACH_SIGMAS, _MOST_PRIOR = 10, 12.0
+
 #: Rotation within a second, rms, below which the camera counts as still: what noise of poses looks like.
 _STILL_RAD_RTS = 0.015
 
@@ -104,8 +108,8 @@ def align_clocks(
     prior
         What is known beforehand (``io.calibration.calibration_prior`` builds one). Its lever arm, readout and
         accelerometer delay pass through; a time offset with a standard deviation below ``OFFSET_UNKNOWN_FROM_S``
-        narrows the search to two standard deviations (and 0.05 s). Where the search cannot find the rotation by
-        itself, a known rotation is held.
+        narrows the search to ten standard deviations (and 0.05 s), and counts beside what rotations say. Where the
+        search cannot find the rotation by itself, a known rotation is held.
     options
         Search range and thresholds.
 
@@ -192,6 +196,7 @@ def _search(
     return _Search(
         path=GyroPath(imu.gyro_t_s, imu.gyro_rad_s, np.zeros(3)),
         offsets_s=_range(trajectory, imu, prior, options),
+        shift_s=epoch_shift_s(imu, trajectory.epoch_ns),
         prior=prior,
         options=options,
     )
@@ -207,17 +212,18 @@ def _range(
         lowest_s, highest_s = shift_s - options.max_offset_s, shift_s + options.max_offset_s
     sigma_s = prior.clock_sigma_s
     if sigma_s < OFFSET_UNKNOWN_FROM_S:
-        centre_s, reach_s = prior.clock_offset_s + shift_s, 2 * sigma_s + 0.05
+        centre_s, reach_s = prior.clock_offset_s + shift_s, _REACH_SIGMAS * sigma_s + 0.05
         lowest_s, highest_s = max(lowest_s, centre_s - reach_s), min(highest_s, centre_s + reach_s)
     return lowest_s, highest_s
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Search:
-    """Search for the offset: the gyroscope, lowest and highest offset, priors, thresholds."""
+    """Search for the offset: the gyroscope, lowest and highest offset, the epochs' shift, priors, thresholds."""
 
     path: GyroPath
     offsets_s: tuple[float, float]
+    shift_s: float
     prior: CameraImuCalibration
     options: AlignOptions
 
@@ -237,10 +243,9 @@ class _Search:
             )
             if not fits:
                 return NotObservableError("time offset", Fact("no-overlap"))
-            best = fits[0]
-            rival = max([0.0, *(fit.log_likelihood for fit in fits[1:])])
+            best, ahead = self._best(fits)
             explained = measure_explained_share(spaced, self.path, best.offset_s, held, share)
-            if best.log_likelihood - rival >= options.min_log_likelihood and explained >= options.min_explained:
+            if ahead >= options.min_log_likelihood and explained >= options.min_explained:
                 return best
         seconds = intervals_of(trajectory, _SHORTEST_S)
         if np.sqrt(np.mean(np.sum(seconds.turn_rad**2, axis=1) / seconds.dt_s)) < _STILL_RAD_RTS:
@@ -248,6 +253,18 @@ class _Search:
         if explained < options.min_explained:
             return NotObservableError("time offset", Fact("no-offset-fits", explained=explained))
         return NotObservableError("time offset", Fact("offset-ambiguous"))
+
+    def _best(self, fits: list[ClockFit]) -> tuple[ClockFit, float]:
+        """The likeliest fit, and how much likelier it is (nats): than each other one, with what is known beforehand of
+        the offset, and than no relation, without.
+        """
+        sigma_s, known_s = self.prior.clock_sigma_s, self.prior.clock_offset_s + self.shift_s
+        off = np.array([fit.offset_s - known_s for fit in fits]) / sigma_s
+        counts = -np.minimum(0.5 * off**2, _MOST_PRIOR) if sigma_s < OFFSET_UNKNOWN_FROM_S else np.zeros(len(fits))
+        total = counts + [fit.log_likelihood for fit in fits]
+        best = int(np.argmax(total))
+        lead = float(total[best] - np.delete(total, best).max(initial=-np.inf))
+        return fits[best], min(lead, fits[best].log_likelihood)
 
     def mixture(self, trajectory: CameraTrajectory) -> ClockFit | None:
         """The coarse fit of sound rotations among wrong ones; ``None`` where they do not tell an offset from others."""
@@ -263,8 +280,7 @@ class _Search:
             )
             if not fits:
                 return None
-            best = fits[0]
-            ahead = best.log_likelihood - max([0.0, *(fit.log_likelihood for fit in fits[1:])])
+            best, ahead = self._best(fits)
             if (
                 ahead >= options.min_log_likelihood
                 and best.explained >= _LEAST_SOUND

@@ -41,6 +41,7 @@ from colmap_inertial.io.files import write_record
 from colmap_inertial.io.trajectories import write_tum
 from colmap_inertial.model import Model, downgraded, trajectory_from_model
 from colmap_inertial.model.deregistration import deregister_images
+from colmap_inertial.model.own_place import OwnPlace
 from colmap_inertial.model.rigs import has_rigs
 from colmap_inertial.model.submodels.registration import register_again
 from colmap_inertial.motion.align.consensus import describe_consensus, without_consensus
@@ -330,7 +331,9 @@ def gravity_in_model(model: Model) -> Array | None:
     return quat_rotate(model.similarity.rotation_xyzw, gravity)
 
 
-def write_trajectory(path: Path, model: Model, trajectory: CameraTrajectory, imu: ImuRecording) -> None:
+def write_trajectory(
+    path: Path, model: Model, trajectory: CameraTrajectory, imu: ImuRecording, place: OwnPlace | None = None
+) -> None:
     """Write the metric camera path of a model as TUM text, its covariance and motion beside it.
 
     It is smoothed by the IMU; where a stage solved for the motion already, it is what that stage found.
@@ -348,15 +351,17 @@ def write_trajectory(path: Path, model: Model, trajectory: CameraTrajectory, imu
         Its poses, in metres.
     imu
         The IMU recording.
+    place
+        Where the model's coordinates count from, if not from the origin; those in the file do.
     """
-    estimate, gravity = model.scale, gravity_in_model(model)
+    estimate, gravity, place = model.scale, gravity_in_model(model), place or OwnPlace()
     if estimate is None or model.similarity is None or estimate.calibration is None or gravity is None:
         raise ValueError("only a metric model has a metric trajectory")
     target = path.with_name(f"{path.stem}_cov.npz")
     if model.motion is not None:
         # these poses contain the IMU already: smoothing them again would be worse and overconfident
         solved = model.motion.of(trajectory.names, trajectory.cam_in_world)
-        write_tum(path, trajectory)
+        write_tum(path, place.leave_path(trajectory))
         with_cov = [i for i, name in enumerate(trajectory.names) if name in solved.cov]
         cov = np.array([solved.cov[trajectory.names[i]] for i in with_cov]).reshape(-1, 9, 9)
         _write_covariance(target, trajectory.t_s[with_cov] + trajectory.epoch_ns * 1e-9, cov[:, :6, :6], cov[:, 6:, 6:])
@@ -364,7 +369,7 @@ def write_trajectory(path: Path, model: Model, trajectory: CameraTrajectory, imu
         velocity = np.array([solved.velocity_in_world.get(name, unknown) for name in trajectory.names])
     else:
         smoothed = smooth_path(trajectory, imu, estimate, gravity)
-        write_tum(path, smoothed)
+        write_tum(path, place.leave_path(smoothed))
         velocity = smoothed.velocity_in_world
         cov, rotation = _add_drift(model, smoothed, gravity)
         if model.parts and rotation is None:

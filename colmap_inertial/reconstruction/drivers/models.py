@@ -28,6 +28,8 @@ from colmap_inertial.model import (
     transformed,
     write_model,
 )
+from colmap_inertial.model.identity import ModelIdentity
+from colmap_inertial.model.own_place import OwnPlace
 from colmap_inertial.model.rigs import rig_sensors
 from colmap_inertial.model.similarities import undoing
 from colmap_inertial.pipeline.run.context import Recording
@@ -208,10 +210,12 @@ def _run_stages(
     at, joining = next(((i, s) for i, s in enumerate(stages) if joins_models(s)), (len(stages), None))
     torn = TornParts(max(folders) + 1)
     untimed: list[TimingError] = []
+    places: dict[int, OwnPlace] = {}
 
     def begun() -> Iterator[_Begun]:
         for done, model in enumerate(models):
             session.progress("metric", done, len(place_of))
+            place = places[model.colmap_index] = OwnPlace.of(model.reconstruction)
             # COLMAP's own counts, whatever the stages make of the model
             scaled = ScaledModel(
                 index=place_of[model.colmap_index],
@@ -219,14 +223,17 @@ def _run_stages(
                 scale=_refused(Fact("scale-not-estimated")),
                 summary=summarize(model.reconstruction),
                 sparse=_within(session.workspace.root, folders[model.colmap_index]),
+                identity=ModelIdentity.of(model.reconstruction),
             )
             if (reason := _too_few_timed(model)) is None:
+                model = replace(model, reconstruction=place.enter(model.reconstruction))
                 made = _after(stages[:at], model)
                 yield scaled, made
                 # an existing project has no place for models that it did not have
                 for part in torn.split(model, made) if joining is not None and not numbered else ():
                     if _too_few_timed(part) is None:
-                        yield replace(scaled, colmap_index=part.colmap_index), _after(stages[:at], part)
+                        places[part.colmap_index] = place
+                        yield replace(scaled, colmap_index=part.colmap_index, identity=None), _after(stages[:at], part)
             else:
                 untimed.append(reason)
                 yield replace(scaled, scale=_refused(reason.fact)), None
@@ -248,9 +255,9 @@ def _run_stages(
             log.info("model %d: refused %s", scaled.index, "; ".join(sentences(scaled.scale.reasons)))
             made.append(scaled)
             continue
-        made.append(_placed(session, recording, scaled, _after(stages[at + 1 :], model)))
+        made.append(_placed(session, recording, scaled, _after(stages[at + 1 :], model), places))
         if numbered:
-            _write_parts(session, model, staged, folders)
+            _write_parts(session, model, staged, folders, places)
     if len(untimed) == len(place_of):
         raise untimed[0]
     session.progress("metric", len(place_of), len(place_of))
@@ -276,7 +283,13 @@ def _joined(
     return [(scaled if numbered else replace(scaled, index=i), model) for i, (scaled, model) in enumerate(left)], gaps
 
 
-def _write_parts(session: Session, model: Model, staged: Mapping[int, Model], folders: Mapping[int, Path]) -> None:
+def _write_parts(
+    session: Session,
+    model: Model,
+    staged: Mapping[int, Model],
+    folders: Mapping[int, Path],
+    places: Mapping[int, OwnPlace],
+) -> None:
     """The other parts of a joined model by themselves, in its world: what a project made from them goes by them.
 
     As the stages before the joining left them.
@@ -287,8 +300,10 @@ def _write_parts(session: Session, model: Model, staged: Mapping[int, Model], fo
         if before.similarity is not None:
             own = transformed(own, undoing(before.similarity))
         target = session.workspace.sparse / str(part.colmap_index)
-        moved = transformed(own, part.similarity)
-        write_model(moved, target, part.similarity, suffix=model_format(folders[part.colmap_index]))
+        place = places[model.colmap_index]
+        moved = place.leave(transformed(own, part.similarity))
+        similarity = place.similarity(part.similarity, places[part.colmap_index])
+        write_model(moved, target, similarity, suffix=model_format(folders[part.colmap_index]))
 
 
 def _others(model: Model | ScaledModel) -> list[JoinedPart]:
@@ -303,9 +318,11 @@ def _after(stages: Sequence[ModelStage], model: Model) -> Model:
     return model
 
 
-def _placed(session: Session, recording: Recording, scaled: ScaledModel, model: Model) -> ScaledModel:
-    """A model that went through the stages, written to where it stays, with its path."""
-    workspace = session.workspace
+def _placed(
+    session: Session, recording: Recording, scaled: ScaledModel, model: Model, places: Mapping[int, OwnPlace]
+) -> ScaledModel:
+    """A model that went through the stages, written to where it stays, with its path; far from the origin again."""
+    workspace, place = session.workspace, places[model.colmap_index]
     if model.scale is None:
         raise ValueError("the model stages must include one that estimates the scale, such as ... or MetricStage")
     scale, similarity = downgraded(model.scale, recording.doubts), model.similarity
@@ -314,19 +331,22 @@ def _placed(session: Session, recording: Recording, scaled: ScaledModel, model: 
     if similarity is not None and scale.verdict != model.scale.verdict:
         similarity = replace(similarity, provenance=f"{similarity.provenance}; {scale.verdict}: {scale.reasons[0]}")
     model = replace(model, scale=scale, similarity=similarity)
-    scaled = replace(scaled, scale=scale, treatments=model.treatments, parts=model.parts)
+    parts = tuple(
+        replace(part, similarity=place.similarity(part.similarity, places[part.colmap_index])) for part in model.parts
+    )
+    scaled = replace(scaled, scale=scale, treatments=model.treatments, parts=parts)
     # the smoother weighs by them; of a model whose motion a stage solved for, nothing is smoothed
     poses, _ = trajectory_from_model(model.reconstruction, model.timing, covariances=model.motion is None)
     if model.similarity is not None:
         target = workspace.sparse / str(scaled.index)
         suffix = model_format(workspace.root / scaled.sparse) or ".bin"
-        write_model(model.reconstruction, target, model.similarity, suffix=suffix)
+        write_model(place.leave(model.reconstruction), target, place.similarity(model.similarity), suffix=suffix)
         poses = metric_trajectory(poses)
         rig = rig_sensors(model.reconstruction)
         scaled = replace(scaled, sparse_metric=_within(workspace.root, target), rig=rig)
         if scale.calibration is not None and gravity_in_model(model) is not None:
             trajectory = workspace.trajectory(scaled.index, first=not any(workspace.root.glob("trajectory*.tum")))
-            write_trajectory(trajectory, model, poses, recording.imu)
+            write_trajectory(trajectory, model, poses, recording.imu, place)
             scaled = replace(scaled, trajectory=_within(workspace.root, trajectory))
     write_model_record(workspace, scaled.index, model, poses, recording.imu)
     log.info("model %d: %s %s", scaled.index, scale.verdict, "; ".join(sentences(scale.reasons)))

@@ -16,7 +16,7 @@ from colmap_inertial.checks.validate import parse_target
 from colmap_inertial.colmap.tsdf import require_mesh_maker
 from colmap_inertial.core.choices import check_kind
 from colmap_inertial.core.errors import FormatError, InertialError, TimingError
-from colmap_inertial.core.facts import Fact, as_fact
+from colmap_inertial.core.facts import Fact, as_fact, read_facts
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.core.types import (
     CameraImuCalibration,
@@ -28,7 +28,7 @@ from colmap_inertial.core.types import (
 from colmap_inertial.io.calibration import calibration_prior, describe_files
 from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.exif import read_exposures_s, stamps_of_exif
-from colmap_inertial.io.files import StrPath, read_record, reading_within, write_record
+from colmap_inertial.io.files import StrPath, read_json, read_record, reading_within, write_record
 from colmap_inertial.io.frame_sources import Video
 from colmap_inertial.io.frame_times import FrameStamps, stamps_of_pattern
 from colmap_inertial.io.frames import read_frame_times, read_frame_timing
@@ -61,7 +61,12 @@ from colmap_inertial.pipeline.stages.inputs import StageInputs
 from colmap_inertial.pipeline.stages.protocols import ModelStage, insert_defaults
 from colmap_inertial.reconstruction.drivers.georeference import run_georeference
 from colmap_inertial.reconstruction.drivers.models import Submodels, run_dense_models, run_models, run_validation
-from colmap_inertial.reconstruction.drivers.project_models import name_made_from, read_submodels, require_refinable
+from colmap_inertial.reconstruction.drivers.project_models import (
+    name_made_from,
+    read_submodels,
+    require_near,
+    require_refinable,
+)
 from colmap_inertial.reconstruction.drivers.project_output import place_project, require_free_names
 from colmap_inertial.reconstruction.drivers.reporting import report_result, reporting_stops, write_recording
 from colmap_inertial.reconstruction.drivers.result import Fragment, ModelResult, ReconstructResult
@@ -175,6 +180,8 @@ def _reconstruct(
     images = _images(project, source, needed=pictures or (options.georeference and not filmed))
     read = functools.cache(read_model)
     require_refinable(options, models, read)
+    if options.dense:
+        require_near(models, read)
     context, folders = RunContext.of(options, progress=progress), () if images is None else (images,)
     decides = given.source, given.capture, given.imu, given.prior, fingerprint(project), model_stages
     with (
@@ -201,6 +208,7 @@ def _reconstruct(
         results = run_validation(session, results, target, images)
         results = run_georeference(session, results, fixes, timing, options.world)
         metric = place_project(session, project, source, models, _scales(results, fragments))
+        results = _told_of_files(results, metric)
         if options.dense and images is not None:
             results = run_dense_models(session, results, images, options.dense_options)
         result = ReconstructResult(
@@ -464,6 +472,15 @@ def _video_times(
 def _noted(result: ModelResult, notes: Sequence[Fact]) -> ModelResult:
     scale = result.scale
     return dataclasses.replace(result, scale=dataclasses.replace(scale, notes=(*scale.notes, *map(as_fact, notes))))
+
+
+def _told_of_files(results: tuple[ModelResult, ...], metric: Path | None) -> tuple[ModelResult, ...]:
+    """The results, the first in metres with what is to be said of the project's other files."""
+    at = next((i for i, result in enumerate(results) if result.sparse_metric is not None), None)
+    if metric is None or at is None:
+        return results
+    notes = read_facts(read_json(metric / TRANSFORM_FILE), "notes")
+    return (*results[:at], _noted(results[at], notes), *results[at + 1 :])
 
 
 def _scales(results: Sequence[ModelResult], fragments: Sequence[Fragment]) -> dict[int | None, ModelScale]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fnmatch
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,7 +11,9 @@ from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.model import is_metric
 from colmap_inertial.model.copying import list_tree
+from colmap_inertial.model.keeping import Kept
 from colmap_inertial.model.layout import Layout, find_made_from, read_layout
+from colmap_inertial.model.own_place import OwnPlace
 from colmap_inertial.model.rigs import has_rigs
 
 if TYPE_CHECKING:
@@ -35,7 +36,8 @@ def read_submodels(project: Path, out: Path, source: ProjectOptions) -> Layout:
     if inner.is_relative_to(outer) or outer.is_relative_to(inner):
         raise OutputError(Fact("folders-within-each-other", folder=str(out), out=str(project)))
     listed = list_tree(project, follow_links=source.follow_links)[0]
-    folders = [folder for folder in listed if not _is_kept(folder, source.keep)]
+    kept = Kept(tuple(source.keep), project)
+    folders = [folder for folder in listed if not kept.covers(folder)]
     for folder in (Path(), *folders):
         if is_metric(project / folder):
             raise AlreadyMetricError(Fact("already-metric", folder=str(project / folder)))
@@ -44,7 +46,8 @@ def read_submodels(project: Path, out: Path, source: ProjectOptions) -> Layout:
 
 def name_made_from(project: Path, layout: Layout, files: Sequence[Path], keep: Sequence[str]) -> str:
     """A file of the project that was made from its models and is not to be kept as it is; empty without one."""
-    made = find_made_from(project, layout, [path for path in files if not _is_kept(path, keep)])
+    kept = Kept(tuple(keep), project)
+    made = find_made_from(project, layout, [path for path in files if not kept.covers(path)])
     return "" if made is None else str(made)
 
 
@@ -57,6 +60,8 @@ def require_refinable(
         raise InertialError(Fact("rigs-not-refined", model=rigs[0]))
 
 
-def _is_kept(path: Path, keep: Sequence[str]) -> bool:
-    """Whether a path of a project stays as it is, or a folder above it does."""
-    return any(fnmatch.fnmatch(str(part), pattern) for part in (path, *path.parents[:-1]) for pattern in keep)
+def require_near(models: Mapping[int, Path], read: Callable[[Path], pycolmap.Reconstruction]) -> None:
+    """Raise :class:`InertialError` for a dense cloud, of single precision, far from the origin."""
+    for folder in models.values():
+        if OwnPlace.of(read(folder)).pivot is not None:
+            raise InertialError(Fact("dense-far-away", folder=str(folder)))

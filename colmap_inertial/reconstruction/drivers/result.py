@@ -22,7 +22,9 @@ from colmap_inertial.core.types import Action, CameraImuCalibration, Gap, Joined
 from colmap_inertial.inertial.georeference import Georeference
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.model import similarity_as_json
+from colmap_inertial.model.identity import ModelIdentity
 from colmap_inertial.model.rigs import RigSensor
+from colmap_inertial.model.similarities import OF_MODEL
 from colmap_inertial.pipeline.run.workspace import Workspace
 from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
 from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan, note_as_json
@@ -54,6 +56,8 @@ class ScaledModel:
         What it was joined of; empty where it is one of COLMAP's models.
     rig
         Where the cameras of rigs are, in metres; empty without rigs.
+    identity
+        Of COLMAP's model that the scale is of; ``None`` where it is of a part of one.
     """
 
     index: int
@@ -66,6 +70,7 @@ class ScaledModel:
     treatments: tuple[Treatment, ...] = ()
     parts: tuple[JoinedPart, ...] = ()
     rig: tuple[RigSensor, ...] = ()
+    identity: ModelIdentity | None = None
 
 
 @prints_in_lines
@@ -315,6 +320,7 @@ def result_as_json(result: ReconstructResult, capture: Capture) -> dict[str, obj
                 "sparse_metric": relative(model.sparse_metric),
                 "trajectory": relative(model.trajectory),
                 **model.scale.as_json(),
+                **({} if model.identity is None else {OF_MODEL: model.identity.as_json()}),
                 "calibration_change": None
                 if plan.view is None
                 else _change(plan.view.calibration, model.scale.calibration),

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -236,7 +237,7 @@ def export_model(
         if target.pictures:
             content = replace(content, pictures=source.pictures(out, list(content.names), images, filmed))
             content.notes.extend(_notes_on(content.pictures, images))
-            content.notes.extend(_notes_on_masks(out, source.found.images))
+            content.notes.extend(_notes_on_masks(out, source.found.images, content.names.values()))
             (partial / "images").mkdir()
         if target.recentres and content.offset is not None:
             content = content.recentred()
@@ -315,15 +316,23 @@ def _record(made: Exported, content: ExportContent, kind: ExportImages) -> dict[
     }
 
 
-#: Names of folders with masks.
-_MASKS = ("masks", "mask")
+#: What names of folders with masks, or of masks among the pictures, hold.
+_MASKS = re.compile(r"(?i)mask|matte|segmentation|^seg$|^alphas?$")
 
 
-def _notes_on_masks(out: Path, pictures: Iterable[Path]) -> list[Fact]:
-    """Note for the user on masks beside the pictures."""
-    folders = {folder / name for folder in (out, *(path.parent for path in pictures)) for name in _MASKS}
-    found = [folder for folder in sorted(folders) if folder.is_dir() and any(folder.iterdir())]
-    return [Fact("masks-left", folder=str(folder)) for folder in found]
+def _notes_on_masks(out: Path, pictures: Collection[Path], names: Collection[str]) -> list[Fact]:
+    """Note for the user on masks beside the folders of the pictures, or in them; ``names`` are the pictures' own."""
+    beside = {path for folder in {out, *(path.parent for path in pictures)} for path in _contents(folder)}
+    masks = {path for path in beside if _MASKS.search(path.name) and _contents(path)}
+    for folder in pictures:
+        others = (path for path in _contents(folder) if path.name not in names)
+        if any(_MASKS.search(path.name) and path.is_file() for path in others):
+            masks.add(folder)
+    return [Fact("masks-left", folder=str(folder)) for folder in sorted(masks)]
+
+
+def _contents(folder: Path) -> list[Path]:
+    return sorted(folder.iterdir()) if folder.is_dir() else []
 
 
 def _notes_on(pictures: Mapping[str, Picture], kind: ExportImages) -> list[Fact]:

@@ -92,8 +92,10 @@ def sparse_cloud(reconstruction: pycolmap.Reconstruction, most: int) -> Cloud:
 
 
 @reader("points")
-def dense_cloud(path: Path, most: int) -> Cloud:
+def dense_cloud(path: Path, most: int, origin: Array | None = None) -> Cloud:
     """At most ``most`` points of a PLY file, evenly chosen; only these are read, and shown where they are finite.
+
+    Coordinates count from (3,) ``origin``.
 
     Raises
     ------
@@ -102,7 +104,7 @@ def dense_cloud(path: Path, most: int) -> Cloud:
     """
     table, _ = _vertices(path)
     some = np.asarray(table[strided(len(table), most)])
-    xyz = _positions(some)
+    xyz = _positions(some, origin)
     finite = np.isfinite(xyz).all(axis=1)
     some, xyz = some[finite], xyz[finite]
     rgb = _colours(some)
@@ -111,8 +113,10 @@ def dense_cloud(path: Path, most: int) -> Cloud:
 
 
 @reader("a mesh")
-def read_mesh(path: Path, most_faces: int) -> Mesh | None:
+def read_mesh(path: Path, most_faces: int, origin: Array | None = None) -> Mesh | None:
     """A PLY file of triangles; ``None`` where it has more than ``most_faces``, or none. Without what is not finite.
+
+    Coordinates count from (3,) ``origin``.
 
     Raises
     ------
@@ -140,7 +144,7 @@ def read_mesh(path: Path, most_faces: int) -> Mesh | None:
     faces = np.memmap(path, dtype, "r", offset, (element.rows,))
     if not (faces["count"] == 3).all() or faces["index"].max() >= len(table):
         raise FormatError(path, Fact("faces-not-triangles"))
-    vertices, index, rgb = _positions(table), faces["index"].astype(np.uint32), _colours(table)
+    vertices, index, rgb = _positions(table, origin), faces["index"].astype(np.uint32), _colours(table)
     finite = np.asarray(np.isfinite(vertices).all(axis=1))
     if not finite.all():
         renumbered = (np.cumsum(finite) - 1).astype(np.uint32)
@@ -172,9 +176,10 @@ def _vertices(path: Path) -> tuple[Any, tuple[Element, int, str] | None]:
     return table, None if faces is None else (faces, end, order)
 
 
-def _positions(table: Any) -> Float32Array:
-    with np.errstate(over="ignore"):  # what float32 cannot hold is not finite, and left out like the rest of it
-        return np.stack([table[name] for name in "xyz"], axis=1).astype(np.float32)
+def _positions(table: Any, origin: Array | None) -> Float32Array:
+    xyz = np.stack([table[name] for name in "xyz"], axis=1)
+    with np.errstate(over="ignore", invalid="ignore"):  # what float32 cannot hold is not finite, and left out
+        return (xyz if origin is None else xyz.astype(np.float64) - origin).astype(np.float32)
 
 
 def _colours(table: Any) -> UInt8Array | None:

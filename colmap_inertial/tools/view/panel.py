@@ -78,7 +78,7 @@ def ground_text(scene: Scene) -> str:
 def camera_text(scene: Scene, camera: int, problem: str = "") -> str:
     """Name and place of a camera, and why its image is not shown."""
     unit = "m" if scene.scale.unit == "m" else "units"
-    x, y, z = scene.cameras.cam_in_world[camera]
+    x, y, z = scene.cameras.cam_in_world[camera] + scene.offset_in_world
     text = f"**{_plain(scene.cameras.names[camera])}** at {x:.3f}, {y:.3f}, {z:.3f} {unit}"
     return f"{text}\n\n{_plain(problem)}" if problem else text
 

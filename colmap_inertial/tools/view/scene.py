@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +15,7 @@ from colmap_inertial.core.types import DOWN_IN_WORLD
 from colmap_inertial.io.picture_names import picture_in
 from colmap_inertial.io.trajectories import read_tum
 from colmap_inertial.model import read_model
+from colmap_inertial.model.own_place import OwnPlace
 from colmap_inertial.pipeline.run.runner import explaining_losses
 from colmap_inertial.pipeline.run.workspace import Workspace
 from colmap_inertial.tools.view.clouds import Cloud, Mesh, centre_and_reach, dense_cloud, read_mesh, sparse_cloud
@@ -134,6 +135,8 @@ class Scene:
         (3,) where one looks at the scene from in the beginning.
     target_lines, labelled
         Of the validator's target: (K, 2, 3) lines between neighbouring corners; distances that get a label.
+    offset_in_world
+        (3,) the point of the model's world that all coordinates here count from: its origin, unless that is far away.
     """
 
     out: Path
@@ -152,6 +155,7 @@ class Scene:
     start: Array
     target_lines: Array
     labelled: tuple[KnownDistance, ...]
+    offset_in_world: Array
 
     @property
     def scale(self) -> ScaleFacts:
@@ -199,14 +203,17 @@ def load_scene(out: Path, *, model: int | None = None, images: Path | None = Non
     with explaining_losses(Workspace(Path(out))):
         source = find_source(Path(out), model, images=images)
         reconstruction = read_model(source.folder)
+    # browsers draw in single precision
+    place = OwnPlace.of(reconstruction)
+    reconstruction, source = place.enter(reconstruction), _about(source, place)
     cameras = _cameras(reconstruction)
     if source.fused is not None and source.fused.is_file():
-        cloud = dense_cloud(source.fused, max_points)
+        cloud = dense_cloud(source.fused, max_points, place.pivot)
     else:
         cloud = sparse_cloud(reconstruction, max_points)
     mesh, mesh_note = None, None
     if source.mesh is not None and source.mesh.is_file():
-        mesh = read_mesh(source.mesh, LIMITS.faces)
+        mesh = read_mesh(source.mesh, LIMITS.faces, place.pivot)
         mesh_note = None if mesh is not None else Fact("mesh-not-shown", most_faces=LIMITS.faces)
     up, gravity_known = _find_up(source, cameras)
     centre, reach = centre_and_reach(cloud.xyz.astype(np.float64), cameras.cam_in_world)
@@ -216,7 +223,7 @@ def load_scene(out: Path, *, model: int | None = None, images: Path | None = Non
     seen = near if ground is None else np.concatenate([near, ground.bar])
     start = centre + _distance(side, reach, up, seen - centre) * side
     lines, labelled = _target_parts(source.target)
-    path, path_percent = _path(source, cameras)
+    path, path_percent = _path(source, cameras, place)
     return Scene(
         out=Path(out),
         source=source,
@@ -234,7 +241,16 @@ def load_scene(out: Path, *, model: int | None = None, images: Path | None = Non
         start=start,
         target_lines=lines,
         labelled=labelled,
+        offset_in_world=np.zeros(3) if place.pivot is None else place.pivot,
     )
+
+
+def _about(source: ViewSource, place: OwnPlace) -> ViewSource:
+    """What is shown, its target where the model is."""
+    if place.pivot is None or source.target is None:
+        return source
+    corners = {name: xyz - place.pivot for name, xyz in source.target.corners.items()}
+    return replace(source, target=replace(source.target, corners=corners))
 
 
 def _cameras(reconstruction: pycolmap.Reconstruction) -> Cameras:
@@ -264,12 +280,12 @@ def _find_up(source: ViewSource, cameras: Cameras) -> tuple[Array, bool]:
     return (edges / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])), False
 
 
-def _path(source: ViewSource, cameras: Cameras) -> tuple[Array, Array | None]:
+def _path(source: ViewSource, cameras: Cameras, place: OwnPlace) -> tuple[Array, Array | None]:
     """Pieces of the smoothed path where there is one, else between cameras in the order of their names; its stretch."""
     places, percent = cameras.cam_in_world, None
     if source.trajectory is not None and source.trajectory.is_file():
         trajectory = read_tum(source.trajectory)
-        places = trajectory.cam_in_world
+        places = trajectory.cam_in_world - (0 if place.pivot is None else place.pivot)
         if source.stretched:
             # both begin with the first image
             middles_s = [0.5 * (part.begin_s + part.end_s) - source.stretched[0].begin_s for part in source.stretched]
