@@ -258,6 +258,7 @@ def checkerboard(spec: str, says: str) -> Mistake:
         name=f"target {spec}",
         make=toml("checkerboard:8x6:0.04", spec),
         says=says,
+        codes=("length-in-millimetres", "not-a-number-in-target", "target-kind-unknown", "target-fields"),
         mend=toml(spec, "checkerboard:8x6:0.04"),
     )
 
@@ -409,6 +410,7 @@ def columns() -> Iterator[Mistake]:
     column = partial(Mistake, kind="columns")
     yield column(
         name="a column that is not there",
+        codes=("no-column",),
         make=toml(GYRO_UNIT, GYRO_UNIT.replace('"y"', '"gy"')),
         says=r'"?gy"?.*\bx\b',
         mend=toml('"gy"', '"y"'),
@@ -426,6 +428,7 @@ def columns() -> Iterator[Mistake]:
     )
     yield column(
         name="a time column that is not there",
+        codes=("no-column",),
         make=toml('file = "gyro.csv"\ntime = "t"', 'file = "gyro.csv"\ntime = "timestamp"'),
         says=r"timestamp.*\bt\b",
         mend=toml('time = "timestamp"', 'time = "t"'),
@@ -443,12 +446,14 @@ def columns() -> Iterator[Mistake]:
     )
     yield column(
         name="a column given twice",
+        codes=("columns-repeated",),
         make=toml(GYRO_UNIT, GYRO_UNIT.replace('"y"', '"x"')),
         says="twice|different columns|same column|axes",
         mend=restore_toml,
     )
     yield column(
         name="frame times without a column of names",
+        codes=("not-one-time-column",),
         make=text("frames.csv", "name,t_s", "image,when"),
         says="name",
         mend=text("frames.csv", "image,when", "name,t_s"),
@@ -467,24 +472,28 @@ def paths() -> Iterator[Mistake]:
     path = partial(Mistake, kind="paths")
     yield path(
         name="folder of images misspelt",
+        codes=("no-such-file",),
         make=toml('folder = "frames"', 'folder = "frame"'),
         says="frame",
         mend=toml('folder = "frame"', 'folder = "frames"'),
     )
     yield path(
         name="IMU file misspelt",
+        codes=("no-such-file",),
         make=misspell("capture.toml", "gyro.csv", "accel.csv"),
         says=r"no such file",
         mend=restore_toml,
     )
     yield path(
         name="capture misspelt",
+        codes=("no-such-file",),
         arguments=("reconstruct", "{scene}s", "{out}"),
         says="no such file or folder|scene",
         again=("diagnose", "{scene}"),
     )
     yield path(
         name="result into a folder with other things",
+        codes=("output-among-pictures",),
         arguments=("reconstruct", "{scene}", "{scene}/frames"),
         says="choose a folder outside",
         again=("diagnose", "{scene}"),
@@ -501,6 +510,7 @@ def paths() -> Iterator[Mistake]:
     )
     yield path(
         name="a model instead of a trajectory",
+        codes=("no-model-here",),
         arguments=("scale", "{scene}/frames", "--imu", "{scene}"),
         says="model|frames",
         again=SCALE,

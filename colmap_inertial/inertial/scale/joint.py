@@ -404,7 +404,7 @@ class FoundScale:
     widened
         Factor on variances of the fit: squares beyond their expectation, few degrees of freedom, what no model has.
     wrong_gain
-        Whether the accelerometer is off in gain; ``None`` of a calibrated one.
+        Whether the accelerometer is off in gain; ``None`` of a calibrated one that nothing contradicts.
     """
 
     metres_per_unit: float
@@ -438,7 +438,9 @@ def scale_of(fit: Fit, t_s: Array, accel: AccelPart, clock_rate: float = 0.0) ->
     variances["accel_gain"] *= fit.gain_surprise
     variances["noise_levels"] = (student * _UNIFORM * share) ** 2 + fit.level_variance
     variances["accel_gain"] += accel.model_sigma**2
-    wrong_gain = None if accel.calibrated else judge_gain(fit.estimate, fit.cov, fit.prior_info, widened)
+    wrong_gain: WrongGain | None = judge_gain(fit.estimate, fit.cov, fit.prior_info, widened)
+    if accel.calibrated and wrong_gain is not None and not wrong_gain.is_likely:
+        wrong_gain = None  # what was calibrated is believed unless it is contradicted
     variances["accel_gain"] += 0.0 if wrong_gain is None else wrong_gain.variance
     variances["accel_gain"] *= accel.factor**2
     variances["lens"] = PRIORS.lens**2
@@ -500,6 +502,8 @@ def _check_gains(fit: Fit, scale: FoundScale, accel: AccelPart) -> tuple[list[Fa
         return ([found], []) if exceeds_usual(gains, sigma).any() else ([], [found])
     if wrong_gain is None or not wrong_gain.is_likely:
         return [], []
+    if accel.calibrated:
+        return [Fact("calibrated-gain-contradicted", gains=(wrong_gain.gain,) * 3)], []
     found = Fact("accel-gain-doubtful", gain=wrong_gain.gain, excess=wrong_gain.excess)
     return ([found], []) if wrong_gain.is_large else ([], [found])
 
