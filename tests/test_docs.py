@@ -27,7 +27,7 @@ import colmap_inertial
 from colmap_inertial.checks.report import write_report
 from colmap_inertial.cli import main, parse
 from colmap_inertial.colmap.depth_maps import DenseResult
-from colmap_inertial.core.errors import InertialError, MappingError
+from colmap_inertial.core.errors import InertialError, NotObservableError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.core.types import Action, CameraModel, FrameTiming, Treatment
@@ -537,7 +537,7 @@ def test_a_stopped_run_and_one_with_every_section_fit_the_schema_of_the_report(t
     capture = tiny_capture(tmp_path / "capture")
     for path in (capture / "frames").iterdir():
         cv2.imwrite(str(path), np.full((240, 320, 3), 120, np.uint8))
-    with pytest.raises(MappingError):
+    with pytest.raises(NotObservableError):
         reconstruct(capture, tmp_path / "out", TINY)
     for name in ("report", "diagnosis"):
         assert find_violations(name, json.loads((tmp_path / "out" / f"{name}.json").read_text())) == []

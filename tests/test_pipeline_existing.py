@@ -436,6 +436,7 @@ def test_a_project_far_from_the_origin_is_scaled_where_it_stands(box, finished, 
     model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), FAR))
     model.write_binary(str(project / "sparse" / "0"))
     write_ply(project / "cloud.ply", xyz := np.array([point.xyz for point in model.points3D.values()]))
+    (project / "scan.las").write_bytes(b"LASF")
     out = tmp_path / "out"
     source = ProjectOptions(imu=box.imu, frame_times=box.frame_times)
     reconstruct_project(project, out, source, NOT_REFINED)
@@ -448,6 +449,8 @@ def test_a_project_far_from_the_origin_is_scaled_where_it_stands(box, finished, 
     (here,) = json.loads((out / "result.json").read_text())["models"]
     for name in ("metres_per_unit", "sigma_log", "verdict"):
         assert here[name] == (there[name] if name == "verdict" else pytest.approx(there[name], rel=1e-6))
+    # what apply says of other files is said here, too
+    assert any("1 .las" in note for note in here["notes"])
     assert here["of_model"]["poses"] == ModelIdentity.of(model).poses
     shift = far.image(1).projection_center() - near.image(1).projection_center()
     for number in far.reg_image_ids():

@@ -5,6 +5,7 @@ Code that decides looks at codes and values. Their words are in ``messages``, an
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -132,7 +133,9 @@ def _frozen(value: Any) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """JSON types: facts by code and values."""
+    """JSON types: facts by code and values, numbers that JSON lacks by their names."""
     if isinstance(value, tuple):
         return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
     return value.as_json() if isinstance(value, Fact) else value

@@ -326,3 +326,24 @@ def offset_by_pixels(sigma_s: float, rate: float | None, rate_sigma: float) -> s
 )
 def frames_selected(used: int, frames: int, ranked_by: tuple[str, ...], clocks: Said) -> str:
     return f"{used} of {frames} frames, by {' and '.join(_RANKS[way] for way in ranked_by)}; {clocks}"
+
+
+# frames in no model
+
+
+@message(example={"features": 4})
+def image_without_features(features: int) -> str:
+    return f"it is in no model: it has {features} features (black, blurred, or without texture)"
+
+
+@message(example={"features": 900})
+def image_without_matches(features: int) -> str:
+    return f"it is in no model: none of its {features} features agree with an image of a model"
+
+
+@message(example={"images": 2, "matches": 17})
+def image_not_placed(images: int, matches: int) -> str:
+    return (
+        f"it is in no model: it matches {images} {'image' if images == 1 else 'images'} of a model, the best with "
+        f"{matches} features, and COLMAP found no pose from them"
+    )

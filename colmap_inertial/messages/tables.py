@@ -68,7 +68,13 @@ def table_open(source: str, open: Sequence[tuple[str, str]], header: str | None,
     for sensor, point in open:
         points.setdefault(point, []).append(_SENSORS[sensor])
     said = [_POINTS[point].format(" and ".join(sensors)) for point, sensors in points.items()]
-    begin = f"it does not say {', '.join(said)}" if said else f"it is to be confirmed that this is from {source}"
+    begin = f"it does not say {', '.join(said)}"
+    if not said:
+        begin = (
+            f"it is to be confirmed that this is from {source}"
+            if source
+            else "holds one sensor, a table beside it the other"
+        )
     return begin + (f"; the header is: {header}" if header else "")
 
 

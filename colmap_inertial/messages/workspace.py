@@ -182,11 +182,13 @@ def unmoved_depths(count: int, example: str, factors: tuple[float, ...]) -> str:
 
 
 @message(
-    advice="it is right where it is in metres already; else leave it out of rig_configurator",
-    example={"path": "rig_config.json"},
+    advice="it is right where it is in metres already",
+    example={"path": "rig_config.json", "ratio": 2.5},
 )
-def rig_elsewhere(path: str) -> str:
-    return f"{path}: copied as it is, as its cameras are not as far apart as a model here has them"
+def rig_elsewhere(path: str, ratio: float | None) -> str:
+    if ratio is None:
+        return f"{path}: copied as it is, as no model here has images of its cameras"
+    return f"{path}: copied as it is, as its cameras are {ratio:.4g} times as far apart as a model had them"
 
 
 @message(

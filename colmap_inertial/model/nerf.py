@@ -262,7 +262,8 @@ def _frames(path: Path) -> dict[str, Any] | None:
 
 def _applied(path: Path, values: Mapping[str, Any]) -> Array:
     """(4, 4) what was done to the model's world before the cameras were written: nerfstudio scales last."""
-    given, scale = values.get("applied_transform"), values.get("applied_scale")
+    given = values.get("applied_transform")
+    scale: Any = values.get("applied_scale")
     applied = np.eye(4) if given is None else _matrix(path, given)
     if _is_number(scale) and 0 < scale < math.inf:
         applied[:3] *= scale

@@ -22,13 +22,18 @@ from colmap_inertial.model.nerf import (
     read_applied_transform,
     unmoved_fields,
 )
-from colmap_inertial.model.other_files import find_parsed_world, is_dataparser, is_rig_of, read_training_world
+from colmap_inertial.model.other_files import (
+    find_parsed_world,
+    is_dataparser,
+    is_rig_of,
+    read_training_world,
+    rig_ratio,
+)
 from colmap_inertial.model.places import express_in_world, find_world, is_elsewhere
 
 #: What the user is told of a file whose cameras are those of no model here, by its kind.
 _TOLD = {
     **dict.fromkeys(("transforms", "splat cameras", "poses and bounds"), "cameras-elsewhere-in-file"),
-    "rig configuration": "rig-elsewhere",
     "dataparser": "training-of-another-model",
 }
 
@@ -102,6 +107,9 @@ class Worlds:
         else:
             written = CAMERAS_OF[kind](self._project / path)
             owners = [model.index for model in self._placed if are_cameras_of(model, written)]
+        if not owners and kind == "rig configuration":
+            ratios = [rig_ratio(self._project / path, model) for model in self._placed]
+            self._note(Fact("rig-elsewhere", path=str(path), ratio=next((r for r in ratios if r is not None), None)))
         if not owners and kind in _TOLD:
             self._note(Fact(_TOLD[kind], path=str(path)))
         return owners

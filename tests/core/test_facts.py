@@ -1,6 +1,7 @@
 """Facts: codes with values, their words, and their way through JSON."""
 
 import ast
+import math
 import pickle
 from dataclasses import dataclass
 from pathlib import Path
@@ -114,6 +115,13 @@ def test_records_keep_sentences_for_people_and_codes_for_programs(tmp_path):
 def test_records_of_versions_without_codes_are_read(tmp_path):
     write_record(tmp_path / "kept.json", {"reason": "because", "notes": ["a", "b"], "treatments": []})
     assert read_record(tmp_path / "kept.json", Kept).notes == (Fact.stated("a"), Fact.stated("b"))
+
+
+def test_numbers_that_json_lacks_are_named(tmp_path):
+    fact = Fact("not-in-range", low=-math.inf, high=1.0, found="7")
+    assert str(fact) == "must be from -inf to 1, found 7"
+    write_record(tmp_path / "fact.json", {"fact": fact})
+    assert read_json(tmp_path / "fact.json")["fact"]["values"] == {"low": "-inf", "high": 1.0, "found": "7"}
 
 
 def test_fields_without_facts_stay():

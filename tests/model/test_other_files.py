@@ -128,7 +128,8 @@ def test_a_rig_configuration_in_other_units_is_named(tmp_path):
     write_rig(tmp_path / "p" / "rig_config.json", model, ["left/", "right/"], times=2.5)
     applied = apply_to_project(tmp_path / "p", tmp_path / "out", SIM3)
     assert [group.example for group in applied.unmoved] == ["rig_config.json"]
-    assert any("rig_config.json: copied as it is" in str(note) for note in applied.notes)
+    (note,) = [note.values["found"] for note in applied.notes if note.values["found"].code == "rig-elsewhere"]
+    assert note.values["ratio"] == pytest.approx(2.5, rel=0.1)
     same = [(folder / "rig_config.json").read_bytes() for folder in (tmp_path / "p", tmp_path / "out")]
     assert same[0] == same[1]
 

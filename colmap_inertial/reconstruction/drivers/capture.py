@@ -31,6 +31,7 @@ from colmap_inertial.io.frames import picture_folders, read_frames
 from colmap_inertial.io.imu import read_raw_capture_imu
 from colmap_inertial.io.plausible import RawImu
 from colmap_inertial.io.rig_frames import RigFrames, pair_rig_frames
+from colmap_inertial.model import find_models
 from colmap_inertial.pipeline.run.context import Recording, RunContext, correct_imu, prior_calibration
 from colmap_inertial.pipeline.run.executable import Device
 from colmap_inertial.pipeline.run.progress import Progress, silent
@@ -62,6 +63,7 @@ from colmap_inertial.reconstruction.drivers.georeference import run_georeference
 from colmap_inertial.reconstruction.drivers.models import Submodels, run_dense_models, run_models, run_validation
 from colmap_inertial.reconstruction.drivers.reporting import report_result, reporting_stops, write_recording
 from colmap_inertial.reconstruction.drivers.result import ReconstructResult
+from colmap_inertial.reconstruction.drivers.unplaced import note_unplaced
 from colmap_inertial.reconstruction.preparation.geolocation import positions_of
 from colmap_inertial.reconstruction.preparation.plan import add_stated_exposures, ask_for_plan, run_plan
 from colmap_inertial.reconstruction.preparation.preflight import check_imu, run_preflight
@@ -319,7 +321,11 @@ def _run(session: Session, given: _Given, options: ReconstructOptions, stages: S
         models=models,
         fragments=fragments,
         gaps=gaps,
-        frames=note_rectified(records, rectified),
+        frames=note_unplaced(
+            note_rectified(records, rectified),
+            find_models(workspace.colmap_sparse).values(),
+            workspace.colmap_database,
+        ),
         keypoints=keypoints,
         matching=matching,
         mapping=mapping,
