@@ -431,6 +431,9 @@ def test_what_is_known_of_an_offset_counts_beside_the_rotations(subtests):
             ]
             best, ahead = search._best(fits)
             assert best.offset_s == offset_s and ahead == pytest.approx(lead)
+            # where nothing else is likely: unrelated recordings fit best anywhere in the range of 2.1 s
+            alone = search._best(fits[1:])[1]
+            assert alone == pytest.approx(30 + known * (np.log(2.1 / (0.1 * np.sqrt(2 * np.pi))) - 0.125))
 
 
 # --- refusals

@@ -255,16 +255,19 @@ class _Search:
         return NotObservableError("time offset", Fact("offset-ambiguous"))
 
     def _best(self, fits: list[ClockFit]) -> tuple[ClockFit, float]:
-        """The likeliest fit, and how much likelier it is (nats): than each other one, with what is known beforehand of
-        the offset, and than no relation, without.
+        """The likeliest fit, and how much likelier it is (nats), with what is known beforehand of the offset: than each
+        other one, and than no relation, by which it may be anywhere in the range.
         """
         sigma_s, known_s = self.prior.clock_sigma_s, self.prior.clock_offset_s + self.shift_s
         off = np.array([fit.offset_s - known_s for fit in fits]) / sigma_s
-        counts = -np.minimum(0.5 * off**2, _MOST_PRIOR) if sigma_s < OFFSET_UNKNOWN_FROM_S else np.zeros(len(fits))
+        known = sigma_s < OFFSET_UNKNOWN_FROM_S
+        counts = -np.minimum(0.5 * off**2, _MOST_PRIOR) if known else np.zeros(len(fits))
         total = counts + [fit.log_likelihood for fit in fits]
         best = int(np.argmax(total))
         lead = float(total[best] - np.delete(total, best).max(initial=-np.inf))
-        return fits[best], min(lead, fits[best].log_likelihood)
+        range_s = self.offsets_s[1] - self.offsets_s[0]
+        expected = float(np.log(range_s / (sigma_s * np.sqrt(2 * np.pi))) + counts[best]) if known else 0.0
+        return fits[best], min(lead, fits[best].log_likelihood + max(expected, 0.0))
 
     def mixture(self, trajectory: CameraTrajectory) -> ClockFit | None:
         """The coarse fit of sound rotations among wrong ones; ``None`` where they do not tell an offset from others."""
