@@ -50,8 +50,7 @@ class WrongGain:
     gain, sigma, excess
         What it would be, with its standard deviation, and by what share gravity reads too long.
     variance
-        Of the logarithm of the scale, as it may be so: the mean square of what it would change by, and how much less
-        sure it would be, as a gain that is off is known less well.
+        Of the logarithm of the scale, as it may be so: the mean square of what it would change by.
     """
 
     probability: float
@@ -113,9 +112,7 @@ def judge_gain(x: Estimate, cov: Array, prior_info: Array, widened: float) -> Wr
     likely = (likely / likely.sum())[2:]
     known = np.sum(1 / observed, axis=1) + gain**-2
     expected = np.sum(seen / observed, axis=1) / known
-    by_gain = float(cov[par.SCALE] @ mean_gain) / variance
-    change = by_gain * (expected[2:] - fitted)
-    less_sure = by_gain**2 * np.maximum(1 / known[2:] - widened * variance, 0.0)
+    change = float(cov[par.SCALE] @ mean_gain) / variance * (expected[2:] - fitted)
     mean = float(likely @ expected[2:] / likely.sum())
     square = float(likely @ (expected[2:] ** 2 + 1 / known[2:]) / likely.sum())
     return WrongGain(
@@ -123,5 +120,5 @@ def judge_gain(x: Estimate, cov: Array, prior_info: Array, widened: float) -> Wr
         gain=mean,
         sigma=max(square - mean**2, 0.0) ** 0.5,
         excess=excess_m_s2 / gravity,
-        variance=float(likely @ (change**2 + less_sure)),
+        variance=float(likely @ change**2),
     )
