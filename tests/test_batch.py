@@ -80,7 +80,7 @@ def processes_of(out: Path) -> list[int]:
     return found
 
 
-def eventually(condition, seconds: float = 60.0):
+def eventually(condition, seconds: float = 180.0):
     """The first true value of ``condition``."""
     until = time.monotonic() + seconds
     while time.monotonic() < until:

@@ -10,7 +10,7 @@ import errno
 from pathlib import Path
 from typing import Any, ClassVar
 
-from colmap_inertial.core.facts import Fact
+from colmap_inertial.core.facts import Fact, as_fact
 
 #: Libraries that open3d and pycolmap-cuda12 take from the system, and their packages on Debian.
 _SYSTEM_LIBRARIES = {
@@ -32,7 +32,7 @@ class InertialError(Exception):
     Parameters
     ----------
     fact
-        What is wrong; its message is shown with its advice.
+        What is wrong; its message is shown with its advice. Formats and stages of users may give words.
     shown
         What is shown in its place.
 
@@ -46,9 +46,9 @@ class InertialError(Exception):
 
     exit_code: ClassVar[int] = 2
 
-    def __init__(self, fact: Fact, *, shown: str = "") -> None:
-        self.fact = fact
-        super().__init__(shown or fact.with_advice)
+    def __init__(self, fact: Fact | str, *, shown: str = "") -> None:
+        self.fact = as_fact(fact)
+        super().__init__(shown or self.fact.with_advice)
 
     def __reduce__(self) -> tuple[object, ...]:
         # by fields: a worker's errors come to another process, and the constructors take other arguments
@@ -88,12 +88,13 @@ class FormatError(InertialError):
         One-based line number, where the file has lines.
     """
 
-    def __init__(self, path: Path | str, reason: Fact, *, line: int | None = None) -> None:
+    def __init__(self, path: Path | str, reason: Fact | str, *, line: int | None = None) -> None:
         self.path = Path(path)
-        self.reason = reason.with_advice
+        fact = as_fact(reason)
+        self.reason = fact.with_advice
         self.line = line
         place = f"{path}{'' if line is None else f', line {line}'}"
-        super().__init__(reason, shown=f"{place}: {self.reason}")
+        super().__init__(fact, shown=f"{place}: {self.reason}")
 
 
 class TimingError(InertialError):
@@ -152,12 +153,13 @@ class NotObservableError(InertialError):
 
     exit_code = 3
 
-    def __init__(self, quantity: str, hint: Fact, *, sigma: float | None = None) -> None:
+    def __init__(self, quantity: str, hint: Fact | str, *, sigma: float | None = None) -> None:
         self.quantity = quantity
-        self.hint = hint.with_advice
+        fact = as_fact(hint)
+        self.hint = fact.with_advice
         self.sigma = sigma
         spread = "" if sigma is None else f" (standard deviation {100 * sigma:.1f} %)"
-        super().__init__(hint, shown=f"{quantity} is not observable{spread}: {self.hint}")
+        super().__init__(fact, shown=f"{quantity} is not observable{spread}: {self.hint}")
 
 
 class MappingError(InertialError):

@@ -10,6 +10,7 @@ import pytest
 
 import colmap_inertial
 from colmap_inertial import messages
+from colmap_inertial.core import errors
 from colmap_inertial.core.errors import (
     FormatError,
     MappingError,
@@ -23,6 +24,7 @@ from colmap_inertial.core.types import Action, Treatment
 from colmap_inertial.io.files import read_json, read_record, write_record
 
 PACKAGE = Path(colmap_inertial.__file__).parent
+ERRORS = {name for name, one in vars(errors).items() if isinstance(one, type) and issubclass(one, errors.InertialError)}
 
 
 @pytest.fixture(autouse=True)
@@ -86,6 +88,24 @@ def test_every_code_that_the_package_names_has_a_message_that_takes_its_values()
                     except TypeError as error:
                         wrong.append(f"{place}: {error}")
     assert wrong == []
+
+
+def test_no_error_of_the_package_is_raised_with_words():
+    worded = []
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ERRORS:
+                # FormatError's path and NotObservableError's quantity come before what is wrong
+                of = 1 if node.func.id in ("FormatError", "NotObservableError", "MissingExtraError") else 0
+                if len(node.args) > of and isinstance(node.args[of], ast.Constant | ast.JoinedStr):
+                    worded.append(f"{path.relative_to(PACKAGE)}:{node.lineno}")
+    assert worded == []
+
+
+def test_words_of_a_user_s_format_are_an_error_s_fact():
+    error = FormatError("imu.csv", "is not mine", line=2)
+    assert str(error) == "imu.csv, line 2: is not mine"
+    assert (error.code, error.fact) == ("stated", Fact.stated("is not mine"))
 
 
 def test_every_message_is_said_somewhere():

@@ -76,7 +76,7 @@ def test_what_does_not_belong_is_refused_with_wrong_rotations_too(still):
     imu, stranger = (at_rest(one) if still else one.imu for one in (recording, other))
     poses = two_views(recording.trajectory, 0, wrong=0.15, still=still)
     align_clocks(poses, imu)
-    late = replace(poses, t_s=poses.t_s + 3.0)
+    late = replace(poses, t_s=poses.t_s + 6.0)  # beyond the reach of ten standard deviations
     offset_s = recording.truth.calibration.gyro_time_offset_s
     near = calibration_prior(Declared(gyro_time_offset_s=offset_s, time_offset_sigma_s=0.5))
     align_clocks(poses, imu, prior=near)
