@@ -38,7 +38,6 @@ from pathlib import Path
 import numpy as np
 from bench_report import write_report
 
-from colmap_inertial.checks.diagnose import Recorded, diagnose
 from colmap_inertial.cli import main as run_command
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import InertialError
@@ -48,6 +47,7 @@ from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import CameraTrajectory, ImuCalibration, ImuRecording
 from colmap_inertial.core.types.imu import IMU_CAL
+from colmap_inertial.diagnose import Recorded, diagnose
 from colmap_inertial.inertial.scale import estimate_scale
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.imu import read_imu
