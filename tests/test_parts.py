@@ -151,7 +151,7 @@ from pathlib import Path
 from colmap_inertial.colmap import mapping, submaps
 from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.run.steps import chunks
-from colmap_inertial.run.steps.context import RunContext
+from colmap_inertial.colmap.context import RunContext
 
 submaps.SIZES = replace(submaps.SIZES, least=2, shortest=12, longest=12, shared=1 / 3)
 started, start = [], chunks.start_process
