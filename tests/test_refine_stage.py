@@ -440,7 +440,7 @@ def test_auto_refines_where_drift_exceeds_what_is_left(walked, monkeypatch):
     made, said = refined_by(tracks.imu, model, auto=True)
     worth = said.values["expected"]
     assert said.action == "refined" and worth["risk"] < 0.05 and worth["share"] < 0.25
-    assert "expected to err by" in str(said.reason) and "mm by images alone" in str(made.scale.notes[-1])
+    assert "expected error" in str(said.reason) and "mm by images alone" in str(made.scale.notes[-1])
     # as far off as it was expected to be, by the truth; frames that see next to nothing are farther
     truth = tracks.motion.cam_in_world_m(tracks.timing.pose_t_s())
     before, after = (error_of(centres_of(one.reconstruction), truth) for one in (model, made))
@@ -448,8 +448,8 @@ def test_auto_refines_where_drift_exceeds_what_is_left(walked, monkeypatch):
     for name, value, why in (
         ("share", 1e-6, "of the time that features and mapping take"),
         ("most_bytes", 1, "of the time"),
-        ("least_drift", 1.0, "images hold its shape by themselves"),
-        ("most_risk", 0.0, "of such paths come out farther off"),
+        ("least_drift", 1.0, "the images alone fix the shape"),
+        ("most_risk", 0.0, "of such paths become worse"),
     ):
         monkeypatch.setattr(motion, "_LIMITS", motion.DriftLimits(**{name: value}))
         same, said = refined_by(tracks.imu, model, auto=True)
@@ -465,7 +465,7 @@ def test_auto_leaves_a_model_that_loops_hold():
     model = Model(reconstruction=adjusted(tracks.reconstruction()), colmap_index=0, timing=tracks.timing)
     model = MetricStage(imu=tracks.imu, calibration=UNKNOWN)(model)
     same, said = refined_by(tracks.imu, model, auto=True)
-    assert "images hold its shape by themselves" in str(said.reason) and same.reconstruction is model.reconstruction
+    assert "the images alone fix the shape" in str(said.reason) and same.reconstruction is model.reconstruction
     truth = tracks.motion.cam_in_world_m(tracks.timing.pose_t_s())
     expected_m = said.values["expected"]["alone_m"]
     assert 0.5 < error_of(centres_of(model.reconstruction), truth) / expected_m < 2
@@ -606,7 +606,7 @@ def test_an_imu_that_contradicts_the_pictures_leaves_the_model_as_it_is(walked):
     imu = replace(tracks.imu, accel_m_s2=tracks.imu.accel_m_s2[:, [1, 0, 2]] * [1.0, 1.0, 1.0])
     made, said = refined_by(imu, model)
     assert said.action == ""
-    assert str(said.reason).startswith("left as it is: ")
+    assert str(said.reason).startswith("refinement discarded: ")
     assert made.reconstruction is model.reconstruction
 
 
@@ -617,7 +617,7 @@ def test_what_predicts_worse_is_not_believed(walked, monkeypatch):
         judge, "evaluate_held_out", lambda problem, x, seen: evaluate_held_out(problem, x, seen) * _sign(problem)
     )
     made, said = refined_by(tracks.imu, model)
-    assert "no better with the IMU" in str(said.reason)
+    assert "did not improve the held-out observations" in str(said.reason)
     assert not said.values["accepted"]
     assert made.reconstruction is model.reconstruction
 
@@ -632,8 +632,8 @@ def test_what_takes_too_much_memory_is_left_as_it_is(walked, monkeypatch):
 
 def test_what_does_not_converge_is_not_believed(walked, monkeypatch):
     tracks, model = walked
-    # pictures alone, the refinement, without a readout, with the noise measured, and with all observations
-    whys = ("pictures alone", *3 * ("the refinement does not",), "with all observations")
+    # images alone, the refinement, without a readout, with the noise measured, and with all observations
+    whys = ("images alone", *3 * ("the refinement does not",), "with all observations")
     for restless, why in enumerate(whys):
         count = iter(range(len(whys)))
 
@@ -682,8 +682,8 @@ def test_what_cannot_be_refined_is_said(walked):
     tracks, model = walked
     for other, why in (
         (replace(model, similarity=None), "it has no scale"),
-        (replace(model, scale=replace(model.scale, noise=None)), "the joint method does"),
-        (replace(model, rectified=True), "cannot say from where"),
+        (replace(model, scale=replace(model.scale, noise=None)), "not estimated by the joint method"),
+        (replace(model, rectified=True), "cannot be inverted"),
         (replace(model, scale=replace(model.scale, parts={"accel_faults": 1e-3})), "has faults"),
         (replace(model, timing=replace(model.timing, t_s=model.timing.t_s + 1e4)), "less than half"),
     ):

@@ -533,7 +533,7 @@ def test_the_first_screen_says_how_large_how_sure_where_and_what_next(full, tmp_
     for said in ("12.3 m × 45.6 cm, 3 m high", "12.3 m are known to ±13 cm, lengths of 10 m to ±11 cm (±1.1 %, 95 %)"):
         assert said in first
     assert "−0.31 % off, within the tolerance of 2 %" in first and "no positions (GPS) were used" in first
-    assert "What next" in first and "colmap-inertial view ." in first
+    assert "Next steps" in first and "colmap-inertial view ." in first
     assert "of COLMAP's own model" not in first  # the unit scale is of no use for the metric model
     model["georeference"] = {
         "origin": {"latitude_deg": 47.3769, "longitude_deg": 8.5417},
@@ -576,7 +576,7 @@ def test_a_section_without_data_is_left_out_with_the_reason(full, tmp_path, gone
 def test_without_exposure_times_there_is_no_blur(full, tmp_path):
     out = copy_of(full, tmp_path)
     result = json.loads((out / "result.json").read_text(encoding="utf-8"))
-    result["imaging"]["deblur"] = "frames stay as they were filmed: the exposure time is unknown"
+    result["imaging"]["deblur"] = "frames are not deblurred: the exposure time is unknown"
     for frame in result["frames"]:
         frame["blur_px"] = None
     content, page = report_of_changed(out, result)
@@ -1051,7 +1051,7 @@ def test_a_failing_report_of_a_stop_hides_no_reason(tmp_path, monkeypatch, repor
     workspace, capture = Workspace(tmp_path), Capture(path=tmp_path, calibration=calibration_prior())
     with pytest.raises(MappingError, match="nothing matches") as stopped, reporting_stops(workspace, capture):
         raise MappingError(Fact.stated("nothing matches"))
-    assert stopped.value.__notes__ == [f"what was found, and what to do: {tmp_path / 'report.html'}"]
+    assert stopped.value.__notes__ == [f"findings and remedies: {tmp_path / 'report.html'}"]
     monkeypatch.setattr("colmap_inertial.run.commands.reporting.write_report", broken)
     with pytest.raises(MappingError, match="nothing matches"), reporting_stops(workspace, capture):
         raise MappingError(Fact.stated("nothing matches"))

@@ -253,7 +253,7 @@ def test_views_from_one_place_give_no_length(tmp_path, monkeypatch):
     monkeypatch.setattr(failures, "_count_boards", lambda *_: 0)  # takes seconds
     centre = np.array([0.1, 0.1, -0.6])
     poses = [look_at(centre, (x, 0.0, 0.0), roll) for x, roll in ((0.03, 0.3), (-0.03, 1.0))]
-    with pytest.raises(NotObservableError, match="along the same line"):
+    with pytest.raises(NotObservableError, match="from the same direction"):
         Scene(tmp_path, poses, SMALL, samples=1).validate()
 
 
