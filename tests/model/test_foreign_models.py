@@ -5,7 +5,6 @@ import struct
 import numpy as np
 import pycolmap
 import pytest
-from foreign_models import build, centres, points, save, write_points
 
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.model import num_registered, read_model
@@ -15,6 +14,7 @@ from colmap_inertial.model.pose_covariances import pose_covariances
 from colmap_inertial.model.project import apply_to_project
 from colmap_inertial.model.rigs import list_posed_frames
 from colmap_inertial.model.similarities import plain_factor
+from tests.helpers.foreign_models import build, centres, points, save, write_points
 
 
 def read(folder, **how):

@@ -7,7 +7,17 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from foreign_models import (
+
+from colmap_inertial.cli import main
+from colmap_inertial.core.errors import AlreadyMetricError, FormatError, InertialError
+from colmap_inertial.core.geometry import matrix_from_quat
+from colmap_inertial.core.types import ScaleEstimate, Similarity
+from colmap_inertial.model import read_model
+from colmap_inertial.model.identity import ModelIdentity
+from colmap_inertial.model.project import apply_to_project, undo_project
+from colmap_inertial.model.similarities import plain_factor, read_scales
+from colmap_inertial.tools.export.whole import export_model
+from tests.helpers.foreign_models import (
     COUNT,
     HEIGHT,
     WIDTH,
@@ -19,17 +29,15 @@ from foreign_models import (
     write_json,
     write_ply as ply,
 )
-from other_files import in_order, into_training, read_mvsnet, read_rig, training_of, write_mvsnet, write_rig
-
-from colmap_inertial.cli import main
-from colmap_inertial.core.errors import AlreadyMetricError, FormatError, InertialError
-from colmap_inertial.core.geometry import matrix_from_quat
-from colmap_inertial.core.types import ScaleEstimate, Similarity
-from colmap_inertial.model import read_model
-from colmap_inertial.model.identity import ModelIdentity
-from colmap_inertial.model.project import apply_to_project, undo_project
-from colmap_inertial.model.similarities import plain_factor, read_scales
-from colmap_inertial.tools.export.whole import export_model
+from tests.helpers.other_files import (
+    in_order,
+    into_training,
+    read_mvsnet,
+    read_rig,
+    training_of,
+    write_mvsnet,
+    write_rig,
+)
 
 QUAT = np.array([0.5, -0.1, 0.3, 0.8062257748298549])
 SIM3 = Similarity(

@@ -5,8 +5,13 @@ import json
 import cv2
 import numpy as np
 import pytest
-from foreign_models import HEIGHT, WIDTH, build, ply_points, save, write_json, write_ply
-from other_files import (
+
+from colmap_inertial.core.geometry import matrix_from_quat
+from colmap_inertial.core.types import Similarity
+from colmap_inertial.model.project import apply_to_project, undo_project
+from colmap_inertial.model.similarities import ModelScale
+from tests.helpers.foreign_models import HEIGHT, WIDTH, build, ply_points, save, write_json, write_ply
+from tests.helpers.other_files import (
     in_order,
     into_training,
     mvsnet_text,
@@ -16,11 +21,6 @@ from other_files import (
     write_mvsnet,
     write_rig,
 )
-
-from colmap_inertial.core.geometry import matrix_from_quat
-from colmap_inertial.core.types import Similarity
-from colmap_inertial.model.project import apply_to_project, undo_project
-from colmap_inertial.model.similarities import ModelScale
 
 QUAT = np.array([0.5, -0.1, 0.3, 0.8062257748298549])
 SIM3 = Similarity(
