@@ -232,6 +232,7 @@ _LEVERS = {
     "inverse": "that of the inverse fits: imu_in_cam_m, and the last column of cam_from_imu, is the IMU in the "
     "camera's frame (T_cam_imu)",
     "sign": "with the other sign it fits: imu_in_cam_m points from the camera to the IMU",
+    "millimetres": "it fits in millimetres: imu_in_cam_m, and the last column of cam_from_imu, is in metres",
     "": "correct it, or leave it out, and it is estimated",
 }
 

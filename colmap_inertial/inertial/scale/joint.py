@@ -35,13 +35,14 @@ from colmap_inertial.core.types import (
 from colmap_inertial.inertial.core import parameters as par
 from colmap_inertial.inertial.core.parameters import Prior
 from colmap_inertial.inertial.core.priors import PRIORS, AccelPart, accel_part, clock_scale_sigma
-from colmap_inertial.inertial.scale._declared import find_contradicted_lever, open_lever
+from colmap_inertial.inertial.scale._declared import doubts_lever, find_contradicted_lever, leave_out_lever
 from colmap_inertial.inertial.scale._fit import Fit, fit_jointly
 from colmap_inertial.inertial.scale._gain import WrongGain, exceeds_usual, judge_gain
 from colmap_inertial.inertial.scale._setup import Data, prepare
 from colmap_inertial.inertial.scale._shape import LIMITS as SHAPE_LIMITS, ShapeFault, confirmed, suspect
 from colmap_inertial.inertial.scale._suspects import Faults, filter_of_lag, worst
 from colmap_inertial.inertial.scale.verdict import check_clocks, scale_drifts, student_factor, verdict_of
+from colmap_inertial.io.calibration import SIGMAS
 
 #: So many times at most is something wrong with the accelerometer looked for, undone, and the rest fitted again.
 _MOST_FAULTS = 6
@@ -130,11 +131,7 @@ def estimate_joint(
     options = options or JointOptions()
     accel, expected_s = accel_part(timed.imu), timed.calibration.accel_delay_s
     try:
-        timed, data, prior, fit = _fit_in_step(trajectory, timed, options)
-        lever = find_contradicted_lever(fit, prior)
-        if lever is not None:
-            prior = open_lever(prior)
-            fit = fit_jointly(data, prior, timed.imu.noise)
+        timed, data, prior, fit, lever = _fit_believed(trajectory, timed, options)
         fit, faults = _fit_soundly(fit, data, prior, timed.imu.noise)
         shape = Shape()
         # a path that was smoothed has no shape to speak of
@@ -213,6 +210,30 @@ def fit_path(
     widened = scale_of(fit, data.t_s, accel).widened
     wrong = (*shape.undone, *shape.said)
     return data, fit, (*faults.as_facts(), *(fault.as_fact(data.t_s, widened) for fault in wrong))
+
+
+def _fit_believed(
+    trajectory: CameraTrajectory, timed: CameraTimedImu, options: JointOptions
+) -> tuple[CameraTimedImu, Data, Prior, Fit, Fact | None]:
+    """As :func:`_fit_in_step`, without a declared lever arm where a fit without it contradicts it; then that fact."""
+
+    def fit_without(length_m: float) -> tuple[CameraTimedImu, Data, Prior, Fit]:
+        return _fit_in_step(
+            trajectory,
+            replace(timed, calibration=leave_out_lever(timed.calibration, length_m=length_m)),
+            options,
+        )
+
+    believed = _fit_in_step(trajectory, timed, options)
+    _, data, prior, fit = believed
+    if not doubts_lever(fit, prior, is_refused=bool(_refusals(fit, data.t_s))):
+        return *believed, None
+    length_m = float(np.linalg.norm(prior.mean.imu_in_cam_m))
+    alone = fit_without(length_m)
+    lever = None if _refusals(alone[-1], data.t_s) else find_contradicted_lever(alone[-1], prior)
+    if lever is None:
+        return *believed, None
+    return *(alone if length_m <= SIGMAS.unknown_lever_arm_m else fit_without(0.0)), lever
 
 
 def _fit_in_step(
