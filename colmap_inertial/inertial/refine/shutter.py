@@ -47,8 +47,8 @@ class ShutterLimits:
     most: int = 15_000
     #: Steps of the refinement: from a global shutter, three come within 3 to 11 % of 20 ms (``study_refine_real.py``).
     steps: int = 3
-    #: A declared readout is contradicted by one that is off by so many standard deviations, and by this; a declared focal
-    #: length by one that is as surely another, and by this share.
+    #: A declared readout is contradicted by one that is off by so many standard deviations, and by this; a declared
+    #: focal length by one that is as surely another, and by this share.
     contradicts_sigmas: float = 5.0
     contradicts_s: float = 3e-3
     contradicts_focal: float = 0.03
