@@ -373,8 +373,10 @@ def _judged(
         reasons = (*reasons, *(() if worthless else wrong))
     else:
         bent = [fault.as_fact(t_s, scale.widened) for fault in shape.doubtful] or _check_drift(fit.drift)
-        large, usual = _check_gains(fit, scale, accel)
-        doubts = [*wrong, *check_clocks(clock_rate), *_check_length(t_s), *_check_rest(fit), *large, *bent]
+        declared = _check_calibrated(fit, scale) if accel.calibrated else []
+        large, usual = ([], []) if accel.calibrated else _check_gains(fit, scale)
+        # what was declared is named first
+        doubts = [*declared, *wrong, *check_clocks(clock_rate), *_check_length(t_s), *_check_rest(fit), *large, *bent]
         verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, doubts)
         # what is in the interval makes nothing weak by itself; where the interval is wide, it may be why
         said = [fault for fault in shape.said if fault not in shape.doubtful]
@@ -509,22 +511,25 @@ def _check_rest(fit: Fit) -> list[Fact]:
     return [] if fit.converged else [Fact("fit-hardly-converged", moves_log=fit.unsettled_log)]
 
 
-def _check_gains(fit: Fit, scale: FoundScale, accel: AccelPart) -> tuple[list[Fact], list[Fact]]:
-    """Gains of the accelerometer: larger than any sensor's, and others that are worth a word.
+def _check_calibrated(fit: Fit, scale: FoundScale) -> list[Fact]:
+    """A doubt where a calibrated accelerometer has gains, which contradict the calibration."""
+    wrong_gain = scale.wrong_gain
+    if fit.gain_chi2 > par.LARGEST_GAIN_CHI2:
+        return [Fact("calibrated-gain-contradicted", gains=-np.diagonal(fit.estimate.accel_gain))]
+    if wrong_gain is not None and wrong_gain.is_likely:
+        return [Fact("calibrated-gain-contradicted", gains=(wrong_gain.gain,) * 3)]
+    return []
 
-    Of a calibrated one they are zero, and others contradict the calibration.
-    """
+
+def _check_gains(fit: Fit, scale: FoundScale) -> tuple[list[Fact], list[Fact]]:
+    """Gains of an accelerometer that was not calibrated: larger than any sensor's, and others that are worth a word."""
     gains, wrong_gain = fit.estimate.accel_gain, scale.wrong_gain
-    if fit.gain_chi2 > par.LARGEST_GAIN_CHI2 and accel.calibrated:
-        return [Fact("calibrated-gain-contradicted", gains=-np.diagonal(gains))], []
     if fit.gain_chi2 > par.LARGEST_GAIN_CHI2:
         sigma = np.sqrt(scale.widened * np.diagonal(fit.cov[par.ACCEL_GAIN, par.ACCEL_GAIN])).reshape(3, 3)
         found = Fact("accel-gain-large", gains=-np.diagonal(gains))
         return ([found], []) if exceeds_usual(gains, sigma).any() else ([], [found])
     if wrong_gain is None or not wrong_gain.is_likely:
         return [], []
-    if accel.calibrated:
-        return [Fact("calibrated-gain-contradicted", gains=(wrong_gain.gain,) * 3)], []
     found = Fact("accel-gain-doubtful", gain=wrong_gain.gain, excess=wrong_gain.excess)
     return ([found], []) if wrong_gain.is_large else ([], [found])
 
