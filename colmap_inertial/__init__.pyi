@@ -1,11 +1,5 @@
-from .checks.report import write_report as write_report
-from .checks.validate import (
-    Target as Target,
-    Validation as Validation,
-    parse_target as parse_target,
-    validate_model as validate_model,
-)
-from .colmap.sparse import KeypointRecord as KeypointRecord
+from .colmap.features.extraction import KeypointRecord as KeypointRecord
+from .colmap.workers import using_workers as using_workers
 from .core.errors import (
     AlreadyMetricError as AlreadyMetricError,
     FormatError as FormatError,
@@ -29,6 +23,7 @@ from .core.options import (
     StageNames as StageNames,
     ValidateOptions as ValidateOptions,
 )
+from .core.progress import Progress as Progress
 from .core.types import (
     AcceptedScale as AcceptedScale,
     Action as Action,
@@ -48,6 +43,11 @@ from .core.types import (
     Similarity as Similarity,
     SmoothedTrajectory as SmoothedTrajectory,
     Treatment as Treatment,
+)
+from .hooks import (
+    FrameStage as FrameStage,
+    KeypointStage as KeypointStage,
+    ModelStage as ModelStage,
 )
 from .imaging.blur_field import BlurField as BlurField
 from .imaging.gyro_camera import FrameShutter as FrameShutter, GyroCamera as GyroCamera
@@ -80,32 +80,26 @@ from .model.similarities import ModelScale as ModelScale, read_scales as read_sc
 from .motion.align import AlignOptions as AlignOptions, align_camera_imu as align_camera_imu
 from .motion.align.conventions import LikelyConvention as LikelyConvention, likely_convention as likely_convention
 from .motion.smooth import smooth_trajectory as smooth_trajectory
-from .pipeline.run.config import read_config as read_config
-from .pipeline.run.progress import Progress as Progress
-from .pipeline.run.workers import using_workers as using_workers
-from .pipeline.stages.apertures import ApertureStage as ApertureStage
-from .pipeline.stages.deblur import DeblurStage as DeblurStage
-from .pipeline.stages.exposures import ExposureStage as ExposureStage
-from .pipeline.stages.frame_folder import FrameRecord as FrameRecord
-from .pipeline.stages.join import JoinStage as JoinStage
-from .pipeline.stages.metric import MetricStage as MetricStage
-from .pipeline.stages.protocols import (
-    FrameStage as FrameStage,
-    KeypointStage as KeypointStage,
-    ModelStage as ModelStage,
-)
-from .pipeline.stages.readout import ReadoutStage as ReadoutStage
-from .pipeline.stages.refine import RefineStage as RefineStage
-from .pipeline.stages.rolling_shutter import RollingShutterStage as RollingShutterStage
-from .reconstruction.drivers.capture import reconstruct as reconstruct
-from .reconstruction.drivers.images_alone import deblur_capture as deblur_capture
-from .reconstruction.drivers.project import reconstruct_project as reconstruct_project
-from .reconstruction.drivers.result import (
+from .report import write_report as write_report
+from .run.commands.images_alone import deblur_capture as deblur_capture
+from .run.commands.reconstruct import reconstruct as reconstruct
+from .run.commands.reconstruct_project import reconstruct_project as reconstruct_project
+from .run.commands.result import (
     DeblurResult as DeblurResult,
     Fragment as Fragment,
     ModelResult as ModelResult,
     ReconstructResult as ReconstructResult,
 )
+from .run.stages.apertures import ApertureStage as ApertureStage
+from .run.stages.deblur import DeblurStage as DeblurStage
+from .run.stages.exposures import ExposureStage as ExposureStage
+from .run.stages.frame_folder import FrameRecord as FrameRecord
+from .run.stages.join import JoinStage as JoinStage
+from .run.stages.metric import MetricStage as MetricStage
+from .run.stages.readout import ReadoutStage as ReadoutStage
+from .run.stages.refine import RefineStage as RefineStage
+from .run.stages.rolling_shutter import RollingShutterStage as RollingShutterStage
+from .run.steps.config import read_config as read_config
 from .tools.batch import (
     BatchCapture as BatchCapture,
     BatchResult as BatchResult,
@@ -114,5 +108,11 @@ from .tools.batch import (
     run_batch as run_batch,
 )
 from .tools.export.whole import Exported as Exported, export_model as export_model
+from .validate import (
+    Target as Target,
+    Validation as Validation,
+    parse_target as parse_target,
+    validate_model as validate_model,
+)
 
 __version__: str

@@ -34,11 +34,11 @@ import numpy as np
 import study_model_faults
 from real_imu import FLOWN, HANDHELD, RECORDINGS, Motion, Window, read, reconstructed
 
-from colmap_inertial.checks.diagnose import Recorded, diagnose
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.facts import Fact, sentences
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_multiply
 from colmap_inertial.core.types import CameraTrajectory, ImuRecording
+from colmap_inertial.diagnose import Recorded, diagnose
 from colmap_inertial.inertial.scale import estimate_scale
 from colmap_inertial.inertial.scale.verdict import half_width
 from colmap_inertial.io.trajectories import read_inertial_scale, write_tum

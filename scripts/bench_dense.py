@@ -42,16 +42,16 @@ from bench_report import write_report
 from photo_world import PhotoWorld
 from scipy.spatial import cKDTree
 
-from colmap_inertial.colmap.depth_maps import fuse_maps, map_file
-from colmap_inertial.colmap.sweep_stereo import SweptWorkspace
+from colmap_inertial.colmap.context import RunContext
+from colmap_inertial.colmap.dense.depth_maps import fuse_maps, map_file
+from colmap_inertial.colmap.dense.sweep_stereo import SweptWorkspace
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.types import CameraModel
 from colmap_inertial.io.files import read_json
 from colmap_inertial.model import read_model
 from colmap_inertial.model.artefacts import read_map
-from colmap_inertial.pipeline.run.context import RunContext
-from colmap_inertial.pipeline.run.workspace import Workspace
+from colmap_inertial.run.steps.workspace import Workspace
 from colmap_inertial.tools.simulate import (
     Scene,
     SceneRecipe,
@@ -328,7 +328,7 @@ def cost(scene: str, work: Path, width: int) -> dict[str, float]:
     code = (
         "import sys, tempfile, time\n"
         "from pathlib import Path\n"
-        "from colmap_inertial.colmap.sweep_stereo import SweptWorkspace\n"
+        "from colmap_inertial.colmap.dense.sweep_stereo import SweptWorkspace\n"
         "with tempfile.TemporaryDirectory() as raw:\n"
         "    swept = SweptWorkspace(Path(sys.argv[1]), Path(raw) / 'raw')\n"
         "    swept.begin(None)\n"

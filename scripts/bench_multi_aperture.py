@@ -67,7 +67,7 @@ from colmap_inertial.imaging.multi_aperture import (
     plane_of,
 )
 from colmap_inertial.imaging.multi_aperture.disparity import Disparity
-from colmap_inertial.reconstruction.drivers.images_alone import fuse_captured
+from colmap_inertial.run.commands.images_alone import fuse_captured
 from colmap_inertial.tools.simulate import MotionOptions, SceneRecipe, ShutterCamera, make_scene
 from colmap_inertial.tools.simulate.aperture_array import write_aperture_capture
 

@@ -56,9 +56,11 @@ from check_euroc import similarity
 from walk_features import write_features
 from walk_scenes import Scene, Walk, places_m, world_of, write_walk
 
-from colmap_inertial.colmap.mapping import map_images
-from colmap_inertial.colmap.pairing import match_capture
-from colmap_inertial.colmap.sparse import extract_features
+from colmap_inertial.colmap.chunks import Processes
+from colmap_inertial.colmap.context import RunContext
+from colmap_inertial.colmap.features.extraction import extract_features
+from colmap_inertial.colmap.mapping.mapper import map_images
+from colmap_inertial.colmap.matching.pairing import match_capture
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import matrix_from_quat, quat_rotate, slerp
 from colmap_inertial.core.options import MappingOptions
@@ -66,10 +68,9 @@ from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.files import read_json, write_json
 from colmap_inertial.io.frames import read_frames
 from colmap_inertial.io.imu import read_capture_imu
+from colmap_inertial.io.recording import Recording
 from colmap_inertial.model import find_models, read_model
-from colmap_inertial.pipeline.run.chunks import Processes
-from colmap_inertial.pipeline.run.context import Recording, RunContext
-from colmap_inertial.pipeline.run.session import keep_colmap_quiet
+from colmap_inertial.run.steps.session import keep_colmap_quiet
 
 if TYPE_CHECKING:
     import pycolmap

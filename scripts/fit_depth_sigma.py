@@ -23,7 +23,7 @@ import numpy as np
 from bench_dense import NEARER_M
 from photo_world import PhotoWorld
 
-from colmap_inertial.colmap.sweep_stereo import SweptWorkspace
+from colmap_inertial.colmap.dense.sweep_stereo import SweptWorkspace
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.imaging.plane_sweep import (
     MEASURES,

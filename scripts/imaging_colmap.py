@@ -22,9 +22,9 @@ from colmap_inertial.core.types import CameraTrajectory, FrameTiming
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.imaging.psf import predict_blur_px
 from colmap_inertial.model import colmap_camera, read_model
-from colmap_inertial.pipeline.stages import deblur
-from colmap_inertial.pipeline.stages.deblur import SMOOTHING
-from colmap_inertial.reconstruction.drivers.capture import reconstruct
+from colmap_inertial.run.commands.reconstruct import reconstruct
+from colmap_inertial.run.stages import deblur
+from colmap_inertial.run.stages.deblur import SMOOTHING
 from colmap_inertial.tools.simulate import MotionOptions, SceneRecipe, make_scene, read_truth, write_capture
 
 #: Share of the blur at which any blur is smoothed alike.

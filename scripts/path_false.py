@@ -32,9 +32,9 @@ from colmap_inertial.imaging.path_filters import smoothed
 from colmap_inertial.imaging.psf import blur_field, blur_path
 from colmap_inertial.motion.flow import measure_rotation
 from colmap_inertial.motion.sign import SignCheck, compare_signs
-from colmap_inertial.pipeline.stages import deblur
-from colmap_inertial.pipeline.stages.deblur import smoothing_for
-from colmap_inertial.reconstruction.preparation.judge import Looked, judged
+from colmap_inertial.run.preparation.judge import Looked, judged
+from colmap_inertial.run.stages import deblur
+from colmap_inertial.run.stages.deblur import smoothing_for
 
 #: Shares of the picture that are sky, blurs, and the blurs at which gyroscopes are wrong, px.
 SKIES, SKY_PX, FALSE_PX = (0.7, 0.9), (6.0, 10.0), (10.0, 20.0)

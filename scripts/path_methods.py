@@ -25,7 +25,7 @@ from colmap_inertial.imaging.path_filters import half_quadratic, path_wiener, sm
 from colmap_inertial.imaging.psf import blur_field, blur_path
 from colmap_inertial.imaging.restoration import Network, deepgyro, load_network
 from colmap_inertial.imaging.wiener import DeblurOptions, deblur
-from colmap_inertial.pipeline.stages.deblur import SMOOTHING, smoothing_for
+from colmap_inertial.run.stages.deblur import SMOOTHING, smoothing_for
 
 #: Costs are measured at these blurs, px, of a frame of this size.
 COSTS_PX, COST_SIZE = (10.0, 20.0, 40.0), (1920, 1080)

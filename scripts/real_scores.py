@@ -19,7 +19,7 @@ from colmap_inertial.core.types import CameraMotion
 from colmap_inertial.io.files import read_record
 from colmap_inertial.io.trajectories import read_tum
 from colmap_inertial.model import Model, trajectory_from_model
-from colmap_inertial.pipeline.stages.metric import gravity_in_model, metric_trajectory, motion_file, write_trajectory
+from colmap_inertial.run.stages.metric import gravity_in_model, metric_trajectory, motion_file, write_trajectory
 
 #: Over so many seconds errors of the shape are told.
 SPANS_S = (1.0, 5.0)

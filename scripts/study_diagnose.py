@@ -29,16 +29,16 @@ import numpy as np
 from bench_report import write_report
 from real_imu import read
 
-from colmap_inertial.checks.diagnose import Diagnosis, Recorded, diagnose
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import quat_conjugate, quat_from_matrix, so3_exp
 from colmap_inertial.core.types import CameraModel, CameraTrajectory, FrameTiming, ImuRecording
+from colmap_inertial.diagnose import Diagnosis, Recorded, diagnose
 from colmap_inertial.io.pose_convention import ARRAYS, PoseConvention, reread
 from colmap_inertial.io.trajectories import read_inertial_scale, write_tum
 from colmap_inertial.io.units import STANDARD_GRAVITY_M_S2
 from colmap_inertial.motion.flow import VisualRotation
-from colmap_inertial.reconstruction.drivers.diagnosis import collect
-from colmap_inertial.reconstruction.drivers.sources import ScaleSource
+from colmap_inertial.run.commands.diagnose import collect
+from colmap_inertial.run.commands.scale import ScaleSource
 from colmap_inertial.tools.simulate import IMU_PRESETS, MotionOptions, RecordingOptions, simulate_recording
 
 HERE = Path(__file__).resolve().parents[1]

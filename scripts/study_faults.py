@@ -36,7 +36,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 import cv2
 from study_kill import OPTIONS, contents
 
-from colmap_inertial.pipeline.run.session import keep_colmap_quiet
+from colmap_inertial.run.steps.session import keep_colmap_quiet
 
 FAULTS = ("kill", "disk", "quota", "memory", "files")
 #: Sets limits of its own process, and is then the command line.

@@ -31,10 +31,10 @@ from batch_captures import FRAMES, TINY, tiny_capture
 
 from colmap_inertial.cli import main as command_line
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
-from colmap_inertial.pipeline.run.config import config_as_toml
-from colmap_inertial.reconstruction.drivers.capture import reconstruct
-from colmap_inertial.reconstruction.drivers.images_alone import deblur_capture
-from colmap_inertial.reconstruction.drivers.project import reconstruct_project
+from colmap_inertial.run.commands.images_alone import deblur_capture
+from colmap_inertial.run.commands.reconstruct import reconstruct
+from colmap_inertial.run.commands.reconstruct_project import reconstruct_project
+from colmap_inertial.run.steps.config import config_as_toml
 
 #: What a stranger would like to have: no byte of it may come into an output folder.
 SECRET = b"nobody's business"

@@ -56,8 +56,8 @@ from colmap_inertial.io.files import read_json
 from colmap_inertial.io.trajectories import read_inertial_scale, read_tum
 from colmap_inertial.model import Model, trajectory_from_model
 from colmap_inertial.model.submodels.matches import PlacedImages, place_images
-from colmap_inertial.pipeline.stages.join import JoinStage
-from colmap_inertial.pipeline.stages.metric import MetricStage, metric_trajectory, write_trajectory
+from colmap_inertial.run.stages.join import JoinStage
+from colmap_inertial.run.stages.metric import MetricStage, metric_trajectory, write_trajectory
 from colmap_inertial.tools.simulate.motion import MotionOptions
 from colmap_inertial.tools.simulate.tracks import TrackOptions, Tracks, simulate_tracks
 

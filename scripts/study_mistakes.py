@@ -41,7 +41,6 @@ import numpy as np
 import pycolmap
 from bench_report import write_report
 
-from colmap_inertial.checks.diagnose import Recorded, diagnose
 from colmap_inertial.cli import main as run_command
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import InertialError
@@ -51,15 +50,16 @@ from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import CameraTrajectory, ImuCalibration, ImuRecording, ScaleEstimate
 from colmap_inertial.core.types.imu import IMU_CAL
+from colmap_inertial.diagnose import Recorded, diagnose
 from colmap_inertial.inertial.scale import estimate_scale
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.io.trajectories import read_tum
 from colmap_inertial.model import Model
-from colmap_inertial.pipeline.stages.imaging_plan import GyroView
-from colmap_inertial.pipeline.stages.metric import MetricStage
-from colmap_inertial.pipeline.stages.readout import ReadoutStage
-from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage
+from colmap_inertial.run.stages.imaging_plan import GyroView
+from colmap_inertial.run.stages.metric import MetricStage
+from colmap_inertial.run.stages.readout import ReadoutStage
+from colmap_inertial.run.stages.rolling_shutter import RollingShutterStage
 from colmap_inertial.tools.simulate import IMU_PRESETS, MotionOptions, RecordingOptions, simulate_recording
 from colmap_inertial.tools.simulate.tracks import TrackOptions, simulate_tracks
 

@@ -38,7 +38,8 @@ import numpy as np
 import pycolmap
 from check_euroc import similarity
 
-from colmap_inertial.colmap.mapping import map_images
+from colmap_inertial.colmap.context import RunContext
+from colmap_inertial.colmap.mapping.mapper import map_images
 from colmap_inertial.core.facts import sentences
 from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, quat_multiply, so3_log
 from colmap_inertial.core.options import MappingOptions
@@ -55,12 +56,11 @@ from colmap_inertial.inertial.refine.solve import factored, solve
 from colmap_inertial.inertial.refine.values import Estimate, Problem
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.model import Model
-from colmap_inertial.pipeline.run.context import RunContext
-from colmap_inertial.pipeline.stages.imaging_plan import GyroView
-from colmap_inertial.pipeline.stages.metric import MetricStage
-from colmap_inertial.pipeline.stages.readout import ReadoutStage
-from colmap_inertial.pipeline.stages.refine import RefineStage
-from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage
+from colmap_inertial.run.stages.imaging_plan import GyroView
+from colmap_inertial.run.stages.metric import MetricStage
+from colmap_inertial.run.stages.readout import ReadoutStage
+from colmap_inertial.run.stages.refine import RefineStage
+from colmap_inertial.run.stages.rolling_shutter import RollingShutterStage
 from colmap_inertial.tools.simulate.motion import MotionOptions
 from colmap_inertial.tools.simulate.tracks import TrackOptions, Tracks, simulate_tracks
 

@@ -49,8 +49,8 @@ from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.files import read_json
 from colmap_inertial.io.trajectories import read_inertial_scale
 from colmap_inertial.model import Model
-from colmap_inertial.pipeline.stages.metric import MetricStage
-from colmap_inertial.pipeline.stages.refine import RefineStage
+from colmap_inertial.run.stages.metric import MetricStage
+from colmap_inertial.run.stages.refine import RefineStage
 
 #: Of the made pictures: one pose of so many, points of each, how many frames on either side see one, and how far (m).
 EVERY, POINTS, BESIDE, DEPTH_M = 8, 60, 5, (2.0, 7.0)

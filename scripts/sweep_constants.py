@@ -125,7 +125,7 @@ def _faults(imu: Any, other: Any, rng: np.random.Generator) -> dict[str, Any]:
 
 def run_scale(shared: Path) -> Figures:
     """Scales and findings of recordings, as they are and with faults."""
-    from colmap_inertial.checks.diagnose import Recorded, diagnose
+    from colmap_inertial.diagnose import Recorded, diagnose
     from colmap_inertial.inertial.scale import estimate_scale
     from colmap_inertial.io.trajectories import read_inertial_scale
 

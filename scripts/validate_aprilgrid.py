@@ -23,10 +23,10 @@ import pycolmap
 import yaml
 from rich.console import Console
 
-from colmap_inertial.checks.validate import Validation, parse_target, validate_model, validation_table
-from colmap_inertial.checks.validate.detect import Detection, detect
 from colmap_inertial.core.geometry import skew
 from colmap_inertial.core.options import ValidateOptions
+from colmap_inertial.validate import Validation, parse_target, validate_model, validation_table
+from colmap_inertial.validate.detect import Detection, detect
 
 SPEC = "aprilgrid:6x6:0.088:0.3"
 LEAST_COMMON = 16

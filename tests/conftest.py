@@ -102,7 +102,7 @@ def _once(measure: Callable) -> Callable:
 @pytest.fixture(scope="session", autouse=True)
 def _pictures_are_compared_once():
     """Many tests reconstruct the same capture: what is measured in its pictures beforehand is kept."""
-    from colmap_inertial.reconstruction.preparation import preflight, sampling
+    from colmap_inertial.run.preparation import preflight, sampling
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(preflight, "measure_two_view_rotations", _once(preflight.measure_two_view_rotations))
@@ -131,7 +131,7 @@ class _Errors(logging.Handler):
 def report_failures():
     """What went wrong with reports, which a run survives; a test that means it to happen empties the list."""
     handler = _Errors()
-    logger = logging.getLogger("colmap_inertial.reconstruction.drivers.reporting")
+    logger = logging.getLogger("colmap_inertial.run.commands.reporting")
     logger.addHandler(handler)
     yield handler.messages
     logger.removeHandler(handler)

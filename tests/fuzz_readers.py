@@ -18,7 +18,6 @@ from fuzz_structure import structural
 from test_io_recorders import FRAME_NS, LAYOUTS, at_one_clock, recorded
 from test_multi_aperture_io import kalibr_text
 
-from colmap_inertial.checks.report import write_report
 from colmap_inertial.core.errors import InertialError
 from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.io.calibration import read_calibration
@@ -32,7 +31,8 @@ from colmap_inertial.io.trajectories import read_inertial_scale
 from colmap_inertial.model import read_model
 from colmap_inertial.model.project import apply_to_project, undo_project
 from colmap_inertial.model.similarities import plain_factor, read_scales, read_similarity
-from colmap_inertial.pipeline.run.config import read_config
+from colmap_inertial.report import write_report
+from colmap_inertial.run.steps.config import read_config
 from colmap_inertial.tools.batch.manifest import read_manifest
 from colmap_inertial.tools.simulate.recipe import load_recipe, recipe_text
 from colmap_inertial.tools.simulate.truth import read_truth
@@ -216,7 +216,7 @@ def _read_jsons(folder: Path) -> None:
 
 
 def _tomls(folder: Path) -> list[Path]:
-    from colmap_inertial.pipeline.run.config import config_as_toml
+    from colmap_inertial.run.steps.config import config_as_toml
 
     (folder / "config.toml").write_text(config_as_toml(ReconstructOptions()))
     (folder / "manifest.toml").write_text(

@@ -18,9 +18,9 @@ from test_multi_aperture_io import ROTATION, SHIFT, write_plane_capture
 from test_splats import write_splats, write_trained
 from test_validate_lengths import PLACES, validated
 
-from colmap_inertial.checks.validate.markers import add_bars, add_check_points
-from colmap_inertial.colmap.given_database import read_given
-from colmap_inertial.colmap.two_views import open_features
+from colmap_inertial.colmap.features.given_database import read_given
+from colmap_inertial.colmap.settings import read_settings
+from colmap_inertial.colmap.views.two_views import open_features
 from colmap_inertial.io.calibration import read_calibrations, write_imu_calibration
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.files import write_json
@@ -34,11 +34,11 @@ from colmap_inertial.model.database import transform_database
 from colmap_inertial.model.nerf import transform_transforms
 from colmap_inertial.model.similarities import plain_factor
 from colmap_inertial.model.submodels.matches import read_matches
-from colmap_inertial.pipeline.run.colmap_settings import read_settings
-from colmap_inertial.pipeline.stages.frame_folder import read_frame_records
-from colmap_inertial.reconstruction.preparation.geolocation import read_georeference
+from colmap_inertial.run.preparation.geolocation import read_georeference
+from colmap_inertial.run.stages.frame_folder import read_frame_records
 from colmap_inertial.tools.batch.task import CaptureStatus, read_end, read_status, write_status
 from colmap_inertial.tools.export.source import read_source
+from colmap_inertial.validate.markers import add_bars, add_check_points
 
 DOUBLE = plain_factor(2.0)
 

@@ -9,14 +9,14 @@ import cv2
 import numpy as np
 import pycolmap
 
-from colmap_inertial.checks.report.folders import CROPS_FOLDER, DATA_FOLDER
-from colmap_inertial.checks.report.photogrammetry import photogrammetry_record, scene_record
-from colmap_inertial.checks.report.signals import signal_record
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import quat_rotate
 from colmap_inertial.core.types import Similarity
 from colmap_inertial.inertial.scale import estimate_scale
 from colmap_inertial.io.files import write_json
+from colmap_inertial.report.folders import CROPS_FOLDER, DATA_FOLDER
+from colmap_inertial.report.photogrammetry import photogrammetry_record, scene_record
+from colmap_inertial.report.signals import signal_record
 from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, simulate_recording
 
 #: What a user may call things, and what a page must not run.

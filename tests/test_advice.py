@@ -11,13 +11,13 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
 from study_diagnose import LENS, pictures, simulated
 
-from colmap_inertial.checks.diagnose import Finding, Recorded, diagnose, unreadable
-from colmap_inertial.checks.words import not_checked, outcome_of_model
 from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import ImuRecording
+from colmap_inertial.diagnose import Finding, Recorded, diagnose, unreadable
 from colmap_inertial.messages import all_messages
 from colmap_inertial.motion.flow import VisualRotation
+from colmap_inertial.report.words import not_checked, outcome_of_model
 
 ROOT = Path(__file__).parents[1]
 REFUSED = {

@@ -30,11 +30,17 @@ from cases import loop_over
 from json_schemas import find_violations
 
 from colmap_inertial.cli import main, parse
-from colmap_inertial.colmap import feature_chunks, submaps
-from colmap_inertial.colmap.feature_chunks import ChunkSizes, FindFeatures, find_elsewhere
-from colmap_inertial.colmap.mapping import map_images
+from colmap_inertial.colmap import workers
+from colmap_inertial.colmap.chunks import Chunk, Processes
+from colmap_inertial.colmap.context import RunContext
+from colmap_inertial.colmap.features import chunks as feature_chunks
+from colmap_inertial.colmap.features.chunks import ChunkSizes, FindFeatures, find_elsewhere
+from colmap_inertial.colmap.features.extraction import extract_features, image_pairs, match_pairs
+from colmap_inertial.colmap.mapping import submaps
+from colmap_inertial.colmap.mapping.mapper import map_images
 from colmap_inertial.colmap.parts import MapPart
-from colmap_inertial.colmap.sparse import extract_features, image_pairs, match_pairs
+from colmap_inertial.colmap.settings import ColmapSettings
+from colmap_inertial.colmap.workers import Cluster, connect, describe_versions, do_for_another, using_workers
 from colmap_inertial.core.errors import (
     FormatError,
     InertialError,
@@ -44,15 +50,10 @@ from colmap_inertial.core.errors import (
     OutputExistsError,
 )
 from colmap_inertial.core.options import BatchOptions, MappingOptions, ReconstructOptions
+from colmap_inertial.core.progress import silent
 from colmap_inertial.io.capture import load_capture
-from colmap_inertial.pipeline.run import workers
-from colmap_inertial.pipeline.run.chunks import Chunk, Processes
-from colmap_inertial.pipeline.run.colmap_settings import ColmapSettings
-from colmap_inertial.pipeline.run.config import config_as_toml
-from colmap_inertial.pipeline.run.context import RunContext
-from colmap_inertial.pipeline.run.progress import silent
-from colmap_inertial.pipeline.run.workers import Cluster, connect, describe_versions, do_for_another, using_workers
-from colmap_inertial.reconstruction.drivers.capture import reconstruct
+from colmap_inertial.run.commands.reconstruct import reconstruct
+from colmap_inertial.run.steps.config import config_as_toml
 from colmap_inertial.tools import batch
 from colmap_inertial.tools.batch import BatchCapture, needs_gpu, read_manifest, run_batch
 from colmap_inertial.tools.batch.pools import available_memory, shares_of_this_machine
@@ -556,7 +557,7 @@ def test_what_keeps_a_cluster_from_helping_is_said_before_the_work(cluster, tmp_
     with using_workers(scheduler=cluster[0]):
         executor = RunContext().executor
         executor.require(tmp_path)
-        monkeypatch.setattr("colmap_inertial.pipeline.run.workers.describe_versions", lambda: "pycolmap 9")
+        monkeypatch.setattr("colmap_inertial.colmap.workers.describe_versions", lambda: "pycolmap 9")
         with pytest.raises(
             InertialError, match=rf"worker tcp://.* has {here}; here is pycolmap 9: install the same there"
         ):

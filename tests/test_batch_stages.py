@@ -13,8 +13,8 @@ from cases import loop_over
 from colmap_inertial.cli import main
 from colmap_inertial.core.errors import FormatError, InertialError
 from colmap_inertial.core.options import StageNames
-from colmap_inertial.pipeline.run.config import config_as_toml
-from colmap_inertial.pipeline.stages.protocols import load_stages
+from colmap_inertial.hooks import load_stages
+from colmap_inertial.run.steps.config import config_as_toml
 from colmap_inertial.tools.batch import BatchCapture, read_manifest, run_batch
 from colmap_inertial.tools.batch.task import CaptureStatus
 

@@ -8,13 +8,13 @@ import numpy as np
 import pycolmap
 import pytest
 
-from colmap_inertial.colmap.depth_maps import fuse_maps
-from colmap_inertial.colmap.sweep_stereo import SweptWorkspace
+from colmap_inertial.colmap.context import RunContext
+from colmap_inertial.colmap.dense.depth_maps import fuse_maps
+from colmap_inertial.colmap.dense.sweep_stereo import SweptWorkspace
 from colmap_inertial.core.geometry import matrix_from_quat, so3_exp
 from colmap_inertial.core.types import CameraModel
 from colmap_inertial.io.files import write_json
 from colmap_inertial.model.artefacts import write_map
-from colmap_inertial.pipeline.run.context import RunContext
 from colmap_inertial.tools.simulate import MotionOptions, SceneRecipe, ShutterCamera, develop, make_scene
 from colmap_inertial.tools.simulate.capture import _truth
 

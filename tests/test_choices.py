@@ -24,8 +24,8 @@ from colmap_inertial.imaging.wiener import DeblurOptions
 from colmap_inertial.model.project import Applied
 from colmap_inertial.model.similarities import ModelScale
 from colmap_inertial.motion.align import AlignOptions
-from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
-from colmap_inertial.reconstruction.drivers.result import Fragment
+from colmap_inertial.run.commands.result import Fragment
+from colmap_inertial.run.stages.frame_folder import FrameRecord
 from colmap_inertial.tools.batch.manifest import BatchCapture
 
 

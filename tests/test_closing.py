@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from colmap_inertial.colmap import loop_closure
-from colmap_inertial.colmap.loop_closure import LoopClosure, MappedCapture, close_gaps
+from colmap_inertial.colmap.loops import closure as loop_closure
+from colmap_inertial.colmap.loops.closure import LoopClosure, MappedCapture, close_gaps
 from colmap_inertial.io.files import read_record, write_record
 
 #: A camera turns once around in the middle of a round room, looking outwards.
@@ -176,9 +176,9 @@ def test_ends_are_not_joined_by_pairs_of_which_nobody_knows_whether_they_join_co
 def test_the_mapper_s_model_is_the_joined_one_where_the_order_in_time_is_known(tmp_path, monkeypatch, given, joins):
     import pycolmap
 
-    from colmap_inertial.colmap import mapping
+    from colmap_inertial.colmap.context import RunContext
+    from colmap_inertial.colmap.mapping import mapper as mapping
     from colmap_inertial.core.options import MappingOptions
-    from colmap_inertial.pipeline.run.context import RunContext
 
     ring = make(tmp_path)
     asked = []
@@ -220,9 +220,9 @@ def test_the_mapper_s_model_is_the_joined_one_where_the_order_in_time_is_known(t
 def test_pairs_far_apart_in_time_are_believed_where_somebody_looked(tmp_path, monkeypatch, pairing, judged, nearest):
     import pycolmap
 
-    from colmap_inertial.colmap import mapping
+    from colmap_inertial.colmap.context import RunContext
+    from colmap_inertial.colmap.mapping import mapper as mapping
     from colmap_inertial.core.options import MappingOptions
-    from colmap_inertial.pipeline.run.context import RunContext
 
     ring = make(tmp_path)
     asked = []

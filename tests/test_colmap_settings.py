@@ -7,16 +7,21 @@ import pycolmap
 import pytest
 
 from colmap_inertial.cli import parse
-from colmap_inertial.colmap.depth_maps import fusion_options
-from colmap_inertial.colmap.loop_closure import MappedCapture, _adjustment
-from colmap_inertial.colmap.mapping import global_options, incremental_options
-from colmap_inertial.colmap.sparse import extraction_options, matching_options, require_features, verification_options
+from colmap_inertial.colmap.context import RunContext
+from colmap_inertial.colmap.dense.depth_maps import fusion_options
+from colmap_inertial.colmap.features.extraction import (
+    extraction_options,
+    matching_options,
+    require_features,
+    verification_options,
+)
+from colmap_inertial.colmap.loops.closure import MappedCapture, _adjustment
+from colmap_inertial.colmap.mapping.mapper import global_options, incremental_options
+from colmap_inertial.colmap.settings import _SECTIONS, ColmapSettings, read_settings
 from colmap_inertial.core.errors import FormatError, InertialError
 from colmap_inertial.core.options import MappingOptions, ReconstructOptions
-from colmap_inertial.pipeline.run.colmap_settings import _SECTIONS, ColmapSettings, read_settings
-from colmap_inertial.pipeline.run.config import config_as_toml, read_config
-from colmap_inertial.pipeline.run.context import RunContext
-from colmap_inertial.reconstruction.drivers.capture import reconstruct
+from colmap_inertial.run.commands.reconstruct import reconstruct
+from colmap_inertial.run.steps.config import config_as_toml, read_config
 
 SCENE = Path(__file__).parents[1] / "example_scenes" / "desk"
 PAGE = Path(__file__).parents[1] / "docs" / "colmap.md"

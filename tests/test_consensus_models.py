@@ -19,13 +19,13 @@ from colmap_inertial.model.deregistration import deregister_images
 from colmap_inertial.model.project import apply_to_project
 from colmap_inertial.model.similarities import read_scales
 from colmap_inertial.model.submodels.registration import register_again
-from colmap_inertial.pipeline.run.workspace import Workspace
-from colmap_inertial.pipeline.stages.join import JoinStage
-from colmap_inertial.pipeline.stages.metric import MetricStage
-from colmap_inertial.reconstruction.drivers.diagnosis import diagnose_source
-from colmap_inertial.reconstruction.drivers.models import Submodels, run_models
-from colmap_inertial.reconstruction.drivers.project import reconstruct_project
-from colmap_inertial.reconstruction.drivers.sources import ScaleSource, align_source, scale_source
+from colmap_inertial.run.commands.diagnose import diagnose_source
+from colmap_inertial.run.commands.models import Submodels, run_models
+from colmap_inertial.run.commands.reconstruct_project import reconstruct_project
+from colmap_inertial.run.commands.scale import ScaleSource, align_source, scale_source
+from colmap_inertial.run.stages.join import JoinStage
+from colmap_inertial.run.stages.metric import MetricStage
+from colmap_inertial.run.steps.workspace import Workspace
 
 
 @pytest.fixture(scope="module")

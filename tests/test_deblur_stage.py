@@ -10,8 +10,8 @@ from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import Frame
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.gate import GATE_LIMITS, Decision, FrameDecision, GateOptions, RecordingVerdict
-from colmap_inertial.pipeline.stages import deblur
-from colmap_inertial.pipeline.stages.deblur import DeblurStage
+from colmap_inertial.run.stages import deblur
+from colmap_inertial.run.stages.deblur import DeblurStage
 
 
 def verdict_of(trusted):

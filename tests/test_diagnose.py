@@ -13,12 +13,12 @@ import pytest
 from conftest import Project
 from far_scene import CAM_FROM_IMU, FarScene
 
-from colmap_inertial.checks.diagnose import Diagnosis, FramesInVideo, Recorded, diagnose
 from colmap_inertial.cli import main
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import quat_conjugate, quat_exp, quat_multiply, quat_rotate, so3_exp
 from colmap_inertial.core.types import CameraModel, CameraTrajectory, Frame, FrameLog, FrameTiming, ImuRecording
+from colmap_inertial.diagnose import Diagnosis, FramesInVideo, Recorded, diagnose
 from colmap_inertial.imaging.gyro_camera import FrameShutter
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.capture import load_capture
@@ -27,8 +27,8 @@ from colmap_inertial.io.imu import read_capture_imu, read_imu
 from colmap_inertial.io.trajectories import read_inertial_scale
 from colmap_inertial.model import Model, read_model
 from colmap_inertial.motion.flow import measure_rotation
-from colmap_inertial.pipeline.stages.metric import MetricStage
-from colmap_inertial.reconstruction.preparation.preflight import stop_or_doubt
+from colmap_inertial.run.preparation.preflight import stop_or_doubt
+from colmap_inertial.run.stages.metric import MetricStage
 from colmap_inertial.tools.simulate.motion import MotionKind, MotionOptions
 from colmap_inertial.tools.simulate.recording import RecordingOptions, SimulatedRecording, simulate_recording
 from colmap_inertial.tools.simulate.render import colmap_camera

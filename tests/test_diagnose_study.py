@@ -10,7 +10,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
 import study_diagnose as study
 
-from colmap_inertial.checks.diagnose import diagnose
+from colmap_inertial.diagnose import diagnose
 
 #: What the other tests of ``diagnose`` do not put in.
 SEEDED = (

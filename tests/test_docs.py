@@ -24,9 +24,8 @@ from report_runs import write_run
 from test_pipeline import copy_scene
 
 import colmap_inertial
-from colmap_inertial.checks.report import write_report
 from colmap_inertial.cli import main, parse
-from colmap_inertial.colmap.depth_maps import DenseResult
+from colmap_inertial.colmap.dense.depth_maps import DenseResult
 from colmap_inertial.core.errors import InertialError, NotObservableError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ReconstructOptions
@@ -43,18 +42,19 @@ from colmap_inertial.io.frames import read_frame_times
 from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.io.imu_formats import imu_formats
 from colmap_inertial.messages import all_messages, findings
-from colmap_inertial.pipeline.run.config import config_as_toml
-from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
-from colmap_inertial.pipeline.stages.imaging_plan import GyroView, ImagingPlan
-from colmap_inertial.reconstruction.drivers.capture import reconstruct
-from colmap_inertial.reconstruction.drivers.result import (
+from colmap_inertial.report import write_report
+from colmap_inertial.run.commands.reconstruct import reconstruct
+from colmap_inertial.run.commands.result import (
     Fragment,
     ModelResult,
     ReconstructResult,
     frame_as_json,
     imaging_as_json,
 )
-from colmap_inertial.reconstruction.preparation.selection import Selection
+from colmap_inertial.run.preparation.selection import Selection
+from colmap_inertial.run.stages.frame_folder import FrameRecord
+from colmap_inertial.run.stages.imaging_plan import GyroView, ImagingPlan
+from colmap_inertial.run.steps.config import config_as_toml
 from colmap_inertial.tools.batch import read_manifest
 
 ROOT = Path(__file__).parents[1]

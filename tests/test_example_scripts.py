@@ -11,7 +11,7 @@ from batch_captures import TINY, tiny_capture
 from test_pipeline import copy_scene
 
 from colmap_inertial.model import read_model
-from colmap_inertial.pipeline.run.config import config_as_toml
+from colmap_inertial.run.steps.config import config_as_toml
 
 SCRIPTS = Path(__file__).parents[1] / "scripts"
 

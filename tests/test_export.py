@@ -566,7 +566,7 @@ def rolling(tmp_path_factory):
     from corner_scene import CALIBRATED, CornerScene
 
     from colmap_inertial.core.options import MappingOptions, ReconstructOptions
-    from colmap_inertial.reconstruction.drivers.capture import reconstruct
+    from colmap_inertial.run.commands.reconstruct import reconstruct
 
     root = tmp_path_factory.mktemp("rolling")
     scene = CornerScene.make(exposure_s=0.004, readout_s=0.03, frames=21)

@@ -27,19 +27,19 @@ from colmap_inertial.core.errors import (
 )
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ExposureOptions, ReconstructOptions
+from colmap_inertial.core.progress import silent
 from colmap_inertial.imaging.exposure_pairs import replace_departures
 from colmap_inertial.imaging.restoration import shipped
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frames import read_frame_timing, read_frames
-from colmap_inertial.pipeline.run.progress import silent
-from colmap_inertial.pipeline.run.workspace import Workspace
-from colmap_inertial.pipeline.stages import frame_folder
-from colmap_inertial.pipeline.stages.exposures import ExposureStage
-from colmap_inertial.pipeline.stages.inputs import Fuser
-from colmap_inertial.reconstruction.drivers import capture as driver, images_alone
-from colmap_inertial.reconstruction.drivers.capture import reconstruct
-from colmap_inertial.reconstruction.drivers.images_alone import deblur_capture, fuse_exposures_captured
-from colmap_inertial.reconstruction.preparation import plan
+from colmap_inertial.run.commands import images_alone, reconstruct as driver
+from colmap_inertial.run.commands.images_alone import deblur_capture, fuse_exposures_captured
+from colmap_inertial.run.commands.reconstruct import reconstruct
+from colmap_inertial.run.preparation import plan
+from colmap_inertial.run.stages import frame_folder
+from colmap_inertial.run.stages.exposures import ExposureStage
+from colmap_inertial.run.stages.inputs import Fuser
+from colmap_inertial.run.steps.workspace import Workspace
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -486,7 +486,7 @@ def test_a_missing_partner_or_network_is_said_before_the_work(capture, tmp_path,
     def missing(*args, **options):
         raise MissingExtraError("restore", Fact.stated("networks run in onnxruntime"))
 
-    monkeypatch.setattr("colmap_inertial.pipeline.stages.inputs.load_network", missing)
+    monkeypatch.setattr("colmap_inertial.run.stages.inputs.load_network", missing)
     for command in ("reconstruct", "fuse-exposures"):
         with pytest.raises(SystemExit) as end:
             main([command, str(capture), str(tmp_path / "out")])

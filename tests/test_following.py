@@ -15,8 +15,8 @@ from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.imaging.psf import predict_blur_px
 from colmap_inertial.imaging.selection import _Compare, _fit_rotation, _FollowedImage, _Follower
 from colmap_inertial.model import colmap_camera
-from colmap_inertial.reconstruction.preparation import selection as choosing
-from colmap_inertial.reconstruction.preparation.selection import _Clocks
+from colmap_inertial.run.preparation import selection as choosing
+from colmap_inertial.run.preparation.selection import _Clocks
 
 
 def textured(seed=0, size=(700, 560)):

@@ -11,7 +11,6 @@ import pytest
 from cases import loop_over
 from report_runs import write_run
 
-from colmap_inertial.checks.report import write_report
 from colmap_inertial.cli import main
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.options import ReconstructOptions
@@ -19,7 +18,8 @@ from colmap_inertial.io.ply import transform_ply
 from colmap_inertial.model.database import transform_database
 from colmap_inertial.model.nerf import transform_transforms
 from colmap_inertial.model.similarities import plain_factor
-from colmap_inertial.pipeline.run.config import read_config
+from colmap_inertial.report import write_report
+from colmap_inertial.run.steps.config import read_config
 from colmap_inertial.tools.batch import read_manifest
 
 
@@ -130,10 +130,10 @@ def test_a_reader_that_has_enough():
 LIMITED = """
 import resource, sys
 from pathlib import Path
-from colmap_inertial.colmap.sparse import extract_features
+from colmap_inertial.colmap.features.extraction import extract_features
 from colmap_inertial.core.errors import OutputError
 from colmap_inertial.core.options import MappingOptions
-from colmap_inertial.pipeline.run.context import RunContext
+from colmap_inertial.colmap.context import RunContext
 folder = Path(sys.argv[1])
 sys.dont_write_bytecode = True  # it would be cut off, for good
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), resource.RLIM_INFINITY))

@@ -18,7 +18,6 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
 from study_georeference import measure
 
-from colmap_inertial.checks.words import place_facts
 from colmap_inertial.core.earth import ecef_from_enu, ecef_of_geodetic, geodetic_of_ecef
 from colmap_inertial.core.errors import FormatError, NotObservableError
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
@@ -26,8 +25,9 @@ from colmap_inertial.core.types import CameraTrajectory, PositionFixes
 from colmap_inertial.inertial.georeference import Georeference, georeference, georeference_of_json
 from colmap_inertial.io.positions import positions_in_pictures, positions_in_video
 from colmap_inertial.model import read_model
-from colmap_inertial.reconstruction.drivers.project import reconstruct_project
-from colmap_inertial.reconstruction.preparation.geolocation import located, path_at, read_georeference
+from colmap_inertial.report.words import place_facts
+from colmap_inertial.run.commands.reconstruct_project import reconstruct_project
+from colmap_inertial.run.preparation.geolocation import located, path_at, read_georeference
 from colmap_inertial.tools.export.whole import export_model
 
 UP = np.array([0.0, 0.0, 1.0])

@@ -15,14 +15,15 @@ import pycolmap
 import pytest
 from test_pipeline import QUICK, SCENE, centres, copy_scene
 
-from colmap_inertial.colmap import given_database, pairing
-from colmap_inertial.colmap.given_database import read_given, read_matched_pairs
+from colmap_inertial.colmap.features import given_database
+from colmap_inertial.colmap.features.given_database import read_given, read_matched_pairs
+from colmap_inertial.colmap.matching import pairing
 from colmap_inertial.core.errors import FormatError, InertialError
 from colmap_inertial.core.options import ReconstructOptions, ReferenceOptions
+from colmap_inertial.hooks import KeypointStage
 from colmap_inertial.model import read_model
-from colmap_inertial.pipeline.stages.protocols import KeypointStage
-from colmap_inertial.reconstruction.drivers.capture import reconstruct
-from colmap_inertial.reconstruction.drivers.reference import reconstruct_by
+from colmap_inertial.run.commands.reconstruct import reconstruct
+from colmap_inertial.run.commands.scale_by_reference import reconstruct_by
 from colmap_inertial.tools.simulate.truth import read_truth, true_metres_per_unit
 
 FIRST = 12

@@ -19,7 +19,7 @@ from colmap_inertial import (
     reconstruct,
     write_calibration,
 )
-from colmap_inertial.pipeline.stages.protocols import insert_defaults
+from colmap_inertial.hooks import insert_defaults
 
 
 @pytest.fixture(scope="module")
@@ -154,7 +154,7 @@ def test_what_a_visitor_s_keypoint_stage_did_is_what_the_result_says(capture, tm
 
 
 def test_doubts_are_enforced_after_the_stages_whoever_wrote_them(capture, bare, tmp_path, monkeypatch):
-    from colmap_inertial.reconstruction.preparation import preflight
+    from colmap_inertial.run.preparation import preflight
 
     monkeypatch.setattr(preflight, "stop_or_doubt", lambda diagnosis, force: ("the video was stabilised",))
     _, plain, _ = bare

@@ -15,7 +15,7 @@ from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.parallax import Parallax, parallax_from_points
 from colmap_inertial.imaging.psf import blur_field, predict_blur_px
-from colmap_inertial.reconstruction.preparation import translation
+from colmap_inertial.run.preparation import translation
 from colmap_inertial.tools.simulate import MotionOptions, make_motion
 from colmap_inertial.tools.simulate.render import ShutterCamera, colmap_camera
 

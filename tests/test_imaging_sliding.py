@@ -9,19 +9,20 @@ import pytest
 from corner_scene import CALIBRATED, LENS, PLANES, CornerScene
 from test_imaging_psf import PINHOLE, turning
 
+from colmap_inertial.colmap.context import RunContext
 from colmap_inertial.core.geometry import quat_exp, quat_from_matrix, quat_multiply
+from colmap_inertial.core.progress import silent
 from colmap_inertial.core.types import Frame, FrameTiming
 from colmap_inertial.imaging.gyro_camera import FrameShutter
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frames import read_frames
 from colmap_inertial.io.imu import read_capture_imu
+from colmap_inertial.io.recording import Recording, prior_calibration
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.motion.lateral_flow import FollowedPair, follow_pairs
-from colmap_inertial.pipeline.run.context import Recording, RunContext, prior_calibration
-from colmap_inertial.pipeline.run.progress import silent
-from colmap_inertial.reconstruction.drivers.images_alone import deblur_capture
-from colmap_inertial.reconstruction.preparation import plan as imaging, translation as looked_at
-from colmap_inertial.reconstruction.preparation.plan import Treatments, plan_imaging
+from colmap_inertial.run.commands.images_alone import deblur_capture
+from colmap_inertial.run.preparation import plan as imaging, translation as looked_at
+from colmap_inertial.run.preparation.plan import Treatments, plan_imaging
 from colmap_inertial.tools.simulate.motion import MARGIN_S, Motion
 
 FRAMES, EXPOSURE_S = 18, 0.025

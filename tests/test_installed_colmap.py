@@ -19,14 +19,14 @@ from test_given_database import is_right, keypoints_of
 from test_pipeline import QUICK, copy_scene
 
 from colmap_inertial.cli import main
+from colmap_inertial.colmap import executable
+from colmap_inertial.colmap.executable import read_executable
+from colmap_inertial.colmap.settings import read_settings
 from colmap_inertial.core.errors import FormatError, InertialError, MappingError
 from colmap_inertial.core.options import MappingOptions, ProjectOptions, ReconstructOptions, ReferenceOptions
-from colmap_inertial.pipeline.run import executable
-from colmap_inertial.pipeline.run.colmap_settings import read_settings
-from colmap_inertial.pipeline.run.executable import read_executable
-from colmap_inertial.reconstruction.drivers.capture import reconstruct
-from colmap_inertial.reconstruction.drivers.project import reconstruct_project
-from colmap_inertial.reconstruction.drivers.reference import reconstruct_by
+from colmap_inertial.run.commands.reconstruct import reconstruct
+from colmap_inertial.run.commands.reconstruct_project import reconstruct_project
+from colmap_inertial.run.commands.scale_by_reference import reconstruct_by
 
 COLMAP = shutil.which("colmap")
 needs_colmap = pytest.mark.skipif(COLMAP is None, reason="no colmap is installed")

@@ -27,10 +27,10 @@ from colmap_inertial.io.calibration import (
 )
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.imu import read_imu
-from colmap_inertial.pipeline.run.config import config_as_toml, read_config
-from colmap_inertial.pipeline.run.context import correct_imu, prior_calibration
-from colmap_inertial.reconstruction.drivers import device_store
-from colmap_inertial.reconstruction.drivers.device_store import configuration_folder, read_remembered, remember
+from colmap_inertial.io.recording import correct_imu, prior_calibration
+from colmap_inertial.run.commands import calibrate_imu as device_store
+from colmap_inertial.run.commands.calibrate_imu import configuration_folder, read_remembered, remember
+from colmap_inertial.run.steps.config import config_as_toml, read_config
 from colmap_inertial.tools.simulate import RestOptions, simulate_rests
 
 ROOT = Path(__file__).parents[1]

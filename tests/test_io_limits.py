@@ -28,8 +28,8 @@ from colmap_inertial.io.imu import read_imu
 from colmap_inertial.io.tables import read_table
 from colmap_inertial.io.toml_section import read_toml
 from colmap_inertial.io.video import video_stamps_ns
-from colmap_inertial.pipeline.run.config import read_config
-from colmap_inertial.reconstruction.drivers.capture import reconstruct
+from colmap_inertial.run.commands.reconstruct import reconstruct
+from colmap_inertial.run.steps.config import read_config
 from colmap_inertial.tools.view.images import read_preview
 
 

@@ -23,9 +23,9 @@ from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.model import Model, trajectory_from_model, transformed
 from colmap_inertial.model.submodels.graph import PLACEMENT
 from colmap_inertial.model.submodels.merging import merge_models
-from colmap_inertial.pipeline.stages.join import JoinStage
-from colmap_inertial.pipeline.stages.metric import MetricStage
-from colmap_inertial.pipeline.stages.refine import RefineStage
+from colmap_inertial.run.stages.join import JoinStage
+from colmap_inertial.run.stages.metric import MetricStage
+from colmap_inertial.run.stages.refine import RefineStage
 from colmap_inertial.tools.simulate.tracks import simulate_tracks
 from colmap_inertial.tools.view.sources import find_source
 

@@ -17,7 +17,7 @@ from colmap_inertial.inertial.join.placement import FittedSubmodel
 from colmap_inertial.inertial.join.relative_poses import tie_cov, worst
 from colmap_inertial.inertial.scale.posterior import FittedPath
 from colmap_inertial.io.calibration import calibration_prior
-from colmap_inertial.pipeline.stages.join import _cameras
+from colmap_inertial.run.stages.join import _cameras
 from colmap_inertial.tools.simulate.tracks import simulate_tracks
 
 LIMITS = JoinOptions()

@@ -17,8 +17,8 @@ from colmap_inertial.inertial.join.evidence import find_links, find_matched
 from colmap_inertial.inertial.join.judge import join_submodels
 from colmap_inertial.model import Model
 from colmap_inertial.model.submodels.matches import PlacedImages, place_images
-from colmap_inertial.pipeline.stages.join import JoinStage
-from colmap_inertial.pipeline.stages.metric import MetricStage
+from colmap_inertial.run.stages.join import JoinStage
+from colmap_inertial.run.stages.metric import MetricStage
 from colmap_inertial.tools.simulate.motion import MotionOptions
 from colmap_inertial.tools.simulate.tracks import TrackOptions, simulate_tracks
 

@@ -48,10 +48,10 @@ ROWS = [
     ("io", "imaging"),
     ("model", "motion"),
     ("inertial",),
-    ("checks",),
-    ("pipeline",),
+    ("diagnose", "report"),
+    ("validate", "hooks"),
     ("colmap",),
-    ("reconstruction",),
+    ("run",),
     ("tools",),
     ("cli",),
 ]
@@ -62,9 +62,8 @@ ROWS_INSIDE = {
     "model": [("submodels",)],
     "motion": [("flow",), ("two_view_rotation", "shutter", "lateral_flow", "sign"), ("align", "smooth")],
     "inertial": [("core",), ("scale",), ("static_calibration", "georeference"), ("refine", "join")],
-    "checks": [("diagnose", "validate", "report")],
-    "pipeline": [("run",), ("stages",)],
-    "reconstruction": [("preparation",), ("drivers",)],
+    "colmap": [("views",), ("loops",), ("features",), ("matching",), ("mapping",), ("dense",)],
+    "run": [("steps",), ("stages",), ("preparation",), ("commands",)],
     "tools": [("simulate", "batch", "view"), ("export",)],
 }
 ROW = {room: row for row, rooms in enumerate(ROWS) for room in rooms}
@@ -73,10 +72,10 @@ ROW_INSIDE = {
 }
 
 #: The only importers of pycolmap.
-COLMAP = ("model", "inertial.refine", "checks", "pipeline", "colmap", "reconstruction", "tools", "cli")
+COLMAP = ("model", "inertial.refine", "diagnose", "validate", "report", "hooks", "colmap", "run", "tools", "cli")
 #: What computes touches no file.
 COMPUTES = ("core", "_kernels", "imaging", "motion", "inertial")
-TOUCHES_FILES = ("core.errors", "core.options", "core.threads")
+TOUCHES_FILES = ("core.errors", "core.options", "core.progress", "core.threads")
 
 
 def inside(module: str, places: tuple[str, ...]) -> bool:

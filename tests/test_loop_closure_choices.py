@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 from cases import loop_over
 
-from colmap_inertial.colmap import loop_closure
+from colmap_inertial.colmap.loops import closure as loop_closure
 from colmap_inertial.model.submodels.matches import LIMITS
 
 NAMES = [f"{k:02d}" for k in range(16)]

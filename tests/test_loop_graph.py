@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 from test_pairing import circle, headings_of, way_along
 
-from colmap_inertial.colmap import loop_graph
-from colmap_inertial.colmap.loop_graph import select_likely_loops, select_loops
-from colmap_inertial.colmap.relative_track import DRIFT, LoopPose
+from colmap_inertial.colmap.loops import pose_graph as loop_graph
+from colmap_inertial.colmap.loops.pose_graph import select_likely_loops, select_loops
+from colmap_inertial.colmap.views.relative_track import DRIFT, LoopPose
 from colmap_inertial.core.geometry import so3_exp, so3_log
 
 RATE_HZ, DEPTH_M = 8.0, 2.0

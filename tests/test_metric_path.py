@@ -12,8 +12,8 @@ from colmap_inertial.core.types import CAL, CameraTrajectory, FrameTiming, ImuRe
 from colmap_inertial.inertial.refine.motion import PictureDrift
 from colmap_inertial.inertial.refine.shutter import SHUTTER_LIMITS
 from colmap_inertial.io.calibration import Declared, calibration_prior
-from colmap_inertial.pipeline.stages import metric
-from colmap_inertial.pipeline.stages.metric import MetricStage, _add_drift, _motion, calibration_of_rectified
+from colmap_inertial.run.stages import metric
+from colmap_inertial.run.stages.metric import MetricStage, _add_drift, _motion, calibration_of_rectified
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 COUNT = 4

@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from colmap_inertial.colmap.given_database import read_given
+from colmap_inertial.colmap.features.given_database import read_given
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.io.sqlite import BOUNDS, open_foreign
 from colmap_inertial.model.database import PlacedModel, check_records, copy_database, transform_database

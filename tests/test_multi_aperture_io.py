@@ -20,9 +20,9 @@ from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.capture_images import SubImages
 from colmap_inertial.io.frames import read_frames
 from colmap_inertial.io.rig_calibration import read_rig_calibration
-from colmap_inertial.pipeline.stages.apertures import ApertureStage
-from colmap_inertial.reconstruction.drivers.capture import reconstruct
-from colmap_inertial.reconstruction.drivers.images_alone import fuse_captured
+from colmap_inertial.run.commands.images_alone import fuse_captured
+from colmap_inertial.run.commands.reconstruct import reconstruct
+from colmap_inertial.run.stages.apertures import ApertureStage
 from colmap_inertial.tools.simulate import MotionOptions, SceneRecipe, ShutterCamera
 from colmap_inertial.tools.simulate.aperture_array import write_aperture_capture
 

@@ -12,8 +12,8 @@ from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.core.types import CameraModel, Treatment
 from colmap_inertial.io.files import write_json
 from colmap_inertial.model.similarities import read_scales, read_similarity
-from colmap_inertial.pipeline.run.config import config_as_toml, read_config
-from colmap_inertial.pipeline.stages.frame_folder import FrameRecord, read_frame_records
+from colmap_inertial.run.stages.frame_folder import FrameRecord, read_frame_records
+from colmap_inertial.run.steps.config import config_as_toml, read_config
 from colmap_inertial.tools.batch import read_manifest
 from colmap_inertial.tools.batch.task import CaptureStatus, read_end, read_status, write_status
 

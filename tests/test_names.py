@@ -12,10 +12,8 @@ import pycolmap
 import pytest
 from cases import loop_over
 
-from colmap_inertial.checks.report.page import embed_images
-from colmap_inertial.checks.validate.views import load_views
-from colmap_inertial.colmap.dense import _check_images
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.progress import silent
 from colmap_inertial.core.types import Frame, FrameTiming
 from colmap_inertial.io.capture_images import SubImages
 from colmap_inertial.io.exif import stamps_of_exif
@@ -23,11 +21,13 @@ from colmap_inertial.io.files import check_names, path_in
 from colmap_inertial.io.frame_sources import ImageFolder
 from colmap_inertial.io.picture_names import picture_in
 from colmap_inertial.model import read_model
-from colmap_inertial.pipeline.run.progress import silent
-from colmap_inertial.pipeline.stages.frame_folder import FramePaths, write_frames, write_images
-from colmap_inertial.reconstruction.preparation.sampling import some_frames
+from colmap_inertial.report.page import embed_images
+from colmap_inertial.run.commands.dense_steps import _check_images
+from colmap_inertial.run.preparation.sampling import some_frames
+from colmap_inertial.run.stages.frame_folder import FramePaths, write_frames, write_images
 from colmap_inertial.tools.batch import read_manifest
 from colmap_inertial.tools.view.sources import find_source
+from colmap_inertial.validate.views import load_views
 
 BAD = ["", ".", "/etc/passwd", "../a.png", "a/../../b.png", "a\\..\\b.png", "a\0.png", "x" * 256, "a/" + "\udfff" * 90]
 

@@ -8,8 +8,8 @@ from colmap_inertial.core.errors import FormatError, OutputError
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frame_sources import ImageFolder, image_names
 from colmap_inertial.io.frames import picture_folders
-from colmap_inertial.pipeline.run.session import open_session
-from colmap_inertial.reconstruction.drivers.capture import reconstruct
+from colmap_inertial.run.commands.reconstruct import reconstruct
+from colmap_inertial.run.steps.session import open_session
 
 
 @pytest.fixture(scope="module")

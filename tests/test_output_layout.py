@@ -14,12 +14,10 @@ from test_io_ply import SIMILARITY
 from test_pipeline import copy_scene
 from test_pipeline_parts import session_in
 
-from colmap_inertial.checks.words import describe_mapping, parts_mapped_in_words
 from colmap_inertial.cli.terminal import show_result
-from colmap_inertial.colmap import dense as dense_room
-from colmap_inertial.colmap.depth_maps import MadeFrom
-from colmap_inertial.colmap.loop_closure import LoopClosure
-from colmap_inertial.colmap.mapping import MapRecord, ModelEnds
+from colmap_inertial.colmap.dense.depth_maps import MadeFrom
+from colmap_inertial.colmap.loops.closure import LoopClosure
+from colmap_inertial.colmap.mapping.mapper import MapRecord, ModelEnds
 from colmap_inertial.core.errors import AlreadyMetricError, FormatError, MappingError, OutputError, OutputExistsError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ProjectOptions
@@ -29,20 +27,21 @@ from colmap_inertial.io.capture import Capture
 from colmap_inertial.model import read_model, transformed, write_model
 from colmap_inertial.model.project import apply_to_project, undo_project
 from colmap_inertial.model.similarities import ModelScale, plain_factor
-from colmap_inertial.pipeline.run.workspace import Workspace, places_of
-from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
-from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan
-from colmap_inertial.reconstruction.drivers import images_alone
-from colmap_inertial.reconstruction.drivers.frames import run_images
-from colmap_inertial.reconstruction.drivers.project_output import (
+from colmap_inertial.report.words import describe_mapping, parts_mapped_in_words
+from colmap_inertial.run.commands import dense_steps as dense_room, images_alone
+from colmap_inertial.run.commands.frames import run_images
+from colmap_inertial.run.commands.project_output import (
     list_placed_paths,
     place_project,
     remove_placed,
     remove_stale_dense,
     require_free_names,
 )
-from colmap_inertial.reconstruction.drivers.reporting import reporting_stops
-from colmap_inertial.reconstruction.drivers.result import ModelResult, ReconstructResult
+from colmap_inertial.run.commands.reporting import reporting_stops
+from colmap_inertial.run.commands.result import ModelResult, ReconstructResult
+from colmap_inertial.run.stages.frame_folder import FrameRecord
+from colmap_inertial.run.stages.imaging_plan import ImagingPlan
+from colmap_inertial.run.steps.workspace import Workspace, places_of
 
 SCALE = ModelScale(similarity=SIMILARITY, verdict="trusted")
 REFUSED = ModelScale(similarity=None, verdict="refused", reasons=("the camera stood still",))

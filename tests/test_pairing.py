@@ -8,26 +8,30 @@ import numpy as np
 import pycolmap
 import pytest
 
-from colmap_inertial.colmap import loops, pairing, relative_track, sparse
-from colmap_inertial.colmap.gyro_orientations import (
+from colmap_inertial.colmap.context import RunContext
+from colmap_inertial.colmap.features import extraction as sparse
+from colmap_inertial.colmap.features.extraction import mapping_device
+from colmap_inertial.colmap.loops import search as loops
+from colmap_inertial.colmap.loops.pose_graph import select_loops
+from colmap_inertial.colmap.loops.search import LoopSearch, candidates, key_frames
+from colmap_inertial.colmap.matching import pairing
+from colmap_inertial.colmap.matching.pairing import match_capture
+from colmap_inertial.colmap.views import relative_track
+from colmap_inertial.colmap.views.gyro_orientations import (
     GyroOrientations,
     RayPairs,
     _curvature,
     estimate_bias_correction,
     estimate_gyro_orientations,
 )
-from colmap_inertial.colmap.loop_graph import select_loops
-from colmap_inertial.colmap.loops import LoopSearch, candidates, key_frames
-from colmap_inertial.colmap.pairing import match_capture
-from colmap_inertial.colmap.relative_track import (
+from colmap_inertial.colmap.views.relative_track import (
     LoopPose,
     Observations,
     RelativeTrack,
     estimate_relative_track,
     link_observations,
 )
-from colmap_inertial.colmap.sparse import mapping_device
-from colmap_inertial.colmap.two_views import (
+from colmap_inertial.colmap.views.two_views import (
     Covisibility,
     TwoViews,
     compare,
@@ -43,7 +47,6 @@ from colmap_inertial.core.geometry import quat_from_matrix, so3_exp
 from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.core.types import CAL, CameraModel, FrameTiming, ImuRecording
 from colmap_inertial.io.calibration import Declared, calibration_prior
-from colmap_inertial.pipeline.run.context import RunContext
 
 CAMERA = CameraModel(model="PINHOLE", width=480, height=360, params=(400.0, 400.0, 240.0, 180.0))
 BIAS = np.array([0.004, -0.01, 0.02])

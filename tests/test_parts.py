@@ -15,12 +15,12 @@ from test_closing import NAMES, make
 
 from colmap_inertial.cli import main
 from colmap_inertial.cli.captures import Reconstruct
+from colmap_inertial.colmap.chunks import Processes, start_process
+from colmap_inertial.colmap.context import RunContext
 from colmap_inertial.colmap.parts import map_parts, prepare_part, write_part_database
+from colmap_inertial.colmap.workers import using_workers
 from colmap_inertial.core.errors import MappingError
 from colmap_inertial.core.threads import usable_processors
-from colmap_inertial.pipeline.run.chunks import Processes, start_process
-from colmap_inertial.pipeline.run.context import RunContext
-from colmap_inertial.pipeline.run.workers import using_workers
 
 PARTS = [(0, 18), (12, 30), (24, 42)]
 
@@ -135,7 +135,7 @@ def test_a_part_is_kept_unless_what_it_reads_changed_or_it_is_damaged(ring, tmp_
         with pycolmap.Database.open(str(path)) as opened:
             opened.delete_two_view_geometry(*pair)
     assert prepare(4, outside).is_made() and not prepare(5, inside).is_made()
-    monkeypatch.setattr("colmap_inertial.pipeline.run.chunks.start_process", None)  # nothing is started
+    monkeypatch.setattr("colmap_inertial.colmap.chunks.start_process", None)  # nothing is started
     (kept,) = map_parts([again], Processes(number=1), told.append)
     assert told == [18] and kept[0].num_reg_images() == 18 and not again.folder.exists()
     points = again.made / "0" / "points3D.bin"
@@ -150,8 +150,8 @@ from dataclasses import replace
 from pathlib import Path
 from colmap_inertial.colmap import mapping, submaps
 from colmap_inertial.core.options import MappingOptions
-from colmap_inertial.pipeline.run import chunks
-from colmap_inertial.pipeline.run.context import RunContext
+from colmap_inertial.run.steps import chunks
+from colmap_inertial.colmap.context import RunContext
 
 submaps.SIZES = replace(submaps.SIZES, least=2, shortest=12, longest=12, shared=1 / 3)
 started, start = [], chunks.start_process

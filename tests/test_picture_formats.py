@@ -13,7 +13,7 @@ from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.exif import exposure_of, position_of, stamps_of_exif
 from colmap_inertial.io.frames import read_frame_timing
 from colmap_inertial.io.jpeg_coding import read_jpeg_coding
-from colmap_inertial.pipeline.stages.frame_folder import encode_image
+from colmap_inertial.run.stages.frame_folder import encode_image
 
 
 def picture(dtype=np.uint8, channels=3):

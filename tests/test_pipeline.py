@@ -20,7 +20,7 @@ from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate
 from colmap_inertial.core.options import MappingOptions, ReconstructOptions
 from colmap_inertial.io.trajectories import read_tum
 from colmap_inertial.model import read_model
-from colmap_inertial.reconstruction.drivers.capture import reconstruct
+from colmap_inertial.run.commands.reconstruct import reconstruct
 from colmap_inertial.tools.simulate.truth import read_truth, true_metres_per_unit
 
 SCENE = Path(__file__).parents[1] / "example_scenes" / "desk"
@@ -279,7 +279,7 @@ sys.path.insert(0, sys.argv[3])
 from pathlib import Path
 import cv2, pycolmap, scipy.optimize
 from test_pipeline import DETERMINISTIC
-from colmap_inertial.reconstruction.drivers.capture import reconstruct
+from colmap_inertial.run.commands.reconstruct import reconstruct
 
 def run(at):
     def progress(stage, done, total):

@@ -16,17 +16,18 @@ import pytest
 from box_project import HIGH, LOW, build, cast, off_the_walls, rays
 from test_pipeline_existing import contents, run
 
-from colmap_inertial.colmap import dense as dense_stage, depth_maps
-from colmap_inertial.colmap.tsdf import require_mesh_maker, tsdf_mesh
+from colmap_inertial.colmap.context import RunContext
+from colmap_inertial.colmap.dense import depth_maps
+from colmap_inertial.colmap.dense.tsdf import require_mesh_maker, tsdf_mesh
+from colmap_inertial.colmap.settings import ColmapSettings
 from colmap_inertial.core.errors import InertialError, OutputError
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.options import DenseOptions, ProjectOptions, ReconstructOptions
 from colmap_inertial.io.ply import read_ply_header
 from colmap_inertial.model import read_model
 from colmap_inertial.model.artefacts import read_map, write_map
-from colmap_inertial.pipeline.run.colmap_settings import ColmapSettings
-from colmap_inertial.pipeline.run.context import RunContext
-from colmap_inertial.reconstruction.drivers.project import reconstruct_project
+from colmap_inertial.run.commands import dense_steps as dense_stage
+from colmap_inertial.run.commands.reconstruct_project import reconstruct_project
 
 QUICK = ReconstructOptions(dense=True, dense_options=DenseOptions(max_image_size=96), refine="off", deterministic=True)
 SPARSE = ["--deterministic", "--refine", "off"]

@@ -9,7 +9,7 @@ import pytest
 from batch_captures import TINY, model_bytes, tiny_capture
 
 from colmap_inertial.core.errors import OutputError
-from colmap_inertial.reconstruction.drivers.capture import reconstruct
+from colmap_inertial.run.commands.reconstruct import reconstruct
 
 LIMITED = """
 import resource, sys

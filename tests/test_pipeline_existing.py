@@ -29,7 +29,7 @@ from colmap_inertial.model import read_model
 from colmap_inertial.model.identity import ModelIdentity
 from colmap_inertial.model.project import apply_to_project
 from colmap_inertial.model.similarities import read_similarity
-from colmap_inertial.reconstruction.drivers.project import is_project, reconstruct_project
+from colmap_inertial.run.commands.reconstruct_project import is_project, reconstruct_project
 from colmap_inertial.tools.view import load_scene
 
 #: For tests of what goes in and comes out: the refinement takes a third of a run.
@@ -580,7 +580,7 @@ def test_euroc_keyframes_mapped_by_colmap(shared_data, tmp_path, capsys):
 
 
 def test_options_that_are_left_alone_pass():
-    from colmap_inertial.reconstruction.drivers.project import _check_options
+    from colmap_inertial.run.commands.reconstruct_project import _check_options
 
     _check_options(ReconstructOptions(deblur="off", rolling_shutter="off", seed=4, deterministic=True))
     with pytest.raises(InertialError, match=r"--mapping\.first-octave, --deblur"):

@@ -16,24 +16,25 @@ from corner_scene import CALIBRATED, LENS, CornerScene
 from test_pipeline import contents
 
 from colmap_inertial.cli import main
+from colmap_inertial.colmap.context import RunContext
 from colmap_inertial.core.errors import InertialError, NotObservableError
 from colmap_inertial.core.options import MappingOptions, ReconstructOptions
+from colmap_inertial.core.progress import silent
 from colmap_inertial.imaging.psf import blur_field
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.exif import carry_metadata, read_exposures_s
 from colmap_inertial.io.frames import read_frames
 from colmap_inertial.io.imu import read_capture_imu
+from colmap_inertial.io.recording import Recording, prior_calibration
 from colmap_inertial.model import colmap_camera, read_model
-from colmap_inertial.pipeline.run.context import Recording, RunContext, prior_calibration
-from colmap_inertial.pipeline.run.progress import silent
-from colmap_inertial.pipeline.stages.deblur import DeblurStage
-from colmap_inertial.pipeline.stages.imaging_plan import read_plan, write_plan
-from colmap_inertial.reconstruction.drivers.capture import reconstruct
-from colmap_inertial.reconstruction.drivers.images_alone import deblur_capture
-from colmap_inertial.reconstruction.preparation import calibrate as first_look, plan as imaging
-from colmap_inertial.reconstruction.preparation.plan import Treatments, add_stated_exposures, plan_imaging
-from colmap_inertial.reconstruction.preparation.selection import part_of
-from colmap_inertial.reconstruction.preparation.translation import find_parallaxes
+from colmap_inertial.run.commands.images_alone import deblur_capture
+from colmap_inertial.run.commands.reconstruct import reconstruct
+from colmap_inertial.run.preparation import calibrate as first_look, plan as imaging
+from colmap_inertial.run.preparation.plan import Treatments, add_stated_exposures, plan_imaging
+from colmap_inertial.run.preparation.selection import part_of
+from colmap_inertial.run.preparation.translation import find_parallaxes
+from colmap_inertial.run.stages.deblur import DeblurStage
+from colmap_inertial.run.stages.imaging_plan import read_plan, write_plan
 from colmap_inertial.tools.simulate import MotionOptions, make_motion
 
 QUICK = ReconstructOptions(mapping=MappingOptions(max_num_features=700, first_octave=0), deterministic=True)

@@ -14,28 +14,29 @@ import pytest
 from cases import loop_over
 
 from colmap_inertial.cli.terminal import show_applied
-from colmap_inertial.colmap.sparse import check_pair_names, image_pairs
+from colmap_inertial.colmap.context import RunContext
+from colmap_inertial.colmap.features.extraction import check_pair_names, image_pairs
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError, OutputExistsError, TimingError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import MappingOptions, ReconstructOptions
+from colmap_inertial.core.progress import silent
 from colmap_inertial.core.types import CameraModel, Frame, FrameTiming
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.frames import read_frame_times
 from colmap_inertial.io.imu import read_imu
+from colmap_inertial.io.recording import Recording
 from colmap_inertial.model import read_model
 from colmap_inertial.model.project import Applied
-from colmap_inertial.pipeline.run.config import config_as_toml, read_config
-from colmap_inertial.pipeline.run.context import Recording, RunContext
-from colmap_inertial.pipeline.run.progress import silent
-from colmap_inertial.pipeline.run.runner import StepRunner, canonical
-from colmap_inertial.pipeline.run.session import Session
-from colmap_inertial.pipeline.run.workspace import Workspace
-from colmap_inertial.pipeline.stages.frame_folder import FramePaths, read_frame_records, write_frames
-from colmap_inertial.pipeline.stages.metric import MetricStage
-from colmap_inertial.reconstruction.drivers.models import Submodels, run_models
-from colmap_inertial.reconstruction.drivers.reporting import report_result
-from colmap_inertial.reconstruction.drivers.result import ReconstructResult
+from colmap_inertial.run.commands.models import Submodels, run_models
+from colmap_inertial.run.commands.reporting import report_result
+from colmap_inertial.run.commands.result import ReconstructResult
+from colmap_inertial.run.stages.frame_folder import FramePaths, read_frame_records, write_frames
+from colmap_inertial.run.stages.metric import MetricStage
+from colmap_inertial.run.steps.config import config_as_toml, read_config
+from colmap_inertial.run.steps.runner import StepRunner, canonical
+from colmap_inertial.run.steps.session import Session
+from colmap_inertial.run.steps.workspace import Workspace
 
 
 def test_a_stage_runs_once_and_again_when_anything_before_it_changes(tmp_path):

@@ -9,7 +9,7 @@ from pathlib import Path
 from batch_captures import TINY
 from test_pipeline import SCENE, copy_scene
 
-from colmap_inertial.pipeline.run.config import config_as_toml
+from colmap_inertial.run.steps.config import config_as_toml
 
 #: Takes it away, then runs the commands of a JSON list and prints their exit codes.
 ELSEWHERE = """

@@ -14,13 +14,13 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 from study_mistakes import DESK, stamps, toml, values, write_poses
 
 from colmap_inertial import ReconstructOptions, reconstruct
-from colmap_inertial.checks.diagnose import Diagnosis, Recorded, diagnose
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ScaleOptions
 from colmap_inertial.core.types import CameraTrajectory, FrameTiming, ImuRecording
-from colmap_inertial.reconstruction.drivers.diagnosis import collect, diagnose_source
-from colmap_inertial.reconstruction.drivers.sources import ScaleSource, scale_source
+from colmap_inertial.diagnose import Diagnosis, Recorded, diagnose
+from colmap_inertial.run.commands.diagnose import collect, diagnose_source
+from colmap_inertial.run.commands.scale import ScaleSource, scale_source
 
 
 class _Stopped(Exception):

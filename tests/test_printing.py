@@ -10,11 +10,11 @@ import pytest
 from cases import loop_over
 from report_runs import write_run
 
-from colmap_inertial.checks.report import write_report
 from colmap_inertial.cli import main
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.printing import PrintableFormatter, cell, open_console, printable, printable_values
 from colmap_inertial.io.files import check_names, require_utf8
+from colmap_inertial.report import write_report
 
 TITLE = "\x1b]0;gone\x07\x1b[2J"
 SHOWN = "\\x1b]0;gone\\x07\\x1b[2J"

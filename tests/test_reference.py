@@ -13,14 +13,14 @@ from cases import loop_over
 from test_cli import run
 from test_validate_lengths import validated
 
-from colmap_inertial.checks.validate.result import LengthCheck
 from colmap_inertial.cli.terminal import show_reference
+from colmap_inertial.colmap.chunks import Processes
 from colmap_inertial.core.errors import InertialError, NotObservableError, TargetNotFoundError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ReferenceOptions
-from colmap_inertial.pipeline.run.chunks import Processes
-from colmap_inertial.reconstruction.drivers import reference as rooms
-from colmap_inertial.reconstruction.drivers.reference import Reference, scale_project_by
+from colmap_inertial.run.commands import scale_by_reference as rooms
+from colmap_inertial.run.commands.scale_by_reference import Reference, scale_project_by
+from colmap_inertial.validate.result import LengthCheck
 
 
 @pytest.fixture

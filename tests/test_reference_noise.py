@@ -10,8 +10,8 @@ from test_validate_lengths import validated
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ReferenceOptions
-from colmap_inertial.reconstruction.drivers import reference
-from colmap_inertial.reconstruction.drivers.reference import _scale_by_distance, _scale_by_target
+from colmap_inertial.run.commands import scale_by_reference as reference
+from colmap_inertial.run.commands.scale_by_reference import _scale_by_distance, _scale_by_target
 
 BETWEEN = ReferenceOptions(
     scale_from="distance", target="aruco:DICT_4X4_50:0.1", between=("0", "1"), distance="2.0+-0.01"

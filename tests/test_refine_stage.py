@@ -25,23 +25,23 @@ from colmap_inertial.inertial.refine.values import ROTATION
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import read_record
+from colmap_inertial.io.recording import Recording
 from colmap_inertial.io.trajectories import read_tum
 from colmap_inertial.model import Model, transformed
 from colmap_inertial.model.layout import find_made_from, read_layout
-from colmap_inertial.pipeline.run.context import Recording
-from colmap_inertial.pipeline.run.runner import canonical
-from colmap_inertial.pipeline.stages import refine as refine_stage
-from colmap_inertial.pipeline.stages.defaults import default_model_stages
-from colmap_inertial.pipeline.stages.imaging_plan import GyroView
-from colmap_inertial.pipeline.stages.inputs import StageInputs
-from colmap_inertial.pipeline.stages.join import JoinStage
-from colmap_inertial.pipeline.stages.metric import MetricStage, gravity_in_model
-from colmap_inertial.pipeline.stages.readout import ReadoutStage
-from colmap_inertial.pipeline.stages.refine import RefineStage, axes_by
-from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage
-from colmap_inertial.reconstruction.drivers import frames
-from colmap_inertial.reconstruction.drivers.frames import stages_of_refined
-from colmap_inertial.reconstruction.drivers.sources import ScaleSource, scale_source
+from colmap_inertial.run.commands import frames
+from colmap_inertial.run.commands.frames import stages_of_refined
+from colmap_inertial.run.commands.scale import ScaleSource, scale_source
+from colmap_inertial.run.stages import refine as refine_stage
+from colmap_inertial.run.stages.defaults import default_model_stages
+from colmap_inertial.run.stages.imaging_plan import GyroView
+from colmap_inertial.run.stages.inputs import StageInputs
+from colmap_inertial.run.stages.join import JoinStage
+from colmap_inertial.run.stages.metric import MetricStage, gravity_in_model
+from colmap_inertial.run.stages.readout import ReadoutStage
+from colmap_inertial.run.stages.refine import RefineStage, axes_by
+from colmap_inertial.run.stages.rolling_shutter import RollingShutterStage
+from colmap_inertial.run.steps.runner import canonical
 from colmap_inertial.tools.simulate.tracks import TrackOptions
 
 UNKNOWN = calibration_prior()

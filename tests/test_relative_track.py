@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from test_pairing import circle, headings_of, sightings_along, way_along
 
-from colmap_inertial.colmap import loops, relative_track
-from colmap_inertial.colmap.loops import LoopSearch, candidates, key_frames
-from colmap_inertial.colmap.relative_track import (
+from colmap_inertial.colmap.loops import search as loops
+from colmap_inertial.colmap.loops.search import LoopSearch, candidates, key_frames
+from colmap_inertial.colmap.views import relative_track
+from colmap_inertial.colmap.views.relative_track import (
     DRIFT,
     LoopPose,
     Observations,
@@ -16,7 +17,7 @@ from colmap_inertial.colmap.relative_track import (
     estimate_relative_track,
     link_observations,
 )
-from colmap_inertial.colmap.two_views import TwoViews
+from colmap_inertial.colmap.views.two_views import TwoViews
 from colmap_inertial.core.geometry import so3_exp
 
 

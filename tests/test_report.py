@@ -18,17 +18,8 @@ import pytest
 from report_runs import HOSTILE, cloud, recorded, write_run
 from test_pipeline import DETERMINISTIC, SCENE, copy_scene
 
-from colmap_inertial.checks.report import figures, signals, write_report
-from colmap_inertial.checks.report.content import _describe_path
-from colmap_inertial.checks.report.figure_3d import _grid, scene_figure
-from colmap_inertial.checks.report.photogrammetry import scene_record
-from colmap_inertial.checks.report.series import SIZES, nice_length, rounded, strided, thinned
-from colmap_inertial.checks.report.signals import signal_record
-from colmap_inertial.checks.report.still import STYLE, draw_still
-from colmap_inertial.checks.report.still_3d import StillView, draw_scene_still
-from colmap_inertial.checks.report.still_axes import choose_axis, equalise
-from colmap_inertial.checks.words import outcome_of_model
 from colmap_inertial.cli import main
+from colmap_inertial.colmap.context import RunContext
 from colmap_inertial.core.errors import FormatError, InertialError, MappingError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import quat_exp, quat_rotate
@@ -45,16 +36,26 @@ from colmap_inertial.inertial.scale import estimate_scale
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import write_json
+from colmap_inertial.io.recording import Recording
 from colmap_inertial.model import trajectory_from_model
-from colmap_inertial.pipeline.run.context import Recording, RunContext
-from colmap_inertial.pipeline.run.runner import StepRunner
-from colmap_inertial.pipeline.run.session import Session
-from colmap_inertial.pipeline.run.workspace import Workspace
-from colmap_inertial.pipeline.stages.imaging_plan import GyroView
-from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage
-from colmap_inertial.reconstruction.drivers.capture import reconstruct
-from colmap_inertial.reconstruction.drivers.project import reconstruct_project
-from colmap_inertial.reconstruction.drivers.reporting import reporting_stops, write_recording
+from colmap_inertial.report import figures, signals, write_report
+from colmap_inertial.report.content import _describe_path
+from colmap_inertial.report.figure_3d import _grid, scene_figure
+from colmap_inertial.report.photogrammetry import scene_record
+from colmap_inertial.report.series import SIZES, nice_length, rounded, strided, thinned
+from colmap_inertial.report.signals import signal_record
+from colmap_inertial.report.still import STYLE, draw_still
+from colmap_inertial.report.still_3d import StillView, draw_scene_still
+from colmap_inertial.report.still_axes import choose_axis, equalise
+from colmap_inertial.report.words import outcome_of_model
+from colmap_inertial.run.commands.reconstruct import reconstruct
+from colmap_inertial.run.commands.reconstruct_project import reconstruct_project
+from colmap_inertial.run.commands.reporting import reporting_stops, write_recording
+from colmap_inertial.run.stages.imaging_plan import GyroView
+from colmap_inertial.run.stages.rolling_shutter import RollingShutterStage
+from colmap_inertial.run.steps.runner import StepRunner
+from colmap_inertial.run.steps.session import Session
+from colmap_inertial.run.steps.workspace import Workspace
 
 
 class Page(html.parser.HTMLParser):
@@ -1051,7 +1052,7 @@ def test_a_failing_report_of_a_stop_hides_no_reason(tmp_path, monkeypatch, repor
     with pytest.raises(MappingError, match="nothing matches") as stopped, reporting_stops(workspace, capture):
         raise MappingError(Fact.stated("nothing matches"))
     assert stopped.value.__notes__ == [f"what was found, and what to do: {tmp_path / 'report.html'}"]
-    monkeypatch.setattr("colmap_inertial.reconstruction.drivers.reporting.write_report", broken)
+    monkeypatch.setattr("colmap_inertial.run.commands.reporting.write_report", broken)
     with pytest.raises(MappingError, match="nothing matches"), reporting_stops(workspace, capture):
         raise MappingError(Fact.stated("nothing matches"))
     assert len(report_failures) == 1

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from report_runs import HOSTILE, write_run
 
-from colmap_inertial.checks.report import write_report
+from colmap_inertial.report import write_report
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 DRIVER = shutil.which("chromedriver")

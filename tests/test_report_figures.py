@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from colmap_inertial.checks.report import figures
-from colmap_inertial.checks.report.figure_3d import scene_figure
-from colmap_inertial.checks.report.still import draw_still
-from colmap_inertial.checks.report.still_3d import StillView, draw_scene_still
+from colmap_inertial.report import figures
+from colmap_inertial.report.figure_3d import scene_figure
+from colmap_inertial.report.still import draw_still
+from colmap_inertial.report.still_3d import StillView, draw_scene_still
 
 KEPT = Path(__file__).parent / "references" / "report_figures.json"
 T_S = [0.0, 0.5, 1.0, 1.5, 2.0, 2.5]

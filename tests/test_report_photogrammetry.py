@@ -9,9 +9,9 @@ import pytest
 from jsonschema import Draft202012Validator
 from report_runs import write_run
 
-from colmap_inertial.checks.report import write_report
-from colmap_inertial.checks.report.photogrammetry import photogrammetry_record
 from colmap_inertial.model.readout import intrinsics_sigma
+from colmap_inertial.report import write_report
+from colmap_inertial.report.photogrammetry import photogrammetry_record
 
 ROOT = Path(__file__).parents[1]
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])

@@ -14,22 +14,22 @@ from corner_scene import CALIBRATED, LENS, CornerScene
 from test_pipeline import contents
 from test_pipeline_imaging import QUICK, parts, planned
 
-from colmap_inertial.checks.report.content import _blur
 from colmap_inertial.cli import main
 from colmap_inertial.core import threads
 from colmap_inertial.core.errors import FormatError, MissingExtraError, NotObservableError
 from colmap_inertial.core.facts import Fact
+from colmap_inertial.core.progress import silent
 from colmap_inertial.imaging.restoration import shipped
 from colmap_inertial.io.frames import read_frames
-from colmap_inertial.pipeline.run.progress import silent
-from colmap_inertial.pipeline.run.runner import canonical
-from colmap_inertial.pipeline.stages import deblur as stages
-from colmap_inertial.pipeline.stages.deblur import DeblurStage
-from colmap_inertial.pipeline.stages.frame_folder import read_frame_records
-from colmap_inertial.pipeline.stages.imaging_plan import read_plan, write_plan
-from colmap_inertial.reconstruction.drivers.capture import reconstruct
-from colmap_inertial.reconstruction.drivers.images_alone import deblur_capture
-from colmap_inertial.reconstruction.preparation import plan as imaging
+from colmap_inertial.report.content import _blur
+from colmap_inertial.run.commands.images_alone import deblur_capture
+from colmap_inertial.run.commands.reconstruct import reconstruct
+from colmap_inertial.run.preparation import plan as imaging
+from colmap_inertial.run.stages import deblur as stages
+from colmap_inertial.run.stages.deblur import DeblurStage
+from colmap_inertial.run.stages.frame_folder import read_frame_records
+from colmap_inertial.run.stages.imaging_plan import read_plan, write_plan
+from colmap_inertial.run.steps.runner import canonical
 
 DEEP = replace(QUICK, deblur="deepgyro")
 

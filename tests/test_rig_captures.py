@@ -10,7 +10,7 @@ import pytest
 from box_video import FOCAL, HEIGHT, WIDTH, film, film_beside
 
 from colmap_inertial.cli import main
-from colmap_inertial.colmap.rigs import find_rig_poses, write_rig
+from colmap_inertial.colmap.matching.rigs import find_rig_poses, write_rig
 from colmap_inertial.core.errors import FormatError, InertialError, MappingError, TimingError
 from colmap_inertial.core.geometry import quat_exp, quat_multiply, so3_exp
 from colmap_inertial.core.options import MappingOptions, ReconstructOptions
@@ -20,7 +20,7 @@ from colmap_inertial.io.frame_sources import ImageFolder, Video
 from colmap_inertial.io.frames import picture_folders, read_frames
 from colmap_inertial.io.rig_frames import pair_rig_frames
 from colmap_inertial.model import read_model
-from colmap_inertial.reconstruction.drivers.capture import reconstruct
+from colmap_inertial.run.commands.reconstruct import reconstruct
 from colmap_inertial.tools.simulate import MotionOptions
 
 #: Second camera from the first, in metres.

@@ -23,7 +23,7 @@ from colmap_inertial.io.imu import read_imu
 from colmap_inertial.io.trajectories import read_tum
 from colmap_inertial.model import read_model, trajectory_from_model
 from colmap_inertial.model.rigs import frames_of_rigs, list_posed_frames, rig_sensors
-from colmap_inertial.reconstruction.drivers.project import reconstruct_project
+from colmap_inertial.run.commands.reconstruct_project import reconstruct_project
 from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, SfmOptions, simulate_recording
 
 #: Second camera against the first, in metres.

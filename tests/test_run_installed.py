@@ -7,9 +7,9 @@ import pytest
 
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
-from colmap_inertial.pipeline.run import session
-from colmap_inertial.reconstruction.drivers.capture import reconstruct
-from colmap_inertial.reconstruction.drivers.project import reconstruct_project
+from colmap_inertial.run.commands.reconstruct import reconstruct
+from colmap_inertial.run.commands.reconstruct_project import reconstruct_project
+from colmap_inertial.run.steps import session
 
 
 @pytest.fixture

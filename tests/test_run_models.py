@@ -10,8 +10,6 @@ import pytest
 from conftest import write_project
 from test_pipeline_parts import recording_of, session_in
 
-from colmap_inertial.checks.validate import Validation, parse_target
-from colmap_inertial.checks.words import describe_joined
 from colmap_inertial.cli import terminal
 from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.core.facts import Fact
@@ -36,19 +34,21 @@ from colmap_inertial.model import Model, colmap_camera, num_registered, read_mod
 from colmap_inertial.model.project import apply_to_project, undo_project
 from colmap_inertial.model.readout import Settled
 from colmap_inertial.model.similarities import ModelScale, plain_factor, read_similarity
-from colmap_inertial.pipeline.run.workspace import Workspace
-from colmap_inertial.pipeline.stages import readout
-from colmap_inertial.pipeline.stages.deblur import SMOOTHING, DeblurStage, smoothing_for
-from colmap_inertial.pipeline.stages.imaging_plan import GyroView, ImagingPlan
-from colmap_inertial.pipeline.stages.join import JoinStage
-from colmap_inertial.pipeline.stages.metric import MetricStage, calibration_of_rectified, gravity_in_model
-from colmap_inertial.pipeline.stages.readout import ReadoutStage
-from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage
-from colmap_inertial.reconstruction.drivers import models
-from colmap_inertial.reconstruction.drivers.models import Submodels, run_models, run_validation
-from colmap_inertial.reconstruction.drivers.project import _scales
-from colmap_inertial.reconstruction.drivers.result import ModelResult, ReconstructResult, result_as_json
+from colmap_inertial.report.words import describe_joined
+from colmap_inertial.run.commands import models
+from colmap_inertial.run.commands.models import Submodels, run_models, run_validation
+from colmap_inertial.run.commands.reconstruct_project import _scales
+from colmap_inertial.run.commands.result import ModelResult, ReconstructResult, result_as_json
+from colmap_inertial.run.stages import readout
+from colmap_inertial.run.stages.deblur import SMOOTHING, DeblurStage, smoothing_for
+from colmap_inertial.run.stages.imaging_plan import GyroView, ImagingPlan
+from colmap_inertial.run.stages.join import JoinStage
+from colmap_inertial.run.stages.metric import MetricStage, calibration_of_rectified, gravity_in_model
+from colmap_inertial.run.stages.readout import ReadoutStage
+from colmap_inertial.run.stages.rolling_shutter import RollingShutterStage
+from colmap_inertial.run.steps.workspace import Workspace
 from colmap_inertial.tools.simulate import ImuOptions, MotionOptions, RecordingOptions, SfmOptions, simulate_recording
+from colmap_inertial.validate import Validation, parse_target
 
 CAMERA = CameraModel(model="PINHOLE", width=640, height=480, params=(500.0, 500.0, 320.0, 240.0))
 

@@ -11,26 +11,26 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from colmap_inertial.colmap import feature_chunks
+from colmap_inertial.colmap.features import chunks as feature_chunks
+from colmap_inertial.colmap.workers import warn_without_gpu
 from colmap_inertial.core.errors import FormatError, InertialError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ReconstructOptions, ValidateOptions
 from colmap_inertial.core.types import FrameTiming
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.gate import GATE_LIMITS, RecordingVerdict
-from colmap_inertial.pipeline.run import runner
-from colmap_inertial.pipeline.run.replacing import _flat
-from colmap_inertial.pipeline.run.runner import fingerprint
-from colmap_inertial.pipeline.run.workers import warn_without_gpu
-from colmap_inertial.pipeline.stages.join import _beside, _spans
-from colmap_inertial.pipeline.stages.readout import ReadoutStage
-from colmap_inertial.pipeline.stages.refine import _alternate
-from colmap_inertial.reconstruction.drivers import frames as framing, project_output, reporting, validation
-from colmap_inertial.reconstruction.drivers.project_output import _restore_dense, _set_dense_aside
-from colmap_inertial.reconstruction.drivers.reference import _place
-from colmap_inertial.reconstruction.drivers.validation import ValidationOutputs, validate_source
-from colmap_inertial.reconstruction.preparation import judge as judging, sampling
-from colmap_inertial.reconstruction.preparation.plan import Treatments, plan_imaging
+from colmap_inertial.io.fingerprints import fingerprint
+from colmap_inertial.run.commands import frames as framing, project_output, reporting, validate as validation
+from colmap_inertial.run.commands.project_output import _restore_dense, _set_dense_aside
+from colmap_inertial.run.commands.scale_by_reference import _place
+from colmap_inertial.run.commands.validate import ValidationOutputs, validate_source
+from colmap_inertial.run.preparation import judge as judging, sampling
+from colmap_inertial.run.preparation.plan import Treatments, plan_imaging
+from colmap_inertial.run.stages.join import _beside, _spans
+from colmap_inertial.run.stages.readout import ReadoutStage
+from colmap_inertial.run.stages.refine import _alternate
+from colmap_inertial.run.steps import runner
+from colmap_inertial.run.steps.replacing import _flat
 from colmap_inertial.tools.batch import write_summary
 from colmap_inertial.tools.batch.task import CaptureStatus, _verdict
 

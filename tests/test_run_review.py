@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from colmap_inertial import AlreadyMetricError, Model, OutputExistsError, ScaleEstimate, Similarity, reconstruct
+from colmap_inertial.colmap.context import RunContext
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.model import downgraded, read_model
 from colmap_inertial.model.similarities import read_scales
-from colmap_inertial.pipeline.run.context import RunContext
-from colmap_inertial.pipeline.run.runner import StepRunner, canonical
-from colmap_inertial.pipeline.run.session import Session
-from colmap_inertial.pipeline.run.workspace import Workspace
+from colmap_inertial.run.steps.runner import StepRunner, canonical
+from colmap_inertial.run.steps.session import Session
+from colmap_inertial.run.steps.workspace import Workspace
 
 ESTIMATE = ScaleEstimate(
     metres_per_unit=2.0, sigma_log=0.01, ci95=(1.9, 2.1), verdict="trusted", method="joint",
@@ -101,7 +101,7 @@ def test_wrong_hooks_and_names_are_said_before_the_work(tmp_path):
 
 
 KEY = """
-from colmap_inertial.pipeline.run.runner import canonical
+from colmap_inertial.run.steps.runner import canonical
 def stage(frames):
     return [f for f in frames if f.name in {"a.jpg", "b.jpg", "c.jpg", "d.jpg", "e.jpg"}]
 print(canonical(stage))

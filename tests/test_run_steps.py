@@ -18,51 +18,57 @@ import pytest
 from test_pipeline import contents
 from test_pipeline_parts import frames_of, recording_of, session_in
 
-from colmap_inertial.checks.diagnose import Recorded, diagnose
 from colmap_inertial.cli import main
-from colmap_inertial.colmap import steps
-from colmap_inertial.colmap.mapping import MapRecord, map_images
-from colmap_inertial.colmap.sparse import (
+from colmap_inertial.colmap.context import RunContext
+from colmap_inertial.colmap.features.extraction import (
     KeypointRecords,
     MatchRecord,
     extract_features,
     image_pairs,
     write_gravity_priors,
 )
+from colmap_inertial.colmap.mapping.mapper import MapRecord, map_images
 from colmap_inertial.core.errors import FormatError, NotObservableError, OutputError, OutputExistsError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import MappingOptions, ProjectOptions, ReconstructOptions
+from colmap_inertial.core.progress import silent
 from colmap_inertial.core.threads import map_in_order
 from colmap_inertial.core.types import CALIBRATION_PARAMETERS, CameraModel, FrameTiming, ImuRecording, Treatment
+from colmap_inertial.diagnose import Recorded, diagnose
 from colmap_inertial.imaging.gate import RecordingVerdict
 from colmap_inertial.io.calibration import Declared, calibration_prior, write_calibration
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.capture_images import LongExposures, SubImages
 from colmap_inertial.io.files import write_json
+from colmap_inertial.io.fingerprints import fingerprint
 from colmap_inertial.io.frame_sources import ImageFolder
+from colmap_inertial.io.recording import Recording, prior_calibration
 from colmap_inertial.io.video_match import VideoMatch
 from colmap_inertial.model import TRANSFORM_FILE
 from colmap_inertial.model.similarities import ModelScale, plain_factor
-from colmap_inertial.pipeline.run.context import Recording, RunContext, prior_calibration
-from colmap_inertial.pipeline.run.progress import silent
-from colmap_inertial.pipeline.run.replacing import replace_result
-from colmap_inertial.pipeline.run.runner import StepRunner, fingerprint
-from colmap_inertial.pipeline.run.session import Session, open_session
-from colmap_inertial.pipeline.run.workspace import Workspace, refuse_links
-from colmap_inertial.pipeline.stages.defaults import default_keypoint_stages
-from colmap_inertial.pipeline.stages.exposures import ExposureStage
-from colmap_inertial.pipeline.stages.frame_folder import FramePaths, FrameRecord, write_frames, write_images
-from colmap_inertial.pipeline.stages.imaging_plan import GyroView
-from colmap_inertial.pipeline.stages.inputs import Fuser, StageInputs
-from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage
-from colmap_inertial.reconstruction.drivers import frames as framing, project as existing, project_output
-from colmap_inertial.reconstruction.drivers.frames import run_frames, run_images
-from colmap_inertial.reconstruction.drivers.paths import check_output
-from colmap_inertial.reconstruction.preparation import calibrate, plan as imaging, sampling
-from colmap_inertial.reconstruction.preparation.judge import Looked, judge_each_frame, judge_sky
-from colmap_inertial.reconstruction.preparation.plan import Treatments, plan_imaging, run_plan
-from colmap_inertial.reconstruction.preparation.preflight import stop_or_doubt
-from colmap_inertial.reconstruction.preparation.selection import part_of
+from colmap_inertial.run.commands import (
+    colmap_steps as steps,
+    frames as framing,
+    project_output,
+    reconstruct_project as existing,
+)
+from colmap_inertial.run.commands.frames import run_frames, run_images
+from colmap_inertial.run.commands.paths import check_output
+from colmap_inertial.run.preparation import calibrate, plan as imaging, sampling
+from colmap_inertial.run.preparation.judge import Looked, judge_each_frame, judge_sky
+from colmap_inertial.run.preparation.plan import Treatments, plan_imaging, run_plan
+from colmap_inertial.run.preparation.preflight import stop_or_doubt
+from colmap_inertial.run.preparation.selection import part_of
+from colmap_inertial.run.stages.defaults import default_keypoint_stages
+from colmap_inertial.run.stages.exposures import ExposureStage
+from colmap_inertial.run.stages.frame_folder import FramePaths, FrameRecord, write_frames, write_images
+from colmap_inertial.run.stages.imaging_plan import GyroView
+from colmap_inertial.run.stages.inputs import Fuser, StageInputs
+from colmap_inertial.run.stages.rolling_shutter import RollingShutterStage
+from colmap_inertial.run.steps.replacing import replace_result
+from colmap_inertial.run.steps.runner import StepRunner
+from colmap_inertial.run.steps.session import Session, open_session
+from colmap_inertial.run.steps.workspace import Workspace, refuse_links
 from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, simulate_recording
 
 NAMES = tuple(f"{i}.jpg" for i in range(6))

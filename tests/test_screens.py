@@ -12,8 +12,8 @@ from colmap_inertial.cli.captures import Reconstruct
 from colmap_inertial.cli.models import Apply, CalibrateImu, Export, Scale, Validate, View
 from colmap_inertial.core.types import CAL, Action
 from colmap_inertial.io.calibration import Declared, calibration_prior
-from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
-from colmap_inertial.reconstruction.drivers import result as results
+from colmap_inertial.run.commands import result as results
+from colmap_inertial.run.stages.frame_folder import FrameRecord
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from box_video import BoxVideo, film
 
+from colmap_inertial.colmap.context import RunContext
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply
 from colmap_inertial.core.gyro import GyroPath
@@ -23,15 +24,12 @@ from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.frames import read_frame_timing, read_frames
 from colmap_inertial.io.imu import read_capture_imu
+from colmap_inertial.io.recording import Recording
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.motion.flow import VisualRotation
-from colmap_inertial.pipeline.run.context import Recording, RunContext
-from colmap_inertial.pipeline.run.runner import StepRunner
-from colmap_inertial.pipeline.run.session import Session
-from colmap_inertial.pipeline.run.workspace import Workspace
-from colmap_inertial.reconstruction.drivers.capture import reconstruct
-from colmap_inertial.reconstruction.preparation import selection as choosing
-from colmap_inertial.reconstruction.preparation.selection import (
+from colmap_inertial.run.commands.reconstruct import reconstruct
+from colmap_inertial.run.preparation import selection as choosing
+from colmap_inertial.run.preparation.selection import (
     Selection,
     _Clocks,
     everything,
@@ -42,6 +40,9 @@ from colmap_inertial.reconstruction.preparation.selection import (
     use_all,
     write_selection,
 )
+from colmap_inertial.run.steps.runner import StepRunner
+from colmap_inertial.run.steps.session import Session
+from colmap_inertial.run.steps.workspace import Workspace
 from colmap_inertial.tools.simulate import MotionOptions
 from colmap_inertial.tools.simulate.capture import make_scene
 from colmap_inertial.tools.simulate.recipe import SceneRecipe
@@ -377,7 +378,7 @@ def test_folders_and_thinned_videos_are_used_as_they_are(turning, tmp_path):
 
 def test_a_quick_camera_s_frames_are_ranked_before_they_are_decoded():
     """At 240 frames a second, the least blurred of each thirtieth is looked at."""
-    from colmap_inertial.reconstruction.preparation.selection import _slots
+    from colmap_inertial.run.preparation.selection import _slots
 
     t_s = np.arange(480) / 240
     blur = np.random.default_rng(0).uniform(1, 9, 480)

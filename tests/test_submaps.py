@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 from test_closing import FRAMES, NAMES, make
 
-from colmap_inertial.colmap import mapping, submaps
-from colmap_inertial.colmap.loop_closure import LONGEST, LoopClosure, SubmapOverlap, merge_overlaps
+from colmap_inertial.colmap.chunks import Processes
+from colmap_inertial.colmap.context import RunContext
+from colmap_inertial.colmap.loops.closure import LONGEST, LoopClosure, SubmapOverlap, merge_overlaps
+from colmap_inertial.colmap.mapping import mapper as mapping, submaps
+from colmap_inertial.colmap.mapping.submaps import MappedRun, join_runs, merge_parts, place_parts, runs, split_capture
 from colmap_inertial.colmap.parts import write_part_database
-from colmap_inertial.colmap.submaps import MappedRun, join_runs, merge_parts, place_parts, runs, split_capture
 from colmap_inertial.core.geometry import so3_exp
 from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.model.submodels.graph import (
@@ -26,8 +28,6 @@ from colmap_inertial.model.submodels.graph import (
     minimised,
 )
 from colmap_inertial.model.submodels.matches import Submodel, constrain_by_points, find_common_features
-from colmap_inertial.pipeline.run.chunks import Processes
-from colmap_inertial.pipeline.run.context import RunContext
 
 #: Runs of the ring's images.
 PARTS = [(0, 18), (12, 30), (24, 42), (36, 48)]

@@ -8,12 +8,12 @@ from box_project import off_the_walls
 from sweep_scenes import camera, depth_of, picture_of, sights_of
 from test_pipeline_dense import vertices
 
-from colmap_inertial.colmap import sweep_stereo
-from colmap_inertial.colmap.depth_maps import MadeFrom, choose_maker, coverage, find_maps, fuse_maps, map_file
-from colmap_inertial.colmap.sweep_stereo import SweptWorkspace
+from colmap_inertial.colmap.context import RunContext
+from colmap_inertial.colmap.dense import sweep_stereo
+from colmap_inertial.colmap.dense.depth_maps import MadeFrom, choose_maker, coverage, find_maps, fuse_maps, map_file
+from colmap_inertial.colmap.dense.sweep_stereo import SweptWorkspace
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.model.artefacts import read_map, write_map
-from colmap_inertial.pipeline.run.context import RunContext
 
 VIEWS = [camera((x, -0.6 + z, 0.3 + z), (5 * z, -6 * x, 20 * x)) for x in (-0.5, -0.2, 0.2, 0.5) for z in (-0.15, 0.15)]
 #: One in a folder; the last one sees nothing that others see.

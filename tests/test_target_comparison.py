@@ -14,7 +14,7 @@ from colmap_inertial.core.errors import FormatError, NotObservableError, OutputE
 from colmap_inertial.inertial.core.target_comparison import TargetComparison, calibrate_by_targets
 from colmap_inertial.inertial.scale import estimate_scale
 from colmap_inertial.io.calibration import read_imu_calibration, write_imu_calibration
-from colmap_inertial.reconstruction.drivers.device_store import _read_comparison, calibrate_from_results, remember
+from colmap_inertial.run.commands.calibrate_imu import _read_comparison, calibrate_from_results, remember
 from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, simulate_recording
 
 by_targets = partial(calibrate_by_targets, gravity_m_s2=9.81)

@@ -11,12 +11,12 @@ from conftest import write_project
 from rich.console import Console
 from rich.progress import Progress as Bars
 
-from colmap_inertial.checks.diagnose import Diagnosis, Finding
 from colmap_inertial.cli import main
 from colmap_inertial.cli.screen import Screen, Stage
 from colmap_inertial.cli.terminal import show_scale
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import ScaleEstimate
+from colmap_inertial.diagnose import Diagnosis, Finding
 from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, simulate_recording
 
 GLIDES = Finding(

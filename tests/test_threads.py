@@ -21,8 +21,8 @@ from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.inertial.refine._panels import Layout, PanelFactor
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.model import Model, trajectory_from_model
-from colmap_inertial.pipeline.stages.metric import MetricStage, gravity_in_model, metric_trajectory, smooth_path
-from colmap_inertial.pipeline.stages.refine import RefineStage
+from colmap_inertial.run.stages.metric import MetricStage, gravity_in_model, metric_trajectory, smooth_path
+from colmap_inertial.run.stages.refine import RefineStage
 
 PLACES = ("scipy/linalg/_decomp_cholesky.py", "scipy/linalg/_basic.py", "core/arrow.py", "refine/_panels.py")
 SOLVES = ("cholesky_banded", "cho_solve_banded", "cho_factor", "cho_solve", "solve_triangular", "solve", "marginals")

@@ -11,9 +11,9 @@ import pytest
 from far_scene import FarScene
 from test_diagnose import imu_of, run
 
-from colmap_inertial.checks.diagnose import Recorded, diagnose
 from colmap_inertial.core.geometry import so3_exp, so3_log
 from colmap_inertial.core.types import CameraModel, Frame, FrameTiming
+from colmap_inertial.diagnose import Recorded, diagnose
 from colmap_inertial.imaging.gyro_camera import FrameShutter
 from colmap_inertial.motion.two_view_rotation import (
     _estimate_rotation,

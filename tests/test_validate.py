@@ -24,7 +24,10 @@ from validate_scenes import (
     write_images,
 )
 
-from colmap_inertial.checks.validate import (
+from colmap_inertial.core.errors import FormatError, NotObservableError, TargetNotFoundError
+from colmap_inertial.core.geometry import colmap_px_from_opencv
+from colmap_inertial.core.options import ValidateOptions
+from colmap_inertial.validate import (
     failures,
     parse_target,
     place as search_module,
@@ -32,11 +35,8 @@ from colmap_inertial.checks.validate import (
     validation_table,
     write_overlays,
 )
-from colmap_inertial.checks.validate.detect import Detection, detect
-from colmap_inertial.checks.validate.views import sight
-from colmap_inertial.core.errors import FormatError, NotObservableError, TargetNotFoundError
-from colmap_inertial.core.geometry import colmap_px_from_opencv
-from colmap_inertial.core.options import ValidateOptions
+from colmap_inertial.validate.detect import Detection, detect
+from colmap_inertial.validate.views import sight
 
 TARGET = parse_target("checkerboard:9x6:0.03")
 CAMERA = default_camera()

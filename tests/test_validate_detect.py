@@ -18,8 +18,8 @@ from validate_scenes import (
 )
 from versions import version_of
 
-from colmap_inertial.checks.validate import parse_target
-from colmap_inertial.checks.validate.detect import _fit_homography, _project, _refine, detect, find_any_checkerboard
+from colmap_inertial.validate import parse_target
+from colmap_inertial.validate.detect import _fit_homography, _project, _refine, detect, find_any_checkerboard
 
 CAMERA = default_camera()
 

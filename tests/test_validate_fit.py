@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from validate_scenes import default_camera, orbit
 
-from colmap_inertial.checks.validate import parse_target
-from colmap_inertial.checks.validate.detect import Detection
-from colmap_inertial.checks.validate.fit import (
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.geometry import so3_exp
+from colmap_inertial.validate import parse_target
+from colmap_inertial.validate.detect import Detection
+from colmap_inertial.validate.fit import (
     compute_restricted_likelihood,
     estimate_ratio,
     fit_scale,
@@ -16,12 +18,10 @@ from colmap_inertial.checks.validate.fit import (
     settle,
     weigh_equations,
 )
-from colmap_inertial.checks.validate.measure import fit_without_outliers
-from colmap_inertial.checks.validate.observations import Placement, linearise, triangulate
-from colmap_inertial.checks.validate.place import _place_by_pair, observe
-from colmap_inertial.checks.validate.views import View, sight
-from colmap_inertial.core.errors import NotObservableError
-from colmap_inertial.core.geometry import so3_exp
+from colmap_inertial.validate.measure import fit_without_outliers
+from colmap_inertial.validate.observations import Placement, linearise, triangulate
+from colmap_inertial.validate.place import _place_by_pair, observe
+from colmap_inertial.validate.views import View, sight
 
 TARGET = parse_target("checkerboard:9x6:0.03")
 CAMERA = default_camera()

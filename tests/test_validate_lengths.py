@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 from cases import loop_over
 
-from colmap_inertial.checks.validate import (
+from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError
+from colmap_inertial.core.geometry import quat_exp, quat_rotate
+from colmap_inertial.core.options import ValidateOptions
+from colmap_inertial.run.commands.validate import KnownLengths, validate_source
+from colmap_inertial.validate import (
     Corner,
     Distance,
     TargetSpecError,
@@ -15,12 +19,8 @@ from colmap_inertial.checks.validate import (
     add_other_target,
     parse_target,
 )
-from colmap_inertial.checks.validate.markers import add_check_points, distance_between
-from colmap_inertial.checks.validate.result import check_lengths, model_diagonal
-from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError
-from colmap_inertial.core.geometry import quat_exp, quat_rotate
-from colmap_inertial.core.options import ValidateOptions
-from colmap_inertial.reconstruction.drivers.validation import KnownLengths, validate_source
+from colmap_inertial.validate.markers import add_check_points, distance_between
+from colmap_inertial.validate.result import check_lengths, model_diagonal
 
 SIDE_M = 0.1
 PLACES = {0: (0, 0, 0), 1: (2, 0, 0), 2: (0, 3, 0.5), 3: (2, 3, 1), 7: (1, 1, 2)}

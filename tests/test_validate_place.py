@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from colmap_inertial.checks.validate import parse_target, place
-from colmap_inertial.checks.validate.views import Sighting, View
 from colmap_inertial.core.geometry import so3_exp
+from colmap_inertial.validate import parse_target, place
+from colmap_inertial.validate.views import Sighting, View
 
 TARGET = parse_target("checkerboard:5x4:0.05")
 

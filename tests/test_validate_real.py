@@ -10,8 +10,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from colmap_inertial.checks.validate import parse_target
-from colmap_inertial.checks.validate.detect import detect
+from colmap_inertial.validate import parse_target
+from colmap_inertial.validate.detect import detect
 
 SCRIPT = Path(__file__).parents[1] / "scripts" / "validate_aprilgrid.py"
 TARGET = parse_target("aprilgrid:6x6:0.088:0.3")

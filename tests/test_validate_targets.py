@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from cases import loop_over
 
-from colmap_inertial.checks.validate import TargetSpecError, parse_target
+from colmap_inertial.validate import TargetSpecError, parse_target
 
 
 def distance(target, a, b):

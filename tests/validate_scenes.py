@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pycolmap
 
-from colmap_inertial.checks.validate import Target
 from colmap_inertial.core.geometry import quat_from_matrix
+from colmap_inertial.validate import Target
 
 Texture = Callable[[np.ndarray], np.ndarray]
 

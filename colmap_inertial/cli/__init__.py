@@ -208,7 +208,7 @@ def _move_lists_last(args: Sequence[str]) -> list[str]:
 
 def _read_default(cls: type[Speaker], args: Sequence[str]) -> Speaker | None:
     """The command with its options from ``--config``, so that flags go before the file and the file before defaults."""
-    from colmap_inertial.pipeline.run.config import read_config
+    from colmap_inertial.run.steps.config import read_config
 
     given = [word.partition("=")[2] for word in args if word.startswith("--config=")]
     given += [value for word, value in itertools.pairwise(args) if word == "--config"]

@@ -67,15 +67,15 @@ class Reconstruct(DeviceCommand, ConfiguredCommand):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.pipeline.run.workers import using_workers
+        from colmap_inertial.colmap.workers import using_workers
 
         with using_workers(self.workers, scheduler=self.scheduler):
             return self._by_reference() if self.reference.scale_from != "imu" else self._by_imu()
 
     def _by_imu(self) -> int:
-        from colmap_inertial.checks.diagnose import Diagnosis
-        from colmap_inertial.reconstruction.drivers.capture import reconstruct
-        from colmap_inertial.reconstruction.drivers.project import is_project, reconstruct_project
+        from colmap_inertial.diagnose import Diagnosis
+        from colmap_inertial.run.commands.reconstruct import reconstruct
+        from colmap_inertial.run.commands.reconstruct_project import is_project, reconstruct_project
 
         self.check_json(self.capture, self.project.imu, self.project.frame_times)
         options = self.options
@@ -110,8 +110,8 @@ class Reconstruct(DeviceCommand, ConfiguredCommand):
 
     def _by_reference(self) -> int:
         self.check_json(self.capture, self.project.imu, self.project.frame_times)
-        from colmap_inertial.reconstruction.drivers.project import is_project
-        from colmap_inertial.reconstruction.drivers.reference import reconstruct_by, scale_project_by
+        from colmap_inertial.run.commands.reconstruct_project import is_project
+        from colmap_inertial.run.commands.scale_by_reference import reconstruct_by, scale_project_by
 
         with self.progress() as screen:
             if is_project(self.capture):
@@ -153,7 +153,7 @@ class Deblur(Reader):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.reconstruction.drivers.images_alone import deblur_capture
+        from colmap_inertial.run.commands.images_alone import deblur_capture
 
         self.check_json(self.capture)
         with self.progress() as progress:
@@ -180,7 +180,7 @@ class Fuser(Reader):
 
     def tell_fused(self, lines: Sequence[str], screen: Screen) -> None:
         """Say what became of the pictures."""
-        from colmap_inertial.pipeline.run.workspace import Workspace
+        from colmap_inertial.run.steps.workspace import Workspace
 
         result = Workspace(self.out).result
         self.tell(lambda: show_fused(lines, screen), result, {"out": self.out, "unchanged": screen.unchanged})
@@ -208,7 +208,7 @@ class FuseApertures(Fuser):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.reconstruction.drivers.images_alone import fuse_captured
+        from colmap_inertial.run.commands.images_alone import fuse_captured
 
         options = FuseAperturesOptions(fusion=self.fusion, refocus=self.refocus, lens_width=self.lens_width)
         self.check_json(self.capture)
@@ -242,7 +242,7 @@ class FuseExposures(Fuser):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.reconstruction.drivers.images_alone import fuse_exposures_captured
+        from colmap_inertial.run.commands.images_alone import fuse_exposures_captured
 
         options = ExposureOptions(fusion=self.fusion, device=self.device)
         self.check_json(self.capture)

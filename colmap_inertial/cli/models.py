@@ -35,7 +35,7 @@ from colmap_inertial.core.options import (
 
 if TYPE_CHECKING:
     from colmap_inertial.model.project import Applied
-    from colmap_inertial.reconstruction.drivers.sources import ScaleSource
+    from colmap_inertial.run.commands.scale import ScaleSource
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +54,7 @@ class SourceReader(Reader):
 
     def read_from(self, calibration: tuple[Path, ...] | None = None) -> ScaleSource:
         """Source of poses and IMU, with these calibrations or the given ones."""
-        from colmap_inertial.reconstruction.drivers.sources import ScaleSource
+        from colmap_inertial.run.commands.scale import ScaleSource
 
         files = self.calibration if calibration is None else calibration
         return ScaleSource(source=self.source, imu=self.imu, frame_times=self.frame_times, calibration=files)
@@ -84,7 +84,7 @@ class Scale(DeviceCommand, SourceReader):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.reconstruction.drivers.sources import scale_as_json, scale_source
+        from colmap_inertial.run.commands.scale import scale_as_json, scale_source
 
         calibration = self.add_remembered(self.calibration, self.imu or self.source)
         source = self.read_from(calibration)
@@ -215,8 +215,8 @@ class Align(SourceReader):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.reconstruction.drivers.device_store import remember
-        from colmap_inertial.reconstruction.drivers.sources import align_source
+        from colmap_inertial.run.commands.calibrate_imu import remember
+        from colmap_inertial.run.commands.scale import align_source
 
         self.check_json(self.source, self.imu, self.frame_times, self.out)
         calibration = align_source(self.read_from(), self.out)
@@ -260,7 +260,7 @@ class CalibrateImu(Reader):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.reconstruction.drivers.device_store import (
+        from colmap_inertial.run.commands.calibrate_imu import (
             calibrate_from_results,
             calibrate_source,
             remember,
@@ -307,7 +307,7 @@ class Diagnose(SourceReader):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.reconstruction.drivers.diagnosis import describe_table, diagnose_source
+        from colmap_inertial.run.commands.diagnose import describe_table, diagnose_source
 
         report = describe_table(self.read_from(), self.capture) if self.imu is None else None
         if report is not None and self.talks:
@@ -363,7 +363,7 @@ class Validate(Reader):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.reconstruction.drivers.validation import KnownLengths, ValidationOutputs, validate_source
+        from colmap_inertial.run.commands.validate import KnownLengths, ValidationOutputs, validate_source
 
         result = validate_source(
             self.model,

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress as Bars, TaskID
 
-    from colmap_inertial.checks.diagnose import Diagnosis
+    from colmap_inertial.diagnose import Diagnosis
 
 _STAGES = {
     "rendering": "Rendering",

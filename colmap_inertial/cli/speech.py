@@ -61,7 +61,7 @@ class Speaker:
     def check_json(self, *inputs: Path | None) -> None:
         """Refuse, before the work, a file for the JSON that is an input or not of ours."""
         if self.json_file is not None:
-            from colmap_inertial.reconstruction.drivers.paths import check_output
+            from colmap_inertial.run.commands.paths import check_output
 
             check_output(self.json_file, inputs)
 
@@ -141,7 +141,7 @@ class DeviceCommand(Speaker):
         """These calibrations, and those kept of the recording's device."""
         if not self.remembered:
             return calibration
-        from colmap_inertial.reconstruction.drivers.device_store import read_remembered
+        from colmap_inertial.run.commands.calibrate_imu import read_remembered
 
         kept = read_remembered(recording, calibration, device=self.device)
         if self.talks:

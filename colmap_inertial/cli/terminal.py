@@ -21,18 +21,18 @@ from colmap_inertial.core.printing import open_console, say
 if TYPE_CHECKING:
     from rich.text import Text
 
-    from colmap_inertial.checks.diagnose import Diagnosis
-    from colmap_inertial.checks.validate import Validation
     from colmap_inertial.core.types import CameraImuCalibration, ImuCalibration, ScaleEstimate
+    from colmap_inertial.diagnose import Diagnosis
     from colmap_inertial.inertial.static_calibration import RestCalibration
     from colmap_inertial.io.table_report import TableReport
     from colmap_inertial.model.project import Applied
-    from colmap_inertial.pipeline.run.workspace import Workspace
-    from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
-    from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan
-    from colmap_inertial.reconstruction.drivers.reference import Reference
-    from colmap_inertial.reconstruction.drivers.result import DeblurResult, ModelResult, ReconstructResult
+    from colmap_inertial.run.commands.result import DeblurResult, ModelResult, ReconstructResult
+    from colmap_inertial.run.commands.scale_by_reference import Reference
+    from colmap_inertial.run.stages.frame_folder import FrameRecord
+    from colmap_inertial.run.stages.imaging_plan import ImagingPlan
+    from colmap_inertial.run.steps.workspace import Workspace
     from colmap_inertial.tools.export.whole import Exported
+    from colmap_inertial.validate import Validation
 
 #: A label and what there is to say.
 Line = tuple[str, "str | Text"]
@@ -55,7 +55,7 @@ def _next_to_see(out: Path, report: Path | None) -> str:
 
 def next_command(result: ReconstructResult, source: Path) -> str:
     """The next command to type, by how a reconstruction ended."""
-    from colmap_inertial.checks.validate import Validation
+    from colmap_inertial.validate import Validation
 
     out, best = result.workspace.root, result.models[0]
     unfit = isinstance(best.validation, Validation) and not best.validation.within_tolerance
@@ -72,7 +72,7 @@ def scale_lines(estimate: ScaleEstimate) -> list[Line]:
     """The estimate as labelled lines, the first of them what a user wants to know."""
     from rich.text import Text
 
-    from colmap_inertial.checks.words import half_width_pct, length_in_words, scale_facts, sensor_facts
+    from colmap_inertial.report.words import half_width_pct, length_in_words, scale_facts, sensor_facts
 
     stopped = any(reason.code == "force-goes-on" for reason in estimate.reasons)
     metres = "no metres: " + ("stopped by what is wrong" if stopped else "the recording does not determine the scale")
@@ -162,7 +162,7 @@ def show_imu_calibration(calibration: RestCalibration, source: Path, out: Path, 
     """Print what the rests say of an IMU, with 95 % intervals."""
     from rich.text import Text
 
-    from colmap_inertial.checks.report.imu_calibration import calibration_facts, gain_effect
+    from colmap_inertial.report.imu_calibration import calibration_facts, gain_effect
 
     colour = {"good": "green", "weak": "yellow"}[calibration.verdict]
     lines: list[Line] = [
@@ -194,7 +194,7 @@ def show_diagnosis(diagnosis: Diagnosis, source: Path) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from colmap_inertial.checks.words import not_checked
+    from colmap_inertial.report.words import not_checked
 
     title = f"{source} (looked at: {', '.join(diagnosis.checked) or 'nothing'})"
     table = Table(title=Text(title), title_justify="left", show_lines=True)
@@ -246,14 +246,14 @@ _KINDS = {
 def show_validation(result: Validation) -> None:
     """Print a validation."""
 
-    from colmap_inertial.checks.validate import validation_table
+    from colmap_inertial.validate import validation_table
 
     open_console().print(validation_table(result))
 
 
 def imaging_lines(frames: Sequence[FrameRecord], plan: ImagingPlan, rectified: Collection[str]) -> list[Line]:
     """Treatment of the frames, as labelled lines."""
-    from colmap_inertial.reconstruction.drivers.result import shutter_note
+    from colmap_inertial.run.commands.result import shutter_note
 
     counts = {"deblurred": sum(f.sharpened for f in frames), "dropped": sum(not f.used for f in frames)}
     done = ", ".join(f"{count} {word}" for word, count in counts.items() if count)
@@ -273,7 +273,7 @@ def show_nothing_to_do(workspace: Workspace) -> None:
 
 def show_reference(reference: Reference) -> None:
     """Print where a project's metres come from, and how good they are."""
-    from colmap_inertial.checks.words import half_width_pct, length_in_words, scale_facts
+    from colmap_inertial.report.words import half_width_pct, length_in_words, scale_facts
 
     # a small target says how long things are where it lies, and no more
     lengths = None if reference.validation is None else reference.validation.lengths
@@ -335,7 +335,7 @@ def show_result(result: ReconstructResult, source: Path) -> None:
 
 def _model_lines(model: ModelResult, result: ReconstructResult) -> Iterator[Line]:
     """Summary of one model, as labelled lines."""
-    from colmap_inertial.checks.words import (
+    from colmap_inertial.report.words import (
         describe_joined,
         describe_mapping,
         model_facts,
@@ -343,7 +343,7 @@ def _model_lines(model: ModelResult, result: ReconstructResult) -> Iterator[Line
         place_facts,
         target_facts,
     )
-    from colmap_inertial.reconstruction.drivers.result import measurement_as_json
+    from colmap_inertial.run.commands.result import measurement_as_json
 
     frames, dense = result.frames, model.dense
     mapping = None if result.mapping is None else asdict(result.mapping)

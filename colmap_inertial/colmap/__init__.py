@@ -1,1 +1,1 @@
-"""COLMAP's own steps: features, matches, mapping, dense."""
+"""COLMAP's work: features, matching, mapping, dense reconstruction."""

@@ -15,13 +15,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from colmap_inertial.colmap.executable import ColmapExecutable
 from colmap_inertial.core.errors import MappingError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import MappingOptions
+from colmap_inertial.core.progress import Progress
+from colmap_inertial.io.disk import require_room
 from colmap_inertial.model.soundness import check_binary_model
-from colmap_inertial.pipeline.run.executable import ColmapExecutable
-from colmap_inertial.pipeline.run.progress import Progress
-from colmap_inertial.pipeline.run.workspace import require_room
 
 if TYPE_CHECKING:
     import pycolmap

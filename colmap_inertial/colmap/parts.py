@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from colmap_inertial.colmap.chunks import Chunk, Executor, do_chunks
 from colmap_inertial.model.soundness import check_binary_model
-from colmap_inertial.pipeline.run.chunks import Chunk, Executor, do_chunks
 
 if TYPE_CHECKING:
     import pycolmap
@@ -53,7 +53,7 @@ class MapPart:
     options: dict[str, Any]
 
     def __call__(self, folder: Path, images: Path, made: Path, told: Callable[[], None]) -> None:
-        """As of :class:`~colmap_inertial.pipeline.run.chunks.Work`."""
+        """As of :class:`~colmap_inertial.colmap.chunks.Work`."""
         import pycolmap
 
         options = pycolmap.IncrementalPipelineOptions()
@@ -64,7 +64,7 @@ class MapPart:
         )
 
     def check(self, made: Path) -> None:
-        """As of :class:`~colmap_inertial.pipeline.run.chunks.Work`."""
+        """As of :class:`~colmap_inertial.colmap.chunks.Work`."""
         for path in made.iterdir():
             check_binary_model(path)
 

@@ -17,7 +17,7 @@ import secrets
 import stat
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -501,3 +501,8 @@ def name_fault(name: str) -> Fact | None:
         return Fact("name-unprintable")
     longest = max(len(part.encode()) for part in parts)
     return Fact("name-too-long", longest=_LONGEST) if longest > _LONGEST else None
+
+
+def a_record_of_ours(path: Path) -> AbstractContextManager[None]:
+    """While a record of an earlier run is taken apart: what does not fit means that it was changed since."""
+    return reading(path, Fact("changed-record"))

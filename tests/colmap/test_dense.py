@@ -4,8 +4,8 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from colmap_inertial.colmap import dense
 from colmap_inertial.core.geometry import matrix_from_quat, quat_exp
+from colmap_inertial.run.commands import dense_steps as dense
 
 
 def seen_from(away, focal_px):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from colmap_inertial.colmap.loops import key_frames
+from colmap_inertial.colmap.loops.search import key_frames
 
 
 def test_key_frames_begin_with_the_first_and_are_a_second_apart():

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from colmap_inertial.colmap import rigs
+from colmap_inertial.colmap.matching import rigs
 
 
 def test_poses_of_a_rig_are_known_where_each_is_declared():

@@ -4,7 +4,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from colmap_inertial.colmap import tsdf
+from colmap_inertial.colmap.dense import tsdf
 
 
 def test_a_quarter_of_the_known_depths_is_near():

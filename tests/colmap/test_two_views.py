@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from colmap_inertial.colmap.two_views import match_quickly
+from colmap_inertial.colmap.views.two_views import match_quickly
 
 
 def test_single_descriptors_are_no_matches():

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from colmap_inertial.colmap.loops import find_returns
-from colmap_inertial.colmap.pairing import match_capture
-from colmap_inertial.colmap.sparse import MatchRecord, image_pairs, matches_every_pair
-from colmap_inertial.colmap.two_views import Covisibility
+from colmap_inertial.colmap.context import RunContext
+from colmap_inertial.colmap.features.extraction import MatchRecord, image_pairs, matches_every_pair
+from colmap_inertial.colmap.loops.search import find_returns
+from colmap_inertial.colmap.matching.pairing import match_capture
+from colmap_inertial.colmap.views.two_views import Covisibility
 from colmap_inertial.core.options import MappingOptions
-from colmap_inertial.pipeline.run.context import RunContext
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
 FRAMES = 96

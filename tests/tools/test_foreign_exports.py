@@ -17,7 +17,7 @@ from foreign_models import HEIGHT, WIDTH, build, ply_points, save, write_picture
 from colmap_inertial.core.errors import FormatError, OutputExistsError
 from colmap_inertial.core.types import CameraModel
 from colmap_inertial.io.images import read_image
-from colmap_inertial.pipeline.run.workspace import Workspace
+from colmap_inertial.run.steps.workspace import Workspace
 from colmap_inertial.tools.export.transforms import Exposure, View, view_matrices
 from colmap_inertial.tools.export.undistort import Undistortion
 from colmap_inertial.tools.export.whole import export_model

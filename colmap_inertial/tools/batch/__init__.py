@@ -26,8 +26,8 @@ from colmap_inertial.core.options import BatchOptions, ReconstructOptions, Stage
 from colmap_inertial.core.printing import cell
 from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.io.files import StrPath, locked, remove_temporaries, write_json, write_text
-from colmap_inertial.pipeline.run.config import config_as_toml
-from colmap_inertial.pipeline.run.workspace import refuse_links
+from colmap_inertial.run.steps.config import config_as_toml
+from colmap_inertial.run.steps.workspace import refuse_links
 from colmap_inertial.tools.batch.manifest import BatchCapture, check_unique, read_manifest
 from colmap_inertial.tools.batch.pools import Pending, dask_pool, local_pool, shares_of_this_machine
 from colmap_inertial.tools.batch.task import (

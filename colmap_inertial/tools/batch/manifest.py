@@ -14,7 +14,7 @@ from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, Sta
 from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.io.files import StrPath, check_names, reader
 from colmap_inertial.io.toml_section import Section, read_toml
-from colmap_inertial.pipeline.run.config import override_options, read_values
+from colmap_inertial.run.steps.config import override_options, read_values
 
 #: What the batch itself writes into its output folder.
 _RESERVED = ("status", "summary.csv", "summary.json")

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+from colmap_inertial.colmap.workers import connect, warn_without_gpu
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.threads import usable_cores
-from colmap_inertial.pipeline.run.workers import connect, warn_without_gpu
 from colmap_inertial.tools.batch.task import CaptureStatus, CaptureTask, run_capture
 
 
@@ -113,7 +113,7 @@ def local_pool(shares: list[list[int]]) -> Iterator[Submit]:
 def dask_pool(address: str) -> Iterator[Submit]:
     """The workers of a Dask cluster. A capture whose worker is lost goes to another one.
 
-    Errors are those of :func:`~colmap_inertial.pipeline.run.workers.connect`.
+    Errors are those of :func:`~colmap_inertial.colmap.workers.connect`.
     """
     client = connect(address, Fact("captures-need-dask"))
     submitted: list[Any] = []

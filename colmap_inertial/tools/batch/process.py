@@ -14,17 +14,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from colmap_inertial.checks.diagnose import Diagnosis
 from colmap_inertial.core.errors import InertialError, OutputExistsError, fact_of
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ProjectOptions, StageNames
+from colmap_inertial.core.progress import Progress
+from colmap_inertial.diagnose import Diagnosis
+from colmap_inertial.hooks import load_stages
 from colmap_inertial.io.files import locked, reading_within, write_text
-from colmap_inertial.pipeline.run.config import config_as_toml, read_config
-from colmap_inertial.pipeline.run.progress import Progress
-from colmap_inertial.pipeline.run.workspace import Workspace
-from colmap_inertial.pipeline.stages.protocols import load_stages
-from colmap_inertial.reconstruction.drivers.capture import reconstruct
-from colmap_inertial.reconstruction.drivers.project import is_project, reconstruct_project
+from colmap_inertial.run.commands.reconstruct import reconstruct
+from colmap_inertial.run.commands.reconstruct_project import is_project, reconstruct_project
+from colmap_inertial.run.steps.config import config_as_toml, read_config
+from colmap_inertial.run.steps.workspace import Workspace
 from colmap_inertial.tools.batch.task import (
     CaptureTask,
     Job,

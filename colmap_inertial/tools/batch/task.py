@@ -25,9 +25,9 @@ from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, StageNames
 from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.io.files import read_json, write_json
-from colmap_inertial.pipeline.run.config import read_config
-from colmap_inertial.pipeline.run.runner import find_loss
-from colmap_inertial.pipeline.run.workspace import Workspace
+from colmap_inertial.run.steps.config import read_config
+from colmap_inertial.run.steps.runner import find_loss
+from colmap_inertial.run.steps.workspace import Workspace
 
 State = Literal["waiting", "running", "done", "failed", "interrupted"]
 

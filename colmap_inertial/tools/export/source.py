@@ -17,17 +17,17 @@ from colmap_inertial.core.options import ExportImages
 from colmap_inertial.core.types import DOWN_IN_WORLD, Action, CameraMotion, CameraTrajectory
 from colmap_inertial.inertial.georeference import Georeference
 from colmap_inertial.io.capture import Capture
-from colmap_inertial.io.files import read_json, read_record
+from colmap_inertial.io.files import a_record_of_ours, read_json, read_record
 from colmap_inertial.io.frames import read_frame_timing
 from colmap_inertial.io.picture_names import picture_in
 from colmap_inertial.io.positions import positions_in_pictures
 from colmap_inertial.model import read_model, transformed
 from colmap_inertial.model.nerf import NEVER_SCALED, NO_SCALE, NO_UP
 from colmap_inertial.model.places import Place, translation
-from colmap_inertial.pipeline.run.runner import explaining_losses, find_change
-from colmap_inertial.pipeline.run.workspace import Workspace, a_record_of_ours, places_of
-from colmap_inertial.pipeline.stages.metric import motion_file
-from colmap_inertial.reconstruction.preparation.geolocation import georeference_path, positions_of, read_georeference
+from colmap_inertial.run.preparation.geolocation import georeference_path, positions_of, read_georeference
+from colmap_inertial.run.stages.metric import motion_file
+from colmap_inertial.run.steps.runner import explaining_losses, find_change
+from colmap_inertial.run.steps.workspace import Workspace, places_of
 from colmap_inertial.tools.export.formats import sparse_points
 from colmap_inertial.tools.export.transforms import View
 from colmap_inertial.tools.export.undistort import Undistortion, list_needed_cameras

@@ -15,6 +15,7 @@ from colmap_inertial.core.arrays import AnyArray, UInt8Array
 from colmap_inertial.core.errors import FormatError, OutputError
 from colmap_inertial.core.facts import Fact, as_fact, with_sentences
 from colmap_inertial.core.options import ExportImages, ExportProgram
+from colmap_inertial.core.progress import Progress, silent
 from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.threads import frames_at_once, map_in_order
 from colmap_inertial.inertial.georeference import Georeference
@@ -24,9 +25,8 @@ from colmap_inertial.io.frames import read_frames
 from colmap_inertial.io.images import read_alpha, read_image
 from colmap_inertial.model.copying import new_folder
 from colmap_inertial.model.nerf import EXPORT_FORMAT, NOT_METRES
-from colmap_inertial.pipeline.run.progress import Progress, silent
-from colmap_inertial.pipeline.stages.frame_folder import encode_image
-from colmap_inertial.reconstruction.preparation.geolocation import cameras_as_json
+from colmap_inertial.run.preparation.geolocation import cameras_as_json
+from colmap_inertial.run.stages.frame_folder import encode_image
 from colmap_inertial.tools.export.source import ExportContent, Picture, find_georeference, read_source
 from colmap_inertial.tools.export.targets import TARGETS, TRAINERS, write_metadata
 from colmap_inertial.tools.export.undistort import Undistortion

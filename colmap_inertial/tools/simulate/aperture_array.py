@@ -16,7 +16,7 @@ from colmap_inertial.core.types import SpectralRole
 from colmap_inertial.imaging.transfer import decode_table, srgb_from_linear
 from colmap_inertial.io.files import write_text
 from colmap_inertial.io.images import read_image
-from colmap_inertial.pipeline.stages.frame_folder import encode_image
+from colmap_inertial.run.stages.frame_folder import encode_image
 from colmap_inertial.tools.simulate.capture import write_capture
 from colmap_inertial.tools.simulate.recipe import SceneRecipe
 from colmap_inertial.tools.simulate.render import ShutterCamera

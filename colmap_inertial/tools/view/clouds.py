@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.checks.report.series import strided
 from colmap_inertial.core.arrays import Array, Float32Array, UInt8Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.files import reader
 from colmap_inertial.io.ply import Element, read_ply_header
+from colmap_inertial.report.series import strided
 
 if TYPE_CHECKING:
     import pycolmap

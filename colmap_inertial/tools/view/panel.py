@@ -8,8 +8,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from colmap_inertial.checks.report.series import strided
-from colmap_inertial.checks.words import place_against_tolerance
+from colmap_inertial.report.series import strided
+from colmap_inertial.report.words import place_against_tolerance
 from colmap_inertial.tools.view.measure import Measured, length_text
 from colmap_inertial.tools.view.scene import Scene
 from colmap_inertial.tools.view.sources import KnownDistance, TargetFacts

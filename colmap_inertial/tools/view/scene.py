@@ -16,8 +16,8 @@ from colmap_inertial.io.picture_names import picture_in
 from colmap_inertial.io.trajectories import read_tum
 from colmap_inertial.model import read_model
 from colmap_inertial.model.own_place import OwnPlace
-from colmap_inertial.pipeline.run.runner import explaining_losses
-from colmap_inertial.pipeline.run.workspace import Workspace
+from colmap_inertial.run.steps.runner import explaining_losses
+from colmap_inertial.run.steps.workspace import Workspace
 from colmap_inertial.tools.view.clouds import Cloud, Mesh, centre_and_reach, dense_cloud, read_mesh, sparse_cloud
 from colmap_inertial.tools.view.measure import round_length
 from colmap_inertial.tools.view.sources import KnownDistance, ScaleFacts, TargetFacts, ViewSource, find_source

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from colmap_inertial.checks.report.series import strided
 from colmap_inertial.core.arrays import Array, UInt8Array
 from colmap_inertial.core.errors import MissingExtraError, OutputError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import quat_rotate
+from colmap_inertial.report.series import strided
 from colmap_inertial.tools.view import panel
 from colmap_inertial.tools.view.drawing import RED, Drawing
 from colmap_inertial.tools.view.guard import Guard, guarding

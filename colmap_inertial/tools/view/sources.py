@@ -15,10 +15,10 @@ from colmap_inertial.core.facts import Fact, read_facts
 from colmap_inertial.core.geometry import quat_rotate
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import LengthUnit
-from colmap_inertial.io.files import path_in, read_json, reader
+from colmap_inertial.io.files import a_record_of_ours, path_in, read_json, reader
 from colmap_inertial.model import TRANSFORM_FILE, find_models, is_metric, model_format
 from colmap_inertial.model.similarities import similarity_from_json
-from colmap_inertial.pipeline.run.workspace import Workspace, a_record_of_ours, places_of, refuse_links
+from colmap_inertial.run.steps.workspace import Workspace, places_of, refuse_links
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -1,0 +1,1 @@
+"""Depth maps, their fusion, and a mesh."""

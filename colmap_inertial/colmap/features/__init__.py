@@ -1,0 +1,1 @@
+"""Features of images, with their matches: found, or given in a database."""

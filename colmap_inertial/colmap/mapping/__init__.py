@@ -1,0 +1,1 @@
+"""Models of what was matched, at once or in parts."""

@@ -1,0 +1,1 @@
+"""Orientations, tracks and two-view rotations of images before there is a model."""

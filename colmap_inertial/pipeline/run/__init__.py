@@ -1,1 +1,0 @@
-"""A run: its folder, its steps and their resumption, options as TOML, progress."""

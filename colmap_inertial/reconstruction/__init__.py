@@ -1,1 +1,0 @@
-"""Reconstruction, from a recording to a result."""

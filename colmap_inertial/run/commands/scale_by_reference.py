@@ -1,0 +1,435 @@
+"""Scale by a reference, such as a target or a distance: of an existing model, or of pictures without an IMU."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from colmap_inertial.colmap.context import RunContext
+from colmap_inertial.colmap.features.extraction import (
+    check_pair_names,
+    extract_features,
+    image_pairs,
+    mapping_device,
+    match_pairs,
+    require_features,
+)
+from colmap_inertial.colmap.mapping.mapper import map_images
+from colmap_inertial.colmap.settings import read_settings
+from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError, OutputExistsError, fact_of
+from colmap_inertial.core.facts import Fact, with_sentences
+from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, ReferenceOptions, ValidateOptions
+from colmap_inertial.core.progress import Progress, counted, silent
+from colmap_inertial.core.quantiles import Z95
+from colmap_inertial.io.calibration import calibration_prior
+from colmap_inertial.io.capture import Capture, load_capture
+from colmap_inertial.io.files import StrPath, a_record_of_ours, path_in, read_json, write_json
+from colmap_inertial.io.fingerprints import fingerprint
+from colmap_inertial.io.frame_sources import ImageFolder, Video, image_names
+from colmap_inertial.io.frames import read_frames
+from colmap_inertial.io.imu import is_capture
+from colmap_inertial.io.mp4 import is_mp4
+from colmap_inertial.model import find_models, read_model
+from colmap_inertial.model.copying import copy_file, new_folder
+from colmap_inertial.model.project import apply_to_project
+from colmap_inertial.run.commands.paths import only_model
+from colmap_inertial.run.commands.validate import scaling
+from colmap_inertial.run.stages.frame_folder import encode_image, require_frames
+from colmap_inertial.run.steps.session import keep_colmap_quiet
+from colmap_inertial.run.steps.workspace import refuse_links, require_apart
+from colmap_inertial.validate import Validation, parse_target, validate_model
+from colmap_inertial.validate.markers import marker_centres
+
+#: What the folder keeps beside the project: where its metres come from.
+REFERENCE_FILE = "scale.json"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Reference:
+    """A scale that no IMU gave.
+
+    Attributes
+    ----------
+    out
+        The project in metres.
+    scale_from
+        ``"target"`` or ``"distance"``.
+    metres_per_unit, ci95
+        The scale and its 95 % interval.
+    made_of
+        What it was measured by, in words.
+    notes
+        What the user should know.
+    validation
+        The target, where one was measured.
+    """
+
+    out: Path
+    scale_from: str
+    metres_per_unit: float
+    ci95: tuple[float, float]
+    made_of: str
+    notes: tuple[Fact, ...]
+    validation: Validation | None = None
+
+    def as_json(self) -> dict[str, object]:
+        """The content of ``scale.json``."""
+        kept = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in ("validation", "out")}
+        return {**with_sentences(kept), "validation": self.validation and self.validation.as_json()}
+
+
+def scale_project_by(
+    project: StrPath,
+    out: StrPath,
+    reference: ReferenceOptions,
+    source: ProjectOptions | None = None,
+    *,
+    progress: Progress = silent,
+) -> Reference:
+    """Write a whole COLMAP project in metres, by what is known of its size.
+
+    Parameters
+    ----------
+    project
+        A folder with one COLMAP model; it is only read.
+    out
+        A folder that does not exist; it appears whole or not at all.
+    reference
+        What is known.
+    source
+        Where the project's pictures are, and how files are taken over.
+    progress
+        Called with ``"validation"`` and ``"apply"``.
+
+    Raises
+    ------
+    InertialError
+        For what is not given, cannot be read or cannot be found; see also :func:`validate_model` and
+        :func:`apply_to_project`.
+    """
+    project, out, source = Path(project), Path(out), source or ProjectOptions()
+    model = only_model(project / "sparse" if (project / "sparse").is_dir() else project)
+    validation = None
+    if reference.target is not None:
+        images = project / "images" if source.images is None else source.images
+        if not images.is_dir():
+            raise FormatError(images, Fact("no-folder-of-pictures"))
+        validation = validate_model(
+            model,
+            images,
+            parse_target(reference.target),
+            ValidateOptions(unscaled=True),
+            progress=lambda done, total: progress("validation", done, total),
+        )
+        if validation.doubts and reference.scale_from == "target":
+            raise NotObservableError("scale", Fact("found-together", found=validation.doubts))
+    if reference.scale_from == "distance":
+        scale, sigma_log, made_of = _scale_by_distance(reference, validation)
+    else:
+        scale, sigma_log, made_of = _scale_by_target(validation)
+    half = Z95 * sigma_log
+    notes = [Fact("up-unknown-without-imu")]
+    if validation is not None:
+        notes += [] if validation.lengths is None else [Fact("target-proves", proof=validation.lengths.proves)]
+        if validation.check_error_pct is not None:
+            notes.append(Fact("check-corners-off", error=validation.check_error_pct / 100))
+        notes += (*validation.doubts, *validation.reasons)
+    by_reference = Reference(
+        out=out,
+        scale_from=reference.scale_from,
+        metres_per_unit=scale,
+        ci95=(scale * float(np.exp(-half)), scale * float(np.exp(half))),
+        made_of=made_of,
+        notes=tuple(notes),
+        validation=validation,
+    )
+    apply_to_project(
+        project,
+        out,
+        scaling(scale, sigma_log, made_of),
+        link=source.link,
+        keep=source.keep,
+        follow_links=source.follow_links,
+        progress=lambda done, total: progress("apply", done, total),
+    )
+    write_json(out / REFERENCE_FILE, by_reference.as_json())
+    return by_reference
+
+
+def check_reference(reference: ReferenceOptions) -> None:
+    """Refuse, before any work, what is not given or cannot be.
+
+    Raises
+    ------
+    InertialError
+        With all that is missing.
+    """
+    if reference.scale_from == "target" and reference.target is None:
+        raise InertialError(Fact("target-not-given"))
+    if reference.scale_from == "distance":
+        if reference.between is None or reference.distance is None:
+            raise InertialError(Fact("distance-not-given"))
+        _length(reference.distance)
+        if reference.target is None and not all("," in end for end in reference.between):
+            raise InertialError(Fact("markers-not-given"))
+    if reference.target is not None:
+        parse_target(reference.target)
+
+
+def _scale_by_target(validation: Validation | None) -> tuple[float, float, str]:
+    if validation is None:
+        raise InertialError(Fact("target-not-given"))
+    # by half of its corners, so that the others can tell how right that is
+    control = validation.control
+    scale = validation.metres_per_unit if control is None else control.metres_per_unit
+    low, high = validation.metres_per_unit_ci95 if control is None else control.ci95
+    made_of = f"target {validation.target.spec} in {validation.views_used} images"
+    return scale, float(np.log(high / low)) / (2 * Z95), made_of
+
+
+def _scale_by_distance(reference: ReferenceOptions, validation: Validation | None) -> tuple[float, float, str]:
+    between, distance = reference.between, reference.distance
+    if between is None or distance is None:
+        raise InertialError(Fact("distance-not-given"))
+    metres, sigma_m = _length(distance)
+    places, noise = zip(*(_place(text, validation) for text in between), strict=True)
+    measured = float(np.linalg.norm(places[0] - places[1]))
+    if not measured > 0:
+        raise NotObservableError("scale", Fact("one-place", first=between[0], second=between[1]))
+    sigma_log = float(np.hypot(sigma_m / metres, np.hypot(*noise) / measured))
+    return metres / measured, sigma_log, f"distance of {distance} m between {between[0]} and {between[1]}"
+
+
+def _length(text: str) -> tuple[float, float]:
+    try:
+        metres, sigma_m = (float(part) for part in text.split("+-"))
+    except ValueError:
+        metres = sigma_m = float("nan")
+    if not (0 < sigma_m < metres < float("inf")):
+        raise InertialError(Fact("distance-unreadable", text=text))
+    return metres, sigma_m
+
+
+def _place(text: str, validation: Validation | None) -> tuple[Array, float]:
+    """(3,) a marker's centre or a point, and its standard deviation; model units."""
+    parts = text.split(",")
+    if len(parts) == 3:
+        try:
+            place = np.array([float(part) for part in parts])
+        except ValueError:
+            place = np.full(3, np.nan)
+        if not np.isfinite(place).all():
+            raise InertialError(Fact("point-unreadable", text=text))
+        return place, 0.0
+    if not text.isdecimal() or len(text) > 9:
+        raise InertialError(Fact("marker-unreadable", text=text))
+    if validation is None or validation.target.kind != "aruco":
+        raise InertialError(Fact("markers-not-given"))
+    centres = marker_centres(validation)
+    if int(text) not in centres:
+        raise NotObservableError("distance", Fact("marker-not-measured", marker=text, measured=sorted(centres)))
+    return centres[int(text)], _noise(validation, int(text))
+
+
+def _noise(validation: Validation, marker: int) -> float:
+    """Standard deviation of a marker's centre along a line: from how far its corners are from a square's."""
+    corners: Sequence[Array] = [c.in_model for c in validation.corners if c.name.startswith(f"marker{marker}.")]
+    measured, square = np.array(corners), validation.target.corners_m[:4] / validation.metres_per_unit
+    measured = measured - measured.mean(axis=0)
+    u, _, vt = np.linalg.svd(square.T @ measured)
+    turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    residual = measured - square @ turn
+    # 12 coordinates less 6 of place and turn; the centre is the mean of four corners
+    return float(np.sqrt(np.sum(residual**2) / 6) / 2)
+
+
+#: Of a video, so many frames a second, where its capture does not say.
+_FRAMES_PER_S = 2.0
+#: Says in ``OUT/colmap`` of what it was made.
+_MADE_FROM = "made_from.json"
+
+
+def reconstruct_by(
+    capture: StrPath,
+    out: StrPath,
+    reference: ReferenceOptions,
+    options: ReconstructOptions = ReconstructOptions(),
+    *,
+    progress: Progress = silent,
+) -> Reference:
+    """Map pictures or a video with COLMAP, and write the model in metres by what is known of its size.
+
+    Parameters
+    ----------
+    capture
+        A capture.toml, a folder of pictures, or a video. What it says of an IMU is not used.
+    out
+        A folder that does not exist, or one with nothing but ``colmap/`` of an earlier run on the same pictures, whose
+        scale was not found: that model is then taken.
+    reference
+        What is known: a target, or the distance of two markers.
+    options
+        ``mapping``, ``deterministic`` and ``seed`` count.
+    progress
+        Called with ``"frames"``, what COLMAP does, ``"validation"`` and ``"apply"``.
+
+    Raises
+    ------
+    FormatError, MappingError, NotObservableError, OutputExistsError
+        For links in ``out``, pictures that cannot be read or mapped, and sizes that cannot be found. COLMAP's model is
+        kept then.
+    """
+    capture, out = Path(capture), Path(out)
+    check_reference(reference)
+    if out.is_dir() and any(out.iterdir()) and not (out / "colmap" / _MADE_FROM).exists():
+        raise OutputExistsError(Fact("output-not-empty", path=str(out)))
+    refuse_links(out)
+    if options.colmap_executable is not None:
+        raise InertialError(Fact("for-metres-of-the-imu", option="--colmap-executable"))
+    if options.database is not None:
+        raise InertialError(Fact("for-metres-of-the-imu", option="--database"))
+    if any("," in end for end in reference.between or ()):
+        raise InertialError(Fact("points-need-a-model"))
+    pictures = _pictures(capture)
+    names = _names(pictures)
+    made_from = {"capture": str(capture.resolve()), "pictures": len(names), **dataclasses.asdict(options.mapping)}
+    if settings := read_settings(options.colmap, options.colmap_project).settings:
+        made_from["colmap"] = list(settings)
+    if not _is_mapped(out, made_from):
+        with new_folder(out) as work:
+            left_out = _map(pictures, names, work / "colmap", options, progress)
+            files = _contents(work / "colmap")
+            write_json(work / "colmap" / _MADE_FROM, {**made_from, "left_out": left_out, "files": files})
+    left_out = read_json(out / "colmap" / _MADE_FROM)["left_out"]
+    metric = out / "metric"
+    scaled = scale_project_by(
+        out / "colmap", metric, reference, ProjectOptions(link=True, keep=(_MADE_FROM,)), progress=progress
+    )
+    notes = (*scaled.notes, Fact("treatment-without-imu"))
+    if left_out:
+        notes = (*notes, Fact("more-models-left-out", images=left_out))
+    scaled = dataclasses.replace(scaled, out=out, notes=notes)
+    (metric / _MADE_FROM).unlink()
+    write_json(metric / "scale.json", scaled.as_json())
+    # the scale last: where it stands, everything does
+    for path in sorted(metric.iterdir(), key=lambda path: path.name == "scale.json"):
+        path.rename(out / path.name)
+    metric.rmdir()
+    return scaled
+
+
+def _is_mapped(out: Path, made_from: dict[str, object]) -> bool:
+    """Whether ``out`` is an earlier run's that mapped these pictures and found no scale."""
+    record = out / "colmap" / _MADE_FROM
+    if not record.is_file() or (out / "scale.json").exists():
+        return False
+    shutil.rmtree(out / "metric", ignore_errors=True)
+    if {path.name for path in out.iterdir()} != {"colmap"}:
+        return False
+    try:
+        with a_record_of_ours(record):
+            known = read_json(record)
+            list(map(int, known["left_out"]))
+            kept = dict(known["files"])
+    except FormatError as error:
+        raise OutputExistsError(Fact("record-unreadable", found=fact_of(error), out=str(out))) from None
+    if any(known.get(key) != value for key, value in made_from.items()):
+        raise OutputExistsError(Fact("output-of-another-run", path=str(out)))
+    contents = _contents(record.parent)
+    if changed := sorted(name for name in kept | contents if kept.get(name) != contents.get(name)):
+        raise OutputExistsError(Fact("output-changed", path=str(record.parent / changed[0]), out=str(out)))
+    return True
+
+
+def _contents(project: Path) -> dict[str, list[object]]:
+    """Size and digest of a project's files, without the record of what it was made from."""
+    rows: Any = fingerprint(project)
+    contents = {Path(path).relative_to(project.resolve()).as_posix(): [size, digest] for path, size, _, digest in rows}
+    contents.pop(_MADE_FROM, None)
+    return contents
+
+
+def _pictures(path: Path) -> Capture:
+    """A capture, a folder of pictures, or a video."""
+    if not path.exists():
+        raise FormatError(path, Fact("no-such-file", what="file or folder"))
+    frames: ImageFolder | Video
+    if path.is_file() and is_mp4(path):
+        frames = Video(file=path, frames_per_s=_FRAMES_PER_S)
+        return Capture(path=path, frames=frames, calibration=calibration_prior())
+    if path.is_dir() and not is_capture(path):
+        frames = ImageFolder(folder=path)
+        return Capture(path=path, frames=frames, calibration=calibration_prior())
+    capture = load_capture(path)
+    if capture.frames is None:
+        raise FormatError(path, Fact("capture-has-no-pictures"))
+    if capture.apertures is not None or capture.exposures is not None:
+        raise FormatError(path, Fact("scale-from-plain-pictures"))
+    if capture.rig:
+        raise FormatError(path, Fact("scale-from-one-camera"))
+    if isinstance(capture.frames, Video) and capture.frames.frames_per_s is None:
+        capture = dataclasses.replace(capture, frames=dataclasses.replace(capture.frames, frames_per_s=_FRAMES_PER_S))
+    return capture
+
+
+def _names(capture: Capture) -> list[str]:
+    if isinstance(capture.frames, ImageFolder):
+        names = image_names(capture.frames)
+    else:
+        names = list(read_frames(capture)[0].names)
+    require_frames(len(names), of=len(names))
+    check_pair_names(names)
+    return names
+
+
+def _map(
+    capture: Capture, names: list[str], project: Path, options: ReconstructOptions, progress: Progress
+) -> list[int]:
+    """Make a COLMAP project of pictures; how many images the models have that are left out, the largest first."""
+    keep_colmap_quiet()
+    mapping = options.mapping
+    if isinstance(capture.frames, ImageFolder):
+        require_apart(project, (capture.frames.folder,))
+    images, sparse = project / "images", project / "sparse"
+    device = mapping_device(mapping, deterministic=options.deterministic)
+    context = dataclasses.replace(RunContext.of(options, device=device, progress=progress), scratch=project)
+    require_features(context)
+    project.mkdir()
+    context.executor.require(project)
+    for _ in counted(_written(capture, names, images), len(names), "frames", progress):
+        pass
+    database = project / "database.db"
+    extract_features(images, dict.fromkeys(names, capture.camera), database, mapping, context=context)
+    match_pairs(database, image_pairs(names, mapping), context)
+    refine = capture.camera is None if mapping.refine_intrinsics is None else mapping.refine_intrinsics
+    made = project / "models"
+    decided = dataclasses.replace(mapping, refine_intrinsics=refine)
+    map_images(database, images, made, decided, context, in_time=names, judged=False)
+    sizes = {folder: int(read_model(folder).num_reg_images()) for folder in find_models(made).values()}
+    ranked = sorted(sizes, key=lambda folder: -sizes[folder])
+    sparse.mkdir()
+    ranked[0].rename(sparse / "0")
+    shutil.rmtree(made)
+    return [sizes[folder] for folder in ranked[1:]]
+
+
+def _written(capture: Capture, names: list[str], images: Path) -> Iterator[None]:
+    """Put every picture into a folder: files as they are, frames of a video as PNG."""
+    if isinstance(capture.frames, ImageFolder):
+        for name in names:
+            target = path_in(images, name)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            copy_file(path_in(capture.frames.folder, name), target)
+            yield
+        return
+    images.mkdir(parents=True)
+    for frame in read_frames(capture)[1]:
+        encode_image(path_in(images, frame.name), frame.image)
+        yield

@@ -1,0 +1,350 @@
+"""Camera and IMU brought together before the reconstruction: what deblurring and the rolling shutter need.
+
+The rotation between frames comes from a small model that COLMAP makes of some of the frames at reduced size; it tells
+rotation from translation, which pixels followed from frame to frame cannot. Where there is no such model (a camera
+that only turns), the followed pixels serve; in a video they also tell whether it was stabilised.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from colmap_inertial.colmap.chunks import Processes
+from colmap_inertial.colmap.context import RunContext
+from colmap_inertial.colmap.features.extraction import extract_features, image_pairs, match_pairs, verify_again
+from colmap_inertial.colmap.mapping.mapper import map_images
+from colmap_inertial.core.errors import FormatError, MappingError, NotObservableError, fact_of
+from colmap_inertial.core.facts import Fact
+from colmap_inertial.core.options import MappingOptions
+from colmap_inertial.core.progress import Progress
+from colmap_inertial.core.types import (
+    CameraImuCalibration,
+    CameraModel,
+    CameraTrajectory,
+    FrameTiming,
+)
+from colmap_inertial.hooks import FrameStage
+from colmap_inertial.io.capture import Capture
+from colmap_inertial.io.files import path_in
+from colmap_inertial.io.recording import Recording
+from colmap_inertial.model import find_models, read_model, trajectory_from_model
+from colmap_inertial.motion.align import AlignOptions, align_clocks
+from colmap_inertial.motion.align.consensus import align_by_consensus
+from colmap_inertial.motion.flow import VisualRotation, check_motion, find_stabilisation
+from colmap_inertial.motion.sign import check_sign
+from colmap_inertial.run.preparation.sampling import (
+    guess_camera,
+    measure_sampled_rotation,
+    sample_middle,
+    sample_spaced,
+    some_frames,
+)
+from colmap_inertial.run.stages.frame_folder import encode_image, smooth_for_colmap
+from colmap_inertial.run.stages.imaging_plan import GyroView
+from colmap_inertial.run.stages.rolling_shutter import RollingShutterStage
+
+if TYPE_CHECKING:
+    import pycolmap
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PreliminaryLimits:
+    """Limits for a calibration before the reconstruction."""
+
+    #: Frames of the small model: at most so many, at least so far apart.
+    model_frames: int = 60
+    model_spacing_s: float = 0.24
+    #: Frames of one small model, where they are to cover a recording: the cost stays linear in its length.
+    segment_frames: int = 240
+    #: Frames that are followed by their pixels: at most so many, not closer than this.
+    flow_frames: int = 300
+    flow_spacing_s: float = 0.06
+    #: Of pictures, as many tell a wrong sign.
+    sign_frames: int = 40
+    #: Frames of a video are closer than this.
+    video_step_s: float = 0.13
+    #: A declared calibration that is as good as this needs no search.
+    good_rotation_rad: float = 0.03
+    good_offset_s: float = 0.005
+    #: What is estimated must be as good as this.
+    usable_rotation_rad: float = 0.1
+    usable_offset_s: float = 0.01
+
+
+_LIMITS = PreliminaryLimits()
+
+
+_SMALL = MappingOptions(
+    pairing="sequential", overlap=6, max_num_features=1500, first_octave=0, max_image_size=800, refine_intrinsics=None
+)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PreliminaryCalibration:
+    """Calibration before the reconstruction.
+
+    Attributes
+    ----------
+    view
+        Gyroscope, camera and times, brought together.
+    models
+        COLMAP's models of frames all along the recording, of keypoints without the rolling shutter; empty where none
+        were needed.
+    """
+
+    view: GyroView
+    models: tuple[pycolmap.Reconstruction, ...] = ()
+
+
+def estimate_preliminary_calibration(recording: Recording, context: RunContext) -> PreliminaryCalibration:
+    """Find the calibration that the treatment of frames needs.
+
+    Parameters
+    ----------
+    recording
+        What is known beforehand is used as it stands where that is enough. Pixels are followed through all frames of a
+        video.
+    context
+        ``progress`` is called with ``"motion"`` and ``"calibration"``.
+
+    Raises
+    ------
+    NotObservableError
+        Where the frames do not turn as the gyroscope does, or were stabilised.
+    """
+    capture, timing, every, progress = recording.capture, recording.timing, recording.every, context.progress
+    camera = guess_camera(capture, timing)
+    is_video = len(every.t_s) > 1 and float(np.median(np.diff(every.t_s))) <= _LIMITS.video_step_s
+    rotation_rad, offset_s = _sigmas(recording.prior)
+    declared = rotation_rad <= _LIMITS.good_rotation_rad and offset_s <= _LIMITS.good_offset_s
+    along = sample_middle(every, _LIMITS.flow_spacing_s, _LIMITS.flow_frames)
+    rotation = measure_sampled_rotation(capture, every, camera, along, progress) if is_video else None
+    view: GyroView | NotObservableError
+    models: tuple[pycolmap.Reconstruction, ...] = ()
+    if declared:
+        notes = () if capture.camera is not None else (Fact("focal-length-guessed", focal_px=camera.params[0]),)
+        view = GyroView(
+            imu=recording.imu, timing=timing, calibration=recording.prior, camera=camera, source="capture", notes=notes
+        )
+    else:
+        view, models = _calibrate_by_model(recording, context)
+        if isinstance(view, NotObservableError):
+            rotation = rotation or measure_sampled_rotation(capture, every, camera, along, progress)
+            view = _calibrate_by_pixels(rotation, recording, camera, view)
+    if rotation is not None:
+        known_s = None if isinstance(view, NotObservableError) else view.motion().offset_s
+        stabilised = find_stabilisation(rotation, recording.imu, offset_s=known_s)
+        if stabilised.stabilised:
+            raise NotObservableError("the pixels' motion", stabilised.reason)
+        if not isinstance(view, NotObservableError):
+            agreement = check_motion(rotation, view.motion())
+            if agreement.agrees is False:
+                raise NotObservableError("the pixels' motion", agreement.reason)
+    if isinstance(view, NotObservableError):
+        raise view
+    return PreliminaryCalibration(view=_check_declared_sign(view, recording, rotation, progress), models=models)
+
+
+def _check_declared_sign(
+    view: GyroView, recording: Recording, rotation: VisualRotation | None, progress: Progress
+) -> GyroView:
+    """The view, with what there is to say about its sign; what was estimated has the right one.
+
+    Raises
+    ------
+    NotObservableError
+        Where the pictures turn the other way.
+    """
+    if view.source != "capture":
+        return view
+    if rotation is None:
+        some = sample_middle(recording.every, _LIMITS.flow_spacing_s, _LIMITS.sign_frames)
+        rotation = measure_sampled_rotation(recording.capture, recording.every, view.camera, some, progress)
+    sign = check_sign(rotation, view.motion())
+    if sign.right is False:
+        raise NotObservableError("the pixels' motion", sign.reason)
+    return view if sign.right else replace(view, sign_doubt=sign.reason)
+
+
+def survey_parts(timing: FrameTiming) -> list[list[str]]:
+    """Frames all along a recording, not too close together, in parts for small models of their own."""
+    names = [timing.names[i] for i in sample_spaced(timing, _LIMITS.model_spacing_s)]
+    segments = np.array_split(np.array(names, dtype=object), -(-len(names) // _LIMITS.segment_frames))
+    return [segment.tolist() for segment in segments]
+
+
+def survey(
+    capture: Capture, view: GyroView, names: Sequence[str], stages: Sequence[FrameStage], context: RunContext
+) -> tuple[pycolmap.Reconstruction, ...]:
+    """COLMAP's small models of some frames; empty where it makes none.
+
+    Parameters
+    ----------
+    capture
+        The recording.
+    view
+        By which keypoints are rectified.
+    names
+        Of the frames, as :func:`survey_parts` has them.
+    stages
+        That they go through.
+    context
+        ``progress`` is called with ``"survey"``.
+    """
+    steps = itertools.count()
+
+    def step(stage: str, done: int, total: int, /) -> None:
+        context.progress("survey", min(next(steps), 10 * len(names)), 10 * len(names))
+
+    with tempfile.TemporaryDirectory(dir=context.scratch) as folder:
+        work = Path(folder)
+        images = _image_folder(capture, view.timing, names, work, stages)
+        try:
+            models = _small_models(capture, images, names, work / "0", view, context.reporting(step))
+        except (MappingError, FormatError) as error:
+            log.info("no survey: %s", error)
+            models = ()
+    context.progress("survey", 1, 1)
+    return models
+
+
+def _sigmas(calibration: CameraImuCalibration) -> tuple[float, float]:
+    """Standard deviations of rotation (rad) and of the gyroscope's time offset (s)."""
+    rotation = calibration.rotation_sigma_rad
+    return rotation, calibration.clock_sigma_s
+
+
+def _calibrate_by_pixels(
+    rotation: VisualRotation, recording: Recording, camera: CameraModel, instead_of: NotObservableError
+) -> GyroView | NotObservableError:
+    try:
+        view = _aligned(rotation.trajectory(), recording, camera, "pixels")
+    except NotObservableError as error:
+        why = Fact(
+            "neither-by-pixels-nor-model", by_pixels=error.fact, quantity=instead_of.quantity, by_model=instead_of.fact
+        )
+        return NotObservableError(error.quantity, why)
+    # what translation does to pixels looks like a bias of the gyroscope
+    return replace(view, calibration=replace(view.calibration, gyro_bias_rad_s=recording.prior.gyro_bias_rad_s))
+
+
+def _aligned(trajectory: CameraTrajectory, recording: Recording, camera: CameraModel, source: str) -> GyroView:
+    options = AlignOptions(max_offset_s=recording.max_offset_s)
+    if source == "pixels":
+        alignment = align_clocks(trajectory, recording.imu, prior=recording.prior, options=options)
+    else:
+        alignment, _ = align_by_consensus(trajectory, recording.imu, prior=recording.prior, options=options)
+    rotation_rad, offset_s = _sigmas(alignment.calibration)
+    if rotation_rad > _LIMITS.usable_rotation_rad or offset_s > _LIMITS.usable_offset_s:
+        raise NotObservableError(
+            "camera-IMU calibration",
+            Fact("calibration-too-loose", rotation_sigma_rad=rotation_rad, offset_sigma_s=offset_s),
+        )
+    return GyroView(
+        imu=recording.imu, timing=recording.timing, calibration=alignment.settled(), camera=camera, source=source
+    )
+
+
+def _calibrate_by_model(
+    recording: Recording, context: RunContext
+) -> tuple[GyroView | NotObservableError, tuple[pycolmap.Reconstruction, ...]]:
+    """The calibration by a small model; with a rolling shutter, by a second one of rectified keypoints.
+
+    Also the models, where they are of all the recording.
+    """
+    capture, timing = recording.capture, recording.timing
+    indices = sample_middle(timing, _LIMITS.model_spacing_s, _LIMITS.model_frames)
+    whole = len(indices) == len(sample_spaced(timing, _LIMITS.model_spacing_s))
+    names = [timing.names[i] for i in indices]
+    rounds = 2 if timing.readout_s else 1
+    steps = itertools.count()
+
+    def step(stage: str, done: int, total: int, /) -> None:
+        context.progress("calibration", min(next(steps), 10 * len(names) * rounds), 10 * len(names) * rounds)
+
+    models: tuple[pycolmap.Reconstruction, ...] = ()
+    with tempfile.TemporaryDirectory(dir=context.scratch) as folder:
+        work = Path(folder)
+        images = _image_folder(capture, timing, names, work)
+        view: GyroView | None = None
+        try:
+            for i in range(rounds):
+                matched = work / "0" if i else None
+                models = _small_models(capture, images, names, work / str(i), view, context.reporting(step), matched)
+                trajectory, _ = trajectory_from_model(models[0], timing, covariances=False)
+                view = _aligned(trajectory, recording, _camera_of(models[0]), "model")
+        except (MappingError, FormatError) as error:
+            return view or NotObservableError("camera-IMU calibration", fact_of(error)), ()
+        except NotObservableError as error:
+            return view or error, ()
+    assert view is not None
+    context.progress("calibration", 1, 1)
+    return view, models if whole else ()
+
+
+def _image_folder(
+    capture: Capture, timing: FrameTiming, names: Sequence[str], work: Path, stages: Sequence[FrameStage] = ()
+) -> Path:
+    """Folder with some frames as pictures: the capture's own, or one to which they are written."""
+    images = capture.image_folder
+    if images is not None and not stages:
+        return images
+    images = work / "images"
+    place = {name: i for i, name in enumerate(timing.names)}
+    frames = some_frames(capture, timing, [place[name] for name in names])
+    for stage in stages:
+        frames = stage(frames)
+    for frame in frames:
+        target = path_in(images, frame.name)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        encode_image(target, smooth_for_colmap(frame))
+    return images
+
+
+def _small_models(
+    capture: Capture,
+    images: Path,
+    names: Sequence[str],
+    work: Path,
+    view: GyroView | None,
+    context: RunContext,
+    matched: Path | None = None,
+) -> tuple[pycolmap.Reconstruction, ...]:
+    """COLMAP's models of some frames, the largest first; with a view, of rectified keypoints.
+
+    ``matched``: where models of the same frames were made before, of keypoints as they are: what has been moved already
+    would be moved twice.
+    """
+    work.mkdir()
+    database, sparse = work / "database.db", work / "sparse"
+    cameras = {name: capture.camera for name in names}
+    stages = [] if view is None else [RollingShutterStage(view=view)]
+    pairs = image_pairs(names, _SMALL)
+    # what is small, and of images that others may not see, is done here
+    context = replace(context, executor=Processes(number=1))
+    # COLMAP's matcher and mapper differ from run to run with several threads, and the rest of a run would follow them
+    alone = replace(context, num_threads=1, executable=None)
+    if matched is None:
+        extract_features(images, cameras, database, _SMALL, keypoint_stages=stages, context=context)
+        match_pairs(database, pairs, alone)
+    else:
+        verify_again(matched / "database.db", database, pairs, stages, alone)
+    map_images(database, images, sparse, replace(_SMALL, refine_intrinsics=capture.camera is None), alone)
+    models = [read_model(folder) for folder in find_models(sparse).values()]
+    return tuple(sorted(models, key=lambda model: -int(model.num_reg_images())))
+
+
+def _camera_of(model: pycolmap.Reconstruction) -> CameraModel:
+    used = next(iter(model.cameras.values()))
+    params = tuple(float(value) for value in used.params)
+    return CameraModel(model=used.model.name, width=used.width, height=used.height, params=params)
