@@ -253,6 +253,24 @@ def declared_lever_arm(declared_m: Sequence[float], found_m: Sequence[float], si
     )
 
 
+_AGAINST_TARGETS = {
+    "camera": "likeliest the declared intrinsics, which the images contradict, too",
+    "readout": "likeliest the readout, which the images contradict, too",
+    "declared": "likeliest what was declared of the IMU, which the recording contradicts, too",
+    "target": "likeliest the target's stated size: measure its squares, and compare them with [target]",
+    "accelerometer": "likeliest the accelerometer's gain: calibrate it (calibrate-imu)",
+    "": "measure the target's squares, compare them with [target], and see the reasons beside this one",
+}
+
+
+@message(example={"target": "checkerboard:8x6:0.04", "error_pct": -24.1, "sigmas": 18.0, "likely": "camera"})
+def target_contradicts_scale(target: str, error_pct: float, sigmas: float, likely: str) -> str:
+    return (
+        f"the target in the images ({target}) contradicts the scale: its lengths are {error_pct:+.1f} % off, "
+        f"{sigmas:.0f} standard deviations of both: {_AGAINST_TARGETS[likely]}"
+    )
+
+
 @message(example={"gain": 0.02, "excess": 0.015})
 def accel_gain_doubtful(gain: float, excess: float) -> str:
     return (
