@@ -228,6 +228,7 @@ _LEVERS = {
     "inverse": "that of the inverse fits: imu_in_cam_m, and the last column of cam_from_imu, is the IMU in the "
     "camera's frame (T_cam_imu)",
     "sign": "with the other sign it fits: imu_in_cam_m points from the camera to the IMU",
+    "millimetres": "it fits in millimetres: imu_in_cam_m, and the last column of cam_from_imu, is in metres",
     "": "correct it, or leave it out, and it is estimated",
 }
 
@@ -245,6 +246,24 @@ def declared_lever_arm(declared_m: Sequence[float], found_m: Sequence[float], si
     return (
         f"the declared lever arm is {declared} mm, and the recording shows {found} mm (+-{2e3 * sigma_m:.0f}), by "
         f"which the scale is estimated: {_LEVERS[likely]}"
+    )
+
+
+_AGAINST_TARGETS = {
+    "camera": "likeliest the declared intrinsics, which the images contradict, too",
+    "readout": "likeliest the readout, which the images contradict, too",
+    "declared": "likeliest what was declared of the IMU, which the recording contradicts, too",
+    "target": "likeliest the target's stated size: measure its squares, and compare them with [target]",
+    "accelerometer": "likeliest the accelerometer's gain: calibrate it (calibrate-imu)",
+    "": "measure the target's squares, compare them with [target], and see the reasons beside this one",
+}
+
+
+@message(example={"target": "checkerboard:8x6:0.04", "error_pct": -24.1, "sigmas": 18.0, "likely": "camera"})
+def target_contradicts_scale(target: str, error_pct: float, sigmas: float, likely: str) -> str:
+    return (
+        f"the target in the images ({target}) contradicts the scale: its lengths are {error_pct:+.1f} % off, "
+        f"{sigmas:.0f} standard deviations of both: {_AGAINST_TARGETS[likely]}"
     )
 
 

@@ -381,6 +381,28 @@ def test_a_declared_global_shutter_that_the_images_contradict_is_named(rolled, b
     assert model.treatments[-1].reason == found
 
 
+@pytest.mark.parametrize("times", [1.0, 0.5, 1.6])
+def test_a_declared_readout_that_rectified_keypoints_contradict_is_named(rolled, times):
+    tracks = rolled[0]
+    declared_s = times * 0.025
+    timing, known = replace(tracks.timing, readout_s=declared_s), calibration_prior(Declared(readout_s=declared_s))
+    view = GyroView(
+        imu=tracks.imu, timing=timing, calibration=tracks.calibration, camera=tracks.camera, source="capture"
+    )
+    shutter, xy_px = RollingShutterStage(view=view), tracks.xy_px.copy()
+    for i, name in enumerate(timing.names):
+        xy_px[tracks.frame == i] = shutter.moved(name, xy_px[tracks.frame == i])
+    start = Model(reconstruction=adjusted(tracks.reconstruction(xy_px)), colmap_index=0, timing=timing, rectified=True)
+    start = ReadoutStage(imu=tracks.imu, calibration=known, refine_intrinsics=False, num_threads=1)(start)
+    model = MetricStage(imu=tracks.imu, calibration=known, shutter=shutter)(start)
+    found = [reason for reason in model.scale.reasons if reason.code == "declared-readout"]
+    assert bool(found) == (times != 1.0)
+    if found:
+        assert model.scale.verdict == "weak" and model.scale.reasons[0] == found[0]
+        assert found[0].values["declared_s"] == declared_s and found[0].values["direction"] == "down"
+        assert abs(found[0].values["readout_s"] - 0.025) < 3 * found[0].values["sigma_s"] < 0.006
+
+
 @pytest.mark.parametrize("factor", [1.0, 0.9, 1.35])
 def test_a_declared_focal_length_is_compared_with_what_the_images_show(factor):
     tracks = tracks_of(walk(16.0, points_per_m=50.0))
