@@ -663,6 +663,17 @@ def test_used_frames_of_a_video_are_told(full, tmp_path):
     assert "120 of 900: the sharpest of each window" in page.text
 
 
+def test_frames_are_listed_with_what_was_done_to_them(full, tmp_path):
+    out = copy_of(full, tmp_path)
+    result = json.loads((out / "result.json").read_text(encoding="utf-8"))
+    content, _ = report_of_changed(out, result)
+    rows, blur_px = content["frame_table"]["rows"], {f["name"]: f["blur_px"] for f in result["frames"]}
+    assert content["frame_table"]["count"] == len(rows) == len(blur_px)
+    assert {row["name"]: row["blur_px"] for row in rows} == blur_px
+    listed = [row["blur_px"] or 0.0 for row in rows]
+    assert listed == sorted(listed, reverse=True)
+
+
 def test_why_there_is_no_target_and_there_are_no_crops(full, tmp_path):
     out = copy_of(full, tmp_path)
     result = json.loads((out / "result.json").read_text(encoding="utf-8"))
