@@ -401,7 +401,7 @@ def test_names_that_the_run_needs_are_said_before_any_work(placing):
         require_free_names(placing.project, placing.workspace, dense=True)
     for name in ("log.txt", "report.html", "trajectory_2.tum", ".stages"):
         (placing.project / name).touch()
-        with pytest.raises(OutputError, match=rf"{name} has a name that the output folder needs"):
+        with pytest.raises(OutputError, match=rf"{name} has a name that the output folder uses"):
             require_free_names(placing.project, placing.workspace, dense=False)
         (placing.project / name).unlink()
 
