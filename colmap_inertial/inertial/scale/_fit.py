@@ -112,6 +112,8 @@ class Fit:
 
     Attributes
     ----------
+    t_s
+        (K,) camera times of the states.
     estimate, noise
         Parameters and levels.
     cov
@@ -151,6 +153,7 @@ class Fit:
         information is the prior's.
     """
 
+    t_s: Array
     estimate: Estimate
     noise: Noise
     cov: Array
@@ -211,6 +214,7 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
     weights = [groups[name].weight for name in ("rotation", "centre")]
     weight = np.min([each for each in weights if each is not None], axis=0)
     return Fit(
+        t_s=data.t_s,
         estimate=x,
         noise=noise,
         cov=cov,
