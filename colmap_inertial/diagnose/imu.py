@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.sampling import MUCH_CUT, PAUSE_STEPS, find_clipped, integral_at, is_gap
 from colmap_inertial.core.types import CameraTrajectory, ImuRecording
 from colmap_inertial.diagnose.findings import Finding, Recorded, Severity
-from colmap_inertial.io.plausible import RawImu, check_consistent
+from colmap_inertial.io.plausible import check_consistent
 from colmap_inertial.motion.align import Alignment
 
 
@@ -169,9 +168,8 @@ def check_axes(recorded: Recorded) -> Iterator[Finding]:
     imu = recorded.imu
     if imu is None or not imu.has_accel or recorded.implausible or not isinstance(recorded.aligned, Alignment):
         return
-    raw = RawImu(imu=imu, path=Path("IMU"), gyro_axes=recorded.gyro_axes, accel_axes=recorded.accel_axes)
     try:
-        check_consistent(raw, confirmed=True)
+        check_consistent(imu, confirmed=True)
     except FormatError as error:
         yield Finding(fact=error.fact, severity="error")
 

@@ -27,6 +27,7 @@ from typing import cast
 import numpy as np
 
 from colmap_inertial.core.arrays import Array, Int64Array
+from colmap_inertial.core.axes import Axes
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import FrameLog, HeightDatum, ImuRecording, PositionFixes
@@ -35,7 +36,7 @@ from colmap_inertial.io.gpmf import Entry, Stream, entries, read_streams
 from colmap_inertial.io.imu_text import build_recording
 from colmap_inertial.io.mp4 import Movie, has_track, read_movie
 from colmap_inertial.io.samples import Samples, nearest, order_samples
-from colmap_inertial.io.units import SENSOR_UNITS, Axes, DeclaredUnits, Quantity, unit_of
+from colmap_inertial.io.units import SENSOR_UNITS, DeclaredUnits, Quantity, unit_of
 
 _SENSORS: dict[str, Quantity] = {"GYRO": "gyro", "ACCL": "accel"}
 #: Streams with one sample for each frame, the best one first.

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.axes import Axes
 from colmap_inertial.core.errors import FormatError, MissingExtraError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import FrameLog, ImuRecording
@@ -30,7 +31,7 @@ from colmap_inertial.io.files import first_line
 from colmap_inertial.io.imu_text import build_recording, order_rows
 from colmap_inertial.io.samples import Samples, order_samples
 from colmap_inertial.io.tables import read_table
-from colmap_inertial.io.units import SENSOR_NAMES, Axes, DeclaredUnits, Quantity
+from colmap_inertial.io.units import SENSOR_NAMES, DeclaredUnits, Quantity
 
 #: Names of logs of counts, and the columns with which they begin; the columns that tell Mobius by itself.
 _NAMES = re.compile(r"(RC_GyroData|gyroDat[ae]|Thumb).*\.csv", re.IGNORECASE)
