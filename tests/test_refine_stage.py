@@ -701,7 +701,7 @@ def test_what_cannot_be_refined_is_said(walked):
         (slice(30, 31), None),
     ):
         stage = RefineStage(imu=tracks.imu, calibration=UNKNOWN, refine_intrinsics=False)
-        why_not = stage._why_not(replace(model, reconstruction=two_cameras(model.reconstruction, second)))
+        why_not = stage._find_obstacle(replace(model, reconstruction=two_cameras(model.reconstruction, second)))
         assert (None if why_not is None else why_not.code) == code
     # where each image has a camera of its own, devices differ by folder, size or focus, and one that zooms is one
     for camera_of, name_of, code in (
@@ -713,7 +713,7 @@ def test_what_cannot_be_refined_is_said(walked):
     ):
         stage = RefineStage(imu=tracks.imu, calibration=UNKNOWN, refine_intrinsics=False)
         each, timing = camera_for_each(model, camera_of, name_of)
-        why_not = stage._why_not(replace(model, reconstruction=each, timing=timing))
+        why_not = stage._find_obstacle(replace(model, reconstruction=each, timing=timing))
         assert (None if why_not is None else why_not.code) == code
     empty = pycolmap.Reconstruction(model.reconstruction)
     for point_id in list(empty.point3D_ids()):
