@@ -42,7 +42,7 @@ from colmap_inertial.report import figures, signals, write_report
 from colmap_inertial.report.content import _describe_path
 from colmap_inertial.report.figure_3d import _grid, scene_figure
 from colmap_inertial.report.photogrammetry import scene_record
-from colmap_inertial.report.series import SIZES, nice_length, rounded, strided, thinned
+from colmap_inertial.report.series import SIZES, nice_length, round_values, stride_indices, thin_line
 from colmap_inertial.report.signals import signal_record
 from colmap_inertial.report.still import STYLE, draw_still
 from colmap_inertial.report.still_3d import StillView, draw_scene_still
@@ -770,22 +770,22 @@ def test_thinning_keeps_the_extremes_the_order_and_the_gaps():
     values = np.sin(t_s)
     values[7777], values[15000] = 9.0, -9.0
     values[4000:6000] = np.nan
-    line = thinned(t_s, values)
+    line = thin_line(t_s, values)
     assert len(line["t_s"]) == len(line["values"]) <= SIZES.line_points
     assert line["t_s"] == sorted(line["t_s"])
     known = [value for value in line["values"] if value is not None]
     assert max(known) == 9.0 and min(known) == -9.0
     assert None in line["values"]
     assert not [t for t, v in zip(line["t_s"], line["values"], strict=True) if v is not None and 20.1 < t < 29.9]
-    short = thinned(t_s[:50], values[:50])
+    short = thin_line(t_s[:50], values[:50])
     assert len(short["t_s"]) == 50
 
 
 def test_numbers_are_short_and_right():
     values = np.array([123456.789, -0.000123456, 0.0, np.nan, np.inf, 1e-300])
-    assert rounded(values, 4) == [123500.0, -0.0001235, 0.0, None, None, 1e-300]
-    assert strided(5, 10).tolist() == [0, 1, 2, 3, 4]
-    assert strided(1000, 3).tolist() == [0, 500, 999]
+    assert round_values(values, 4) == [123500.0, -0.0001235, 0.0, None, None, 1e-300]
+    assert stride_indices(5, 10).tolist() == [0, 1, 2, 3, 4]
+    assert stride_indices(1000, 3).tolist() == [0, 500, 999]
 
 
 def steady_turn(rate_rad_s, *, offset_s=0.0):

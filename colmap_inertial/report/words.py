@@ -239,7 +239,7 @@ def outcome_of_model(model: dict[str, Any]) -> dict[str, Any]:
     """
     verdict, scale, ci95 = model["verdict"], model["metres_per_unit"], model["ci95"]
     if scale is None or ci95 is None:
-        return _refused(model)
+        return _describe_refused_model(model)
     pct = half_width_pct(scale, ci95)
     extent = model.get("photogrammetry", {}).get("extent")
     sides = [length(side, 3 if verdict == "trusted" else 2) for side in extent or ()]
@@ -350,7 +350,7 @@ def _describe_attempt(model: dict[str, Any]) -> list[str]:
     return tried
 
 
-def _refused(model: dict[str, Any]) -> dict[str, Any]:
+def _describe_refused_model(model: dict[str, Any]) -> dict[str, Any]:
     summary = ["The recording does not determine the scale, so no number is given rather than a wrong one."]
     signals, findings = model.get("signals", {}), model.get("findings", ())
     causes = [finding for finding in findings if finding["severity"] == "error"]
