@@ -507,7 +507,7 @@ def test_auto_leaves_a_project_from_which_more_was_made(walked, tmp_path):
 @pytest.mark.parametrize("found", [(1.5e-3, 0.49e-3), (0.9e-3, 1e-5), (-5e-3, 2e-3)])
 def test_a_readout_that_predicts_nothing_better_is_none(walked, monkeypatch, found):
     tracks, model = walked
-    monkeypatch.setattr(judge, "_readout", lambda *_: found)
+    monkeypatch.setattr(judge, "_estimate_readout", lambda *_: found)
     _, said = refined_by(tracks.imu, model)
     assert said.action == "refined" and said.values["readout_s"] == 0 and "rolling" not in str(said.reason)
 

@@ -159,7 +159,7 @@ def check_readout(recorded: Recorded) -> Iterator[Finding]:
         yield from _compare_readout(recorded, recorded.timing.readout_s, recorded.timing.readout_direction)
         return
     try:
-        readout = _readout(recorded)
+        readout = _estimate_readout(recorded)
     except NotObservableError as error:
         yield Finding(fact=Fact("readout-unknown", why=error.fact), severity="warning")
         return
@@ -176,7 +176,7 @@ def check_readout(recorded: Recorded) -> Iterator[Finding]:
 def _compare_readout(recorded: Recorded, declared_s: float, direction: ReadoutDirection) -> Iterator[Finding]:
     """A declared readout against one that is estimated without it."""
     try:
-        found = _readout(recorded)
+        found = _estimate_readout(recorded)
     except NotObservableError:
         return
     opposite = {direction, found.direction} in ({"down", "up"}, {"right", "left"})
@@ -195,7 +195,7 @@ def _compare_readout(recorded: Recorded, declared_s: float, direction: ReadoutDi
         yield Finding(fact=fact, severity="warning")
 
 
-def _readout(recorded: Recorded) -> ReadoutEstimate:
+def _estimate_readout(recorded: Recorded) -> ReadoutEstimate:
     """Estimate the readout from tracked corners and the aligned gyroscope."""
     rotation, aligned, imu = recorded.rotation, recorded.aligned, recorded.imu
     if rotation is not None and not recorded.is_dense:

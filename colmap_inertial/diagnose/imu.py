@@ -206,7 +206,7 @@ def check_repairs(recorded: Recorded) -> Iterator[Finding]:
 
 def check_pauses(recorded: Recorded) -> Iterator[Finding]:
     """Pauses of either sensor while frames came, where it is known when they did."""
-    begin_s, end_s = _filmed(recorded)
+    begin_s, end_s = _find_filmed_span(recorded)
     for sensor, t_s, _ in _sensors(recorded.imu):
         step_s = np.diff(t_s)
         usual_s = float(np.median(step_s))
@@ -231,7 +231,7 @@ def check_pauses(recorded: Recorded) -> Iterator[Finding]:
             yield Finding(fact=fact, severity="error" if share > _LIMITS.most_paused else "warning")
 
 
-def _filmed(recorded: Recorded) -> tuple[float, float]:
+def _find_filmed_span(recorded: Recorded) -> tuple[float, float]:
     """First and last frame on the IMU's clock; without limits where it is not known."""
     frames = recorded.trajectory or recorded.timing
     shift_s = None if frames is None else recorded.offset_s(frames.epoch_ns)

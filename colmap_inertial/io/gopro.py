@@ -116,7 +116,7 @@ def read_gopro_frames(path: Path) -> FrameLog:
         stream = telemetry.streams.get(key)
         if stream is None or stream.values.shape[1] != channels:
             return None
-        nearest = _nearest(telemetry.times_ns(key), stream.values, frame_ns)
+        nearest = _find_nearest(telemetry.times_ns(key), stream.values, frame_ns)
         # directions and orientations have a length, exposures a bound; what has not is damaged
         good = (
             nearest is not None
@@ -340,7 +340,7 @@ def _stabilisation(settings: dict[str, Entry], image: Array | None) -> tuple[boo
     return (False if flag == "N" else None), words
 
 
-def _nearest(t_ns: Int64Array, values: Array, frame_ns: Int64Array) -> Array | None:
+def _find_nearest(t_ns: Int64Array, values: Array, frame_ns: Int64Array) -> Array | None:
     """The sample nearest to each frame; ``None`` where frames lie outside the samples."""
     slack_ns = _LIMITS.missing_frames * float(np.median(np.diff(t_ns)))
     if frame_ns[0] < t_ns[0] - slack_ns or frame_ns[-1] > t_ns[-1] + slack_ns:

@@ -78,7 +78,7 @@ class Reading:
     factor: float = 1.0
 
 
-def _readings() -> tuple[Reading, ...]:
+def _list_readings() -> tuple[Reading, ...]:
     """The readings as stated, in every other order and sign of the axes, and in other units."""
     matrices = []
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
@@ -106,18 +106,18 @@ def better_readings(imu: ImuRecording, *, confirmed: bool = False) -> tuple[Read
     The best one first, then those that the recording cannot tell from it; empty where the stated reading is fine or the
     recording cannot tell.
     """
-    turns, force = _windows(imu)
+    turns, force = _cut_windows(imu)
     if len(turns) < LIMITS.fewest_windows:
         return ()
-    readings = _readings()
-    spread = _spread(turns, force, readings)
+    readings = _list_readings()
+    spread = _measure_spread(turns, force, readings)
     ranked = np.argsort(np.mean(spread, axis=1), kind="stable").tolist()
     best = spread[ranked[0]]
     at_rest = _log_variance(force)
-    turned = float((at_rest - best).mean()) > LIMITS.clear_advantage if confirmed else _clearly(best, at_rest)
-    if not (turned and _clearly(best, spread[0])):
+    turned = float((at_rest - best).mean()) > LIMITS.clear_advantage if confirmed else _is_clearly_better(best, at_rest)
+    if not (turned and _is_clearly_better(best, spread[0])):
         return ()
-    return tuple(readings[i] for i in ranked if not _clearly(best, spread[i]))
+    return tuple(readings[i] for i in ranked if not _is_clearly_better(best, spread[i]))
 
 
 def best_mirrored_reading(imu: ImuRecording) -> Reading | None:
@@ -125,14 +125,14 @@ def best_mirrored_reading(imu: ImuRecording) -> Reading | None:
 
     Minus the unit matrix says that both sensors are mirrored alike, or that the gyroscope measures the opposite.
     """
-    turns, force = _windows(imu)
+    turns, force = _cut_windows(imu)
     if len(turns) < LIMITS.fewest_mirrored_windows:
         return None
-    readings = [reading for reading in _readings() if np.linalg.det(reading.matrix) < 0]
-    return readings[int(np.argmin(np.mean(_spread(turns, force, readings), axis=1)))]
+    readings = [reading for reading in _list_readings() if np.linalg.det(reading.matrix) < 0]
+    return readings[int(np.argmin(np.mean(_measure_spread(turns, force, readings), axis=1)))]
 
 
-def _spread(turns: Array, force: Array, readings: Sequence[Reading]) -> list[Array]:
+def _measure_spread(turns: Array, force: Array, readings: Sequence[Reading]) -> list[Array]:
     """Logarithm of the variance (W,) that each reading leaves of the specific force in each window."""
     orientations: dict[float, Array] = {}
     spread = []
@@ -145,7 +145,7 @@ def _spread(turns: Array, force: Array, readings: Sequence[Reading]) -> list[Arr
     return spread
 
 
-def _clearly(better: Array, worse: Array) -> bool:
+def _is_clearly_better(better: Array, worse: Array) -> bool:
     difference = worse - better
     error = float(difference.std(ddof=1)) / len(difference) ** 0.5
     advantage = LIMITS.clear_advantage if len(better) >= LIMITS.enough_windows else LIMITS.few_advantage
@@ -172,7 +172,7 @@ def _integrate(turns: Array) -> Array:
     return matrix_from_quat(orientation)
 
 
-def _windows(imu: ImuRecording) -> tuple[Array, Array]:
+def _cut_windows(imu: ImuRecording) -> tuple[Array, Array]:
     """Turns (W, K, 3) in rad and mean specific forces (W, K, 3) in m/s2 of each step of each window without a gap."""
     start_s, end_s = max(imu.gyro_t_s[0], imu.accel_t_s[0]), min(imu.gyro_t_s[-1], imu.accel_t_s[-1])
     count = max(0, int((end_s - start_s) / LIMITS.window_s))

@@ -102,7 +102,7 @@ def _evaluate(problem: Problem, x: Estimate, observations: Observations) -> _Poi
     return _Point(estimate=x, projected=projected, rows=rows, offset=offset, cost=cost)
 
 
-def _weighted(problem: Problem, at: _Point, informs: float = 1.0) -> tuple[Derivatives, Array]:
+def _weight_rows(problem: Problem, at: _Point, informs: float = 1.0) -> tuple[Derivatives, Array]:
     """Derivatives and residuals of a problem's rows over their standard deviations, times the roots of their robust
     weights.
 
@@ -127,7 +127,9 @@ def _weighted(problem: Problem, at: _Point, informs: float = 1.0) -> tuple[Deriv
     return by, np.insert(residual, ends, away, axis=0)
 
 
-def _built(problem: Problem, layout: Layout, at: _Point, by: Derivatives, residual: Array, damping: float) -> System:
+def _build_system(
+    problem: Problem, layout: Layout, at: _Point, by: Derivatives, residual: Array, damping: float
+) -> System:
     info = problem.prior.info
     return System.build(layout, problem.rows, by, residual, at.rows, (info, -info @ at.offset), damping=damping)
 
@@ -139,23 +141,23 @@ def solve(problem: Problem, start: Estimate, *, most_steps: int = SOLVE.steps) -
     at, damping, growth = _evaluate(problem, start, observations), SOLVE.first_damping, 2.0
     converged, steps, stretch = False, 0, 1.0
     for steps in range(1, most_steps + 1):
-        by, residual = _weighted(problem, at)
+        by, residual = _weight_rows(problem, at)
         gained = pushed = False
         while not gained and damping < SOLVE.most_damping:
-            system = _built(problem, layout, at, by, residual, damping)
-            step = _step(system, rows, by)
+            system = _build_system(problem, layout, at, by, residual, damping)
+            step = _find_step(system, rows, by)
             if step is None:
                 damping, growth = damping * growth, 2 * growth
                 continue
-            if not _plausible(start, step.taken(at.estimate, stretch, problem.distances)):
+            if not _is_plausible(start, step.taken(at.estimate, stretch, problem.distances)):
                 damping, growth = damping * growth, 2 * growth
                 continue
-            promised = _promised(problem, at, residual, step)
+            promised = _predict_decrease(problem, at, residual, step)
             of_points = 0.5 * float(np.einsum("pi,pij,pj->", system.pull, system.inverse, system.pull))
             of_points = min(of_points, SOLVE.settled_point * len(system.pull))
             if promised - of_points < SOLVE.settled:
                 if damping <= SOLVE.rest_damping or pushed:
-                    return _solution(at, steps, converged=damping <= SOLVE.rest_damping)
+                    return _make_solution(at, steps, converged=damping <= SOLVE.rest_damping)
                 damping, growth, pushed = SOLVE.rest_damping, 2.0, True
                 continue
             for length in (stretch, 1.0) if stretch > 1 else (1.0,):
@@ -176,10 +178,10 @@ def solve(problem: Problem, start: Estimate, *, most_steps: int = SOLVE.steps) -
                 damping, growth = damping * growth, 2 * growth
         if not gained:
             break
-    return _solution(at, steps, converged=converged)
+    return _make_solution(at, steps, converged=converged)
 
 
-def _step(system: System, observations: Observations, by: Derivatives) -> Step | None:
+def _find_step(system: System, observations: Observations, by: Derivatives) -> Step | None:
     """Step of the system; ``None`` where it needs more damping to be solved."""
     try:
         step = system.factored().step(system, observations, by)
@@ -188,13 +190,13 @@ def _step(system: System, observations: Observations, by: Derivatives) -> Step |
     return step if all(np.isfinite(part).all() for part in (step.states, step.shared, step.points)) else None
 
 
-def _plausible(start: Estimate, moved: Estimate) -> bool:
+def _is_plausible(start: Estimate, moved: Estimate) -> bool:
     """Whether a step leaves a camera that can be one: a focal length keeps its sign and size."""
     away = np.abs(moved.intrinsics - start.intrinsics)
     return bool(np.all(away <= SOLVE.largest_change * np.maximum(np.abs(start.intrinsics), 1.0)))
 
 
-def _promised(problem: Problem, at: _Point, residual: Array, step: Step) -> float:
+def _predict_decrease(problem: Problem, at: _Point, residual: Array, step: Step) -> float:
     """Decrease of the cost by a step, if all were linear."""
     total = -float(np.sum(step.change * residual)) - 0.5 * float(np.sum(step.change**2))
     for block in at.rows.values():
@@ -209,7 +211,7 @@ def _promised(problem: Problem, at: _Point, residual: Array, step: Step) -> floa
     return total - float(step.shared @ info @ (at.offset + 0.5 * step.shared))
 
 
-def _solution(at: _Point, steps: int, *, converged: bool) -> Solution:
+def _make_solution(at: _Point, steps: int, *, converged: bool) -> Solution:
     squares = {name: float(np.sum(block.residual**2)) for name, block in at.rows.items()}
     return Solution(estimate=at.estimate, cost=at.cost, squares=squares, steps=steps, converged=converged)
 
@@ -218,7 +220,7 @@ def factored(problem: Problem, x: Estimate, *, damping: float = 0.0) -> Factored
     """The information at an estimate, for covariances."""
     layout = Layout.of(problem.observations, len(x.velocity_m_s))
     at = _evaluate(problem, x, problem.observations)
-    return _built(problem, layout, at, *_weighted(problem, at, problem.informs), damping).factored()
+    return _build_system(problem, layout, at, *_weight_rows(problem, at, problem.informs), damping).factored()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -241,7 +243,7 @@ class Linearised:
             offset=prior_offset(problem, x),
             cost=np.nan,
         )
-        system = _built(problem, self.layout, at, self.by, self.residual, 0.0)
+        system = _build_system(problem, self.layout, at, self.by, self.residual, 0.0)
         solved = system.factored()
         step = solved.step(system, problem.rows, self.by)
         return solved, step.states, step.shared
@@ -250,7 +252,7 @@ class Linearised:
 def linearised(problem: Problem, x: Estimate) -> Linearised:
     """The observations at an estimate."""
     at = _evaluate(problem, x, problem.observations)
-    by, residual = _weighted(problem, at, problem.informs)
+    by, residual = _weight_rows(problem, at, problem.informs)
     layout = Layout.of(problem.observations, len(x.velocity_m_s))
     return Linearised(layout=layout, projected=at.projected, by=by, residual=residual, estimate=x)
 
@@ -319,7 +321,7 @@ def _level_step(problem: Problem, x: Estimate, at: Linearised, change: float) ->
     own = rows.share @ left
     squares = float(np.sum(left * own))
     signs = np.random.default_rng(_SEED).choice([-1.0, 1.0], (*rows.residual.shape, _PROBES))
-    along = _followed(rows, np.concatenate([signs, own], axis=2), solved)
+    along = _project_on_fit(rows, np.concatenate([signs, own], axis=2), solved)
     explained = float(np.sum(signs * (rows.share @ along[:, :, :-1]))) / _PROBES
     count = float(np.trace(rows.share, axis1=1, axis2=2).sum())
     right = max(count - explained, 0.01 * count)
@@ -337,7 +339,7 @@ def _apply_rows(rows: Rows, states: Array, shared: Array) -> Array:
     return np.asarray(rows.here @ states[:-1] + rows.after @ states[1:] + rows.by_shared @ shared)
 
 
-def _followed(rows: Rows, values: Array, solved: Factored) -> Array:
+def _project_on_fit(rows: Rows, values: Array, solved: Factored) -> Array:
     """(N, r, k) of values the part that the fit follows: derivatives, covariance, derivatives."""
     assert rows.after is not None and rows.by_shared is not None
     place, count = solved.layout.place, values.shape[2]
