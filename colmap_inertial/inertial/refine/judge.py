@@ -159,20 +159,19 @@ def refine(
         raise NotObservableError("refinement", Fact("refine-too-large", size_bytes=needed))
     alone = pictures_alone(problem, at_once_px)
     noise = measure_picture_noise(alone, start)
-    problem, alone = (apply_noise(each, noise) for each in (problem, alone))
-    whole, whole_start = problem, start
-    if (points := draw_points(problem.observations, len(t_s))) is not None:
-        problem, alone = (select_points(each, points) for each in (problem, alone))
+    whole, whole_start = apply_noise(problem, noise), start
+    problem, alone = whole, apply_noise(alone, noise)
+    points = draw_points(problem.observations, len(t_s))
+    if points is not None:
+        problem, alone = select_points(problem, points), select_points(alone, points)
         start = replace(start, points_m=start.points_m[points])
+    # docs/dev/refinement.md#acceptance: two solutions without a tenth of the observations
     kept = ~_choose_held_out(problem.observations)
-    seen_alone, seen = (
-        solve(_select_observations(alone, kept), start),
-        solve(_select_observations(problem, kept), start),
-    )
-    # pictures alone may fit worse than with a rolling shutter: the IMU's own squares are the least that it costs
-    freedom = _count_freedom(problem)
-    chi2 = max(2 * (seen.cost - seen_alone.cost), seen.squares["imu"]) / freedom
+    seen_alone = solve(_select_observations(alone, kept), start)
+    seen = solve(_select_observations(problem, kept), start)
     steps = seen_alone.steps + seen.steps
+    # pictures alone may fit worse than with a rolling shutter: the IMU's own squares are the least that it costs
+    chi2 = max(2 * (seen.cost - seen_alone.cost), seen.squares["imu"]) / _count_freedom(problem)
     readout = None
     if seen.converged and not readout_declared:
         readout, problem, seen = _test_readout(problem, kept, seen)
@@ -184,20 +183,18 @@ def refine(
         steps += seen.steps
     before = evaluate_held_out(alone, seen_alone.estimate, alone.observations.select(~kept))
     after = evaluate_held_out(problem, seen.estimate, problem.observations.select(~kept))
-    change, count = after - before, len(before)
-    mean = float(change.mean()) if count else 0.0
-    spread = float(change.std(ddof=1) / count**0.5) if count > 1 else np.inf
-    reason = _find_doubt(seen_alone, seen, chi2, mean, spread) or _find_late_clock(problem, seen.estimate)
+    change, change_sigma = _average_change(before, after)
+    reason = _find_doubt(seen_alone, seen, chi2, change, change_sigma) or _find_late_clock(problem, seen.estimate)
     assert problem.inertial is not None
     judged = Judged(
         estimate=whole_start,
         accepted=False,
         reason=reason,
-        held_out=count,
+        held_out=len(before),
         before_px=_convert_cost_to_px(before, problem.sigma_px),
         after_px=_convert_cost_to_px(after, problem.sigma_px),
-        change=mean,
-        change_sigma=spread,
+        change=change,
+        change_sigma=change_sigma,
         chi2=chi2,
         sigma_px=noise.sigma_px,
         accel_noise_m_s2_rthz=problem.inertial.noise.accel_density_m_s2_rthz,
@@ -211,6 +208,13 @@ def refine(
     if points is not None:
         problem, x = restore_points(whole, problem), carry_points(whole.observations, whole_start, x)
     return _solve_all(judged, problem, x, t_s)
+
+
+def _average_change(before: Array, after: Array) -> tuple[float, float]:
+    """Mean change of the costs (M,) of what was held out, and its standard deviation."""
+    change, count = after - before, len(before)
+    mean = float(change.mean()) if count else 0.0
+    return mean, float(change.std(ddof=1) / count**0.5) if count > 1 else np.inf
 
 
 def _solve_all(judged: Judged, problem: Problem, x: Estimate, t_s: Array) -> Judged:

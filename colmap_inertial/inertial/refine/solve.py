@@ -45,6 +45,8 @@ class SolveLimits:
 
 
 SOLVE = SolveLimits()
+#: A step counts where the cost falls by more than this share of what it promised.
+_GAINS = 1e-4
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -134,51 +136,78 @@ def _build_system(
     return System.build(layout, problem.rows, by, residual, at.rows, (info, -info @ at.offset), damping=damping)
 
 
+@dataclass(kw_only=True)
+class _Damping:
+    """Damping by Nielsen's rule (Madsen, Nielsen, Tingleff, *Methods for non-linear least squares*, 2004)."""
+
+    value: float = SOLVE.first_damping
+    growth: float = 2.0
+
+    @property
+    def is_exhausted(self) -> bool:
+        """Whether more of it is of no use."""
+        return self.value >= SOLVE.most_damping
+
+    def grow(self) -> None:
+        """After a step that leads nowhere."""
+        self.value, self.growth = self.value * self.growth, 2 * self.growth
+
+    def shrink(self, ratio: float) -> None:
+        """After a step that brought so many times what it promised."""
+        self.value = max(self.value * max(0.1, 1 - (2 * ratio - 1) ** 3), SOLVE.least_damping)
+        self.growth = 2.0
+
+
 def solve(problem: Problem, start: Estimate, *, most_steps: int = SOLVE.steps) -> Solution:
-    """Refine an estimate."""
+    """Refine an estimate (``docs/dev/refinement.md``, Solver)."""
     observations, rows = problem.observations, problem.rows
     layout = Layout.of(observations, len(start.velocity_m_s))
-    at, damping, growth = _evaluate(problem, start, observations), SOLVE.first_damping, 2.0
-    converged, steps, stretch = False, 0, 1.0
+    at, damping = _evaluate(problem, start, observations), _Damping()
+    steps, stretch = 0, 1.0
     for steps in range(1, most_steps + 1):
         by, residual = _weight_rows(problem, at)
         gained = pushed = False
-        while not gained and damping < SOLVE.most_damping:
-            system = _build_system(problem, layout, at, by, residual, damping)
+        while not gained and not damping.is_exhausted:
+            system = _build_system(problem, layout, at, by, residual, damping.value)
             step = _find_step(system, rows, by)
-            if step is None:
-                damping, growth = damping * growth, 2 * growth
-                continue
-            if not _is_plausible(start, step.taken(at.estimate, stretch, problem.distances)):
-                damping, growth = damping * growth, 2 * growth
+            if step is None or not _is_plausible(start, step.taken(at.estimate, stretch, problem.distances)):
+                damping.grow()
                 continue
             promised = _predict_decrease(problem, at, residual, step)
-            of_points = 0.5 * float(np.einsum("pi,pij,pj->", system.pull, system.inverse, system.pull))
-            of_points = min(of_points, SOLVE.settled_point * len(system.pull))
-            if promised - of_points < SOLVE.settled:
-                if damping <= SOLVE.rest_damping or pushed:
-                    return _make_solution(at, steps, converged=damping <= SOLVE.rest_damping)
-                damping, growth, pushed = SOLVE.rest_damping, 2.0, True
+            if promised - _predict_decrease_by_points(system) < SOLVE.settled:
+                if damping.value <= SOLVE.rest_damping or pushed:
+                    return _make_solution(at, steps, converged=damping.value <= SOLVE.rest_damping)
+                damping, pushed = _Damping(value=SOLVE.rest_damping), True
                 continue
-            for length in (stretch, 1.0) if stretch > 1 else (1.0,):
-                tried = _evaluate(problem, step.taken(at.estimate, length, problem.distances), observations)
-                ratio = (at.cost - tried.cost) / promised
-                gained = ratio > 1e-4
-                if gained:
-                    break
-            stretch = 1.0
-            if gained:
-                at = tried
-                damping = max(damping * max(0.1, 1 - (2 * ratio - 1) ** 3), SOLVE.least_damping)
-                growth = 2.0
-                # of the curvature by the weights, the share that this step met
-                share = (2 * length - ratio) / length**2
-                stretch = 1 / min(max(share, 1 / SOLVE.longest_stretch), 1.0)
-            else:
-                damping, growth = damping * growth, 2 * growth
+            tried, length = _try_step(problem, at, step, stretch, promised)
+            ratio = (at.cost - tried.cost) / promised
+            gained, stretch = ratio > _GAINS, 1.0
+            if not gained:
+                damping.grow()
+                continue
+            at = tried
+            damping.shrink(ratio)
+            # of the curvature by the weights, the share that this step met
+            share = (2 * length - ratio) / length**2
+            stretch = 1 / min(max(share, 1 / SOLVE.longest_stretch), 1.0)
         if not gained:
             break
-    return _make_solution(at, steps, converged=converged)
+    return _make_solution(at, steps, converged=False)
+
+
+def _try_step(problem: Problem, at: _Point, step: Step, stretch: float, promised: float) -> tuple[_Point, float]:
+    """What a step leads to, and its length: stretched, or as it is where that brings nothing."""
+    for length in (stretch, 1.0) if stretch > 1 else (1.0,):
+        tried = _evaluate(problem, step.taken(at.estimate, length, problem.distances), problem.observations)
+        if (at.cost - tried.cost) / promised > _GAINS:
+            break
+    return tried, length
+
+
+def _predict_decrease_by_points(system: System) -> float:
+    """Decrease of the cost that points by themselves promise, as far as a false one that creeps on may hide it."""
+    of_points = 0.5 * float(np.einsum("pi,pij,pj->", system.pull, system.inverse, system.pull))
+    return min(of_points, SOLVE.settled_point * len(system.pull))
 
 
 def _find_step(system: System, observations: Observations, by: Derivatives) -> Step | None:

@@ -321,23 +321,29 @@ def _estimate_without_moved_end(
     for from_end in (number, number[::-1]):
         few, many = 0, int(_MOVED.most_share * len(trajectory))
         without = _estimate(trajectory.select(sound & (from_end >= many)), timed, options)
-        if without.cov is None or without.verdict == "refused" or without.cov[0, 0] > limit:
+        if not _is_known_within(without, limit):
             continue
+        assert without.cov is not None
         limit = min(limit, _MOVED.grows**2 * float(without.cov[0, 0]))
+        # the fewest that it takes, by halving
         while many - few > 1:
             between = (few + many) // 2
             trial = _estimate(trajectory.select(sound & (from_end >= between)), timed, options)
-            if trial.cov is None or trial.verdict == "refused" or trial.cov[0, 0] > limit:
-                few = between
-            else:
+            if _is_known_within(trial, limit):
                 many, without = between, trial
+            else:
+                few = between
         best, kept = without, sound & (from_end >= many)
-        beyond = set(moved) - set(trajectory.names)
         left_out = (
-            *(name for name in moved if name in beyond),
+            *(name for name in moved if name not in trajectory.names),
             *(name for name, is_kept in zip(trajectory.names, kept.tolist(), strict=True) if not is_kept),
         )
     return best, left_out
+
+
+def _is_known_within(estimate: ScaleEstimate, variance: float) -> bool:
+    """Whether a scale is given, and its logarithm has no larger variance."""
+    return estimate.cov is not None and estimate.verdict != "refused" and not estimate.cov[0, 0] > variance
 
 
 def _estimate(trajectory: CameraTrajectory, timed: CameraTimedImu, options: ScaleOptions) -> ScaleEstimate:
