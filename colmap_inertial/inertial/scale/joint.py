@@ -35,9 +35,9 @@ from colmap_inertial.core.types import (
 from colmap_inertial.inertial.core import parameters as par
 from colmap_inertial.inertial.core.parameters import Prior
 from colmap_inertial.inertial.core.priors import PRIORS, AccelPart, accel_part
-from colmap_inertial.inertial.scale._declared import find_contradicted_lever, open_lever
+from colmap_inertial.inertial.scale._declared import doubts_lever, find_contradicted_lever, leave_out_lever
 from colmap_inertial.inertial.scale._fit import Fit, fit_jointly
-from colmap_inertial.inertial.scale._gain import exceeds_usual
+from colmap_inertial.inertial.scale._gain import WrongGain, exceeds_usual
 from colmap_inertial.inertial.scale._setup import Data, prepare
 from colmap_inertial.inertial.scale._shape import (
     LIMITS as SHAPE_LIMITS,
@@ -53,6 +53,7 @@ from colmap_inertial.inertial.scale.interval import (
     variance_factor,
 )
 from colmap_inertial.inertial.scale.verdict import check_clocks, scale_drifts, verdict_of
+from colmap_inertial.io.calibration import SIGMAS
 
 #: So many times at most is something wrong with the accelerometer looked for, undone, and the rest fitted again.
 _MOST_FAULTS = 6
@@ -136,11 +137,7 @@ def estimate_joint(
     accel, expected_s = accel_part(timed.imu), timed.calibration.accel_delay_s
     shape = ShapeFaults()
     try:
-        timed, data, prior, fit = _fit_moving_stamps(trajectory, timed, options)
-        lever = find_contradicted_lever(fit, prior)
-        if lever is not None:
-            prior = open_lever(prior)
-            fit = fit_jointly(data, prior, timed.imu.noise)
+        timed, data, prior, fit, lever = _fit_without_contradicted_lever(trajectory, timed, options)
         fit, faults = _fit_undoing_accel_faults(fit, data, prior, timed.imu.noise)
         # a path that was smoothed has no shape to speak of
         if not faults.path_is_smoothed:
@@ -217,6 +214,27 @@ def fit_path(
     _, shape = _fit_undoing_shape_faults(fit, faults.undo(data), faults.loosen_delay(prior), timed.imu.noise)
     widened = variance_factor(fit)
     return data, fit, (*faults.as_facts(), *(fault.as_fact(data.t_s, widened) for fault in shape.found))
+
+
+def _fit_without_contradicted_lever(
+    trajectory: CameraTrajectory, timed: CameraTimedImu, options: JointOptions
+) -> tuple[CameraTimedImu, Data, Prior, Fit, Fact | None]:
+    """As :func:`_fit_moving_stamps`, without a declared lever arm that a fit without it contradicts; then that fact."""
+
+    def fit_without(length_m: float) -> tuple[CameraTimedImu, Data, Prior, Fit]:
+        calibration = leave_out_lever(timed.calibration, length_m=length_m)
+        return _fit_moving_stamps(trajectory, replace(timed, calibration=calibration), options)
+
+    believed = _fit_moving_stamps(trajectory, timed, options)
+    _, _, prior, fit = believed
+    if not doubts_lever(fit, prior, is_refused=bool(_find_refusals(fit))):
+        return *believed, None
+    length_m = float(np.linalg.norm(prior.mean.imu_in_cam_m))
+    alone = fit_without(length_m)
+    lever = None if _find_refusals(alone[-1]) else find_contradicted_lever(alone[-1], prior)
+    if lever is None:
+        return *believed, None
+    return *(alone if length_m <= SIGMAS.unknown_lever_arm_m else fit_without(0.0)), lever
 
 
 def _fit_moving_stamps(
@@ -362,8 +380,8 @@ def _judge_fit(
     if verdict == "refused":
         reasons = (*reasons, *(() if worthless else wrong))
     else:
-        doubts, within = _find_doubts(fit, accel, clock_rate, shape)
-        verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, [*wrong, *doubts])
+        doubts, within = _find_doubts(fit, accel, clock_rate, wrong, shape)
+        verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, doubts)
         counted = tuple(Fact("counted-in-interval", found=fact) for fact in within)
     # what is in the interval makes nothing weak by itself; where the interval is wide, it may be why
     reasons, notes = (reasons, counted) if verdict == "trusted" else ((*reasons, *counted), ())
@@ -389,12 +407,16 @@ def _judge_fit(
     )
 
 
-def _find_doubts(fit: Fit, accel: AccelPart, clock_rate: float, shape: ShapeFaults) -> tuple[list[Fact], list[Fact]]:
-    """Findings that make a scale weak, and others that are in its interval."""
-    widened = variance_factor(fit)
-    large, usual = _check_gains(fit, accel)
+def _find_doubts(
+    fit: Fit, accel: AccelPart, clock_rate: float, wrong: Sequence[Fact], shape: ShapeFaults
+) -> tuple[list[Fact], list[Fact]]:
+    """Findings that make a scale weak, what was declared first, and others that are in its interval."""
+    widened, wrong_gain = variance_factor(fit), find_wrong_gain(fit, accel)
+    declared = _check_calibrated_gains(fit, wrong_gain) if accel.calibrated else []
+    large, usual = ([], []) if accel.calibrated else _check_gains(fit, wrong_gain)
     bent = [fault.as_fact(fit.t_s, widened) for fault in shape.doubtful] or _check_drift(fit.drift)
-    doubts = [*check_clocks(clock_rate), *_check_length(fit.t_s), *_check_rest(fit), *large, *bent]
+    others = [*check_clocks(clock_rate), *_check_length(fit.t_s), *_check_rest(fit)]
+    doubts = [*declared, *wrong, *others, *large, *bent]
     return doubts, [*usual, *(fault.as_fact(fit.t_s, widened) for fault in shape.harmless)]
 
 
@@ -446,22 +468,24 @@ def _check_rest(fit: Fit) -> list[Fact]:
     return [] if fit.converged else [Fact("fit-hardly-converged", moves_log=fit.unsettled_log)]
 
 
-def _check_gains(fit: Fit, accel: AccelPart) -> tuple[list[Fact], list[Fact]]:
-    """Gains of the accelerometer: larger than any sensor's, and others that are worth a word.
+def _check_calibrated_gains(fit: Fit, wrong_gain: WrongGain | None) -> list[Fact]:
+    """A doubt where a calibrated accelerometer has gains, which contradict the calibration."""
+    if fit.gain_chi2 > par.LARGEST_GAIN_CHI2:
+        return [Fact("calibrated-gain-contradicted", gains=-np.diagonal(fit.estimate.accel_gain))]
+    if wrong_gain is not None and wrong_gain.is_likely:
+        return [Fact("calibrated-gain-contradicted", gains=(wrong_gain.gain,) * 3)]
+    return []
 
-    Of a calibrated one they are zero, and others contradict the calibration.
-    """
-    gains, wrong_gain = fit.estimate.accel_gain, find_wrong_gain(fit, accel)
-    if fit.gain_chi2 > par.LARGEST_GAIN_CHI2 and accel.calibrated:
-        return [Fact("calibrated-gain-contradicted", gains=-np.diagonal(gains))], []
+
+def _check_gains(fit: Fit, wrong_gain: WrongGain | None) -> tuple[list[Fact], list[Fact]]:
+    """Gains of an accelerometer that was not calibrated: larger than any sensor's, and others that are worth a word."""
+    gains = fit.estimate.accel_gain
     if fit.gain_chi2 > par.LARGEST_GAIN_CHI2:
         sigma = np.sqrt(variance_factor(fit) * np.diagonal(fit.cov[par.ACCEL_GAIN, par.ACCEL_GAIN])).reshape(3, 3)
         found = Fact("accel-gain-large", gains=-np.diagonal(gains))
         return ([found], []) if exceeds_usual(gains, sigma).any() else ([], [found])
     if wrong_gain is None or not wrong_gain.is_likely:
         return [], []
-    if accel.calibrated:
-        return [Fact("calibrated-gain-contradicted", gains=(wrong_gain.gain,) * 3)], []
     found = Fact("accel-gain-doubtful", gain=wrong_gain.gain, excess=wrong_gain.excess)
     return ([found], []) if wrong_gain.is_large else ([], [found])
 
