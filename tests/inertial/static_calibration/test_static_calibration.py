@@ -14,7 +14,7 @@ from colmap_inertial import calibrate_imu, estimate_scale, gravity_at_latitude_m
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import IMU_CAL, IMU_CALIBRATION_PARAMETERS, ImuCalibration, ImuRecording
-from colmap_inertial.inertial.static_calibration import _judged, _residual
+from colmap_inertial.inertial.static_calibration import _judge_calibration, _residual
 from colmap_inertial.inertial.static_calibration._rests import _means, candidate_rests
 from colmap_inertial.tools.simulate import RecordingOptions, RestOptions, simulate_recording, simulate_rests
 from colmap_inertial.tools.simulate.sensors import IMU_PRESETS
@@ -368,7 +368,7 @@ def test_the_worst_of_three_axes_makes_a_calibration_weak(entry, sigma, said):
 
     def judged():
         calibration = SimpleNamespace(cov=np.diag(sigmas**2), gravity_m_s2=9.8)
-        return _judged(calibration, sound, rests, 1e-4, apart=False)
+        return _judge_calibration(calibration, sound, rests, 1e-4, apart=False)
 
     assert judged() == ("good", ())
     sigmas[np.arange(len(sigmas))[IMU_CAL.ACCEL_GAIN].reshape(3, 3)[entry]] = sigma
