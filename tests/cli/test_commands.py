@@ -371,8 +371,8 @@ def test_outputs_never_replace_what_is_not_an_earlier_result(capsys, project, tm
     thesis.write_text('{"years": 4}')
     for target, words in (
         (times, "is an input"),
-        (thesis, "is no earlier result"),
-        (imu / "gyroscope.txt", "is no earlier result"),
+        (thesis, "is not an earlier result"),
+        (imu / "gyroscope.txt", "is not an earlier result"),
         (imu, "is a folder"),
     ):
         before = None if target.is_dir() else target.read_bytes()
@@ -391,7 +391,7 @@ def test_an_output_folder_that_cannot_be_made_is_an_error(capsys, tmp_path):
     (tmp_path / "file").write_text("")
     code, _, err = run(capsys, "reconstruct", SCENE, tmp_path / "file" / "out")
     assert code == 2
-    assert "cannot be made" in err
+    assert "cannot be created" in err
 
 
 def test_an_imu_shorter_than_the_recording_is_mentioned(capsys, project, tmp_path):
@@ -405,7 +405,7 @@ def test_an_imu_shorter_than_the_recording_is_mentioned(capsys, project, tmp_pat
         capsys, "scale", project.model, "--imu", imu, "--frame-times", project.frame_times, "--json", target
     )
     assert code in (0, 3)
-    assert "the IMU runs along with" in " ".join(json.loads(target.read_text())["notes"])
+    assert "IMU data cover" in " ".join(json.loads(target.read_text())["notes"])
 
 
 def test_validate_does_not_write_into_a_folder_of_pictures(capsys, project, tmp_path):

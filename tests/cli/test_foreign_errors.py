@@ -103,7 +103,7 @@ def test_a_report_of_damaged_files(run, name, content):
     whole = (run / name).read_bytes()
     try:
         (run / name).write_text(json.dumps(content))
-        with pytest.raises(FormatError, match="damaged since it was written"):
+        with pytest.raises(FormatError, match="changed since it was written"):
             write_report(run)
     finally:
         (run / name).write_bytes(whole)

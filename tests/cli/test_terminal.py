@@ -76,7 +76,7 @@ def test_what_the_check_beforehand_finds_is_said_before_the_work(still, tmp_path
         capsys, "reconstruct", still.model, tmp_path / "out", "--imu", still.imu, "--frame-times", still.frame_times
     )
     assert code == 3
-    assert "no-acceleration" not in err and "it stood on a tripod" in err and "Metric scale ..." not in err
+    assert "no-acceleration" not in err and "it stood still" in err and "Metric scale ..." not in err
 
 
 @pytest.mark.parametrize("width", [80, 140, None], ids=["80", "140", "piped"])
@@ -269,7 +269,7 @@ def test_a_scale_says_apart_what_its_recording_has(project, tmp_path, capsys):
     )  # fmt: skip
     assert code == 0, err
     found = json.loads((tmp_path / "scale.json").read_text())
-    said = "the stamps of camera and IMU have no time in common"
+    said = "camera and IMU clocks do not overlap"
     assert not any(said in reason for reason in found["reasons"]) and any(said in note for note in found["notes"])
     (line,) = (line for line in out.splitlines() if said in line)
     assert "Note" in line
@@ -315,7 +315,7 @@ def test_the_last_screen_begins_with_metres_and_ends_with_the_next_command(made,
     _, out, _ = run(capsys, *made)
     lines = out.splitlines()
     box = [line for line in lines if line.startswith("\u2502")]
-    assert re.match(r"\u2502 Metres +lengths of 10 m are right to within \d+(\.\d)? cm", box[0])
+    assert re.match(r"\u2502 Metres +lengths of 10 m are accurate to \d+(\.\d)? cm", box[0])
     assert [line.split()[1] for line in box if line.split()[1] in ("Verdict", "Scale", "Images", "Written")] == [
         "Verdict", "Scale", "Images", "Written",
     ]  # fmt: skip

@@ -230,7 +230,7 @@ def read(path, *, settings=(), deterministic=False, **mapping):
 def test_device_and_names_are_those_that_it_has(tmp_path):
     older = program(tmp_path / "colmap", OLDER)
     assert (read(older).version, read(older).device) == ("3.8", "cuda")
-    with pytest.raises(InertialError, match="--deterministic goes with pycolmap alone"):
+    with pytest.raises(InertialError, match="--deterministic works with pycolmap only"):
         read(older, deterministic=True)
     assert read(older, device="cpu").device == "cpu"
     settings = ("FeatureExtraction.max_image_size=99",)
@@ -249,7 +249,7 @@ def test_device_and_names_are_those_that_it_has(tmp_path):
     assert read(newer).device == "cpu"
     with pytest.raises(InertialError, match=r"--mapping.device cuda: .*newer is built without CUDA"):
         read(newer, device="cuda")
-    with pytest.raises(InertialError, match="aliked goes with pycolmap alone"):
+    with pytest.raises(InertialError, match="aliked works with pycolmap only"):
         read(newer, features="aliked")
 
 

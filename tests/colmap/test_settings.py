@@ -84,7 +84,7 @@ def test_what_colmap_does_not_have_is_refused(subtests):
         ("SiftExtraction.normalization=l3", "as L1_ROOT is"),
         ("SiftExtraction.max_num_features=-5", "COLMAP refuses this value"),
         ("TwoViewGeometry.max_error=-1", "COLMAP refuses this value"),
-        ("Mapper.num_threads=3", "--deterministic decides"),
+        ("Mapper.num_threads=3", "set by --deterministic"),
         ("SequentialMatching.overlap=3", r"--mapping\.pairing"),
         ("AlikedExtraction.min_score=1", "the installed pycolmap has no AlikedExtraction"),
         ("Mapper.init_num_trials", "write SECTION.option=value"),
@@ -118,7 +118,7 @@ def test_of_a_project_ini_counts_what_differs_and_a_setting_goes_before_it(tmp_p
     with pytest.raises(FormatError, match="init_num_trials"):
         read_settings((), ini)
     ini.write_text("[Mapper\n")
-    with pytest.raises(FormatError, match=r"is no project\.ini"):
+    with pytest.raises(FormatError, match=r"is not a project\.ini"):
         read_settings((), ini)
 
 

@@ -83,7 +83,7 @@ def test_a_folder_whose_name_is_no_utf_8(subtests, tmp_path_factory):
             assert (
                 done.returncode == 2
                 and done.stderr.startswith("error: ")
-                and "is no UTF-8 or holds a control" in done.stderr
+                and "is not UTF-8 or holds a control" in done.stderr
             )
             with pytest.raises(FormatError, match="rename it"):
                 require_utf8(tmp_path, name)

@@ -198,7 +198,7 @@ def test_a_pose_is_a_matrix_with_or_without_a_place_or_a_quaternion(tmp_path: Pa
         assert np.abs(known.cam_from_imu_xyzw @ turned) == pytest.approx(1, abs=1e-12)
         assert known.imu_in_cam_m == pytest.approx(np.array([0.01, -0.02, 0.03]))
     for said, complaint in (
-        (f"cam_from_imu = {pose.tolist()}\n{lever}", "say the same; leave one out"),
+        (f"cam_from_imu = {pose.tolist()}\n{lever}", "give the same value; leave one out"),
         (f"cam_from_imu = {pose[:3, :3].tolist()}\ncam_from_imu_xyzw = {turned.tolist()}\n", "leave one out"),
         (f"cam_from_imu = {np.vstack([pose[:3], [0, 0, 0.1, 1]]).tolist()}\n", "last row"),
         (f"cam_from_imu = {pose[:3].tolist()}\n", "found 3x4"),
@@ -227,7 +227,7 @@ def test_intrinsics_count_from_the_corner_or_the_centre_of_the_first_pixel(tmp_p
     ("gyro", "said"),
     [
         ('columns = ["gx", "gy"]', "three names"),
-        ("columns = [1, 2, 3]", "another than time"),
+        ("columns = [1, 2, 3]", "none of them the time"),
         ("columns = [0, 2, 3]", "counted from 1"),
         ("columns = [2, 3, 40]", "there is no column 40"),
         ('columns = ["gx", "gy", "gz"]', 'has no column "gx"; the header is'),
@@ -436,7 +436,7 @@ def test_a_key_of_many_parts_is_refused_and_a_text_with_many_dots_is_none(tmp_pa
     deep = ".".join("a" * 32)
     assert parse_toml(tmp_path, f"{deep} = 1")["a"]["a"]
     for text in (f"{deep}.b = 1", f"[{deep}.b]", f'{deep}."b" = 1', f"x = {{ {deep} . b = 1 }}"):
-        with pytest.raises(FormatError, match="more than 32 parts"):
+        with pytest.raises(FormatError, match="more than 32 dotted parts"):
             parse_toml(tmp_path, text)
     dots = "." * 99
     for text in (f'x = "{dots}"', f"x = '{dots}'", f'x = """\n{dots}"""', f"x = '''{dots}'''"):

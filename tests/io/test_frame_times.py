@@ -35,10 +35,10 @@ def test_a_name_or_pattern_without_a_time_is_named(subtests):
         ("ns", "12_34.png", "several numbers of one length"),
         ("cam0_{ns}", "cam1_5.png", r"cam1_5.png: the name does not fit"),
         ("cam0_{ns}", "cam0_5_6.png", "does not fit"),
-        ("{ns}_{ms}", "5_6.png", "does not say how names hold times"),
-        ("{min}", "5.png", "does not say how names hold times"),
-        ("%Y%m%d_%H%M%S", "20240501_123015.png", "does not say how names hold times"),
-        ("%H%M%S%f", "123015250.png", "does not say how names hold times"),
+        ("{ns}_{ms}", "5_6.png", "does not describe how names hold times"),
+        ("{min}", "5.png", "does not describe how names hold times"),
+        ("%Y%m%d_%H%M%S", "20240501_123015.png", "does not describe how names hold times"),
+        ("%H%M%S%f", "123015250.png", "does not describe how names hold times"),
         ("%Y%m%d_%H%M%S%f", "20241301_123015250.png", "does not fit"),
         ("cam0/ns", "cam1/5.png", "no image lies in a folder 'cam0'"),
     ):
@@ -62,7 +62,7 @@ def test_a_log_has_a_time_for_each_frame(subtests, tmp_path_factory):
 def test_a_log_without_clear_times_is_named(subtests, tmp_path_factory):
     for text, unit, error, said in (
         ("5,6\n7,8\n", "ns", TimingError, "2 columns and no header; name the time column"),
-        ("5\n7\n", None, TimingError, "does not say the unit of its times"),
+        ("5\n7\n", None, TimingError, "does not state the unit of its times"),
         ("t_ns,t_ms\n5,6\n7,8\n", None, TimingError, "several columns of times"),
         ("x,y\n5,6\n7,8\n", None, TimingError, "no column of times"),
         ("t_ns\n5\n7\n", "ms", TimingError, "the header says ns, time_unit says ms"),
@@ -79,7 +79,7 @@ def test_frames_of_a_log_follow_each_other():
     log = frame_log(HERE, np.array([5, 7, 12], dtype=np.int64) * 10**9, readout_s=0.02)
     assert log.t_s.tolist() == [0, 2, 7] and log.epoch_ns == 5 * 10**9 and log.shared_clock and log.readout_s == 0.02
     for times, frame in (([5, 7, 7], 3), ([5, 4, 9], 2)):
-        with pytest.raises(FormatError, match=f"the time of frame {frame} is not after the one before"):
+        with pytest.raises(FormatError, match=f"the time of frame {frame} is not after the previous one"):
             frame_log(HERE, np.array(times, dtype=np.int64))
 
 

@@ -247,7 +247,7 @@ def test_an_empty_or_missing_folder_is_named(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="no such folder"):
         read_frame_timing(tmp_path)
     (tmp_path / "frames").mkdir()
-    with pytest.raises(FormatError, match="holds no pictures"):
+    with pytest.raises(FormatError, match="holds no images"):
         read_frame_timing(tmp_path)
     (tmp_path / "capture.toml").write_text('[imu]\npath = "a"\n')
     with pytest.raises(FormatError, match=r"\[images\] or \[video\]"):

@@ -236,7 +236,7 @@ def test_what_is_there_twice_is_refused(tmp_path):
         path = again / f"{name}.txt"
         first = without_comments(path.read_text().splitlines())
         path.write_text("\n".join([*first, *first[: 2 if name == "images" else 1]]) + "\n")
-        with pytest.raises(FormatError, match=f"{what}.* is there twice"):
+        with pytest.raises(FormatError, match=f"{what}.* appears twice"):
             read_model(again)
 
 

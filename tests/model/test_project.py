@@ -419,7 +419,7 @@ def test_what_cannot_be_told_is_refused(two_models, tmp_path):
     model = read_model(project / "dense" / "sparse")
     model.transform(pycolmap.Sim3d(1.4, pycolmap.Rotation3d(), np.zeros(3)))
     model.write_binary(str(project / "dense" / "sparse"))
-    with pytest.raises(FormatError, match="its cameras stand elsewhere"):
+    with pytest.raises(FormatError, match="its cameras are elsewhere"):
         apply_to_project(project, tmp_path / "out", scales)
     for image in model.images.values():
         image.name = "x" + image.name
@@ -451,7 +451,7 @@ def test_out_must_be_new_and_elsewhere(made, project, tmp_path):
     (tmp_path / "there").mkdir()
     with pytest.raises(OutputError, match="exists already"):
         apply_to_project(project, tmp_path / "there", SIMILARITY)
-    with pytest.raises(OutputError, match="lie within each other"):
+    with pytest.raises(OutputError, match="lies within the other"):
         apply_to_project(project, project / "metric", SIMILARITY)
     assert digest(project) == digest(made / "project")
 

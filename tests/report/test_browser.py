@@ -321,7 +321,7 @@ def test_text_tables_and_plots_stand_without_scripts(browser, pages):
         names = " ".join(str(node.get("name", {}).get("value", "")) for node in text["nodes"])
     finally:
         browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": False})
-    assert "No scale could be found" in names
+    assert "The scale could not be determined" in names
     assert "With JavaScript, the plots can be turned and zoomed" in names
     # the words of the still pictures
     assert "time since the first frame (s)" in names

@@ -40,7 +40,7 @@ from colmap_inertial.report import figures, signals, write_report
 from colmap_inertial.report.content import _describe_path
 from colmap_inertial.report.figure_3d import _grid, scene_figure
 from colmap_inertial.report.photogrammetry import scene_record
-from colmap_inertial.report.series import SIZES, nice_length, rounded, strided, thinned
+from colmap_inertial.report.series import SIZES, nice_length, round_values, stride_indices, thin_line
 from colmap_inertial.report.signals import signal_record
 from colmap_inertial.report.still import STYLE, draw_still
 from colmap_inertial.report.still_3d import StillView, draw_scene_still
@@ -533,7 +533,7 @@ def test_the_first_screen_says_how_large_how_sure_where_and_what_next(full, tmp_
     for said in ("12.3 m × 45.6 cm, 3 m high", "12.3 m are known to ±13 cm, lengths of 10 m to ±11 cm (±1.1 %, 95 %)"):
         assert said in first
     assert "−0.31 % off, within the tolerance of 2 %" in first and "no positions (GPS) were used" in first
-    assert "What next" in first and "colmap-inertial view ." in first
+    assert "Next steps" in first and "colmap-inertial view ." in first
     assert "of COLMAP's own model" not in first  # the unit scale is of no use for the metric model
     model["georeference"] = {
         "origin": {"latitude_deg": 47.3769, "longitude_deg": 8.5417},
@@ -576,7 +576,7 @@ def test_a_section_without_data_is_left_out_with_the_reason(full, tmp_path, gone
 def test_without_exposure_times_there_is_no_blur(full, tmp_path):
     out = copy_of(full, tmp_path)
     result = json.loads((out / "result.json").read_text(encoding="utf-8"))
-    result["imaging"]["deblur"] = "frames stay as they were filmed: the exposure time is unknown"
+    result["imaging"]["deblur"] = "frames are not deblurred: the exposure time is unknown"
     for frame in result["frames"]:
         frame["blur_px"] = None
     content, page = report_of_changed(out, result)
@@ -661,6 +661,17 @@ def test_used_frames_of_a_video_are_told(full, tmp_path):
     content, page = report_of_changed(out, result)
     assert content["selection"] == {"frames": 900, "used": 120, "note": "the sharpest of each window"}
     assert "120 of 900: the sharpest of each window" in page.text
+
+
+def test_frames_are_listed_with_what_was_done_to_them(full, tmp_path):
+    out = copy_of(full, tmp_path)
+    result = json.loads((out / "result.json").read_text(encoding="utf-8"))
+    content, _ = report_of_changed(out, result)
+    rows, blur_px = content["frame_table"]["rows"], {f["name"]: f["blur_px"] for f in result["frames"]}
+    assert content["frame_table"]["count"] == len(rows) == len(blur_px)
+    assert {row["name"]: row["blur_px"] for row in rows} == blur_px
+    listed = [row["blur_px"] or 0.0 for row in rows]
+    assert listed == sorted(listed, reverse=True)
 
 
 def test_why_there_is_no_target_and_there_are_no_crops(full, tmp_path):
@@ -770,22 +781,22 @@ def test_thinning_keeps_the_extremes_the_order_and_the_gaps():
     values = np.sin(t_s)
     values[7777], values[15000] = 9.0, -9.0
     values[4000:6000] = np.nan
-    line = thinned(t_s, values)
+    line = thin_line(t_s, values)
     assert len(line["t_s"]) == len(line["values"]) <= SIZES.line_points
     assert line["t_s"] == sorted(line["t_s"])
     known = [value for value in line["values"] if value is not None]
     assert max(known) == 9.0 and min(known) == -9.0
     assert None in line["values"]
     assert not [t for t, v in zip(line["t_s"], line["values"], strict=True) if v is not None and 20.1 < t < 29.9]
-    short = thinned(t_s[:50], values[:50])
+    short = thin_line(t_s[:50], values[:50])
     assert len(short["t_s"]) == 50
 
 
 def test_numbers_are_short_and_right():
     values = np.array([123456.789, -0.000123456, 0.0, np.nan, np.inf, 1e-300])
-    assert rounded(values, 4) == [123500.0, -0.0001235, 0.0, None, None, 1e-300]
-    assert strided(5, 10).tolist() == [0, 1, 2, 3, 4]
-    assert strided(1000, 3).tolist() == [0, 500, 999]
+    assert round_values(values, 4) == [123500.0, -0.0001235, 0.0, None, None, 1e-300]
+    assert stride_indices(5, 10).tolist() == [0, 1, 2, 3, 4]
+    assert stride_indices(1000, 3).tolist() == [0, 500, 999]
 
 
 def steady_turn(rate_rad_s, *, offset_s=0.0):
@@ -1051,7 +1062,7 @@ def test_a_failing_report_of_a_stop_hides_no_reason(tmp_path, monkeypatch, repor
     workspace, capture = Workspace(tmp_path), Capture(path=tmp_path, calibration=calibration_prior())
     with pytest.raises(MappingError, match="nothing matches") as stopped, reporting_stops(workspace, capture):
         raise MappingError(Fact.stated("nothing matches"))
-    assert stopped.value.__notes__ == [f"what was found, and what to do: {tmp_path / 'report.html'}"]
+    assert stopped.value.__notes__ == [f"findings and remedies: {tmp_path / 'report.html'}"]
     monkeypatch.setattr("colmap_inertial.run.commands.reporting.write_report", broken)
     with pytest.raises(MappingError, match="nothing matches"), reporting_stops(workspace, capture):
         raise MappingError(Fact.stated("nothing matches"))

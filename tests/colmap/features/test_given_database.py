@@ -217,8 +217,11 @@ def test_what_cannot_be_gone_on_with_is_refused_in_words(capture, names, akaze, 
 
 def test_damage_is_said_before_colmap_ends_the_process(subtests, akaze, tmp_path_factory):
     for change, said in (
-        ("UPDATE keypoints SET data = x'00' WHERE image_id = 3", "1 rows of keypoints are not as long as they say"),
-        ("UPDATE keypoints SET cols = 3", "rows of keypoints are not as long"),
+        (
+            "UPDATE keypoints SET data = x'00' WHERE image_id = 3",
+            "1 rows of keypoints do not have their stated length",
+        ),
+        ("UPDATE keypoints SET cols = 3", "rows of keypoints do not have their stated length"),
         ("UPDATE matches SET rows = rows + 1", "rows of matches are not as long"),
         ("UPDATE descriptors SET cols = 60", "rows of descriptors are not as long"),
         ("DELETE FROM cameras", "an image has no camera"),
@@ -243,7 +246,7 @@ def test_matches_of_keypoints_that_there_are_not_are_refused(capture, names, aka
         database.execute(
             "UPDATE matches SET rows = 20, data = ? WHERE pair_id = (SELECT MIN(pair_id) FROM matches)", (far,)
         )
-    with pytest.raises(FormatError, match="name keypoints that there are not"):
+    with pytest.raises(FormatError, match="name keypoints that do not exist"):
         run(capture, tmp_path / "out", torn)
 
 

@@ -353,7 +353,7 @@ WRONG = {
         small.network(
             [helper.make_node("AveragePool", ["picture"], ["restored"], kernel_shape=[2, 2], strides=[2, 2])]
         ),
-        r"makes \(1, 3, 16, 24\) of \(1, 3, 32, 48\); a picture must keep its size",
+        r"makes \(1, 3, 16, 24\) of \(1, 3, 32, 48\); an image must keep its size",
     ),
 }
 

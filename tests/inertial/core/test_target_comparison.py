@@ -181,13 +181,13 @@ def test_a_result_that_shows_nothing_is_refused_by_name(subtests, tmp_path_facto
         (
             (result(validation={"scale_error_pct": None}), "no scale with a measured target"),
             (result(verdict="refused"), "no scale with a measured target"),
-            (result(imu_calibration={"attitudes": 12}), "calibration of the IMU went into its scale"),
+            (result(imu_calibration={"attitudes": 12}), "already used a calibration of the IMU"),
             (result(validation={"doubts": ["too few"]}), "its target may not be the stated one: too few"),
             (earlier(), "its target may not be the stated one: two images only"),
             (result(validation={"target": "checkerboard:8x6:0.04"}), r"is not stated; measure it, and add \+-"),
             (result(parts=None), "not that of the joint method"),
-            ({"capture": "x"}, "is no result"),
-            (result(capture="b"), "as another of these results"),
+            ({"capture": "x"}, "is not a result"),
+            (result(capture="b"), "like another of these results"),
         )
     ):
         with subtests.test(i=i, said=said):
@@ -208,10 +208,10 @@ def test_a_calibration_by_rests_is_not_replaced_by_targets_and_a_place_is_for_re
         write_imu_calibration(tmp_path / f"{name}.json", calibration)
     kept = remember("My phone", tmp_path / "targets.json")
     assert remember("My phone", tmp_path / "rests.json") == kept
-    with pytest.raises(OutputError, match="by rests, which says more than targets: remove it first"):
+    with pytest.raises(OutputError, match="from rests, which is better than one from targets: remove it first"):
         remember("My phone", tmp_path / "targets.json")
     assert read_imu_calibration(kept).attitudes == 12
     out = ["--out", str(tmp_path / "out.json")]
-    for words, said in ((["a", "b", "--latitude-deg", "47"], "leave out the place"), ([], "name the recording")):
+    for words, said in ((["a", "b", "--latitude-deg", "47"], "leave it out with results"), ([], "name the recording")):
         assert run(["calibrate-imu", *words, *out]) == 2
         assert said in capsys.readouterr().err

@@ -91,7 +91,7 @@ def test_matches_place_a_part_better_than_the_imu_alone(returned, parts, found):
     assert alone.gaps[0].matched_images == 0 and alone.gaps[0].joined
     (gap,), (group,) = both.gaps, both.groups
     assert gap.joined and gap.matched_images > 10 and gap.shared_images == 0
-    assert "match the other, and the IMU" in str(gap.reason)
+    assert "matched images, and the IMU" in str(gap.reason)
     assert gap.sigma_m < 0.6 * alone.gaps[0].sigma_m
     assert group.matched == {(0, 1)} and alone.groups[0].matched == frozenset()
     placed = error_m(tracks, parts, group.placed)
@@ -110,7 +110,7 @@ def test_matches_that_contradict_the_imu_are_left_out(returned, parts, found):
     assert all(len(one.images) > 10 for one in find_matched(parts, false))
     joined, alone = (join_submodels(parts, tracks.imu, LIMITS, one) for one in (false, ()))
     assert joined.gaps[0].joined and joined.gaps[0].matched_images == 0
-    assert "contradict it, and are left out" in str(joined.gaps[0].reason)
+    assert "contradicting matches between the two are left out" in str(joined.gaps[0].reason)
     assert joined.gaps[0].sigma_m == pytest.approx(alone.gaps[0].sigma_m)
     assert joined.groups[0].matched == frozenset()
 
@@ -237,5 +237,5 @@ def test_a_database_that_cannot_be_read_is_said_in_a_sentence(subtests, returned
             data = database.read_bytes()
             broken = tmp_path / "database.db"
             broken.write_bytes(data[: int(kept * len(data))] or b"no database" * 99)
-            with pytest.raises(FormatError, match="put it back as it was"):
+            with pytest.raises(FormatError, match="restore it"):
                 replace(stage, database=broken).join_models(models)

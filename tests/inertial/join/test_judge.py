@@ -102,7 +102,7 @@ def test_two_cameras_are_not_one_device(subtests, walked):
             other = part_of(walked, T_S[(T_S > 9.5) & (T_S < 17)], 1, mounted_m=(mounted_m, 0, 0))
             (gap,) = join_submodels([first, other], walked.imu, LIMITS).gaps
             assert gap.joined == (mounted_m == 0)
-            assert gap.joined or "is mounted to the IMU otherwise" in str(gap.reason)
+            assert gap.joined or "mounted differently on the IMU" in str(gap.reason)
 
 
 def test_ties_that_are_off_never_widen_a_scale_beyond_its_own():

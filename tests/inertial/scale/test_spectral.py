@@ -159,14 +159,14 @@ def test_a_jump_of_the_poses_and_missing_frames_are_survived(handheld):
 def test_derivatives_of_the_magnitudes_are_right(handheld):
     signals = Signals.of(handheld.trajectory, timed(handheld.trajectory, handheld.imu, known(handheld)))
     data = signals.spectra(1.2)
-    prior = spectral_module._prior(known(handheld))
+    prior = spectral_module._make_prior(known(handheld))
     state, noise = spectral_module._linear_start(data, prior, 9.80665)
-    residual, jacobian = spectral_module._magnitudes(data, noise, prior, state)
+    residual, jacobian = spectral_module._compare_magnitudes(data, noise, prior, state)
     for i, size in enumerate([1e-6, *[1e-6] * 6, 1e-7, 1e-7]):
         step = np.zeros(9)
         step[i] = size
-        ahead, _ = spectral_module._magnitudes(data, noise, prior, state.moved(step))
-        behind, _ = spectral_module._magnitudes(data, noise, prior, state.moved(-step))
+        ahead, _ = spectral_module._compare_magnitudes(data, noise, prior, state.moved(step))
+        behind, _ = spectral_module._compare_magnitudes(data, noise, prior, state.moved(-step))
         numeric = (ahead - behind) / (2 * size)
         assert np.allclose(jacobian[:, i], numeric, rtol=1e-3, atol=1e-3 * np.abs(jacobian[:, i]).max())
     assert len(residual) == 3 * len(data.frequency_hz) + 6

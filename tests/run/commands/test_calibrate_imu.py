@@ -267,7 +267,7 @@ def test_too_few_attitudes_end_with_3_and_what_to_do(capsys, tmp_path) -> None:
     write_table(tmp_path / "rests.csv", simulate_rests(RestOptions(attitudes=4), seed=2).recording)
     code, _, err = run(capsys, "calibrate-imu", tmp_path / "rests.csv", "--out", tmp_path / "imu.json")
     assert code == 3
-    assert "4 attitudes only" in err and "six sides" in err
+    assert "rested in 4 attitudes" in err and "six sides" in err
     assert not (tmp_path / "imu.json").exists()
 
 

@@ -33,7 +33,7 @@ def test_images_that_cannot_be_written_are_an_error(tmp_path):
     done = subprocess.run(args, capture_output=True, text=True)
     assert done.returncode == 2, done.stderr
     last = done.stderr.splitlines()[-1]
-    assert last.startswith(f"error: {tmp_path / 'out'}: a file in it would be larger") and "(ulimit -f)" in last
+    assert last.startswith(f"error: {tmp_path / 'out'}: a file in it would exceed") and "(ulimit -f)" in last
     assert not list((tmp_path / "out").rglob("*.partial*"))
     assert contents(capture) == before
 

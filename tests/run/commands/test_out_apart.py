@@ -27,12 +27,10 @@ def test_an_output_among_the_pictures_is_refused(subtests, capture, tmp_path_fac
             tmp_path = tmp_path_factory.mktemp("given")
             (folder,) = picture_folders(load_capture(capture))
             before = listing(capture)
-            with pytest.raises(
-                OutputError, match="the folder of the capture's pictures; choose a folder outside of it"
-            ):
+            with pytest.raises(OutputError, match="the folder of the capture's images; choose a folder outside of it"):
                 reconstruct(capture, folder / out, TINY)
             (tmp_path / "link").symlink_to(folder)
-            with pytest.raises(OutputError, match="the capture's pictures"):
+            with pytest.raises(OutputError, match="the capture's images"):
                 reconstruct(capture, tmp_path / "link" / "out", TINY)
             assert listing(capture) == before
 

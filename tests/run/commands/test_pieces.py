@@ -28,7 +28,7 @@ from colmap_inertial.run.preparation import judge as judging, sampling
 from colmap_inertial.run.preparation.plan import Treatments, plan_imaging
 from colmap_inertial.run.stages.join import _beside, _spans
 from colmap_inertial.run.stages.readout import ReadoutStage
-from colmap_inertial.run.stages.refine import _alternate
+from colmap_inertial.run.stages.refine import _takes_turns
 from colmap_inertial.run.steps import runner
 from colmap_inertial.run.steps.replacing import _flat
 from colmap_inertial.tools.batch import write_summary
@@ -442,7 +442,7 @@ def test_cameras_take_turns_where_they_come_back_often(subtests):
         )
     ):
         with subtests.test(i=i, alternate=alternate):
-            assert _alternate(model) == alternate
+            assert _takes_turns(model) == alternate
 
 
 def test_frames_speak_for_themselves_where_too_few_confirm_the_gyroscope(subtests):

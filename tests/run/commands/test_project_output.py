@@ -397,11 +397,11 @@ def test_the_whole_project_can_be_taken_back(placing, tmp_path):
 
 def test_names_that_the_run_needs_are_said_before_any_work(placing):
     require_free_names(placing.project, placing.workspace, dense=False)
-    with pytest.raises(OutputError, match=r"dense comes along in metres: leave out --dense"):
+    with pytest.raises(OutputError, match=r"dense is already included, in metres: leave out --dense"):
         require_free_names(placing.project, placing.workspace, dense=True)
     for name in ("log.txt", "report.html", "trajectory_2.tum", ".stages"):
         (placing.project / name).touch()
-        with pytest.raises(OutputError, match=rf"{name} has a name that the output folder needs"):
+        with pytest.raises(OutputError, match=rf"{name} has a name that the output folder uses"):
             require_free_names(placing.project, placing.workspace, dense=False)
         (placing.project / name).unlink()
 

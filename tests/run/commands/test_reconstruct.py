@@ -385,7 +385,7 @@ def test_too_few_frames_and_pictures_that_do_not_match_are_said(tmp_path, capsys
     assert stopped.value.code == 4
     told = capsys.readouterr().err
     assert "COLMAP found no model" in told
-    assert f"what was found, and what to do: {tmp_path / 'out2' / 'report.html'}" in told
+    assert f"findings and remedies: {tmp_path / 'out2' / 'report.html'}" in told
 
 
 def test_a_missing_capture_is_said(tmp_path, capsys):

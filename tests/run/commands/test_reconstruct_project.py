@@ -138,7 +138,7 @@ def test_a_project_is_checked_beforehand_and_force_goes_on(box, tmp_path, capsys
     run(capsys, "reconstruct", box.root, tmp_path / "forced", *flags, "--force")
     (model,) = json.loads((tmp_path / "forced" / "result.json").read_text())["models"]
     assert model["verdict"] in ("weak", "refused")
-    assert "forced to go on" in model["reasons"][0]
+    assert "continued by --force" in model["reasons"][0]
     codes = [f["code"] for f in json.loads((tmp_path / "forced" / "diagnosis.json").read_text())["findings"]]
     assert "gyro-mirrored" in codes or "imu-does-not-fit" in codes
 
@@ -271,8 +271,8 @@ def test_repeated_frames_and_strangers_have_no_match(box, tmp_path):
     names = sorted(path.name for path in folder.iterdir())
     match = match_to_video(clip, folder, names)
     assert "several frames" in str(match.doubtful["10.png"])
-    assert "another picture" in str(match.doubtful["04.png"])
-    assert "another picture" in str(match.doubtful["again.png"])
+    assert "another image" in str(match.doubtful["04.png"])
+    assert "another image" in str(match.doubtful["again.png"])
     assert "no frame" in str(match.doubtful["flat.png"])
     assert all(f"{i}.png" in match.doubtful for i in range(24, 30))
     expected = {f"{i:02}.png": 40_000_000 * (i if i < 10 else i + 2) for i in range(20)}
@@ -319,7 +319,7 @@ def test_a_refused_project_is_named_from_anywhere(box, tmp_path, monkeypatch):
     monkeypatch.chdir(box.root.parent)
     out = tmp_path / "out"
     source = ProjectOptions(imu=described, images=Path(box.root.name) / "images")
-    with pytest.raises(NotObservableError, match="a gyroscope alone"):
+    with pytest.raises(NotObservableError, match="a gyroscope but no accelerometer"):
         reconstruct_project(Path(box.root.name), tmp_path / "stopped", source)
     result = reconstruct_project(Path(box.root.name), out, source, ReconstructOptions(force=True))
     assert result.models[0].scale.verdict == "refused"
@@ -379,7 +379,7 @@ def test_what_is_missing_or_makes_no_sense_is_said_before_any_work(box, video, t
         ([box.root, out, *csv, "--mapping.max-num-features", "500"], "--mapping.max-num-features"),
         ([box.root, out, *csv, "--exposures.fusion", "mertens"], "--exposures.fusion"),
         ([box.imu, out, *csv], "holds no COLMAP model"),
-        ([box.root, box.root / "metric", *csv], "lie within each other"),
+        ([box.root, box.root / "metric", *csv], "lies within the other"),
         ([box.root, out, "--imu", box.imu, "--frame-times", tmp_path / "no.csv"], "no.csv"),
         ([box.root, out, *csv, "--images", tmp_path / "no"], "--images"),
         ([box.root / "sparse" / "0", out, *csv, "--dense"], "--images"),
@@ -493,7 +493,7 @@ def test_a_result_says_of_which_model_each_scale_is(box, finished, tmp_path, cap
     result = finished[1] / "result.json"
     code, shown, _ = run(capsys, "apply", box.root, tmp_path / "applied", "--scale", result)
     assert code == 0
-    assert "of which model" not in shown
+    assert "does not name its model" not in shown
     other = read_model(box.root / "sparse" / "0")
     other.deregister_frame(other.image(3).frame_id)
     (tmp_path / "other" / "sparse" / "0").mkdir(parents=True)
@@ -506,7 +506,7 @@ def test_a_result_says_of_which_model_each_scale_is(box, finished, tmp_path, cap
     (tmp_path / "old.json").write_text(json.dumps(content))
     code, shown, _ = run(capsys, "apply", tmp_path / "other", tmp_path / "yes", "--scale", tmp_path / "old.json")
     assert code == 0
-    assert "of which model" in shown
+    assert "does not name its model" in shown
 
 
 def test_an_interrupted_run_continues(box, finished, tmp_path):

@@ -40,7 +40,7 @@ def test_a_known_distance_of_two_points_makes_a_project_metric(bare, tmp_path, c
     args = ["--scale-from", "distance", "--between", *between, "--distance", "2.5+-0.01"]
     code, said, err = run(capsys, "reconstruct", bare, out, *args)
     assert code == 0, err
-    assert "lengths of 10 m are right to within 7.8 cm" in said and said.splitlines()[-1].endswith(
+    assert "lengths of 10 m are accurate to 7.8 cm" in said and said.splitlines()[-1].endswith(
         f"colmap-inertial view {out}"
     )
     after = pycolmap.Reconstruction(str(out / "sparse" / "0"))
@@ -148,7 +148,7 @@ def test_pictures_alone_are_mapped_and_scaled(pictures, tmp_path, monkeypatch, c
     monkeypatch.setattr(rooms, "validate_model", lambda *_, **__: validated(0.5, unscaled=True))
     code, said, err = run(capsys, *args)
     assert code == 0, err
-    assert "lengths of 10 m are right to within" in said
+    assert "lengths of 10 m are accurate to" in said
     assert mapped == [["0.png", "1.png", "2.png", "3.png"]]  # not a second time
     assert sorted(path.name for path in out.iterdir()) == [
         *("colmap", "database.db", "images", "scale.json", "sparse", "transform.json")

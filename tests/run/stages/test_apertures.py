@@ -335,8 +335,8 @@ def test_a_capture_s_apertures_are_its_camera(tmp_path):
         ('role = "red"', "", "role is missing"),
         ('calibration = "rig.yaml"', "", "calibration is missing"),
         ('calibration = "rig.yaml"', 'calibration = "no.yaml"', "no such file"),
-        ('rename = ["_0.", "_1."]', "", "the same pictures as the reference"),
-        ('rename = ["_0.", "_1."]', 'rename = "x"', "must be two texts"),
+        ('rename = ["_0.", "_1."]', "", "the same images as the reference"),
+        ('rename = ["_0.", "_1."]', 'rename = "x"', "must be two strings"),
         ('camera = "c1"', 'camera = "c0"', "at the same place"),
         ('camera = "c0"', 'camera = "c0"\nfolder = "elsewhere"', "that of .images. for the reference"),
         (
@@ -358,7 +358,7 @@ def test_apertures_need_pictures_in_a_folder(tmp_path):
     path = tmp_path / "capture.toml"
     text = path.read_text()
     path.write_text(text[text.index("[apertures]") :])
-    with pytest.raises(FormatError, match=r"belongs to \[images\]"):
+    with pytest.raises(FormatError, match=r"needs \[images\]"):
         load_capture(path)
 
 

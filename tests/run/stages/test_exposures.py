@@ -152,21 +152,21 @@ def test_partners_have_the_same_stem_or_are_renamed(tmp_path):
     assert loaded.exposures.path("x_s.png") == tmp_path / "b" / "x_l.png"
     assert loaded.exposures.timing(read_frame_timing(loaded)) is not None
     changed(tmp_path / "b", ("*_s.png", "*.png"))
-    with pytest.raises(FormatError, match=r"let pattern under .images. take the short ones alone"):
+    with pytest.raises(FormatError, match=r"let pattern under .images. match the short ones only"):
         fuse_exposures_captured(tmp_path / "b", tmp_path / "out", fuser=AVERAGE, progress=silent)
 
 
 def test_what_is_wrong_with_the_exposures_is_said(subtests, two_pairs, tmp_path):
     wrong = (
-        ('folder = "long"', "", "the same pictures as .images."),
-        ('folder = "long"', 'folder = "short"', "the same pictures as .images."),
-        ('folder = "long"', 'folder = "long"\nrename = "x"', "must be two texts"),
+        ('folder = "long"', "", "the same images as .images."),
+        ('folder = "long"', 'folder = "short"', "the same images as .images."),
+        ('folder = "long"', 'folder = "long"\nrename = "x"', "must be two strings"),
         ('folder = "long"', 'folder = "long"\nlong_delay_s = 0.1', "stands in place of times"),
         ("short_iso = 1600", "short_iso = 0", "must be above 0"),
         ("short_iso = 1600", "long_exposure_s = 11", "must be from 0 to 10"),
         ("short_iso = 1600", "long_delay_s = 11", "must be from -10 to 10"),
         ("short_iso = 1600", "shrot_iso = 1600", 'did you mean "short_iso"'),
-        ('[images]\nfolder = "short"\ntimes = "frames.csv"', 'video = "a.mp4"', r"belongs to \[images\]"),
+        ('[images]\nfolder = "short"\ntimes = "frames.csv"', 'video = "a.mp4"', r"needs \[images\]"),
     )
     for i, (old, new, reason) in enumerate(wrong):
         with subtests.test(new=new, reason=reason):
@@ -369,7 +369,7 @@ def test_a_full_disk_is_told(capture, tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(frame_folder, "encode_image", full)
-    with pytest.raises(OutputError, match=r"is full .* make room and start again, it continues"):
+    with pytest.raises(OutputError, match=r"is full .* free some space and start again; the run continues"):
         fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
 
 
@@ -477,7 +477,7 @@ def test_deblurring_needs_no_long_exposures(written, tmp_path):
 
 def test_a_fused_frame_is_not_deblurred_again(written, tmp_path):
     folder, _ = written
-    with pytest.raises(InertialError, match="are fused, and not deblurred"):
+    with pytest.raises(InertialError, match="are fused, not deblurred"):
         reconstruct(folder, tmp_path / "out", replace(OPTIONS, deblur="wiener"), progress=silent)
     assert not (tmp_path / "out").exists()
 

@@ -220,8 +220,8 @@ def test_times_by_exif_are_universal_where_their_offset_is_stated(tmp_path):
 def test_times_by_exif_that_cannot_be_compared_are_refused(subtests, tmp_path_factory):
     for wrong, error, said in (
         ({"fraction": b"5\0"}, TimingError, "b.tif: its EXIF gives the time to tenths of a second only"),
-        ({"fraction": None}, TimingError, "b.tif: its EXIF gives the time to whole seconds only"),
-        ({"fraction": b"2x\0"}, TimingError, "whole seconds only"),
+        ({"fraction": None}, TimingError, "b.tif: its EXIF gives the time to only to whole seconds"),
+        ({"fraction": b"2x\0"}, TimingError, "only to whole seconds"),
         ({"date": None}, FormatError, "b.tif: its EXIF has no DateTimeOriginal"),
         ({"date": b"2024-05-01 12:30:15\0"}, FormatError, "no DateTimeOriginal"),
         ({"offset": None}, TimingError, "b.tif: its EXIF does not state the offset from universal time, that of a.tif"),
@@ -240,5 +240,5 @@ def test_pictures_without_exif_have_no_time(tmp_path):
     (tmp_path / "b.tif").write_bytes(tiff_with("<", 0x8769, [])[:24])
     with pytest.raises(FormatError, match=r"b.tif: its EXIF is damaged or empty"):
         stamps_of_exif(tmp_path, ["b.tif"])
-    with pytest.raises(FormatError, match="no such picture"):
+    with pytest.raises(FormatError, match="no such image"):
         stamps_of_exif(tmp_path, ["c.tif"])

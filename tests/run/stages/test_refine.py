@@ -381,6 +381,28 @@ def test_a_declared_global_shutter_that_the_images_contradict_is_named(rolled, b
     assert model.treatments[-1].reason == found
 
 
+@pytest.mark.parametrize("times", [1.0, 0.5, 1.6])
+def test_a_declared_readout_that_rectified_keypoints_contradict_is_named(rolled, times):
+    tracks = rolled[0]
+    declared_s = times * 0.025
+    timing, known = replace(tracks.timing, readout_s=declared_s), calibration_prior(Declared(readout_s=declared_s))
+    view = GyroView(
+        imu=tracks.imu, timing=timing, calibration=tracks.calibration, camera=tracks.camera, source="capture"
+    )
+    shutter, xy_px = RollingShutterStage(view=view), tracks.xy_px.copy()
+    for i, name in enumerate(timing.names):
+        xy_px[tracks.frame == i] = shutter.moved(name, xy_px[tracks.frame == i])
+    start = Model(reconstruction=adjusted(tracks.reconstruction(xy_px)), colmap_index=0, timing=timing, rectified=True)
+    start = ReadoutStage(imu=tracks.imu, calibration=known, refine_intrinsics=False, num_threads=1)(start)
+    model = MetricStage(imu=tracks.imu, calibration=known, shutter=shutter)(start)
+    found = [reason for reason in model.scale.reasons if reason.code == "declared-readout"]
+    assert bool(found) == (times != 1.0)
+    if found:
+        assert model.scale.verdict == "weak" and model.scale.reasons[0] == found[0]
+        assert found[0].values["declared_s"] == declared_s and found[0].values["direction"] == "down"
+        assert abs(found[0].values["readout_s"] - 0.025) < 3 * found[0].values["sigma_s"] < 0.006
+
+
 @pytest.mark.parametrize("factor", [1.0, 0.9, 1.35])
 def test_a_declared_focal_length_is_compared_with_what_the_images_show(factor):
     tracks = tracks_of(walk(16.0, points_per_m=50.0))
@@ -440,7 +462,7 @@ def test_auto_refines_where_drift_exceeds_what_is_left(walked, monkeypatch):
     made, said = refined_by(tracks.imu, model, auto=True)
     worth = said.values["expected"]
     assert said.action == "refined" and worth["risk"] < 0.05 and worth["share"] < 0.25
-    assert "expected to err by" in str(said.reason) and "mm by images alone" in str(made.scale.notes[-1])
+    assert "expected error" in str(said.reason) and "mm by images alone" in str(made.scale.notes[-1])
     # as far off as it was expected to be, by the truth; frames that see next to nothing are farther
     truth = tracks.motion.cam_in_world_m(tracks.timing.pose_t_s())
     before, after = (error_of(centres_of(one.reconstruction), truth) for one in (model, made))
@@ -448,8 +470,8 @@ def test_auto_refines_where_drift_exceeds_what_is_left(walked, monkeypatch):
     for name, value, why in (
         ("share", 1e-6, "of the time that features and mapping take"),
         ("most_bytes", 1, "of the time"),
-        ("least_drift", 1.0, "images hold its shape by themselves"),
-        ("most_risk", 0.0, "of such paths come out farther off"),
+        ("least_drift", 1.0, "the images alone fix the shape"),
+        ("most_risk", 0.0, "of such paths become worse"),
     ):
         monkeypatch.setattr(motion, "_LIMITS", motion.DriftLimits(**{name: value}))
         same, said = refined_by(tracks.imu, model, auto=True)
@@ -465,7 +487,7 @@ def test_auto_leaves_a_model_that_loops_hold():
     model = Model(reconstruction=adjusted(tracks.reconstruction()), colmap_index=0, timing=tracks.timing)
     model = MetricStage(imu=tracks.imu, calibration=UNKNOWN)(model)
     same, said = refined_by(tracks.imu, model, auto=True)
-    assert "images hold its shape by themselves" in str(said.reason) and same.reconstruction is model.reconstruction
+    assert "the images alone fix the shape" in str(said.reason) and same.reconstruction is model.reconstruction
     truth = tracks.motion.cam_in_world_m(tracks.timing.pose_t_s())
     expected_m = said.values["expected"]["alone_m"]
     assert 0.5 < error_of(centres_of(model.reconstruction), truth) / expected_m < 2
@@ -507,7 +529,7 @@ def test_auto_leaves_a_project_from_which_more_was_made(walked, tmp_path):
 @pytest.mark.parametrize("found", [(1.5e-3, 0.49e-3), (0.9e-3, 1e-5), (-5e-3, 2e-3)])
 def test_a_readout_that_predicts_nothing_better_is_none(walked, monkeypatch, found):
     tracks, model = walked
-    monkeypatch.setattr(judge, "_readout", lambda *_: found)
+    monkeypatch.setattr(judge, "_estimate_readout", lambda *_: found)
     _, said = refined_by(tracks.imu, model)
     assert said.action == "refined" and said.values["readout_s"] == 0 and "rolling" not in str(said.reason)
 
@@ -606,7 +628,7 @@ def test_an_imu_that_contradicts_the_pictures_leaves_the_model_as_it_is(walked):
     imu = replace(tracks.imu, accel_m_s2=tracks.imu.accel_m_s2[:, [1, 0, 2]] * [1.0, 1.0, 1.0])
     made, said = refined_by(imu, model)
     assert said.action == ""
-    assert str(said.reason).startswith("left as it is: ")
+    assert str(said.reason).startswith("refinement discarded: ")
     assert made.reconstruction is model.reconstruction
 
 
@@ -617,7 +639,7 @@ def test_what_predicts_worse_is_not_believed(walked, monkeypatch):
         judge, "evaluate_held_out", lambda problem, x, seen: evaluate_held_out(problem, x, seen) * _sign(problem)
     )
     made, said = refined_by(tracks.imu, model)
-    assert "no better with the IMU" in str(said.reason)
+    assert "did not improve the held-out observations" in str(said.reason)
     assert not said.values["accepted"]
     assert made.reconstruction is model.reconstruction
 
@@ -632,8 +654,8 @@ def test_what_takes_too_much_memory_is_left_as_it_is(walked, monkeypatch):
 
 def test_what_does_not_converge_is_not_believed(walked, monkeypatch):
     tracks, model = walked
-    # pictures alone, the refinement, without a readout, with the noise measured, and with all observations
-    whys = ("pictures alone", *3 * ("the refinement does not",), "with all observations")
+    # images alone, the refinement, without a readout, with the noise measured, and with all observations
+    whys = ("images alone", *3 * ("the refinement does not",), "with all observations")
     for restless, why in enumerate(whys):
         count = iter(range(len(whys)))
 
@@ -682,8 +704,8 @@ def test_what_cannot_be_refined_is_said(walked):
     tracks, model = walked
     for other, why in (
         (replace(model, similarity=None), "it has no scale"),
-        (replace(model, scale=replace(model.scale, noise=None)), "the joint method does"),
-        (replace(model, rectified=True), "cannot say from where"),
+        (replace(model, scale=replace(model.scale, noise=None)), "not estimated by the joint method"),
+        (replace(model, rectified=True), "cannot be inverted"),
         (replace(model, scale=replace(model.scale, parts={"accel_faults": 1e-3})), "has faults"),
         (replace(model, timing=replace(model.timing, t_s=model.timing.t_s + 1e4)), "less than half"),
     ):
@@ -701,7 +723,7 @@ def test_what_cannot_be_refined_is_said(walked):
         (slice(30, 31), None),
     ):
         stage = RefineStage(imu=tracks.imu, calibration=UNKNOWN, refine_intrinsics=False)
-        why_not = stage._why_not(replace(model, reconstruction=two_cameras(model.reconstruction, second)))
+        why_not = stage._find_obstacle(replace(model, reconstruction=two_cameras(model.reconstruction, second)))
         assert (None if why_not is None else why_not.code) == code
     # where each image has a camera of its own, devices differ by folder, size or focus, and one that zooms is one
     for camera_of, name_of, code in (
@@ -713,7 +735,7 @@ def test_what_cannot_be_refined_is_said(walked):
     ):
         stage = RefineStage(imu=tracks.imu, calibration=UNKNOWN, refine_intrinsics=False)
         each, timing = camera_for_each(model, camera_of, name_of)
-        why_not = stage._why_not(replace(model, reconstruction=each, timing=timing))
+        why_not = stage._find_obstacle(replace(model, reconstruction=each, timing=timing))
         assert (None if why_not is None else why_not.code) == code
     empty = pycolmap.Reconstruction(model.reconstruction)
     for point_id in list(empty.point3D_ids()):

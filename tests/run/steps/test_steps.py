@@ -815,7 +815,7 @@ def test_a_mirrored_gyroscope_stops_a_reconstruction():
     assert "gyro-mirrored" in told.codes
     # the finding alone: whatever else such a recording shows
     told = replace(told, findings=tuple(one for one in told.findings if one.code == "gyro-mirrored"))
-    with pytest.raises(NotObservableError, match="--force goes on"):
+    with pytest.raises(NotObservableError, match="--force continues"):
         stop_or_doubt(told, force=False)
     (doubt,) = stop_or_doubt(told, force=True)
     assert doubt.code == "forced-to-go-on"

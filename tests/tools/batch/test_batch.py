@@ -309,7 +309,7 @@ def test_processes_end_with_a_batch_that_is_killed(manifest, tmp_path):
 def test_a_folder_of_something_else_is_left_alone(manifest, tmp_path):
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "a.jpg").write_bytes(b"precious")
-    with pytest.raises(OutputExistsError, match="no batch's folder"):
+    with pytest.raises(OutputExistsError, match="not the folder of a batch"):
         run_batch(manifest, tmp_path / "photos")
     assert [path.name for path in (tmp_path / "photos").iterdir()] == ["a.jpg"]
 
@@ -501,7 +501,7 @@ def test_a_chunk_that_a_run_has_begun_anew_is_given_up(tmp_path, monkeypatch):
     monkeypatch.setattr(distributed, "get_worker", lambda: worker)
     part = a_part_without_matches(tmp_path / "0")
     (part.folder / "wanted").write_text("by the run that goes on")
-    with pytest.raises(MappingError, match="not wanted any more"):
+    with pytest.raises(MappingError, match="cancelled"):
         do_for_another(part, describe_versions(), "by the run that was killed")
     assert do_for_another(part, describe_versions(), "by the run that goes on") == {}
     killed = [sys.executable, "-c", "import os; os.kill(os.getpid(), 9)"]
@@ -562,7 +562,7 @@ def test_what_keeps_a_cluster_from_helping_is_said_before_the_work(cluster, tmp_
             InertialError, match=rf"worker tcp://.* has {here}; here is pycolmap 9: install the same there"
         ):
             executor.require(tmp_path)
-        with pytest.raises(InertialError, match="works on this machine alone"):
+        with pytest.raises(InertialError, match="works on this machine only"):
             RunContext.of(ReconstructOptions(colmap_executable=Path("colmap")))
     with pytest.raises(InertialError, match=r"tls://127.0.0.1:1 needs certificates: .*distributed\.comm\.tls"):
         connect("tls://127.0.0.1:1", "")

@@ -131,7 +131,7 @@ def test_near_exports_have_no_offset(tmp_path):
     made = export_model(tmp_path / "p", tmp_path / "out", "gsplat", unscaled=True)
     assert not (tmp_path / "out" / "metadata.xml").exists()
     assert "offset_in_world" not in json.loads((tmp_path / "out" / "export.json").read_text())
-    assert any("never given a scale" in note for note in map(str, made.notes))
+    assert any("never scaled" in note for note in map(str, made.notes))
     assert not any("refused" in note for note in map(str, made.notes))
 
 
@@ -238,12 +238,12 @@ def test_pictures_of_other_formats_are_read(tmp_path, ending):
 @pytest.mark.parametrize(
     ("data", "match"),
     [
-        (b"\0\0\0\x18ftypheic" + bytes(90), "is a HEIF or AVIF picture"),
+        (b"\0\0\0\x18ftypheic" + bytes(90), "is a HEIF or AVIF image"),
         (b"\xff\x0a" + bytes(range(90)), "is a JPEG XL picture"),
         (b"GIF89a" + bytes(90), "is a GIF picture"),
         (b"version https://git-lfs.github.com/spec/v1\n", "is a Git LFS pointer"),
-        (b"\x00\x05\x16\x07\x00\x02\x00\x00Mac OS X        ", "is what macOS leaves"),
-        (bytes(4000), "holds nothing but zeros"),
+        (b"\x00\x05\x16\x07\x00\x02\x00\x00Mac OS X        ", "is a macOS metadata file"),
+        (bytes(4000), "holds only zeros"),
     ],
 )
 def test_pictures_that_are_none_are_called_what_they_are(tmp_path, data, match):

@@ -14,7 +14,7 @@ from websockets.sync.client import connect
 
 from colmap_inertial.core.errors import OutputError
 from colmap_inertial.tools.view import load_scene
-from colmap_inertial.tools.view.guard import LIMITS, Guard, allowed, guarding, is_loopback
+from colmap_inertial.tools.view.guard import LIMITS, Guard, guarding, is_allowed, is_loopback
 from colmap_inertial.tools.view.server import Viewer
 from tests.helpers.cases import loop_over
 from tests.tools.view.test_view import ESTIMATE, write_result
@@ -200,11 +200,11 @@ def test_no_message_silences_the_slider_for_the_next_one(viewer, place):
 def test_what_the_page_sends_is_let_through():
     click = {"type": "ScenePointerMessage", "event_type": "click", "ray_origin": [0.0, 1, 2], "ray_direction": None,
              "screen_pos": [[0.5, 0.5]], "modifier": None}  # fmt: skip
-    assert allowed(click)
-    assert not allowed({**click, "owner": "x"})
-    assert not allowed({**click, "ray_origin": [float("inf"), 0, 0]})
-    assert not allowed({"type": "RunJavascriptMessage", "source": "x"})
-    assert not allowed([1]) and not allowed({"type": []})
+    assert is_allowed(click)
+    assert not is_allowed({**click, "owner": "x"})
+    assert not is_allowed({**click, "ray_origin": [float("inf"), 0, 0]})
+    assert not is_allowed({"type": "RunJavascriptMessage", "source": "x"})
+    assert not is_allowed([1]) and not is_allowed({"type": []})
 
 
 def test_a_viser_that_listens_in_another_way_is_not_served():

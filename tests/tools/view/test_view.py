@@ -381,10 +381,10 @@ def test_a_mesh_is_read_without_what_is_not_finite(subtests, tmp_path_factory):
 def test_what_is_no_mesh_of_triangles_is_refused(subtests, tmp_path_factory):
     for changed, said in (
         ({"faces": ()}, "a mesh without faces"),
-        ({"faces": [[0, 1, 2, 4]]}, "other faces than triangles"),
-        ({"faces": [[0, 1, 5]]}, "other faces than triangles"),
+        ({"faces": [[0, 1, 2, 4]]}, "faces other than triangles"),
+        ({"faces": [[0, 1, 5]]}, "faces other than triangles"),
         ({"cut": 1}, "truncated"),
-        ({"lists": "list uchar int vertex_indices; list uchar int more"}, "not a list of vertices alone"),
+        ({"lists": "list uchar int vertex_indices; list uchar int more"}, "more than lists of vertices"),
         ({"order": None}, "only binary PLY"),
         ({"axes": "xyw"}, "holds no points"),
         ({"vertices": VERTICES[:0]}, "holds no points"),
