@@ -19,7 +19,7 @@ from colmap_inertial import (
     write_calibration,
 )
 from colmap_inertial.hooks import insert_defaults
-from tests.run.commands.test_reconstruct import DETERMINISTIC, contents, copy_scene
+from tests.helpers.desk_scene import DETERMINISTIC, contents, copy_scene
 
 
 @pytest.fixture(scope="module")

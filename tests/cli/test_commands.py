@@ -386,7 +386,7 @@ def test_outputs_never_replace_what_is_not_an_earlier_result(capsys, project, tm
 
 
 def test_an_output_folder_that_cannot_be_made_is_an_error(capsys, tmp_path):
-    from tests.run.commands.test_reconstruct import SCENE
+    from tests.helpers.desk_scene import SCENE
 
     (tmp_path / "file").write_text("")
     code, _, err = run(capsys, "reconstruct", SCENE, tmp_path / "file" / "out")

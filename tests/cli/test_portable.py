@@ -8,7 +8,7 @@ from pathlib import Path
 
 from colmap_inertial.run.steps.config import config_as_toml
 from tests.helpers.batch_captures import TINY
-from tests.run.commands.test_reconstruct import SCENE, copy_scene
+from tests.helpers.desk_scene import SCENE, copy_scene
 
 #: Takes it away, then runs the commands of a JSON list and prints their exit codes.
 ELSEWHERE = """

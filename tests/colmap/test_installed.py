@@ -26,7 +26,7 @@ from colmap_inertial.run.commands.reconstruct import reconstruct
 from colmap_inertial.run.commands.reconstruct_project import reconstruct_project
 from colmap_inertial.run.commands.scale_by_reference import reconstruct_by
 from tests.colmap.features.test_given_database import is_right, keypoints_of
-from tests.run.commands.test_reconstruct import QUICK, copy_scene
+from tests.helpers.desk_scene import QUICK, copy_scene
 
 COLMAP = shutil.which("colmap")
 needs_colmap = pytest.mark.skipif(COLMAP is None, reason="no colmap is installed")

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from tests.run.commands.test_reconstruct import DETERMINISTIC, copy_scene
+from tests.helpers.desk_scene import DETERMINISTIC, copy_scene
 
 #: A capture of them is reconstructed in about three seconds.
 TINY = DETERMINISTIC

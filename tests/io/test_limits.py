@@ -30,7 +30,7 @@ from colmap_inertial.run.commands.reconstruct import reconstruct
 from colmap_inertial.run.steps.config import read_config
 from colmap_inertial.tools.view.images import read_preview
 from tests.helpers.cases import loop_over
-from tests.run.commands.test_reconstruct import copy_scene
+from tests.helpers.desk_scene import copy_scene
 
 
 def png(width, height):

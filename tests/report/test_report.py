@@ -54,8 +54,8 @@ from colmap_inertial.run.stages.rolling_shutter import RollingShutterStage
 from colmap_inertial.run.steps.runner import StepRunner
 from colmap_inertial.run.steps.session import Session
 from colmap_inertial.run.steps.workspace import Workspace
+from tests.helpers.desk_scene import DETERMINISTIC, SCENE, copy_scene
 from tests.helpers.report_runs import HOSTILE, cloud, recorded, write_run
-from tests.run.commands.test_reconstruct import DETERMINISTIC, SCENE, copy_scene
 
 
 class Page(html.parser.HTMLParser):

@@ -55,9 +55,9 @@ from scripts.doc_examples import write_examples
 from scripts.make_reference import pages
 from tests.helpers import imu_files
 from tests.helpers.batch_captures import FRAMES, TINY, tiny_capture
+from tests.helpers.desk_scene import copy_scene
 from tests.helpers.json_schemas import find_violations, read_schema
 from tests.helpers.report_runs import write_run
-from tests.run.commands.test_reconstruct import copy_scene
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"

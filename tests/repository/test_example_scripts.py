@@ -11,7 +11,7 @@ import pytest
 from colmap_inertial.model import read_model
 from colmap_inertial.run.steps.config import config_as_toml
 from tests.helpers.batch_captures import TINY, tiny_capture
-from tests.run.commands.test_reconstruct import copy_scene
+from tests.helpers.desk_scene import copy_scene
 
 ROOT = Path(__file__).parents[2]
 SCRIPTS = ROOT / "scripts"

@@ -24,7 +24,7 @@ from colmap_inertial.model import read_model
 from colmap_inertial.run.commands.reconstruct import reconstruct
 from colmap_inertial.run.commands.scale_by_reference import reconstruct_by
 from colmap_inertial.tools.simulate.truth import read_truth, true_metres_per_unit
-from tests.run.commands.test_reconstruct import QUICK, SCENE, centres, copy_scene
+from tests.helpers.desk_scene import QUICK, SCENE, centres, copy_scene
 
 FIRST = 12
 FEATURES = 500

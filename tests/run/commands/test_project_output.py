@@ -38,9 +38,9 @@ from colmap_inertial.run.commands.result import ModelResult, ReconstructResult
 from colmap_inertial.run.stages.frame_folder import FrameRecord
 from colmap_inertial.run.stages.imaging_plan import ImagingPlan
 from colmap_inertial.run.steps.workspace import Workspace, places_of
+from tests.helpers.desk_scene import copy_scene
 from tests.helpers.model_project import NAMES, write_project
 from tests.io.test_ply import SIMILARITY
-from tests.run.commands.test_reconstruct import copy_scene
 from tests.run.steps.test_runner import session_in
 
 SCALE = ModelScale(similarity=SIMILARITY, verdict="trusted")

@@ -35,7 +35,7 @@ from colmap_inertial.run.stages.deblur import DeblurStage
 from colmap_inertial.run.stages.imaging_plan import read_plan, write_plan
 from colmap_inertial.tools.simulate import MotionOptions, make_motion
 from tests.helpers.corner_scene import CALIBRATED, LENS, CornerScene
-from tests.run.commands.test_reconstruct import contents
+from tests.helpers.desk_scene import contents
 
 QUICK = ReconstructOptions(mapping=MappingOptions(max_num_features=700, first_octave=0), deterministic=True)
 OFF = replace(QUICK, deblur="off", rolling_shutter="off")

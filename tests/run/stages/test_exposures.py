@@ -37,9 +37,9 @@ from colmap_inertial.run.stages.exposures import ExposureStage
 from colmap_inertial.run.stages.inputs import Fuser
 from colmap_inertial.run.steps.workspace import Workspace
 from tests.helpers import small_networks as small
+from tests.helpers.desk_scene import contents
 from tests.helpers.exposure_scenes import GAIN, LONG_S, SHORT_S, psnr_db, write_pair_capture
 from tests.helpers.json_schemas import find_violations
-from tests.run.commands.test_reconstruct import contents
 
 DOCS = Path(__file__).parents[3] / "docs"
 

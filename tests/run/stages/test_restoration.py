@@ -28,7 +28,7 @@ from colmap_inertial.run.stages.imaging_plan import read_plan, write_plan
 from colmap_inertial.run.steps.runner import canonical
 from tests.helpers import small_networks as small
 from tests.helpers.corner_scene import CALIBRATED, LENS, CornerScene
-from tests.run.commands.test_reconstruct import contents
+from tests.helpers.desk_scene import contents
 from tests.run.commands.test_reconstruct_blurred import QUICK, parts, planned
 
 DEEP = replace(QUICK, deblur="deepgyro")

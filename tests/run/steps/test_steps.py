@@ -68,7 +68,7 @@ from colmap_inertial.run.steps.runner import StepRunner
 from colmap_inertial.run.steps.session import Session, open_session
 from colmap_inertial.run.steps.workspace import Workspace, refuse_links
 from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, simulate_recording
-from tests.run.commands.test_reconstruct import contents
+from tests.helpers.desk_scene import contents
 from tests.run.steps.test_runner import frames_of, recording_of, session_in
 
 NAMES = tuple(f"{i}.jpg" for i in range(6))
