@@ -1,15 +1,10 @@
 """Advice follows the finding: one table, the refusals of results, and findings that a run would otherwise end with."""
 
 import re
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
-
-from study_diagnose import LENS, pictures, simulated
 
 from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.core.facts import Fact
@@ -18,6 +13,7 @@ from colmap_inertial.diagnose import Finding, Recorded, diagnose, unreadable
 from colmap_inertial.messages import all_messages
 from colmap_inertial.motion.flow import VisualRotation
 from colmap_inertial.report.words import not_checked, outcome_of_model
+from scripts.studies.diagnose import LENS, pictures, simulated
 
 ROOT = Path(__file__).parents[2]
 REFUSED = {
