@@ -223,7 +223,7 @@ def test_a_recording_warmer_than_its_calibration_is_less_sure_and_says_so():
 
     unknown, alike, warm = estimated(None), estimated(24.0), estimated(51.0)
     assert not any("calibrated at" in str(note) for note in (*unknown.notes, *alike.notes))
-    assert any("calibrated at 21 °C and was 51 °C warm here" in str(note) for note in warm.notes)
+    assert any("calibrated at 21 °C and recorded at 51 °C" in str(note) for note in warm.notes)
     assert unknown.sigma_log <= alike.sigma_log < 1.1 * unknown.sigma_log
     assert warm.sigma_log > 1.4 * alike.sigma_log
     assert warm.as_json()["imu_calibration"]["temperature_c"] == 21.0

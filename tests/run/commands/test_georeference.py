@@ -237,7 +237,7 @@ def test_the_scale_is_never_touched_and_a_wrong_one_is_named():
     found = one.fitted()
     np.testing.assert_allclose(found.enu_from_world @ found.enu_from_world.T, np.eye(3), atol=1e-12)
     assert found.length_ratio == pytest.approx(1.3, abs=4 * found.length_ratio_sigma)
-    assert "times as far apart" in str(found.notes[0]) and "left as it is" in str(found.notes[0])
+    assert "times as far apart" in str(found.notes[0]) and "scale is unchanged" in str(found.notes[0])
     sound = walk(3, white_m=0.5)
     (note,) = sound.fitted().notes
     assert note.code == "accuracy-assumed"

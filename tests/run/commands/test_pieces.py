@@ -297,7 +297,7 @@ def test_what_was_lost_since_a_run_is_said_with_the_error(tmp_path, monkeypatch)
         raise FormatError("a.bin", Fact.stated("is damaged"))
     lost.append("sparse/0/cameras.bin")
     with (
-        pytest.raises(FormatError, match=r"out: a.bin: is damaged; sparse/0/cameras.bin is missing or damaged since"),
+        pytest.raises(FormatError, match=r"out: a.bin: is damaged; sparse/0/cameras.bin was damaged or removed since"),
         runner.explaining_losses(space),
     ):
         raise FormatError("a.bin", Fact.stated("is damaged"))
