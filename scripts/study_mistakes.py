@@ -199,7 +199,7 @@ def follow_gain(scene: Path, message: str) -> None:
 
 def follow_frame_rate(scene: Path, message: str) -> None:
     """Time the frames by the rate that a message gives."""
-    rate = number(r"if ([\d.]+) times as many come in a second", message)
+    rate = number(r"at ([\d.]+) times the stated frame rate", message)
     frame_times(lambda t_s: t_s / rate)(scene, message)
 
 
