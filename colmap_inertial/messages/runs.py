@@ -391,11 +391,6 @@ def found_on_page(page: str) -> str:
     return f"what was found, and what to do: {page}"
 
 
-@message(example={"out": "out"})
-def earlier_result_stays(out: str) -> str:
-    return f"the earlier result in {out} stays as it was"
-
-
 # the folder of a run
 
 
@@ -426,6 +421,25 @@ def run_of_another_version(out: str) -> str:
 @message(advice="choose another folder or remove it", example={"out": "out", "what": "capture", "named": "/data/walk"})
 def run_of_another_kind(out: str, what: str, named: object) -> str:
     return f"{out} holds a run of another {what} ({named})"
+
+
+@message(example={"option": "world", "now": "y-down", "before": "z-up"})
+def option_changed(option: str, now: object, before: object) -> str:
+    now, before = ("not given" if value is None else value for value in (now, before))
+    return f"{option} = {now} (was {before})"
+
+
+@message(
+    advice="choose another folder, or give --overwrite to make again what depends on it",
+    example={
+        "out": "out",
+        "step": "metric",
+        "changes": ({"code": "option-changed", "values": {"option": "world", "now": "y-down", "before": "z-up"}},),
+    },
+)
+def result_is_finished(out: str, step: str, changes: Sequence[Said]) -> str:
+    why = "; ".join(map(str, changes)) or "the recording, a stage, the program, or an option that is not in config.toml"
+    return f"{out} holds a finished result, whose step {step.replace('_', ' ')} would not stay as it is: {why}"
 
 
 state("device-in-output", "is a device, a pipe or a socket in an output folder", advice="remove it", joint=": ")
