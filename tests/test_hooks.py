@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_pipeline import DETERMINISTIC, contents, copy_scene
 
 from colmap_inertial import (
     Frame,
@@ -21,6 +20,7 @@ from colmap_inertial import (
 )
 from colmap_inertial.core.errors import OutputExistsError
 from colmap_inertial.hooks import insert_defaults
+from tests.run.commands.test_reconstruct import DETERMINISTIC, contents, copy_scene
 
 
 @pytest.fixture(scope="module")
@@ -252,7 +252,7 @@ def test_a_recording_that_changed_does_not_replace_a_finished_result(capture, ba
     before = contents(out)
     rows = (recording / "gyro.csv").read_text().splitlines(keepends=True)
     (recording / "gyro.csv").write_text("".join(rows[:-1]))
-    with pytest.raises(OutputExistsError, match="step check would not stay as it is: the recording"):
+    with pytest.raises(OutputExistsError, match="step check would change: the recording"):
         reconstruct(recording, out, DETERMINISTIC, frame_stages=[], keypoint_stages=[])
     found = contents(out)
     assert {name for name in found if found[name] != before.get(name)} == {"log.txt"}

@@ -174,7 +174,7 @@ def _find_better_fit(recorded: Recorded, imu: ImuRecording) -> Finding | None:
     """Find the sign, rate, frame rate or offset with which the gyroscope turns as the camera does."""
     if isinstance(recorded.align(replace(imu, gyro_rad_s=-imu.gyro_rad_s)), Alignment):
         return _find_mirroring(recorded, imu)
-    elsewhere = recorded.align(imu, any_offset=True)
+    elsewhere = recorded.align(imu, any_offset=True) if recorded.is_offset_limited else None
     if isinstance(elsewhere, Alignment):
         return offset_finding(recorded, elsewhere.calibration.clock_offset_s)
     begin_s = imu.gyro_t_s[0]

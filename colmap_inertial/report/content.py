@@ -13,7 +13,7 @@ from colmap_inertial.core.types import Action
 from colmap_inertial.io.files import read_json, read_text
 from colmap_inertial.io.toml_section import parse_toml
 from colmap_inertial.report.folders import CROPS_FOLDER, DATA_FOLDER, model_file, recording_file
-from colmap_inertial.report.series import SIZES, strided
+from colmap_inertial.report.series import SIZES, stride_indices
 from colmap_inertial.report.words import (
     describe_joined,
     describe_mapping,
@@ -182,7 +182,7 @@ def _validation(out: Path, model: Content, *, project: bool) -> Content:
         return _mark_missing(f"The target could not be measured: {validation['error']}.")
     folder = out / "validation" / str(model["index"])
     images = sorted(folder.glob("*.jpg")) if folder.is_dir() else []
-    chosen = [str(images[i].relative_to(out)) for i in strided(len(images), SIZES.target_images)]
+    chosen = [str(images[i].relative_to(out)) for i in stride_indices(len(images), SIZES.target_images)]
     return {**validation, "pictures": chosen}
 
 
@@ -210,7 +210,7 @@ def _blur(done: Content, recording: Content | None, *, project: bool) -> Content
         return _mark_missing(f"No blur to show: {note}.")
     time_of = dict(zip(recording["frames"]["names"], recording["frames"]["t_s"], strict=True))
     blur_px = np.array([frame["blur_px"] for frame in known])
-    some = strided(len(known), SIZES.blur_frames)
+    some = stride_indices(len(known), SIZES.blur_frames)
     worst = np.argsort(-blur_px, kind="stable")[: SIZES.blur_frames // 10] if len(some) < len(known) else some[:0]
     return {
         "note": note,

@@ -79,14 +79,14 @@ def render_page(template: str, *, out: Path | None = None, **values: Any) -> str
             links.append((anchor, short))
         return ""
 
-    def embedded(paths: Sequence[str], captions: Sequence[str] | None = None) -> list[tuple[str, str]]:
+    def embed(paths: Sequence[str], captions: Sequence[str] | None = None) -> list[tuple[str, str]]:
         return [] if out is None else embed_images(out, paths, captions)
 
     shared = {
         "plot": plot,
         "picture": picture,
         "add_link": add_link,
-        "embedded": embedded,
+        "embedded": embed,
         "figures_drawn": figures,
         "links": links,
     }
@@ -113,7 +113,7 @@ def _environment() -> Environment:
         "digits": digits,
         "signed": signed,
         "degrees": math.degrees,
-        "packed_json": lambda value: _packed(json.dumps(value, separators=(",", ":"), allow_nan=False).encode()),
+        "packed_json": _pack_json,
     }
     environment.globals |= {
         "library": _plotly_library,
@@ -174,8 +174,12 @@ def _plotly_library() -> str:
     """plotly.js, packed: it is five megabytes long."""
     from plotly.offline import get_plotlyjs
 
-    return _packed(get_plotlyjs().encode())
+    return _compress_to_base64(get_plotlyjs().encode())
 
 
-def _packed(data: bytes) -> str:
+def _pack_json(value: Any) -> str:
+    return _compress_to_base64(json.dumps(value, separators=(",", ":"), allow_nan=False).encode())
+
+
+def _compress_to_base64(data: bytes) -> str:
     return base64.b64encode(gzip.compress(data, 6, mtime=0)).decode("ascii")

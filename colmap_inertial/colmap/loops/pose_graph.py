@@ -351,7 +351,7 @@ def _close(graph: _Graph, loops: _Edges, depth: Array, matches: Array) -> tuple[
     graph = graph.adjusted(loops.only(accepted))
     for _ in range(2 * len(depth)):
         off, _ = graph.residuals(loops)
-        worst = np.argmax(np.where(accepted, _squared(off, loops.covariance), 0.0))
+        worst = np.argmax(np.where(accepted, _squared_mahalanobis(off, loops.covariance), 0.0))
         if accepted[worst] and not _agree(off[worst], loops.covariance[worst]):
             # others moved it too far away; it stays out, so that the rounds end
             accepted[worst], dropped[worst] = False, True
@@ -403,9 +403,9 @@ def _prevail(
 
 def _agree(off: Array, covariance: Array) -> BoolArray:
     """(...,) whether vectors (..., 7) are as small as their covariances (..., 7, 7) say."""
-    return np.asarray(_squared(off, covariance) < _NOISE.agree_7)
+    return np.asarray(_squared_mahalanobis(off, covariance) < _NOISE.agree_7)
 
 
-def _squared(off: Array, covariance: Array) -> Array:
+def _squared_mahalanobis(off: Array, covariance: Array) -> Array:
     """(...,) squares of vectors (..., 7) over their covariances (..., 7, 7)."""
     return np.asarray(np.sum(off * np.linalg.solve(covariance, off[..., None])[..., 0], axis=-1))

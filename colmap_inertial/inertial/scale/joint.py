@@ -35,13 +35,14 @@ from colmap_inertial.core.types import (
 from colmap_inertial.inertial.core import parameters as par
 from colmap_inertial.inertial.core.parameters import Prior
 from colmap_inertial.inertial.core.priors import PRIORS, AccelPart, accel_part, clock_scale_sigma
-from colmap_inertial.inertial.scale._declared import find_contradicted_lever, open_lever
+from colmap_inertial.inertial.scale._declared import doubts_lever, find_contradicted_lever, leave_out_lever
 from colmap_inertial.inertial.scale._fit import Fit, fit_jointly
 from colmap_inertial.inertial.scale._gain import WrongGain, exceeds_usual, judge_gain
 from colmap_inertial.inertial.scale._setup import Data, prepare
 from colmap_inertial.inertial.scale._shape import LIMITS as SHAPE_LIMITS, ShapeFault, confirmed, suspect
 from colmap_inertial.inertial.scale._suspects import Faults, filter_of_lag, worst
 from colmap_inertial.inertial.scale.verdict import check_clocks, scale_drifts, student_factor, verdict_of
+from colmap_inertial.io.calibration import SIGMAS
 
 #: So many times at most is something wrong with the accelerometer looked for, undone, and the rest fitted again.
 _MOST_FAULTS = 6
@@ -130,11 +131,7 @@ def estimate_joint(
     options = options or JointOptions()
     accel, expected_s = accel_part(timed.imu), timed.calibration.accel_delay_s
     try:
-        timed, data, prior, fit = _fit_in_step(trajectory, timed, options)
-        lever = find_contradicted_lever(fit, prior)
-        if lever is not None:
-            prior = open_lever(prior)
-            fit = fit_jointly(data, prior, timed.imu.noise)
+        timed, data, prior, fit, lever = _fit_believed(trajectory, timed, options)
         fit, faults = _fit_soundly(fit, data, prior, timed.imu.noise)
         shape = Shape()
         # a path that was smoothed has no shape to speak of
@@ -213,6 +210,30 @@ def fit_path(
     widened = scale_of(fit, data.t_s, accel).widened
     wrong = (*shape.undone, *shape.said)
     return data, fit, (*faults.as_facts(), *(fault.as_fact(data.t_s, widened) for fault in wrong))
+
+
+def _fit_believed(
+    trajectory: CameraTrajectory, timed: CameraTimedImu, options: JointOptions
+) -> tuple[CameraTimedImu, Data, Prior, Fit, Fact | None]:
+    """As :func:`_fit_in_step`, without a declared lever arm where a fit without it contradicts it; then that fact."""
+
+    def fit_without(length_m: float) -> tuple[CameraTimedImu, Data, Prior, Fit]:
+        return _fit_in_step(
+            trajectory,
+            replace(timed, calibration=leave_out_lever(timed.calibration, length_m=length_m)),
+            options,
+        )
+
+    believed = _fit_in_step(trajectory, timed, options)
+    _, data, prior, fit = believed
+    if not doubts_lever(fit, prior, is_refused=bool(_refusals(fit, data.t_s))):
+        return *believed, None
+    length_m = float(np.linalg.norm(prior.mean.imu_in_cam_m))
+    alone = fit_without(length_m)
+    lever = None if _refusals(alone[-1], data.t_s) else find_contradicted_lever(alone[-1], prior)
+    if lever is None:
+        return *believed, None
+    return *(alone if length_m <= SIGMAS.unknown_lever_arm_m else fit_without(0.0)), lever
 
 
 def _fit_in_step(
@@ -352,8 +373,10 @@ def _judged(
         reasons = (*reasons, *(() if worthless else wrong))
     else:
         bent = [fault.as_fact(t_s, scale.widened) for fault in shape.doubtful] or _check_drift(fit.drift)
-        large, usual = _check_gains(fit, scale, accel)
-        doubts = [*wrong, *check_clocks(clock_rate), *_check_length(t_s), *_check_rest(fit), *large, *bent]
+        declared = _check_calibrated(fit, scale) if accel.calibrated else []
+        large, usual = ([], []) if accel.calibrated else _check_gains(fit, scale)
+        # what was declared is named first
+        doubts = [*declared, *wrong, *check_clocks(clock_rate), *_check_length(t_s), *_check_rest(fit), *large, *bent]
         verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, doubts)
         # what is in the interval makes nothing weak by itself; where the interval is wide, it may be why
         said = [fault for fault in shape.said if fault not in shape.doubtful]
@@ -488,22 +511,25 @@ def _check_rest(fit: Fit) -> list[Fact]:
     return [] if fit.converged else [Fact("fit-hardly-converged", moves_log=fit.unsettled_log)]
 
 
-def _check_gains(fit: Fit, scale: FoundScale, accel: AccelPart) -> tuple[list[Fact], list[Fact]]:
-    """Gains of the accelerometer: larger than any sensor's, and others that are worth a word.
+def _check_calibrated(fit: Fit, scale: FoundScale) -> list[Fact]:
+    """A doubt where a calibrated accelerometer has gains, which contradict the calibration."""
+    wrong_gain = scale.wrong_gain
+    if fit.gain_chi2 > par.LARGEST_GAIN_CHI2:
+        return [Fact("calibrated-gain-contradicted", gains=-np.diagonal(fit.estimate.accel_gain))]
+    if wrong_gain is not None and wrong_gain.is_likely:
+        return [Fact("calibrated-gain-contradicted", gains=(wrong_gain.gain,) * 3)]
+    return []
 
-    Of a calibrated one they are zero, and others contradict the calibration.
-    """
+
+def _check_gains(fit: Fit, scale: FoundScale) -> tuple[list[Fact], list[Fact]]:
+    """Gains of an accelerometer that was not calibrated: larger than any sensor's, and others that are worth a word."""
     gains, wrong_gain = fit.estimate.accel_gain, scale.wrong_gain
-    if fit.gain_chi2 > par.LARGEST_GAIN_CHI2 and accel.calibrated:
-        return [Fact("calibrated-gain-contradicted", gains=-np.diagonal(gains))], []
     if fit.gain_chi2 > par.LARGEST_GAIN_CHI2:
         sigma = np.sqrt(scale.widened * np.diagonal(fit.cov[par.ACCEL_GAIN, par.ACCEL_GAIN])).reshape(3, 3)
         found = Fact("accel-gain-large", gains=-np.diagonal(gains))
         return ([found], []) if exceeds_usual(gains, sigma).any() else ([], [found])
     if wrong_gain is None or not wrong_gain.is_likely:
         return [], []
-    if accel.calibrated:
-        return [Fact("calibrated-gain-contradicted", gains=(wrong_gain.gain,) * 3)], []
     found = Fact("accel-gain-doubtful", gain=wrong_gain.gain, excess=wrong_gain.excess)
     return ([found], []) if wrong_gain.is_large else ([], [found])
 

@@ -66,6 +66,7 @@ def align_by_consensus(
     *,
     prior: CameraImuCalibration | None = None,
     options: AlignOptions | None = None,
+    together: Alignment | NotObservableError | None = None,
 ) -> tuple[Alignment, RotationConsensus]:
     """Align a camera and an IMU by the cameras of a reconstruction that agree with the gyroscope.
 
@@ -76,6 +77,8 @@ def align_by_consensus(
     ----------
     trajectory, imu, prior, options
         As of :func:`align_clocks`.
+    together
+        What this found or refused by them, where that is known already.
 
     Returns
     -------
@@ -90,7 +93,9 @@ def align_by_consensus(
     aligned: Alignment | None = None
     before = np.zeros(len(trajectory), dtype=np.intp)
     try:
-        aligned = align_clocks(trajectory, imu, prior=prior, options=options)
+        if isinstance(together, NotObservableError):
+            raise together
+        aligned = together or align_clocks(trajectory, imu, prior=prior, options=options)
         calibration = aligned.calibration
     except NotObservableError:
         trimmed = align_trimmed(trajectory, imu, prior=prior, options=options)

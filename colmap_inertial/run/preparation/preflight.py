@@ -12,7 +12,7 @@ import numpy as np
 
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError, TimingError
 from colmap_inertial.core.facts import Fact
-from colmap_inertial.core.progress import Progress, counted
+from colmap_inertial.core.progress import Progress, report_each
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, Frame, FrameTiming
 from colmap_inertial.diagnose import Diagnosis, FramesInVideo, Recorded, diagnose
@@ -256,7 +256,7 @@ def measure_images(
         return None
     first = max(0, (len(timing.t_s) - _EFFORT.compared) // 2)
     few = range(first, min(first + _EFFORT.compared, len(timing.t_s)))
-    frames = counted(some_frames(capture, timing, few), len(few), "check", progress)
+    frames = report_each(some_frames(capture, timing, few), len(few), "check", progress)
     if look is not None:
         frames = show_frames(frames, look)
     camera = colmap_camera(guess_camera(capture, timing))

@@ -25,7 +25,6 @@ from colmap_inertial.inertial.refine.pictures import remove_extremes
 from colmap_inertial.inertial.refine.setup import (
     Seen,
     Written,
-    keypoints_of,
     make_problem,
     move_to_middle_lines,
     read_seen,
@@ -38,7 +37,7 @@ from colmap_inertial.model import Model, downgraded
 from colmap_inertial.model.rigs import has_rigs
 from colmap_inertial.model.similarities import compose
 from colmap_inertial.run.stages.inputs import StageInputs
-from colmap_inertial.run.stages.metric import InertialStage, gravity_in_model
+from colmap_inertial.run.stages.metric import InertialStage, exposed_keypoints, gravity_in_model
 
 if TYPE_CHECKING:
     import pycolmap
@@ -191,13 +190,7 @@ class RefineStage(InertialStage):
         """(M, 2) observations in the pictures as they were exposed."""
         if not model.rectified or self.shutter is None:
             return seen.observations.xy_px
-        keypoints = {}
-        for image_id, name in zip(seen.image_ids, seen.names, strict=True):
-            points = model.reconstruction.image(image_id).points2D
-            mapped = model.observed_px.get(name)
-            xy_px = np.array([p.xy for p in points]).reshape(-1, 2) if mapped is None else mapped
-            keypoints[name] = self.shutter.as_exposed(name, xy_px)
-        return keypoints_of(seen, keypoints)
+        return exposed_keypoints(model, self.shutter, seen)
 
 
 def _doubt_contradicted(model: Model, judged: Judged) -> Model:
