@@ -1060,11 +1060,12 @@ def test_a_report_that_fails_costs_no_result_and_is_told(project, tmp_path, monk
 
 def test_a_failing_report_of_a_stop_hides_no_reason(tmp_path, monkeypatch, report_failures):
     workspace, capture = Workspace(tmp_path), Capture(path=tmp_path, calibration=calibration_prior())
-    with pytest.raises(MappingError, match="nothing matches") as stopped, reporting_stops(workspace, capture):
+    session = Session(workspace=workspace, runner=StepRunner(workspace), context=RunContext(scratch=workspace.stamps))
+    with pytest.raises(MappingError, match="nothing matches") as stopped, reporting_stops(session, capture):
         raise MappingError(Fact.stated("nothing matches"))
     assert stopped.value.__notes__ == [f"findings and remedies: {tmp_path / 'report.html'}"]
     monkeypatch.setattr("colmap_inertial.run.commands.reporting.write_report", broken)
-    with pytest.raises(MappingError, match="nothing matches"), reporting_stops(workspace, capture):
+    with pytest.raises(MappingError, match="nothing matches"), reporting_stops(session, capture):
         raise MappingError(Fact.stated("nothing matches"))
     assert len(report_failures) == 1
     report_failures.clear()

@@ -139,11 +139,11 @@ def test_an_existing_project_names_its_recording_in_the_manifest(project, tmp_pa
         (end,) = run_batch(tmp_path / "m.toml", tmp_path / "out").captures
         assert (end.state, end.models[0]["verdict"]) == ("done", "trusted"), end.error
     assert (tmp_path / "out" / "desk" / "sparse" / "0" / "transform.json").is_file()
-    # a result of other options is not this capture's result
+    # other options do not replace a result unasked
     made = model_bytes(tmp_path / "out" / "desk")
     other = dataclasses.replace(capture, project=dataclasses.replace(capture.project, link=True))
     (end,) = run_batch([other], tmp_path / "out").captures
-    assert end.exit_code == 2 and "another set of options" in end.error
+    assert end.exit_code == 2 and "step apply would change" in end.error
     assert model_bytes(tmp_path / "out" / "desk") == made != {}
 
 
