@@ -270,11 +270,11 @@ def _find_optimum(data: Data, prior: Prior, search: LevelSearch) -> tuple[_Optim
     for iteration in range(_MAX_ITERATIONS):
         if settled or not fac.still_near(there, x, data.t_s, tolerance=4.0 if iteration <= _FEWEST_ITERATIONS else 1.0):
             integrated, there = res.integrate(data, x), x
-        pre = fac.corrected(integrated, there, x)
+        pre = fac.correct_increments(integrated, there, x)
         local = prior.at(x)
         groups = res.all_groups(data, search.noise, local, x, pre, robust=iteration > 2)
         system, rhs, rhs_z = fac.normal_equations(list(groups.values()), local, x)
-        inverse = system.inverted()
+        inverse = system.invert()
         states, z = inverse.solve(rhs, rhs_z)
         turned = search.at_rest and float(z[par.SCALE, 0]) * signed < -_TURNS_BACK * signed**2
         signed = float(z[par.SCALE, 0])

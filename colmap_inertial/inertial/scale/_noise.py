@@ -219,7 +219,7 @@ class LevelSearch:
             )
             if group.share is not None:
                 count = float(np.trace(group.share, axis1=1, axis2=2).sum())
-            counts[i], right[i] = count, max(count - group.explained(inverse), self.expected.least_left * count)
+            counts[i], right[i] = count, max(count - group.count_explained(inverse), self.expected.least_left * count)
             group.pull_back(own[i], rhs[:, :, i : i + 1], rhs_z[:, i : i + 1])
         # a hundredth of the residuals, or they tell nothing of how much larger than expected they are
         expected = np.maximum(right, 0.01 * counts)

@@ -138,7 +138,7 @@ class Equations:
         self.matrix[columns, columns] = np.eye(columns.stop - columns.start) * 1e12
         self.gradient[columns] = 0.0
 
-    def solved(self) -> tuple[Array, Array]:
+    def solve(self) -> tuple[Array, Array]:
         """The step, and the covariance of all unknowns.
 
         Raises
@@ -181,7 +181,7 @@ def minimised(
     for _ in range(limits.rounds):
         equations = equations_of(state)
         settled = abs(squares - equations.squares) < limits.squares + limits.squares_share * equations.squares
-        step, cov = equations.solved()
+        step, cov = equations.solve()
         if largest < limits.step or settled:
             return state, cov, equations.squares
         squares, state = equations.squares, state.moved(step)

@@ -106,7 +106,7 @@ class ClockFit:
     gain: float = 1.0
     mirrored: float = -np.inf
 
-    def applied(self, prior: CameraImuCalibration, shift_s: float) -> CameraImuCalibration:
+    def apply_to(self, prior: CameraImuCalibration, shift_s: float) -> CameraImuCalibration:
         """A calibration with what was fitted; ``shift_s`` is that of the two epochs (``epoch_shift_s``)."""
         return replace(
             prior.replace_clock_offset(self.offset_s - shift_s),

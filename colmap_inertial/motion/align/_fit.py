@@ -76,7 +76,7 @@ class Alignment:
         """
         return abs(self.calibration.clock_rate) > max(_SIGNIFICANT * self.clock_rate_sigma, faster_than)
 
-    def settled(self) -> CameraImuCalibration:
+    def settle_clock_rate(self) -> CameraImuCalibration:
         """The calibration to continue with: its clock rate is zero unless the clocks drift apart (:meth:`drifts`)."""
         return self.calibration if self.drifts() else replace(self.calibration, clock_rate=0.0)
 

@@ -676,7 +676,7 @@ def test_what_nothing_is_known_about_is_not_believed(walked, monkeypatch):
     def failed(problem, x):
         raise np.linalg.LinAlgError
 
-    monkeypatch.setattr(judge, "factored", failed)
+    monkeypatch.setattr(judge, "factor_information", failed)
     made, said = refined_by(tracks.imu, model)
     assert "how sure" in str(said.reason)
     assert said.values["chi2"] < 1.5
