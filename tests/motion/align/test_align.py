@@ -183,7 +183,7 @@ def test_derivatives_of_the_residuals_are_those_of_finite_differences():
 
     def residuals(step):
         moved = state.moved(step)
-        return fit._residuals(trajectory, path, moved, moved.bias, middle_s)
+        return fit._compare_rotations(trajectory, path, moved, moved.bias, middle_s)
 
     count = fit._N + fit._N_NUISANCE
     residual, jacobian, _ = residuals(np.zeros(count))
