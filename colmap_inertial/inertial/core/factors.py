@@ -212,7 +212,7 @@ def correct_increments(pre: Preintegrated, then: Estimate, x: Estimate) -> Prein
 
 
 def imu_group(noise: ImuNoise, x: InertialStates, pre: Preintegrated, *, rotation_only: bool = False) -> Group:
-    """Rows: rotation, velocity, position between consecutive nodes."""
+    """``r_R, r_v, r_p`` of ``docs/dev/scale.md#imu-factor`` between consecutive nodes, whitened."""
     k, dt = len(pre.dt_s), pre.dt_s[:, None]
     body_from_world = x.world_from_imu[:-1].transpose(0, 2, 1)
     step_velocity = x.velocity_m_s[1:] - x.velocity_m_s[:-1] - x.gravity_m_s2 * dt
