@@ -23,7 +23,7 @@ from colmap_inertial.inertial.join.evidence import (
     times_counted,
 )
 from colmap_inertial.inertial.join.placement import FittedSubmodel, ImuLink, Placed, Problem, place_submodels
-from colmap_inertial.inertial.join.relative_poses import JoinedGroup, end_images, tie_cov, worst
+from colmap_inertial.inertial.join.relative_poses import JoinedGroup, end_images, tie_cov, worst_sigmas
 from colmap_inertial.model.submodels.graph import Pair, SimilarityConstraint, among, pair_of
 from colmap_inertial.model.submodels.matches import PlacedImages
 
@@ -295,7 +295,7 @@ def _try(evidence: Evidence, members: Sequence[int], matched: Collection[Similar
         farthest = max(farthest, float(misfit @ np.linalg.solve(cov, misfit)))
         a, b = pair_of(tie)
         pair = members[a], members[b]
-        sigmas[pair] = tuple(np.maximum(sigmas.get(pair, (0.0, 0.0)), worst(cov)).tolist())
+        sigmas[pair] = tuple(np.maximum(sigmas.get(pair, (0.0, 0.0)), worst_sigmas(cov)).tolist())
     why: Fact | None = None
     if device_chi2 > chi2_limit(device_dof, real=True):
         why = Fact("other-imu")

@@ -27,9 +27,9 @@ from colmap_inertial.model.submodels.graph import (
     Equations,
     Placements,
     SimilarityConstraint,
-    chained,
+    chain_placements,
     columns_of,
-    minimised,
+    minimise_placements,
 )
 
 #: Stamps are no better than this.
@@ -203,7 +203,7 @@ class Problem:
                 tie.attach(state, new, scaled=False)
 
         ties: list[SimilarityConstraint | ImuLink] = [*self.constraints, *self.links]
-        return chained(origin, self.held, ties, attach)
+        return chain_placements(origin, self.held, ties, attach)
 
     def _attach_by_imu(self, state: Placements, link: ImuLink, new: int) -> None:
         """Place one end's submodel by the other's and the IMU between; gravity stays down."""
@@ -404,7 +404,9 @@ def place_submodels(problem: Problem, *, by_imu: bool = True) -> Placed:
     numpy.linalg.LinAlgError
         Where it does not converge.
     """
-    state, cov, squares = minimised(problem.start(), lambda state: problem.equations(state, by_imu=by_imu), CONVERGENCE)
+    state, cov, squares = minimise_placements(
+        problem.start(), lambda state: problem.equations(state, by_imu=by_imu), CONVERGENCE
+    )
     count, own = len(problem.submodels), problem.own(problem.held)
     change = state.change[own + post.GRAVITY.start : own + post.GRAVITY.stop]
     return Placed(

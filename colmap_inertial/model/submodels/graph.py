@@ -35,7 +35,7 @@ def pair_of(constraint: Any) -> Pair:
     return min(constraint.first, constraint.second), max(constraint.first, constraint.second)
 
 
-def connected(members: Sequence[int], pairs: Iterable[Pair]) -> list[list[int]]:
+def find_connected(members: Sequence[int], pairs: Iterable[Pair]) -> list[list[int]]:
     """Connected components of a graph of submodels."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -167,7 +167,7 @@ class Convergence:
     squares_share: float
 
 
-def minimised(
+def minimise_placements(
     start: Placements, equations_of: Callable[[Placements], Equations], limits: Convergence
 ) -> tuple[Placements, Array, float]:
     """The most probable placements, their covariance with all unknowns, and the sum of squares.
@@ -323,7 +323,7 @@ class SimilarityConstraint:
 _FIT_ROUNDS = 5
 
 
-def chained(
+def chain_placements(
     start: Placements, held: int, ties: Sequence[Tie], attach: Callable[[Placements, Tie, int], None]
 ) -> Placements:
     """Placements by one constraint after the other, from the held submodel on, the first ones of ``ties`` first."""

@@ -15,7 +15,7 @@ from colmap_inertial.core.options import JoinOptions, ProjectOptions, Reconstruc
 from colmap_inertial.inertial.join.evidence import Evidence, find_links, find_shared
 from colmap_inertial.inertial.join.judge import join_submodels
 from colmap_inertial.inertial.join.placement import FittedSubmodel, ImuLink, Problem, place_submodels
-from colmap_inertial.inertial.join.relative_poses import end_images, tie_cov, worst
+from colmap_inertial.inertial.join.relative_poses import end_images, tie_cov, worst_sigmas
 from colmap_inertial.inertial.scale.posterior import CLOCK_RATE, DELAY, FittedPath
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.model import Model, trajectory_from_model, transformed
@@ -121,7 +121,7 @@ def test_the_imu_places_one_part_in_the_world_of_the_other(walked, halves):
     for part in (slice(0, 3), slice(3, 6)):
         assert error[part] @ np.linalg.solve(cov[part, part], error[part]) < 11.3  # one in a hundred by chance
     assert group.placed.inflation == pytest.approx(max(1.0, gap.chi2 / gap.dof), rel=0.5)
-    assert worst(cov) == pytest.approx((gap.sigma_m, np.radians(gap.sigma_deg)), rel=1e-6)
+    assert worst_sigmas(cov) == pytest.approx((gap.sigma_m, np.radians(gap.sigma_deg)), rel=1e-6)
     assert 0.002 < gap.sigma_m < 0.05
     # both were upright already, as well as each knew by itself
     held, other = group.placed.places.rotation
