@@ -8,7 +8,7 @@ from typing import Literal
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import ScaleEstimate
-from colmap_inertial.model import downgraded
+from colmap_inertial.model import add_doubts
 from colmap_inertial.validate.result import Validation
 
 _CODE = "target-contradicts-scale"
@@ -40,7 +40,7 @@ def doubt_by_target(estimate: ScaleEstimate, validation: Validation) -> ScaleEst
         Of a target in this model.
     """
     fact = contradict_scale(estimate, validation)
-    return estimate if fact is None else downgraded(estimate, (fact,))
+    return estimate if fact is None else add_doubts(estimate, (fact,))
 
 
 def contradict_scale(estimate: ScaleEstimate, validation: Validation) -> Fact | None:

@@ -13,7 +13,7 @@ from colmap_inertial import AlreadyMetricError, Model, OutputExistsError, ScaleE
 from colmap_inertial.colmap.context import RunContext
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.facts import Fact
-from colmap_inertial.model import downgraded, read_model
+from colmap_inertial.model import add_doubts, read_model
 from colmap_inertial.model.similarities import read_scales
 from colmap_inertial.run.steps.hashing import as_json_types
 from colmap_inertial.run.steps.runner import StepRunner
@@ -49,11 +49,11 @@ def test_scales_of_a_result_belong_to_colmap_s_numbers(tmp_path):
 
 def test_doubts_lower_a_verdict_that_was_raised_again():
     doubts = (Fact.stated("the video was stabilised"),)
-    once = downgraded(ESTIMATE, doubts)
+    once = add_doubts(ESTIMATE, doubts)
     raised = dataclasses.replace(once, verdict="trusted")
-    assert once.verdict == downgraded(raised, doubts).verdict == "weak"
-    assert downgraded(raised, doubts).reasons == once.reasons == doubts
-    assert downgraded(ESTIMATE, ()) is ESTIMATE
+    assert once.verdict == add_doubts(raised, doubts).verdict == "weak"
+    assert add_doubts(raised, doubts).reasons == once.reasons == doubts
+    assert add_doubts(ESTIMATE, ()) is ESTIMATE
 
 
 def test_a_model_is_scaled_once(project):
