@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -27,9 +26,8 @@ from colmap_inertial.core.types import (
 )
 from colmap_inertial.diagnose.declared import Contradicted, compare_declared, leave_out
 from colmap_inertial.io.calibration import reset_for_recording
-from colmap_inertial.io.plausible import RawImu
+from colmap_inertial.io.plausible import find_faults
 from colmap_inertial.io.pose_convention import ARRAYS, PoseConvention
-from colmap_inertial.io.units import Axes
 from colmap_inertial.motion.align import Alignment, AlignOptions, align_clocks, searched_around_s
 from colmap_inertial.motion.align.consensus import NO_MAJORITY, align_by_consensus
 from colmap_inertial.motion.align.conventions import LikelyConvention, likely_convention
@@ -208,8 +206,6 @@ class Recorded:
         What could not be read, and why.
     imu
         Before any check of plausibility.
-    gyro_axes, accel_axes
-        Mappings of axes that a capture.toml applied.
     timing, log
         Of the frames.
     is_capture
@@ -230,8 +226,6 @@ class Recorded:
 
     refused: Sequence[InertialError] = ()
     imu: ImuRecording | None = None
-    gyro_axes: Axes | None = None
-    accel_axes: Axes | None = None
     timing: FrameTiming | None = None
     log: FrameLog | None = None
     is_capture: bool = False
@@ -248,10 +242,7 @@ class Recorded:
     @cached_property
     def implausible(self) -> tuple[FormatError, ...]:
         """Reasons why a reader would refuse the inertial samples."""
-        if self.imu is None:
-            return ()
-        raw = RawImu(imu=self.imu, path=Path("IMU"), gyro_axes=self.gyro_axes, accel_axes=self.accel_axes)
-        return tuple(raw.problems())
+        return () if self.imu is None else tuple(find_faults(self.imu))
 
     @property
     def is_dense(self) -> bool:
@@ -304,6 +295,8 @@ class Recorded:
         """Agreement of a reconstruction's cameras with the gyroscope; ``None`` where either is missing."""
         if self.imu is None or self.trajectory is None:
             return None
+        if self._too_long is not None:
+            return self._too_long
         options = AlignOptions(max_offset_s=self.max_offset_s)
         try:
             return align_by_consensus(
@@ -405,6 +398,13 @@ class Recorded:
             prior = reset_for_recording(prior)
         return self._align(self.turning, imu, prior, None if any_offset else self.max_offset_s)
 
+    @property
+    def _too_long(self) -> NotObservableError | None:
+        """Why no offset is searched: there are hours of them, for frames that mostly have no gyroscope beside them."""
+        if self.clocks is None or (self.clocks.unit_factor or 0) <= 1:
+            return None
+        return NotObservableError("time offset", self.clocks.fact)
+
     def _align(
         self,
         turning: CameraTrajectory,
@@ -412,9 +412,8 @@ class Recorded:
         prior: CameraImuCalibration | None,
         max_offset_s: float | None,
     ) -> Alignment | NotObservableError:
-        if self.clocks is not None and (self.clocks.unit_factor or 0) > 1:
-            # hours of offsets to search, for frames that mostly have no gyroscope beside them
-            return NotObservableError("time offset", self.clocks.fact)
+        if self._too_long is not None:
+            return self._too_long
         options = AlignOptions(max_offset_s=max_offset_s)
         if self.trajectory is None:
             # the camera's translation is in the pixels' motion, and no gyroscope explains it

@@ -160,7 +160,7 @@ def check_readout(recorded: Recorded) -> Iterator[Finding]:
         yield from _compare_readout(recorded, timing)
         return
     try:
-        readout = _readout(recorded)
+        readout = _estimate_readout(recorded)
     except NotObservableError as error:
         yield Finding(fact=Fact("readout-unknown", why=error.fact), severity="warning")
         return
@@ -177,7 +177,7 @@ def check_readout(recorded: Recorded) -> Iterator[Finding]:
 def _compare_readout(recorded: Recorded, timing: FrameTiming) -> Iterator[Finding]:
     """A declared readout against one that is estimated without it."""
     try:
-        found = _readout(recorded)
+        found = _estimate_readout(recorded)
     except NotObservableError:
         return
     fact = compare_readout(
@@ -192,7 +192,7 @@ def _compare_readout(recorded: Recorded, timing: FrameTiming) -> Iterator[Findin
         yield Finding(fact=fact, severity="warning")
 
 
-def _readout(recorded: Recorded) -> ReadoutEstimate:
+def _estimate_readout(recorded: Recorded) -> ReadoutEstimate:
     """Estimate the readout from tracked corners and the aligned gyroscope."""
     rotation, aligned, imu = recorded.rotation, recorded.aligned, recorded.imu
     if rotation is not None and not recorded.is_dense:

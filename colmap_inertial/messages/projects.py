@@ -181,6 +181,17 @@ def target_lengths_disagree(largest_m: float, tolerance_share: float, longest_m:
     )
 
 
+_SIDES = {"aprilgrid": "tag side", "aruco": "marker side"}
+
+
+@message(example={"kind": "checkerboard", "stated_m": 0.03, "fits_m": 0.04})
+def target_or_scale_wrong(kind: str, stated_m: float, fits_m: float) -> str:
+    return (
+        f"all lengths are off by {100 * (fits_m / stated_m - 1):+.1f} %: the {_SIDES.get(kind, 'square side')} of "
+        f"{stated_m:.4g} m or the model's scale is wrong; {fits_m:.4g} m would fit"
+    )
+
+
 @message(
     example={"longest_m": 0.3, "diagonal_m": 12.0, "longest_share": 0.025, "directions": 2, "shows_elsewhere": "little"}
 )

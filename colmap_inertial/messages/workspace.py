@@ -354,7 +354,7 @@ def lengths_contradict(
     likely_gap: float | None = None,
 ) -> str:
     listed = ", ".join(
-        f"{length:.4g} mm in a {line} {off:+.2g} %"
+        f"{length:.4g} mm in a {line} {off:+.{0 if abs(off) >= 100 else 1}f} %"
         for length, off, line in zip(lengths_mm, off_pct, along, strict=True)
     )
     return f"its lengths contradict each other systematically: {listed}"

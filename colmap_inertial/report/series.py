@@ -18,6 +18,9 @@ class ReportSizes:
     models: int = 3
     #: Frames in the plot of blur, images of the target, distances of the target.
     blur_frames: int = 3000
+    #: Rows of the table of frames, and the width of their thumbnails.
+    frame_rows: int = 120
+    thumbnail_px: int = 112
     target_images: int = 4
     target_distances: int = 1500
     #: Points of a line: more than a screen has columns.

@@ -68,7 +68,7 @@ def test_places_are_taken_where_there_is_a_fix_on_earth(monkeypatch):
         fix(), fix(kind=2), fix(kind=0), fix(lat=90.0, lon=-180.0), fix(lat=90.1), fix(lon=180.1), fix(lon=180.0),
         fix(height=np.inf), fix(lat=np.nan), fix(sigma=0.0), fix(lat=-90.0, height=-12.0),
     ]  # fmt: skip
-    monkeypatch.setattr(camm, "_open", lambda _: opened(samples))
+    monkeypatch.setattr(camm, "_open_movie", lambda _: opened(samples))
     found = read_camm_positions(Path("film.mp4"))
     assert found.t_ns.tolist() == [0, 10, 30, 60, 90, 100]
     assert found.latitude_deg.tolist() == [48, 48, 90, 48, 48, -90]
@@ -77,10 +77,10 @@ def test_places_are_taken_where_there_is_a_fix_on_earth(monkeypatch):
     assert np.isnan(found.height_m).tolist() == [False, True, False, False, False, False] and found.height_m[5] == -12
     assert np.isnan(found.sigma_m).tolist() == [False] * 4 + [True, False] and found.sigma_m[0] == 2.5
     assert found.height_above == "ellipsoid"
-    monkeypatch.setattr(camm, "_open", lambda _: opened([fix(kind=1), turn(1.0)]))
+    monkeypatch.setattr(camm, "_open_movie", lambda _: opened([fix(kind=1), turn(1.0)]))
     assert read_camm_positions(Path("film.mp4")) is None
     plain = [packet(5, "3d", 48.0, 11.0, 500.0), packet(5, "3d", 91.0, 11.0, 500.0), packet(5, "3d", 47.0, 10.0, 4.0)]
-    monkeypatch.setattr(camm, "_open", lambda _: opened(plain))
+    monkeypatch.setattr(camm, "_open_movie", lambda _: opened(plain))
     found = read_camm_positions(Path("film.mp4"))
     assert found.t_ns.tolist() == [0, 20] and found.height_m.tolist() == [500, 4] and np.isnan(found.sigma_m).all()
 
@@ -97,7 +97,7 @@ def test_exposures_are_those_next_to_the_frames(subtests, monkeypatch):
             samples = [packet(1, "2i", exposure_ns + (1000 * k if exposure_ns > 0 else 0), skew_ns) for k in range(5)]
             movie, track = opened(samples)
             movie.frame_times_ns = lambda: np.array([1, 19, 42], dtype=np.int64)
-            monkeypatch.setattr(camm, "_open", lambda _, found=(movie, track): found)
+            monkeypatch.setattr(camm, "_open_movie", lambda _, found=(movie, track): found)
             log = read_camm_frames(Path("film.mp4"))
             if exposure_s is None:
                 assert log.exposure_s is None

@@ -505,9 +505,9 @@ def test_a_refused_scale_has_no_number_and_says_what_to_do(refused):
     (model,) = content["models"]
     assert content["outcome"]["verdict"] == result["models"][0]["verdict"] == "refused"
     assert model["metres_per_unit"] is None and model["half_width_pct"] is None
-    assert "What was tried" in page.text and "What to record or to mend" in page.text
+    assert "What was tried" in page.text and "What to record or correct" in page.text
     assert "Film again" in page.text
-    assert "they differ by" in page.text.partition("What was tried")[2]
+    assert "their rates differ by" in page.text.partition("What was tried")[2]
     assert "How the scale was found" not in page.text and "how the scale was found" not in page.text
     assert model["reasons"][0] in page.text.replace("The scale", "the scale", 1) or model["reasons"][0][1:] in page.text
     assert model["signals"]["acceleration"]["camera_unit"] == "units/s2"
@@ -635,9 +635,9 @@ def test_parts_of_the_recording_are_judged_as_the_estimator_judges_them(full, tm
     assert "They agree within their uncertainty" in report_of_changed(out, result)[1].text
     drift["trend_log_per_s"] = 4e-3  # steady: the estimator reports it whatever the parts scatter by
     text = report_of_changed(out, result)[1].text
-    assert "They differ by more than chance explains" in text and "+24.00 ±12 % a minute" in text
+    assert "They differ by more than chance" in text and "+24.00 ±12 % a minute" in text
     drift |= {"p_value": 1e-5, "trend_log_per_s": 0.0}
-    assert "They differ by more than chance explains" in report_of_changed(out, result)[1].text
+    assert "They differ by more than chance" in report_of_changed(out, result)[1].text
     drift |= {"p_value": 0.5}
     for part in drift["parts"][1:]:
         part["sigma_log"] = 1e4
@@ -661,6 +661,17 @@ def test_used_frames_of_a_video_are_told(full, tmp_path):
     content, page = report_of_changed(out, result)
     assert content["selection"] == {"frames": 900, "used": 120, "note": "the sharpest of each window"}
     assert "120 of 900: the sharpest of each window" in page.text
+
+
+def test_frames_are_listed_with_what_was_done_to_them(full, tmp_path):
+    out = copy_of(full, tmp_path)
+    result = json.loads((out / "result.json").read_text(encoding="utf-8"))
+    content, _ = report_of_changed(out, result)
+    rows, blur_px = content["frame_table"]["rows"], {f["name"]: f["blur_px"] for f in result["frames"]}
+    assert content["frame_table"]["count"] == len(rows) == len(blur_px)
+    assert {row["name"]: row["blur_px"] for row in rows} == blur_px
+    listed = [row["blur_px"] or 0.0 for row in rows]
+    assert listed == sorted(listed, reverse=True)
 
 
 def test_why_there_is_no_target_and_there_are_no_crops(full, tmp_path):

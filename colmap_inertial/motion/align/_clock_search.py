@@ -251,7 +251,7 @@ def _correlate(
     offset_s = np.asarray(begin_s - imu_begin_s - lag * _GRID_S, dtype=np.float64)
     enough = cells[:, 0] >= max(1.0, min_overlap * min(visual_ok.sum(), inertial_ok.sum()))
     kept = np.argsort(-lag)
-    kept = kept[(enough & _allowed(offset_s, offsets_s, _GRID_S))[kept]]
+    kept = kept[(enough & _select_offsets(offset_s, offsets_s, _GRID_S))[kept]]
     count, sum_v, sum_g = cells[kept], correlate(v, g_ok)[kept], correlate(v_ok, g)[kept]
     energy_v = correlate(spectrum(np.sum(visual**2, axis=1))[:, None], g_ok)[kept, 0]
     energy_g = correlate(v_ok, spectrum(np.sum(inertial**2, axis=1))[:, None])[kept, 0]
@@ -264,7 +264,7 @@ def _correlate(
     return offset_s[kept], _gain(energy_v, left, per_second * _GRID_S * count[:, 0]), per_second
 
 
-def _allowed(offset_s: Array, offsets_s: tuple[float, float], step_s: float) -> BoolArray:
+def _select_offsets(offset_s: Array, offsets_s: tuple[float, float], step_s: float) -> BoolArray:
     return (offset_s >= offsets_s[0] - step_s) & (offset_s <= offsets_s[1] + step_s)
 
 
@@ -328,7 +328,7 @@ def _scan(
     offset_s = begin_s - grid[0] - lag * _SCAN_S
     needed_s = min_overlap * min(float(end_s - begin_s), float(path.t_s[-1] - path.t_s[0])) * some.dt_s.sum()
     needed_s /= float(end_s - begin_s)
-    allowed = _allowed(offset_s, offsets_s, _SCAN_S)
+    allowed = _select_offsets(offset_s, offsets_s, _SCAN_S)
     offset_s, lag = offset_s[allowed], lag[allowed]
     effective = _effective_intervals(some)
     gain = np.full(len(lag), np.nan)

@@ -107,7 +107,7 @@ def align_by_consensus(
         if aligned is not None and np.array_equal(consensus.part, before):
             break
         before = consensus.part
-        aligned = align_clocks(_mended(trajectory, consensus), imu, prior=prior, options=options)
+        aligned = align_clocks(_mend_rotations(trajectory, consensus), imu, prior=prior, options=options)
         calibration = aligned.calibration
     assert aligned is not None
     if not consensus.kept.all():
@@ -115,7 +115,7 @@ def align_by_consensus(
     return aligned, consensus
 
 
-def _mended(trajectory: CameraTrajectory, consensus: RotationConsensus) -> CameraTrajectory:
+def _mend_rotations(trajectory: CameraTrajectory, consensus: RotationConsensus) -> CameraTrajectory:
     """Rotations without those of wrong cameras, parts turned to fit."""
     sound = consensus.part >= 0
     part_from_ref = quat_conjugate(consensus.ref_from_part_xyzw)[consensus.part[sound]]

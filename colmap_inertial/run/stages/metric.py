@@ -153,18 +153,15 @@ class InertialStage:
         estimate, trajectory = self._estimate(model)
         consensus = estimate.rotations
         if consensus is not None and not consensus.kept.all() and estimate.verdict != "refused":
-            reconstruction, placed = self._register_again(model, consensus)
-            if placed:
-                second, poses = self._estimate(replace(model, reconstruction=reconstruction))
-                if second.rotations is not None and second.verdict != "refused":
-                    estimate, trajectory, consensus = second, poses, consensus.updated(second.rotations)
+            reconstruction, registered = self._register_again(model, consensus)
+            if registered:
+                again, poses = self._estimate(replace(model, reconstruction=reconstruction))
+                if again.rotations is not None and again.verdict != "refused":
+                    estimate, trajectory, consensus = again, poses, consensus.updated(again.rotations)
             left_out = set(consensus.left_out)
             trajectory = trajectory.select(np.array([name not in left_out for name in trajectory.names]))
             model = _select_agreeing_images(model, reconstruction, consensus)
-        if model.rotations is not None and estimate.rotations is not None:
-            notes = (*without_consensus(estimate.notes), *describe_consensus(model.rotations))
-            estimate = replace(estimate, rotations=model.rotations, notes=notes)
-        return model, estimate, trajectory
+        return model, _describe_rotations_of(model, estimate), trajectory
 
     def _estimate(self, model: Model) -> tuple[ScaleEstimate, CameraTrajectory]:
         """The scale of a model as it is, and its poses; notes name images that have no time."""
@@ -180,6 +177,14 @@ class InertialStage:
         if not wrong or self.database is None or not self.database.is_file() or has_rigs(model.reconstruction):
             return model.reconstruction, ()
         return register_again(model.reconstruction, wrong, self.database)
+
+
+def _describe_rotations_of(model: Model, estimate: ScaleEstimate) -> ScaleEstimate:
+    """The estimate with what is known of the model's cameras, where more is than the estimate itself found."""
+    if model.rotations is None or estimate.rotations is None:
+        return estimate
+    notes = (*without_consensus(estimate.notes), *describe_consensus(model.rotations))
+    return replace(estimate, rotations=model.rotations, notes=notes)
 
 
 def _select_agreeing_images(

@@ -163,12 +163,12 @@ def test_rotations_across_a_gap_of_the_gyroscope_are_not_believed():
 
 def test_loops_that_pull_apart_are_not_both_in_the_graph():
     walk = DriftingWalk(*laps(300, 240), np.random.default_rng(6), drift=0.0, bias_sigma=1e-6)
-    (part,) = loop_graph._parts(walk.track, {(i, i + 240): walk.loop(i, i + 240, noise=0) for i in (0, 2)})
-    loops, depth, matches = loop_graph._attach(walk.track, walk.orientations, part)
+    (part,) = loop_graph._split_by_part(walk.track, {(i, i + 240): walk.loop(i, i + 240, noise=0) for i in (0, 2)})
+    loops, depth, matches = loop_graph._attach_loops(walk.track, walk.orientations, part)
     graph = loop_graph._Graph.of(walk.track, walk.orientations, part.nodes)
     loops.step[:] += np.array([[0.8, 0, 0], [-0.8, 0, 0]])
     surer = replace(loops, sigma=loops.sigma * np.array([0.05, 0.05, 0.05, 1, 1, 1, 1]))
-    closed, accepted = loop_graph._close(graph, surer, 1e3 * depth, matches)
+    closed, accepted = loop_graph._accept_loops(graph, surer, 1e3 * depth, matches)
     np.testing.assert_allclose(closed.place, graph.adjusted(surer.only(accepted)).place, atol=1e-4)
     assert accepted.sum() < 2
 
@@ -176,7 +176,7 @@ def test_loops_that_pull_apart_are_not_both_in_the_graph():
 def test_poses_that_are_no_numbers_end_the_grouping():
     _, edges = a_graph()
     off = np.full((len(edges.a), 7), np.nan)
-    best, group = loop_graph._group(off, edges, np.ones(len(edges.a)))
+    best, group = loop_graph._group_agreeing(off, edges, np.ones(len(edges.a)))
     assert len(best) == len(group) == 3
 
 
@@ -195,8 +195,8 @@ def test_errors_of_loops_are_as_large_as_their_covariances():
     shares, squares = [], []
     for seed in range(200):
         walk = DriftingWalk(*laps(170, 120), np.random.default_rng([seed, 8]), bias_sigma=3e-4)
-        (part,) = loop_graph._parts(walk.track, {(20, 141): walk.loop(20, 141, noise=1.0)})
-        edge, _, _ = loop_graph._attach(walk.track, walk.orientations, part)
+        (part,) = loop_graph._split_by_part(walk.track, {(20, 141): walk.loop(20, 141, noise=1.0)})
+        edge, _, _ = loop_graph._attach_loops(walk.track, walk.orientations, part)
         graph = loop_graph._Graph.of(walk.track, walk.orientations, part.nodes).adjusted(edge.only(slice(0)))
         off, covariance = graph.residuals(edge)[0][0], (graph.covariances(edge) + edge.covariance)[0]
         shares.append(off**2 / np.diag(covariance))
@@ -209,8 +209,8 @@ def test_errors_of_loops_are_as_large_as_their_covariances():
 def a_graph():
     rng = np.random.default_rng(9)
     walk = DriftingWalk(circle(60), np.linspace(0, 360, 60), rng)
-    (part,) = loop_graph._parts(walk.track, {pair: walk.loop(*pair) for pair in [(0, 57), (2, 49), (17, 40)]})
-    edges, _, _ = loop_graph._attach(walk.track, walk.orientations, part)
+    (part,) = loop_graph._split_by_part(walk.track, {pair: walk.loop(*pair) for pair in [(0, 57), (2, 49), (17, 40)]})
+    edges, _, _ = loop_graph._attach_loops(walk.track, walk.orientations, part)
     return loop_graph._Graph.of(walk.track, walk.orientations, part.nodes), edges
 
 

@@ -87,7 +87,7 @@ def test_errors_in_pixels_are_roots_of_mean_costs():
 def test_what_the_imu_adds_is_counted(links, nodes, expected):
     flags = [np.arange(20) < count for count in (links, nodes)]
     inertial = SimpleNamespace(linked=flags[0], touched=flags[1])
-    assert judge._freedom(SimpleNamespace(inertial=inertial)) == expected
+    assert judge._count_freedom(SimpleNamespace(inertial=inertial)) == expected
 
 
 @loop_over(
@@ -103,7 +103,7 @@ def test_what_the_imu_adds_is_counted(links, nodes, expected):
 )
 def test_a_refinement_is_doubted(alone, seen, chi2, change, code):
     solutions = [SimpleNamespace(converged=rests) for rests in (alone, seen)]
-    doubt = judge._doubt(*solutions, chi2, change, 0.01)
+    doubt = judge._find_doubt(*solutions, chi2, change, 0.01)
     assert (None if doubt is None else doubt.code) == code
 
 
@@ -131,7 +131,7 @@ def test_clocks_are_too_far_apart_where_readings_do_not_reach(offset_s, clock_ra
         turning=SimpleNamespace(half_span_s=0.05),
     )
     x = SimpleNamespace(offset_s=offset_s, clock_rate=clock_rate, readout_s=readout_s)
-    assert bool(judge._too_late(SimpleNamespace(inertial=inertial), x)) == refused
+    assert bool(judge._find_late_clock(SimpleNamespace(inertial=inertial), x)) == refused
 
 
 def test_every_tenth_of_points_that_are_seen_often_is_held_out():
@@ -140,20 +140,20 @@ def test_every_tenth_of_points_that_are_seen_often_is_held_out():
     point = np.repeat(np.arange(8), lengths)
     observations = SimpleNamespace(first=first, point=point, frame=np.zeros(len(point)))
     often = [m for m in range(len(point)) if lengths[point[m]] >= 4]
-    assert np.flatnonzero(judge._chosen(observations)).tolist() == often[5::10]
+    assert np.flatnonzero(judge._choose_held_out(observations)).tolist() == often[5::10]
 
 
 def test_a_sigma_of_the_readout_is_that_of_its_column(monkeypatch):
     cov = np.diag(np.arange(1.0, 41.0)) * 1e-6
     monkeypatch.setattr(judge, "factored", lambda problem, x: SimpleNamespace(shared_cov=lambda: cov))
-    found = judge._readout(SimpleNamespace(), SimpleNamespace(readout_s=0.02))
+    found = judge._estimate_readout(SimpleNamespace(), SimpleNamespace(readout_s=0.02))
     assert found == (0.02, pytest.approx(np.sqrt(1e-6 * (judge.READOUT + 1))))
 
     def singular(problem, x):
         raise np.linalg.LinAlgError
 
     monkeypatch.setattr(judge, "factored", singular)
-    assert judge._readout(SimpleNamespace(), SimpleNamespace(readout_s=0.02)) is None
+    assert judge._estimate_readout(SimpleNamespace(), SimpleNamespace(readout_s=0.02)) is None
 
 
 def test_noise_that_cannot_be_measured_stays_as_it_was(monkeypatch):
@@ -161,6 +161,6 @@ def test_noise_that_cannot_be_measured_stays_as_it_was(monkeypatch):
         raise np.linalg.LinAlgError
 
     monkeypatch.setattr(judge, "apply_measured_noise", singular)
-    monkeypatch.setattr(judge, "_part", lambda problem, keep: problem)
+    monkeypatch.setattr(judge, "_select_observations", lambda problem, keep: problem)
     problem = SimpleNamespace(inertial=1)
-    assert judge._measured(problem, np.ones(3, dtype=bool), None) is problem
+    assert judge._measure_accel_noise(problem, np.ones(3, dtype=bool), None) is problem

@@ -15,7 +15,14 @@ from colmap_inertial.inertial.refine._panels import Layout
 from colmap_inertial.inertial.refine._residuals import moving
 from colmap_inertial.inertial.refine._system import System
 from colmap_inertial.inertial.refine.motion import find_motion_covs
-from colmap_inertial.inertial.refine.solve import _evaluate, _plausible, _weighted, evaluate_held_out, factored, solve
+from colmap_inertial.inertial.refine.solve import (
+    _evaluate,
+    _is_plausible,
+    _weight_rows,
+    evaluate_held_out,
+    factored,
+    solve,
+)
 from colmap_inertial.inertial.refine.values import Distances, FreeCamera
 from tests.helpers.refine_walk import PINHOLE, known_of, nudged, problem_of, tracks_of, walk
 
@@ -167,7 +174,7 @@ def test_the_compiled_step_and_covariance_are_those_of_the_whole_system(subtests
                 problem, start, _ = problem_of(tracks_of(options), options)
                 x = nudged(start, np.random.default_rng(2))
                 at = _evaluate(problem, x, problem.observations)
-                by, residual = _weighted(problem, at)
+                by, residual = _weight_rows(problem, at)
                 layout = Layout.of(problem.observations, len(x.velocity_m_s))
                 if folded:
                     count = len(layout.place)
@@ -363,8 +370,8 @@ def test_a_gap_of_the_gyroscope_links_nothing():
     assert gap.inertial.linked[~across].sum() >= (~across).sum() - 2
     # each chain's residuals less its velocities; nothing of what hangs between
     chains = 2
-    assert judge._freedom(gap) == 6 * gap.inertial.linked.sum() - 3 * chains
-    assert judge._freedom(whole) == 6 * whole.inertial.linked.sum() - 3
+    assert judge._count_freedom(gap) == 6 * gap.inertial.linked.sum() - 3 * chains
+    assert judge._count_freedom(whole) == 6 * whole.inertial.linked.sum() - 3
 
 
 def test_frames_more_than_ten_seconds_apart_are_not_linked():
@@ -395,12 +402,12 @@ def test_an_offset_beyond_the_readings_that_were_looked_up_is_refused(small):
     _, problem, start, _ = small
     reach_s = problem.inertial.turning.half_span_s - 0.5 * abs(start.readout_s)
     near_s, far_s = reach_s - 0.001, reach_s + 0.001
-    assert judge._too_late(problem, replace(start, offset_s=near_s)) is None
-    assert f"by {1e3 * far_s:.0f} ms" in str(judge._too_late(problem, replace(start, offset_s=-far_s)))
+    assert judge._find_late_clock(problem, replace(start, offset_s=near_s)) is None
+    assert f"by {1e3 * far_s:.0f} ms" in str(judge._find_late_clock(problem, replace(start, offset_s=-far_s)))
     drifting = replace(start, offset_s=near_s, clock_rate=0.002 / np.ptp(problem.inertial.nodes_s) * 2)
-    assert f"by {1e3 * far_s:.0f} ms" in str(judge._too_late(problem, drifting))
+    assert f"by {1e3 * far_s:.0f} ms" in str(judge._find_late_clock(problem, drifting))
     longer = replace(start, offset_s=near_s, readout_s=start.readout_s + 0.004)
-    assert "a readout of" in str(judge._too_late(problem, longer))
+    assert "a readout of" in str(judge._find_late_clock(problem, longer))
 
 
 def test_a_step_that_leaves_no_camera_is_not_tried(small):
@@ -408,20 +415,20 @@ def test_a_step_that_leaves_no_camera_is_not_tried(small):
     for factor, plausible in ((1.4, True), (1.6, False), (-1.0, False)):
         numbers = start.intrinsics.copy()
         numbers[0] *= factor
-        assert _plausible(start, replace(start, intrinsics=numbers)) == plausible
+        assert _is_plausible(start, replace(start, intrinsics=numbers)) == plausible
 
 
 def test_what_is_held_out_must_be_predicted_better_than_chance_does(small):
     _, problem, start, _ = small
-    rests = solver._solution(_evaluate(problem, start, problem.observations), 1, converged=True)
-    assert judge._doubt(rests, rests, 1.0, -0.02, 0.01) is None
+    rests = solver._make_solution(_evaluate(problem, start, problem.observations), 1, converged=True)
+    assert judge._find_doubt(rests, rests, 1.0, -0.02, 0.01) is None
     for change, spread in ((-0.009, 0.01), (0.0, 0.0), (-1.0, np.inf)):
-        assert "no better" in str(judge._doubt(rests, rests, 1.0, change, spread))
+        assert "no better" in str(judge._find_doubt(rests, rests, 1.0, change, spread))
 
 
 def test_what_is_held_out_leaves_each_point_enough(small):
     _, problem, _, _ = small
-    chosen = judge._chosen(problem.observations)
+    chosen = judge._choose_held_out(problem.observations)
     assert 0.05 < chosen.mean() < 0.12
     left = problem.observations.select(~chosen)
     assert np.diff(left.first).min() >= 2
@@ -516,12 +523,12 @@ def test_what_a_small_step_promises_is_what_it_gives(subtests, small):
         with subtests.test(share=share):
             _, problem, start, _ = small
             at = _evaluate(problem, nudged(start, np.random.default_rng(11), 3e-4), problem.observations)
-            by, residual = _weighted(problem, at)
+            by, residual = _weight_rows(problem, at)
             layout = Layout.of(problem.observations, len(start.velocity_m_s))
-            system = solver._built(problem, layout, at, by, residual, 1e-4)
-            step = solver._step(system, problem.rows, by)
+            system = solver._build_system(problem, layout, at, by, residual, 1e-4)
+            step = solver._find_step(system, problem.rows, by)
             step = replace(step, **{field.name: share * getattr(step, field.name) for field in fields(step)})
-            promised = solver._promised(problem, at, residual, step)
+            promised = solver._predict_decrease(problem, at, residual, step)
             gained = (
                 at.cost - _evaluate(problem, step.taken(at.estimate, 1.0, problem.distances), problem.observations).cost
             )
@@ -532,7 +539,7 @@ def test_observations_that_tell_more_pull_as_much_and_hold_so_many_times_as_firm
     _, problem, start, _ = small
     problem = replace(problem, distances=None)
     at = _evaluate(problem, nudged(start, np.random.default_rng(12), 3e-4), problem.observations)
-    plain, firm = _weighted(problem, at), _weighted(problem, at, 4.0)
+    plain, firm = _weight_rows(problem, at), _weight_rows(problem, at, 4.0)
 
     def sums(by, residual):
         points = by.by_point

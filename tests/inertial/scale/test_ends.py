@@ -30,6 +30,6 @@ def test_an_end_is_left_out_where_the_scale_is_three_times_as_sure_without_it(su
                 estimate = partial(estimate_of, misplaced, sigma_without)
                 monkeypatch.setattr(scale, "_estimate", estimate)
                 whole = estimate(path, None, None)
-                best, left_out = scale._estimate_without_end(path, None, None, (whole, ()))
+                best, left_out = scale._estimate_without_moved_end(path, None, None, (whole, ()))
                 assert set(left_out) == (misplaced if believed else set())
                 assert best.cov[0, 0] == pytest.approx(sigma_without**2 if believed else 1.0)

@@ -18,7 +18,8 @@ from colmap_inertial.inertial.core.priors import PRIORS, UNCALIBRATED
 from colmap_inertial.inertial.scale import _residuals as res, _setup, estimate_scale, first_seconds
 from colmap_inertial.inertial.scale._noise import LEVELS, TYPICAL, Expected
 from colmap_inertial.inertial.scale._setup import first_of_groups, group_frames, prepare, roughness
-from colmap_inertial.inertial.scale.joint import JointOptions, estimate_joint, fit_path, scale_of
+from colmap_inertial.inertial.scale.interval import metres_per_unit_of, scale_variances
+from colmap_inertial.inertial.scale.joint import JointOptions, estimate_joint, fit_path
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.motion.align import align_camera_imu
 from colmap_inertial.tools.simulate import IMU_PRESETS
@@ -677,12 +678,11 @@ def test_increments_are_integrated_again_where_the_device_is_another(recording, 
 def test_errors_of_a_shaken_accelerometer_that_stay_for_a_while_are_told_from_white_noise():
     for seed in range(2):
         recording, imu, calibration = shaken(seed, 0.0, 0.06)
-        data, fit, _ = fit_path(recording.trajectory, timed(recording.trajectory, imu, calibration), JointOptions())
+        _, fit, _ = fit_path(recording.trajectory, timed(recording.trajectory, imu, calibration), JointOptions())
         assert fit.noise.accel_slow_m_s2_rts == pytest.approx(0.06, rel=0.35)
         assert fit.noise.accel_density_m_s2_rthz < 0.015
-        found = scale_of(fit, data.t_s, UNCALIBRATED)
-        error = np.log(found.metres_per_unit / recording.truth.metres_per_unit)
-        assert abs(error) < 1.96 * found.sigma_log
+        error = np.log(metres_per_unit_of(fit) / recording.truth.metres_per_unit)
+        assert abs(error) < 1.96 * sum(scale_variances(fit, UNCALIBRATED).values()) ** 0.5
 
 
 def test_what_residuals_lose_to_the_fit_is_the_trace_of_a_dense_inverse(recording, calibration):

@@ -283,14 +283,15 @@ def test_variances_are_widened_to_those_of_errors_that_are_not_white():
             error[k] = correlation * error[k - 1] + fresh
         residual, jacobian = np.repeat(error[:, None], 3, axis=1), np.tile(np.eye(3), (count, 1, 1))
         residual = residual - residual.mean(axis=0)
-        cov = fit._widened(np.eye(3) / count, residual, jacobian, np.ones(count))
+        cov = fit._widen_for_correlation(np.eye(3) / count, residual, jacobian, np.ones(count))
         assert np.allclose(cov, cov.T)
         true.append(error.mean() ** 2)
         stated.append(cov[0, 0])
     assert np.mean(stated) == pytest.approx(np.mean(true), rel=0.5)
     assert np.mean(stated) > 8 / count
     white = rng.standard_normal((count, 3))
-    assert fit._widened(np.eye(3) / count, 0.1 * white, jacobian, np.ones(count)) == pytest.approx(np.eye(3) / count)
+    cov = fit._widen_for_correlation(np.eye(3) / count, 0.1 * white, jacobian, np.ones(count))
+    assert cov == pytest.approx(np.eye(3) / count)
 
 
 def test_the_offset_is_between_raw_stamps_whatever_the_epochs():

@@ -27,7 +27,7 @@ from colmap_inertial.run.preparation import judge as judging, sampling
 from colmap_inertial.run.preparation.plan import Treatments, plan_imaging
 from colmap_inertial.run.stages.join import _beside, _spans
 from colmap_inertial.run.stages.readout import ReadoutStage
-from colmap_inertial.run.stages.refine import _alternate
+from colmap_inertial.run.stages.refine import _takes_turns
 from colmap_inertial.run.steps import runner
 from colmap_inertial.tools.batch import write_summary
 from colmap_inertial.tools.batch.task import CaptureStatus, _verdict
@@ -259,7 +259,7 @@ def test_what_was_lost_since_a_run_is_said_with_the_error(tmp_path, monkeypatch)
         raise FormatError("a.bin", Fact.stated("is damaged"))
     lost.append("sparse/0/cameras.bin")
     with (
-        pytest.raises(FormatError, match=r"out: a.bin: is damaged; sparse/0/cameras.bin is missing or damaged since"),
+        pytest.raises(FormatError, match=r"out: a.bin: is damaged; sparse/0/cameras.bin was damaged or removed since"),
         runner.explaining_losses(space),
     ):
         raise FormatError("a.bin", Fact.stated("is damaged"))
@@ -403,7 +403,7 @@ def test_cameras_take_turns_where_they_come_back_often(subtests):
         )
     ):
         with subtests.test(i=i, alternate=alternate):
-            assert _alternate(model) == alternate
+            assert _takes_turns(model) == alternate
 
 
 def test_frames_speak_for_themselves_where_too_few_confirm_the_gyroscope(subtests):

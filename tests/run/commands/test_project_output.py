@@ -391,14 +391,14 @@ def test_names_that_the_run_needs_are_said_before_any_work(placing):
         require_free_names(placing.project, placing.workspace, dense=True)
     for name in ("log.txt", "report.html", "trajectory_2.tum", ".stages"):
         (placing.project / name).touch()
-        with pytest.raises(OutputError, match=rf"{name} has a name that the output folder needs"):
+        with pytest.raises(OutputError, match=rf"{name} has a name that the output folder uses"):
             require_free_names(placing.project, placing.workspace, dense=False)
         (placing.project / name).unlink()
 
 
 def test_what_is_not_of_the_project_is_not_written_over(placing):
     (placing.workspace.root / "notes.txt").write_text("mine")
-    with pytest.raises(OutputExistsError, match=r"notes\.txt stands where the project's is to come"):
+    with pytest.raises(OutputExistsError, match=r"notes\.txt is in the place of the project's"):
         placing()
     assert (placing.workspace.root / "notes.txt").read_text() == "mine"
     assert "images" not in placing.names()

@@ -529,7 +529,7 @@ def test_auto_leaves_a_project_from_which_more_was_made(walked, tmp_path):
 @pytest.mark.parametrize("found", [(1.5e-3, 0.49e-3), (0.9e-3, 1e-5), (-5e-3, 2e-3)])
 def test_a_readout_that_predicts_nothing_better_is_none(walked, monkeypatch, found):
     tracks, model = walked
-    monkeypatch.setattr(judge, "_readout", lambda *_: found)
+    monkeypatch.setattr(judge, "_estimate_readout", lambda *_: found)
     _, said = refined_by(tracks.imu, model)
     assert said.action == "refined" and said.values["readout_s"] == 0 and "rolling" not in str(said.reason)
 
@@ -723,7 +723,7 @@ def test_what_cannot_be_refined_is_said(walked):
         (slice(30, 31), None),
     ):
         stage = RefineStage(imu=tracks.imu, calibration=UNKNOWN, refine_intrinsics=False)
-        why_not = stage._why_not(replace(model, reconstruction=two_cameras(model.reconstruction, second)))
+        why_not = stage._find_obstacle(replace(model, reconstruction=two_cameras(model.reconstruction, second)))
         assert (None if why_not is None else why_not.code) == code
     # where each image has a camera of its own, devices differ by folder, size or focus, and one that zooms is one
     for camera_of, name_of, code in (
@@ -735,7 +735,7 @@ def test_what_cannot_be_refined_is_said(walked):
     ):
         stage = RefineStage(imu=tracks.imu, calibration=UNKNOWN, refine_intrinsics=False)
         each, timing = camera_for_each(model, camera_of, name_of)
-        why_not = stage._why_not(replace(model, reconstruction=each, timing=timing))
+        why_not = stage._find_obstacle(replace(model, reconstruction=each, timing=timing))
         assert (None if why_not is None else why_not.code) == code
     empty = pycolmap.Reconstruction(model.reconstruction)
     for point_id in list(empty.point3D_ids()):

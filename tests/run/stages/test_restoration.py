@@ -88,7 +88,7 @@ def test_the_network_treats_the_frames_that_the_filter_would_and_the_result_says
     assert "DeepGyro" in said
     stored = json.loads((root / "out" / "result.json").read_text())
     assert stored["imaging"]["deblur_method"] == "deepgyro"
-    assert "the network DeepGyro undoes it" in stored["imaging"]["deblur"]
+    assert "deblurred by the network DeepGyro" in stored["imaging"]["deblur"]
     before = json.loads(by_filter.workspace.result.read_text())
     assert before["imaging"]["deblur_method"] == "wiener" and "DeepGyro" not in before["imaging"]["deblur"]
     assert "the images confirm the gyroscope's blur" in before["imaging"]["deblur"]

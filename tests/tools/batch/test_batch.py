@@ -507,7 +507,7 @@ def test_a_chunk_that_a_run_has_begun_anew_is_given_up(tmp_path, monkeypatch):
     killed = [sys.executable, "-c", "import os; os.kill(os.getpid(), 9)"]
     with monkeypatch.context() as patch:
         patch.setattr(workers, "start_process", lambda *_, **__: subprocess.Popen(killed, stdin=subprocess.PIPE))
-        with pytest.raises(MappingError, match=r"signal 9\); where memory is short, give workers more of it"):
+        with pytest.raises(MappingError, match=r"signal 9\); if memory ran out, give workers more of it"):
             do_for_another(part, describe_versions(), "by the run that goes on")
     shutil.rmtree(part.folder)
     with pytest.raises(InertialError, match=r"worker tcp://a:1 does not see .*0: .* that all machines share"):
