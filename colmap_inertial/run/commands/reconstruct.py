@@ -54,6 +54,7 @@ from colmap_inertial.run.commands.reporting import report_result, reporting_stop
 from colmap_inertial.run.commands.result import ReconstructResult
 from colmap_inertial.run.commands.unplaced import note_unplaced
 from colmap_inertial.run.preparation.geolocation import positions_of
+from colmap_inertial.run.preparation.packages import warn_of_conflicts
 from colmap_inertial.run.preparation.plan import add_stated_exposures, ask_for_plan, run_plan
 from colmap_inertial.run.preparation.preflight import check_imu, run_preflight
 from colmap_inertial.run.preparation.selection import part_of, run_selection
@@ -66,7 +67,7 @@ from colmap_inertial.run.stages.defaults import (
 from colmap_inertial.run.stages.exposures import fuses_pairs
 from colmap_inertial.run.stages.frame_folder import note_rectified, require_frames
 from colmap_inertial.run.stages.inputs import Fuser, StageInputs, lsd2_fuser
-from colmap_inertial.run.steps.session import Session, open_session, warn_of_conflicts
+from colmap_inertial.run.steps.session import Session, open_session
 from colmap_inertial.validate import Target, parse_target
 
 log = logging.getLogger(__name__)

@@ -60,10 +60,11 @@ from colmap_inertial.run.commands.project_sources import (
 from colmap_inertial.run.commands.reporting import report_result, reporting_stops, write_recording
 from colmap_inertial.run.commands.result import Fragment, ModelResult, ReconstructResult
 from colmap_inertial.run.preparation.geolocation import positions_of
+from colmap_inertial.run.preparation.packages import warn_of_conflicts
 from colmap_inertial.run.preparation.preflight import run_preflight
 from colmap_inertial.run.stages.defaults import default_model_stages
 from colmap_inertial.run.stages.inputs import StageInputs
-from colmap_inertial.run.steps.session import Session, open_session, warn_of_conflicts
+from colmap_inertial.run.steps.session import Session, open_session
 from colmap_inertial.run.steps.workspace import Workspace
 from colmap_inertial.validate import Target, parse_target
 

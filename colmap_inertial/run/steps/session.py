@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.metadata
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -192,43 +191,3 @@ def keep_colmap_quiet() -> None:
     import pycolmap
 
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
-
-
-#: By module, the distributions that bring it.
-_PROVIDERS: Mapping[str, tuple[str, ...]] = {
-    "pycolmap": ("pycolmap", "pycolmap-cuda12", "pycolmap-cuda11", "pycolmap-cuda"),
-    "cv2": (
-        "opencv-contrib-python-headless",
-        "opencv-contrib-python",
-        "opencv-python-headless",
-        "opencv-python",
-    ),
-}
-
-
-def conflicts() -> list[str]:
-    """A sentence for each module that several installed distributions bring, on what to do."""
-    clashes = []
-    for module, names in _PROVIDERS.items():
-        there = [f"{name} {version}" for name in names if (version := _version(name)) is not None]
-        if len(there) > 1:
-            kept = there[-1].split()[0] if module == "pycolmap" else there[0].split()[0]
-            every = " ".join(word.split()[0] for word in there)
-            clashes.append(
-                f"{' and '.join(there)} are installed, and each brings the module {module}: the files of the last one "
-                f"overwrote the others'; keep one of them: pip uninstall {every}; pip install {kept}"
-            )
-    return clashes
-
-
-def warn_of_conflicts() -> None:
-    """Log conflicts of installed packages, before they cause failures that do not name them."""
-    for sentence in conflicts():
-        log.warning("%s", sentence)
-
-
-def _version(name: str) -> str | None:
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return None
