@@ -292,7 +292,7 @@ def fuse_captured(
     ]
     with _open_session(out, loaded, options, "fuse-apertures", overwrite=overwrite, progress=progress) as session:
         root = session.workspace.root
-        session.runner.discard(*(root / kind for kind in {"disparity", "depth", "refocused"} - set(kinds)))
+        session.runner.discard(*(root / kind for kind in ("depth", "disparity", "refocused") if kind not in kinds))
         frames = (Frame(name=name, image=read_image(path_in(folder, name)), t_s=0.0) for name in names)
         depends = {"capture": loaded, "options": options, "inputs": inputs}
         outputs = [root / kind for kind in kinds]
