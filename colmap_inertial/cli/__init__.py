@@ -56,8 +56,8 @@ _GROUPS: dict[str, dict[str, type[Speaker]]] = {
 _COMMANDS: dict[str, type[Speaker]] = {name: cls for group in _GROUPS.values() for name, cls in group.items()}
 #: Options that most people use, by field; in the help they come first. Without an entry all do, in their order.
 _COMMON: dict[str, tuple[str, ...]] = {
-    "reconstruct": ("dense", "calibration", "deblur", "rolling_shutter", "world", "config", "force"),
-    "batch": ("workers", "config", "dense", "allow_stages"),
+    "reconstruct": ("dense", "calibration", "deblur", "rolling_shutter", "world", "config", "force", "overwrite"),
+    "batch": ("workers", "config", "dense", "allow_stages", "overwrite"),
     "scale": ("imu", "frame_times", "calibration", "json"),
     "align": ("imu", "frame_times", "out", "remember"),
     "diagnose": ("imu", "frame_times", "json"),

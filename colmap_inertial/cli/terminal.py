@@ -249,12 +249,12 @@ def show_validation(result: Validation) -> None:
 
 def imaging_lines(frames: Sequence[FrameRecord], plan: ImagingPlan, rectified: Collection[str]) -> list[Line]:
     """Treatment of the frames, as labelled lines."""
-    from colmap_inertial.run.commands.result import shutter_note
+    from colmap_inertial.run.commands.result import describe_shutter
 
     counts = {"deblurred": sum(f.sharpened for f in frames), "dropped": sum(not f.used for f in frames)}
     done = ", ".join(f"{count} {word}" for word, count in counts.items() if count)
     view = plan.view
-    note, shutter = str(plan.deblur_note or ""), str(shutter_note(plan, rectified) or "")
+    note, shutter = str(plan.deblur_note or ""), str(describe_shutter(plan, rectified) or "")
     lines: list[Line] = [
         ("deblurring", f"{done} of {len(frames)} frames: {note}" if done else note),
         ("shutter", shutter),

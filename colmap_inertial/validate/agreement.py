@@ -9,7 +9,7 @@ from typing import Literal
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import ScaleEstimate
-from colmap_inertial.model import downgraded
+from colmap_inertial.model import add_doubts
 from colmap_inertial.validate.result import Validation
 
 _CODE = "target-contradicts-scale"
@@ -47,7 +47,7 @@ def doubt_by_target(estimate: ScaleEstimate, validation: Validation) -> ScaleEst
     named = {code for code, _ in _NAMED}
     first = tuple(reason for reason in estimate.reasons if reason.code in named)
     rest = tuple(reason for reason in estimate.reasons if reason.code not in {_CODE, *named})
-    return replace(downgraded(estimate, (fact,)), reasons=(*first, fact, *rest))
+    return replace(add_doubts(estimate, (fact,)), reasons=(*first, fact, *rest))
 
 
 def contradict_scale(estimate: ScaleEstimate, validation: Validation) -> Fact | None:

@@ -143,7 +143,7 @@ def test_a_reconstruction_says_what_was_left_out_or_not_joined(told, tmp_path, m
 
 
 def test_deblurring_is_counted_by_what_was_done(monkeypatch):
-    monkeypatch.setattr(results, "shutter_note", lambda plan, rectified: "global")
+    monkeypatch.setattr(results, "describe_shutter", lambda plan, rectified: "global")
 
     def lines(*actions, view=None):
         plan = SimpleNamespace(view=view, deblur_note="by the gyroscope")

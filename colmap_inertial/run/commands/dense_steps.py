@@ -102,12 +102,12 @@ def run_dense(session: Session, indices: Sequence[int], images: Path, options: D
         session.progress("dense", done, total)
 
     for index in indices:
-        _undistort(session, index, images, prepared[index])
+        _undistort_images(session, index, images, prepared[index])
         count(_WORK.undistorted * images_of[index])
     results: dict[int, DenseResult] = {}
     for index in indices:
         end = done + by_image * images_of[index]
-        results[index] = _densify(session, index, prepared[index], options, count)
+        results[index] = _reconstruct_densely(session, index, prepared[index], options, count)
         # what was kept, or was not needed, counts as done
         count(end - done)
     return results
@@ -132,7 +132,7 @@ class _Prepared:
     has_maps: bool
 
 
-def _densify(
+def _reconstruct_densely(
     session: Session, index: int, prepared: _Prepared, options: DenseOptions, count: Callable[[int], None]
 ) -> DenseResult:
     """Everything after undistortion."""
@@ -142,9 +142,9 @@ def _densify(
     folder, names, maker = session.workspace.dense / str(index), prepared.names, prepared.made_from.maps
     before = [f"dense_{index}_undistorted"]
     if maker == "plane sweep":
-        _sweep(session, index, prepared, count)
+        _sweep_depths(session, index, prepared, count)
     elif pycolmap.has_cuda:
-        _patch_match(session, index, prepared, count)
+        _match_patches(session, index, prepared, count)
     kind, mapped = find_maps(folder, names)
     result = DenseResult(folder=folder, images=len(names), depth_maps=len(mapped), maps=maker)
     if not mapped:
@@ -161,7 +161,7 @@ def _densify(
         fuse_maps(folder, mapped, targets, maker=maker, kind=kind, scratch=scratch, context=context)
         write_json(partial[2], {"coverage": coverage(folder, mapped, kind)})
 
-    maps = [fingerprint(place) for place in _map_folders(folder)]
+    maps = [fingerprint(place) for place in _list_map_folders(folder)]
     record = session.workspace.stamps / f"dense_{index}_measured.json"
     outputs = [fused, folder / "fused.ply.vis", record]
     chosen = fusion_options(maker, context)
@@ -205,7 +205,7 @@ def _prepare_model(session: Session, index: int, images: Path, options: DenseOpt
     return _Prepared(names=names, made_from=made_from, has_maps=has_maps)
 
 
-def _sweep(session: Session, index: int, prepared: _Prepared, count: Callable[[int], None]) -> None:
+def _sweep_depths(session: Session, index: int, prepared: _Prepared, count: Callable[[int], None]) -> None:
     """Depth maps by our own sweep; those that a run made that was cut off are kept."""
     folder, stamps = session.workspace.dense / str(index), session.workspace.stamps
     record, raw = stamps / f"dense_{index}_depth_maps.json", stamps / f"sweep_{index}"
@@ -222,10 +222,10 @@ def _sweep(session: Session, index: int, prepared: _Prepared, count: Callable[[i
 
     depends = {"maps": prepared.made_from.maps}
     after, step = [f"dense_{index}_undistorted"], f"dense_{index}_depth"
-    session.runner.run(step, depends, [record], work, after=after, beside=partial(_map_folders, folder))
+    session.runner.run(step, depends, [record], work, after=after, beside=partial(_list_map_folders, folder))
 
 
-def _patch_match(session: Session, index: int, prepared: _Prepared, count: Callable[[int], None]) -> None:
+def _match_patches(session: Session, index: int, prepared: _Prepared, count: Callable[[int], None]) -> None:
     """Depth maps by COLMAP's patch-match, of each image a photometric one and a geometric one."""
     folder, made_from = session.workspace.dense / str(index), prepared.made_from
     whole, counted = len(prepared.names) * (_WORK.matched + _WORK.confirmed), 0
@@ -243,15 +243,15 @@ def _patch_match(session: Session, index: int, prepared: _Prepared, count: Calla
 
     decided = {"maps": made_from.maps, "settings": made_from.settings}
     after, step = [f"dense_{index}_undistorted"], f"dense_{index}_depth"
-    session.runner.run(step, decided, [], work, after=after, beside=partial(_map_folders, folder))
+    session.runner.run(step, decided, [], work, after=after, beside=partial(_list_map_folders, folder))
     count(whole - counted)
 
 
-def _map_folders(folder: Path) -> list[Path]:
+def _list_map_folders(folder: Path) -> list[Path]:
     return [folder / "stereo" / f"{what}_maps" for what in ("depth", "normal")]
 
 
-def _undistort(session: Session, index: int, images: Path, prepared: _Prepared) -> None:
+def _undistort_images(session: Session, index: int, images: Path, prepared: _Prepared) -> None:
     """Write the dense workspace without depth maps."""
     import pycolmap
 

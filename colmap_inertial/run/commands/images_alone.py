@@ -66,7 +66,7 @@ def _open_session(
     )
 
 
-def _finish(session: Session, capture: Capture, content: Mapping[str, object]) -> bool:
+def _write_result(session: Session, capture: Capture, content: Mapping[str, object]) -> bool:
     """Write ``result.json``; returns whether it stood already."""
     source = capture.image_folder
     return session.finish(
@@ -186,7 +186,7 @@ def deblur_capture(
         rectified = rectifiable(movers, timing.names)
         if rectify:
             run_images(session, records, rectified, movers, smoothed=for_matching)
-        shown = _shown(records)
+        shown = _list_deblurred(records)
         if sheet is not None and shown and plan.view is not None:
             write_json(workspace.stamps / _SHEET, {"sheet": str(sheet.resolve())})
             write_contact_sheet(sheet, loaded, plan, deblurred, shown)
@@ -194,7 +194,7 @@ def deblur_capture(
             "imaging": imaging_as_json(plan, rectified),
             "frames": [frame_as_json(record, plan, rectified) for record in records],
         }
-        unchanged = _finish(session, loaded, content)
+        unchanged = _write_result(session, loaded, content)
         return DeblurResult(
             workspace=workspace,
             frames=note_rectified(records, rectified),
@@ -219,7 +219,7 @@ def _require_free_sheet(sheet: Path, out: Path) -> None:
         raise InertialError(Fact("contact-sheet-is-png", path=str(sheet)))
 
 
-def _shown(records: Sequence[FrameRecord]) -> list[str]:
+def _list_deblurred(records: Sequence[FrameRecord]) -> list[str]:
     """Names of the deblurred frames, the most blurred first."""
     deblurred = [record for record in records if record.sharpened]
     return [record.name for record in sorted(deblurred, key=lambda record: -(record.value("blur_px") or 0.0))]
@@ -292,12 +292,12 @@ def fuse_captured(
     ]
     with _open_session(out, loaded, options, "fuse-apertures", overwrite=overwrite, progress=progress) as session:
         root = session.workspace.root
-        session.runner.discard(*(root / kind for kind in {"disparity", "depth", "refocused"} - set(kinds)))
+        session.runner.discard(*(root / kind for kind in ("depth", "disparity", "refocused") if kind not in kinds))
         frames = (Frame(name=name, image=read_image(path_in(folder, name)), t_s=0.0) for name in names)
         depends = {"capture": loaded, "options": options, "inputs": inputs}
         outputs = [root / kind for kind in kinds]
         records = _run_fusion(session, folder, frames, names, lambda to: partial(fuse_into, to), depends, outputs)
-        _finish(session, loaded, {"frames": [record.name for record in records]})
+        _write_result(session, loaded, {"frames": [record.name for record in records]})
         return tuple(session.workspace.images / name for name in names)
 
 
@@ -376,7 +376,7 @@ def fuse_exposures_captured(
             "stage": stage,
             "inputs": inputs,
         }
-        frames = _frames(loaded, timing, names)
+        frames = _read_short_exposures(loaded, timing, names)
         records = _run_fusion(session, folder, frames, names, lambda _: stage, depends)
         pairs = tuple(structured(FusedPair, record.value("pair")) for record in records)
         content = {
@@ -385,11 +385,11 @@ def fuse_exposures_captured(
             "fusion": options.fusion,
             "frames": [with_sentences(vars(pair)) for pair in pairs],
         }
-        _finish(session, loaded, content)
+        _write_result(session, loaded, content)
         return pairs
 
 
-def _frames(capture: Capture, timing: FrameTiming | None, names: Sequence[str]) -> Iterator[Frame]:
+def _read_short_exposures(capture: Capture, timing: FrameTiming | None, names: Sequence[str]) -> Iterator[Frame]:
     assert isinstance(capture.frames, ImageFolder)
     for i, name in enumerate(names):
         exposures_s = None if timing is None else timing.exposure_s

@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Placed:
+class _PlacedPaths:
     """Paths in the output folder that came from the project."""
 
     paths: tuple[str, ...]
@@ -79,13 +79,13 @@ def place_project(
             log.info("%s", note)
         folders = {index: submodels[index].relative_to(project) for index in applied.models}
         _correct_record(scratch / TRANSFORM_FILE, workspace, folders)
-        moves = _moves(workspace, scratch, folders)
+        moves = _plan_moves(workspace, scratch, folders)
         remove_placed(workspace)
         for target in moves:
             if os.path.lexists(target):
                 raise OutputExistsError(Fact("place-taken", path=str(target)))
         paths = [target.relative_to(workspace.root).as_posix() for target in moves]
-        write_record(workspace.placed, _Placed(paths=tuple(paths)))
+        write_record(workspace.placed, _PlacedPaths(paths=tuple(paths)))
         for target, moved in moves.items():
             target.parent.mkdir(parents=True, exist_ok=True)
             os.replace(moved, target)
@@ -104,7 +104,7 @@ def list_placed_paths(workspace: Workspace) -> list[Path]:
     """Paths in the folder that came from the project; a killed run may have left part of it."""
     if not workspace.placed.is_file():
         return []
-    names = read_record(workspace.placed, _Placed).paths
+    names = read_record(workspace.placed, _PlacedPaths).paths
     check_names(names, workspace.placed)
     for folder in {PurePosixPath(name).parent.as_posix() for name in names} - {"."}:
         path_in(workspace.root, folder, workspace.placed)
@@ -130,7 +130,7 @@ def _correct_record(path: Path, workspace: Workspace, folders: Mapping[int, Path
     write_json(path, {**record, "beside": list(workspace.own_names)})
 
 
-def _moves(workspace: Workspace, scratch: Path, folders: Mapping[int, Path]) -> dict[Path, Path]:
+def _plan_moves(workspace: Workspace, scratch: Path, folders: Mapping[int, Path]) -> dict[Path, Path]:
     """Destination of each part of the transformed project, without the metric models.
 
     A model that is there in the other format, too, is written again: a model stage may have changed it.

@@ -22,7 +22,7 @@ from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.gyro import gravity_in_cam
 from colmap_inertial.core.options import BlurRemover, ReconstructOptions
 from colmap_inertial.core.progress import Progress, silent
-from colmap_inertial.core.types import Frame, ImuRecording, PositionFixes
+from colmap_inertial.core.types import Frame, FrameTiming, ImuRecording, PositionFixes
 from colmap_inertial.diagnose import Diagnosis
 from colmap_inertial.hooks import (
     FrameStage,
@@ -54,6 +54,7 @@ from colmap_inertial.run.commands.reporting import report_result, reporting_stop
 from colmap_inertial.run.commands.result import ReconstructResult
 from colmap_inertial.run.commands.unplaced import note_unplaced
 from colmap_inertial.run.preparation.geolocation import positions_of
+from colmap_inertial.run.preparation.packages import warn_of_conflicts
 from colmap_inertial.run.preparation.plan import add_stated_exposures, ask_for_plan, run_plan
 from colmap_inertial.run.preparation.preflight import check_imu, run_preflight
 from colmap_inertial.run.preparation.selection import part_of, run_selection
@@ -66,7 +67,7 @@ from colmap_inertial.run.stages.defaults import (
 from colmap_inertial.run.stages.exposures import fuses_pairs
 from colmap_inertial.run.stages.frame_folder import note_rectified, require_frames
 from colmap_inertial.run.stages.inputs import Fuser, StageInputs, lsd2_fuser
-from colmap_inertial.run.steps.session import Session, open_session, warn_of_conflicts
+from colmap_inertial.run.steps.session import Session, open_session
 from colmap_inertial.validate import Target, parse_target
 
 log = logging.getLogger(__name__)
@@ -135,7 +136,7 @@ def reconstruct(
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _Given:
+class _CheckedCapture:
     """A capture that was read and checked.
 
     Attributes
@@ -171,7 +172,7 @@ class _Given:
     rig: RigFrames | None
 
 
-def _read(path: Path, options: ReconstructOptions, stages: Stages) -> _Given:
+def _read_capture(path: Path, options: ReconstructOptions, stages: Stages) -> _CheckedCapture:
     """Read a capture; what is wrong with it, the options or the stages is said before any work."""
     for kind in (stages.frame, stages.keypoint, stages.model):
         insert_defaults(kind, [])
@@ -189,21 +190,8 @@ def _read(path: Path, options: ReconstructOptions, stages: Stages) -> _Given:
     capture = capture if pairs else replace(capture, exposures=None)
     raw = check_imu(read_unchecked_capture_imu(capture), force=options.force)
     target = None if capture.target is None else parse_target(capture.target)
-    given = None if options.database is None else read_given(options.database)
     _refuse_with_rig(capture, options)
-    timing, frames = read_frames(capture)
-    rig = None
-    if capture.rig:
-        rig = pair_rig_frames(capture, timing)
-        if rig.alone:
-            log.warning("%d frames are left out: a camera of the rig has no image of them", len(rig.alone))
-        timing = part_of(timing, rig.own_names[0].keys() - set(rig.alone))
-        _, frames = read_frames(capture, only=timing.names)
-    if given is not None:
-        timing = part_of(timing, given.names_in_time(timing.names))
-        first = next(read_frames(capture, only=timing.names[:1])[1])
-        given.require_size(first.name, first.image.shape[1], first.image.shape[0])
-        _, frames = read_frames(capture, only=timing.names)
+    timing, frames, rig = _read_used_frames(capture, options)
     timing = add_stated_exposures(capture, timing)
     require_frames(len(timing.names), of=len(timing.names))
     prior = prior_calibration(capture, options.calibration)
@@ -212,7 +200,7 @@ def _read(path: Path, options: ReconstructOptions, stages: Stages) -> _Given:
     insert_defaults(stages.model, default_model_stages(StageInputs(recording=recording, options=options)))
     gravity = _gravity_priors(recording, options)
     check_pair_names(timing.names)
-    return _Given(
+    return _CheckedCapture(
         capture=capture,
         raw=raw,
         recording=recording,
@@ -223,6 +211,27 @@ def _read(path: Path, options: ReconstructOptions, stages: Stages) -> _Given:
         fixes=positions_of(capture, timing.names) if options.georeference else None,
         rig=rig,
     )
+
+
+def _read_used_frames(
+    capture: Capture, options: ReconstructOptions
+) -> tuple[FrameTiming, Iterator[Frame], RigFrames | None]:
+    """The frames of a capture: of a rig, those that all cameras took; with a given database, those that it has."""
+    timing, frames = read_frames(capture)
+    rig = None
+    if capture.rig:
+        rig = pair_rig_frames(capture, timing)
+        if rig.alone:
+            log.warning("%d frames are left out: a camera of the rig has no image of them", len(rig.alone))
+        timing = part_of(timing, rig.own_names[0].keys() - set(rig.alone))
+        _, frames = read_frames(capture, only=timing.names)
+    if options.database is not None:
+        given = read_given(options.database)
+        timing = part_of(timing, given.names_in_time(timing.names))
+        first = next(read_frames(capture, only=timing.names[:1])[1])
+        given.require_size(first.name, first.image.shape[1], first.image.shape[0])
+        _, frames = read_frames(capture, only=timing.names)
+    return timing, frames, rig
 
 
 def _refuse_with_rig(capture: Capture, options: ReconstructOptions) -> None:
@@ -251,7 +260,7 @@ def _reconstruct(
     progress: Progress,
     findings: Callable[[Diagnosis], None],
 ) -> ReconstructResult:
-    given = _read(path, options, stages)
+    given = _read_capture(path, options, stages)
     capture, used_calibration = given.capture, describe_files(options.calibration)
     device: Device = "cpu"  # of pycolmap, which only verifies where an installed COLMAP does the rest
     if options.colmap_executable is None:
@@ -266,14 +275,16 @@ def _reconstruct(
         session.context.executor.require(session.context.scratch)
         doubts = run_preflight(session, given.recording, given.raw, findings, force=options.force)
         given = replace(given, recording=replace(given.recording, doubts=doubts))
-        result = _run(session, given, options, stages)
+        result = _run_steps(session, given, options, stages)
         result = report_result(session, result, capture, used_calibration)
         remove(session.workspace.colmap_features)
         session.runner.forget("features")
     return result
 
 
-def _run(session: Session, given: _Given, options: ReconstructOptions, stages: Stages) -> ReconstructResult:
+def _run_steps(
+    session: Session, given: _CheckedCapture, options: ReconstructOptions, stages: Stages
+) -> ReconstructResult:
     """The steps of a run, from the choice of frames to the dense reconstruction."""
     workspace, capture = session.workspace, given.capture
     recording, frames, timing = given.recording, given.frames, given.recording.timing

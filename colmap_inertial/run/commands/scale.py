@@ -35,7 +35,7 @@ from colmap_inertial.io.pose_convention import COLMAP, INERTIAL_SCALE, TUM
 from colmap_inertial.io.trajectories import read_inertial_scale_poses, read_tum
 from colmap_inertial.model import (
     Model,
-    downgraded,
+    add_doubts,
     is_metric,
     read_model,
     trajectory_from_model,
@@ -320,7 +320,7 @@ def scale_source(
             options=options,
             read_as=recording.checked.read_as,
         )
-        estimate = downgraded(_judge_shutter(source.source, recording, options, estimate), doubts)
+        estimate = add_doubts(_judge_shutter(source.source, recording, options, estimate), doubts)
     notes = (*left_out, *estimate.notes, *recording.imu.repairs, *recording.notes)
     estimate = dataclasses.replace(estimate, notes=notes)
     if json is not None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.metadata
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -71,7 +70,7 @@ class Session:
             Where a finished result would lose steps.
         """
         known = _read_result(self.workspace)
-        self.runner.leave_out(sorted(known.get("seconds", {}).keys() - content.get("seconds", {}).keys()))
+        self.runner.leave_out(sorted(_list_kinds(known) - _list_kinds(content)))
         same = _without_times(known) == _without_times(convert_to_plain(content))
         unchanged = same and not self.runner.worked and not find_loss(self.workspace, ["report"])
         if not unchanged:
@@ -81,6 +80,11 @@ class Session:
             write_json(self.workspace.result, content)
         log.info("nothing to do" if unchanged else "finished")
         return unchanged
+
+
+def _list_kinds(content: Mapping[str, Any]) -> set[str]:
+    """The kinds of a result's steps, such as ``dense``: who makes the depth maps depends on the machine."""
+    return {step.partition("_")[0] for step in content.get("seconds", ())}
 
 
 def _without_times(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -187,43 +191,3 @@ def keep_colmap_quiet() -> None:
     import pycolmap
 
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
-
-
-#: By module, the distributions that bring it.
-_PROVIDERS: Mapping[str, tuple[str, ...]] = {
-    "pycolmap": ("pycolmap", "pycolmap-cuda12", "pycolmap-cuda11", "pycolmap-cuda"),
-    "cv2": (
-        "opencv-contrib-python-headless",
-        "opencv-contrib-python",
-        "opencv-python-headless",
-        "opencv-python",
-    ),
-}
-
-
-def conflicts() -> list[str]:
-    """A sentence for each module that several installed distributions bring, on what to do."""
-    clashes = []
-    for module, names in _PROVIDERS.items():
-        there = [f"{name} {version}" for name in names if (version := _version(name)) is not None]
-        if len(there) > 1:
-            kept = there[-1].split()[0] if module == "pycolmap" else there[0].split()[0]
-            every = " ".join(word.split()[0] for word in there)
-            clashes.append(
-                f"{' and '.join(there)} are installed, and each brings the module {module}: the files of the last one "
-                f"overwrote the others'; keep one of them: pip uninstall {every}; pip install {kept}"
-            )
-    return clashes
-
-
-def warn_of_conflicts() -> None:
-    """Log conflicts of installed packages, before they cause failures that do not name them."""
-    for sentence in conflicts():
-        log.warning("%s", sentence)
-
-
-def _version(name: str) -> str | None:
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return None

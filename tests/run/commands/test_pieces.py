@@ -21,7 +21,7 @@ from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.gate import GATE_LIMITS, RecordingVerdict
 from colmap_inertial.io.fingerprints import fingerprint
 from colmap_inertial.run.commands import frames as framing, reporting, validate as validation
-from colmap_inertial.run.commands.scale_by_reference import _place
+from colmap_inertial.run.commands.scale_by_reference import _find_place
 from colmap_inertial.run.commands.validate import ValidationOutputs, validate_source
 from colmap_inertial.run.preparation import judge as judging, sampling
 from colmap_inertial.run.preparation.plan import Treatments, plan_imaging
@@ -94,14 +94,14 @@ def test_gaps_lie_between_the_last_image_of_a_model_and_the_first_of_the_next():
 def test_what_is_neither_a_point_nor_a_marker_is_refused(subtests):
     for text in ("nan,1,2", "1,inf,2", "1,2,x", "1,2", "-1", "one", "1234567890"):
         with subtests.test(text=text), pytest.raises(InertialError, match="--between"):
-            _place(text, None)
+            _find_place(text, None)
 
 
 def test_a_point_is_exact_and_a_marker_needs_markers():
-    place, sigma = _place("1,-2.5,3e-1", None)
+    place, sigma = _find_place("1,-2.5,3e-1", None)
     assert place.tolist() == [1, -2.5, 0.3] and sigma == 0
     with pytest.raises(InertialError):
-        _place("7", None)
+        _find_place("7", None)
 
 
 def test_rectifying_by_name_needs_a_readout():

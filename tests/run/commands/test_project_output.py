@@ -196,7 +196,7 @@ def test_a_dense_reconstruction_that_was_cut_off_early_goes_with_its_model(works
     made_from = MadeFrom(model=dense_room.digest_of_model(models[0]), max_image_size=None, maps="plane sweep")
     prepared = dense_room._Prepared(names=(), made_from=made_from, has_maps=False)
     with pytest.raises(KeyboardInterrupt):
-        dense_room._undistort(session, 0, workspace.images, prepared)
+        dense_room._undistort_images(session, 0, workspace.images, prepared)
     remove_stale_dense(workspace, models)
     assert (workspace.dense / "0").is_dir()
     (workspace.stamps / "sweep_0").mkdir()

@@ -386,12 +386,15 @@ def test_a_stopped_run_is_gone_on_with_and_ends_as_if_undisturbed(capture, tmp_p
     pairs = fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
     assert contents(tmp_path / "out" / "images") == contents(tmp_path / "whole" / "images")
     before = (tmp_path / "out" / "result.json").read_bytes()
-    # nothing is left to do; another fusion makes the pictures again
+    # nothing is left to do; another fusion makes the pictures again where that is asked for
     stages = []
     again = fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=lambda s, *_: stages.append(s))
     assert again == pairs and stages == [] and (tmp_path / "out" / "result.json").read_bytes() == before
     options = ExposureOptions(fusion="mertens")
-    fuse_exposures_captured(capture, tmp_path / "out", options, fuser=AVERAGE, progress=silent)
+    with pytest.raises(OutputExistsError, match=r"fusion = mertens \(was none\)"):
+        fuse_exposures_captured(capture, tmp_path / "out", options, fuser=AVERAGE, progress=silent)
+    assert contents(tmp_path / "out" / "images") == contents(tmp_path / "whole" / "images")
+    fuse_exposures_captured(capture, tmp_path / "out", options, fuser=AVERAGE, overwrite=True, progress=silent)
     assert contents(tmp_path / "out" / "images") != contents(tmp_path / "whole" / "images")
     with Workspace(tmp_path / "out").locked(), pytest.raises(OutputExistsError, match="another run is at work"):
         fuse_exposures_captured(capture, tmp_path / "out", options, fuser=AVERAGE, progress=silent)

@@ -13,7 +13,8 @@ from colmap_inertial import AlreadyMetricError, Model, OutputExistsError, ScaleE
 from colmap_inertial.colmap.context import RunContext
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.facts import Fact
-from colmap_inertial.model import downgraded, read_model
+from colmap_inertial.core.types import FrameTiming
+from colmap_inertial.model import add_doubts, read_model
 from colmap_inertial.model.similarities import read_scales
 from colmap_inertial.run.steps.hashing import as_json_types
 from colmap_inertial.run.steps.runner import StepRunner
@@ -49,11 +50,23 @@ def test_scales_of_a_result_belong_to_colmap_s_numbers(tmp_path):
 
 def test_doubts_lower_a_verdict_that_was_raised_again():
     doubts = (Fact.stated("the video was stabilised"),)
-    once = downgraded(ESTIMATE, doubts)
+    once = add_doubts(ESTIMATE, doubts)
     raised = dataclasses.replace(once, verdict="trusted")
-    assert once.verdict == downgraded(raised, doubts).verdict == "weak"
-    assert downgraded(raised, doubts).reasons == once.reasons == doubts
-    assert downgraded(ESTIMATE, ()) is ESTIMATE
+    assert once.verdict == add_doubts(raised, doubts).verdict == "weak"
+    assert add_doubts(raised, doubts).reasons == once.reasons == doubts
+    assert add_doubts(ESTIMATE, ()) is ESTIMATE
+    # whatever a stage puts before them
+    other = Fact.stated("the target is bent")
+    assert add_doubts(add_doubts(once, (other,)), doubts).reasons == (other, *doubts)
+
+
+def test_no_model_of_a_doubted_recording_is_trusted(tmp_path):
+    timing = FrameTiming(names=("a", "b"), t_s=[0.0, 1.0])
+    model = Model(reconstruction=None, colmap_index=0, timing=timing, doubts=("the video was stabilised",))
+    assert model.scale is None
+    doubted = dataclasses.replace(model, scale=ESTIMATE)
+    assert doubted.scale.verdict == "weak" and [str(fact) for fact in doubted.scale.reasons] == [str(model.doubts[0])]
+    assert dataclasses.replace(doubted, rectified=True).scale.reasons == doubted.scale.reasons
 
 
 def test_a_model_is_scaled_once(project):

@@ -48,7 +48,7 @@ from colmap_inertial.run.commands import (
     colmap_steps as steps,
     frames as framing,
     project_output,
-    reconstruct_project as existing,
+    project_sources as existing,
 )
 from colmap_inertial.run.commands.frames import run_frames, run_images
 from colmap_inertial.run.commands.paths import check_output
@@ -923,7 +923,7 @@ def test_the_readout_turns_with_the_pictures(subtests, tmp_path_factory, monkeyp
             )
             monkeypatch.setattr(existing, "match_to_video", lambda *args, match=match, **more: match)
             capture = recording().capture
-            timing, _ = existing._video_times(capture, tmp_path / "a.mp4", tmp_path, list(match.t_ns), silent)
+            timing, _ = existing._read_video_times(capture, tmp_path / "a.mp4", tmp_path, list(match.t_ns), silent)
             read_at = np.rot90(np.repeat(np.arange(5.0)[:, None], 5, axis=1), turns)
             down, right = read_at[-1, 2] - read_at[0, 2], read_at[2, -1] - read_at[2, 0]
             expected = {(4, 0): "down", (-4, 0): "up", (0, 4): "right", (0, -4): "left"}[int(down), int(right)]

@@ -116,7 +116,7 @@ def test_a_manifest_s_stages_run_where_they_are_allowed(capsys, hooks, capture, 
     for other in (StageNames(), SEEN, SEEN):  # a refusal changes nothing
         (end,) = run_batch([dataclasses.replace(entry, stages=other)], out).captures
         assert (end.state, end.exit_code) == ("failed", 2)
-        assert f"{out / 'hall'} holds a finished result, whose step" in end.error and "--overwrite" in end.error
+        assert f"{out / 'hall'} holds a finished result, and its step" in end.error and "--overwrite" in end.error
     assert model_bytes(out / "hall") == made
     (again,) = run_batch(manifest, out, TINY, allow_stages=True).captures
     assert (again.state, again.attempts) == ("done", 1), "nothing was written down of the stages that were refused"
