@@ -43,6 +43,8 @@ class Deblur(ReadingCommand):
     """Undo the rolling shutter, too (needs its readout time); OUT/colmap/images are those with it."""
     sheet: Path | None = None
     """Write a PNG with parts of the most blurred frames before and after."""
+    overwrite: bool = False
+    """Where OUT holds a finished result of other options: make it again."""
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
@@ -58,6 +60,7 @@ class Deblur(ReadingCommand):
                 calibration=self.calibration,
                 rectify=self.rectify,
                 sheet=self.sheet,
+                overwrite=self.overwrite,
                 progress=progress,
             )
         self.tell(

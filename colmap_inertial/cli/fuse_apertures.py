@@ -36,6 +36,8 @@ class FuseApertures(ReadingCommand):
     lens_width: float = 1.0
     """Width of the lens that refocused pictures show, in distances between the first two apertures."""
     fusion: Annotated[ApertureOptions, arg(name="")] = dataclasses.field(default_factory=ApertureOptions)
+    overwrite: bool = False
+    """Where OUT holds a finished result of other options: make it again."""
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
@@ -45,7 +47,7 @@ class FuseApertures(ReadingCommand):
         options = FuseAperturesOptions(fusion=self.fusion, refocus=self.refocus, lens_width=self.lens_width)
         self.check_json(self.capture)
         with self.progress() as screen:
-            written = fuse_captured(self.capture, self.out, options, progress=screen)
+            written = fuse_captured(self.capture, self.out, options, overwrite=self.overwrite, progress=screen)
         lines = [f"{len(written)} pictures in {self.out / 'images'}"]
         self.tell(
             lambda: show_fused(lines, screen),

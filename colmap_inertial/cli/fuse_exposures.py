@@ -36,6 +36,8 @@ class FuseExposures(ReadingCommand):
     """What the network runs on; auto: CUDA where onnxruntime has it."""
     calibration: tuple[Path, ...] = ()
     """Calibration files of this device: from `align --out`, from `calibrate-imu --out`, or both."""
+    overwrite: bool = False
+    """Where OUT holds a finished result of other options: make it again."""
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
@@ -46,7 +48,12 @@ class FuseExposures(ReadingCommand):
         self.check_json(self.capture)
         with self.progress() as screen:
             pairs = fuse_exposures_captured(
-                self.capture, self.out, options, calibration=self.calibration, progress=screen
+                self.capture,
+                self.out,
+                options,
+                calibration=self.calibration,
+                overwrite=self.overwrite,
+                progress=screen,
             )
         fused = sum(pair.fused for pair in pairs)
         lines = [f"{fused} of {len(pairs)} pairs fused in {self.out / 'images'}"]

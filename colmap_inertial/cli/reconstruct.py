@@ -22,8 +22,8 @@ class Reconstruct(DeviceCommand, ConfiguredCommand):
 
     OUT is a COLMAP project in metres: OUT/images, OUT/sparse, and with --dense OUT/dense; beside it are
     OUT/trajectory.tum, OUT/report.html and OUT/result.json. What COLMAP saw and made, in its own units, is in
-    OUT/colmap. Without an accepted scale there is no OUT/sparse. Started again after an interruption, or with other
-    options, it runs only the steps that are missing or depend on them.
+    OUT/colmap. Without an accepted scale there is no OUT/sparse. Started again, it does what is missing, such as the
+    dense reconstruction with --dense. Options that change a finished result need another OUT, or --overwrite.
 
     CAPTURE may be an existing COLMAP project: give --imu, and when its images were taken. Nothing is mapped again, and
     OUT is all of the project in metres. Without an IMU --scale-from takes the metres from a target or a known distance:
@@ -32,7 +32,7 @@ class Reconstruct(DeviceCommand, ConfiguredCommand):
     Example: colmap-inertial reconstruct my_capture/capture.toml out
     """
 
-    common: ClassVar = ("dense", "calibration", "deblur", "rolling_shutter", "world", "config", "force")
+    common: ClassVar = ("dense", "calibration", "deblur", "rolling_shutter", "world", "config", "force", "overwrite")
     resumes: ClassVar = True
 
     capture: Positional[Path]
@@ -46,6 +46,9 @@ class Reconstruct(DeviceCommand, ConfiguredCommand):
     workers: int | None = None
     """Processes that map the parts of a long capture; by default one for each processor. Their number does not change
     the result."""
+    overwrite: bool = False
+    """Where OUT holds a finished result of other options, or of a recording that was changed since: make again in place
+    what depends on that, and keep the rest."""
     scheduler: str | None = None
     """Address of a Dask scheduler (tcp://host:8786), whose workers find features, match pairs and map parts (needs the
     extra `cluster`, and OUT under the same path everywhere). With --deterministic they do not change the result."""
@@ -80,10 +83,18 @@ class Reconstruct(DeviceCommand, ConfiguredCommand):
 
             if self.project != ProjectOptions() or is_project(self.capture):
                 result = reconstruct_project(
-                    self.capture, self.out, self.project, options, progress=screen, findings=findings
+                    self.capture,
+                    self.out,
+                    self.project,
+                    options,
+                    overwrite=self.overwrite,
+                    progress=screen,
+                    findings=findings,
                 )
             else:
-                result = reconstruct(self.capture, self.out, options, progress=screen, findings=findings)
+                result = reconstruct(
+                    self.capture, self.out, options, overwrite=self.overwrite, progress=screen, findings=findings
+                )
         code, stopped = 0, None
         try:
             code = result.exit_code()
