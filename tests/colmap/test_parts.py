@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from colmap_inertial.cli import main
-from colmap_inertial.cli.captures import Reconstruct
+from colmap_inertial.cli.reconstruct import Reconstruct
 from colmap_inertial.colmap.chunks import Processes, start_process
 from colmap_inertial.colmap.context import RunContext
 from colmap_inertial.colmap.parts import map_parts, prepare_part, write_part_database

@@ -141,7 +141,7 @@ def test_the_command_line_takes_it_several_times_and_swallows_no_path(tmp_path):
     for words in (
         ["--colmap", "Mapper.init_num_trials=3", "capture", "out", "--colmap", "SiftMatching.max_ratio=.7"],
         ["--colmap=Mapper.init_num_trials=3", "capture", "--colmap", "SiftMatching.max_ratio=.7", "out"],
-        ["capture", "--colmap", "Mapper.init_num_trials=3", "SiftMatching.max_ratio=.7", "out"],
+        ["capture", "--colmap", "Mapper.init_num_trials=3", "out", "--colmap", "SiftMatching.max_ratio=.7"],
     ):
         command = parse(["reconstruct", *words])
         assert command.options.colmap == ("Mapper.init_num_trials=3", "SiftMatching.max_ratio=.7")
@@ -149,8 +149,12 @@ def test_the_command_line_takes_it_several_times_and_swallows_no_path(tmp_path):
     config = tmp_path / "config.toml"
     config.write_text(config_as_toml(command.options))
     assert read_config(config, ReconstructOptions) == command.options
-    with pytest.raises(InertialError, match=r"takes SECTION\.option=value"):
-        parse(["reconstruct", "capture", "out", "--colmap"])
+    more = parse(["reconstruct", "capture", "out", "--config", str(config), "--colmap", "Mapper.init_num_trials=4"])
+    assert more.options.colmap == (*command.options.colmap, "Mapper.init_num_trials=4")  # of which the last one counts
+    assert read_settings(more.options.colmap, None).settings == (
+        "Mapper.init_num_trials=4",
+        "SiftMatching.max_ratio=.7",
+    )
 
 
 def listed():
