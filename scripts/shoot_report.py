@@ -12,8 +12,8 @@ import tempfile
 import time
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from chromium import Page
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from tests.helpers.chromium import Page
 
 #: Name, width and height (px), whether the screen is dark, and whether scripts run.
 _SCREENS = [

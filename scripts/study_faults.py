@@ -31,7 +31,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import cv2
 from study_kill import OPTIONS, contents
@@ -84,10 +84,10 @@ def batch_made(out: Path) -> dict[str, bytes]:
 
 def commands(root: Path) -> dict[str, Command]:
     """Small inputs for each command, and its command line."""
-    import model_project
-    from batch_captures import tiny_capture
-    from exposure_scenes import write_pair_capture
-    from test_multi_aperture_io import write_plane_capture
+    from tests.helpers import model_project
+    from tests.helpers.batch_captures import tiny_capture
+    from tests.helpers.exposure_scenes import write_pair_capture
+    from tests.run.stages.test_apertures import write_plane_capture
 
     options = root / "options.toml"
     options.write_text(OPTIONS)

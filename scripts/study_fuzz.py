@@ -4,10 +4,10 @@
 
 Three of four mutants change the structure of a file: nodes of JSON and TOML, members and methods of a zip, values and
 tables of SQLite, boxes of MP4, chunks and tags of images, headers of PLY, cells and columns of tables, counts of binary
-records (``tests/fuzz_structure.py``); the others its bytes and lines.
+records (``tests/helpers/fuzz_structure.py``); the others its bytes and lines.
 
-Needs the checkout and the extra ``dev``. Each reader of ``tests/fuzz_readers.py`` and ``tests/fuzz_steps.py`` works in
-a process of its own, in which it reads one mutant after the other: with at most 1 GB more address space than at its
+Needs the checkout and the extra ``dev``. Each reader of ``tests/helpers/fuzz_readers.py`` and ``fuzz_steps.py`` works
+in a process of its own, in which it reads one mutant after the other: with at most 1 GB more address space than at its
 start, and 10 s of processor time for each. Prints a table of readers and outcomes: ``read`` (by one of its functions at
 least); ``refused``, by an ``InertialError`` of the reader's own words; ``gated``, by the gate of all readers, which had
 none; ``control``, a message that still drives a terminal as it is shown; ``foreign``, any other exception; ``hung``;
@@ -36,15 +36,14 @@ from typing import NoReturn
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-
-from conftest import write_anew
-from fuzz_readers import READERS as SINGLE, Reader, mutant
-from fuzz_steps import MORE
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from colmap_inertial.core.errors import InertialError
 from colmap_inertial.core.printing import printable
 from colmap_inertial.io.files import DAMAGED
+from tests.helpers.files import write_anew
+from tests.helpers.fuzz_readers import READERS as SINGLE, Reader, mutant
+from tests.helpers.fuzz_steps import MORE
 
 READERS = {**SINGLE, **MORE}
 OUTCOMES = ("read", "refused", "gated", "control", "foreign", "hung", "large", "died")

@@ -25,9 +25,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-
-from batch_captures import FRAMES, TINY, tiny_capture
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from colmap_inertial.cli import main as command_line
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
@@ -35,6 +33,7 @@ from colmap_inertial.run.commands.images_alone import deblur_capture
 from colmap_inertial.run.commands.reconstruct import reconstruct
 from colmap_inertial.run.commands.reconstruct_project import reconstruct_project
 from colmap_inertial.run.steps.config import config_as_toml
+from tests.helpers.batch_captures import FRAMES, TINY, tiny_capture
 
 #: What a stranger would like to have: no byte of it may come into an output folder.
 SECRET = b"nobody's business"
@@ -122,7 +121,7 @@ def _without_times(value: object) -> object:
 
 def commands(root: Path) -> dict[str, Command]:
     """Small inputs, and the commands on them."""
-    from corner_scene import CALIBRATED, CornerScene
+    from tests.helpers.corner_scene import CALIBRATED, CornerScene
 
     (root / "options.toml").write_text(config_as_toml(TINY))
     for name, frames in (("hall", FRAMES), ("yard", FRAMES - 1)):

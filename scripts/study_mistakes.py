@@ -11,9 +11,10 @@ After that, the check beforehand must find no error, and ``scale`` must find the
 the right ones. Exit code 1 where more than two mistakes are not caught or mended.
 
 ``--declared`` draws so many simulated recordings of 25 s instead, and declares values of their device wrongly: the
-inverse rotation, another order or other axes, the time offset's other sign or unit, another lever arm or its inverse,
-the gains of another IMU. It counts as caught where the check stops it by its code, or the scale is weak and has the
-code among its reasons; as harmless where the interval holds the truth, or the declared value was left out and said so.
+inverse rotation, another order or other axes, the time offset's other sign or unit, another lever arm, its inverse or
+unit, the gains of another IMU; and of walks of 16 s with points, another focal length or readout. It counts as caught
+where the check stops it by its code, or the scale is weak and names it first; as harmless where the interval holds the
+truth, or the declared value was left out and said so.
 Exit code 1 where any gives a trusted scale that is wrong, or more than one is called by another name.
 """
 
@@ -30,12 +31,14 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pycolmap
 from bench_report import write_report
 
 from colmap_inertial.cli import main as run_command
@@ -45,14 +48,20 @@ from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_multiply, quat_normalize
 from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.core.quantiles import Z95
-from colmap_inertial.core.types import CameraTrajectory, ImuCalibration, ImuRecording
+from colmap_inertial.core.types import CameraTrajectory, ImuCalibration, ImuRecording, ScaleEstimate
 from colmap_inertial.core.types.imu import IMU_CAL
 from colmap_inertial.diagnose import Recorded, diagnose
 from colmap_inertial.inertial.scale import estimate_scale
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.io.trajectories import read_tum
+from colmap_inertial.model import Model
+from colmap_inertial.run.stages.imaging_plan import GyroView
+from colmap_inertial.run.stages.metric import MetricStage
+from colmap_inertial.run.stages.readout import ReadoutStage
+from colmap_inertial.run.stages.rolling_shutter import RollingShutterStage
 from colmap_inertial.tools.simulate import IMU_PRESETS, MotionOptions, RecordingOptions, simulate_recording
+from colmap_inertial.tools.simulate.tracks import TrackOptions, simulate_tracks
 
 HERE = Path(__file__).resolve().parents[1]
 DESK = HERE / "example_scenes" / "desk"
@@ -190,7 +199,7 @@ def follow_gain(scene: Path, message: str) -> None:
 
 def follow_frame_rate(scene: Path, message: str) -> None:
     """Time the frames by the rate that a message gives."""
-    rate = number(r"if ([\d.]+) times as many come in a second", message)
+    rate = number(r"at ([\d.]+) times the stated frame rate", message)
     frame_times(lambda t_s: t_s / rate)(scene, message)
 
 
@@ -699,12 +708,71 @@ DECLARED = {
     "time offset in ms": ("declared-offset",),
     "lever arm of the inverse": ("declared-lever-arm",),
     "lever arm, 15 cm off": ("declared-lever-arm",),
+    "lever arm in millimetres": ("declared-lever-arm",),
     "gains of another IMU, 4 %": ("calibrated-gain-contradicted",),
+    "focal length, 8 to 35 % off": ("declared-focal-length",),
+    "readout of 0": ("rolling-shutter-ignored",),
+    "readout, 5 ms or more off": ("declared-readout",),
 }
+#: Those that points of a model tell.
+OF_MODELS = ("focal length, 8 to 35 % off", "readout of 0", "readout, 5 ms or more off")
+
+
+def draw_camera(kind: str, k: int, seed: int) -> tuple[str, str]:
+    """A walk whose camera is declared wrongly, and COLMAP's model of it: what came of it, and what is said."""
+    rng = np.random.default_rng([seed, 61, k])
+    readout_s = 0.0 if kind.startswith("focal") else float(rng.uniform(0.01, 0.03))
+    motion = MotionOptions(kind="walk", duration_s=16.0, speed_m_s=1.0, vigour=0.6, look_deg=40.0)
+    device = IMU_PRESETS[list(IMU_PRESETS)[k % 2]]
+    options = TrackOptions(motion=motion, imu=device, readout_s=readout_s, points_per_m=60.0)
+    tracks = simulate_tracks(options, seed=int(rng.integers(1 << 31)))
+    timing, xy_px, shutter, times = replace(tracks.timing, readout_s=0.0), tracks.xy_px.copy(), None, 1.0
+    if kind == "readout, 5 ms or more off":
+        stated_s = readout_s + (0.005 + float(rng.uniform(0, 0.01))) * (-1 if readout_s > 0.02 else 1)
+        timing = replace(tracks.timing, readout_s=stated_s)
+        view = GyroView(
+            imu=tracks.imu, timing=timing, calibration=tracks.calibration, camera=tracks.camera, source="capture"
+        )
+        shutter = RollingShutterStage(view=view)
+        for i, name in enumerate(timing.names):
+            xy_px[tracks.frame == i] = shutter.moved(name, xy_px[tracks.frame == i])
+    elif kind.startswith("focal"):
+        times = float(np.exp(rng.choice([-1, 1]) * rng.uniform(np.log(1.08), np.log(1.35))))
+    mapped = map_with_camera(tracks.reconstruction(xy_px), times)
+    prior = calibration_prior(Declared(readout_s=timing.readout_s))
+    model = Model(reconstruction=mapped, colmap_index=0, timing=timing, rectified=shutter is not None)
+    stages: dict[str, Any] = {"imu": tracks.imu, "calibration": prior, "keeps_intrinsics": True}
+    model = ReadoutStage(**stages, refine_intrinsics=False, num_threads=1)(model)
+    estimate = MetricStage(**stages, shutter=shutter)(model).scale
+    assert estimate is not None
+    centres = np.array([mapped.find_image_with_name(name).projection_center() for name in timing.names])
+    truth = tracks.motion.cam_in_world_m(timing.pose_t_s())
+    spread = [float(np.sqrt(np.sum((at - at.mean(axis=0)) ** 2))) for at in (centres, truth)]
+    return judge_declared(kind, estimate, spread[1] / spread[0], [])
+
+
+def map_with_camera(reconstruction: pycolmap.Reconstruction, times: float) -> pycolmap.Reconstruction:
+    """COLMAP's bundle adjustment with a focal length that is so many times the true one, and stays."""
+    for camera in reconstruction.cameras.values():
+        for i in camera.focal_length_idxs():
+            camera.params[i] *= times
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = options.refine_principal_point = False
+    options.refine_focal_length = options.refine_extra_params = False
+    getattr(options, "ceres", options).solver_options.num_threads = 1
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in reconstruction.reg_image_ids():
+        config.add_image(image_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, config, reconstruction).solve()
+    reconstruction.update_point_3d_errors()
+    return reconstruction
 
 
 def draw_declared(kind: str, k: int, seed: int) -> tuple[str, str]:
     """A recording whose device is declared wrongly: what came of it, and what is said."""
+    if kind in OF_MODELS:
+        return draw_camera(kind, k, seed)
     rng = np.random.default_rng([seed, 60, k])
     motion = MotionOptions(kind=("orbit", "walk", "roam")[k % 3], duration_s=25.0)  # type: ignore[arg-type]
     device = IMU_PRESETS[list(IMU_PRESETS)[k % len(IMU_PRESETS)]]
@@ -732,6 +800,7 @@ def draw_declared(kind: str, k: int, seed: int) -> tuple[str, str]:
         "time offset's sign": {"gyro_time_offset_s": -shift_s},
         "time offset in ms": {"gyro_time_offset_s": 1e3 * shift_s},
         "lever arm of the inverse": {"imu_in_cam_m": -matrix_from_quat(rotation).T @ arm_m},
+        "lever arm in millimetres": {"imu_in_cam_m": 1e3 * arm_m},
         "lever arm, 15 cm off": {"imu_in_cam_m": arm_m + 0.15 * direction / np.linalg.norm(direction)},
     }.get(kind, {})
     own = None
@@ -752,17 +821,25 @@ def draw_declared(kind: str, k: int, seed: int) -> tuple[str, str]:
         said = [finding.code for finding in told.stopping]
         return ("stopped" if set(said) <= set(DECLARED[kind]) else "misnamed"), " ".join(said)
     estimate = estimate_scale(made.trajectory, imu, calibration=recorded.believed, imu_calibration=own)
-    said = [fact.code for fact in (*recorded.contradicted.facts, *estimate.reasons)]
+    return judge_declared(kind, estimate, made.truth.metres_per_unit, recorded.contradicted.facts)
+
+
+def judge_declared(kind: str, estimate: ScaleEstimate, truth: float, before: Sequence[Fact]) -> tuple[str, str]:
+    """What came of a declared value by the scale, and what is said; facts of the check come before."""
+    said = [fact.code for fact in (*before, *estimate.reasons)]
     off = np.inf
     if estimate.metres_per_unit is not None and estimate.sigma_log:
-        off = abs(float(np.log(estimate.metres_per_unit / made.truth.metres_per_unit))) / estimate.sigma_log
-    if set(said) & set(DECLARED[kind]):
+        off = abs(float(np.log(estimate.metres_per_unit / truth))) / estimate.sigma_log
+    is_named = bool(said) and said[0] in DECLARED[kind]
+    if estimate.verdict == "refused":
+        outcome = "refused" if is_named else "misnamed"
+    elif is_named:
         outcome = "weak" if estimate.verdict != "trusted" else "left out" if off < Z95 else "WRONG"
     elif estimate.verdict == "trusted":
         outcome = "harmless" if off < Z95 else "WRONG"
     else:
         outcome = "misnamed" if off >= Z95 else "harmless"
-    return outcome, " ".join(said)
+    return outcome, f"{' '.join(said)} ({off:.1f} sigma)"
 
 
 def study_declared(count: int, seed: int) -> int:
@@ -773,7 +850,7 @@ def study_declared(count: int, seed: int) -> int:
         outcome, said = draw_declared(kind, k, seed)
         outcomes[kind][outcome] += 1
         print(f"{k:3d} {kind:28} {outcome:9} {said}", flush=True)
-    columns = ("stopped", "weak", "left out", "harmless", "misnamed", "WRONG")
+    columns = ("stopped", "refused", "weak", "left out", "harmless", "misnamed", "WRONG")
     print(f"{'':28}{'drawn':>7}" + "".join(f"{name:>10}" for name in columns))
     for kind, of in outcomes.items():
         print(f"{kind:28}{sum(of.values()):7d}" + "".join(f"{of[name]:10d}" for name in columns))

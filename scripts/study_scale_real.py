@@ -26,7 +26,6 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from bench_report import write_report
@@ -39,7 +38,8 @@ from colmap_inertial.core.facts import sentences
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuCalibration, ImuRecording
-from colmap_inertial.inertial.scale import estimate_scale, joint, learn_lever_arm
+from colmap_inertial.inertial.scale import estimate_scale, interval, learn_lever_arm
+from colmap_inertial.inertial.scale._fit import Fit
 from colmap_inertial.io.calibration import calibration_prior
 
 LENGTHS_S = (np.inf, 20.0, 10.0, 5.0, 3.0)
@@ -72,18 +72,17 @@ class Outcome:
 def listening() -> Iterator[list[float]]:
     """Shifts of the scale that the joint fit makes, as they come."""
     shifts: list[float] = []
-    scale_of = joint.scale_of
+    scale_shift = interval.scale_shift
 
-    def heard(*args: Any, **kwargs: Any) -> joint.FoundScale:
-        found = scale_of(*args, **kwargs)
-        shifts.append(found.shift)
-        return found
+    def record_shift(fit: Fit) -> float:
+        shifts.append(scale_shift(fit))
+        return shifts[-1]
 
-    joint.scale_of = heard
+    interval.scale_shift = record_shift
     try:
         yield shifts
     finally:
-        joint.scale_of = scale_of
+        interval.scale_shift = scale_shift
 
 
 def calibrations(folder: Path) -> dict[str, ImuCalibration]:
