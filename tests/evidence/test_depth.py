@@ -5,13 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from depth_scenes import VIEW, Sensor, record
 
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import quat_from_matrix
 from colmap_inertial.core.types.depth import DepthMap, PinholeGrid
 from colmap_inertial.evidence._surface import fit_surface
 from colmap_inertial.evidence.depth import combine_blocks, scale_by_depth
+from tests.helpers.depth_scenes import VIEW, Sensor, record
 
 
 def test_the_scale_of_a_path_is_found_within_its_random_error():

@@ -7,12 +7,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from depth_scenes import VIEW, record
 
 from colmap_inertial.core.errors import FormatError, MissingExtraError
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate
 from colmap_inertial.io.depth_maps import read_depth_map, unpack_lzfse
 from colmap_inertial.io.device_folders import is_device_folder, read_device_folder
+from tests.helpers.depth_scenes import VIEW, record
 
 MAPS, PATH = record(count=6, seed=2, pose_m=0.0, pose_rad=0.0)
 #: Intrinsics as apps write them: of the picture, ten times as large, its top-left pixel's centre at (0, 0).
