@@ -131,9 +131,8 @@ LONG = ("parts", "rolling_shutter", "blurred", "desk")
 def prepare(folder: Path, data: Path) -> None:
     """Everything that jobs read and that is not public data, made anew by the checkout of the working directory."""
     here = Path.cwd()
-    sys.path[:0] = [str(here), str(here / "scripts")]
-    import walk_scenes
-
+    sys.path.insert(0, str(here))
+    from scripts.common import walk_scenes
     from tests.helpers import exposure_scenes, model_project, refine_walk
     from tests.inertial.join import test_join
     from tests.inertial.static_calibration import test_static_calibration as rests

@@ -34,8 +34,8 @@ class Reconstruct(DeviceCommand, ConfiguredCommand):
 
     OUT is a COLMAP project in metres: OUT/images, OUT/sparse, and with --dense OUT/dense; beside it are
     OUT/trajectory.tum, OUT/report.html and OUT/result.json. What COLMAP saw and made, in its own units, is in
-    OUT/colmap. Without an accepted scale there is no OUT/sparse. Started again after an interruption, or with other
-    options, it runs only the steps that are missing or depend on them.
+    OUT/colmap. Without an accepted scale there is no OUT/sparse. Started again, it does what is missing, such as the
+    dense reconstruction with --dense. Options that change a finished result need another OUT, or --overwrite.
 
     CAPTURE may be an existing COLMAP project: give --imu, and when its images were taken. Nothing is mapped again, and
     OUT is all of the project in metres. Without an IMU --scale-from takes the metres from a target or a known distance:
@@ -55,6 +55,9 @@ class Reconstruct(DeviceCommand, ConfiguredCommand):
     workers: int | None = None
     """Processes that map the parts of a long capture; by default one for each processor. Their number does not change
     the result."""
+    overwrite: bool = False
+    """Where OUT holds a finished result of other options, or of a recording that was changed since: make again in place
+    what depends on that, and keep the rest."""
     scheduler: str | None = None
     """Address of a Dask scheduler (tcp://host:8786), whose workers find features, match pairs and map parts (needs the
     extra `cluster`, and OUT under the same path everywhere). With --deterministic they do not change the result."""
@@ -89,10 +92,18 @@ class Reconstruct(DeviceCommand, ConfiguredCommand):
 
             if self.project != ProjectOptions() or is_project(self.capture):
                 result = reconstruct_project(
-                    self.capture, self.out, self.project, options, progress=screen, findings=findings
+                    self.capture,
+                    self.out,
+                    self.project,
+                    options,
+                    overwrite=self.overwrite,
+                    progress=screen,
+                    findings=findings,
                 )
             else:
-                result = reconstruct(self.capture, self.out, options, progress=screen, findings=findings)
+                result = reconstruct(
+                    self.capture, self.out, options, overwrite=self.overwrite, progress=screen, findings=findings
+                )
         code, stopped = 0, None
         try:
             code = result.exit_code()
@@ -150,6 +161,8 @@ class Deblur(Reader):
     """Undo the rolling shutter, too (needs its readout time); OUT/colmap/images are those with it."""
     sheet: Path | None = None
     """Write a PNG with parts of the most blurred frames before and after."""
+    overwrite: bool = False
+    """Where OUT holds a finished result of other options: make it again."""
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
@@ -165,6 +178,7 @@ class Deblur(Reader):
                 calibration=self.calibration,
                 rectify=self.rectify,
                 sheet=self.sheet,
+                overwrite=self.overwrite,
                 progress=progress,
             )
         self.tell(
@@ -205,6 +219,8 @@ class FuseApertures(Fuser):
     lens_width: float = 1.0
     """Width of the lens that refocused pictures show, in distances between the first two apertures."""
     fusion: Annotated[ApertureOptions, arg(name="")] = dataclasses.field(default_factory=ApertureOptions)
+    overwrite: bool = False
+    """Where OUT holds a finished result of other options: make it again."""
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
@@ -213,7 +229,7 @@ class FuseApertures(Fuser):
         options = FuseAperturesOptions(fusion=self.fusion, refocus=self.refocus, lens_width=self.lens_width)
         self.check_json(self.capture)
         with self.progress() as screen:
-            written = fuse_captured(self.capture, self.out, options, progress=screen)
+            written = fuse_captured(self.capture, self.out, options, overwrite=self.overwrite, progress=screen)
         self.tell_fused([f"{len(written)} pictures in {self.out / 'images'}"], screen)
         return 0
 
@@ -239,6 +255,8 @@ class FuseExposures(Fuser):
     """What the network runs on; auto: CUDA where onnxruntime has it."""
     calibration: tuple[Path, ...] = ()
     """Calibration files of this device: from `align --out`, from `calibrate-imu --out`, or both."""
+    overwrite: bool = False
+    """Where OUT holds a finished result of other options: make it again."""
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
@@ -248,7 +266,12 @@ class FuseExposures(Fuser):
         self.check_json(self.capture)
         with self.progress() as screen:
             pairs = fuse_exposures_captured(
-                self.capture, self.out, options, calibration=self.calibration, progress=screen
+                self.capture,
+                self.out,
+                options,
+                calibration=self.calibration,
+                overwrite=self.overwrite,
+                progress=screen,
             )
         fused = sum(pair.fused for pair in pairs)
         lines = [f"{fused} of {len(pairs)} pairs fused in {self.out / 'images'}"]

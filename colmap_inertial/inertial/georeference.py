@@ -37,12 +37,12 @@ class GeoreferenceLimits:
     white_m: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0)
     slow_m: tuple[float, ...] = (0.02, 0.1, 0.25, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0, 16.0)
     #: In steps of 10^(1/4): with steps of 10^(1/2), the mean over them gives errors alike over 5 s half-widths of up to
-    #: 3.5 times the rms in place of 2.9 (scripts/study_georeference.py).
+    #: 3.5 times the rms in place of 2.9 (scripts/studies/georeference.py).
     alike_s: tuple[float, ...] = (1.0, 1.8, 3.2, 5.6, 10.0, 18.0, 32.0, 56.0, 100.0, 180.0, 320.0, 560.0, 1000.0)
     #: Prior of the slow errors: log-normal about what the receiver states, by this factor. A wider one makes intervals
     #: too wide for errors alike over 5 to 60 s, as their short pieces look like pieces of larger and slower ones. Where
     #: nothing is stated: about this size (m), by this factor; by 1.4, intervals hold in .63 for errors of 6 m
-    #: (scripts/study_georeference.py --unstated).
+    #: (python -m scripts.studies.georeference --unstated).
     slow_factor: float = 1.4
     unstated_slow: tuple[float, float] = (3.0, 2.5)
     #: The positions show over how long errors are alike where this much of the probability is within this factor of the

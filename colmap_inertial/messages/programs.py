@@ -268,11 +268,6 @@ def folder_exists(folder: str) -> str:
 # how a capture of a batch ended
 
 
-@message(advice="remove it or choose another folder", example={"out": "out/walk", "what": "set of options"})
-def result_of_another(out: str, what: str) -> str:
-    return f"{out} holds the result of another {what}"
-
-
 @message(
     advice="workers need the same files under the same paths",
     joint=": ",

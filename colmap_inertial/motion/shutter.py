@@ -70,7 +70,7 @@ class ReadoutLimits:
     clear_sigmas: float = 3.0
     #: one that is seen the other way, too, must be clear and this share of it.
     beside_share: float = 0.2
-    #: Added to what scatter shows (``scripts/study_readout.py``): seconds,
+    #: Added to what scatter shows (``scripts/studies/readout.py``): seconds,
     floor_s: float = 2e-4
     #: and the share of a readout by which it comes out too short where depths are of all sizes.
     floor_share: float = 0.02

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Literal
 
 from colmap_inertial.core.facts import Fact
@@ -40,7 +41,13 @@ def doubt_by_target(estimate: ScaleEstimate, validation: Validation) -> ScaleEst
         Of a target in this model.
     """
     fact = contradict_scale(estimate, validation)
-    return estimate if fact is None else downgraded(estimate, (fact,))
+    if fact is None:
+        return estimate
+    # what is likeliest wrong comes before what it does
+    named = {code for code, _ in _NAMED}
+    first = tuple(reason for reason in estimate.reasons if reason.code in named)
+    rest = tuple(reason for reason in estimate.reasons if reason.code not in {_CODE, *named})
+    return replace(downgraded(estimate, (fact,)), reasons=(*first, fact, *rest))
 
 
 def contradict_scale(estimate: ScaleEstimate, validation: Validation) -> Fact | None:

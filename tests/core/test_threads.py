@@ -13,7 +13,6 @@ from colmap_inertial.core.threads import usable_processors
 #: Prints how many threads BLAS has in each solve of what stands in place of ``WORK``, by function.
 COUNTED = """
 import json, sys
-sys.path.insert(0, sys.argv[1])
 import numpy as np
 from tests.helpers.refine_walk import tracks_of, walk
 from threadpoolctl import threadpool_info

@@ -1,4 +1,4 @@
-"""Every reader of files from outside, with whole files for it: what ``scripts/study_fuzz.py`` damages."""
+"""Every reader of files from outside, with whole files for it: what ``scripts/studies/fuzz.py`` damages."""
 
 import dataclasses
 import functools

@@ -1,8 +1,6 @@
 """How wrong the blur may be follows from what is known of the gyroscope, and the filter and the gate know it."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,12 +16,10 @@ from colmap_inertial.imaging.psf import blur_field, blur_path
 from colmap_inertial.imaging.transfer import srgb_from_linear
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.tools.simulate.render import colmap_camera
+from scripts.common.gated_deblur import deblur_gated
 from tests.helpers.far_scene import FarScene
 from tests.imaging.test_psf_pictures import CAM_FROM_IMU, PINHOLE, turning
 from tests.references.path_filters import Frequencies, doubt_of, transfer_of
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
-from gated_deblur import deblur_gated
 
 CAMERA = colmap_camera(PINHOLE)
 SHUTTER = FrameShutter(width=640, height=480, t_s=2.4, exposure_s=0.03, readout_s=0.0)

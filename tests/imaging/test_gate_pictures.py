@@ -1,9 +1,7 @@
 """Nothing that is sharp gets worse, and what is blurred is still deblurred."""
 
-import sys
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -36,10 +34,8 @@ from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.psf import PredictedBlur, blur_field
 from colmap_inertial.imaging.rolling_shutter import rectify_keypoints
 from colmap_inertial.tools.simulate.render import colmap_camera
+from scripts.common.gated_deblur import deblur_gated
 from tests.helpers.far_scene import FarScene
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
-from gated_deblur import deblur_gated
 
 WIDTH, HEIGHT = 800, 450
 LENS = CameraModel(

@@ -51,7 +51,7 @@ def png(width, height):
 def test_a_text_of_yaml_is_no_longer_than_calibrations_are(tmp_path):
     path = tmp_path / "a.yaml"
     path.write_text("a: [" + "1," * 300_000 + "1]\n")
-    with pytest.raises(FormatError, match="is no calibration: its 600007 characters are more than any has"):
+    with pytest.raises(FormatError, match="is not a calibration: its 600007 characters are too many"):
         read_yaml(path, "a calibration")
 
 

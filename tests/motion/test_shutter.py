@@ -1,8 +1,6 @@
 """The readout of a rolling shutter, from what pictures and the gyroscope tell; from pictures: test_flow_pictures.py."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,10 +8,7 @@ import pytest
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import quat_exp, quat_multiply
 from colmap_inertial.motion.shutter import estimate_readout
-
-sys.path.append(str(Path(__file__).parents[2] / "scripts"))
-
-from study_readout import Film
+from scripts.studies.readout import Film
 
 
 @pytest.mark.parametrize(

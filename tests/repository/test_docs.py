@@ -51,6 +51,8 @@ from colmap_inertial.run.stages.frame_folder import FrameRecord
 from colmap_inertial.run.stages.imaging_plan import GyroView, ImagingPlan
 from colmap_inertial.run.steps.config import config_as_toml
 from colmap_inertial.tools.batch import read_manifest
+from scripts.doc_examples import write_examples
+from scripts.make_reference import pages
 from tests.helpers import imu_files
 from tests.helpers.batch_captures import FRAMES, TINY, tiny_capture
 from tests.helpers.json_schemas import find_violations, read_schema
@@ -58,11 +60,6 @@ from tests.helpers.report_runs import write_run
 from tests.run.commands.test_reconstruct import copy_scene
 
 ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT / "scripts"))
-
-from doc_examples import write_examples  # noqa: E402
-from make_reference import pages  # noqa: E402
-
 DOCS = ROOT / "docs"
 PAGES = [
     ROOT / "README.md",
@@ -191,6 +188,10 @@ def test_every_option_of_reconstruct_is_explained(capsys):
 # --- the package from within -----------------------------------------------------------------------------------------
 
 
+#: A benchmark or study by the command that runs it.
+_SCRIPT = re.compile(r"python -m (scripts(?:\.\w+)+)")
+
+
 def test_names_of_the_code_exist():
     """Functions, types, fields, packages and files that the pages for contributors name; scripts and tests of all."""
     package = ROOT / "colmap_inertial"
@@ -199,7 +200,8 @@ def test_names_of_the_code_exist():
     unknown = []
     for page in PAGES:
         prose = _FENCE.sub("", page.read_text())
-        paths = re.findall(r"`(?:python |bash )?((?:scripts|tests)/\w+\.(?:py|sh))\b", prose)
+        paths = re.findall(r"`(?:python |bash )?((?:scripts|tests)/[\w/]+\.(?:py|sh))\b", prose)
+        paths += [f"{name.replace('.', '/')}.py" for name in _SCRIPT.findall(page.read_text())]
         words = []
         if page in DEVELOPERS:
             paths += re.findall(r"`((?:\w+/)+\w+(?:\.py)?)`", prose)
@@ -212,10 +214,12 @@ def test_names_of_the_code_exist():
 
 
 def test_figures_name_options_that_their_scripts_have():
-    """Each ``scripts/NAME.py --option`` of the pages."""
+    """Each ``python -m scripts.FOLDER.NAME --option`` of the pages."""
     unknown = []
-    for name, arguments in re.findall(r"`(?:python )?scripts/(\w+\.py)((?:\s[^`]*)?)`", TEXT):
-        text = (ROOT / "scripts" / name).read_text()
+    commands = re.findall(rf"`{_SCRIPT.pattern}((?:\s[^`]*)?)`", TEXT)
+    assert len(commands) > 30
+    for name, arguments in commands:
+        text = (ROOT / f"{name.replace('.', '/')}.py").read_text()
         unknown += [(name, o) for o in re.findall(r"--[a-z][\w-]*", arguments) if f'"{o}"' not in text]
     assert unknown == []
 

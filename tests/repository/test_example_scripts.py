@@ -13,7 +13,9 @@ from colmap_inertial.run.steps.config import config_as_toml
 from tests.helpers.batch_captures import TINY, tiny_capture
 from tests.run.commands.test_reconstruct import copy_scene
 
-SCRIPTS = Path(__file__).parents[2] / "scripts"
+ROOT = Path(__file__).parents[2]
+SCRIPTS = ROOT / "scripts"
+MODULES = sorted(".".join(p.relative_to(ROOT).with_suffix("").parts) for p in SCRIPTS.rglob("[!_]*.py"))
 
 
 @pytest.fixture
@@ -68,27 +70,23 @@ def test_a_batch_over_a_folder(config, tmp_path):
 # --- all scripts -----------------------------------------------------------------------------------------------------
 
 #: Where a script that is of use to somebody is named.
-PLACES = (
-    "README.md",
-    "CONTRIBUTING.md",
-    "SECURITY.md",
-    "docs/**/*.md",
-    ".github/**/*.yml",
-    "scripts/*",
-    "tests/**/*.py",
-)
+PLACES = ("*.md", "docs/**/*.md", ".github/**/*.yml", "scripts/**/*.*", "tests/**/*.py", "colmap_inertial/**/*.md")
 
 
 def test_every_script_is_named_by_a_page_a_test_or_another_script():
-    texts = {path: path.read_text() for place in PLACES for path in SCRIPTS.parent.glob(place) if path.is_file()}
-    for script in SCRIPTS.glob("*.py"):
-        name = re.compile(rf"\b{script.stem}\.py|(import|from) {script.stem}\b|\"{script.stem}\"")
-        assert any(name.search(text) for path, text in texts.items() if path != script), script.name
+    texts = {path: path.read_text() for place in PLACES for path in ROOT.glob(place) if path.suffix != ".pyc"}
+    for script in MODULES:
+        *folders, name = script.split(".")
+        place = re.escape("/".join([*folders, name])) + r"\.py"
+        imported = rf"from {re.escape('.'.join(folders))} import [^)]*?\b{name}\b"
+        named = re.compile(rf"{place}|{re.escape(script)}\b|{imported}")
+        assert any(
+            named.search(text) for path, text in texts.items() if path != ROOT / f"{script.replace('.', '/')}.py"
+        ), script
 
 
 def test_every_script_can_be_imported():
-    names = sorted(path.stem for path in SCRIPTS.glob("*.py"))
-    names.remove("train_restoration")  # needs torch
+    names = [name for name in MODULES if not name.startswith("scripts.restoration.")]  # these need torch
     code = f"import importlib, sys; sys.argv = ['script']; [importlib.import_module(name) for name in {names}]"
-    done = subprocess.run([sys.executable, "-c", code], cwd=SCRIPTS, capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

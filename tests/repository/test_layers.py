@@ -76,7 +76,7 @@ ROW_INSIDE = {
 COLMAP = ("model", "inertial.refine", "diagnose", "validate", "report", "hooks", "colmap", "run", "tools", "cli")
 #: What computes touches no file.
 COMPUTES = ("core", "_kernels", "imaging", "motion", "inertial", "evidence")
-TOUCHES_FILES = ("core.errors", "core.options", "core.progress", "core.threads")
+TOUCHES_FILES = ("core.errors", "core.options", "core.progress", "core.threads", "core.types.imu")
 
 
 def inside(module: str, places: tuple[str, ...]) -> bool:

@@ -11,13 +11,11 @@ from pathlib import Path
 import yaml
 
 import colmap_inertial
+from scripts.index_readme import LINK, absolute
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
-sys.path.insert(0, str(ROOT / "scripts"))
-
-from index_readme import LINK, absolute  # noqa: E402
 
 
 def test_there_is_one_version_and_the_changelog_has_it():

@@ -1,9 +1,6 @@
 """Real images of an AprilGrid: another program's detections and a calibrated stereo baseline as second opinions."""
 
-import importlib.util
 import json
-import sys
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,18 +9,9 @@ import pytest
 
 from colmap_inertial.validate import parse_target
 from colmap_inertial.validate.detect import detect
+from scripts.studies import validate_aprilgrid as script
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "validate_aprilgrid.py"
 TARGET = parse_target("aprilgrid:6x6:0.088:0.3")
-
-
-@pytest.fixture(scope="module")
-def script():
-    spec = importlib.util.spec_from_file_location("validate_aprilgrid", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 def test_tag_corners_and_their_numbers_agree_with_another_programs(shared_data):
@@ -47,7 +35,7 @@ def test_tag_corners_and_their_numbers_agree_with_another_programs(shared_data):
 
 
 @pytest.mark.slow
-def test_a_model_scaled_by_the_tags_has_the_stereo_baseline(shared_data, script):
+def test_a_model_scaled_by_the_tags_has_the_stereo_baseline(shared_data):
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     result = script.measure(shared_data, pairs=18)
     assert result.registered == 36

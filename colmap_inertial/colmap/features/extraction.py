@@ -412,7 +412,7 @@ def matching_work(pairs: Sequence[tuple[str, str]]) -> int:
     """Cost of matching pairs after others, in pairs: to index an image's features for a batch costs as much as two.
 
     With that, batches of 20 to 570 pairs of the example scene take the same time a unit within 10 %
-    (``scripts/study_progress.py``).
+    (``scripts/studies/progress.py``).
     """
     return sum(map(_batch_work, growing_batches(pairs, first=_MATCHING_BATCH)))
 

@@ -38,14 +38,16 @@ class ShutterLimits:
     least_s: float = 1e-3
     sure_sigma: float = 3.0
     #: COLMAP leaves out observations that its global shutter misses by 4 px, and keeps those whose noise brings them
-    #: nearer: found readouts are 2 to 10 % short, 5 % rms, and right with all observations (``study_refine_real.py``).
+    #: nearer: found readouts are 2 to 10 % short, 5 % rms, and right with all observations
+    #: (``scripts/studies/refine_real.py``).
     cut_share: float = 0.05
     #: Images in a row that are looked at: a readout is the camera's, not the recording's.
     most_images: int = 300
     #: Observations, at least, and about how many are looked at: more take longer and tell it no better than the model.
     fewest: int = 500
     most: int = 15_000
-    #: Steps of the refinement: from a global shutter, three come within 3 to 11 % of 20 ms (``study_refine_real.py``).
+    #: Steps of the refinement: from a global shutter, three come within 3 to 11 % of 20 ms
+    #: (``scripts/studies/refine_real.py``).
     steps: int = 3
     #: A declared readout is contradicted by one that is off by so many standard deviations, and by this; a declared
     #: focal length by one that is as surely another, and by this share.

@@ -50,7 +50,7 @@ class MovedLimits:
     #: ... or a block of up to this share at an end, which is sought where the scale is known no better (standard
     #: deviation), and believed where this is less than so much of it without the block, and grows no more than this
     #: with the nearer part of it: cameras that COLMAP put before the copy of a wall
-    #: (``scripts/study_wrong_cameras.py``: a hundredth).
+    #: (``scripts/studies/wrong_cameras.py``: a hundredth).
     most_share: float = 0.34
     poor_log: float = 0.05
     shrinks_much: float = 0.33

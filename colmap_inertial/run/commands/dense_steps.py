@@ -56,7 +56,7 @@ _TRIM_LEVELS = 3
 
 @dataclass(frozen=True, kw_only=True)
 class DenseWork:
-    """Work for one image by step: its time on the example scene and on EuRoC (``scripts/study_progress.py``)."""
+    """Work for one image by step: its time on the example scene and on EuRoC (``scripts/studies/progress.py``)."""
 
     #: To find its depths by the plane sweep, 1.3 s of two cores, and to compare them with those of others.
     matched: int = 40
@@ -172,10 +172,8 @@ def _densify(
     with a_record_of_ours(record):
         covered = float(read_json(record)["coverage"])
     result = replace(result, fused=fused, points=_count_elements(fused, "vertex"), coverage=covered)
-    for other in folder.glob("meshed-*.ply"):
-        if other != mesh or not result.points:
-            remove(other)
     if options.mesh == "none" or not result.points:
+        runner.discard(*folder.glob("meshed-*.ply"))
         return result
     if options.mesh == "tsdf":
         depends: dict[str, object] = {"maps": maps}
@@ -184,17 +182,21 @@ def _densify(
         depth, trim = _choose_octree(fused, read_model(folder / "sparse"))
         depends = {"depth": depth, "trim": trim}
         make_mesh = partial(mesh_points, fused, depth=depth, trim=trim, context=context)
+
+    def write_mesh(partial: Sequence[Path]) -> None:
+        make_mesh(partial[0])
+        for other in set(folder.glob("meshed-*.ply")) - {partial[0]}:
+            remove(other)
+
     # its time does not follow from that of the depth maps: 0.4 to 4.6 times as long on two scenes
     session.progress("mesh", 0, 1)
-    runner.run(
-        f"dense_{index}_mesh", depends, [mesh], lambda outputs: make_mesh(outputs[0]), after=[f"dense_{index}_fused"]
-    )
+    runner.run(f"dense_{index}_mesh", depends, [mesh], write_mesh, after=[f"dense_{index}_fused"])
     session.progress("mesh", 1, 1)
     return replace(result, mesh=mesh, faces=_count_elements(mesh, "face"))
 
 
 def _prepare_model(session: Session, index: int, images: Path, options: DenseOptions) -> _Prepared:
-    """Look at what there is, and decide who makes the depth maps; removes old ones of our own."""
+    """Look at what there is, and decide who makes the depth maps."""
     model, folder = session.workspace.sparse / str(index), session.workspace.dense / str(index)
     reconstruction = read_model(model)
     names = tuple(sorted(reconstruction.image(i).name for i in reconstruction.reg_image_ids()))
@@ -209,6 +211,7 @@ def _sweep(session: Session, index: int, prepared: _Prepared, count: Callable[[i
     record, raw = stamps / f"dense_{index}_depth_maps.json", stamps / f"sweep_{index}"
 
     def work(partial: Sequence[Path]) -> None:
+        prepared.made_from.write(folder)
         swept = SweptWorkspace(folder, raw)
         swept.begin({"made_from": prepared.made_from, "images": fingerprint(folder / "images")})
         threads = session.context.num_threads
@@ -235,6 +238,7 @@ def _patch_match(session: Session, index: int, prepared: _Prepared, count: Calla
             counted = now
 
     def work(_: Sequence[Path]) -> None:
+        made_from.write(folder)
         patch_match(folder, made_from.max_image_size, session.context.colmap, count_maps)
 
     decided = {"maps": made_from.maps, "settings": made_from.settings}
@@ -253,11 +257,10 @@ def _undistort(session: Session, index: int, images: Path, prepared: _Prepared) 
 
     runner, workspace = session.runner, session.workspace
     model, folder = workspace.sparse / str(index), workspace.dense / str(index)
-    folder.mkdir(parents=True, exist_ok=True)
     names, made_from = prepared.names, prepared.made_from
-    made_from.write(folder)  # before there is anything that must not outlive the model
 
     def work(partial: Sequence[Path]) -> None:
+        made_from.write(folder)  # before there is anything that must not outlive the model
         scratch = workspace.stamps / "dense"
         remove(scratch)
         scratch.mkdir(parents=True)

@@ -399,16 +399,15 @@ def run_validation(
 ) -> tuple[ModelResult, ...]:
     """Measure the target in the metric models; one that cannot be measured does not undo its model."""
     if target is None or images is None:
-        remove(session.workspace.validation)
+        session.runner.discard(session.workspace.validation)
         return tuple(models)
     checked = []
-    for stale in session.workspace.validation.glob("[0-9]*"):
-        if stale.name not in {str(model.index) for model in models}:
-            remove(stale)
+    metric_models = {str(model.index) for model in models if model.sparse_metric is not None}
+    pictures_there = session.workspace.validation.glob("[0-9]*")
+    session.runner.discard(*(folder for folder in pictures_there if folder.name not in metric_models))
     for model in models:
         pictures = session.workspace.validation / str(model.index)
         if model.sparse_metric is None:
-            remove(pictures)
             checked.append(model)
             continue
         metric = model.sparse_metric
@@ -428,7 +427,7 @@ def run_validation(
                 write_record(partial[0], _Checked(found=validation))
 
         record = session.workspace.stamps / f"validated_{model.index}.json"
-        after = ["metric", *session.runner.of("frames", "images")]
+        after = ["metric", *session.runner.list_own("frames", "images")]
         depends = {"target": target.spec, "images": [] if len(after) > 1 else fingerprint(images)}
         step = f"validation_{model.index}"
         session.runner.run(step, depends, [record], work, after=after, beside=partial(list, [pictures]))

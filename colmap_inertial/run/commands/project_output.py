@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from colmap_inertial.colmap.dense.depth_maps import digest_of_model, has_depth_maps, model_of
+from colmap_inertial.colmap.dense.depth_maps import digest_of_model, model_of
 from colmap_inertial.core.errors import OutputError, OutputExistsError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ProjectOptions
@@ -160,10 +160,6 @@ def _moves(workspace: Workspace, scratch: Path, folders: Mapping[int, Path]) -> 
     return moves
 
 
-#: In a reconstruction that is set aside: which of its steps are finished.
-_STEPS = ".stages"
-
-
 def withdraw(workspace: Workspace) -> None:
     """Take away everything metric: there is no accepted scale, or none any more."""
     remove_stale_dense(workspace, {})
@@ -173,10 +169,7 @@ def withdraw(workspace: Workspace) -> None:
 
 
 def remove_stale_dense(workspace: Workspace, models: Mapping[int, Path]) -> None:
-    """Leave no dense reconstruction beside a model that it was not made from.
-
-    One with depth maps, which may have taken hours, is kept in ``earlier/``, and comes back when its model does (as
-    with ``--world`` to and fro); any other of ours is removed. What somebody else made there is left alone.
+    """Remove each dense reconstruction of ours that was made from another model than the one that is there.
 
     Parameters
     ----------
@@ -185,55 +178,14 @@ def remove_stale_dense(workspace: Workspace, models: Mapping[int, Path]) -> None
     models
         The metric models that are there, by their numbers.
     """
-    places = [place for place in (workspace.dense, workspace.earlier) if place.is_dir()]
-    if not places or workspace.dense in list_placed_paths(workspace):  # the project's own goes with its models
+    if workspace.dense in list_placed_paths(workspace):  # the project's own goes with its models
         return
-    digests = {index: digest_of_model(model) for index, model in models.items()}
+    digests = {str(index): digest_of_model(model) for index, model in models.items()}
     for folder in sorted(workspace.dense.glob("*")):
-        made_from, index = model_of(folder), folder.name
-        number = int(index) if index.isdecimal() and index.isascii() else -1
-        if made_from is not None and made_from != digests.get(number):
-            _set_dense_aside(workspace, folder)
-    for number, made_from in digests.items():
-        _restore_dense(workspace, number, made_from)
-    for folder in (workspace.earlier / workspace.dense.name, workspace.earlier, workspace.dense):
-        if folder.is_dir() and not any(folder.iterdir()):
-            folder.rmdir()
-
-
-def _set_dense_aside(workspace: Workspace, folder: Path) -> None:
-    """Keep a dense reconstruction with depth maps in ``earlier/``, with its stamps; remove one without."""
-    steps = list(workspace.stamps.glob(f"dense_{folder.name}_*.json"))
-    if not has_depth_maps(folder):
-        for path in (*steps, workspace.stamps / f"sweep_{folder.name}", folder):
-            remove(path)
-        return
-    (folder / _STEPS).mkdir(exist_ok=True)
-    for step in steps:
-        os.replace(step, folder / _STEPS / step.name)
-    aside = _free_name(workspace.earlier / workspace.dense.name / folder.name)
-    aside.parent.mkdir(parents=True, exist_ok=True)
-    os.replace(folder, aside)
-    log.warning("the depth maps in %s are not of the model that is there now: kept in %s", folder, aside)
-
-
-def _restore_dense(workspace: Workspace, index: int, model_digest: str) -> None:
-    """Put back the dense reconstruction that was made from a model, where there is none, and its stamps."""
-    place = workspace.dense / str(index)
-    kept = (path for path in sorted(workspace.earlier.glob("*/*")) if model_of(path) == model_digest)
-    if not place.exists() and (aside := next(kept, None)) is not None:
-        place.parent.mkdir(exist_ok=True)
-        os.replace(aside, place)
-        log.info("the dense reconstruction in %s is of the model that is there now: %s", aside, place)
-    if (place / _STEPS).is_dir() and model_of(place) == model_digest:
-        for step in (place / _STEPS).glob(f"dense_{index}_*.json"):
-            os.replace(step, workspace.stamps / step.name)
-        remove(place / _STEPS)
-
-
-def _free_name(path: Path) -> Path:
-    """The path, or the first of it with a number behind that is free."""
-    count = 1
-    while (named := path if count == 1 else path.with_name(f"{path.name}-{count}")).exists():
-        count += 1
-    return named
+        made_from = model_of(folder)
+        if made_from is not None and made_from != digests.get(folder.name):
+            steps = workspace.stamps.glob(f"dense_{folder.name}_*.json")
+            for path in (*steps, workspace.stamps / f"sweep_{folder.name}", folder):
+                remove(path)
+    if workspace.dense.is_dir() and not any(workspace.dense.iterdir()):
+        workspace.dense.rmdir()

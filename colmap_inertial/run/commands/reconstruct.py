@@ -83,6 +83,7 @@ def reconstruct(
     frame_stages: Sequence[FrameStage | EllipsisType] = (...,),
     keypoint_stages: Sequence[KeypointStage | EllipsisType] = (...,),
     model_stages: Sequence[ModelStage | EllipsisType] = (...,),
+    overwrite: bool = False,
     progress: Progress = silent,
     findings: Callable[[Diagnosis], None] = lambda _: None,
 ) -> ReconstructResult:
@@ -93,8 +94,7 @@ def reconstruct(
     capture
         A ``capture.toml``, a folder that holds one, or a dataset folder that ``load_capture`` knows.
     out
-        A folder that does not exist, or holds a run of the same capture, which is then continued: only what the
-        options, the recording or the stages changed is made again.
+        A folder that does not exist, or holds a run of the same capture, which is then continued.
     options
         See :class:`ReconstructOptions`.
     frame_stages, keypoint_stages, model_stages
@@ -103,6 +103,9 @@ def reconstruct(
         :class:`RollingShutterStage`; :class:`ReadoutStage`, :class:`MetricStage`, :class:`JoinStage` and
         :class:`RefineStage`, where the options and the recording allow them. The model stages must include one that
         makes the model metric.
+    overwrite
+        Where ``out`` holds a finished result of other options, stages or another recording: make again in place what
+        depends on them. Without it, options may only add steps to a finished result, such as ``dense``.
     progress
         Called with stage, steps done and steps in all.
     findings
@@ -118,7 +121,7 @@ def reconstruct(
     FormatError, TimingError
         For a capture that cannot be read.
     OutputExistsError
-        When ``out`` holds something else.
+        When ``out`` holds something else, or a finished result that would not stay as it is.
     MappingError
         When COLMAP finds no model.
     NotObservableError
@@ -128,7 +131,7 @@ def reconstruct(
     check_kind("options", options, ReconstructOptions)
     stages = Stages(frame=tuple(frame_stages), keypoint=tuple(keypoint_stages), model=tuple(model_stages))
     with reading_within(options.limits):
-        return _reconstruct(Path(capture), Path(out), options, stages, progress, findings)
+        return _reconstruct(Path(capture), Path(out), options, stages, overwrite, progress, findings)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -244,6 +247,7 @@ def _reconstruct(
     out: Path,
     options: ReconstructOptions,
     stages: Stages,
+    overwrite: bool,
     progress: Progress,
     findings: Callable[[Diagnosis], None],
 ) -> ReconstructResult:
@@ -254,20 +258,19 @@ def _reconstruct(
         device = mapping_device(options.mapping, deterministic=options.deterministic)
     context = RunContext.of(options, device=device, progress=progress)
     require_features(context)
-    decides, pictures = (given.recording.identity(), stages), picture_folders(capture)
+    pictures = picture_folders(capture)
     with (
-        open_session(out, capture.path, options, context, pictures=pictures, decides=decides) as session,
-        reporting_stops(session.workspace, capture),
+        open_session(out, capture.path, options, context, pictures=pictures, overwrite=overwrite) as session,
+        reporting_stops(session, capture, given.recording),
     ):
         session.context.executor.require(session.context.scratch)
-        write_recording(session, given.recording)  # a run that stops reports it, too
         doubts = run_preflight(session, given.recording, given.raw, findings, force=options.force)
         given = replace(given, recording=replace(given.recording, doubts=doubts))
         result = _run(session, given, options, stages)
         result = report_result(session, result, capture, used_calibration)
         remove(session.workspace.colmap_features)
         session.runner.forget("features")
-    return session.in_place(result)
+    return result
 
 
 def _run(session: Session, given: _Given, options: ReconstructOptions, stages: Stages) -> ReconstructResult:
@@ -281,7 +284,7 @@ def _run(session: Session, given: _Given, options: ReconstructOptions, stages: S
         recording = recording.using(part_of(timing, selection.names))
         _, frames = read_frames(capture, only=selection.names)
     if not options.apertures.depth:
-        remove(workspace.apertures)  # of an earlier run that kept them
+        session.runner.discard(workspace.apertures)
     asked = ask_for_plan(options, stages.frame, stages.keypoint, pairs=given.fuser is not None)
     inputs = StageInputs(
         recording=recording,

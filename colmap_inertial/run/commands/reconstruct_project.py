@@ -117,6 +117,7 @@ def reconstruct_project(
     options: ReconstructOptions = ReconstructOptions(),
     *,
     model_stages: Sequence[ModelStage | EllipsisType] = (...,),
+    overwrite: bool = False,
     progress: Progress = silent,
     findings: Callable[[Diagnosis], None] = lambda _: None,
 ) -> ReconstructResult:
@@ -133,7 +134,7 @@ def reconstruct_project(
         The IMU recording, and when the images were taken.
     options
         Those of mapping and of pixels must be left alone: the model is what it is.
-    model_stages
+    model_stages, overwrite
         As of :func:`reconstruct`.
     progress
         Called with stage, steps done and steps in all.
@@ -147,15 +148,15 @@ def reconstruct_project(
     AlreadyMetricError
         When the project carries a similarity of ours.
     OutputError, OutputExistsError
-        When ``out`` holds something else, or lies in the project, or something in the project has a name that the run
-        needs.
+        When ``out`` holds something else or a finished result that would not stay as it is, or lies in the project, or
+        something in the project has a name that the run needs.
     NotObservableError
         When the recording cannot give metres (``options.force`` goes on).
     """
     check_kind("source", source, ProjectOptions, options=ReconstructOptions)
     check_kind("options", options, ReconstructOptions, source=ProjectOptions)
     with reading_within(options.limits):
-        return _reconstruct(Path(project), Path(out), source, options, model_stages, progress, findings)
+        return _reconstruct(Path(project), Path(out), source, options, model_stages, overwrite, progress, findings)
 
 
 def _reconstruct(
@@ -164,6 +165,7 @@ def _reconstruct(
     source: ProjectOptions,
     options: ReconstructOptions,
     model_stages: Sequence[ModelStage | EllipsisType],
+    overwrite: bool,
     progress: Progress,
     findings: Callable[[Diagnosis], None],
 ) -> ReconstructResult:
@@ -183,10 +185,9 @@ def _reconstruct(
     if options.dense:
         require_near(models, read)
     context, folders = RunContext.of(options, progress=progress), () if images is None else (images,)
-    decides = given.source, given.capture, given.imu, given.prior, fingerprint(project), model_stages
     with (
-        open_session(out, project, options, context, pictures=folders, decides=decides) as session,
-        reporting_stops(session.workspace, given.capture),
+        open_session(out, project, options, context, pictures=folders, overwrite=overwrite) as session,
+        reporting_stops(session, given.capture),
     ):
         timing, notes = _run_times(session, given, models, images, read)
         fixes = positions_of(given.capture, _registered(models, read), images) if options.georeference else None
@@ -220,7 +221,7 @@ def _reconstruct(
             project_metric=metric,
         )
         write_recording(session, recording)
-        return session.in_place(report_result(session, result, given.capture, given.calibration_files, project=source))
+        return report_result(session, result, given.capture, given.calibration_files, project=source)
 
 
 def _trajectory(model: pycolmap.Reconstruction, timing: FrameTiming) -> CameraTrajectory | Literal["untimed"]:

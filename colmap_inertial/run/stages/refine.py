@@ -214,7 +214,9 @@ def _doubt_contradicted(model: Model, judged: Judged) -> Model:
     reason, scale = judged.reason, model.scale
     if reason is None or reason.code != "imu-contradicts-pictures" or judged.chi2 <= _GROSS_CHI2 or scale is None:
         return model
-    return replace(model, scale=downgraded(scale, (reason,)))
+    # what is contradicted by itself, as declared intrinsics are, is likelier its cause, and comes before
+    doubted = downgraded(scale, (reason,))
+    return replace(model, scale=replace(doubted, reasons=(*scale.reasons, reason)))
 
 
 def _has_readout(model: Model, judged: Judged) -> bool:

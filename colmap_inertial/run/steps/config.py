@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import tomllib
 import typing
 from collections.abc import Mapping
 from pathlib import Path
@@ -40,6 +41,27 @@ def _plain(options: Any) -> dict[str, Any]:
 
 def _plain_item(item: object) -> object:
     return str(item.resolve()) if isinstance(item, Path) else item
+
+
+def list_changed_options(earlier: Path, config: str) -> tuple[Fact, ...]:
+    """Each option whose value differs in an earlier configuration; none where that file cannot be read."""
+    try:
+        before = _flatten(read_values(earlier))
+    except FormatError:
+        return ()
+    now = _flatten(tomllib.loads(config))
+    return tuple(
+        Fact("option-changed", option=name, now=now.get(name), before=before.get(name))
+        for name in sorted(before.keys() | now.keys())
+        if before.get(name) != now.get(name)
+    )
+
+
+def _flatten(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in table.items():
+        flat |= _flatten(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {prefix + key: value}
+    return flat
 
 
 @reader("options")

@@ -27,7 +27,7 @@ class HandheldSpectra:
 
     The densities are the mean of the motion-capture ground truth of TUM-VI room1, room3 and room5 (Schubert et al.
     2018, CC BY 4.0), after subtracting the capture system's noise floor (0.1 mm and 1 mrad per sample at 120 Hz).
-    ``scripts/compare_motion.py`` recomputes and compares them.
+    ``scripts/studies/compare_motion.py`` recomputes and compares them.
     """
 
     frequency_hz: Spectrum = (0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0)

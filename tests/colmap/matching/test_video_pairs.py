@@ -1,8 +1,6 @@
 """Pairs of a video: neighbours and returns, few beside all pairs; frames at a standstill are matched with one."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,24 +11,13 @@ from colmap_inertial.colmap.loops.search import find_returns
 from colmap_inertial.colmap.matching.pairing import match_capture
 from colmap_inertial.colmap.views.two_views import Covisibility
 from colmap_inertial.core.options import MappingOptions
+from scripts.benchmarks import whole as bench
 
-SCRIPTS = Path(__file__).parents[3] / "scripts"
 FRAMES = 96
 
 
 @pytest.fixture(scope="module")
-def bench():
-    sys.path.insert(0, str(SCRIPTS))
-    try:
-        import bench_whole
-
-        yield bench_whole
-    finally:
-        sys.path.remove(str(SCRIPTS))
-
-
-@pytest.fixture(scope="module")
-def loop(bench, tmp_path_factory):
+def loop(tmp_path_factory):
     """A walk around a room and a little further, and its features; the truth is the simulator's."""
     folder = tmp_path_factory.mktemp("loop")
     walk = bench.Walk(seed=100, frames=FRAMES, frame_rate_hz=FRAMES / 40, drawn=False)
@@ -40,7 +27,7 @@ def loop(bench, tmp_path_factory):
     return walk, folder, recording
 
 
-def matched(bench, loop, tmp_path, recording):
+def matched(loop, tmp_path, recording):
     """The record of matching, and of verified pairs far apart the share of matches that are right."""
     walk, folder, _ = loop
     options, database = MappingOptions(refine_intrinsics=False), tmp_path / "database.db"
@@ -50,7 +37,7 @@ def matched(bench, loop, tmp_path, recording):
     return record, bench.true_shares(walk, names, *bench.true_poses(folder), database, apart=FRAMES // 2)
 
 
-def test_a_loop_is_closed_without_all_pairs(bench, loop, tmp_path):
+def test_a_loop_is_closed_without_all_pairs(loop, tmp_path):
     record, shares = matched(bench, loop, tmp_path, loop[2])
     assert record.pairing == "sequential" and record.still == 0
     assert record.heading_sigma_deg is not None and record.heading_sigma_deg < 3
@@ -59,7 +46,7 @@ def test_a_loop_is_closed_without_all_pairs(bench, loop, tmp_path):
     assert np.mean([share > 0.5 for share in shares.values()]) > 0.9
 
 
-def test_returns_are_found_without_a_gyroscope(bench, loop, tmp_path):
+def test_returns_are_found_without_a_gyroscope(loop, tmp_path):
     recording = loop[2]
     silent = np.zeros_like(recording.imu.gyro_rad_s)
     record, shares = matched(bench, loop, tmp_path, replace(recording, imu=replace(recording.imu, gyro_rad_s=silent)))

@@ -1,24 +1,18 @@
 """Simulated pairs of all sorts: none is refused, none of two scenes is blended, and no picture is made worse.
 
-``scripts/bench_exposures.py`` does the same with photographs, recorded motion, larger pictures and more of them.
+``scripts/benchmarks/exposures.py`` does the same with photographs, recorded motion, larger pictures and more of them.
 """
-
-import sys
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from tests.helpers.exposure_scenes import codes, psnr_db
-
-sys.path.insert(0, str(Path(__file__).parents[3] / "scripts"))
-from simulated_exposures import TEXTURES, pairs
-from turning_world import Turning
-
 from colmap_inertial.imaging.exposure_pairs import better_alone, bring_together, first_brightness
 from colmap_inertial.imaging.exposure_pairs._search import places
 from colmap_inertial.imaging.restoration import load_network, lsd2
+from scripts.common.simulated_exposures import TEXTURES, pairs
+from scripts.common.turning_world import Turning
+from tests.helpers.exposure_scenes import codes, psnr_db
 
 SEED, WIDTH, WRONG_WIDTH = 3, 200, 240
 

@@ -39,7 +39,7 @@ def test_a_drift_of_the_scale_is_undone_and_told_from_end_to_end():
     fault = ShapeFault(kind="drift", value=np.array([0.08]), cov=cov, by_scale=np.zeros(1))
     assert fault.undo(t_s, model) == pytest.approx(truth, abs=1e-9)
     # more metres per unit at the end: the model's lengths are smaller there
-    assert "lengths are -7.7 +- 2.8 % larger at the end" in str(fault.as_fact(t_s, 2.0))
+    assert "lengths are -7.7 +- 2.8 % longer at the end" in str(fault.as_fact(t_s, 2.0))
     tolerated = 0.01
     assert fault.chi2(2.0, tolerated) == pytest.approx(0.08**2 / (2e-4 + tolerated**2))
 

@@ -1,7 +1,6 @@
 """``calibrate-imu``: rests found, gains and biases with intervals that hold, and what they do for a scale."""
 
 import dataclasses
-import importlib.util
 import json
 import re
 from pathlib import Path
@@ -18,18 +17,10 @@ from colmap_inertial.inertial.static_calibration import _judge_calibration, _res
 from colmap_inertial.inertial.static_calibration._rests import _means, candidate_rests
 from colmap_inertial.tools.simulate import RecordingOptions, RestOptions, simulate_recording, simulate_rests
 from colmap_inertial.tools.simulate.sensors import IMU_PRESETS
+from scripts.studies import calibrate_imu as study
 
 ROOT = Path(__file__).parents[3]
 GAINS, BESIDE = np.array([0, 4, 8]), np.array([3, 6, 7])
-
-
-@pytest.fixture(scope="module")
-def study():
-    """The study script."""
-    spec = importlib.util.spec_from_file_location("study", ROOT / "scripts" / "study_calibrate_imu.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def calibrated(truth, *, gravity_m_s2=9.81):
@@ -65,8 +56,8 @@ def laid_down(ups, *, rest_s=4.0, turn_s=1.0, seed=0, hz=100.0) -> ImuRecording:
 # --- what comes out --------------------------------------------------------------------------------------------------
 
 
-def test_intervals_hold_the_truth(study):
-    """A small part of the study; all of it: scripts/study_calibrate_imu.py."""
+def test_intervals_hold_the_truth():
+    """A small part of the study; all of it: scripts/studies/calibrate_imu.py."""
     table = study.study(RestOptions(), 24, 500)
     assert table.pop("runs") == {"refused": 0, "attitudes missed": 0}
     inside = [row["inside"] for row in table.values()]
@@ -232,7 +223,7 @@ def test_a_recording_warmer_than_its_calibration_is_less_sure_and_says_so():
 
     unknown, alike, warm = estimated(None), estimated(24.0), estimated(51.0)
     assert not any("calibrated at" in str(note) for note in (*unknown.notes, *alike.notes))
-    assert any("calibrated at 21 °C and was 51 °C warm here" in str(note) for note in warm.notes)
+    assert any("calibrated at 21 °C and recorded at 51 °C" in str(note) for note in warm.notes)
     assert unknown.sigma_log <= alike.sigma_log < 1.1 * unknown.sigma_log
     assert warm.sigma_log > 1.4 * alike.sigma_log
     assert warm.as_json()["imu_calibration"]["temperature_c"] == 21.0
@@ -286,7 +277,7 @@ def test_gravity_by_latitude_and_height():
 # --- real rests ------------------------------------------------------------------------------------------------------
 
 
-def test_the_rests_of_an_xsens_are_found_and_gravity_is_as_long_in_all(study, shared_data):
+def test_the_rests_of_an_xsens_are_found_and_gravity_is_as_long_in_all(shared_data):
     recording = study.read_xsens(shared_data / "imu_rest" / "xsens.csv.xz")
     found = calibrate_imu(recording, gravity_m_s2=9.81744, gravity_sigma_m_s2=5e-4)
     assert len(found.rests) == 38

@@ -1,8 +1,6 @@
 """Cameras that contradict the gyroscope are named and left out; what remains is right, or is refused."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,25 +14,13 @@ from colmap_inertial.io.files import read_record, write_record
 from colmap_inertial.motion.align import align_clocks
 from colmap_inertial.motion.align.consensus import align_by_consensus, describe_consensus
 from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, simulate_recording
-
-SCRIPTS = Path(__file__).parents[3] / "scripts"
+from scripts.studies import consensus as study
 
 
 @pytest.fixture(scope="module")
 def walk():
     """Half a minute at 15 frames a second; the truth is the simulator's."""
     return simulate_recording(RecordingOptions(motion=MotionOptions(duration_s=30.0)), seed=3)
-
-
-@pytest.fixture(scope="module")
-def study():
-    sys.path.insert(0, str(SCRIPTS))
-    try:
-        import study_consensus
-
-        yield study_consensus
-    finally:
-        sys.path.remove(str(SCRIPTS))
 
 
 def keyframes(recording, *, step, count=30):
@@ -160,7 +146,7 @@ def test_a_consensus_is_read_as_it_was_written(walk, tmp_path):
     assert np.array_equal(again.part, consensus.part)
 
 
-def test_real_recordings_with_wrong_cameras_keep_their_scale(study, shared_data):
+def test_real_recordings_with_wrong_cameras_keep_their_scale(shared_data):
     # the truth is that of the motion capture; room3 and V102, keyframes three times a second, and 20 s of video
     tasks = study.tasks_of(shared_data / "real_imu", ["K3", "V20"], ["one", "three", "block"], 1)
     outcomes = [study.run(task) for task in tasks if task.window.recording in ("room3", "V102")]
@@ -170,7 +156,7 @@ def test_real_recordings_with_wrong_cameras_keep_their_scale(study, shared_data)
     assert sum(abs(outcome.error) < 1.96 * outcome.sigma for outcome in outcomes) >= 11
 
 
-def test_real_keyframes_in_another_place_are_named_and_the_scale_is_as_sure_as_without(study, shared_data):
+def test_real_keyframes_in_another_place_are_named_and_the_scale_is_as_sure_as_without(shared_data):
     tasks = study.tasks_of(shared_data / "real_imu", ["K2"], ["moved", "clean"], 1)
     outcomes = [study.run(task) for task in tasks]
     moved, clean = ([o for o in outcomes if o.case == case] for case in ("moved", "clean"))
@@ -180,7 +166,7 @@ def test_real_keyframes_in_another_place_are_named_and_the_scale_is_as_sure_as_w
     assert np.median([o.sigma for o in given]) < 1.5 * np.median([o.sigma for o in clean])
 
 
-def test_real_recordings_refuse_each_other_s_imu(study, shared_data):
+def test_real_recordings_refuse_each_other_s_imu(shared_data):
     tasks = study.tasks_of(shared_data / "real_imu", ["K3", "V20"], ["foreign"], 1)
     assert {study.run(task).verdict for task in tasks[::2]} == {"refused"}
 

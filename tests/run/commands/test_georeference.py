@@ -4,20 +4,10 @@ import csv
 import json
 import shutil
 import struct
-import sys
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-from tests.helpers import imu_files
-from tests.helpers.box_project import build
-from tests.io.test_recorders import recorded
-
-sys.path.insert(0, str(Path(__file__).parents[3] / "scripts"))
-
-from study_georeference import measure
 
 from colmap_inertial.core.earth import ecef_from_enu, ecef_of_geodetic, geodetic_of_ecef
 from colmap_inertial.core.errors import FormatError, NotObservableError
@@ -30,6 +20,10 @@ from colmap_inertial.report.words import place_facts
 from colmap_inertial.run.commands.reconstruct_project import reconstruct_project
 from colmap_inertial.run.preparation.geolocation import located, path_at, read_georeference
 from colmap_inertial.tools.export.whole import export_model
+from scripts.studies.georeference import measure
+from tests.helpers import imu_files
+from tests.helpers.box_project import build
+from tests.io.test_recorders import recorded
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -136,7 +130,7 @@ def test_heading_and_place_lie_within_their_intervals(errors):
 
 
 def test_intervals_hold_however_long_errors_are_alike(subtests):
-    """The study by scripts/study_georeference.py, smaller."""
+    """The study by scripts/studies/georeference.py, smaller."""
     for slow_m, alike_s in ((3.0, 5.0), (1.0, 20.0), (6.0, 60.0), (3.0, 300.0)):
         with subtests.test(slow_m=slow_m, alike_s=alike_s):
             row = measure(slow_m, alike_s, walks=12, stated=True, seed=5)
@@ -243,7 +237,7 @@ def test_the_scale_is_never_touched_and_a_wrong_one_is_named():
     found = one.fitted()
     np.testing.assert_allclose(found.enu_from_world @ found.enu_from_world.T, np.eye(3), atol=1e-12)
     assert found.length_ratio == pytest.approx(1.3, abs=4 * found.length_ratio_sigma)
-    assert "times as far apart" in str(found.notes[0]) and "left as it is" in str(found.notes[0])
+    assert "times as far apart" in str(found.notes[0]) and "scale is unchanged" in str(found.notes[0])
     sound = walk(3, white_m=0.5)
     (note,) = sound.fitted().notes
     assert note.code == "accuracy-assumed"

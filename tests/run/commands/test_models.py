@@ -251,7 +251,7 @@ def test_a_project_that_was_joined_is_not_taken_back(project, tmp_path):
     shutil.copytree(project.model, tmp_path / "project" / "sparse" / "0")
     scale = ModelScale(similarity=plain_factor(2.0), joined_of=(0, 3))
     apply_to_project(tmp_path / "project", tmp_path / "metric", {0: scale})
-    with pytest.raises(FormatError, match=r"transform\.json: model 0 was joined of the models 0, 3, which cannot"):
+    with pytest.raises(FormatError, match=r"transform\.json: model 0 was joined from the models 0, 3 and cannot"):
         undo_project(tmp_path / "metric", tmp_path / "back")
     assert not (tmp_path / "back").exists()
 

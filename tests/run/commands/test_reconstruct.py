@@ -275,7 +275,6 @@ def test_a_refused_scale_keeps_colmap_s_model_and_exits_3(whole, tmp_path, capsy
 #: Kills a run at each stage in turn. Each run is a process of its own that has the imports of this one.
 KILLED = """
 import os, signal, sys
-sys.path.insert(0, sys.argv[3])
 from pathlib import Path
 import cv2, pycolmap, scipy.optimize
 from tests.run.commands.test_reconstruct import DETERMINISTIC

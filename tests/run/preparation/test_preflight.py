@@ -1,17 +1,12 @@
 """The check beforehand is the same for every command: what `diagnose` finds stops `reconstruct` and `scale`, too."""
 
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[3] / "scripts"))
-
-from study_mistakes import DESK, stamps, toml, values, write_poses
 
 from colmap_inertial import ReconstructOptions, reconstruct
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError
@@ -21,6 +16,7 @@ from colmap_inertial.core.types import CameraTrajectory, FrameTiming, ImuRecordi
 from colmap_inertial.diagnose import Diagnosis, Recorded, diagnose
 from colmap_inertial.run.commands.diagnose import collect, diagnose_source
 from colmap_inertial.run.commands.scale import ScaleSource, scale_source
+from scripts.studies.mistakes import DESK, stamps, toml, values, write_poses
 
 
 class _Stopped(Exception):

@@ -1,14 +1,9 @@
 """Covariances of paths that are joined across gaps, against simulated walks."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 
 from colmap_inertial.core.options import JoinOptions
-
-sys.path.insert(0, str(Path(__file__).parents[3] / "scripts"))
-import study_join
+from scripts.studies import join as study_join
 
 
 def test_errors_of_joined_paths_are_as_large_as_their_covariances_say():

@@ -39,7 +39,7 @@ from colmap_inertial.run.stages.metric import MetricStage, gravity_in_model
 from colmap_inertial.run.stages.readout import ReadoutStage
 from colmap_inertial.run.stages.refine import RefineStage, axes_by
 from colmap_inertial.run.stages.rolling_shutter import RollingShutterStage
-from colmap_inertial.run.steps.runner import canonical
+from colmap_inertial.run.steps.hashing import as_json_types
 from colmap_inertial.tools.simulate.tracks import TrackOptions
 from tests.helpers.json_schemas import read_schema
 from tests.helpers.refine_walk import problem_of, tracks_of, walk
@@ -299,10 +299,10 @@ def test_derivatives_of_a_sensor_s_axes_are_those_of_finite_differences(walked):
 def test_a_run_goes_on_from_no_older_layout(walked):
     tracks, _ = walked
     stage = RefineStage(imu=tracks.imu, calibration=UNKNOWN, refine_intrinsics=False)
-    assert canonical(replace(stage)) == canonical(stage)
+    assert as_json_types(replace(stage)) == as_json_types(stage)
     older = replace(stage)
     object.__setattr__(older, "_writes", stage._writes - 1)
-    assert canonical(older) != canonical(stage)
+    assert as_json_types(older) != as_json_types(stage)
 
 
 def test_a_rolling_shutter_is_part_of_it(rolled):

@@ -1,16 +1,9 @@
-"""Sound recordings are not stopped, and what their checks find has an honest size (scripts/bench_checks.py)."""
+"""Sound recordings are not stopped, and what their checks find has an honest size (scripts/benchmarks/checks.py)."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[3] / "scripts"))
-
-import bench_checks as bench
-import study_diagnose as study
 
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.quantiles import Z95
@@ -28,6 +21,8 @@ from colmap_inertial.tools.simulate import (
     SimulatedRecording,
     simulate_recording,
 )
+from scripts.benchmarks import checks as bench
+from scripts.studies import diagnose as study
 
 #: Of the bench: the short orbit, one of each kind of motion, and rests of each length and place.
 SEEDED = ("short orbit #0", "#18/20", "#19/20", "#20/20", "beginning #1/", "middle #4/", "end #8/")

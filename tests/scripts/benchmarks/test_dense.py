@@ -1,8 +1,5 @@
 """The dense benchmark's figures on a small scene with true poses, and on answers that are known."""
 
-import sys
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pycolmap
@@ -17,14 +14,8 @@ from colmap_inertial.io.files import write_json
 from colmap_inertial.model.artefacts import write_map
 from colmap_inertial.tools.simulate import MotionOptions, SceneRecipe, ShutterCamera, develop, make_scene
 from colmap_inertial.tools.simulate.capture import _truth
-
-SCRIPTS = str(Path(__file__).parents[3] / "scripts")
-sys.path.insert(0, SCRIPTS)
-try:
-    import bench_dense as bench
-    import photo_world
-finally:
-    sys.path.remove(SCRIPTS)
+from scripts.benchmarks import dense as bench
+from scripts.common import photo_world
 
 CAMERA = ShutterCamera(
     model=CameraModel(model="PINHOLE", width=256, height=192, params=(208.0, 208.0, 128.0, 96.0)), exposure_s=0.0005

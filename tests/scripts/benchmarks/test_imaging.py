@@ -1,27 +1,25 @@
 """The parts of the imaging benchmark that its figures stand on."""
 
-import sys
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[3] / "scripts"))
-import imaging_baselines as baselines
-import imaging_colmap
-import imaging_metrics as metrics
-import imaging_scenes as scenes
-import imaging_shutter
-from bench_imaging import kept_share, treated, verdict_on
 
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.rolling_shutter import rectify_keypoints
 from colmap_inertial.imaging.wiener import deblur
 from colmap_inertial.tools.simulate import SceneRecipe
 from colmap_inertial.tools.simulate.render import colmap_camera
+from scripts.benchmarks.imaging import kept_share, treated, verdict_on
+from scripts.common import (
+    imaging_baselines as baselines,
+    imaging_colmap,
+    imaging_metrics as metrics,
+    imaging_scenes as scenes,
+    imaging_shutter,
+)
 
 SIZE = (640, 360)
 

@@ -1,29 +1,20 @@
 """The parts of the benchmark of blur along paths that its figures stand on."""
 
-import sys
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[3] / "scripts"))
-import bench_path
-import path_false
-import path_methods
-import path_reconstructions
-import path_scenes
-import path_tables
-import recorded_orbits
-from imaging_scenes import drawn_walls
-from restoration.handheld import Handheld
 from rich.console import Console
-from turning_world import Moment, Turning, TurningCamera
 
 from colmap_inertial.imaging.psf import blur_path
 from colmap_inertial.tools.simulate import MotionOptions, make_motion
+from scripts.benchmarks import path as bench_path
+from scripts.common import path_false, path_methods, path_reconstructions, path_scenes, path_tables, recorded_orbits
+from scripts.common.imaging_scenes import drawn_walls
+from scripts.common.turning_world import Moment, Turning, TurningCamera
+from scripts.restoration.handheld import Handheld
 
 SIZE = (480, 270)
 

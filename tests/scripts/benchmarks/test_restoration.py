@@ -1,22 +1,20 @@
 """The parts of the restoration benchmark that its figures stand on."""
 
-import sys
 from functools import cache
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[3] / "scripts"))
-import imaging_metrics as metrics
-import imaging_scenes as scenes
-import restoration_deblur
-import restoration_exposures as exposures
-from restoration_sheet import CROP_PX, write_sheet
-
 from colmap_inertial.imaging.transfer import decode_table
 from colmap_inertial.imaging.wiener import deblur
+from scripts.common import (
+    imaging_metrics as metrics,
+    imaging_scenes as scenes,
+    restoration_deblur,
+    restoration_exposures as exposures,
+)
+from scripts.common.restoration_sheet import CROP_PX, write_sheet
 
 SIZE = (640, 480)
 NOISE, RATIO, BLUR_PX = 0.06, 10.0, 12.0

@@ -1,8 +1,6 @@
 """The benchmark of scale errors: its baseline is right where nothing disturbs it, its windows are what they say."""
 
 import json
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +10,10 @@ from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.inertial.scale import first_seconds
 from colmap_inertial.motion.align import align_camera_imu
 from colmap_inertial.tools.simulate import ImuOptions, MotionOptions, RecordingOptions, SfmOptions, simulate_recording
+from scripts.benchmarks.scale import first_windows, main, part_windows, path_length_m, read, recordings_in
+from scripts.common.linear_scale import estimate_linear
+from scripts.common.scale_sensitivity import Setting, applied, changed_calibration, constants
 
-SCRIPTS = Path(__file__).parents[3] / "scripts"
 STILL = {
     "position_white_m": 0.0,
     "position_correlated_m": 0.0,
@@ -29,13 +29,6 @@ IDEAL = {
 }
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _scripts_importable():
-    sys.path.insert(0, str(SCRIPTS))
-    yield
-    sys.path.remove(str(SCRIPTS))
-
-
 def simulated(seed, *, duration_s=30.0, kind="orbit", **sfm):
     imu = ImuOptions(**IDEAL, lever_arm_m_sd=(0.0, 0.0, 0.0))
     motion = MotionOptions(duration_s=duration_s, kind=kind)
@@ -45,8 +38,6 @@ def simulated(seed, *, duration_s=30.0, kind="orbit", **sfm):
 def test_the_baseline_recovers_everything_from_perfect_recordings(subtests):
     for seed in (1, 2, 3):
         with subtests.test(seed=seed):
-            from linear_scale import estimate_linear
-
             s = simulated(seed)
             found = estimate_linear(s.trajectory, s.imu, s.truth.calibration)
             assert found.metres_per_unit == pytest.approx(s.truth.metres_per_unit, rel=0.003)
@@ -59,8 +50,6 @@ def test_the_baseline_recovers_everything_from_perfect_recordings(subtests):
 
 
 def test_noise_of_the_positions_shrinks_the_baseline_s_scale():
-    from linear_scale import estimate_linear
-
     ratios = []
     for seed in range(4):
         s = simulated(seed, position_correlated_m=0.02)
@@ -70,16 +59,12 @@ def test_noise_of_the_positions_shrinks_the_baseline_s_scale():
 
 
 def test_the_baseline_refuses_what_is_too_short():
-    from linear_scale import estimate_linear
-
     s = simulated(1)
     with pytest.raises(NotObservableError, match="3 s"):
         estimate_linear(first_seconds(s.trajectory, 2.5), s.imu, s.truth.calibration)
 
 
 def test_the_length_of_a_path_is_that_of_the_motion_and_not_of_its_noise():
-    from bench_scale import path_length_m
-
     clean, noisy = (
         simulated(4, kind="constant_velocity"),
         simulated(4, kind="constant_velocity", position_white_m=0.005),
@@ -91,8 +76,6 @@ def test_the_length_of_a_path_is_that_of_the_motion_and_not_of_its_noise():
 
 
 def test_windows_cover_the_recordings_as_they_say(shared_data):
-    from bench_scale import first_windows, part_windows, read, recordings_in
-
     folders = recordings_in(shared_data / "inertial_scale")
     assert [folder.name for folder in folders] == ["D1", "D3", "D5", "D7", "D9", "D11", "D13", "D15"]
     assert sum(len(part_windows(folder, (2, 3, 6, 12))) for folder in folders) == 184
@@ -105,8 +88,6 @@ def test_windows_cover_the_recordings_as_they_say(shared_data):
 
 
 def test_the_table_holds_all_methods_beside_the_published_figures(shared_data, tmp_path, capsys):
-    from bench_scale import main
-
     folder = tmp_path / "some"
     folder.mkdir()
     for name in ("D1", "D7"):
@@ -127,8 +108,6 @@ def test_the_table_holds_all_methods_beside_the_published_figures(shared_data, t
 
 
 def test_every_constant_whose_sensitivity_is_studied_acts_on_the_estimate():
-    from scale_sensitivity import Setting, applied, changed_calibration, constants
-
     from colmap_inertial.inertial.scale.joint import estimate_joint
 
     sfm = SfmOptions(rotation_correlated_rad=0.004, correlation_s=1.5)

@@ -3,14 +3,8 @@
 import subprocess
 import sys
 import time
-from pathlib import Path
 
-SCRIPTS = str(Path(__file__).parents[3] / "scripts")
-sys.path.insert(0, SCRIPTS)
-try:
-    import bench_steps as bench
-finally:
-    sys.path.remove(SCRIPTS)
+from scripts.benchmarks import steps as bench
 
 
 def test_steps_within_steps_are_told_apart(tmp_path):

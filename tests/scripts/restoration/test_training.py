@@ -1,7 +1,6 @@
 """Training of the restoration networks; needs the extra ``train``."""
 
 import lzma
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,20 +12,18 @@ pytest.importorskip("torch", reason="the extra `train` is not installed")
 pytest.importorskip("onnxruntime", reason="the extra `restore` is not installed")
 import torch
 
-sys.path.insert(0, str(Path(__file__).parents[3] / "scripts"))
-from restoration import samples
-from restoration.camera import jpeg, noisy, srgb
-from restoration.export import export, weights_of
-from restoration.handheld import recorded, simulated
-from restoration.network import RestorationNet
-from restoration.optics import ShotOptions, draw_shots
-from restoration.photographs import photographs
-from restoration.pool import Pool, Sources, make_pool
-from restoration.training import TrainOptions, train, turned
-
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath, middles
 from colmap_inertial.imaging.restoration._tiles import OVERLAP_PX, Span, path_feed
+from scripts.restoration import samples
+from scripts.restoration.camera import jpeg, noisy, srgb
+from scripts.restoration.export import export, weights_of
+from scripts.restoration.handheld import recorded, simulated
+from scripts.restoration.network import RestorationNet
+from scripts.restoration.optics import ShotOptions, draw_shots
+from scripts.restoration.photographs import photographs
+from scripts.restoration.pool import Pool, Sources, make_pool
+from scripts.restoration.training import TrainOptions, train, turned
 
 
 @pytest.fixture(scope="module")
@@ -201,7 +198,7 @@ def pools(photos, tmp_path_factory) -> tuple[Pool, Pool]:
 
 
 def test_an_interrupted_training_ends_as_one_that_was_not(pools, tmp_path, monkeypatch):
-    from restoration import training
+    from scripts.restoration import training
 
     monkeypatch.setattr(training, "_KEEP_EVERY", 2)
     options = TrainOptions(steps=4, batch=4, warm_up=1)
@@ -265,7 +262,7 @@ def test_training_goes_on_from_what_was_exported(tmp_path):
 
 
 def test_faint_texture_that_is_lost_counts_as_strong_edges_do():
-    from restoration.training import _loss
+    from scripts.restoration.training import _loss
 
     x = torch.arange(64.0).expand(64, 64)
     wave = torch.sin(x / 2)[None, None].expand(1, 3, 64, 64)
@@ -276,7 +273,7 @@ def test_faint_texture_that_is_lost_counts_as_strong_edges_do():
 
 
 def test_the_network_looks_no_further_than_its_parts_overlap(monkeypatch):
-    from restoration import network as networks
+    from scripts.restoration import network as networks
 
     # every weight and slope 1e-3: what has any way to a pixel has a derivative
     monkeypatch.setattr(networks.functional, "leaky_relu", lambda x, slope: x)

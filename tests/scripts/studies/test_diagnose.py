@@ -1,16 +1,10 @@
-"""A small part of ``scripts/study_diagnose.py``: a few faults in simulated recordings, and some of the clean ones."""
-
-import sys
-from pathlib import Path
+"""A small part of ``scripts/studies/diagnose.py``: a few faults in simulated recordings, and some of the clean ones."""
 
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[3] / "scripts"))
-
-import study_diagnose as study
-
 from colmap_inertial.diagnose import diagnose
+from scripts.studies import diagnose as study
 
 #: What the other tests of ``diagnose`` do not put in.
 SEEDED = (

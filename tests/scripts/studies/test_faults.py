@@ -1,4 +1,4 @@
-"""A small part of ``scripts/study_faults.py``: short commands without disk, memory or files, and killed."""
+"""A small part of ``scripts/studies/faults.py``: short commands without disk, memory or files, and killed."""
 
 import os
 import random
@@ -11,12 +11,9 @@ from pathlib import Path
 import pytest
 
 from colmap_inertial.cli import main
+from scripts.studies import faults as study_faults
+from scripts.studies.faults import Taken, commands, faults_of, one, start, watch
 from tests.helpers import batch_captures, exposure_scenes
-
-sys.path.insert(0, str(Path(__file__).parents[3] / "scripts"))
-
-import study_faults
-from study_faults import Taken, commands, faults_of, one, start, watch
 
 pytestmark = [
     pytest.mark.slow,

@@ -1,17 +1,12 @@
-"""A small part of ``scripts/study_fuzz.py``: each reader's files damaged a few times; its table counts what is."""
+"""A small part of ``scripts/studies/fuzz.py``: each reader's files damaged a few times; its table counts what is."""
 
-import sys
 from pathlib import Path
-
-from tests.helpers.cases import loop_over
-from tests.helpers.fuzz_readers import Reader
-
-sys.path.insert(0, str(Path(__file__).parents[3] / "scripts"))
-
-from study_fuzz import READERS, outcome, whole_files
 
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.facts import Fact
+from scripts.studies.fuzz import READERS, outcome, whole_files
+from tests.helpers.cases import loop_over
+from tests.helpers.fuzz_readers import Reader
 
 MUTANTS = 12
 

@@ -1,15 +1,9 @@
-"""Output folders that lost something, or got a link to elsewhere, by random draws of ``scripts/study_heal.py``."""
-
-import sys
-from pathlib import Path
+"""Output folders that lost something, or got a link to elsewhere, by random draws of ``scripts/studies/heal.py``."""
 
 import pytest
 
+from scripts.studies import heal as study_heal
 from tests.helpers.batch_captures import tiny_capture
-
-sys.path.insert(0, str(Path(__file__).parents[3] / "scripts"))
-
-import study_heal
 
 
 @pytest.mark.slow

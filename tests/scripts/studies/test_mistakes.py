@@ -1,15 +1,11 @@
-"""Mistakes that people make are named before the work, with advice that helps (scripts/study_mistakes.py)."""
+"""Mistakes that people make are named before the work, with advice that helps (scripts/studies/mistakes.py)."""
 
 import shutil
-import sys
-from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[3] / "scripts"))
-
-import study_mistakes
-from study_mistakes import MISTAKES, try_mistake
+from scripts.studies import mistakes as study_mistakes
+from scripts.studies.mistakes import MISTAKES, try_mistake
 
 #: Of the study, what takes under a minute together.
 QUICK = (

@@ -1,10 +1,7 @@
-"""Real recordings with a wrong clock, gain, convention or model: a seeded part of ``study_model_faults.py``."""
+"""Real recordings with a wrong clock, gain, convention or model: a seeded part of ``studies/model_faults.py``."""
 
-import importlib
-import sys
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,22 +13,11 @@ from colmap_inertial.inertial.scale import estimate_scale
 from colmap_inertial.inertial.scale._shape import Scores, ShapeFault, find_faults
 from colmap_inertial.inertial.scale.posterior import FittedPath
 from colmap_inertial.io.trajectories import read_inertial_scale
-
-SCRIPTS = Path(__file__).parents[3] / "scripts"
-
-
-@pytest.fixture(scope="module")
-def study():
-    """The script as a module; it imports its neighbours as it does on the command line."""
-    sys.path.insert(0, str(SCRIPTS))
-    try:
-        return importlib.import_module("study_model_faults")
-    finally:
-        sys.path.remove(str(SCRIPTS))
+from scripts.studies import model_faults as study
 
 
 @pytest.fixture(scope="module")
-def outcomes(study, shared_data):
+def outcomes(shared_data):
     """What comes of a fault in clips of the recordings."""
     folder = shared_data / "real_imu"
 
@@ -45,14 +31,14 @@ def outcomes(study, shared_data):
     return of
 
 
-def test_a_wrong_clock_is_named_and_counted(study, outcomes):
+def test_a_wrong_clock_is_named_and_counted(outcomes):
     found = study.summary(outcomes("clock", length_s=15.0))
     assert found["n"] == 12 == found["named"]
     assert found["trusted"] == 0
     assert found["inside"] >= found["given"] - 2
 
 
-def test_a_wrong_gain_is_named_and_counted_in_proportion_to_how_likely_it_is(study, outcomes):
+def test_a_wrong_gain_is_named_and_counted_in_proportion_to_how_likely_it_is(outcomes):
     sizes = (0.01, 0.02, 0.03, -0.03, -0.05)
     every = outcomes("gain", length_s=20.0, sizes=sizes)
     found = {size: study.summary([o for o in every if o.altered.size == size]) for size in sizes}
@@ -73,7 +59,7 @@ def test_a_large_bias_of_a_hand_that_turns_is_no_wrong_gain(outcomes):
     assert all(o.verdict == "trusted" and abs(o.error) < Z95 * o.sigma for o in by_hand)
 
 
-def test_arrays_in_another_convention_are_refused_by_name(study, outcomes):
+def test_arrays_in_another_convention_are_refused_by_name(outcomes):
     found = outcomes("wxyz", length_s=20.0, recordings=("room1", "MH03"))
     assert len(found) == 2 and all(o.verdict == "refused" and o.named for o in found)
 
@@ -88,7 +74,7 @@ def test_a_wrong_shape_is_named_and_the_larger_part_keeps_its_metres(outcomes, f
     assert all(abs(o.error) < Z95 * o.sigma for o in by_hand)
 
 
-def test_a_torn_model_is_no_part_of_a_joined_one(study, shared_data):
+def test_a_torn_model_is_no_part_of_a_joined_one(shared_data):
     folder = shared_data / "real_imu"
     window = next(w for w in study.windows(folder, (40.0,), (study.NOISE_M,), most=1) if w.recording == "room3")
     trajectory, imu, truth = study.recorded(folder, window)
@@ -100,7 +86,7 @@ def test_a_torn_model_is_no_part_of_a_joined_one(study, shared_data):
         FittedPath.of(torn, imu, None, ScaleOptions())
 
 
-def test_sound_models_are_not_accused_and_single_wrong_centres_hardly_count(study, outcomes):
+def test_sound_models_are_not_accused_and_single_wrong_centres_hardly_count(outcomes):
     assert not any(o.named for o in outcomes("clean", length_s=30.0))
     moved = study.summary(outcomes("moved", length_s=15.0))
     assert moved["named"] >= 5 and moved["given"] == 6 and moved["inside"] >= 5

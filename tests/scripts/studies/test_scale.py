@@ -1,9 +1,6 @@
 """The joint estimator over many simulated recordings, and the bound that it is measured against."""
 
-import importlib
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,8 +14,8 @@ from colmap_inertial.tools.simulate import (
     draw_imu_errors,
     simulate_recording,
 )
-
-SCRIPTS = Path(__file__).parents[3] / "scripts"
+from scripts.common import scale_bound as bound
+from scripts.studies import scale as study
 
 SWING_M, SWING_HZ = 0.2, 0.5
 NO_NOISE = {
@@ -31,16 +28,6 @@ NO_NOISE = {
     )
 }
 PERFECT_IMU = ImuOptions(**NO_NOISE, lever_arm_m_sd=(0.0, 0.0, 0.0))
-
-
-@pytest.fixture(scope="module")
-def scripts():
-    """The scripts as modules; they import each other as they do on the command line."""
-    sys.path.insert(0, str(SCRIPTS))
-    try:
-        return importlib.import_module("scale_bound"), importlib.import_module("study_scale")
-    finally:
-        sys.path.remove(str(SCRIPTS))
 
 
 def swing() -> Motion:
@@ -71,8 +58,7 @@ def no_errors():
     return draw_imu_errors(replace(PERFECT_IMU, mounting_rad_sd=0.0), 8.0, np.random.default_rng(0))
 
 
-def test_the_bound_is_that_of_a_regression_where_the_imu_is_perfect(scripts):
-    bound, _ = scripts
+def test_the_bound_is_that_of_a_regression_where_the_imu_is_perfect():
     motion, noise_m = swing(), 0.01
     what = options(PERFECT_IMU, position_white_m=noise_m)
     path = motion.cam_in_world_m(np.arange(240) / 30)
@@ -82,8 +68,7 @@ def test_the_bound_is_that_of_a_regression_where_the_imu_is_perfect(scripts):
     assert bound.scale_bound(motion, no_errors(), what, priors) == pytest.approx(expected, rel=1e-3)
 
 
-def test_the_bound_is_that_of_the_accelerometer_where_the_poses_are_perfect(scripts):
-    bound, _ = scripts
+def test_the_bound_is_that_of_the_accelerometer_where_the_poses_are_perfect():
     density = 0.01
     imu = replace(PERFECT_IMU, accel_density_m_s2_rthz=density)
     # Density over the root of the energy of the acceleration
@@ -98,8 +83,7 @@ def test_the_bound_is_that_of_the_accelerometer_where_the_poses_are_perfect(scri
     )
 
 
-def test_more_noise_and_less_knowledge_raise_the_bound_and_more_motion_lowers_it(scripts):
-    bound, _ = scripts
+def test_more_noise_and_less_knowledge_raise_the_bound_and_more_motion_lowers_it():
     base = RecordingOptions(motion=MotionOptions(duration_s=10.0, vigour=0.5))
     recording = simulate_recording(base, seed=3)
     reference = bound.bound_of(recording, base)
@@ -125,16 +109,14 @@ def test_more_noise_and_less_knowledge_raise_the_bound_and_more_motion_lowers_it
         bound.bound_of(recording, replace(base, sfm=replace(base.sfm, readout_s=0.02)))
 
 
-def test_a_seed_alone_reproduces_a_run(scripts):
-    _, study = scripts
+def test_a_seed_alone_reproduces_a_run():
     seed = study.seeds(0, (0, 1, 0, 0))[0]
     first, again = study.run(seed), study.run(seed)
     assert replace(first, seconds=0.0) == replace(again, seconds=0.0)
     assert first.part == "short" and 10 <= first.duration_s <= 30
 
 
-def test_short_recordings_are_covered_and_close_to_the_bound(scripts):
-    _, study = scripts
+def test_short_recordings_are_covered_and_close_to_the_bound():
     runs = [study.run(seed) for seed in study.seeds(100, (0, 16, 0, 0))]
     figures = study.summary(runs)
     given = figures["runs"] - figures["refused"]
@@ -146,8 +128,7 @@ def test_short_recordings_are_covered_and_close_to_the_bound(scripts):
     assert 0.7 < figures["rms_sigma"] / figures["rms_bound"] < 1.4
 
 
-def test_recordings_that_cannot_give_a_scale_are_refused(scripts):
-    _, study = scripts
+def test_recordings_that_cannot_give_a_scale_are_refused():
     seconds = {seed: study.drawn(seed)[0].motion.duration_s for seed in study.seeds(0, (0, 0, 0, 120))}
     by_kind = {kind: list(seconds)[i :: len(study.FUTILE)] for i, kind in enumerate(study.FUTILE)}
     # of each kind the shortest of twenty, but not of those that are too short anyway

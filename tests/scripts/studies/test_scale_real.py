@@ -1,23 +1,10 @@
-"""Scales of recordings of other sensors, with motion capture as truth: a seeded part of ``study_scale_real.py``."""
-
-import importlib
-import sys
-from pathlib import Path
+"""Scales of recordings of other sensors, with motion capture as truth: a seeded part of ``studies/scale_real.py``."""
 
 import numpy as np
 import pytest
 
-SCRIPTS = Path(__file__).parents[3] / "scripts"
-
-
-@pytest.fixture(scope="module")
-def study():
-    """The script as a module; it imports its neighbours as it does on the command line."""
-    sys.path.insert(0, str(SCRIPTS))
-    try:
-        return importlib.import_module("study_scale_real")
-    finally:
-        sys.path.remove(str(SCRIPTS))
+from scripts.common import capture_gains as gains, real_imu
+from scripts.studies import scale_real as study
 
 
 @pytest.fixture(scope="module")
@@ -26,13 +13,13 @@ def folder(shared_data):
 
 
 @pytest.fixture(scope="module")
-def outcomes(study, folder):
+def outcomes(folder):
     """Windows of 10 and 3 s of the six recordings, with errors of 2 mm."""
     found = study.windows(folder, (10.0, 3.0), (0.002,), most=3, first=7000)
     return [study.run((folder, window, None, None)) for window in found]
 
 
-def test_windows_of_other_sensors_are_not_biased_and_their_intervals_hold(study, outcomes):
+def test_windows_of_other_sensors_are_not_biased_and_their_intervals_hold(outcomes):
     longer = study.summary([o for o in outcomes if o.window.length_s == 10.0])
     assert longer["windows"] >= 15
     assert abs(longer["signed"]) < 1.5
@@ -48,9 +35,8 @@ def test_short_clips_are_never_trusted(outcomes):
     assert all(any("short" in str(reason) for reason in o.reasons) for o in short if o.verdict == "weak")
 
 
-def test_a_window_keeps_the_motion_and_changes_the_rest(study, folder):
+def test_a_window_keeps_the_motion_and_changes_the_rest(folder):
     """What the estimator gets: another scale, axes and clock; the distances between centres are those of the truth."""
-    real_imu = sys.modules["real_imu"]
     window = next(w for w in study.windows(folder, (10.0,), (0.0,), most=1, first=3) if w.recording == "room1")
     trajectory, imu, truth = study.recorded(folder, window)
     motion = real_imu.read(folder, "room1")
@@ -61,9 +47,8 @@ def test_a_window_keeps_the_motion_and_changes_the_rest(study, folder):
     assert abs(imu.gyro_t_s[0] - trajectory.t_s[0]) > 10
 
 
-def test_an_accelerometer_calibrated_by_other_recordings_gives_a_third_of_the_interval(study, folder):
+def test_an_accelerometer_calibrated_by_other_recordings_gives_a_third_of_the_interval(folder):
     """Gains by the motion capture of two rooms hold in the third: their errors differ by less than they are stated."""
-    gains = sys.modules["capture_gains"]
     fitted = {name: gains.fitted_gain(folder, name) for name in ("room1", "room3", "room5")}
     for gain in fitted.values():
         assert np.allclose(np.diag(gain), np.mean([np.diag(g) for g in fitted.values()], axis=0), atol=0.0015)
@@ -75,9 +60,8 @@ def test_an_accelerometer_calibrated_by_other_recordings_gives_a_third_of_the_in
     assert calibrated.sigma < 0.45 * plain.sigma
 
 
-def test_an_imu_behind_the_camera_is_found_there_in_short_noisy_clips(study, folder):
+def test_an_imu_behind_the_camera_is_found_there_in_short_noisy_clips(folder):
     """The rig's IMU lies 4.5 cm behind the camera; held at a phone's thickness it pulls the scales down by percents."""
-    real_imu = sys.modules["real_imu"]
     rotation, position_m = real_imu.HANDHELD
     behind_m = float((-rotation.T @ position_m)[2])
     assert behind_m == pytest.approx(-0.045, abs=0.001)

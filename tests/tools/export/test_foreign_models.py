@@ -2,8 +2,6 @@
 
 import json
 import struct
-import sys
-from pathlib import Path
 from xml.etree import ElementTree
 
 import cv2
@@ -11,7 +9,6 @@ import numpy as np
 import pycolmap
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "model"))
 from colmap_inertial.core.errors import FormatError, OutputExistsError
 from colmap_inertial.core.types import CameraModel
 from colmap_inertial.io.images import read_image

@@ -1,9 +1,5 @@
 """The motion's derivatives are exact and its spectrum is that of real hands."""
 
-import importlib.util
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.signal import welch
@@ -11,6 +7,7 @@ from scipy.signal import welch
 from colmap_inertial.core.geometry import quat_conjugate, quat_exp, quat_log, quat_multiply, quat_rotate
 from colmap_inertial.tools.simulate import Motion, MotionOptions, make_motion
 from colmap_inertial.tools.simulate.motion import HANDHELD, _draw_hand
+from scripts.studies.compare_motion import compare
 
 KINDS = ("orbit", "walk", "roam", "constant_velocity", "pure_rotation", "static")
 
@@ -131,14 +128,8 @@ def test_without_a_hand_an_orbit_sweeps_its_arc_around_its_start():
     assert np.abs(axes[:, 0, 2]).max() < 1e-3 and (axes[:, 1, 2] < 0).all()  # level, and not upside down
 
 
-def test_spectrum_matches_the_motion_capture_recordings(shared_data, monkeypatch):
-    spec = importlib.util.spec_from_file_location(
-        "compare_motion", Path(__file__).resolve().parents[3] / "scripts" / "compare_motion.py"
-    )
-    compare = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "compare_motion", compare)
-    spec.loader.exec_module(compare)
-    rows = compare.compare(shared_data / "tumvi_mocap")
+def test_spectrum_matches_the_motion_capture_recordings(shared_data):
+    rows = compare(shared_data / "tumvi_mocap")
     assert len(rows) >= 14
     for row in rows:
         # the three rooms differ among themselves by up to a factor of two
