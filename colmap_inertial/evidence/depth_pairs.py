@@ -113,6 +113,7 @@ def register_pair(
     else:
         if abs(change[0]) > 100 * limits.rest_log:
             return None
+    assert hit is not None
     # slopes are noisy, too, which looks like information: walls that slide along themselves would have some
     information = float(1 / np.linalg.inv(normal + 1e-9 * np.diag(np.diag(normal)))[0, 0])
     information -= float(weight @ (hit.slope_sigma * np.linalg.norm(hit.by_slope @ by_scale, axis=1)) ** 2)

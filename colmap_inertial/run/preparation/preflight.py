@@ -208,7 +208,7 @@ def run_preflight(
         write_record(partial[1], diagnosis)
 
     depends = {
-        "raw": raw,
+        "raw": imu,
         "recording": {name: getattr(recording, name) for name in ("timing", "prior", "max_offset_s")},
         "capture": replace(recording.capture, target=None),
         "looked at": recording.inputs() if model is None else model,
