@@ -26,7 +26,7 @@ class Batch(ConfiguredCommand):
     Example: colmap-inertial batch captures.toml out
     """
 
-    common: ClassVar = ("workers", "config", "dense", "allow_stages")
+    common: ClassVar = ("workers", "config", "dense", "allow_stages", "overwrite")
     resumes: ClassVar = True
 
     manifest: Positional[Path]
