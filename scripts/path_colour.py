@@ -27,6 +27,7 @@ from colmap_inertial.imaging._tiles import TiledPaths, Tiling
 from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.path_filters import (
     FILTER_MODEL,
+    DeblurOptions,
     blend_where_blurred,
     filter_along,
     half_quadratic,
@@ -35,7 +36,6 @@ from colmap_inertial.imaging.path_filters import (
 )
 from colmap_inertial.imaging.psf import blur_path
 from colmap_inertial.imaging.transfer import linearise, srgb_from_linear
-from colmap_inertial.imaging.wiener import DeblurOptions
 
 #: Blurs, px, and walls, of which each is seen at one instant.
 BLURS_PX, WALLS = (10.0, 20.0, 30.0), 3

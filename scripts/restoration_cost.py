@@ -18,9 +18,8 @@ from restoration_weights import use_weights
 
 from colmap_inertial.core.arrays import UInt8Array
 from colmap_inertial.imaging.blur_path import BlurPath
-from colmap_inertial.imaging.path_filters import path_wiener
+from colmap_inertial.imaging.path_filters import DeblurOptions, path_wiener
 from colmap_inertial.imaging.restoration import deepgyro, load_network
-from colmap_inertial.imaging.wiener import DeblurOptions
 
 THREADS = 2
 

@@ -15,8 +15,8 @@ import restoration_deblur
 import restoration_exposures as exposures
 from restoration_sheet import CROP_PX, write_sheet
 
+from colmap_inertial.imaging.path_filters import deblur
 from colmap_inertial.imaging.transfer import decode_table
-from colmap_inertial.imaging.wiener import deblur
 
 SIZE = (640, 480)
 NOISE, RATIO, BLUR_PX = 0.06, 10.0, 12.0
