@@ -131,15 +131,12 @@ LONG = ("parts", "rolling_shutter", "blurred", "desk")
 def prepare(folder: Path, data: Path) -> None:
     """Everything that jobs read and that is not public data, made anew by the checkout of the working directory."""
     here = Path.cwd()
-    sys.path[:0] = [str(here / "tests"), str(here / "scripts")]
-    import exposure_scenes
-    import model_project
-    import refine_walk
-    import test_calibrate_imu as rests
-    import test_join
-    import test_multi_aperture_io as apertures
-    import test_refine_stage
-    import walk_scenes
+    sys.path.insert(0, str(here))
+    from scripts.common import walk_scenes
+    from tests.helpers import exposure_scenes, model_project, refine_walk
+    from tests.inertial.join import test_join
+    from tests.inertial.static_calibration import test_static_calibration as rests
+    from tests.run.stages import test_apertures as apertures, test_refine
 
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
@@ -156,7 +153,7 @@ def prepare(folder: Path, data: Path) -> None:
     halves = test_join.cut(tracks, [(0.0, 9.2), (10.2, 18.0)])
     test_join.project_of(tracks, halves, folder / "joined" / "project")
     tracks = refine_walk.tracks_of(refine_walk.walk(25.0, points_per_m=80.0))
-    whole = test_refine_stage.adjusted(tracks.reconstruction())
+    whole = test_refine.adjusted(tracks.reconstruction())
     test_join.project_of(tracks, [whole], folder / "refined" / "project")
 
     model_project.write_project(folder / "box")

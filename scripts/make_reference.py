@@ -103,25 +103,39 @@ def reference_page(path: Path) -> str:
 
 # --- scripts ---------------------------------------------------------------------------------------------------------
 
+SCRIPT_FOLDERS = {
+    "scripts/benchmarks": "Benchmarks",
+    "scripts/studies": "Studies",
+    "scripts/restoration": "Training",
+    "scripts": "Examples, generators and tools",
+}
+
 
 def scripts_page() -> str:
-    """The page of all scripts that are run by themselves, with the first sentence of each."""
+    """The page of all scripts that are run by themselves: the command, and the first sentence of each."""
     lines = [
         "# Scripts",
         "",
         NOTE,
-        "Benchmarks and studies print tables, and write JSON with machine and versions. `--help` has the options.",
-        "",
-        "| script | prints or does |",
-        "|---|---|",
+        "Run from the repository's root, after `bash scripts/setup.sh dev`. Benchmarks and studies print tables, and",
+        "write JSON with machine and versions; what they share is in `scripts/common`. `--help` has the options.",
     ]
-    for path in sorted((ROOT / "scripts").glob("*.py")):
+    for folder, title in SCRIPT_FOLDERS.items():
+        lines += ["", f"## {title}", "", "| command | prints or does |", "|---|---|", *script_rows(ROOT / folder)]
+    return "\n".join(lines) + "\n"
+
+
+def script_rows(folder: Path) -> list[str]:
+    """A row for each script of a folder."""
+    rows = []
+    for path in sorted(folder.glob("*.py")):
         tree = ast.parse(path.read_text())
         runs = any(isinstance(node, ast.If) and "__main__" in ast.unparse(node.test) for node in tree.body)
         if runs:
             first = (ast.get_docstring(tree) or "").split("\n\n")[0].replace("\n", " ").replace("``", "`")
-            lines.append(f"| `scripts/{path.name}` | {first.removesuffix('.')} |")
-    return "\n".join(lines) + "\n"
+            command = re.search(r"^    (python (?:-m )?\S+)", ast.get_docstring(tree) or "", re.MULTILINE)[1]
+            rows.append(f"| `{command}` | {first.removesuffix('.')} |")
+    return rows
 
 
 # --- messages --------------------------------------------------------------------------------------------------------

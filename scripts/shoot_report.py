@@ -1,6 +1,6 @@
 """Screenshots of a report: desk, phone, dark, without scripts, and on paper.
 
-    python scripts/shoot_report.py OUT/report.html FOLDER
+    python -m scripts.shoot_report OUT/report.html FOLDER
 
 Needs chromium and, for paper, pdftoppm (poppler-utils). Plots are waited for, except where scripts are off.
 """
@@ -12,8 +12,7 @@ import tempfile
 import time
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from chromium import Page
+from tests.helpers.chromium import Page
 
 #: Name, width and height (px), whether the screen is dark, and whether scripts run.
 _SCREENS = [

@@ -5,14 +5,13 @@ import hashlib
 import logging
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, SimulatedRecording, simulate_recording
+from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, simulate_recording
+from tests.helpers.simulated_project import Project, write_project
 
 TESTS = Path(__file__).parent
 
@@ -152,59 +151,6 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"real recordings are not beside this checkout ({folder.name} folder absent)")
     return folder
-
-
-def write_anew(path: Path, data: bytes) -> None:
-    """Put other bytes into a file's place; to empty a file and fill it again makes ext4 write to the disk at once."""
-    path.unlink(missing_ok=True)
-    path.write_bytes(data)
-
-
-@dataclass(frozen=True)
-class Project:
-    """A user's files: a COLMAP model, frame times, an IMU folder; and the truth behind them."""
-
-    model: Path
-    frame_times: Path
-    imu: Path
-    recording: SimulatedRecording
-
-
-def write_project(folder: Path, recording: SimulatedRecording) -> Project:
-    """Write a simulated recording as a user would have it: a COLMAP model without points, a CSV, sensor text files."""
-    import pycolmap
-
-    trajectory, imu = recording.trajectory, recording.imu
-    names = [f"{i:05}.jpg" for i in range(len(trajectory))]
-    model = folder / "sparse" / "0"
-    model.mkdir(parents=True)
-    reconstruction = pycolmap.Reconstruction()
-    camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 500.0, 640, 480)
-    reconstruction.add_camera_with_trivial_rig(camera)
-    for i, (name, q, centre) in enumerate(
-        zip(names, trajectory.cam_from_world_xyzw, trajectory.cam_in_world, strict=True)
-    ):
-        rotation = pycolmap.Rotation3d(q)
-        pose = pycolmap.Rigid3d(rotation, -(rotation.matrix() @ centre))
-        image = pycolmap.Image(name=name, camera_id=1, image_id=i + 1)
-        reconstruction.add_image_with_trivial_frame(image, pose)
-    reconstruction.write_binary(str(model))
-
-    frame_times = folder / "frames.csv"
-    stamps_ns = trajectory.epoch_ns + np.rint(trajectory.t_s * 1e9).astype(np.int64)
-    rows = [f"{name},{stamp}" for name, stamp in zip(names, stamps_ns.tolist(), strict=True)]
-    frame_times.write_text("name,t_ns\n" + "\n".join(rows) + "\n")
-
-    imu_folder = folder / "imu"
-    imu_folder.mkdir()
-    for name, t_s, values in (
-        ("gyroscope.txt", imu.gyro_t_s, imu.gyro_rad_s),
-        ("accelerometer.txt", imu.accel_t_s, imu.accel_m_s2),
-    ):
-        t_ns = imu.epoch_ns + np.rint(t_s * 1e9).astype(np.int64)
-        lines = [f"{t} {x:.8f} {y:.8f} {z:.8f}" for t, (x, y, z) in zip(t_ns.tolist(), values, strict=True)]
-        (imu_folder / name).write_text("\n".join(lines) + "\n")
-    return Project(model=model, frame_times=frame_times, imu=imu_folder, recording=recording)
 
 
 @pytest.fixture(scope="session")

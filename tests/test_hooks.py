@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_pipeline import DETERMINISTIC, contents, copy_scene
 
 from colmap_inertial import (
     Frame,
@@ -20,6 +19,7 @@ from colmap_inertial import (
     write_calibration,
 )
 from colmap_inertial.hooks import insert_defaults
+from tests.run.commands.test_reconstruct import DETERMINISTIC, contents, copy_scene
 
 
 @pytest.fixture(scope="module")

@@ -57,9 +57,9 @@ def clock(seconds: float) -> str:
 class StageCost:
     """Time of a stage against its steps: it grows with this power of the share of steps done.
 
-    Measured on the example scene and EuRoC (``scripts/study_progress.py``), where the times left of features, matches,
-    mapping and depth maps are within a factor of two after a tenth of each stage, by the processors' time. Steps of
-    ``work`` are units of work, shown as a percentage.
+    Measured on the example scene and EuRoC (``scripts/studies/progress.py``), where the times left of features,
+    matches, mapping and depth maps are within a factor of two after a tenth of each stage, by the processors' time.
+    Steps of ``work`` are units of work, shown as a percentage.
     """
 
     power: float = 1.0

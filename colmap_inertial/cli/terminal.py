@@ -60,11 +60,7 @@ def next_command(result: ReconstructResult, source: Path) -> str:
     out, best = result.workspace.root, result.models[0]
     unfit = isinstance(best.validation, Validation) and not best.validation.within_tolerance
     if unfit or all(model.sparse_metric is None for model in result.models):
-        return f"read {result.workspace.report}: why, and what to record or to mend"
-    if best.scale.verdict == "weak" and best.validation is None and best.sparse_metric is not None:
-        images = result.workspace.images
-        words = [_program(), "validate", str(best.sparse_metric), "--images", str(images), "--target"]
-        return f"{shlex.join(words)} checkerboard:8x6:0.03"
+        return f"open {result.workspace.report}: cause and remedy"
     return _next_to_see(out, result.report)
 
 
@@ -75,7 +71,7 @@ def scale_lines(estimate: ScaleEstimate) -> list[Line]:
     from colmap_inertial.report.words import half_width_pct, length_in_words, scale_facts, sensor_facts
 
     stopped = any(reason.code == "force-goes-on" for reason in estimate.reasons)
-    metres = "no metres: " + ("stopped by what is wrong" if stopped else "the recording does not determine the scale")
+    metres = "no metres: " + ("stopped, see the reasons" if stopped else "the recording does not determine the scale")
     if estimate.metres_per_unit is not None and estimate.ci95 is not None:
         metres = length_in_words(estimate.verdict, half_width_pct(estimate.metres_per_unit, estimate.ci95))
     values = estimate.as_json()
@@ -91,13 +87,13 @@ def scale_lines(estimate: ScaleEstimate) -> list[Line]:
 
 
 def _part_lines(estimate: ScaleEstimate) -> list[Line]:
-    """What the interval is made of, and what would narrow it."""
+    """The parts of the interval, and what would reduce it."""
     from colmap_inertial.inertial.scale.verdict import describe_parts
 
     if estimate.parts is None:
         return []
     made_of = describe_parts(estimate.parts)
-    return [("made of", str(made_of)), ("narrower", made_of.advice)]
+    return [("uncertainty", str(made_of)), ("to reduce it", made_of.advice)]
 
 
 def _label_first(label: str, texts: Iterable[object]) -> list[Line]:
@@ -196,7 +192,7 @@ def show_diagnosis(diagnosis: Diagnosis, source: Path) -> None:
 
     from colmap_inertial.report.words import not_checked
 
-    title = f"{source} (looked at: {', '.join(diagnosis.checked) or 'nothing'})"
+    title = f"{source} (checked: {', '.join(diagnosis.checked) or 'nothing'})"
     table = Table(title=Text(title), title_justify="left", show_lines=True)
     for column in ("Severity", "Code", "Found", "What to do"):
         table.add_column(column, overflow="fold", no_wrap=column in ("Severity", "Code"))
@@ -323,7 +319,7 @@ def show_result(result: ReconstructResult, source: Path) -> None:
     for fragment in result.fragments:
         say(
             f"COLMAP's model {fragment.colmap_index} is a fragment of {fragment.registered_images} images, left out; "
-            "--fragments makes it metric, too"
+            "--fragments scales it too"
         )
     for gap in result.gaps:
         if not gap.joined:
@@ -422,6 +418,6 @@ def show_view(out: Path, url: str, host: str) -> None:
     say(f"{out} is shown at {url} (Ctrl-C ends this)")
     if not is_loopback(host):
         say(
-            f"listening at {host}: everybody on the network who learns this address sees the model and its images, and "
-            "nothing is encrypted; to look from elsewhere, ssh -L to this machine is safer"
+            f"listening at {host}: everybody on the network who knows this address sees the model and its images, "
+            "unencrypted; from elsewhere, ssh -L to this machine is safer"
         )

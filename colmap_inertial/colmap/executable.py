@@ -182,7 +182,7 @@ class ColmapExecutable:
         log.unlink(missing_ok=True)  # it may be a link to an earlier run's
         words = [word for name, value in arguments.items() for word in (f"--{name}", str(value))]
         last: deque[str] = deque(maxlen=_LIMITS.shown_lines)
-        with open(log, "w", encoding="utf-8") as file, _started([str(self.path), command, *words]) as process:
+        with open(log, "w", encoding="utf-8") as file, _start_process([str(self.path), command, *words]) as process:
             for line in _lines(process):
                 file.write(line + "\n")
                 if line.strip():
@@ -236,7 +236,7 @@ def read_executable(
 
 
 def _ask(path: Path, *words: str) -> str:
-    with _started([str(path), *words]) as process:
+    with _start_process([str(path), *words]) as process:
         timer = threading.Timer(_LIMITS.help_s, _end, [process])
         timer.start()
         try:
@@ -254,7 +254,7 @@ def _lines(process: subprocess.Popen[bytes]) -> Iterator[str]:
 
 
 @contextlib.contextmanager
-def _started(words: Sequence[str]) -> Iterator[subprocess.Popen[bytes]]:
+def _start_process(words: Sequence[str]) -> Iterator[subprocess.Popen[bytes]]:
     """A process whose output is one pipe; it has ended afterwards."""
     try:
         # a session of its own keeps the terminal's Ctrl-C away

@@ -173,7 +173,7 @@ class Cluster:
             versions, seen = answer
             _require_versions(worker, versions, describe_versions())
             if seen != token:
-                raise _unseen(worker, folder)
+                raise _make_unseen_folder_error(worker, folder)
 
 
 def _result(future: Any, chunk: Chunk) -> dict[str, bytes]:
@@ -207,7 +207,7 @@ def _require_versions(worker: str, versions: str, wanted: str) -> None:
         raise InertialError(Fact("worker-of-another-version", worker=worker, versions=versions, wanted=wanted))
 
 
-def _unseen(worker: str, folder: Path) -> InertialError:
+def _make_unseen_folder_error(worker: str, folder: Path) -> InertialError:
     return InertialError(Fact("worker-sees-no-output", worker=worker, folder=str(folder)))
 
 
@@ -228,7 +228,7 @@ def do_for_another(chunk: Chunk, versions: str, by: str) -> dict[str, bytes]:
     worker = get_worker()
     _require_versions(worker.address, describe_versions(), versions)
     if not chunk.folder.is_dir():
-        raise _unseen(worker.address, chunk.folder)
+        raise _make_unseen_folder_error(worker.address, chunk.folder)
     with tempfile.TemporaryDirectory(dir=worker.local_directory) as scratch:
         own = replace(chunk, folder=Path(scratch) / "chunk")
         shutil.copytree(chunk.folder, own.folder)

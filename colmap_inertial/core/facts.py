@@ -37,7 +37,7 @@ class Fact:
 
     def __init__(self, code: str, /, **values: Any) -> None:
         object.__setattr__(self, "code", code)
-        object.__setattr__(self, "values", {name: _frozen(value) for name, value in values.items()})
+        object.__setattr__(self, "values", {name: _freeze(value) for name, value in values.items()})
         messages.check(code, self.values)
 
     def __str__(self) -> str:
@@ -121,14 +121,14 @@ def details(facts: Iterable[Fact]) -> list[dict[str, object]]:
     return [fact.as_json() for fact in facts]
 
 
-def _frozen(value: Any) -> Any:
+def _freeze(value: Any) -> Any:
     """Plain values, with tuples for sequences, numbers for those of arrays, and facts for what JSON has of them."""
     if hasattr(value, "tolist"):
         value = value.tolist()
     if isinstance(value, Mapping) and value.keys() == {"code", "values"}:
         return Fact(value["code"], **value["values"])
     if isinstance(value, list | tuple):
-        return tuple(_frozen(item) for item in value)
+        return tuple(_freeze(item) for item in value)
     return value
 
 

@@ -158,31 +158,39 @@ def slerp(t_s: Array, xyzw: Array, query_s: Array) -> Array:
     return quat_normalize(quat_multiply(q[i], quat_exp(fraction[..., None] * step)))
 
 
+#: Factors of a block of :func:`quat_cumulative`.
+_BLOCK = 32
+#: ``quat_multiply(a, b)`` as four sums (columns) of four terms (rows): component ``_OF_LEFT`` of ``a`` times component
+#: ``_OF_RIGHT`` of ``[b, -b]``.
+_OF_LEFT = np.array([[3, 3, 3, 3], [0, 1, 2, 0], [1, 2, 0, 1], [2, 0, 1, 2]])
+_OF_RIGHT = np.array([[0, 1, 2, 3], [3, 3, 3, 4], [2, 0, 1, 5], [5, 6, 4, 6]])
+
+
 def quat_cumulative(steps: Array) -> Array:
     """Running products ``[1, s0, s0 s1, s0 s1 s2, ...]`` of unit quaternions xyzw. Shape (N, 4) -> (N + 1, 4).
 
     In linear time: products within blocks, all blocks at once, then the blocks' own running products in front.
     """
-    out = np.concatenate([[[0.0, 0.0, 0.0, 1.0]], np.asarray(steps, dtype=np.float64)])
-    count, block = len(out), 32
-    padded = np.zeros((-(-count // block) * block, 4))
-    padded[:, 3] = 1.0
-    padded[:count] = out
-    grid = padded.reshape(-1, block, 4)
-    factors = np.empty((block, 8, len(grid)))
-    factors[:, :4] = grid.transpose(1, 2, 0)
-    np.negative(factors[:, :4], out=factors[:, 4:])
-    # quat_multiply in few calls, with its very sums: the terms (rows) of each component (columns), a component of the
-    # left factor times one of the right or, from 4 on, of its negative; from -0.0, which keeps the sign of a zero
-    left = np.array([[3, 3, 3, 3], [0, 1, 2, 0], [1, 2, 0, 1], [2, 0, 1, 2]])
-    right = np.array([[0, 1, 2, 3], [3, 3, 3, 4], [2, 0, 1, 5], [5, 6, 4, 6]])
-    for i in range(1, block):
-        np.add.reduce(factors[i - 1, left] * factors[i, right], axis=0, out=factors[i, :4], initial=-0.0)
-    grid[:] = factors[:, :4].transpose(2, 0, 1)
-    if len(grid) > 1:
-        before = quat_cumulative(grid[:-1, -1])[1:]
-        grid[1:] = quat_multiply(before[:, None], grid[1:])
-    return quat_normalize(grid.reshape(-1, 4)[:count])
+    factors = np.concatenate([[[0.0, 0.0, 0.0, 1.0]], np.asarray(steps, dtype=np.float64)])
+    count = -(-len(factors) // _BLOCK)
+    padded = np.tile([0.0, 0.0, 0.0, 1.0], (count * _BLOCK, 1))
+    padded[: len(factors)] = factors
+    products = _multiply_along_blocks(padded.reshape(count, _BLOCK, 4))
+    if count > 1:
+        before = quat_cumulative(products[:-1, -1])[1:]
+        products[1:] = quat_multiply(before[:, None], products[1:])
+    return quat_normalize(products.reshape(-1, 4)[: len(factors)])
+
+
+def _multiply_along_blocks(blocks: Array) -> Array:
+    """(G, B, 4) running products of each of G blocks of B quaternions, with the very sums of ``quat_multiply``."""
+    products = np.ascontiguousarray(blocks.transpose(1, 2, 0))
+    rights = np.concatenate([products, -products], axis=1)
+    for i in range(1, len(products)):
+        terms = products[i - 1, _OF_LEFT] * rights[i, _OF_RIGHT]
+        # from -0.0, which keeps the sign of a zero
+        np.add.reduce(terms, axis=0, out=products[i], initial=-0.0)
+    return np.ascontiguousarray(products.transpose(2, 0, 1))
 
 
 def rotation_between(a: Array, b: Array) -> Array:

@@ -43,7 +43,7 @@ def silent(stage: str, done: int, total: int, /) -> None:
     """A progress receiver that shows nothing."""
 
 
-def counted(items: Iterable[Item], total: int, stage: str, progress: Progress) -> Iterator[Item]:
+def report_each(items: Iterable[Item], total: int, stage: str, progress: Progress) -> Iterator[Item]:
     """The items; ``progress`` hears of each before it goes on, and of the end."""
     for done, item in enumerate(items):
         progress(stage, done, total)
@@ -51,7 +51,7 @@ def counted(items: Iterable[Item], total: int, stage: str, progress: Progress) -
     progress(stage, total, total)
 
 
-def counting(
+def make_counter(
     progress: Progress, stage: str, total: int, *, begin: int = 0, steps: int | None = None, of: int | None = None
 ) -> Callable[..., None]:
     """A function that counts items, one at a time or several, from ``begin`` on; ``of`` items are so many ``steps``.

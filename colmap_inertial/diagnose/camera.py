@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from colmap_inertial.core.axes import Axes
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.facts import Fact, as_fact
 from colmap_inertial.core.sampling import subtract_running_mean
@@ -20,7 +21,6 @@ from colmap_inertial.diagnose.clocks import (
 from colmap_inertial.diagnose.findings import UNIT_FACTORS, Finding, Recorded
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.io.plausible import best_mirrored_reading
-from colmap_inertial.io.units import Axes
 from colmap_inertial.motion.align import Alignment
 from colmap_inertial.motion.align.consensus import describe_consensus
 from colmap_inertial.motion.align.conventions import ACCELERATION_S, QuickAccelerations, quick_accelerations
@@ -82,7 +82,7 @@ def _find_mirroring(recorded: Recorded, imu: ImuRecording) -> Finding:
     reading = best_mirrored_reading(imu) if imu.has_accel else None
     if reading is None or np.array_equal(reading.matrix, -np.eye(3)):
         return Finding(fact=Fact("gyro-mirrored"), severity="error")
-    before = np.eye(3) if recorded.gyro_axes is None else recorded.gyro_axes.matrix
+    before = np.eye(3) if imu.source.gyro_axes is None else imu.source.gyro_axes.matrix
     axes = Axes(matrix=reading.matrix @ before)
     return Finding(fact=Fact("gyro-mirrored", gyro=axes.setting()), severity="error")
 
@@ -174,7 +174,7 @@ def _find_better_fit(recorded: Recorded, imu: ImuRecording) -> Finding | None:
     """Find the sign, rate, frame rate or offset with which the gyroscope turns as the camera does."""
     if isinstance(recorded.align(replace(imu, gyro_rad_s=-imu.gyro_rad_s)), Alignment):
         return _find_mirroring(recorded, imu)
-    elsewhere = recorded.align(imu, any_offset=True)
+    elsewhere = recorded.align(imu, any_offset=True) if recorded.is_offset_limited else None
     if isinstance(elsewhere, Alignment):
         return offset_finding(recorded, elsewhere.calibration.clock_offset_s)
     begin_s = imu.gyro_t_s[0]

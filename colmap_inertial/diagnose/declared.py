@@ -12,6 +12,7 @@ from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply
 from colmap_inertial.core.types import CAL, CameraImuCalibration
 from colmap_inertial.io.calibration import SIGMAS, reset_for_recording
+from colmap_inertial.motion.align import searched_around_s
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,12 +25,10 @@ class DeclaredLimits:
     rotation_rad: float = 0.05
     wrong_rotation_rad: float = 0.35
     sigmas: float = 4.0
-    #: Offsets known worse were not declared; what matters of others; and what an alignment looks for around them.
+    #: Offsets known worse were not declared; and what matters of others.
     known_offset_s: float = 0.1
     offset_s: float = 0.01
     offset_by_pictures_s: float = 0.03
-    searched_sigmas: float = 2.0
-    searched_s: float = 0.05
 
 
 _LIMITS = DeclaredLimits()
@@ -144,5 +143,4 @@ def _compare_offset(
         sigma_s=sigma_s,
         likely=likely if abs(found_s - others[likely]) <= within_s else "",
     )
-    searched_s = _LIMITS.searched_sigmas * declared.clock_sigma_s + _LIMITS.searched_s
-    return fact, abs(found_s - stated_s) > searched_s
+    return fact, abs(found_s - stated_s) > searched_around_s(declared)

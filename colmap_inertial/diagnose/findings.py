@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -27,10 +26,9 @@ from colmap_inertial.core.types import (
 )
 from colmap_inertial.diagnose.declared import Contradicted, compare_declared, leave_out
 from colmap_inertial.io.calibration import reset_for_recording
-from colmap_inertial.io.plausible import RawImu
+from colmap_inertial.io.plausible import find_faults
 from colmap_inertial.io.pose_convention import ARRAYS, PoseConvention
-from colmap_inertial.io.units import Axes
-from colmap_inertial.motion.align import Alignment, AlignOptions, align_clocks
+from colmap_inertial.motion.align import Alignment, AlignOptions, align_clocks, searched_around_s
 from colmap_inertial.motion.align.consensus import NO_MAJORITY, align_by_consensus
 from colmap_inertial.motion.align.conventions import LikelyConvention, likely_convention
 from colmap_inertial.motion.flow import Stabilisation, VisualRotation, find_stabilisation
@@ -208,8 +206,6 @@ class Recorded:
         What could not be read, and why.
     imu
         Before any check of plausibility.
-    gyro_axes, accel_axes
-        Mappings of axes that a capture.toml applied.
     timing, log
         Of the frames.
     is_capture
@@ -230,8 +226,6 @@ class Recorded:
 
     refused: Sequence[InertialError] = ()
     imu: ImuRecording | None = None
-    gyro_axes: Axes | None = None
-    accel_axes: Axes | None = None
     timing: FrameTiming | None = None
     log: FrameLog | None = None
     is_capture: bool = False
@@ -248,10 +242,7 @@ class Recorded:
     @cached_property
     def implausible(self) -> tuple[FormatError, ...]:
         """Reasons why a reader would refuse the inertial samples."""
-        if self.imu is None:
-            return ()
-        raw = RawImu(imu=self.imu, path=Path("IMU"), gyro_axes=self.gyro_axes, accel_axes=self.accel_axes)
-        return tuple(raw.problems())
+        return () if self.imu is None else tuple(find_faults(self.imu))
 
     @property
     def is_dense(self) -> bool:
@@ -293,13 +284,22 @@ class Recorded:
         )
 
     @cached_property
+    def together(self) -> Alignment | NotObservableError | None:
+        """All cameras of a reconstruction and the IMU brought together; ``None`` where either is missing."""
+        if self.imu is None or self.trajectory is None:
+            return None
+        return self._align(self.trajectory, self.imu, self.believed, self.max_offset_s)
+
+    @cached_property
     def consensus(self) -> RotationConsensus | NotObservableError | None:
         """Agreement of a reconstruction's cameras with the gyroscope; ``None`` where either is missing."""
         if self.imu is None or self.trajectory is None:
             return None
         options = AlignOptions(max_offset_s=self.max_offset_s)
         try:
-            return align_by_consensus(self.trajectory, self.imu, prior=self.believed, options=options)[1]
+            return align_by_consensus(
+                self.trajectory, self.imu, prior=self.believed, options=options, together=self.together
+            )[1]
         except NotObservableError as error:
             return error
 
@@ -321,8 +321,7 @@ class Recorded:
             and isinstance(consensus, RotationConsensus)
             and not consensus.kept.all()
         ):
-            together = self._align(poses, imu, self.believed, self.max_offset_s)
-            return poses if isinstance(together, Alignment) else poses.select(consensus.kept)
+            return poses if isinstance(self.together, Alignment) else poses.select(consensus.kept)
         if self.trajectory is not None or self.rotation is None:
             return self.trajectory
         try:
@@ -333,7 +332,15 @@ class Recorded:
     @cached_property
     def aligned(self) -> Alignment | NotObservableError | None:
         """Camera and IMU brought together; ``None`` where one of them is missing."""
-        return None if self.imu is None else self.align(self.imu)
+        if self.imu is None:
+            return None
+        return self.together if self.turning is self.trajectory is not None else self.align(self.imu)
+
+    @property
+    def is_offset_limited(self) -> bool:
+        """Whether less than every offset of the clocks is searched."""
+        known = self.believed is not None and bool(np.isfinite(searched_around_s(self.believed)))
+        return known or self.max_offset_s is not None
 
     @cached_property
     def stabilisation(self) -> Stabilisation | None:
@@ -384,9 +391,6 @@ class Recorded:
         """The same with another reading of the gyroscope, or at any offset of the clocks."""
         if self.turning is None:
             return None
-        if self.clocks is not None and (self.clocks.unit_factor or 0) > 1:
-            # hours of offsets to search, for frames that mostly have no gyroscope beside them
-            return NotObservableError("time offset", self.clocks.fact)
         prior = self.believed
         if any_offset and prior is not None:
             prior = reset_for_recording(prior)
@@ -399,6 +403,9 @@ class Recorded:
         prior: CameraImuCalibration | None,
         max_offset_s: float | None,
     ) -> Alignment | NotObservableError:
+        if self.clocks is not None and (self.clocks.unit_factor or 0) > 1:
+            # hours of offsets to search, for frames that mostly have no gyroscope beside them
+            return NotObservableError("time offset", self.clocks.fact)
         options = AlignOptions(max_offset_s=max_offset_s)
         if self.trajectory is None:
             # the camera's translation is in the pixels' motion, and no gyroscope explains it

@@ -11,11 +11,11 @@ from colmap_inertial.core.arrays import BoolArray
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.facts import Fact
-from colmap_inertial.core.types import ReadoutDirection
+from colmap_inertial.core.types import FrameTiming
 from colmap_inertial.diagnose.findings import Finding, Recorded, Severity
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.motion.align import Alignment
-from colmap_inertial.motion.shutter import ReadoutEstimate, estimate_readout
+from colmap_inertial.motion.shutter import ReadoutEstimate, compare_readout, estimate_readout
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,11 +155,12 @@ def check_readout(recorded: Recorded) -> Iterator[Finding]:
     """A capture that does not say how its shutter runs, or otherwise than its pictures show."""
     if not recorded.is_capture or recorded.timing is None:
         return
-    if recorded.timing.readout_s is not None:
-        yield from _compare_readout(recorded, recorded.timing.readout_s, recorded.timing.readout_direction)
+    timing = recorded.timing
+    if timing.readout_s is not None:
+        yield from _compare_readout(recorded, timing)
         return
     try:
-        readout = _readout(recorded)
+        readout = _estimate_readout(recorded)
     except NotObservableError as error:
         yield Finding(fact=Fact("readout-unknown", why=error.fact), severity="warning")
         return
@@ -173,29 +174,25 @@ def check_readout(recorded: Recorded) -> Iterator[Finding]:
     yield Finding(fact=fact, severity="warning")
 
 
-def _compare_readout(recorded: Recorded, declared_s: float, direction: ReadoutDirection) -> Iterator[Finding]:
+def _compare_readout(recorded: Recorded, timing: FrameTiming) -> Iterator[Finding]:
     """A declared readout against one that is estimated without it."""
     try:
-        found = _readout(recorded)
+        found = _estimate_readout(recorded)
     except NotObservableError:
         return
-    opposite = {direction, found.direction} in ({"down", "up"}, {"right", "left"})
-    along_s = -found.readout_s if opposite else found.readout_s
-    across = not opposite and direction != found.direction
-    off_s = max(declared_s, found.readout_s) if across else abs(declared_s - along_s)
-    if off_s > max(_LIMITS.readout_s, _LIMITS.readout_sigmas * found.sigma_s):
-        fact = Fact(
-            "declared-readout",
-            declared_s=declared_s,
-            declared_direction=direction,
-            readout_s=found.readout_s,
-            sigma_s=found.sigma_s,
-            direction=found.direction,
-        )
+    fact = compare_readout(
+        timing,
+        found.readout_s,
+        found.sigma_s,
+        found.direction,
+        least_s=_LIMITS.readout_s,
+        sigmas=_LIMITS.readout_sigmas,
+    )
+    if fact is not None:
         yield Finding(fact=fact, severity="warning")
 
 
-def _readout(recorded: Recorded) -> ReadoutEstimate:
+def _estimate_readout(recorded: Recorded) -> ReadoutEstimate:
     """Estimate the readout from tracked corners and the aligned gyroscope."""
     rotation, aligned, imu = recorded.rotation, recorded.aligned, recorded.imu
     if rotation is not None and not recorded.is_dense:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.sampling import MUCH_CUT, PAUSE_STEPS, find_clipped, integral_at, is_gap
 from colmap_inertial.core.types import CameraTrajectory, ImuRecording
 from colmap_inertial.diagnose.findings import Finding, Recorded, Severity
-from colmap_inertial.io.plausible import RawImu, check_consistent
+from colmap_inertial.io.plausible import check_consistent
 from colmap_inertial.motion.align import Alignment
 
 
@@ -169,9 +168,8 @@ def check_axes(recorded: Recorded) -> Iterator[Finding]:
     imu = recorded.imu
     if imu is None or not imu.has_accel or recorded.implausible or not isinstance(recorded.aligned, Alignment):
         return
-    raw = RawImu(imu=imu, path=Path("IMU"), gyro_axes=recorded.gyro_axes, accel_axes=recorded.accel_axes)
     try:
-        check_consistent(raw, confirmed=True)
+        check_consistent(imu, confirmed=True)
     except FormatError as error:
         yield Finding(fact=error.fact, severity="error")
 
@@ -208,7 +206,7 @@ def check_repairs(recorded: Recorded) -> Iterator[Finding]:
 
 def check_pauses(recorded: Recorded) -> Iterator[Finding]:
     """Pauses of either sensor while frames came, where it is known when they did."""
-    begin_s, end_s = _filmed(recorded)
+    begin_s, end_s = _find_filmed_span(recorded)
     for sensor, t_s, _ in _sensors(recorded.imu):
         step_s = np.diff(t_s)
         usual_s = float(np.median(step_s))
@@ -233,7 +231,7 @@ def check_pauses(recorded: Recorded) -> Iterator[Finding]:
             yield Finding(fact=fact, severity="error" if share > _LIMITS.most_paused else "warning")
 
 
-def _filmed(recorded: Recorded) -> tuple[float, float]:
+def _find_filmed_span(recorded: Recorded) -> tuple[float, float]:
     """First and last frame on the IMU's clock; without limits where it is not known."""
     frames = recorded.trajectory or recorded.timing
     shift_s = None if frames is None else recorded.offset_s(frames.epoch_ns)

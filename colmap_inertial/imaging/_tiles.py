@@ -135,7 +135,7 @@ class Tiling:
     def window_in(self) -> Float32Array:
         """(side,) by which rows and columns of a tile are multiplied before it is transformed."""
         rise = np.sin(0.5 * np.pi * (np.arange(self.margin) + 0.5) / self.margin) ** 2
-        return self._mirrored(np.concatenate([rise, np.ones(self.side // 2 - self.margin)]))
+        return self._mirror(np.concatenate([rise, np.ones(self.side // 2 - self.margin)]))
 
     def window_out(self) -> Float32Array:
         """(side,) shares of a tile in the result; those of neighbours add up to one.
@@ -144,8 +144,8 @@ class Tiling:
         """
         rise = np.sin(0.5 * np.pi * (np.arange(self.ramp) + 0.5) / self.ramp) ** 2
         flat = np.ones(self.side // 2 - self.margin - self.ramp)
-        return self._mirrored(np.concatenate([np.zeros(self.margin), rise, flat]))
+        return self._mirror(np.concatenate([np.zeros(self.margin), rise, flat]))
 
     @staticmethod
-    def _mirrored(half: Array) -> Float32Array:
+    def _mirror(half: Array) -> Float32Array:
         return np.concatenate([half, half[::-1]]).astype(np.float32)

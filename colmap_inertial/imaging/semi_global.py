@@ -84,7 +84,7 @@ class Views:
 
 def jump_table(views: int) -> tuple[int, UInt16Array]:
     """The small penalty, and (256,) that of a jump by the change of the reference's code."""
-    most = MOST * _counted(views)
+    most = MOST * _count_views(views)
     small = round(MATCHING.small * most)
     jump = MATCHING.jump * most / np.maximum(1, np.arange(256) / MATCHING.edge_codes)
     return small, np.maximum(small + 1, np.floor(jump)).astype(np.uint16)
@@ -93,10 +93,10 @@ def jump_table(views: int) -> tuple[int, UInt16Array]:
 def shares(views: int) -> Int32Array:
     """(views + 1,) factors in 1/256: a cost counts as if all views saw the pixel, and stays below 256."""
     by = np.maximum(1, np.arange(views + 1))
-    return np.asarray(np.rint(256 * _counted(views) / by), dtype=np.int32)
+    return np.asarray(np.rint(256 * _count_views(views) / by), dtype=np.int32)
 
 
-def _counted(views: int) -> int:
+def _count_views(views: int) -> int:
     """The views that a cost of one byte can hold; those of more are scaled down."""
     return min(views, 255 // MOST)
 
@@ -136,7 +136,7 @@ def match_candidates(
             rows=np.ascontiguousarray(rows[:, :, first:last]),
             cost=cost,
             share=shares(count),
-            unseen=round(MATCHING.unseen * MOST * _counted(count)),
+            unseen=round(MATCHING.unseen * MOST * _count_views(count)),
             radius=CENSUS_RADIUS,
             least=views.least,
             tables=views.tables,

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -37,12 +37,12 @@ class GeoreferenceLimits:
     white_m: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0)
     slow_m: tuple[float, ...] = (0.02, 0.1, 0.25, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0, 16.0)
     #: In steps of 10^(1/4): with steps of 10^(1/2), the mean over them gives errors alike over 5 s half-widths of up to
-    #: 3.5 times the rms in place of 2.9 (scripts/study_georeference.py).
+    #: 3.5 times the rms in place of 2.9 (scripts/studies/georeference.py).
     alike_s: tuple[float, ...] = (1.0, 1.8, 3.2, 5.6, 10.0, 18.0, 32.0, 56.0, 100.0, 180.0, 320.0, 560.0, 1000.0)
     #: Prior of the slow errors: log-normal about what the receiver states, by this factor. A wider one makes intervals
     #: too wide for errors alike over 5 to 60 s, as their short pieces look like pieces of larger and slower ones. Where
     #: nothing is stated: about this size (m), by this factor; by 1.4, intervals hold in .63 for errors of 6 m
-    #: (scripts/study_georeference.py --unstated).
+    #: (python -m scripts.studies.georeference --unstated).
     slow_factor: float = 1.4
     unstated_slow: tuple[float, float] = (3.0, 2.5)
     #: The positions show over how long errors are alike where this much of the probability is within this factor of the
@@ -264,7 +264,7 @@ def georeference(
     chosen = chosen[np.unique(np.linspace(0, len(chosen) - 1, _LIMITS.most).round().astype(np.intp))]
     fixes, path_m, t_s = fixes.select(chosen), np.asarray(cam_in_world_m)[chosen], np.asarray(t_s)[chosen]
     origin, enu, heights = _convert_to_enu(fixes)
-    level_from_world = _level(up_in_world)
+    level_from_world = _turn_upright(up_in_world)
     target = enu[:, 0] + 1j * enu[:, 1]
 
     def level_at(delay_s: float) -> Array:
@@ -305,7 +305,7 @@ def georeference(
         delay_sigma_s=None if path_at is None else fit.delay_sigma_s,
         source=fixes.source,
         alike_assumed=fit.alike_assumed,
-        notes=tuple(_notes(fit, stated, fixes.height_above if counted.any() else "ellipsoid")),
+        notes=tuple(_describe_fit(fit, stated, fixes.height_above if counted.any() else "ellipsoid")),
     )
 
 
@@ -343,7 +343,7 @@ def _require_same_path(fit: _Fit) -> None:
         raise NotObservableError("heading", Fact("positions-of-another-path", ratio=fit.ratio))
 
 
-def _notes(fit: _Fit, stated: bool, height_above: HeightDatum | None) -> Iterator[Fact]:
+def _describe_fit(fit: _Fit, stated: bool, height_above: HeightDatum | None) -> Iterator[Fact]:
     """Notes on lengths that differ, on sizes of errors that are assumed, and on heights' zero."""
     if fit.ratio_error > _LIMITS.least_ratio:
         yield Fact("positions-of-another-scale", ratio=fit.ratio, half_width=Z95 * fit.ratio_sigma)
@@ -354,7 +354,7 @@ def _notes(fit: _Fit, stated: bool, height_above: HeightDatum | None) -> Iterato
         yield Fact("heights-not-of-ellipsoid", height_above=height_above)
 
 
-def _level(up_in_world: Array) -> Array:
+def _turn_upright(up_in_world: Array) -> Array:
     """(3, 3) the shortest turn that brings up to z."""
     return np.asarray(matrix_from_quat(rotation_between(up_in_world, np.array([0.0, 0.0, 1.0]))))
 
@@ -431,56 +431,125 @@ def _fit(paths: ComplexArray, delays_s: Array, target: ComplexArray, t_s: Array,
     relative = np.where(np.isfinite(stated_m) & (stated_m > 0), stated_m / usual_m, 1.0)
     apart_s = np.abs(t_s[:, None] - t_s[None, :])
     middle = complex(paths.mean())
-    about, logs_of_delay = paths - middle, -0.5 * ((delays_s - _LIMITS.usual_delay_s) / _LIMITS.delay_sigma_s) ** 2
     white_m, slow_m = (sizes.ravel() for sizes in np.meshgrid(_LIMITS.white_m, _LIMITS.slow_m))
-    prior = -0.5 * (np.log(slow_m / usual_m) / math.log(factor)) ** 2
-    fits = []
-    for alike_s in _LIMITS.alike_s:
-        # in units of each position's own error, and in axes in which all sizes are independent
-        values, axes = np.linalg.eigh(np.exp(-apart_s / alike_s))
-        fit, z = axes.T @ (1 / relative), axes.T @ (target / relative)
-        p = (about / relative) @ axes
-        # columns are sizes, rows are delays
-        var = white_m**2 + slow_m**2 * np.maximum(values, 0.0)[:, None]
-        weight = 1 / var
-        total = fit**2 @ weight
-        shift_p, shift_z = (p * fit) @ weight / total, (z * fit) @ weight / total
-        length = np.maximum(np.abs(p) ** 2 @ weight - total * np.abs(shift_p) ** 2, 1e-12)
-        along = (np.conj(p) * z) @ weight - total * np.conj(shift_p) * shift_z
-        turn = np.where(np.abs(along) > 0, along / np.maximum(np.abs(along), 1e-300), 1.0)
-        left = np.abs(z) ** 2 @ weight - total * np.abs(shift_z) ** 2 + length - 2 * np.abs(along)
-        log = prior - np.sum(np.log(var), axis=0) - 0.5 * left - np.log(total) - 0.5 * np.log(length)
-        # where the path's middle is; its error and the turn's are not independent
-        at, arm = shift_z - turn * shift_p, -1j * turn * shift_p / np.sqrt(length)
-        total = np.broadcast_to(total, length.shape)
-        fits.append((log + logs_of_delay[:, None], turn, at, arm, length, total, np.abs(along) / length))
-    logs, turns, ats, arms, lengths, totals, ratios = map(np.array, zip(*fits, strict=True))
+    log_prior = -0.5 * (np.log(slow_m / usual_m) / math.log(factor)) ** 2
+    by_correlation = [
+        _fit_given_errors(
+            (paths - middle) / relative,
+            target / relative,
+            1 / relative,
+            apart_s / alike_s,
+            (white_m, slow_m),
+            log_prior,
+        )
+        for alike_s in _LIMITS.alike_s
+    ]
+    fits = _Fits(
+        **{field.name: np.array([getattr(one, field.name) for one in by_correlation]) for field in fields(_Fits)}
+    )
+    log_prior_of_delay = -0.5 * ((delays_s - _LIMITS.usual_delay_s) / _LIMITS.delay_sigma_s) ** 2
+    logs = fits.log_probability + log_prior_of_delay[:, None]
     share = np.exp(logs - logs.max())
     share /= share.sum()
-    mean_turn, mean_at = float(np.angle(np.sum(share * turns))), complex(np.sum(share * ats))
-    apart = np.stack([np.angle(turns * np.exp(-1j * mean_turn)), (ats - mean_at).real, (ats - mean_at).imag])
-    arm3 = np.stack([1 / np.sqrt(lengths), arms.real, arms.imag])
-    cov = np.einsum("atk,iatk,jatk->ij", share, arm3, arm3) + np.einsum("atk,iatk,jatk->ij", share, apart, apart)
-    cov += np.diag([0.0, 1.0, 1.0]) * float(np.sum(share / totals))
-    of_delay = share.sum(axis=(0, 2))
-    delay_s = float(of_delay @ delays_s)
-    ratio = float(np.sum(share * ratios))
+    turn, at, cov = _average_placement(fits, share)
+    ratio = float(np.sum(share * fits.ratio))
+    share_of_delay = share.sum(axis=(0, 2))
+    delay_s = float(share_of_delay @ delays_s)
     best = int(np.argmax(logs.max(axis=(0, 1))))
     alike_s, alike_assumed = _judge_correlation(share.sum(axis=(1, 2)))
     return _Fit(
-        turn=mean_turn,
+        turn=turn,
         middle=middle,
-        at=mean_at,
-        cov=0.5 * (cov + cov.T),
+        at=at,
+        cov=cov,
         white_m=float(white_m[best]),
         slow_m=float(slow_m[best]),
         alike_s=alike_s,
         alike_assumed=alike_assumed,
         ratio=ratio,
-        ratio_sigma=math.sqrt(float(np.sum(share * (1 / lengths + (ratios - ratio) ** 2)))),
+        ratio_sigma=math.sqrt(float(np.sum(share * (1 / fits.turn_info + (fits.ratio - ratio) ** 2)))),
         delay_s=delay_s,
-        delay_sigma_s=math.sqrt(float(of_delay @ (delays_s - delay_s) ** 2)),
+        delay_sigma_s=math.sqrt(float(share_of_delay @ (delays_s - delay_s) ** 2)),
     )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Fits:
+    """Placements of a path on the ground by T delays and K sizes of errors, (T, K) each.
+
+    Attributes
+    ----------
+    log_probability
+        Of the errors' sizes, by their prior and the positions.
+    turn, at
+        Turn about the vertical, as a complex number of length one, and where the path's middle is.
+    turn_info, at_info
+        One over the variance of the turn, and of either coordinate of the middle at a given turn.
+    at_by_turn
+        Change of the middle with one standard deviation of the turn.
+    ratio
+        Length of the positions' path over that of the model's.
+    """
+
+    log_probability: Array
+    turn: ComplexArray
+    at: ComplexArray
+    turn_info: Array
+    at_info: Array
+    at_by_turn: ComplexArray
+    ratio: Array
+
+
+def _fit_given_errors(
+    path: ComplexArray, target: ComplexArray, ones: Array, apart: Array, sizes: tuple[Array, Array], log_prior: Array
+) -> _Fits:
+    """The placement of a path (T, N) on positions (N,) of which errors are known, by T delays and K sizes of errors.
+
+    Parameters
+    ----------
+    path, target, ones
+        In units of each position's own error; ``ones`` (N,) is what the placement of the path adds to it.
+    apart
+        (N, N) times between positions, over that in which slow errors are alike.
+    sizes
+        (K,), (K,) standard deviations of white and of slow errors.
+    log_prior
+        (K,) of these.
+    """
+    # in axes in which errors of all sizes are independent
+    eigenvalues, axes = np.linalg.eigh(np.exp(-apart))
+    one, z, p = axes.T @ ones, axes.T @ target, path @ axes
+    white, slow = sizes
+    variance = white**2 + slow**2 * np.maximum(eigenvalues, 0.0)[:, None]
+    weight = 1 / variance
+    at_info = one**2 @ weight
+    middle_p, middle_z = (p * one) @ weight / at_info, (z * one) @ weight / at_info
+    turn_info = np.maximum(np.abs(p) ** 2 @ weight - at_info * np.abs(middle_p) ** 2, 1e-12)
+    along = (np.conj(p) * z) @ weight - at_info * np.conj(middle_p) * middle_z
+    turn = np.where(np.abs(along) > 0, along / np.maximum(np.abs(along), 1e-300), 1.0)
+    chi2 = np.abs(z) ** 2 @ weight - at_info * np.abs(middle_z) ** 2 + turn_info - 2 * np.abs(along)
+    log_det = np.sum(np.log(variance), axis=0)
+    log_probability = log_prior - log_det - 0.5 * chi2 - np.log(at_info) - 0.5 * np.log(turn_info)
+    return _Fits(
+        log_probability=log_probability,
+        turn=turn,
+        at=middle_z - turn * middle_p,
+        turn_info=turn_info,
+        at_info=np.broadcast_to(at_info, turn_info.shape),
+        at_by_turn=-1j * turn * middle_p / np.sqrt(turn_info),
+        ratio=np.abs(along) / turn_info,
+    )
+
+
+def _average_placement(fits: _Fits, share: Array) -> tuple[float, complex, Array]:
+    """Mean turn and place by shares (A, T, K) of fits; (3, 3) their covariance, within the fits and between them."""
+    turn, at = float(np.angle(np.sum(share * fits.turn))), complex(np.sum(share * fits.at))
+    turned = np.angle(fits.turn * np.exp(-1j * turn))
+    apart = np.stack([turned, (fits.at - at).real, (fits.at - at).imag])
+    by_turn = np.stack([1 / np.sqrt(fits.turn_info), fits.at_by_turn.real, fits.at_by_turn.imag])
+    cov = sum(np.einsum("atk,iatk,jatk->ij", share, errors, errors) for errors in (by_turn, apart))
+    cov = cov + np.diag([0.0, 1.0, 1.0]) * float(np.sum(share / fits.at_info))
+    return turn, at, np.asarray(0.5 * (cov + cov.T))
 
 
 def _judge_correlation(probability: Array) -> tuple[float, bool]:

@@ -52,7 +52,7 @@ def read_camm(path: Path, units: DeclaredUnits) -> ImuRecording:
     FormatError
         Where there is no gyroscope, or the file is damaged.
     """
-    packets = _packets(*_open(path))
+    packets = _packets(*_open_movie(path))
     samples_of: dict[int, Samples] = {}
     sensors: tuple[tuple[int, Quantity, str], ...] = (
         (_GYRO, "gyro", units.gyro or "rad/s"),
@@ -77,7 +77,7 @@ def read_camm_frames(path: Path) -> FrameLog:
     FormatError
         Where the file is damaged or holds no video.
     """
-    movie, track = _open(path)
+    movie, track = _open_movie(path)
     frame_ns = movie.frame_times_ns()
     t_ns, data = _packets(movie, track)[_EXPOSURE]
     exposure_s = readout_s = None
@@ -97,7 +97,7 @@ def read_camm_positions(path: Path) -> PositionFixes | None:
     FormatError
         Where the file is damaged.
     """
-    packets = _packets(*_open(path))
+    packets = _packets(*_open_movie(path))
     t_ns, data = packets[_FIX]
     sigma: Array
     with np.errstate(invalid="ignore"):  # a damaged file may hold signalling NaNs
@@ -124,7 +124,7 @@ def read_camm_positions(path: Path) -> PositionFixes | None:
     )
 
 
-def _open(path: Path) -> tuple[Movie, Track]:
+def _open_movie(path: Path) -> tuple[Movie, Track]:
     movie = read_movie(path)
     return movie, movie.telemetry("camm", "camera motion metadata")
 

@@ -42,7 +42,7 @@ from colmap_inertial.io.capture_tables import (
 from colmap_inertial.io.files import StrPath, reader, require_utf8
 from colmap_inertial.io.frame_sources import IMAGES_KEYS, ImageFolder, Video, read_image_folder, read_video
 from colmap_inertial.io.gcsv import is_gcsv, read_gcsv_frames
-from colmap_inertial.io.imu_formats import Recording, find_recording, refuse_video
+from colmap_inertial.io.imu_formats import RecorderOutput, find_recorder_output, refuse_video
 from colmap_inertial.io.imu_text import is_inertial_scale
 from colmap_inertial.io.toml_section import Section, read_toml
 from colmap_inertial.io.video import readout_of_video
@@ -145,7 +145,7 @@ def load_capture(path: StrPath) -> Capture:
     if not path.exists():
         raise FormatError(path, Fact("no-such-file", what="file or folder"))
     if path.suffix.lower() != ".toml":
-        recording = find_recording(path)
+        recording = find_recorder_output(path)
         if recording is not None:
             return _describe_recording(path, recording)
         refuse_video(path)
@@ -213,7 +213,7 @@ def _add_recorder_notes(capture: Capture) -> Capture:
     if not isinstance(capture.frames, Video):
         return capture
     imu, video = capture.imu, capture.frames
-    recording = find_recording(video.file)
+    recording = find_recorder_output(video.file)
     log = None if recording is None else recording.log
     if recording is not None and imu is None:
         imu = ImuPath(path=recording.imu, format=recording.format)
@@ -332,7 +332,7 @@ def _recognise_folder(path: Path) -> Capture:
     camera, imu = base / "cam0", base / "imu0"
     if all(part.exists() for part in (camera / "data.csv", camera / "data", imu / "data.csv")):
         return _describe_asl(path, camera, imu)
-    recording = find_recording(path)
+    recording = find_recorder_output(path)
     if recording is not None:
         return _describe_recording(path, recording)
     if (path / "recipe.toml").is_file():
@@ -340,7 +340,7 @@ def _recognise_folder(path: Path) -> Capture:
     raise FormatError(path, Fact("no-capture-folder"))
 
 
-def _describe_recording(path: Path, recording: Recording) -> Capture:
+def _describe_recording(path: Path, recording: RecorderOutput) -> Capture:
     """A recording that describes itself."""
     log = recording.log
     readout_s = None if log is None else log.readout_s

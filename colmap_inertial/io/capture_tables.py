@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.axes import Axes
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import quat_from_matrix
 from colmap_inertial.core.types import ImuNoise
@@ -24,7 +25,7 @@ from colmap_inertial.io.camera_table import check_transform
 from colmap_inertial.io.imu_text import SensorTable
 from colmap_inertial.io.stamps import DATE_ORDERS, TimeColumns
 from colmap_inertial.io.toml_section import Section
-from colmap_inertial.io.units import SENSOR_UNITS, TIME_UNITS_NS, Axes, DeclaredUnits, Quantity
+from colmap_inertial.io.units import SENSOR_UNITS, TIME_UNITS_NS, DeclaredUnits, Quantity
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.axes import Axes
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.io.columns import read_name
 from colmap_inertial.io.plausible import PLAUSIBLE
 from colmap_inertial.io.sensor_columns import OPEN, ROWS, Columns, SensorColumns
 from colmap_inertial.io.stamps import TimeColumns
-from colmap_inertial.io.units import SENSOR_UNITS, STANDARD_GRAVITY_M_S2, TIME_UNITS_NS, Axes, Quantity
+from colmap_inertial.io.units import SENSOR_UNITS, STANDARD_GRAVITY_M_S2, TIME_UNITS_NS, Quantity
 
 if TYPE_CHECKING:
     from colmap_inertial.io.tables import Table

@@ -122,7 +122,7 @@ def plain_text(text: str) -> PlainText:
     head = _head(text)
     stated = re.fullmatch(r"\s*\"?sep=(.|\\t)\"?\s*", head[0]) if head else None
     standard = _standard_delimiter(head)
-    layout = _layout(head, standard, stated[1].replace("\\t", "\t") if stated else None)
+    layout = _find_layout(head, standard, stated[1].replace("\\t", "\t") if stated else None)
     if layout is None:
         return PlainText(text=text)
     return _write_plainly(text, layout)
@@ -186,7 +186,7 @@ def _is_row(cells: Sequence[str], decimal: str) -> bool:
     return values >= 2 and 5 * values >= sum(map(bool, cells))
 
 
-def _layout(head: Sequence[str], standard: str | None, stated: str | None) -> _Layout | None:
+def _find_layout(head: Sequence[str], standard: str | None, stated: str | None) -> _Layout | None:
     """How the table is written; ``None`` for a plain one, or where there is none."""
     best, plain_share = None, -1.0
     ways = [way for way in _WAYS if stated is None or way[0] == stated]

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from colmap_inertial.core.axes import Axes
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import FrameLog, ImuRecording, ReadoutDirection
@@ -22,7 +23,7 @@ from colmap_inertial.io.files import first_line, read_limits, read_text
 from colmap_inertial.io.imu_text import build_recording, order_rows
 from colmap_inertial.io.samples import Samples
 from colmap_inertial.io.tables import Table, parse_table, too_wide
-from colmap_inertial.io.units import Axes, DeclaredUnits, Quantity
+from colmap_inertial.io.units import DeclaredUnits, Quantity
 
 _FIRST_LINES = ("GYROFLOW IMU LOG", "CAMERA IMU LOG")
 _DIRECTIONS: dict[str, ReadoutDirection] = {

@@ -27,6 +27,7 @@ from typing import cast
 import numpy as np
 
 from colmap_inertial.core.arrays import Array, Int64Array
+from colmap_inertial.core.axes import Axes
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import FrameLog, HeightDatum, ImuRecording, PositionFixes
@@ -35,7 +36,7 @@ from colmap_inertial.io.gpmf import Entry, Stream, entries, read_streams
 from colmap_inertial.io.imu_text import build_recording
 from colmap_inertial.io.mp4 import Movie, has_track, read_movie
 from colmap_inertial.io.samples import Samples, nearest, order_samples
-from colmap_inertial.io.units import SENSOR_UNITS, Axes, DeclaredUnits, Quantity, unit_of
+from colmap_inertial.io.units import SENSOR_UNITS, DeclaredUnits, Quantity, unit_of
 
 _SENSORS: dict[str, Quantity] = {"GYRO": "gyro", "ACCL": "accel"}
 #: Streams with one sample for each frame, the best one first.
@@ -115,7 +116,7 @@ def read_gopro_frames(path: Path) -> FrameLog:
         stream = telemetry.streams.get(key)
         if stream is None or stream.values.shape[1] != channels:
             return None
-        nearest = _nearest(telemetry.times_ns(key), stream.values, frame_ns)
+        nearest = _find_nearest(telemetry.times_ns(key), stream.values, frame_ns)
         # directions and orientations have a length, exposures a bound; what has not is damaged
         good = (
             nearest is not None
@@ -339,7 +340,7 @@ def _stabilisation(settings: dict[str, Entry], image: Array | None) -> tuple[boo
     return (False if flag == "N" else None), words
 
 
-def _nearest(t_ns: Int64Array, values: Array, frame_ns: Int64Array) -> Array | None:
+def _find_nearest(t_ns: Int64Array, values: Array, frame_ns: Int64Array) -> Array | None:
     """The sample nearest to each frame; ``None`` where frames lie outside the samples."""
     slack_ns = _LIMITS.missing_frames * float(np.median(np.diff(t_ns)))
     if frame_ns[0] < t_ns[0] - slack_ns or frame_ns[-1] > t_ns[-1] + slack_ns:

@@ -10,13 +10,13 @@ from pathlib import Path
 
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.facts import Fact
-from colmap_inertial.core.types import FrameLog, ImuRecording
+from colmap_inertial.core.types import FrameLog, ImuRecording, ImuSource
 from colmap_inertial.io import imu_text
 from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.capture_tables import ImuPath
 from colmap_inertial.io.files import StrPath, reader, reading
 from colmap_inertial.io.imu_formats import find_imu_format
-from colmap_inertial.io.plausible import RawImu
+from colmap_inertial.io.plausible import check_readings
 from colmap_inertial.io.units import DeclaredUnits
 
 
@@ -42,17 +42,15 @@ def read_imu(path: StrPath, *, format: str = "auto") -> ImuRecording:
     TimingError
         Where its stamps run backwards or cannot be in the stated unit.
     """
-    raw = read_raw_imu(Path(path), format=format)
-    raw.check()
-    return raw.imu
+    return check_readings(read_unchecked_imu(Path(path), format=format))
 
 
 @reader("an inertial recording")
-def read_raw_imu(path: Path, *, format: str = "auto") -> RawImu:
+def read_unchecked_imu(path: Path, *, format: str = "auto") -> ImuRecording:
     """:func:`read_imu` without the check that the numbers are plausible, for callers who check themselves."""
     if format == "capture" or (format == "auto" and is_capture(path)):
-        return read_raw_capture_imu(load_capture(path))
-    return RawImu(imu=find_imu_format(path, format).read(path, DeclaredUnits()), path=path)
+        return read_unchecked_capture_imu(load_capture(path))
+    return replace(find_imu_format(path, format).read(path, DeclaredUnits()), source=ImuSource(path=path))
 
 
 @reader("an inertial recording")
@@ -80,13 +78,11 @@ def read_frame_log(path: StrPath, *, format: str = "auto") -> FrameLog | None:
 
 def read_capture_imu(capture: Capture) -> ImuRecording:
     """The inertial recording of a capture, as :func:`read_imu` gives it."""
-    raw = read_raw_capture_imu(capture)
-    raw.check()
-    return raw.imu
+    return check_readings(read_unchecked_capture_imu(capture))
 
 
-def read_raw_capture_imu(capture: Capture) -> RawImu:
-    """The inertial recording of a capture, as :func:`read_raw_imu` gives it."""
+def read_unchecked_capture_imu(capture: Capture) -> ImuRecording:
+    """The inertial recording of a capture, as :func:`read_unchecked_imu` gives it."""
     source = capture.imu
     if source is None:
         raise FormatError(capture.path, Fact("capture-without-imu"))
@@ -100,14 +96,14 @@ def read_raw_capture_imu(capture: Capture) -> RawImu:
             accel_path = source.accel.file
         with reading(path, Fact("not-readable-as-described")):
             imu = imu_text.read_tables(source.gyro, source.accel)
-    imu = replace(
+    return replace(
         imu,
         gyro_rad_s=imu.gyro_rad_s if source.gyro_axes is None else source.gyro_axes.apply(imu.gyro_rad_s),
         accel_m_s2=imu.accel_m_s2 if source.accel_axes is None else source.accel_axes.apply(imu.accel_m_s2),
         noise=imu.noise if source.noise is None else source.noise,
         device=capture.device or imu.device,
+        source=ImuSource(path=path, accel_path=accel_path, gyro_axes=source.gyro_axes, accel_axes=source.accel_axes),
     )
-    return RawImu(imu=imu, path=path, accel_path=accel_path, gyro_axes=source.gyro_axes, accel_axes=source.accel_axes)
 
 
 def is_capture(path: Path) -> bool:

@@ -351,8 +351,8 @@ _OWN: tuple[ImuFormat, ...] = (
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Recording:
-    """Content of a recording.
+class RecorderOutput:
+    """Files that a recorder left: of a recording that describes itself.
 
     Attributes
     ----------
@@ -370,8 +370,8 @@ class Recording:
     log: FrameLog | None
 
 
-def find_recording(path: Path) -> Recording | None:
-    """The recording at ``path``: a video with an IMU inside, or a recorder's folder; ``None`` where it is neither.
+def find_recorder_output(path: Path) -> RecorderOutput | None:
+    """The files of a video with an IMU inside, or of a recorder's folder; ``None`` where ``path`` is neither.
 
     Raises
     ------
@@ -380,13 +380,13 @@ def find_recording(path: Path) -> Recording | None:
     """
     for family in imu_formats():
         if family.video is not None and bool(family.video) == path.is_dir() and family.accepts(path):
-            video = _video(path, family.video) if family.video else path
+            video = _find_video(path, family.video) if family.video else path
             noted = None if family.frames is None else family.frames(path)
-            return Recording(format=family.name, imu=path, video=video, log=noted)
+            return RecorderOutput(format=family.name, imu=path, video=video, log=noted)
     return None
 
 
-def _video(folder: Path, places: tuple[str, ...]) -> Path | None:
+def _find_video(folder: Path, places: tuple[str, ...]) -> Path | None:
     """The one video in the first of the places that has one."""
     for place in places:
         videos = sorted(file for file in folder.glob(place.format(name=folder.name)) if file.is_file())

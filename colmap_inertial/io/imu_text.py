@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from colmap_inertial.core.arrays import Array, Int64Array
+from colmap_inertial.core.axes import Axes
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import ImuNoise, ImuRecording
@@ -31,7 +32,7 @@ from colmap_inertial.io.sensor_columns import Columns, SensorColumns
 from colmap_inertial.io.sensor_yaml import read_imu_noise
 from colmap_inertial.io.stamps import DateOrder, TimeColumns, read_stamps
 from colmap_inertial.io.tables import Table, parse_bytes, read_table, recognise
-from colmap_inertial.io.units import SENSOR_NAMES, SENSOR_UNITS, TIME_UNITS_NS, Axes, DeclaredUnits, Quantity, seconds
+from colmap_inertial.io.units import SENSOR_NAMES, SENSOR_UNITS, TIME_UNITS_NS, DeclaredUnits, Quantity, seconds
 
 #: What names of tables end with.
 TABLE_SUFFIXES = (".csv", ".txt", ".tsv", ".json", ".jsonl", ".ndjson", ".log", ".dat", ".asc")
@@ -433,16 +434,15 @@ def build_recording(
     gyro: Samples, accel: Samples | None, *, noise: ImuNoise | None = None, device: str = ""
 ) -> ImuRecording:
     """An :class:`ImuRecording` of ordered samples, its epoch at the first of them."""
-    if accel is None:
-        accel = Samples(t_ns=np.zeros(0, dtype=np.int64), values=np.zeros((0, 3)), repairs=())
-    epoch_ns = int(np.concatenate([gyro.t_ns, accel.t_ns]).min())
+    sensors = (gyro,) if accel is None else (gyro, accel)
+    epoch_ns = min(int(sensor.t_ns.min()) for sensor in sensors)
     return ImuRecording(
         gyro_t_s=seconds(gyro.t_ns, epoch_ns),
         gyro_rad_s=gyro.values,
-        accel_t_s=seconds(accel.t_ns, epoch_ns),
-        accel_m_s2=accel.values,
+        accel_t_s=np.zeros(0) if accel is None else seconds(accel.t_ns, epoch_ns),
+        accel_m_s2=np.zeros((0, 3)) if accel is None else accel.values,
         epoch_ns=epoch_ns,
-        repairs=tuple(dict.fromkeys(gyro.repairs + accel.repairs)),
+        repairs=tuple(dict.fromkeys(repair for sensor in sensors for repair in sensor.repairs)),
         device=device,
         noise=noise,
     )

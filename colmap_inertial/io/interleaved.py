@@ -107,8 +107,8 @@ def find_rows_of_sensors(path: Path) -> Columns | None:
         if len(said) > _SENSORS:
             continue
         named = {name: re.sub(r"[^a-z0-9]", "", name.lower()) for name in said if said[name] > 2}
-        gyro = _best(named, words.GYRO_ROWS) or _named(named, "gyro")
-        accel = _best(named, words.ACCEL_ROWS) or _named(named, "accel")
+        gyro = _best(named, words.GYRO_ROWS) or _find_named_sensor(named, "gyro")
+        accel = _best(named, words.ACCEL_ROWS) or _find_named_sensor(named, "accel")
         if gyro is not None and accel is not None:
             parts = [_sensor(path, column, gyro, "gyro"), _sensor(path, column, accel, "accel")]
             sure = all(part.is_complete for part in parts)
@@ -124,12 +124,12 @@ def find_numbered_rows(table: Table) -> Columns | None:
         counts = Counter(cells)
         changes = sum(a != b for a, b in itertools.pairwise(cells))
         few = 2 <= len(counts) <= _NUMBERS and all(re.fullmatch(r"\d{1,3}", value) for value in counts)
-        if few and 5 * changes > len(cells) and (part := _numbered(table, column, counts)) is not None:
+        if few and 5 * changes > len(cells) and (part := _find_numbered_columns(table, column, counts)) is not None:
             return Columns(gyro=part, accel=part, why=(f"column {column + 1} numbers the sensor of each row",))
     return None
 
 
-def _numbered(table: Table, column: int, counts: Counter[str]) -> SensorColumns | None:
+def _find_numbered_columns(table: Table, column: int, counts: Counter[str]) -> SensorColumns | None:
     """Three columns of values, and what they are by number of the sensor."""
     time = None
     if table.header is None:
@@ -190,7 +190,7 @@ def _best(named: dict[str, str], known: set[str]) -> str | None:
     return min(found, key=lambda name: ("uncal" in named[name], name)) if found else None
 
 
-def _named(names: Iterable[str], quantity: Quantity) -> str | None:
+def _find_named_sensor(names: Iterable[str], quantity: Quantity) -> str | None:
     """The one name that says a sensor and its unit: ``gyro_dps``."""
     found = [name for name in names if (cell := _read_row_name(name)).kind == quantity and cell.unit is not None]
     return found[0] if len(found) == 1 else None

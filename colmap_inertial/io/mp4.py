@@ -192,7 +192,7 @@ def _find_index(path: Path, file: BinaryIO) -> tuple[bytes, int]:
         elif size == 0:
             size = length - at
         if size < head:
-            raise FormatError(path, Fact("mp4-box-size", box=_shown(name), byte=at, size=size))
+            raise FormatError(path, Fact("mp4-box-size", box=_show_name(name), byte=at, size=size))
         if name == b"moov":
             if at + size > length:
                 raise FormatError(path, Fact("mp4-index-cut-off", byte=at, length=length))
@@ -227,7 +227,7 @@ class _Boxes:
                 # a closing zero is how QuickTime ends user data
                 return
             if size < head or at + size > end:
-                raise self.fail(at, Fact("mp4-box-beyond", box=_shown(name), size=size, left=end - at))
+                raise self.fail(at, Fact("mp4-box-beyond", box=_show_name(name), size=size, left=end - at))
             yield name, at + head, at + size
             at += size
 
@@ -263,7 +263,7 @@ class _Boxes:
         return table.astype(np.int64).reshape(count, columns)
 
 
-def _shown(name: bytes) -> str:
+def _show_name(name: bytes) -> str:
     return repr(name.decode("latin-1"))
 
 

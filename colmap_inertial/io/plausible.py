@@ -18,12 +18,13 @@ from pathlib import Path
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.axes import Axes
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, quat_multiply
 from colmap_inertial.core.sampling import Coverage, integral_at
 from colmap_inertial.core.types import ImuRecording
-from colmap_inertial.io.units import SENSOR_NAMES, STANDARD_GRAVITY_M_S2, Axes, Quantity
+from colmap_inertial.io.units import SENSOR_NAMES, STANDARD_GRAVITY_M_S2, Quantity
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,11 +36,11 @@ class ConsistencyLimits:
     ``clear_advantage``.
     """
 
-    #: Windows, the steps in which the gyroscope is integrated, and the means that are compared in a window.
+    #: Length of a window.
     window_s: float = 4.0
-    #: Windows, the steps in which the gyroscope is integrated, and the means that are compared in a window.
+    #: Steps in which the gyroscope is integrated.
     step_s: float = 0.1
-    #: Windows, the steps in which the gyroscope is integrated, and the means that are compared in a window.
+    #: Length of the means that are compared within a window.
     mean_s: float = 1.0
     #: Enough to decide; few enough to keep hours of recording cheap. With fewer than ``enough_windows`` another reading
     #: must be better by ``few_advantage``: of 92 clips of 20 s of the 8 recordings none is then accused, and of 552
@@ -52,11 +53,9 @@ class ConsistencyLimits:
     most_windows: int = 100
     #: Added to variances: below this, differences are sensor errors.
     floor_m2_s4: float = 0.02
-    #: How much better another reading must be, as mean logarithm of the ratio of variances and in standard errors: than
-    #: the file's own, and than no rotation at all.
+    #: How much better another reading must be than the file's own, and than no rotation at all: mean logarithm of the
+    #: ratio of variances, and its standard errors.
     clear_advantage: float = 0.5
-    #: How much better another reading must be, as mean logarithm of the ratio of variances and in standard errors: than
-    #: the file's own, and than no rotation at all.
     clear_standard_errors: float = 3.0
 
 
@@ -79,7 +78,7 @@ class Reading:
     factor: float = 1.0
 
 
-def _readings() -> tuple[Reading, ...]:
+def _list_readings() -> tuple[Reading, ...]:
     """The readings as stated, in every other order and sign of the axes, and in other units."""
     matrices = []
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
@@ -107,18 +106,18 @@ def better_readings(imu: ImuRecording, *, confirmed: bool = False) -> tuple[Read
     The best one first, then those that the recording cannot tell from it; empty where the stated reading is fine or the
     recording cannot tell.
     """
-    turns, force = _windows(imu)
+    turns, force = _cut_windows(imu)
     if len(turns) < LIMITS.fewest_windows:
         return ()
-    readings = _readings()
-    spread = _spread(turns, force, readings)
+    readings = _list_readings()
+    spread = _measure_spread(turns, force, readings)
     ranked = np.argsort(np.mean(spread, axis=1), kind="stable").tolist()
     best = spread[ranked[0]]
     at_rest = _log_variance(force)
-    turned = float((at_rest - best).mean()) > LIMITS.clear_advantage if confirmed else _clearly(best, at_rest)
-    if not (turned and _clearly(best, spread[0])):
+    turned = float((at_rest - best).mean()) > LIMITS.clear_advantage if confirmed else _is_clearly_better(best, at_rest)
+    if not (turned and _is_clearly_better(best, spread[0])):
         return ()
-    return tuple(readings[i] for i in ranked if not _clearly(best, spread[i]))
+    return tuple(readings[i] for i in ranked if not _is_clearly_better(best, spread[i]))
 
 
 def best_mirrored_reading(imu: ImuRecording) -> Reading | None:
@@ -126,14 +125,14 @@ def best_mirrored_reading(imu: ImuRecording) -> Reading | None:
 
     Minus the unit matrix says that both sensors are mirrored alike, or that the gyroscope measures the opposite.
     """
-    turns, force = _windows(imu)
+    turns, force = _cut_windows(imu)
     if len(turns) < LIMITS.fewest_mirrored_windows:
         return None
-    readings = [reading for reading in _readings() if np.linalg.det(reading.matrix) < 0]
-    return readings[int(np.argmin(np.mean(_spread(turns, force, readings), axis=1)))]
+    readings = [reading for reading in _list_readings() if np.linalg.det(reading.matrix) < 0]
+    return readings[int(np.argmin(np.mean(_measure_spread(turns, force, readings), axis=1)))]
 
 
-def _spread(turns: Array, force: Array, readings: Sequence[Reading]) -> list[Array]:
+def _measure_spread(turns: Array, force: Array, readings: Sequence[Reading]) -> list[Array]:
     """Logarithm of the variance (W,) that each reading leaves of the specific force in each window."""
     orientations: dict[float, Array] = {}
     spread = []
@@ -146,7 +145,7 @@ def _spread(turns: Array, force: Array, readings: Sequence[Reading]) -> list[Arr
     return spread
 
 
-def _clearly(better: Array, worse: Array) -> bool:
+def _is_clearly_better(better: Array, worse: Array) -> bool:
     difference = worse - better
     error = float(difference.std(ddof=1)) / len(difference) ** 0.5
     advantage = LIMITS.clear_advantage if len(better) >= LIMITS.enough_windows else LIMITS.few_advantage
@@ -173,7 +172,7 @@ def _integrate(turns: Array) -> Array:
     return matrix_from_quat(orientation)
 
 
-def _windows(imu: ImuRecording) -> tuple[Array, Array]:
+def _cut_windows(imu: ImuRecording) -> tuple[Array, Array]:
     """Turns (W, K, 3) in rad and mean specific forces (W, K, 3) in m/s2 of each step of each window without a gap."""
     start_s, end_s = max(imu.gyro_t_s[0], imu.accel_t_s[0]), min(imu.gyro_t_s[-1], imu.accel_t_s[-1])
     count = max(0, int((end_s - start_s) / LIMITS.window_s))
@@ -195,8 +194,6 @@ class PlausibleReadings:
     #: The median of |accelerometer| of a device that is carried or flown stays near gravity: sensors are off by up to 5
     #: %, and shaking raises it. Measured on the recordings this was tried on: 9.36 to 9.81, and 10.4 in strong shaking.
     smallest_gravity_m_s2: float = 7.0
-    #: The median of |accelerometer| of a device that is carried or flown stays near gravity: sensors are off by up to 5
-    #: %, and shaking raises it. Measured on the recordings this was tried on: 9.36 to 9.81, and 10.4 in strong shaking.
     largest_gravity_m_s2: float = 14.0
     #: The 5th percentile of |accelerometer| over its median: above 0.75 with gravity, below 0.45 without.
     steady_share: float = 0.6
@@ -209,64 +206,44 @@ class PlausibleReadings:
 PLAUSIBLE = PlausibleReadings()
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class RawImu:
-    """A recording whose numbers nobody has checked.
+def check_readings(imu: ImuRecording) -> ImuRecording:
+    """The recording, if its numbers can be rad/s and m/s2 of a working IMU.
 
-    Attributes
-    ----------
-    imu
-        In SI units, as far as the units are those that were declared.
-    path
-        Where it came from, for messages.
-    accel_path
-        Where the accelerometer came from; faults of it alone name this file. ``None``: ``path``, too.
-    gyro_axes, accel_axes
-        Mappings of axes that were applied, so that a message can name the ones to write in their place.
+    Raises
+    ------
+    FormatError
+        For deg/s, g, exchanged sensors, missing gravity, a dead sensor or axis, axes of one sensor that do not match
+        the other's. The message says what was found, what is expected, and what to write in capture.toml.
     """
+    for fault in find_faults(imu):
+        raise fault
+    return imu
 
-    imu: ImuRecording
-    path: Path
-    accel_path: Path | None = None
-    gyro_axes: Axes | None = None
-    accel_axes: Axes | None = None
 
-    def check(self) -> None:
-        """Refuse a recording whose numbers cannot be rad/s and m/s2 of a working IMU.
+def find_faults(imu: ImuRecording) -> Iterator[FormatError]:
+    """Everything that :func:`check_readings` would refuse a recording for, each with a code.
 
-        Raises
-        ------
-        FormatError
-            For deg/s, g, exchanged sensors, missing gravity, a dead sensor or axis, axes of one sensor that do not
-            match the other's. The message says what was found, what is expected, and what to write in capture.toml.
-        """
-        for problem in self.problems():
-            raise problem
-
-    def problems(self) -> Iterator[FormatError]:
-        """Everything that :meth:`check` would refuse a recording for, each with a code.
-
-        What follows from an earlier fault is not looked for: axes are compared in right units only.
-        """
-        imu, accel_path = self.imu, self.accel_path or self.path
-        sensors, units, axes = [partial(check_alive, imu.gyro_rad_s, "gyro", self.path)], [], []
-        if imu.has_accel:
-            sensors += [
-                partial(check_alive, imu.accel_m_s2, "accel", accel_path),
-                partial(check_exchanged, imu, self.path),
-            ]
-            units = [partial(check_gravity, np.linalg.norm(imu.accel_m_s2, axis=1), accel_path)]
-            axes = [partial(check_consistent, self)]
-        for checks in (sensors, [*units, partial(check_rates, imu.gyro_rad_s, self.path)], axes):
-            is_faulty = False
-            for check in checks:
-                try:
-                    check()
-                except FormatError as problem:
-                    is_faulty = True
-                    yield problem
-            if is_faulty:
-                return
+    What follows from an earlier fault is not looked for: axes are compared in right units only.
+    """
+    path, accel_path = imu.source.path, imu.source.path_of("accel")
+    sensors, units, axes = [partial(check_alive, imu.gyro_rad_s, "gyro", path)], [], []
+    if imu.has_accel:
+        sensors += [
+            partial(check_alive, imu.accel_m_s2, "accel", accel_path),
+            partial(check_exchanged, imu, path),
+        ]
+        units = [partial(check_gravity, np.linalg.norm(imu.accel_m_s2, axis=1), accel_path)]
+        axes = [partial(check_consistent, imu)]
+    for checks in (sensors, [*units, partial(check_rates, imu.gyro_rad_s, path)], axes):
+        is_faulty = False
+        for check in checks:
+            try:
+                check()
+            except FormatError as fault:
+                is_faulty = True
+                yield fault
+        if is_faulty:
+            return
 
 
 def check_exchanged(imu: ImuRecording, path: Path) -> None:
@@ -343,7 +320,7 @@ def check_rates(gyro_rad_s: Array, path: Path) -> None:
     raise FormatError(path, Fact("gyro-in-deg", seen_in="rates", **read))
 
 
-def check_consistent(raw: RawImu, *, confirmed: bool = False) -> None:
+def check_consistent(imu: ImuRecording, *, confirmed: bool = False) -> None:
     """Refuse a gyroscope that clearly fits the accelerometer better with other axes or in another unit.
 
     Parameters
@@ -351,7 +328,7 @@ def check_consistent(raw: RawImu, *, confirmed: bool = False) -> None:
     confirmed
         As of :func:`better_readings`.
     """
-    readings, path = better_readings(raw.imu, confirmed=confirmed), raw.path
+    readings, path = better_readings(imu, confirmed=confirmed), imu.source.path
     if not readings:
         return
     best = readings[0]
@@ -359,7 +336,7 @@ def check_consistent(raw: RawImu, *, confirmed: bool = False) -> None:
         raise FormatError(path, Fact("gyro-in-deg", seen_in="gravity"))
     if best.factor > 1:
         raise FormatError(path, Fact("gyro-not-in-deg", seen_in="gravity"))
-    stated = {"gyro": raw.gyro_axes, "accel": raw.accel_axes}
+    stated = {"gyro": imu.source.gyro_axes, "accel": imu.source.accel_axes}
 
     def setting(quantity: Quantity, matrix: Array) -> tuple[str, bool]:
         before = stated[quantity]

@@ -93,7 +93,7 @@ def _check_database(path: Path, size: int, mode: str) -> None:
         if mode == "message":
             held = 0
             for (data,) in database.execute("SELECT data FROM messages"):
-                held = _add(path, size, held, _unpacked(path, data, "zstd", _most(size) - held))
+                held = _add(path, size, held, _count_unpacked(path, data, "zstd", _limit_unpacked(size) - held))
 
 
 def _check_chunks(path: Path, file: IO[bytes], size: int, chunks: Iterator[_Packed], known: dict[_Packed, int]) -> None:
@@ -106,17 +106,19 @@ def _check_chunks(path: Path, file: IO[bytes], size: int, chunks: Iterator[_Pack
         if chunk not in known:
             file.seek(chunk.begin)
             packed = b"" if chunk.compression in _NOT_PACKED else file.read(chunk.size)
-            known[chunk] = _unpacked(path, packed, chunk.compression, _most(size) - held) if packed else chunk.size
+            known[chunk] = (
+                _count_unpacked(path, packed, chunk.compression, _limit_unpacked(size) - held) if packed else chunk.size
+            )
         held = _add(path, size, held, known[chunk])
 
 
-def _most(size: int) -> int:
+def _limit_unpacked(size: int) -> int:
     return _BOUNDS.anyway + _BOUNDS.ratio * size
 
 
 def _add(path: Path, size: int, held: int, more: int) -> int:
-    if held + more > _most(size):
-        raise FormatError(path, Fact("bag-out-of-proportion", most_mb=_most(size) >> 20, size=size))
+    if held + more > _limit_unpacked(size):
+        raise FormatError(path, Fact("bag-out-of-proportion", most_mb=_limit_unpacked(size) >> 20, size=size))
     return held + more
 
 
@@ -130,7 +132,7 @@ def _decompressors() -> dict[str, Callable[[], Any]]:
     return {"bz2": bz2.BZ2Decompressor, "lz4": LZ4FrameDecompressor, "zstd": ZstdDecompressor}
 
 
-def _unpacked(path: Path, packed: bytes, compression: str, most: int) -> int:
+def _count_unpacked(path: Path, packed: bytes, compression: str, most: int) -> int:
     """Number of bytes after unpacking, or more than ``most``."""
     made = _decompressors().get(compression)
     if made is None:

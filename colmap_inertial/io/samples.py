@@ -38,21 +38,43 @@ LIMITS = SampleLimits()
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Samples:
-    """Samples of one sensor, in order.
+    """Samples of one sensor, and how messages name them.
 
     Attributes
     ----------
+    path, sensor
+        The file and the sensor.
+    counted, numbers
+        ``"line"`` of the file or ``"sample"``, and (N,) which one each is.
     t_ns
-        (N,) strictly increasing.
+        (N,) stamps; strictly increasing once they are ordered.
     values
-        (N, 3) finite.
+        (N, 3) readings; finite once they are ordered.
     repairs
         What was sorted, merged or dropped.
     """
 
+    path: Path
+    sensor: str
+    counted: str
+    numbers: Int64Array
     t_ns: Int64Array
     values: Array
-    repairs: tuple[Fact, ...]
+    repairs: tuple[Fact, ...] = ()
+
+    def select(self, chosen: NDArray[np.bool_ | np.intp]) -> Samples:
+        """Some of the samples, or all in another order."""
+        return replace(self, numbers=self.numbers[chosen], t_ns=self.t_ns[chosen], values=self.values[chosen])
+
+    def add_repair(self, code: str, **values: object) -> Samples:
+        """The samples with a repair of theirs, whose other values are the file and the sensor."""
+        repair = Fact(code, file=self.path.name, sensor=self.sensor, **values)
+        return replace(self, repairs=(*self.repairs, repair))
+
+    def timing_error(self, code: str, at: int | None = None, **values: object) -> TimingError:
+        """The error for stamps that cannot be repaired, at a sample where there is one to look at."""
+        place = {} if at is None else {"counted": self.counted, "number": self.numbers[at]}
+        return refuse_stamps(Fact(code, path=str(self.path), sensor=self.sensor, **place, **values))
 
 
 def order_samples(
@@ -84,40 +106,19 @@ def order_samples(
     TimingError
         For stamps that run backwards, jump back, repeat often, or cannot be in the stated unit.
     """
-    what, counted = SENSOR_NAMES[quantity], "sample" if line_numbers is None else "line"
-    numbers = np.arange(1, len(t_ns) + 1) if line_numbers is None else line_numbers
-    values = convert_to_si(values, quantity, unit)
-    rows = _Rows(path=path, what=what, counted=counted, numbers=numbers, t_ns=t_ns, values=values)
-    rows = _merge(_sort(_drop_incomplete(rows)))
-    check_rate(path, what, rows.t_ns)
-    return Samples(t_ns=rows.t_ns, values=rows.values, repairs=rows.repairs)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Rows:
-    """One sensor's rows of a file, and how messages name them: by number of line or sample."""
-
-    path: Path
-    what: str
-    counted: str
-    numbers: Int64Array
-    t_ns: Int64Array
-    values: Array
-    repairs: tuple[Fact, ...] = ()
-
-    def taken(self, chosen: NDArray[np.bool_ | np.intp]) -> _Rows:
-        """Some of the rows, or all in another order."""
-        return replace(self, numbers=self.numbers[chosen], t_ns=self.t_ns[chosen], values=self.values[chosen])
-
-    def repaired(self, code: str, **values: object) -> _Rows:
-        """The rows with a repair of theirs, whose other values are the file and the sensor."""
-        repair = Fact(code, file=self.path.name, sensor=self.what, **values)
-        return replace(self, repairs=(*self.repairs, repair))
-
-    def refused(self, code: str, at: int | None = None, **values: object) -> TimingError:
-        """The error for stamps that cannot be repaired, at a row where there is one to look at."""
-        place = {} if at is None else {"counted": self.counted, "number": self.numbers[at]}
-        return refuse_stamps(Fact(code, path=str(self.path), sensor=self.what, **place, **values))
+    samples = Samples(
+        path=path,
+        sensor=SENSOR_NAMES[quantity],
+        counted="sample" if line_numbers is None else "line",
+        numbers=np.arange(1, len(t_ns) + 1) if line_numbers is None else line_numbers,
+        t_ns=t_ns,
+        values=convert_to_si(values, quantity, unit),
+    )
+    samples = _drop_incomplete(samples)
+    samples = _sort(samples)
+    samples = _merge_repeated(samples)
+    check_rate(path, samples.sensor, samples.t_ns)
+    return samples
 
 
 def refuse_stamps(fact: Fact) -> TimingError:
@@ -125,62 +126,63 @@ def refuse_stamps(fact: Fact) -> TimingError:
     return TimingError(fact, shown=str(fact))
 
 
-def _drop_incomplete(rows: _Rows) -> _Rows:
+def _drop_incomplete(samples: Samples) -> Samples:
     """The rows that hold a sample."""
     # Loggers that write sensors of different rates to one table leave the cells of the others empty.
-    absent = np.asarray(np.isnan(rows.values).all(axis=1))
+    absent = np.asarray(np.isnan(samples.values).all(axis=1))
     if absent.any():
-        rows = rows.taken(~absent).repaired("rows-without-sample", count=absent.sum(), rows=len(absent))
-    finite = np.asarray((np.abs(rows.values) < LIMITS.largest_reading).all(axis=1))
+        samples = samples.select(~absent).add_repair("rows-without-sample", count=absent.sum(), rows=len(absent))
+    finite = np.asarray((np.abs(samples.values) < LIMITS.largest_reading).all(axis=1))
     if not finite.all():
-        missing, first = int((~finite).sum()), int(rows.numbers[np.argmin(finite)])
+        missing, first = int((~finite).sum()), int(samples.numbers[np.argmin(finite)])
         if missing > LIMITS.harmless_share * len(finite):
-            lacking = Fact("rows-lack-values", count=missing, rows=len(finite), sensor=rows.what)
-            raise FormatError(rows.path, lacking, line=first if rows.counted == "line" else None)
-        rows = rows.taken(finite).repaired("rows-without-value", count=missing, counted=rows.counted, first=first)
-    if len(rows.t_ns) < 2:
-        raise FormatError(rows.path, Fact("too-few-samples", count=len(rows.t_ns), sensor=rows.what))
-    return rows
+            lacking = Fact("rows-lack-values", count=missing, rows=len(finite), sensor=samples.sensor)
+            raise FormatError(samples.path, lacking, line=first if samples.counted == "line" else None)
+        samples = samples.select(finite)
+        samples = samples.add_repair("rows-without-value", count=missing, counted=samples.counted, first=first)
+    if len(samples.t_ns) < 2:
+        raise FormatError(samples.path, Fact("too-few-samples", count=len(samples.t_ns), sensor=samples.sensor))
+    return samples
 
 
-def _sort(rows: _Rows) -> _Rows:
-    """The rows in order of time."""
-    late_ns = np.maximum.accumulate(rows.t_ns) - rows.t_ns
+def _sort(samples: Samples) -> Samples:
+    """The samples in order of time."""
+    late_ns = np.maximum.accumulate(samples.t_ns) - samples.t_ns
     if not late_ns.any():
-        return rows
-    if (np.diff(rows.t_ns) < 0).mean() > 0.5:
-        raise rows.refused("stamps-reversed")
+        return samples
+    if (np.diff(samples.t_ns) < 0).mean() > 0.5:
+        raise samples.timing_error("stamps-reversed")
     if late_ns.max() > LIMITS.latest_arrival_ns:
         first = int(np.argmax(late_ns > LIMITS.latest_arrival_ns))
-        raise rows.refused("stamps-jump-back", first, behind_s=late_ns[first] * 1e-9)
-    return rows.taken(np.argsort(rows.t_ns, kind="stable")).repaired("rows-sorted", count=np.sum(late_ns > 0))
+        raise samples.timing_error("stamps-jump-back", first, behind_s=late_ns[first] * 1e-9)
+    return samples.select(np.argsort(samples.t_ns, kind="stable")).add_repair("rows-sorted", count=np.sum(late_ns > 0))
 
 
-def _merge(rows: _Rows) -> _Rows:
-    """One row for each stamp: the average of those that have it."""
-    same = np.diff(rows.t_ns) == 0
+def _merge_repeated(samples: Samples) -> Samples:
+    """One sample for each stamp: the average of those that have it."""
+    same = np.diff(samples.t_ns) == 0
     if not same.any():
-        return rows
-    differs = same & (rows.values[1:] != rows.values[:-1]).any(axis=1)
+        return samples
+    differs = same & (samples.values[1:] != samples.values[:-1]).any(axis=1)
     n_equal, n_different = int((same & ~differs).sum()), int(differs.sum())
-    if n_different > LIMITS.harmless_share * len(rows.t_ns):
+    if n_different > LIMITS.harmless_share * len(samples.t_ns):
         first_off = 1 + int(np.argmax(differs))
-        raise rows.refused("stamps-too-coarse", first_off, repeated=n_different, samples=len(rows.t_ns))
+        raise samples.timing_error("stamps-too-coarse", first_off, repeated=n_different, samples=len(samples.t_ns))
     group = np.concatenate([[0], np.cumsum(~same)])
     first = np.concatenate([[0], np.flatnonzero(~same) + 1])
     if len(first) < 2:
-        raise TimingError(Fact("one-stamp-for-all", path=str(rows.path), sensor=rows.what))
-    values = rows.values[first]
+        raise TimingError(Fact("one-stamp-for-all", path=str(samples.path), sensor=samples.sensor))
+    values = samples.values[first]
     mixed = np.unique(group[1:][differs])
     if len(mixed):
         sums = np.zeros_like(values)
-        np.add.at(sums, group, rows.values)
+        np.add.at(sums, group, samples.values)
         values[mixed] = sums[mixed] / np.bincount(group)[mixed, None]
-    rows = replace(rows, numbers=rows.numbers[first], t_ns=rows.t_ns[first], values=values)
+    samples = replace(samples, numbers=samples.numbers[first], t_ns=samples.t_ns[first], values=values)
     for code, count in (("rows-merged", n_equal), ("rows-averaged", n_different)):
         if count:
-            rows = rows.repaired(code, count=count)
-    return rows
+            samples = samples.add_repair(code, count=count)
+    return samples
 
 
 def nearest(t_ns: Int64Array, at_ns: Int64Array) -> IndexArray:

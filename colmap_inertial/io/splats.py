@@ -122,13 +122,15 @@ class SplatMover:
         """Move them."""
         scale = self._similarity.scale
         with np.errstate(over="ignore", invalid="ignore"):
-            _put(rows, _POSITION, scale * _get(rows, _POSITION) @ self._rotation.T + self._similarity.translation_m)
+            _put_columns(
+                rows, _POSITION, scale * _get(rows, _POSITION) @ self._rotation.T + self._similarity.translation_m
+            )
             if self._normal:
-                _put(rows, self._normal, _get(rows, self._normal) @ self._rotation.T)
-            _put(rows, self._sizes, _get(rows, self._sizes) + math.log(scale))
-            _put(rows, self._lengths, scale * _get(rows, self._lengths))
+                _put_columns(rows, self._normal, _get(rows, self._normal) @ self._rotation.T)
+            _put_columns(rows, self._sizes, _get(rows, self._sizes) + math.log(scale))
+            _put_columns(rows, self._lengths, scale * _get(rows, self._lengths))
             turned = quat_multiply(self._similarity.rotation_xyzw, _get(rows, _ROTATION)[:, [1, 2, 3, 0]])
-            _put(rows, _ROTATION, turned[:, [3, 0, 1, 2]])
+            _put_columns(rows, _ROTATION, turned[:, [3, 0, 1, 2]])
             if self._rest:
                 # by channel, then by coefficient
                 values = _get(rows, self._rest).reshape(len(rows), 3, -1)
@@ -137,7 +139,7 @@ class SplatMover:
                     part = slice(first, first + len(band))
                     values[:, :, part] = values[:, :, part] @ band.T
                     first += len(band)
-                _put(rows, self._rest, values.reshape(len(rows), -1))
+                _put_columns(rows, self._rest, values.reshape(len(rows), -1))
 
 
 def _get(rows: NDArray[np.void], names: tuple[str, ...] | list[str]) -> Array:
@@ -147,6 +149,6 @@ def _get(rows: NDArray[np.void], names: tuple[str, ...] | list[str]) -> Array:
     return values
 
 
-def _put(rows: NDArray[np.void], names: tuple[str, ...] | list[str], values: Array) -> None:
+def _put_columns(rows: NDArray[np.void], names: tuple[str, ...] | list[str], values: Array) -> None:
     for i, name in enumerate(names):
         rows[name] = values[:, i]

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.axes import Axes
 from colmap_inertial.core.errors import FormatError, MissingExtraError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import FrameLog, ImuRecording
@@ -30,7 +31,7 @@ from colmap_inertial.io.files import first_line
 from colmap_inertial.io.imu_text import build_recording, order_rows
 from colmap_inertial.io.samples import Samples, order_samples
 from colmap_inertial.io.tables import read_table
-from colmap_inertial.io.units import SENSOR_NAMES, Axes, DeclaredUnits, Quantity
+from colmap_inertial.io.units import SENSOR_NAMES, DeclaredUnits, Quantity
 
 #: Names of logs of counts, and the columns with which they begin; the columns that tell Mobius by itself.
 _NAMES = re.compile(r"(RC_GyroData|gyroDat[ae]|Thumb).*\.csv", re.IGNORECASE)
@@ -104,7 +105,7 @@ def read_telemetry(path: Path, units: DeclaredUnits) -> ImuRecording:
     """
     if path.suffix.lower() == ".csv":
         return _read_counts(path, units)
-    camera, groups = _parsed(path)
+    camera, groups = _parse_telemetry(path)
     gyro = _samples(path, groups, "gyro", units.gyro)
     if gyro is None:
         raise FormatError(path, Fact("telemetry-without-gyroscope", camera=camera))
@@ -136,7 +137,7 @@ def read_telemetry_frames(path: Path) -> FrameLog | None:
     """The readout that an Insta360 states of its frames; ``None`` where it states none."""
     if path.suffix.lower() == ".csv":
         return None
-    _, groups = _parsed(path)
+    _, groups = _parse_telemetry(path)
     metadata = groups.get("Default", {}).get("Metadata")
     readout_s = 1e-3 * float(metadata.get("rolling_shutter_time") or 0.0) if isinstance(metadata, dict) else 0.0
     if not 0 < readout_s < _LIMITS.readout_s:
@@ -144,7 +145,7 @@ def read_telemetry_frames(path: Path) -> FrameLog | None:
     return FrameLog(t_s=np.zeros(0), readout_s=readout_s)
 
 
-def _parsed(path: Path) -> tuple[str, dict[str, dict[str, Any]]]:
+def _parse_telemetry(path: Path) -> tuple[str, dict[str, dict[str, Any]]]:
     """The camera's name, and what telemetry-parser found, by group and tag.
 
     It runs in a process of its own: on damaged files it may abort, which no exception tells of.

@@ -68,7 +68,7 @@ def _append_entries(original: bytes, entries: _Values, source: str, target: str,
         value = field[:size] if size <= 4 else original[at : at + size]
         if len(value) < size:
             continue
-        value = _reordered(value, each // 2 if kind in _LAYOUT.fractions else each, source != target)
+        value = _reorder_bytes(value, each // 2 if kind in _LAYOUT.fractions else each, source != target)
         if size > 4:
             value = struct.pack(target + "I", _append(value, out))
         made[tag] = struct.pack(target + "HHI", tag, kind, count) + value.ljust(4, b"\0")
@@ -87,7 +87,7 @@ def _append(data: bytes, out: bytearray) -> int:
     return at
 
 
-def _reordered(value: bytes, part: int, turned: bool) -> bytes:
+def _reorder_bytes(value: bytes, part: int, turned: bool) -> bytes:
     if not turned or part == 1:
         return value
     return b"".join(value[i : i + part][::-1] for i in range(0, len(value), part))

@@ -56,8 +56,8 @@ def read_video_imu_capture(path: Path, units: DeclaredUnits) -> ImuRecording:
             elif number in parts and isinstance(value, tuple):
                 parts[number] += data[value[0] : value[1]]
             elif number in parts:
-                raise _damaged(file, at, Fact("sample-not-three-numbers"))
-        t_ns.append(_signed(stamp))
+                raise _damage_error(file, at, Fact("sample-not-three-numbers"))
+        t_ns.append(_convert_to_signed(stamp))
         rows["gyro"].append(parts[2])
         rows["accel"].append(parts[4])
     stamps = np.array(t_ns, dtype=np.int64)
@@ -89,10 +89,10 @@ def read_video_imu_capture_frames(path: Path) -> FrameLog:
             if number not in wanted:
                 continue
             if isinstance(value, tuple):
-                raise _damaged(file, at, Fact("frame-number-not-one"))
-            row[wanted[number]] = _float32(value) if number == 8 else float(_signed(value))
+                raise _damage_error(file, at, Fact("frame-number-not-one"))
+            row[wanted[number]] = _float32(value) if number == 8 else float(_convert_to_signed(value))
             if number == 1:
-                t_ns.append(_signed(value))
+                t_ns.append(_convert_to_signed(value))
         rows.append(row)
     if len(t_ns) != len(rows) or not rows:
         raise FormatError(file, Fact("frame-without-time" if rows else "no-frames"))
@@ -163,9 +163,9 @@ def _fields(file: Path, data: bytes, begin: int, end: int) -> Iterator[tuple[int
         elif kind in (1, 5):
             length = 8 if kind == 1 else 4
         else:
-            raise _damaged(file, start, Fact("wire-type", type=kind))
+            raise _damage_error(file, start, Fact("wire-type", type=kind))
         if at + length > end:
-            raise _damaged(file, start, Fact("field-beyond-message", length=length, left=end - at))
+            raise _damage_error(file, start, Fact("field-beyond-message", length=length, left=end - at))
         yield key >> 3, (at, at + length) if kind == 2 else int.from_bytes(data[at : at + length], "little"), start
         at += length
 
@@ -180,10 +180,10 @@ def _varint(file: Path, data: bytes, at: int, end: int) -> tuple[int, int]:
         if byte < 0x80:
             return value & (_WRAP - 1), at
         shift += 7
-    raise _damaged(file, start, Fact("number-without-end"))
+    raise _damage_error(file, start, Fact("number-without-end"))
 
 
-def _signed(value: int) -> int:
+def _convert_to_signed(value: int) -> int:
     return value - _WRAP if value >= _SIGN else value
 
 
@@ -191,7 +191,7 @@ def _float32(bits: int) -> float:
     return float(np.array([bits & 0xFFFFFFFF], dtype=np.uint32).view(np.float32)[0])
 
 
-def _damaged(file: Path, at: int, fault: Fact) -> FormatError:
+def _damage_error(file: Path, at: int, fault: Fact) -> FormatError:
     return FormatError(file, Fact("damaged-at-byte", byte=at, fault=fault))
 
 

@@ -14,7 +14,7 @@ def toml_too_long(count: int, most: int) -> str:
 
 @message(example={"most": 32})
 def toml_key_too_deep(most: int) -> str:
-    return f"has a key of more than {most} parts with dots between them"
+    return f"has a key of more than {most} dotted parts"
 
 
 @message(example={"detail": "Invalid value (at line 3, column 8)"})
@@ -29,7 +29,7 @@ def not_a_table(name: str) -> str:
 
 @message(example={"found": "3"})
 def not_a_text(found: str) -> str:
-    return f"must be a text in quotes, found {found}"
+    return f"must be a string in quotes, found {found}"
 
 
 @message(example={"allowed": ("down", "up"), "found": "'left'"})
@@ -113,26 +113,26 @@ def sheet_gives_intrinsics(others: Sequence[str]) -> str:
     return "gives the intrinsics"
 
 
-state("main-camera-missing", "belongs to [images] or [video], the main camera's, which is missing")
-state("reference-pictures-missing", "belongs to [images], the folder of the reference's pictures, which is missing")
-state("short-exposures-missing", "belongs to [images], the folder of the short exposures, which is missing")
+state("main-camera-missing", "needs [images] or [video] of the main camera, which is missing")
+state("reference-pictures-missing", "needs [images], the folder of the reference's images, which is missing")
+state("short-exposures-missing", "needs [images], the folder of the short exposures, which is missing")
 
 
 @message(example={"key": "path"})
 def belongs_to_missing(key: str) -> str:
-    return f"belongs to {key}, which is missing"
+    return f"needs {key}, which is missing"
 
 
-state("translation-said-twice", "and the last column of cam_from_imu say the same", advice="leave one out")
+state("translation-said-twice", "and the last column of cam_from_imu give the same value", advice="leave one out")
 
 
 @message(advice="leave one out", example={"other": "rate_hz"})
 def said_twice(other: str) -> str:
-    return f"and {other} say the same"
+    return f"and {other} give the same value"
 
 
-state("same-pictures-as-reference", "has the same pictures as the reference", advice="give folder or rename")
-state("same-pictures-as-images", "has the same pictures as [images]", advice="give folder or rename")
+state("same-pictures-as-reference", "has the same images as the reference", advice="give folder or rename")
+state("same-pictures-as-images", "has the same images as [images]", advice="give folder or rename")
 
 
 @message(example={"units": ("s", "ns", "date"), "columns": 2, "found": "'h'"})
@@ -152,10 +152,10 @@ state("recipe-without-capture", "holds a recipe, which `colmap-inertial simulate
 state(
     "no-capture-folder",
     (
-        "is no capture by itself: it holds no capture.toml, and is neither an ASL/EuRoC dataset "
+        "is not a capture: it holds no capture.toml, and is neither an ASL/EuRoC dataset "
         "(cam0/data.csv, cam0/data/, imu0/data.csv) nor an InertialScale folder"
     ),
-    advice="describe it in a capture.toml (pictures without an IMU: reconstruct --scale-from target or distance)",
+    advice="describe it in a capture.toml (images without an IMU: reconstruct --scale-from target or distance)",
 )
 
 
@@ -166,7 +166,7 @@ def rename_fits_not(old: str, name: str) -> str:
 
 @message(example={"found": "'a'"})
 def not_a_rename(found: str) -> str:
-    return f"must be two texts, what is replaced by what; found {found}"
+    return f"must be two strings, the old and the new part of the name; found {found}"
 
 
 @message(example={"found": 1})
@@ -179,11 +179,11 @@ state(
     "is that of [images] for the reference, the first aperture",
     advice="leave it and rename out",
 )
-state("no-picture-of-size", "holds no picture that would give the size, which the calibration does not")
+state("no-picture-of-size", "holds no image to take the size from, which the calibration does not give")
 
 
 @message(
-    advice="where both kinds lie in one folder, let pattern under [images] take the short ones alone",
+    advice="if both kinds are in one folder, let pattern under [images] match the short ones only",
     example={"old": "S", "name": "a.jpg"},
 )
 def short_exposure_not_renamed(old: str, name: str) -> str:
@@ -195,7 +195,7 @@ def short_exposure_not_renamed(old: str, name: str) -> str:
     example={"name": "S1.jpg"},
 )
 def long_exposure_missing(name: str) -> str:
-    return f"no such picture: the long exposure of {name} is missing"
+    return f"no such image: the long exposure of {name} is missing"
 
 
 @message(example={"times": "times.csv", "name": "L1.jpg", "short": "S1.jpg"})
@@ -219,7 +219,7 @@ state("calibration-without-unit", "holds lengths without a unit", advice='give u
 
 @message(advice="each has its own", example={"name": "cam1"})
 def calibrated_camera_twice(name: str) -> str:
-    return f"{name!r} is that of another camera, too"
+    return f"{name!r} is also that of another camera"
 
 
 @message(advice="give camera, or reference under [rig]", example={"name": "cam0"})
@@ -232,7 +232,7 @@ state("pose-not-4x4", "must be a 4x4 matrix, with the translation in metres")
 
 @message(example={"name": "cam 1"})
 def camera_name_unsuited(name: str) -> str:
-    return f"the camera's name {name!r} becomes a folder: letters, digits, - and _ alone"
+    return f"the camera's name {name!r} becomes a folder: use only letters, digits, - and _"
 
 
 @message(advice="describe each camera in a table of its own", example={"name": "cam1"})
@@ -250,7 +250,7 @@ def not_three_columns(found: str) -> str:
     return f"must be three names, or numbers counted from 1, of x, y and z; found {found}"
 
 
-state("columns-repeated", "must be three columns, none of them twice, and another than time")
+state("columns-repeated", "must be three different columns, none of them the time")
 
 
 @message(example={"found": "0"})
@@ -258,7 +258,7 @@ def not_a_column(found: str) -> str:
     return f"must be a column's name, or its number counted from 1; found {found}"
 
 
-state("counts-need-one-column", "belongs to one column of time without time_unit")
+state("counts-need-one-column", "is for one time column without time_unit")
 
 
 @message(example={"found": "'GYRO'"})
@@ -271,7 +271,7 @@ def not_a_row_choice(found: str) -> str:
     example={"axes": "-x,y,z"},
 )
 def axes_mirror(axes: str) -> str:
-    return f'"{axes}" turns a right-handed frame into a left-handed one'
+    return f'"{axes}" turn a right-handed frame into a left-handed one'
 
 
 @message(example={"axes": "x,y,z"})
@@ -314,7 +314,7 @@ def pattern_outside(found: str) -> str:
 
 @message(example={"pattern": "../*.jpg"})
 def pattern_leads_out(pattern: str) -> str:
-    return f"the pattern {pattern!r} leads out of it"
+    return f"the pattern {pattern!r} leads outside of it"
 
 
 state("capture-without-frames", "describes no frames", advice="add [images] or [video]")

@@ -16,9 +16,9 @@ def _listed(numbers: Sequence[float]) -> str:
 # models
 
 
-@message(advice="one of them must go", example={"model": 0, "provenance": "inertial scale"})
+@message(advice="remove one of them", example={"model": 0, "provenance": "inertial scale"})
 def scaled_before(model: int, provenance: str) -> str:
-    return f"model {model} was scaled by a stage before ({provenance})"
+    return f"model {model} was already scaled by an earlier stage ({provenance})"
 
 
 state("no-model-here", "no COLMAP model here (cameras, images and points3D, .bin or .txt)")
@@ -59,17 +59,17 @@ def camera_size_impossible(camera: int, width: int, height: int) -> str:
 
 @message(example={"camera": 1, "model": "PINHOLE", "names": "fx, fy, cx, cy", "params": (1000000000.0, 1.0, 0.0, 0.0)})
 def camera_impossible(camera: int, model: str, names: str, params: Sequence[float]) -> str:
-    return f"camera {camera} ({model}) cannot be: {names} = {_listed(params)}"
+    return f"camera {camera} ({model}) has impossible parameters: {names} = {_listed(params)}"
 
 
 @message(example={"image": "a.jpg", "numbers": (0.0, 0.0, 0.0, 0.0, 1.0, 2.0, 3.0)})
 def pose_impossible(image: str, numbers: Sequence[float]) -> str:
-    return f"the pose of {image!r} cannot be: {_listed(numbers)}"
+    return f"the pose of {image!r} is impossible: {_listed(numbers)}"
 
 
 @message(example={"rig": 1, "sensor": 2})
 def rig_pose_impossible(rig: int, sensor: int) -> str:
-    return f"rig {rig}: the pose of sensor {sensor} cannot be"
+    return f"rig {rig}: the pose of sensor {sensor} is impossible"
 
 
 @message(example={"point": 1, "xyz": (1e30, 0.0, 0.0)})
@@ -107,7 +107,7 @@ def blob_of_other_length(what: str, count: int) -> str:
     return f"damaged: a {what} is not {count} numbers"
 
 
-_UNREADABLE = "COLMAP cannot read its database; put it back as it was, or begin anew in another folder"
+_UNREADABLE = "COLMAP cannot read its database; restore it, or start again in another folder"
 state("database-unreadable", _UNREADABLE)
 
 
@@ -147,7 +147,7 @@ def bounding_box(key: str) -> str:
 
 @message(example={"key": "depth_min"})
 def setting_no_number(key: str) -> str:
-    return f"{key} is no number"
+    return f"{key} is not a number"
 
 
 @message(example={"text": "b'v 1 2 x'"})
@@ -157,22 +157,22 @@ def not_three_numbers(text: str) -> str:
 
 state("vertex-incomplete", "a vertex or normal without three numbers")
 
-state("line-without-end", "a line without end")
+state("line-without-end", "a line does not end")
 
 state("changed-while-read", "was changed while it was read")
 
-state("scale-not-above-zero", "has a scale that is no number above 0", advice=_KEEP)
+state("scale-not-above-zero", "has a scale that is not a number above 0", advice=_KEEP)
 
 
 @message(advice="leave it out with --keep", example={"unit": "parsec"})
 def unit_no_length(unit: str) -> str:
-    return f"the unit {unit!r} is no length"
+    return f"the unit {unit!r} is not a length"
 
 
 state("not-a-vector", "a vector that is not three numbers", advice=_KEEP)
 
 
-state("not-a-transform", "a transform that is no matrix of 3 or 4 rows of 4 numbers", advice=_KEEP)
+state("not-a-transform", "a transform that is not a matrix of 3 or 4 rows of 4 numbers", advice=_KEEP)
 
 # the copy of a project
 
@@ -198,9 +198,7 @@ def copy_not_written(path: str, why: Said, name: str | None) -> str:
 state("link-leads-back", "this link leads back to a folder above it")
 
 
-@message(
-    advice="--follow-links (follow_links=True) takes what it leads to into the copy", example={"target": "/data/images"}
-)
+@message(advice="--follow-links (follow_links=True) copies what it points to", example={"target": "/data/images"})
 def link_out_not_followed(target: str) -> str:
     return f"is a link out of the project, to {target}"
 
@@ -224,36 +222,38 @@ state("no-such-folder", "no such folder")
 
 state(
     "owner-unknown",
-    "it cannot be told in which sub-model's units this is",
+    "it is not known in which sub-model's units this is",
     advice="move it into its dense workspace or leave it out with --keep",
 )
 
 
 @message(example={"folder": "out/sparse/0", "detail": "truncated"})
 def model_not_whole(folder: str, detail: str) -> str:
-    return f"{folder}: COLMAP did not write the model whole; is the disk full? ({detail})"
+    return f"{folder}: COLMAP wrote the model incompletely; is the disk full? ({detail})"
 
 
-state("workspace-of-several-models", "this dense workspace holds more than one model: it cannot be told whose")
+state(
+    "workspace-of-several-models", "this dense workspace holds more than one model: it is not known to which it belongs"
+)
 
-state("depth-maps-of-several-models", "depth maps beside several sub-models: it cannot be told whose they are")
+state("depth-maps-of-several-models", "depth maps beside several sub-models: it is not known to which they belong")
 
 
 @message(advice="leave others out with --keep", example={"folders": ("a", "b")})
 def several_candidates(folders: Sequence[str]) -> str:
-    return f"it cannot be told which of these is COLMAP's model: {', '.join(folders)}"
+    return f"it is not known which of these is COLMAP's model: {', '.join(folders)}"
 
 
 @message(example={"folders": ("sparse/0", "sparse/1")})
 def belongs_to_several(folders: Sequence[str]) -> str:
-    return f"it cannot be told whether this belongs to {' and '.join(folders)}"
+    return f"it is not known which of {' and '.join(folders)} this belongs to"
 
 
 @message(advice="leave it out with --keep", example={"other": "sparse/0"})
 def model_elsewhere(other: str) -> str:
     return (
-        f"its images are those of {other}, but its cameras stand elsewhere: it was made from another model, "
-        "whose scale is another"
+        f"its images are those of {other}, but its cameras are elsewhere: it was made from another model, "
+        "with another scale"
     )
 
 
@@ -283,14 +283,14 @@ state("scale-not-a-number", "scale must be a number")
 
 @message(example={"name": "provenance"})
 def field_not_text(name: str) -> str:
-    return f"{name} must be text"
+    return f"{name} must be a string"
 
 
 @message(example={"model": 0, "numbers": (1, 2)})
 def joined_of_models(model: int, numbers: Sequence[int]) -> str:
     return (
-        f"model {model} was joined of the models {', '.join(map(str, numbers))}, which cannot be taken apart again: "
-        "the project that it was made from is as it was; --join off keeps its models apart"
+        f"model {model} was joined from the models {', '.join(map(str, numbers))} and cannot be split again: "
+        "the original project is unchanged; --join off keeps its models apart"
     )
 
 
@@ -311,7 +311,7 @@ def fields_not_numbers(names: Sequence[str]) -> str:
     return f"{' and '.join(names)} must be numbers or null"
 
 
-state("reasons-not-texts", "reasons must be a list of texts")
+state("reasons-not-texts", "reasons must be a list of strings")
 
 
 @message(example={"verdict": "good"})

@@ -65,7 +65,7 @@ state("needs-open3d", "dense_options.mesh tsdf is made by open3d")
 state(
     "memory-used-up",
     "the memory is used up",
-    advice="close other programs, or allow smaller pictures or fewer processes",
+    advice="close other programs, or allow smaller images or fewer processes",
     joint=": ",
 )
 state(

@@ -9,13 +9,13 @@ from colmap_inertial.messages import Said, message, state
 # what the gate of all readers says
 
 state("is-damaged", "is damaged")
-state("changed-record", "was damaged since it was written", advice="remove it and start again")
-state("no-result-of-reconstruct", "is no result of `colmap-inertial reconstruct`")
+state("changed-record", "was changed since it was written", advice="remove it and start again")
+state("no-result-of-reconstruct", "is not a result of `colmap-inertial reconstruct`")
 
 
 @message(example={"names": ("result.json", "report_data")})
 def changed_records(names: Sequence[str]) -> str:
-    return f"its {', '.join(names[:-1])} or {names[-1]} was damaged since it was written"
+    return f"its {', '.join(names[:-1])} or {names[-1]} was changed since it was written"
 
 
 @message(example={"what": "a calibration"})
@@ -51,7 +51,7 @@ def cannot_be_written(path: str, detail: str) -> str:
 
 @message(example={"what": "calibration", "count": 600000})
 def too_many_characters(what: str, count: int) -> str:
-    return f"is no {what}: its {count} characters are more than any has"
+    return f"is not a {what}: its {count} characters are too many"
 
 
 @message(example={"detail": "mapping values are not allowed here"})
@@ -105,7 +105,7 @@ def link_in_output(target: str) -> str:
 state("is-empty", "is empty")
 state("name-absolute", "is absolute")
 state("name-leads-out", 'leads out of its folder by ".."')
-state("name-unprintable", "is no UTF-8, or holds a control character")
+state("name-unprintable", "is not UTF-8, or holds a control character")
 
 
 @message(example={"longest": 255})
@@ -119,7 +119,9 @@ def unsafe_name(name: str, fault: Said) -> str:
 
 
 state(
-    "unprintable-path", "its name, or a folder's above it, is no UTF-8 or holds a control character", advice="rename it"
+    "unprintable-path",
+    "its name, or that of a folder above it, is not UTF-8 or holds a control character",
+    advice="rename it",
 )
 
 
@@ -142,7 +144,7 @@ def code_in_database(fault: Said, kind: str, name: str) -> str:
 
 @message(example={"fault": _UNREAD})
 def database_takes_long(fault: Said) -> str:
-    return f"{fault.with_advice}: it takes longer than its size explains"
+    return f"{fault.with_advice}: reading takes longer than its size explains"
 
 
 @message(example={"fault": _UNREAD, "detail": "database disk image is malformed"})
@@ -160,4 +162,4 @@ def damaged_at_byte(byte: int, fault: Said) -> str:
 
 @message(example={"text": "NaN"})
 def not_a_known_number(text: str) -> str:
-    return f"{text} is not a number that is known here"
+    return f"{text} is not a supported number"

@@ -11,21 +11,20 @@ from colmap_inertial.messages import Said, message, state
 from colmap_inertial.messages.recording import spans_and_rates
 
 _ACCELERATE = (
-    "record a clip in which the camera itself speeds up and slows down: swing it back and forth by 20 cm or more, "
-    "a few times a second or so, for ten seconds or longer"
+    "record a clip in which the camera accelerates: swing it back and forth by 20 cm or more, about once a second or "
+    "faster, for ten seconds or longer"
 )
 _TURN_THROUGHOUT = (
-    "record again and turn the camera about all three axes while recording, all through; the axes of camera and "
-    "gyroscope cannot be compared without, unless a livelier recording of the device gives them (align, then "
-    "--calibration)"
+    "record again and rotate the camera about all three axes throughout; camera and gyroscope cannot be aligned "
+    "without rotation, unless another recording of the device gives their alignment (align, then --calibration)"
 )
 _MAP_AGAIN = (
     "look at these images: repeated texture, blur, or something that moved; leave them out, or map again with more "
     "overlap between images"
 )
 _READ_AGAIN = "correct this and run diagnose again: checks that depend on it were skipped"
-_REPAIRED = "nothing: it was repaired while reading; if there is much of it, look at the logger"
-_PAUSES = "the scale bridges it, less surely; close other apps, or log to a faster card, and record again"
+_REPAIRED = "nothing: repaired while reading; if it is frequent, check the logger"
+_PAUSES = "the scale bridges it with a larger uncertainty; close other apps or log to a faster card, and record again"
 _COUNTS = "for raw counts zero and counts_per_unit, by the sensor's data sheet, in capture.toml"
 _IN_G = 'set unit = "g" under [imu.accel] in capture.toml'
 _IN_M_S2 = 'set unit = "m/s2" under [imu.accel] in capture.toml'
@@ -39,12 +38,12 @@ _UNITS = {"gyroscope": "rad/s", "accelerometer": "m/s2"}
 
 def _rates(largest_rad_s: float, median_rad_s: float, sensor_ends_rad_s: float) -> str:
     return (
-        f"the gyroscope reads up to {largest_rad_s:.4g} rad/s, half of the time above {median_rad_s:.3g} (a hand "
-        f"reaches about 5, a sensor ends at {sensor_ends_rad_s:g})"
+        f"the gyroscope reads up to {largest_rad_s:.4g} rad/s, with a median of {median_rad_s:.3g} (hand-held motion "
+        f"reaches about 5, a sensor's range ends at {sensor_ends_rad_s:g})"
     )
 
 
-_GRAVITY_MOVES = "seen from the turning gyroscope gravity does not stand still, but would"
+_GRAVITY_MOVES = "rotated by the gyroscope, gravity does not stay fixed, but it would"
 
 
 def _advise_deg(seen_in: str, **_: float) -> str:
@@ -78,8 +77,8 @@ def gyro_in_deg(
     if seen_in == "camera":
         return f"the gyroscope turns as the camera does, but {gain:.1f} times as far: its numbers are in deg/s"
     return (
-        f"half of the time the gyroscope turns faster than {median_rad_s:.2g} rad/s, as nobody films: the numbers are "
-        "probably in deg/s"
+        f"the gyroscope's median rate is {median_rad_s:.2g} rad/s, too fast for filming: the numbers are "
+        f"probably in deg/s"
     )
 
 
@@ -93,8 +92,8 @@ def gyro_not_in_deg(seen_in: str, gain: float = 1.0, turning_rad_s: float = 0.0,
             "were deg/s"
         )
     return (
-        f"the gyroscope turns by {turning_rad_s:.2g} rad/s and scatters by {scatter_rad_s:.1g} rad/s from sample to "
-        "sample, less than sensors do: rad/s were probably converted as if they were deg/s"
+        f"the gyroscope's rate is {turning_rad_s:.2g} rad/s with a noise of {scatter_rad_s:.1g} rad/s, less than any "
+        "sensor has: rad/s were probably converted as if they were deg/s"
     )
 
 
@@ -103,7 +102,7 @@ def gyro_not_in_deg(seen_in: str, gain: float = 1.0, turning_rad_s: float = 0.0,
     example={"largest_rad_s": 9000.0, "median_rad_s": 800.0, "sensor_ends_rad_s": 70.0},
 )
 def gyro_unit(largest_rad_s: float, median_rad_s: float, sensor_ends_rad_s: float) -> str:
-    return f"{_rates(largest_rad_s, median_rad_s, sensor_ends_rad_s)}, too much for deg/s, too: these are raw counts"
+    return f"{_rates(largest_rad_s, median_rad_s, sensor_ends_rad_s)}, too large even for deg/s: these are raw counts"
 
 
 def _length(median_m_s2: float) -> str:
@@ -232,8 +231,8 @@ def axes_mirrored(gyro: Setting, others: tuple[tuple[Setting, ...], ...]) -> str
 
 state(
     "no-accelerometer",
-    "the recording holds a gyroscope alone",
-    advice="record the accelerometer too, gravity included; without it there is deblurring, but no scale",
+    "the recording has a gyroscope but no accelerometer",
+    advice="record the accelerometer too, gravity included; without it, frames can be deblurred but not scaled",
 )
 
 
@@ -243,7 +242,7 @@ state(
 )
 def saturated(sensor: str, samples: int, of: int, axes: str, counts: tuple[int, ...], share: float) -> str:
     by_axis = ", ".join(f"{axis}: {count}" for axis, count in zip(axes, counts, strict=True))
-    return f"{samples} of {of} {sensor} samples stand at the end of the range ({by_axis})"
+    return f"{samples} of {of} {sensor} samples are saturated ({by_axis})"
 
 
 @message(
@@ -251,7 +250,7 @@ def saturated(sensor: str, samples: int, of: int, axes: str, counts: tuple[int, 
     example={"sensor": "gyroscope", "rate_hz": 25},
 )
 def rate_too_low(sensor: str, rate_hz: float) -> str:
-    return f"the {sensor} reads {rate_hz:.3g} times a second; a hand shakes ten times a second"
+    return f"the {sensor} is sampled at {rate_hz:.3g} Hz; hand motion reaches about 10 Hz"
 
 
 @message(
@@ -260,8 +259,8 @@ def rate_too_low(sensor: str, rate_hz: float) -> str:
 )
 def low_passed(sensor: str, scatter: float, moving: float) -> str:
     return (
-        f"the {sensor} hardly scatters from sample to sample ({scatter:.1g} {_UNITS[sensor]}), though the device "
-        "moves: its readings were smoothed"
+        f"the {sensor}'s noise is only {scatter:.1g} {_UNITS[sensor]} while the device moves: its readings were "
+        "smoothed"
     )
 
 
@@ -279,20 +278,20 @@ def coarse_resolution(sensor: str, step: float, different_on_x: int, rounding_sh
 )
 def sensors_offset(delay_s: float, delay_sigma_s: float, correlation: float) -> str:
     return (
-        f"the accelerometer's stamps are {1e3 * delay_s:+.0f} +- {1e3 * delay_sigma_s:.0f} ms off the gyroscope's: "
-        f"there, gravity turns against the gyroscope with a correlation of {correlation:.2f}"
+        f"the accelerometer's stamps are {1e3 * delay_s:+.0f} +- {1e3 * delay_sigma_s:.0f} ms off the gyroscope's "
+        f"(gravity follows the gyroscope with a correlation of {correlation:.2f} there)"
     )
 
 
 @message(advice="give two files of one recording, stamped by one clock", example={"together_s": 3.0, "shorter_s": 20.0})
 def sensors_apart(together_s: float, shorter_s: float) -> str:
-    return f"gyroscope and accelerometer run together for {max(together_s, 0):.1f} s of {shorter_s:.1f} s"
+    return f"gyroscope and accelerometer overlap for {max(together_s, 0):.1f} s of {shorter_s:.1f} s"
 
 
 def _pauses(sensor: str, pauses: int, longest_s: float, total_s: float, step_s: float, share: float) -> str:
     return (
-        f"the {sensor} pauses {pauses} times, {longest_s:.3f} s at the longest, {total_s:.2f} s in all; it samples "
-        f"every {1e3 * step_s:.1f} ms"
+        f"the {sensor} pauses {pauses} times, at most {longest_s:.3f} s, {total_s:.2f} s in all; its samples are "
+        f"{1e3 * step_s:.1f} ms apart"
     )
 
 
@@ -325,32 +324,33 @@ for _code in ("stamps-repeated", "stamps-reordered", "empty-cells", "samples-mis
 
 
 def _acceleration(acceleration_rms_m_s2: float) -> str:
-    return f"the camera's acceleration is {acceleration_rms_m_s2:.3f} m/s2 (rms) once gravity is out"
+    return f"the camera's acceleration without gravity is {acceleration_rms_m_s2:.3f} m/s2 (rms)"
 
 
 @message(advice=_ACCELERATE, example={"acceleration_rms_m_s2": 0.02, "turning_rms_rad_s": 0.01})
 def no_motion(acceleration_rms_m_s2: float, turning_rms_rad_s: float) -> str:
     return (
-        f"{_acceleration(acceleration_rms_m_s2)}; it turns by {turning_rms_rad_s:.3f} rad/s: it stood on a tripod or "
-        "table"
+        f"{_acceleration(acceleration_rms_m_s2)}, its rotation {turning_rms_rad_s:.3f} rad/s: it stood still, as on a "
+        "tripod"
     )
 
 
 @message(advice=_ACCELERATE, example={"acceleration_rms_m_s2": 0.02, "turning_rms_rad_s": 0.5})
 def pure_rotation(acceleration_rms_m_s2: float, turning_rms_rad_s: float) -> str:
-    return f"{_acceleration(acceleration_rms_m_s2)}; it only turns, by {turning_rms_rad_s:.2f} rad/s"
+    return f"{_acceleration(acceleration_rms_m_s2)}; the camera only rotates ({turning_rms_rad_s:.2f} rad/s)"
 
 
 @message(advice=_ACCELERATE, example={"acceleration_rms_m_s2": 0.02, "turning_rms_rad_s": 0.5})
 def constant_velocity(acceleration_rms_m_s2: float, turning_rms_rad_s: float) -> str:
-    return f"{_acceleration(acceleration_rms_m_s2)}; it glides at constant speed"
+    return f"{_acceleration(acceleration_rms_m_s2)}; the camera moves at constant speed"
 
 
 @message(advice=_ACCELERATE, example={"acceleration_rms_m_s2": 0.02, "turning_rms_rad_s": 0.5})
 def no_acceleration(acceleration_rms_m_s2: float, turning_rms_rad_s: float) -> str:
     return (
-        f"{_acceleration(acceleration_rms_m_s2)}; it turns by {turning_rms_rad_s:.2f} rad/s, but stays in place or "
-        "glides"
+        f"{_acceleration(acceleration_rms_m_s2)}; the camera rotates ({turning_rms_rad_s:.2f} rad/s), but stays "
+        f"in place or "
+        "moves at constant speed"
     )
 
 
@@ -361,14 +361,14 @@ def rotation_too_little(
     if why is not None:
         return str(why)
     return (
-        f"the camera hardly rotates: half of the time by less than {median_rad_s:.3f} rad/s, most at {fastest_s:.0f} "
-        f"s; how it is turned against the gyroscope is open by {degrees(rotation_sigma_rad):.0f} deg"
+        f"the camera hardly rotates (median {median_rad_s:.3f} rad/s, fastest at {fastest_s:.0f} s), which leaves the "
+        f"rotation between camera and gyroscope uncertain by {degrees(rotation_sigma_rad):.0f} deg"
     )
 
 
 @message(advice="record ten seconds or more, with rotation about all three axes", example={"seconds": 5.0})
 def offset_undecided(seconds: float) -> str:
-    return f"no time offset between camera and gyroscope fits clearly better than others in {seconds:.1f} s"
+    return f"{seconds:.1f} s are too short to find the time offset between camera and gyroscope"
 
 
 # stamps
@@ -385,7 +385,7 @@ def stamps_reversed(path: str, sensor: str) -> str:
 )
 def stamps_jump_back(path: str, counted: str, number: int, sensor: str, behind_s: float) -> str:
     return (
-        f"{path}, {counted} {number}: the {sensor} stamp is {behind_s:.3f} s behind one before it; the "
+        f"{path}, {counted} {number}: the {sensor} stamp is {behind_s:.3f} s before an earlier one; the "
         "clock was set back or a stamp is damaged: split or correct the file there"
     )
 
@@ -396,7 +396,7 @@ def stamps_jump_back(path: str, counted: str, number: int, sensor: str, behind_s
 )
 def stamps_too_coarse(path: str, counted: str, number: int, sensor: str, repeated: int, samples: int) -> str:
     return (
-        f"{path}, {counted} {number}: {repeated} of {samples} {sensor} samples repeat the stamp before them "
+        f"{path}, {counted} {number}: {repeated} of {samples} {sensor} samples repeat the previous stamp "
         "with other values; the stamps are too coarse, or this is not the time column"
     )
 
@@ -431,7 +431,7 @@ def time_unit(
     if sensor:
         direction = "smaller" if step_s > slowest_s else "larger"
         return (
-            f"{path}: {sensor} samples lie {step_s:.3g} s apart, which no IMU does; the stamps are probably in a "
+            f"{path}: {sensor} samples are {step_s:.3g} s apart, which is implausible; the stamps are probably in a "
             f"{direction} unit: set time_unit in capture.toml"
         )
     return (
@@ -458,11 +458,11 @@ def untimed(detail: str) -> str:
 )
 def clock_offset(offset_s: float, max_offset_s: float | None, clocks: Said | None) -> str:
     if max_offset_s is not None:
-        stated = f"which one clock (up to {max_offset_s:g} s apart) does not allow"
+        stated = f"more than the {max_offset_s:g} s of one shared clock"
     else:
-        stated = "which the time offset that was given excludes"
+        stated = "which contradicts the given time offset"
     return (
-        f"camera and gyroscope fit where their stamps are {offset_s:+.3f} s apart, {stated}"
+        f"camera and gyroscope fit with a time offset of {offset_s:+.3f} s, {stated}"
         f"{'' if clocks is None else f'; {clocks}'}"
     )
 
@@ -474,27 +474,29 @@ def clock_offset(offset_s: float, max_offset_s: float | None, clocks: Said | Non
 )
 def clock_rate(rate: float) -> str:
     return (
-        f"the camera's clock runs {100 * rate:+.2f} % faster than the IMU's, and either may be wrong: lengths go with "
-        "the square of time"
+        f"the camera's clock runs {100 * rate:+.2f} % faster than the IMU's; if the camera's is wrong, lengths "
+        f"are off by "
+        "twice as much"
     )
 
 
 @message(advice="give the video itself as [video], or times as the recorder stamped them", example={"rate": 1.25})
 def frame_rate(rate: float) -> str:
     return (
-        f"the frames fit the gyroscope if {rate:.3g} times as many come in a second as are stated: they were timed by "
-        "another frame rate than they were filmed with"
+        f"the frames fit the gyroscope at {rate:.3g} times the stated frame rate: they were timed by another "
+        f"frame rate "
+        "than they were filmed with"
     )
 
 
 @message(
-    advice="start the IMU before the video and stop it after; the scale rests on what both recorded",
+    advice="start the IMU before the video and stop it after; the scale is estimated from what both recorded",
     example={"share": 0.8, "frames_s": 20.0, "imu_s": 16.0},
 )
 def imu_too_short(share: float, frames_s: float, imu_s: float, sensor: str = "") -> str:
     other = {"accelerometer": "gyroscope", "gyroscope": "accelerometer"}.get(sensor)
-    alone = f"; the {other} runs along with the rest" if other else ""
-    return f"the {sensor or 'IMU'} runs along with {100 * share:.0f} % of {frames_s:.1f} s of frames{alone}"
+    alone = f"; the {other} covers the rest" if other else ""
+    return f"{sensor or 'IMU'} data cover {100 * share:.0f} % of the frames' {frames_s:.1f} s{alone}"
 
 
 # camera against gyroscope
@@ -506,9 +508,9 @@ def imu_too_short(share: float, frames_s: float, imu_s: float, sensor: str = "")
 )
 def stabilised(share: float | None = None, recorder_notes: str = "") -> str:
     if share is None:
-        return f"the recorder says that the video was stabilised in the camera ({recorder_notes})"
+        return f"the recorder notes that the video was stabilised in the camera ({recorder_notes})"
     return (
-        f"the pictures hold {100 * share:.0f} % of the quick rotation that the gyroscope measured: the video was "
+        f"the frames show {100 * share:.0f} % of the fast rotation that the gyroscope measured: the video was "
         "stabilised in the camera"
     )
 
@@ -538,11 +540,11 @@ def cameras_turned(
 
 
 @message(
-    advice="take pictures closer together, or film; after a reconstruction diagnose its model", example={"pairs": 5}
+    advice="take images closer together, or film; after a reconstruction, diagnose its model", example={"pairs": 5}
 )
 def pictures_too_few(pairs: int) -> str:
     return (
-        f"only {pairs} pairs of consecutive pictures overlap enough to be compared with the gyroscope, and no time "
+        f"only {pairs} pairs of consecutive images overlap enough to be compared with the gyroscope, and no time "
         "offset fits them"
     )
 
@@ -596,8 +598,8 @@ def pose_convention(
 )
 def gyro_gain(gain: float) -> str:
     return (
-        f"the gyroscope measures {gain:.2f} times the rotation that the images show; sensors are right to a few per "
-        "cent"
+        f"the gyroscope measures {gain:.2f} times the rotation that the images show; a sensor's gain is right to a few "
+        "per cent"
     )
 
 
@@ -644,8 +646,8 @@ _ROTATIONS = {
 )
 def declared_rotation(angle_deg: float, sigma_deg: float, likely: str) -> str:
     return (
-        f"camera and IMU are turned by {angle_deg:.{0 if angle_deg >= 10 else 1}f} deg (+-{2 * sigma_deg:.1f}) against "
-        f"the declared rotation{_ROTATIONS[likely][0]}"
+        f"the declared rotation between camera and IMU is off by {angle_deg:.{0 if angle_deg >= 10 else 1}f} deg "
+        f"(+-{2 * sigma_deg:.1f}){_ROTATIONS[likely][0]}"
     )
 
 
@@ -667,19 +669,20 @@ def _advise_offset(declared_s: float, likely: str, **_: float) -> str:
 def declared_offset(declared_s: float, found_s: float, sigma_s: float, likely: str) -> str:
     other = {"sign": "; with the other sign it fits", "milliseconds": "; as milliseconds it fits"}.get(likely, "")
     return (
-        f"the declared time offset is {declared_s:.4f} s, and the recording shows {found_s:.4f} s "
+        f"the declared time offset is {declared_s:.4f} s, but the recording shows {found_s:.4f} s "
         f"(+-{2e3 * sigma_s:.0f} ms){other}"
     )
 
 
 @message(
-    advice="leave out [camera] to let COLMAP calibrate, or give the intrinsics of this very video mode",
+    advice="leave out [camera] to let COLMAP calibrate, or give the intrinsics of this video mode",
     example={"gain": 1.3, "gain_sigma": 0.02, "focal_px": 1500.0},
 )
 def focal_length(gain: float, gain_sigma: float, focal_px: float) -> str:
     return (
-        f"the pictures turn {gain:.2f} times as far as the gyroscope measured: with the declared focal length of "
-        f"{focal_px:.0f} px, about {focal_px * gain:.0f} px would fit"
+        f"with the declared focal length of {focal_px:.0f} px, the images rotate {gain:.2f} times as far as "
+        f"the gyroscope "
+        f"measured; about {focal_px * gain:.0f} px would fit"
     )
 
 
@@ -706,16 +709,17 @@ _TIMES = "give the presentation stamps of the frames, or the video itself as [vi
 )
 def frame_times_uneven(wander_s: float, worst_s: float, parts: int, sigmas: float) -> str:
     return (
-        f"against the gyroscope, frame times wander by {1e3 * wander_s:.0f} ms; worst {worst_s:.0f} s after the first "
-        "frame"
+        f"the frame times drift by up to {1e3 * wander_s:.0f} ms against the gyroscope, most {worst_s:.0f} s after the "
+        "first frame"
     )
 
 
 @message(advice=_TIMES, example={"wander_s": 0.02})
 def frame_times_counted(wander_s: float) -> str:
     return (
-        f"the pictures' times wander by {1e3 * wander_s:.0f} ms against the presentation stamps of the video's frames "
-        "that they are, as times counted from a frame rate do"
+        f"the frame times drift by up to {1e3 * wander_s:.0f} ms against the video's presentation stamps, as "
+        f"times counted "
+        "at a nominal frame rate do"
     )
 
 
@@ -723,16 +727,16 @@ def frame_times_counted(wander_s: float) -> str:
     advice="add the container's start to the times, or give the video itself as [video]", example={"start_s": 0.033}
 )
 def container_start_ignored(start_s: float) -> str:
-    return f"the pictures' times lack the {1e3 * start_s:+.0f} ms at which the video's container starts"
+    return f"the frame times lack the video container's start time ({1e3 * start_s:+.0f} ms)"
 
 
 @message(
-    advice="where readout, intrinsics or a calibration are declared, cut the pictures without turning them upright "
+    advice="where readout, intrinsics or a calibration are declared, extract the frames without rotating them upright "
     "(ffmpeg -noautorotate): these refer to the sensor's rows",
     example={"angle_deg": 90},
 )
 def frames_turned(angle_deg: float) -> str:
-    return f"the pictures are turned by {angle_deg:.0f} deg against the sensor's rows"
+    return f"the frames are rotated by {angle_deg:.0f} deg against the sensor's rows"
 
 
 @message(
@@ -740,12 +744,12 @@ def frames_turned(angle_deg: float) -> str:
     example={"angle_deg": 90},
 )
 def rotation_ignored(angle_deg: float) -> str:
-    return f"the video asks players to turn it by {angle_deg:.0f} deg; the pictures are as the sensor saw them"
+    return f"the video is to be shown rotated by {angle_deg:.0f} deg; the frames are used as the sensor saw them"
 
 
-@message(advice="name the video that the pictures were cut from", example={"pictures": 3, "looked_for": 60})
+@message(advice="name the video that the images were extracted from", example={"pictures": 3, "looked_for": 60})
 def frames_not_in_video(pictures: int, looked_for: int) -> str:
-    return f"{pictures} of {looked_for} pictures look like no frame of the video, or like several"
+    return f"{pictures} of {looked_for} images match no frame of the video, or several"
 
 
 @message(
@@ -754,13 +758,13 @@ def frames_not_in_video(pictures: int, looked_for: int) -> str:
 )
 def frames_dropped(lost: int, frames: int, step_s: float, longest_s: float) -> str:
     return (
-        f"{lost} frames are missing between {frames} that come every {1e3 * step_s:.1f} ms; the longest pause is "
+        f"{lost} frames are missing among {frames} with a period of {1e3 * step_s:.1f} ms; the longest pause is "
         f"{longest_s:.2f} s"
     )
 
 
 @message(
-    advice="cut frames without filling up to a constant rate (ffmpeg -fps_mode passthrough)",
+    advice="extract frames without filling up to a constant rate (ffmpeg -fps_mode passthrough)",
     example={"repeated": 20, "looked_at": 400},
 )
 def frames_repeated(repeated: int, looked_at: int) -> str:
@@ -768,15 +772,15 @@ def frames_repeated(repeated: int, looked_at: int) -> str:
 
 
 @message(
-    advice="such frames get no pose and are not deblurred: leave them out, or light the scene and take off the cover",
+    advice="such frames get no pose and are not deblurred: leave them out, or light the scene and uncover the lens",
     example={"blank": 12, "looked_at": 300, "example": "0007.jpg"},
 )
 def frames_blank(blank: int, looked_at: int, example: str) -> str:
-    return f"{blank} of {looked_at} frames that were looked at are black or show nothing ({example})"
+    return f"{blank} of {looked_at} examined frames are black or without texture ({example})"
 
 
 @message(
-    advice="film with a shorter exposure (1/200 s or less) and more light; what is blurred is deblurred",
+    advice="film with a shorter exposure (1/200 s or less) and more light",
     example={"share": 0.7, "blur_limit_of_long_side": 0.004, "median_blur_of_long_side": 0.006, "exposure_s": 0.02},
 )
 def exposure_too_long(
@@ -784,13 +788,14 @@ def exposure_too_long(
 ) -> str:
     return (
         f"{100 * share:.0f} % of the frames are blurred by more than {100 * blur_limit_of_long_side:g} % of the "
-        f"picture's long side (median {100 * median_blur_of_long_side:.2f} %, exposure {1e3 * exposure_s:.1f} ms)"
+        f"image's long side (median {100 * median_blur_of_long_side:.2f} %, exposure {1e3 * exposure_s:.1f} ms)"
     )
 
 
 @message(
-    advice="readout_s is the time from the first line to one past the last, readout_direction where the exposed line "
-    "moves in the stored picture: correct them under [timing], or leave both out",
+    advice="readout_s is the time from the first line to one past the last, readout_direction the direction "
+    "in which the "
+    "exposed line moves in the stored image: correct them under [timing], or leave both out",
     example={
         "declared_s": 0.0,
         "declared_direction": "down",
@@ -802,20 +807,20 @@ def exposure_too_long(
 def declared_readout(
     declared_s: float, declared_direction: str, readout_s: float, sigma_s: float, direction: str
 ) -> str:
-    declared = f"{1e3 * declared_s:.1f} ms, {declared_direction}" if declared_s else "0, a global shutter"
+    declared = f"{1e3 * declared_s:.1f} ms, {declared_direction}" if declared_s else "0 (global shutter)"
     return (
-        f"the declared readout is {declared}, and the pictures show {1e3 * readout_s:.1f} ms "
+        f"the declared readout is {declared}, but the frames show {1e3 * readout_s:.1f} ms "
         f"(+-{2e3 * sigma_s:.1f}), {direction}"
     )
 
 
 def _advise_readout(readout_s: float | None = None, direction: str = "down", **_: object) -> str:
     if readout_s is None:
-        return "give readout_s under [timing] in capture.toml (0 for a global shutter), so that it is undone"
+        return "give readout_s under [timing] in capture.toml (0 for a global shutter), so that it is corrected"
     lines = f"readout_s = {readout_s:.4f}"
     if direction != "down":
         lines += f' and readout_direction = "{direction}"'
-    return f"write {lines} under [timing] in capture.toml, so that it is undone"
+    return f"write {lines} under [timing] in capture.toml, so that it is corrected"
 
 
 @message(
@@ -828,10 +833,10 @@ def readout_unknown(
     direction: str = "down",
     pairs: int = 0,
 ) -> str:
-    said = "nothing says whether the camera has a rolling shutter, as nearly all phones do"
+    said = "it is not declared whether the camera has a rolling shutter, as nearly all phones have"
     if why is not None:
         return f"{said}; {why}"
     return (
-        f"{said}; by the pictures and the gyroscope, reading a frame takes {1e3 * readout_s:.1f} +- "
-        f"{1e3 * readout_sigma_s:.1f} ms{'' if readout_s else ', as a global shutter'}"
+        f"{said}; frames and gyroscope show a readout of {1e3 * readout_s:.1f} +- "
+        f"{1e3 * readout_sigma_s:.1f} ms{'' if readout_s else ' (global shutter)'}"
     )

@@ -42,7 +42,7 @@ def name_without_one_time(path: str, numbers: Sequence[str]) -> str:
     example={"pattern": "IMG_*", "units": ("s", "ms")},
 )
 def pattern_without_time(pattern: str, units: Sequence[str]) -> str:
-    return f"{pattern!r} does not say how names hold times"
+    return f"{pattern!r} does not describe how names hold times"
 
 
 @message(
@@ -53,7 +53,7 @@ def pattern_without_time(pattern: str, units: Sequence[str]) -> str:
     example={"count": 3, "first": "a.heic", "endings": (".jpg", ".png")},
 )
 def names_of_other_pictures(count: int, first: str, endings: Sequence[str]) -> str:
-    return f"names {count} files that are no pictures COLMAP reads (first: {first})"
+    return f"names {count} files that are not images COLMAP reads (first: {first})"
 
 
 @message(
@@ -62,7 +62,7 @@ def names_of_other_pictures(count: int, first: str, endings: Sequence[str]) -> s
 def picture_of_other_size(width: int, height: int, declared_width: int, declared_height: int, declared_in: str) -> str:
     turned = (width, height) == (declared_height, declared_width)
     return f"is {width}x{height}, but the camera is declared as {declared_width}x{declared_height} ({declared_in})" + (
-        "; pictures stay as the sensor was read, not turned by 90 degrees for display" if turned else ""
+        "; give images as the sensor was read, not rotated by 90 deg for display" if turned else ""
     )
 
 
@@ -98,7 +98,7 @@ def rig_times_differ(camera: str, found: int, frames: int, within_ms: float, ima
 def exif_time_coarse(path: str, to_tenths: bool) -> str:
     tells = "tenths of a second" if to_tenths else "whole seconds"
     return (
-        f"{path}: its EXIF gives the time to {tells} only (SubSecTimeOriginal, two digits or more, is needed); a scale "
+        f"{path}: its EXIF gives the time only to {tells} (SubSecTimeOriginal, two digits or more, is needed); a scale "
         "needs the times of its images to some milliseconds"
     )
 
@@ -150,7 +150,7 @@ def frame_times_without_header(path: str, width: int) -> str:
 
 @message(example={"frame": 7})
 def frame_time_not_after(frame: int) -> str:
-    return f"the time of frame {frame} is not after the one before"
+    return f"the time of frame {frame} is not after the previous one"
 
 
 @message(advice="correct one of them", example={"path": "times.csv", "written": "ns", "declared": "s"})
@@ -160,7 +160,7 @@ def time_units_contradict(path: str, written: str, declared: str) -> str:
 
 @message(advice="name the column t_s, t_ms, t_us or t_ns", example={"path": "times.csv"})
 def time_unit_missing(path: str) -> str:
-    return f"{path} does not say the unit of its times"
+    return f"{path} does not state the unit of its times"
 
 
 @message(advice="name it exposure_s or exposure_ns", joint=": ", example={"column": "exposure"})
@@ -174,7 +174,7 @@ state("row-without-name", "a row has no name")
 
 @message(example={"frame": "a.jpg"})
 def frame_twice(frame: str) -> str:
-    return f"the frame {frame} comes twice"
+    return f"the frame {frame} appears twice"
 
 
 @message(
@@ -183,19 +183,19 @@ def frame_twice(frame: str) -> str:
     example={"folder": "images", "count": 100},
 )
 def pictures_untimed(folder: str, count: int) -> str:
-    return f"{folder}: nothing says when its {count} pictures were taken (EXIF is too coarse)"
+    return f"{folder}: the times of its {count} images are not known (EXIF is too coarse)"
 
 
 @message(example={"times": "times.csv", "untimed": 3, "count": 100, "first": "a.jpg"})
 def pictures_without_row(times: str, untimed: int, count: int, first: str) -> str:
-    return f"{times}: no row for {untimed} of {count} pictures (first: {first})"
+    return f"{times}: no row for {untimed} of {count} images (first: {first})"
 
 
 @message(
     advice="give frame_times under [video] in a capture.toml", example={"video": "a.mp4", "frames": 100, "noted": 99}
 )
 def recorder_noted_other_count(video: str, frames: int, noted: int) -> str:
-    return f"{video} has {frames} frames, its recorder noted the times of {noted}"
+    return f"{video} has {frames} frames, but its recorder noted the times of {noted}"
 
 
 @message(example={"times_file": "times.csv", "times": 99, "video": "a.mp4", "frames": 100})
@@ -209,7 +209,7 @@ def frame_times_back(times_file: str, row: int) -> str:
 
 
 state("exif-without-date", "its EXIF has no DateTimeOriginal", advice="give --frame-times")
-state("exif-missing", "has no EXIF, which is to give its time", advice="give --frame-times")
+state("exif-missing", "has no EXIF to take its time from", advice="give --frame-times")
 state("exif-damaged", "its EXIF is damaged or empty", advice="give --frame-times")
 
 

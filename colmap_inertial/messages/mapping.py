@@ -39,7 +39,7 @@ state(
 
 state(
     "deterministic-without-pycolmap",
-    "--deterministic goes with pycolmap alone: an installed COLMAP may find other features and matches "
+    "--deterministic works with pycolmap only: an installed COLMAP may find other features and matches "
     "each time (3.8 does)",
     advice="leave --colmap-executable out",
 )
@@ -54,7 +54,7 @@ state(
     example={"features": "aliked"},
 )
 def features_without_pycolmap(features: str) -> str:
-    return f"--mapping.features {features} goes with pycolmap alone"
+    return f"--mapping.features {features} works with pycolmap only"
 
 
 @message(example={"printed": "usage: x"})
@@ -89,7 +89,7 @@ def features_missing(program: str, image: str, others: int) -> str:
 
 state(
     "executable-with-scheduler",
-    "--colmap-executable: an installed COLMAP works on this machine alone",
+    "--colmap-executable: an installed COLMAP works on this machine only",
     advice="leave out --scheduler",
 )
 
@@ -107,7 +107,7 @@ state(
 def colmap_failed(program: str, command: str, version: str, exit_code: int, output: Sequence[str], log: str) -> str:
     what = f"was killed (signal {-exit_code})" if exit_code < 0 else f"failed with exit code {exit_code}"
     printed = " | ".join(output) or "it printed nothing"
-    return f"{program} {command} (COLMAP {version}) {what}: {printed}; all of it is in {log}"
+    return f"{program} {command} (COLMAP {version}) {what}: {printed}; full output in {log}"
 
 
 @message(example={"program": "/usr/bin/colmap", "why": {"code": "database-damaged", "values": {}}})
@@ -128,7 +128,7 @@ state("database-damaged", "damaged")
 
 @message(example={"path": "images"})
 def file_unseen(path: str) -> str:
-    return f"{path} cannot be seen here"
+    return f"{path} is not visible here"
 
 
 @message(example={"path": "images/0007.jpg"})
@@ -136,7 +136,7 @@ def image_unread(path: str) -> str:
     return f"COLMAP could not read {path}"
 
 
-@message(advice="make room and start again, it continues", example={"database": "database.db"})
+@message(advice="free some space and start again; the run continues", example={"database": "database.db"})
 def database_not_written(database: str) -> str:
     return (
         f"{database}: COLMAP cannot write its database here: the disk is full, or a quota, a limit of file "
@@ -146,7 +146,7 @@ def database_not_written(database: str) -> str:
 
 state(
     "pycolmap-without-cuda",
-    "--mapping.device cuda: this pycolmap has none",
+    "--mapping.device cuda: this pycolmap is built without CUDA",
     advice="install pycolmap-cuda12, or leave it out",
 )
 
@@ -190,7 +190,9 @@ def given_image_of_another_size(image: str, width: int, height: int, capture_wid
 
 state("no-given-database", "no such file", advice="--database takes a COLMAP database", joint=": ")
 
-state("database-in-use", "another program has it open, or ended while it wrote", advice="close it there", joint=": ")
+state(
+    "database-in-use", "another program has it open, or was stopped while writing", advice="close it there", joint=": "
+)
 
 
 @message(example={"detail": "row 3 missing from index"})
@@ -208,7 +210,7 @@ state("image-without-camera", "damaged: an image has no camera")
 
 @message(example={"count": 3, "table": "keypoints"})
 def rows_of_other_length(count: int, table: str) -> str:
-    return f"damaged: {count} rows of {table} are not as long as they say"
+    return f"damaged: {count} rows of {table} do not have their stated length"
 
 
 state("no-keypoints", "holds no keypoints", advice="extract features first, or leave --database out", joint=": ")
@@ -223,7 +225,7 @@ state(
 
 @message(example={"first": "a.jpg", "second": "b.jpg"})
 def matches_of_missing_keypoints(first: str, second: str) -> str:
-    return f"damaged: matches of {first} and {second} name keypoints that there are not"
+    return f"damaged: matches of {first} and {second} name keypoints that do not exist"
 
 
 # dense reconstruction
@@ -234,7 +236,7 @@ def images_not_undistorted(folder: str, count: int, of: int, image: str) -> str:
     return f"{folder}: COLMAP could not undistort {count} of {of} images ({image})"
 
 
-state("picture-of-model-missing", "no such picture, but the model has it", advice="give the folder of its images")
+state("picture-of-model-missing", "no such image, but the model has it", advice="give the folder of its images")
 
 
 @message(example={"width": 640, "height": 480, "camera_width": 1920, "camera_height": 1080})
@@ -272,7 +274,7 @@ def no_mesh_written(folder: str, detail: str) -> str:
     return f"{folder}: COLMAP wrote no mesh ({detail})"
 
 
-state("normals-of-other-size", "is not as large as its depth map")
+state("normals-of-other-size", "does not have the size of its depth map")
 
 
 @message(advice="is the disk full?", example={"folder": "dense/0"})
@@ -281,7 +283,7 @@ def points_not_written(folder: str) -> str:
 
 
 @message(
-    advice="shrink the pictures (--dense-options.max-image-size), or take --dense-options.mesh poisson",
+    advice="shrink the images (--dense-options.max-image-size), or take --dense-options.mesh poisson",
     example={"path": "mesh.ply", "voxel_m": 0.01},
 )
 def surface_too_large(path: str, voxel_m: float) -> str:
@@ -295,7 +297,7 @@ def mesh_not_written(path: str) -> str:
 
 @message(example={"folder": "dense/0"})
 def no_depth_maps(folder: str) -> str:
-    return f"{folder} has no depth maps: no two images see enough of the same under a fit angle"
+    return f"{folder} has no depth maps: no two images overlap enough at a suitable angle"
 
 
 # rigs and the gyroscope's bias
@@ -304,7 +306,7 @@ def no_depth_maps(folder: str) -> str:
 @message(advice=_give_pose, example={"camera": "left", "frames": 2})
 def rig_frames_too_few_placed(camera: str, frames: int) -> str:
     return (
-        f"[rig.{camera}]: COLMAP places its images and the main camera's of {frames} frames in one model, "
+        f"[rig.{camera}]: only {frames} frames have its image and the main camera's in one model, "
         "too few to find the camera's pose"
     )
 
@@ -312,8 +314,8 @@ def rig_frames_too_few_placed(camera: str, frames: int) -> str:
 @message(example={"camera": "left", "apart_deg": 3.0})
 def rig_camera_turns(camera: str, apart_deg: float) -> str:
     return (
-        f"[rig.{camera}]: the camera turns against the main one by {apart_deg:.2g} degrees from frame to "
-        "frame (median): cameras of a rig are fixed to each other and triggered together. Correct the "
+        f"[rig.{camera}]: the camera rotates by {apart_deg:.2g} deg against the main one from frame to "
+        "frame (median), but cameras of a rig are rigidly mounted and triggered together. Correct the "
         f"times, or {_give_pose(camera)}"
     )
 
@@ -328,9 +330,9 @@ def pairs_too_few(count: int) -> str:
     return f"{count} pairs of neighbouring images are too few"
 
 
-state("matches-suit-no-bias", "matches of neighbouring images suit no bias")
+state("matches-suit-no-bias", "matches of neighbouring images fit no gyroscope bias")
 
-state("matches-suit-any-bias", "the matches of neighbouring images suit any bias")
+state("matches-suit-any-bias", "matches of neighbouring images fit any gyroscope bias")
 
 # settings of COLMAP
 
@@ -342,7 +344,7 @@ def colmap_setting_wrong(why: Said) -> str:
 
 @message(example={"detail": "no section headers"})
 def no_project_ini(detail: str) -> str:
-    return f"is no project.ini of COLMAP: {detail}"
+    return f"is not a project.ini of COLMAP: {detail}"
 
 
 @message(example={"setting": "Mapper.x"})
@@ -362,7 +364,7 @@ def value_refused(setting: str, default: str) -> str:
 
 @message(example={"setting": "Mapper.x=a", "value": "a", "name": "Mapper.x", "default": "3"})
 def value_of_other_type(setting: str, value: str, name: str, default: str) -> str:
-    return f"{setting}: {value!r} is no value of {name}, as {default} is"
+    return f"{setting}: {value!r} is not a value of {name} (such as {default})"
 
 
 @message(example={"name": "Mapper.x", "section": "Mapper"})
@@ -380,34 +382,34 @@ def option_is_a_table(option: str) -> str:
     return f"{option} is a table of options"
 
 
-state("mapping-pairing-chooses", "--mapping.pairing chooses the pairs")
+state("mapping-pairing-chooses", "set by --mapping.pairing")
 
 
-state("dense-mesh-chooses", "--dense-options.mesh chooses the mesh")
+state("dense-mesh-chooses", "set by --dense-options.mesh")
 
 
-state("of-colmaps-window", "it belongs to COLMAP's own window")
+state("of-colmaps-window", "it is an option of COLMAP's GUI")
 
 
-state("deterministic-decides", "--deterministic decides")
+state("deterministic-decides", "set by --deterministic")
 
 
-state("seed-decides", "--seed decides")
+state("seed-decides", "set by --seed")
 
 
-state("mapping-device-decides", "--mapping.device decides")
+state("mapping-device-decides", "set by --mapping.device")
 
 
-state("mapping-features-decides", "--mapping.features decides")
+state("mapping-features-decides", "set by --mapping.features")
 
 
 state("pairs-by-verified-matches", "pairs are judged by their verified matches")
 
 
-state("capture-says-camera", "the capture says which camera took an image")
+state("capture-says-camera", "the capture assigns images to cameras")
 
 
-state("run-has-own-files", "the run has its own files")
+state("run-has-own-files", "the run uses its own files")
 
 
 @message(example={"setting": "Mapper.random_seed=3", "why": {"code": "seed-decides", "values": {}}})
@@ -452,7 +454,7 @@ def worker_without_us(worker: str, version: str, detail: str) -> str:
     return f"worker {worker} cannot use colmap-inertial {version}: {detail}"
 
 
-@message(advice="started again, it continues", example={"work": "features 3", "detail": "KilledWorker: 3"})
+@message(advice="start it again; it continues", example={"work": "features 3", "detail": "KilledWorker: 3"})
 def work_not_finished(work: str, detail: str) -> str:
     return f"{work}: no worker could finish it: {detail}"
 
@@ -481,17 +483,17 @@ def worker_sees_no_output(worker: str, folder: str) -> str:
 
 @message(example={"work": "features 3"})
 def work_not_wanted(work: str) -> str:
-    return f"{work}: not wanted any more"
+    return f"{work}: cancelled"
 
 
-state("work-needs-dask", "--scheduler hands work to a Dask cluster")
-state("captures-need-dask", "--scheduler hands captures to a Dask cluster")
+state("work-needs-dask", "--scheduler runs work on a Dask cluster")
+state("captures-need-dask", "--scheduler runs captures on a Dask cluster")
 
 
 @message(example={"work": "features 3", "signal": 9, "on_worker": False})
 def process_killed(work: str, signal: int, on_worker: bool) -> str:
-    if_short = "give workers more of it, or one thread each (--nthreads 1)" if on_worker else "give fewer --workers"
-    return f"{work}: the process was killed (signal {signal}); where memory is short, {if_short}"
+    if_short = "give workers more of it, or one thread each (--nthreads 1)" if on_worker else "use fewer --workers"
+    return f"{work}: the process was killed (signal {signal}); if memory ran out, {if_short}"
 
 
 @message(example={"work": "features 3", "exit_code": 1, "detail": None})

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from colmap_inertial.messages import Said, message, state
 
 _MORE_MEMORY = {
-    "cuda": "if memory is short, close what else uses the GPU, or hide it (CUDA_VISIBLE_DEVICES=) to use the processor",
-    "cpu": "if memory is short, make room: each picture in work takes about half a gigabyte",
+    "cuda": "if memory is short, close other programs that use the GPU, or hide it (CUDA_VISIBLE_DEVICES=) to "
+    "use the processor",
+    "cpu": "if memory is short, free some: each image in work takes about half a gigabyte",
 }
 
 
@@ -47,7 +48,7 @@ def no_such_option(command: str, option: str, nearest: str | None) -> str:
     return f"{command} has no option {option}{_did_you_mean(nearest)} ({command} --help lists them)"
 
 
-state("gravity-is-of-rests", "gravity is for recordings of rests; with results, leave out the place")
+state("gravity-is-of-rests", "the place is for recordings of rests only: leave it out with results")
 
 
 @message(
@@ -69,7 +70,7 @@ def table_described_above(source: str, found: Said) -> str:
 @message(example={"missing": ("green",), "apertures": ("A (red)", "B (blue)")})
 def colours_missing(missing: Sequence[str], apertures: Sequence[str]) -> str:
     return (
-        f"fused pictures need a red, a green and a blue aperture; {', '.join(missing)} is missing among "
+        f"fused images need a red, a green and a blue aperture; {', '.join(missing)} is missing among "
         f"{', '.join(apertures)}"
     )
 
@@ -107,7 +108,7 @@ def not_a_network(detail: str) -> str:
 )
 def wrong_network(takes: Sequence[str], gives: Sequence[str], wanted_takes: Sequence[str], wanted_gives: str) -> str:
     return (
-        f"takes {', '.join(takes)} and gives {', '.join(gives)}; a network that restores pictures takes "
+        f"takes {', '.join(takes)} and gives {', '.join(gives)}; a network that restores images takes "
         f"{', '.join(wanted_takes)}, all tensor(float), and gives {wanted_gives}"
     )
 
@@ -117,7 +118,7 @@ def network_does_not_run(width: int, height: int, detail: str) -> str:
     return f"does not run on {width} x {height} px ({detail})"
 
 
-@message(advice="a picture must keep its size", example={"made": (1, 3, 16, 24), "given": (1, 3, 32, 48)})
+@message(advice="an image must keep its size", example={"made": (1, 3, 16, 24), "given": (1, 3, 32, 48)})
 def network_changes_size(made: Sequence[int], given: Sequence[int]) -> str:
     return f"makes {made} of {given}"
 
@@ -142,25 +143,25 @@ def network_damaged(size_bytes: int) -> str:
 
 # exports
 
-state("no-smoothed-path", "has no smoothed path: only a run of reconstruct with a scale makes one; csv needs none")
+state("no-smoothed-path", "has no smoothed path, which only a run of reconstruct with a scale makes; csv needs none")
 
-state("frames-of-several-pictures", "its frames are made of several pictures each: there is no original")
+state("frames-of-several-pictures", "its frames are fused from several images each: there is no original")
 
 
 @message(example={"frame": "0007.jpg"})
 def frame_not_in_capture(frame: str) -> str:
-    return f"has no frame {frame!r}: it is not the capture that the run was made of"
+    return f"has no frame {frame!r}: it is not the capture of this run"
 
 
 state(
     "changed-since-its-run",
-    "is not as its run wrote it: start that again, it makes it again; or say where the pictures are: --image-folder",
+    "was changed since its run: start that again to restore it, or give the images by --image-folder",
 )
 
 
 @message(advice="say where: --image-folder", example={"image": "0007.jpg", "folders": ("images",)})
 def picture_missing(image: str, folders: Sequence[str]) -> str:
-    return f"the picture of its image {image!r} is missing (in {', '.join(folders) or 'no folder of images'})"
+    return f"the image of its image {image!r} is missing (in {', '.join(folders) or 'no folder of images'})"
 
 
 @message(advice="--unscaled exports it in its own units", example={"reasons": ("the camera hardly accelerates",)})
@@ -168,31 +169,31 @@ def export_without_scale(reasons: Sequence[str]) -> str:
     return "; ".join(map(str, reasons))
 
 
-state("nowhere-on-earth", "only a model in metres, with gravity known, stands anywhere on Earth")
+state("nowhere-on-earth", "only a metric model with known gravity can be georeferenced")
 
-state("pictures-not-beside", "its pictures are not beside it", advice="give --capture or --image-folder", joint=": ")
+state("pictures-not-beside", "its images are not beside it", advice="give --capture or --image-folder", joint=": ")
 
-state("times-of-images-lost", "the run kept no times of its images, which positions in a video go by")
+state("times-of-images-lost", "the run kept no times of its images, which positions in a video need")
 
 state("no-velocities", "none of the model's images has a velocity")
 
 state(
     "velocities-not-kept",
     (
-        "the run kept no velocities: its model has no scale, its gyroscope was silent, or an earlier version "
-        "made it (then start reconstruct again with the same arguments, it adds them)"
+        "the run kept no velocities: its model has no scale, its gyroscope recorded nothing, or an earlier version "
+        "made it (then start reconstruct again with the same arguments, which adds them)"
     ),
 )
 
 
-@message(advice="export the rectified ones, or turn the pictures", example={"direction": "up"})
+@message(advice="export the rectified ones, or rotate the images", example={"direction": "up"})
 def readout_not_told(direction: str) -> str:
-    return f"these pictures are read out {direction}, which the program cannot be told"
+    return f"these images are read out {direction}, which the program does not support"
 
 
 @message(example={"camera": 1, "model": "SPHERICAL"})
 def sees_all_around(camera: int, model: str) -> str:
-    return f"camera {camera} ({model}) sees all around; no pinhole does"
+    return f"camera {camera} ({model}) sees all around, which no pinhole camera does"
 
 
 @message(example={"camera": 1, "model": "OPENCV"})
@@ -202,12 +203,12 @@ def not_undistorted(camera: int, model: str) -> str:
 
 @message(example={"width": 640, "height": 480, "camera_width": 1920, "camera_height": 1080})
 def picture_of_another_size(width: int, height: int, camera_width: int, camera_height: int) -> str:
-    return f"has {width} x {height} pixels, its camera {camera_width} x {camera_height}: no picture of the model"
+    return f"has {width} x {height} pixels, its camera {camera_width} x {camera_height}: no image of the model"
 
 
 @message(advice="choose a folder elsewhere", example={"folder": "project", "out": "project/export"})
 def folders_within_each_other(folder: str, out: str) -> str:
-    return f"{folder} and {out} lie within each other"
+    return f"one of {folder} and {out} lies within the other"
 
 
 # batches and simulations
@@ -229,12 +230,12 @@ def not_a_whole_number(found: float) -> str:
 
 @message(advice="choose a new one", example={"out": "out"})
 def not_a_batch(out: str) -> str:
-    return f"{out} is no batch's folder"
+    return f"{out} is not the folder of a batch"
 
 
 @message(example={"out": "out", "detail": "Permission denied"})
 def folder_not_made(out: str, detail: str) -> str:
-    return f"{out} cannot be made: {detail}"
+    return f"{out} cannot be created: {detail}"
 
 
 @message(advice="give one another name", joint=": ", example={"name": "walk", "first": "a/walk", "second": "b/walk"})
@@ -243,7 +244,7 @@ def captures_of_one_name(name: str, first: str, second: str) -> str:
 
 
 @message(
-    advice="look at it first, then allow it with --allow-stages (allow_stages=True)",
+    advice="check it first, then allow it with --allow-stages (allow_stages=True)",
     example={"number": 1, "code": ("my_stages:sharpen",)},
 )
 def batch_names_code(number: int, code: Sequence[str]) -> str:
@@ -305,11 +306,11 @@ def no_worker_finished(detail: str) -> str:
 
 state("mesh-without-faces", "a mesh without faces")
 
-state("faces-with-more", "the faces of this mesh are not a list of vertices alone")
+state("faces-with-more", "the faces of this mesh are more than lists of vertices")
 
-state("mesh-truncated", "truncated, or a mesh of other faces than triangles")
+state("mesh-truncated", "truncated, or a mesh with faces other than triangles")
 
-state("faces-not-triangles", "a mesh of other faces than triangles")
+state("faces-not-triangles", "a mesh with faces other than triangles")
 
 
 state("ply-not-shown", "only binary PLY files that begin with vertices can be shown")
@@ -323,7 +324,7 @@ state("no-folder-of-images", "no such folder of images")
 state(
     "run-not-finished",
     "the run that writes this folder is not finished",
-    advice="start it again with the same arguments, it continues",
+    advice="start it again with the same arguments; it continues",
 )
 
 
@@ -345,7 +346,8 @@ def result_without_own_model(project: str) -> str:
 
 
 state(
-    "neither-result-nor-model", "no result of ours and no COLMAP model here (cameras, images, points3D, .bin or .txt)"
+    "neither-result-nor-model",
+    "neither a result of colmap-inertial nor a COLMAP model here (cameras, images, points3D, .bin or .txt)",
 )
 
 

@@ -11,11 +11,11 @@ from colmap_inertial.messages import Said, message, state
 
 @message(example={"digits": 1})
 def exif_times_coarse(digits: int) -> str:
-    return f"EXIF gives the frames' times to 1/{10**digits} s only"
+    return f"EXIF gives the frames' times only to 1/{10**digits} s"
 
 
-state("not-of-video", "is no frame of the video")
-state("same-frame-as-another", "is the same frame as another picture")
+state("not-of-video", "is not a frame of the video")
+state("same-frame-as-another", "is the same frame as another image")
 state("looks-like-several-frames", "looks like several frames of the video")
 
 
@@ -39,7 +39,7 @@ def video_of_other_images(video: str, found: int, images: int, name: str, why: S
 
 @message(example={"folder": "sparse/1"})
 def model_left_out(folder: str) -> str:
-    return f"{folder} and what was made from it is left out: its scale is refused"
+    return f"{folder} and what was made from it are left out: its scale is refused"
 
 
 @message(example={"folder": "sparse/0", "names": ("0001.jpg", "0002.jpg")})
@@ -52,11 +52,11 @@ def contradicting_images_left_out(folder: str, names: tuple[str, ...]) -> str:
 
 @message(example={"file": "database.db", "count": 5, "kind": "pose priors"})
 def not_in_model_frame(file: str, count: int, kind: str) -> str:
-    return f"{file}: {count} {kind} are not in a model's frame and stay as they are"
+    return f"{file}: {count} {kind} are not in a model's frame and are unchanged"
 
 
 def _priors_stay(file: str, count: int, kind: str) -> str:
-    return f"{file}: {count} pose {'prior' if count == 1 else 'priors'} {kind} stay as they are"
+    return f"{file}: {count} pose {'prior' if count == 1 else 'priors'} {kind} are unchanged"
 
 
 _PRIORS = {"file": "database.db", "count": 120, "kind": "in degrees (WGS84)"}
@@ -112,7 +112,7 @@ state("view-target-not-found", "target not found")
 state("view-disagrees", "does not agree with the other views: a false detection, another target, or a wrong pose")
 state("view-markers-unconfirmed", "shows only markers that no other view confirms")
 state("view-corners-disagree", "fewer than four of its corners agree with the other views")
-state("view-corners-far-off", "its corners are more than four times as far off as those of the other views")
+state("view-corners-far-off", "its residuals are more than four times those of the other views")
 state("views-disagree", "the views of the target do not agree with each other in the model")
 
 
@@ -134,17 +134,17 @@ state("target-without-check-set", "too few corners to keep a control and a check
 
 @message(example={"views": 3})
 def target_in_few_views(views: int) -> str:
-    return f"only {views} views: the interval is wide because pose errors are hard to estimate from so few"
+    return f"only {views} views: the interval is wide, as pose errors are poorly known from so few"
 
 
 @message(example={"images": 2})
 def several_targets(images: int) -> str:
-    return f"{images} images show more than one such target; the one that most views agree on was measured"
+    return f"{images} images show more than one such target; the one with the most consistent views was measured"
 
 
 @message(example={"shift_px": 0.4})
 def target_moved_by_poses(shift_px: float) -> str:
-    return f"errors of the model's poses move the target by {shift_px:.2f} px; the interval allows for them"
+    return f"pose errors of the model shift the target by {shift_px:.2f} px (included in the interval)"
 
 
 state(
@@ -167,17 +167,28 @@ def images_not_searched(images: int) -> str:
 @message(example={"used": 2, "searched": 30})
 def target_size_not_proved(used: int, searched: int) -> str:
     return (
-        f"only {used} of {searched} images agree on the target, which proves no size: "
-        "check its columns and rows, or take it from more sides"
+        f"only {used} of {searched} images agree on the target, too few to prove its size: "
+        "check its columns and rows, or film it from more sides"
     )
 
 
 @message(example={"largest_m": 0.004, "tolerance_share": 0.005, "longest_m": 0.2})
 def target_lengths_disagree(largest_m: float, tolerance_share: float, longest_m: float) -> str:
     return (
-        f"its lengths do not agree: one is off by {1000 * largest_m:+.3g} mm, more than "
-        f"{100 * tolerance_share:g} % of the longest, {1000 * longest_m:.4g} mm: check its columns, rows "
+        f"its lengths contradict each other: one is off by {1000 * largest_m:+.3g} mm, more than "
+        f"{100 * tolerance_share:g} % of the longest ({1000 * longest_m:.4g} mm): check its columns and rows, "
         "and that it is flat"
+    )
+
+
+_SIDES = {"aprilgrid": "tag side", "aruco": "marker side"}
+
+
+@message(example={"kind": "checkerboard", "stated_m": 0.03, "fits_m": 0.04})
+def target_or_scale_wrong(kind: str, stated_m: float, fits_m: float) -> str:
+    return (
+        f"all lengths are off by {100 * (fits_m / stated_m - 1):+.1f} %: the {_SIDES.get(kind, 'square side')} of "
+        f"{stated_m:.4g} m or the model's scale is wrong; {fits_m:.4g} m would fit"
     )
 
 
@@ -191,7 +202,7 @@ def lengths_agree(
     directions: int,
     shows_elsewhere: str | None,
 ) -> str:
-    checked = f"lengths up to {longest_m:.3g} m agree within the errors given here"
+    checked = f"lengths up to {longest_m:.3g} m agree with each other within the errors given here"
     if longest_share is None or diagonal_m is None:
         return checked
     checked += f", in {'one direction' if directions == 1 else f'{directions} directions'}"
@@ -206,8 +217,8 @@ def lengths_agree(
 @message(example={"spec": "checkerboard:9x6:0.025", "found": 30, "agreeing": 6})
 def target_seldom_agrees(spec: str, found: int, agreeing: int) -> str:
     return (
-        f"something like {spec} was found in {found} images, but only {agreeing} of them agree "
-        "on where it is in the model: check the number of columns and rows (inner corners of a checkerboard), and "
+        f"{spec} was detected in {found} images, but only {agreeing} of them agree "
+        "on its place in the model: check the number of columns and rows (inner corners of a checkerboard), and "
         "that the target did not move"
     )
 
@@ -215,7 +226,7 @@ def target_seldom_agrees(spec: str, found: int, agreeing: int) -> str:
 @message(example={"views": 2})
 def target_views_too_close(views: int) -> str:
     return (
-        f"{views} views of the target lie too close together or agree too badly; "
+        f"{views} views of the target are too close together or too inconsistent; "
         "more views from different sides are needed"
     )
 
@@ -223,7 +234,7 @@ def target_views_too_close(views: int) -> str:
 @message(example={"largest_angle_rad": 0.007})
 def target_along_one_line(largest_angle_rad: float) -> str:
     return (
-        f"all views see the target along the same line (within {degrees(largest_angle_rad):.2f} degrees): a length "
+        f"all views see the target from the same direction (within {degrees(largest_angle_rad):.2f} deg): a length "
         "needs views from different places"
     )
 
@@ -246,7 +257,7 @@ state(
 )
 state(
     "aprilgrid-in-doubt",
-    "its tags are those of kalibr, 36h11 from number 0 on with a black border of two bits: are those of yours, and is "
+    "expected are the tags of Kalibr (36h11 from number 0 on, black border of two bits): are these yours, and is "
     "the target large and sharp enough in the images?",
 )
 state(
@@ -257,7 +268,7 @@ state(
 
 @message(example={"columns": 8, "rows": 6})
 def other_board_visible(columns: int, rows: int) -> str:
-    return f"a board with {columns}x{rows} inner corners is visible: is the size in the description right?"
+    return f"a board with {columns}x{rows} inner corners was detected: is the size in the description right?"
 
 
 #: What else than moving places a target that is found in many images nowhere, the likelier first, by its kind.
@@ -270,7 +281,7 @@ _PLACED_NOWHERE = {
 @message(example={"spec": "checkerboard:9x6:0.025", "kind": "checkerboard", "images": 30, "residual_px": 20.0})
 def target_nowhere_alike(spec: str, kind: str, images: int, residual_px: float) -> str:
     return (
-        f"{spec} was found in {images} images, but no two of them agree on where it is in the model "
+        f"{spec} was detected in {images} images, but no two of them agree on its place in the model "
         f"(to {residual_px:g} px): {_PLACED_NOWHERE.get(kind, 'false detections, wrong poses')}, a target that moved "
         "between the images, or images that do not belong to this model"
     )
@@ -281,7 +292,7 @@ _MIRRORED = {"horizontal": "left to right", "vertical": "top to bottom"}
 
 @message(example={"along": "horizontal"})
 def images_mirrored(along: str) -> str:
-    return f"the images are mirrored {_MIRRORED[along]} against the model: give those it was made from"
+    return f"the images are mirrored {_MIRRORED[along]} relative to the model: give those it was made from"
 
 
 @message(example={"spec": "checkerboard:6x5:0.025", "columns": 9, "rows": 6})
@@ -300,11 +311,11 @@ def other_board_likelier(spec: str, used: int, searched: int, columns: int, rows
 
 # exports
 
-state("up-is-not-z", "up is not z in this model (up_in_world says what it is), while most trainers' viewers take z")
-state("never-scaled", "this model was never given one")
-state("blur-not-modelled", "exposure times are not known and count as 0: blur is not modelled")
-state("one-exposure-for-all", "exposure times differ between pictures; the program takes one for all, their median")
-state("one-pose-each", "no velocities are known: each picture has one pose, as if it was taken in an instant")
+state("up-is-not-z", "up is not z in this model (see up_in_world), while most trainers' viewers assume z")
+state("never-scaled", "this model was never scaled")
+state("blur-not-modelled", "exposure times are unknown and taken as 0: blur is not modelled")
+state("one-exposure-for-all", "exposure times differ between images; the program takes one for all, their median")
+state("one-pose-each", "no velocities are known: each image has one pose, as with a global shutter")
 
 
 @message(example={"left_out": 3, "images": 120})
@@ -315,19 +326,19 @@ def images_without_velocity(left_out: int, images: int) -> str:
 @message(example={"count": 120})
 def pictures_with_shutter(count: int) -> str:
     return (
-        f"{count} pictures have their rolling shutter, which the model lacks: they agree with it in the middle "
-        "row alone, unless the program models the shutter"
+        f"{count} images have a rolling shutter, which the model lacks: they agree with it only in the middle "
+        "row, unless the program models the shutter"
     )
 
 
 @message(example={"count": 120})
 def pictures_rectified(count: int) -> str:
-    return f"{count} pictures are rectified: those with their rolling shutter (colmap/images) are gone"
+    return f"{count} images are rectified: those with their rolling shutter (colmap/images) are missing"
 
 
 @message(example={"count": 40})
 def pictures_deblurred(count: int) -> str:
-    return f"{count} pictures are deblurred; with --capture, they are taken from it as they were filmed"
+    return f"{count} images are deblurred; with --capture, they are taken from it as filmed"
 
 
 # the viewer

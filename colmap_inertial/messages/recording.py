@@ -21,7 +21,7 @@ def rows_without_value(file: str, sensor: str, count: int, counted: str, first: 
 
 @message(example={"file": "imu.csv", "sensor": "gyroscope", "count": 4})
 def rows_sorted(file: str, sensor: str, count: int) -> str:
-    return f"{file}: sorted {count} {sensor} rows that came late"
+    return f"{file}: sorted {count} {sensor} rows that were out of order"
 
 
 @message(example={"file": "imu.csv", "sensor": "gyroscope", "count": 1})
@@ -41,7 +41,7 @@ def last_line_cut_off(file: str, line: int) -> str:
 
 @message(example={"file": "imu.csv", "count": 2})
 def comments_passed_over(file: str, count: int) -> str:
-    return f"{file}: passed over {count} lines inside the data that start with #"
+    return f"{file}: skipped {count} lines that start with # among the data"
 
 
 @message(example={"attitudes": 12})
@@ -52,20 +52,20 @@ def imu_corrected(attitudes: int) -> str:
 @message(example={"accel_factor": 0.5, "compared": 4})
 def imu_compared(accel_factor: float, compared: int) -> str:
     return (
-        f"the accelerometer's part of the scale's interval is {accel_factor:.2f} of that of unknown devices, "
-        f"by targets (results of this device: {compared})"
+        f"the accelerometer's part of the interval is {accel_factor:.2f} times that of an unknown device, "
+        f"from {compared} results of this device with targets"
     )
 
 
 @message(example={"clock_rate": 2.5e-4})
 def imu_clock_stretched(clock_rate: float) -> str:
     return (
-        f"the IMU's clock is {-1e6 * clock_rate:+.0f} ppm off the camera's, and either may be wrong (suspect a nominal "
-        "frame rate first); the IMU's stamps were stretched to keep step"
+        f"the IMU's clock is {-1e6 * clock_rate:+.0f} ppm off the camera's; the IMU's stamps were rescaled (if the "
+        "camera's clock is wrong, as with a nominal frame rate, lengths are off by twice that)"
     )
 
 
-state("model-metric-already", "this model is metric already: a scale of 1 says that it is right")
+state("model-metric-already", "this model is already metric: a scale of 1 confirms it")
 
 # camera against gyroscope
 
@@ -88,8 +88,8 @@ def poses_too_short(span_s: float) -> str:
 state("too-few-intervals", "fewer than four frame intervals lie inside the IMU recording")
 state(
     "no-overlap",
-    "camera and IMU do not overlap at any offset that is allowed",
-    advice="check that the recordings belong together and that their clocks are what was declared",
+    "camera and IMU do not overlap at any allowed time offset",
+    advice="check that the recordings belong together and that their clocks are as declared",
     joint=": ",
 )
 state(
@@ -101,7 +101,7 @@ state(
 state(
     "offset-ambiguous",
     "the rotations fit almost as well at another offset",
-    advice="record longer, with rotation that does not repeat itself",
+    advice="record longer, with rotation that does not repeat",
     joint=": ",
 )
 
@@ -114,19 +114,19 @@ state(
 )
 def no_offset_fits(explained: float) -> str:
     return (
-        "no time offset fits gyroscope and camera rotations clearly better than the others (the gyroscope explains "
+        "no time offset clearly fits gyroscope and camera rotations (the gyroscope explains "
         f"{100 * max(explained, 0):.0f} % of them)"
     )
 
 
 @message(advice="turn the camera about at least two axes while recording", joint=": ", example={"axis_sigma_rad": 0.5})
 def rotation_axis_open(axis_sigma_rad: float) -> str:
-    return f"known to no better than {degrees(axis_sigma_rad):.0f} deg about one axis"
+    return f"only known to {degrees(axis_sigma_rad):.0f} deg about one axis"
 
 
 state(
     "rotation-too-slow",
-    "the rotation is too slow to place the clocks to a tenth of a second",
+    "the rotation is too slow to align the clocks to a tenth of a second",
     advice="turn the camera more briskly",
     joint=": ",
 )
@@ -134,7 +134,7 @@ state(
 
 @message(advice="record longer", joint=": ", example={"judged": 5})
 def too_few_cameras_judged(judged: int) -> str:
-    return f"cameras contradict the gyroscope, and {judged} are too few to tell which"
+    return f"cameras contradict the gyroscope, and with {judged} it cannot be determined which"
 
 
 @message(
@@ -150,7 +150,7 @@ def no_majority_of_cameras(largest: int, judged: int) -> str:
 
 state(
     "too-few-corners-shared",
-    "consecutive frames share too few corners to follow the camera's rotation",
+    "consecutive frames share too few corners to track the camera's rotation",
     advice="film at a higher frame rate, or where there is more texture",
     joint=": ",
 )
@@ -166,34 +166,31 @@ def rotation_explained(explained: float, flipped: tuple[str, ...] = ()) -> str:
     return said
 
 
-state("frames-too-sparse", "too few frames close in time to tell stabilisation")
-state("gyroscope-elsewhere", "the gyroscope does not run along with the frames")
-state("camera-held-still", "the camera was held too still to tell whether the video is stabilised")
+state("frames-too-sparse", "too few frames are close in time to detect stabilisation")
+state("gyroscope-elsewhere", "the gyroscope does not cover the frames")
+state("camera-held-still", "the camera was held too still to detect stabilisation")
 
 
 @message(example={"share": 0.95})
 def quick_rotation_shown(share: float) -> str:
-    return f"the pictures show {100 * share:.0f} % of the quick rotation that the gyroscope measured"
+    return f"the frames show {100 * share:.0f} % of the fast rotation that the gyroscope measured"
 
 
 @message(advice="switch stabilisation off and record again", example={"share": 0.2})
 def pictures_stabilised(share: float) -> str:
-    return (
-        f"{quick_rotation_shown(share)}: the video was stabilised in the camera, so its gyroscope does not belong to "
-        "its pixels"
-    )
+    return f"{quick_rotation_shown(share)}: the video was stabilised in the camera"
 
 
 @message(example={"pairs": 12})
 def sign_open(pairs: int) -> str:
-    return f"{pairs} pairs of frames do not tell whether the gyroscope has the right sign"
+    return f"{pairs} pairs of frames do not determine the sign of the gyroscope"
 
 
-state("neither-sign", "the pictures turn neither as the gyroscope does nor the other way")
-state("sign-right", "the pictures turn as the gyroscope does")
+state("neither-sign", "the frames rotate neither with the gyroscope nor against it")
+state("sign-right", "the frames rotate with the gyroscope")
 state(
     "sign-wrong",
-    "the pictures turn the other way than the gyroscope: its axes have the wrong sign",
+    "the frames rotate against the gyroscope: its axes have the wrong sign",
     advice="check axes and rotation of [calibration] in capture.toml",
 )
 
@@ -203,8 +200,8 @@ state(
 )
 def calibration_too_loose(rotation_sigma_rad: float, offset_sigma_s: float) -> str:
     return (
-        f"before the reconstruction it is known to {degrees(rotation_sigma_rad):.1f} deg and "
-        f"{1e3 * offset_sigma_s:.0f} ms, which is too little"
+        f"before the reconstruction it is only known to {degrees(rotation_sigma_rad):.1f} deg and "
+        f"{1e3 * offset_sigma_s:.0f} ms"
     )
 
 
@@ -224,12 +221,12 @@ def neither_by_pixels_nor_model(by_pixels: Said, quantity: str, by_model: Said) 
 
 @message(advice="turn the camera quickly to and fro for some seconds", joint=": ", example={"readout_sigma_s": 0.004})
 def readout_too_loose(readout_sigma_s: float) -> str:
-    return f"the pictures tell the readout to +-{1e3 * readout_sigma_s:.1f} ms only"
+    return f"the frames only determine the readout to +-{1e3 * readout_sigma_s:.1f} ms"
 
 
 state(
     "readout-not-of-lines",
-    "what bends the pictures runs neither along nor across their lines: they were warped, turned or stabilised",
+    "the distortion runs neither along nor across the rows: the frames were warped, rotated or stabilised",
 )
 
 
@@ -240,12 +237,12 @@ def readout_of_few_corners(corners: int, pairs: int) -> str:
 
 @message(advice="turn the camera quickly to and fro for some seconds", joint=": ", example={"change_rad_s": 0.01})
 def readout_of_even_rotation(change_rad_s: float) -> str:
-    return f"the camera's rate changes by {change_rad_s:.2g} rad/s from frame to frame, which is too little to tell it"
+    return f"the angular rate changes by {change_rad_s:.2g} rad/s from frame to frame, too little to estimate it"
 
 
-state("readout-of-sparse-pictures", "pictures that are this far apart in time do not tell it; a video does")
-state("readout-without-gyroscope", "a video and its gyroscope would tell, where they fit each other")
-state("readout-of-stabilised-video", "a stabilised video tells nothing of it")
+state("readout-of-sparse-pictures", "images this far apart in time do not show it; a video does")
+state("readout-without-gyroscope", "it needs a video and a gyroscope that fit each other")
+state("readout-of-stabilised-video", "a stabilised video does not show it")
 
 # stops and doubts
 
@@ -267,7 +264,7 @@ def poses_of_another_convention(found: Said) -> str:
 _FOUND = {"code": "gyro-gain", "values": {"gain": 1.3}}
 _OFFSET = {"declared_s": 0.01, "found_s": -0.0141, "sigma_s": 0.002, "likely": "sign"}
 #: How to go on after a stop, and what that means.
-_WAY_ON = "--force goes on, and metres are then weak at most and may be wrong"
+_WAY_ON = "--force continues, with metres that are weak at most and may be wrong"
 
 
 @message(example={"finding": _FOUND})
@@ -285,24 +282,24 @@ state("force-goes-on", f"stopped before the scale was estimated: {_WAY_ON}")
 
 @message(example={"finding": {"code": "declared-offset", "values": _OFFSET}})
 def declared_left_out(finding: Said) -> str:
-    return f"{finding}; it is left out; {finding.advice} ({finding.code})"
+    return f"{finding}; it is ignored; {finding.advice} ({finding.code})"
 
 
 @message(example={"path": "accel.csv", "finding": {"code": "gravity-removed", "values": {"median_m_s2": 0.5}}})
 def stopped_by_file(path: str, finding: Said) -> str:
-    return f"{path}: {finding.with_advice}; --force goes on without metres: the gyroscope still serves"
+    return f"{path}: {finding.with_advice}; --force continues without metres, using the gyroscope alone"
 
 
 @message(example={"finding": _FOUND})
 def forced_to_go_on(finding: Said) -> str:
-    return f"{finding}; forced to go on"
+    return f"{finding}; continued by --force"
 
 
 @message(example={"doubts": ("its squares measure 3 % off",)})
 def target_doubtful(doubts: tuple[str, ...]) -> str:
-    return f"its target may not be the stated one: {'; '.join(doubts)}"
+    return f"the target may differ from its description: {'; '.join(doubts)}"
 
 
 @message(example={"file": "imu.csv", "times": 2})
 def clock_began_anew(file: str, times: int) -> str:
-    return f"{file}: the clock began anew {times} times, and was counted on"
+    return f"{file}: the clock restarted {times} times; the stamps were continued"

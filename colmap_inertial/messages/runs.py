@@ -22,8 +22,8 @@ def scales_refused(models: Sequence[int], reasons: Sequence[Sequence[Said]]) -> 
     return "; ".join(f"model {i}: {'; '.join(map(str, why))}" for i, why in zip(models, reasons, strict=True))
 
 
-_ROOM = "make room and start again, it continues"
-_RAISE = "raise the limit (ulimit -f) and start again, it continues"
+_ROOM = "free some space and start again; the run continues"
+_RAISE = "raise the limit (ulimit -f) and start again; the run continues"
 
 
 def _remove_or_choose(out: str, **_: object) -> str:
@@ -42,9 +42,9 @@ def not_for_rigs(option: str) -> str:
 
 state(
     "database-of-which-images",
-    "--database: the rolling shutter is corrected here. Say --database-images filmed where its keypoints "
-    "were found in images as filmed, rectified where in those of `deblur --rectify`; or leave the "
-    "correction out with --rolling-shutter off",
+    "--database: the rolling shutter is corrected here. Say --database-images filmed if its keypoints "
+    "were found in the images as filmed, rectified if in those of `deblur --rectify`; or disable the "
+    "correction with --rolling-shutter off",
 )
 
 state(
@@ -71,19 +71,20 @@ state("no-pairs-of-exposures", "describes no pairs of exposures", advice="add [i
 @message(example={"path": "capture.toml"})
 def readout_needed(path: str) -> str:
     return (
-        f"{path}: undoing the rolling shutter needs readout_s under [timing], the time from the first row to the last"
+        f"{path}: correcting the rolling shutter needs readout_s under [timing], the time from the first row "
+        f"to the last"
     )
 
 
-state("frames-on-another-clock", "puts the frames on another clock than the video's, which its positions are on")
+state("frames-on-another-clock", "puts the frames on another clock than the video's, to which its positions refer")
 
-state("nothing-with-positions", "has neither a video nor pictures that could hold positions")
+state("nothing-with-positions", "has neither a video nor images that could hold positions")
 
-state("capture-has-no-pictures", "has no pictures", advice="add [images] or [video]", joint=": ")
+state("capture-has-no-pictures", "has no images", advice="add [images] or [video]", joint=": ")
 
 state(
     "scale-from-plain-pictures",
-    "--scale-from target or distance takes plain pictures",
+    "--scale-from target or distance takes plain images",
     advice="fuse them first",
     joint=": ",
 )
@@ -100,12 +101,12 @@ def folder_not_created(folder: str, detail: str) -> str:
 
 @message(advice="remove it first", joint=": ", example={"path": "phone.json"})
 def calibrated_by_rests(path: str) -> str:
-    return f"{path} is a calibration by rests, which says more than targets"
+    return f"{path} is a calibration from rests, which is better than one from targets"
 
 
 @message(advice="give one result of each recording", example={"capture": "walk/capture.toml"})
 def result_of_same_capture(capture: str) -> str:
-    return f"is of {capture}, as another of these results"
+    return f"is of {capture}, like another of these results"
 
 
 state(
@@ -116,19 +117,19 @@ state(
 
 state(
     "result-with-calibration",
-    "a calibration of the IMU went into its scale",
+    "its scale already used a calibration of the IMU",
     advice="run it without one (--no-remembered)",
 )
 
 
 @message(advice="measure it, and add +- to the target", example={"target": "aruco:4X4_50:0.1"})
 def target_size_unstated(target: str) -> str:
-    return f"how well the size of {target} is known is not stated"
+    return f"the uncertainty of the size of {target} is not stated"
 
 
 state("scale-of-another-method", "its scale is not that of the joint method")
 
-state("device-without-name", "a device needs a name to be remembered by")
+state("device-without-name", "a device needs a name")
 
 
 @message(advice="name it so, as the page beside it ends in .html", example={"out": "phone.html"})
@@ -138,12 +139,12 @@ def calibration_is_json(out: str) -> str:
 
 @message(advice="choose another name or remove it", example={"page": "phone.html"})
 def calibration_page_exists(page: str) -> str:
-    return f"{page} exists, where the calibration's page goes"
+    return f"{page} exists, and the calibration's page is written there"
 
 
 # inputs
 
-state("no-table-of-samples", "is no table of samples: --capture is for one")
+state("no-table-of-samples", "is not a table of samples, which --capture describes")
 
 
 @message(advice=lambda model: f"give one of its models, {model}", joint=": ", example={"model": "project/sparse/0"})
@@ -158,11 +159,11 @@ def holds_several_models(count: int, model: str) -> str:
 
 state(
     "no-model-for-imu",
-    "holds no COLMAP model (sparse/ or a model folder), and --imu and the like belong to one: leave "
-    "them out for a capture, which describes itself",
+    "holds no COLMAP model (sparse/ or a model folder), which --imu and similar options describe: leave "
+    "them out for a capture, which has its own description",
 )
 
-state("no-folder-of-pictures", "no such folder of pictures", advice="give the project's images with --images DIR")
+state("no-folder-of-pictures", "no such folder of images", advice="give the project's images with --images DIR")
 
 state(
     "model-without-times",
@@ -199,7 +200,7 @@ state("project-needs-imu-and-times", f"{_NEEDS_IMU}; and when its images were ta
 
 @message(advice=_HOW_TIMES, joint=": ", example={"project": "project"})
 def project_untimed(project: str) -> str:
-    return f"{project}: nothing says when its images were taken"
+    return f"{project}: the times of its images are not known"
 
 
 # outputs
@@ -207,7 +208,7 @@ def project_untimed(project: str) -> str:
 
 @message(advice="create it first", example={"folder": "out"})
 def no_parent_folder(folder: str) -> str:
-    return f"{folder} is no folder"
+    return f"{folder} is not a folder"
 
 
 @message(advice="name a file in it", example={"path": "out"})
@@ -222,7 +223,7 @@ def output_is_an_input(path: str) -> str:
 
 @message(advice="choose another name or remove it", example={"path": "scale.json"})
 def output_is_foreign(path: str) -> str:
-    return f"{path} exists and is no earlier result"
+    return f"{path} exists and is not an earlier result"
 
 
 @message(advice="choose another name or remove it", example={"path": "capture.toml"})
@@ -249,27 +250,24 @@ def already_metric(folder: str) -> str:
 
 @message(advice="leave it out", example={"model": "sparse/0"})
 def rigs_not_refined(model: str) -> str:
-    return (
-        f"--refine inertial: several cameras took the images of {model}, each with its own place beside "
-        "the IMU, and models with rigs cannot be refined"
-    )
+    return f"--refine inertial: the images of {model} are of several cameras, and models with rigs cannot be refined"
 
 
 @message(advice="rename it, or go in two steps, scale and apply", joint=": ", example={"path": "project/scale.json"})
 def name_needed_by_output(path: str) -> str:
-    return f"{path} has a name that the output folder needs for itself"
+    return f"{path} has a name that the output folder uses itself"
 
 
 @message(
     advice="leave out --dense, or rename it to have another one made", joint=": ", example={"folder": "project/dense"}
 )
 def dense_comes_along(folder: str) -> str:
-    return f"{folder} comes along in metres"
+    return f"{folder} is already included, in metres"
 
 
 @message(advice="rename or remove it", example={"path": "out/sparse"})
 def place_taken(path: str) -> str:
-    return f"{path} stands where the project's is to come"
+    return f"{path} is in the place of the project's"
 
 
 @message(advice="choose another output folder", example={"path": "out"})
@@ -279,7 +277,7 @@ def output_not_empty(path: str) -> str:
 
 @message(advice="choose another folder or remove it", example={"path": "out"})
 def output_of_another_run(path: str) -> str:
-    return f"{path} holds a model of other pictures or options"
+    return f"{path} holds a model of other images or options"
 
 
 @message(advice=_remove_or_choose, example={"path": "out/colmap/0/images.bin", "out": "out"})
@@ -287,7 +285,7 @@ def output_changed(path: str, out: str) -> str:
     return f"{path} is missing or was changed since it was made"
 
 
-@message(advice="name a new folder for the pictures", example={"path": "pictures"})
+@message(advice="name a new folder for the images", example={"path": "pictures"})
 def pictures_exist(path: str) -> str:
     return f"{path} exists"
 
@@ -319,7 +317,7 @@ state(
     advice="distances between single markers go into --bars",
 )
 
-state("other-target-the-same", "--other-target must be another board than --target: nobody could tell them apart")
+state("other-target-the-same", "--other-target must be another board than --target, to tell them apart")
 
 state(
     "corners-too-few-to-keep-apart",
@@ -388,7 +386,7 @@ def for_metres_of_the_imu(option: str) -> str:
 
 @message(example={"page": "out/report.html"})
 def found_on_page(page: str) -> str:
-    return f"what was found, and what to do: {page}"
+    return f"findings and remedies: {page}"
 
 
 @message(example={"out": "out"})
@@ -420,7 +418,7 @@ def output_is_a_file(path: str) -> str:
     example={"out": "out"},
 )
 def run_of_another_version(out: str) -> str:
-    return f"{out} holds a run of another version, which laid its folders out otherwise"
+    return f"{out} holds a run of another version, with another layout of folders"
 
 
 @message(advice="choose another folder or remove it", example={"out": "out", "what": "capture", "named": "/data/walk"})
@@ -433,7 +431,7 @@ state("device-in-output", "is a device, a pipe or a socket in an output folder",
 
 @message(advice=_RAISE, example={"folder": "out"})
 def file_would_be_too_large(folder: str) -> str:
-    return f"{folder}: a file in it would be larger than files may be"
+    return f"{folder}: a file in it would exceed the limit of file sizes"
 
 
 @message(advice=_ROOM, example={"folder": "out", "detail": "No space left on device"})
@@ -443,13 +441,13 @@ def disk_full(folder: str, detail: str) -> str:
 
 @message(advice="choose a folder outside of it", example={"out": "images/out", "folder": "images"})
 def output_among_pictures(out: str, folder: str) -> str:
-    return f"{out} lies in {folder}, the folder of the capture's pictures"
+    return f"{out} lies in {folder}, the folder of the capture's images"
 
 
 @message(advice=_ROOM, example={"folder": "out", "free_bytes": 1000000, "needed_bytes": 50000000})
 def disk_nearly_full(folder: str, free_bytes: int, needed_bytes: int) -> str:
     return (
-        f"the disk of {folder} is nearly full: {free_bytes / 1e6:.0f} MB are left, COLMAP's next step may "
+        f"the disk of {folder} is nearly full: {free_bytes / 1e6:.0f} MB are left, and COLMAP's next step may "
         f"need {needed_bytes / 1e6:.0f} MB"
     )
 
@@ -471,12 +469,12 @@ def owner_unreadable(found: Said, out: str) -> str:
 
 
 @message(
-    advice="start that again, it is made again",
+    advice="run that again, which makes it again",
     joint=": ",
     example={"found": {"code": "not-a-result", "values": {}}, "lost": "scale.json"},
 )
 def lost_since_its_run(found: Said, lost: str) -> str:
-    return f"{found.with_advice}; {lost} is missing or damaged since its run wrote it"
+    return f"{found.with_advice}; {lost} was damaged or removed since its run"
 
 
 # frames, pairs and stages of a user
@@ -501,7 +499,7 @@ def depth_unlike_the_reference(dtype: str, reference_dtype: str) -> str:
 
 @message(advice="leave it out, or leave out the long ones by --exposures.no-fuse", example={"deblur": "wiener"})
 def fused_not_deblurred(deblur: str) -> str:
-    return f"--deblur {deblur}: frames of short and long exposures are fused, and not deblurred then"
+    return f"--deblur {deblur}: frames of short and long exposures are fused, not deblurred"
 
 
 @message(example={"width": 640, "height": 480, "frame": "0007.jpg", "short_width": 1920, "short_height": 1080})
@@ -509,7 +507,7 @@ def long_exposure_of_other_size(width: int, height: int, frame: str, short_width
     return f"is {width}x{height}, but its short exposure {frame} is {short_width}x{short_height}"
 
 
-@message(advice="write both alike", example={"kind": "grey", "frame": "0007.jpg", "short_kind": "in colour"})
+@message(advice="write both in the same way", example={"kind": "grey", "frame": "0007.jpg", "short_kind": "in colour"})
 def long_exposure_of_other_kind(kind: str, frame: str, short_kind: str) -> str:
     return f"is {kind}, but its short exposure {frame} is {short_kind}"
 
@@ -522,7 +520,7 @@ def long_exposure_of_other_depth(dtype: str, frame: str, short_dtype: str) -> st
 
 
 @message(
-    advice="all pictures of a capture must have the camera's size",
+    advice="all images of a capture must have the camera's size",
     example={"width": 640, "height": 480, "camera_width": 1920, "camera_height": 1080},
 )
 def picture_unlike_the_camera(width: int, height: int, camera_width: int, camera_height: int) -> str:
@@ -558,7 +556,7 @@ def stage_is_a_class(stage: str) -> str:
     return f"stage {stage}: is a class"
 
 
-@message(advice="name a function, or what can be called as one", example={"stage": "mine:three", "type": "int"})
+@message(advice="name a function or another callable", example={"stage": "mine:three", "type": "int"})
 def stage_not_callable(stage: str, type: str) -> str:
     return f"stage {stage}: is of type {type}"
 
@@ -568,7 +566,7 @@ def stage_not_imported(stage: str, why: Said) -> str:
     return f"stage {stage}: {why.with_advice}"
 
 
-@message(advice="install it where the capture is worked on, or set PYTHONPATH", example={"module": "mine"})
+@message(advice="install it on the machine that processes the capture, or set PYTHONPATH", example={"module": "mine"})
 def module_of_stage_missing(module: str) -> str:
     return f"there is no module {module}"
 

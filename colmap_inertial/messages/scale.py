@@ -26,10 +26,10 @@ PARTS: dict[str, tuple[str, str]] = {
     "accel_gain": ("the accelerometer's gain", "calibrate the IMU once (calibrate-imu)"),
     "lens": (
         "the lens and the model's shape",
-        "film a target of known size, or two points whose distance is measured, and take the metres from them",
+        "film a target of known size, or measure the distance of two points, and scale by it",
     ),
     "accel_noise": ("the accelerometer's noise", _LONGER),
-    "lost_readings": ("readings that are missing", "record without pauses, and within the ranges of the sensors"),
+    "lost_readings": ("missing readings", "record without pauses and within the sensors' ranges"),
     "accel_bias": ("the accelerometer's bias", _TURN),
     "camera_path": (
         "the camera's path",
@@ -37,21 +37,21 @@ PARTS: dict[str, tuple[str, str]] = {
     ),
     "gyro": ("the gyroscope", _TURN),
     "camera_imu": (
-        "how camera and IMU stand to each other",
-        "calibrate camera and IMU once (align), or give what is known of them",
+        "the camera-IMU alignment",
+        "calibrate camera and IMU once (align), or declare the known calibration",
     ),
     "clocks": (
-        "whether camera or IMU measures time rightly",
+        "the camera's or the IMU's clock rate",
         "give frames and IMU times of one clock, not of a nominal frame rate",
     ),
     "gravity": ("the strength of gravity", "give the latitude"),
-    "accel_faults": ("what was undone of the accelerometer's faults", "record what is undone here rightly"),
-    "model_shape": ("what was undone of the model's wrong shape", "close loops, and film what overlaps more"),
+    "accel_faults": ("the corrected accelerometer faults", "record without the faults named in the notes"),
+    "model_shape": ("the corrected shape of the model", "close loops, and film with more overlap"),
     "rolling_shutter": (
         "a rolling shutter that the model ignores",
         "declare readout_s before mapping, or refine it (--refine inertial)",
     ),
-    "noise_levels": ("how little the clip says of its own noise", "record longer"),
+    "noise_levels": ("uncertainty of the noise estimate", "record longer"),
 }
 
 
@@ -102,24 +102,21 @@ def not_observable(quantity: str, why: Any) -> str:
     return f"{quantity}: {why.with_advice if hasattr(why, 'with_advice') else why}"
 
 
-state(
-    "scale-without-accelerometer", "the recording has no accelerometer, without which metres are unknown; record it too"
-)
-state("scale-not-estimated", "not looked at")
+state("scale-without-accelerometer", "the recording has no accelerometer, which a metric scale needs; record it too")
+state("scale-not-estimated", "not estimated")
 state("fit-singular", f"camera and IMU do not determine a scale together: {_RECORD_INSTEAD}")
 state("motion-not-determined", "camera and IMU do not determine its motion")
 state("camera-still", "the camera does not move in the model: move it, do not only turn it")
 state("recording-too-short", "the recording is too short: record at least five seconds")
 state("camera-still-in-spectra", f"the camera does not move: {_SWING}")
-state("motion-not-felt", f"the accelerometer does not feel the camera's motion, or it is too weak: {_SWING}")
+state("motion-not-felt", f"the camera's motion is not visible in the accelerometer: {_SWING}")
 state("frames-too-few", "fewer than six frames were taken while the accelerometer recorded")
 
 
 @message(example={"sensor": "accelerometer"})
 def sensor_saturated(sensor: str) -> str:
     return (
-        f"nearly all of the {sensor}'s readings stand at the end of its range: move less violently, or give "
-        "the sensor a wider range"
+        f"nearly all of the {sensor}'s readings are saturated: move less violently, or set a wider range of the sensor"
     )
 
 
@@ -138,13 +135,13 @@ def frames_too_sparse_to_differentiate(step_s: float) -> str:
 
 @message(example={"needed_s": 5.0})
 def never_covered(needed_s: float) -> str:
-    needed = f"no stretch of {needed_s:g} s is covered by camera and accelerometer without a pause"
+    needed = f"camera and accelerometer never run together for {needed_s:g} s without a pause"
     return f"{needed}: record longer"
 
 
 @message(example={"faults": ("the accelerometer was low-passed at about 5 Hz",)})
 def path_with_faults(faults: Sequence[Any]) -> str:
-    return f"what is wrong counts from end to end of a gap: {'; '.join(map(str, faults))}"
+    return f"these faults affect the path across a gap: {'; '.join(map(str, faults))}"
 
 
 @message(example={"accel_m_s2": 0.98, "likely": "g"})
@@ -182,7 +179,7 @@ state(
 @message(example={"bias_m_s2": 3.5})
 def accel_bias_impossible(bias_m_s2: float) -> str:
     return (
-        f"the accelerometer would have to be off by {bias_m_s2:.1f} m/s2, more than any working sensor is: check its "
+        f"the fit needs an accelerometer bias of {bias_m_s2:.1f} m/s2, which no working sensor has: check its "
         "unit (m/s2), its sign (at rest it reads +9.8 away from the ground) and its axes"
     )
 
@@ -190,9 +187,8 @@ def accel_bias_impossible(bias_m_s2: float) -> str:
 @message(example={"gain": 0.4})
 def accel_gain_impossible(gain: float) -> str:
     return (
-        f"the accelerometer's gains or axes would have to be off by {100 * gain:.0f} %, more than those of any "
-        "working sensor are: check its unit (m/s2), its sign (at rest it reads +9.8 away from the ground) and its "
-        "axes"
+        f"the fit needs an accelerometer gain or axis error of {100 * gain:.0f} %, which no working sensor has: "
+        "check its unit (m/s2), its sign (at rest it reads +9.8 away from the ground) and its axes"
     )
 
 
@@ -207,23 +203,23 @@ def accel_contradicts_motion(unexplained_m_s2: float, motion_m_s2: float) -> str
 
 @message(example={"span_s": 4.2, "needed_s": 6.0})
 def clip_short(span_s: float, needed_s: float) -> str:
-    return f"the clip is short ({span_s:.1f} s): it says little about its own noise; record {needed_s:.0f} s or more"
+    return f"the clip is short ({span_s:.1f} s), so its noise is poorly known; record {needed_s:.0f} s or more"
 
 
 @message(example={"gains": (0.02, 0.03, -0.02)})
 def accel_gain_large(gains: Sequence[float]) -> str:
     said = ", ".join(f"{100 * gain:+.1f}" for gain in gains)
     return (
-        f"the accelerometer seems to be off in gain by {said} % on its axes, more than such sensors are, which "
-        "is allowed for: check its unit and the strength of gravity, or calibrate it (calibrate-imu)"
+        f"the accelerometer's gain error is {said} % (x, y, z), more than usual, and is corrected: "
+        "check its unit and the strength of gravity, or calibrate it (calibrate-imu)"
     )
 
 
 @message(example={"gains": (0.02, 0.03, -0.02)})
 def calibrated_gain_contradicted(gains: Sequence[float]) -> str:
     return (
-        "the motion contradicts the IMU's calibration: by it the accelerometer is still off in gain by "
-        f"{', '.join(f'{100 * gain:+.1f}' for gain in gains)} % along x, y, z: "
+        "the motion contradicts the IMU's calibration: with it, the accelerometer's gain is still off by "
+        f"{', '.join(f'{100 * gain:+.1f}' for gain in gains)} % (x, y, z): "
         "calibrate it again (calibrate-imu), or leave its calibration out"
     )
 
@@ -232,6 +228,7 @@ _LEVERS = {
     "inverse": "that of the inverse fits: imu_in_cam_m, and the last column of cam_from_imu, is the IMU in the "
     "camera's frame (T_cam_imu)",
     "sign": "with the other sign it fits: imu_in_cam_m points from the camera to the IMU",
+    "millimetres": "it fits in millimetres: imu_in_cam_m, and the last column of cam_from_imu, is in metres",
     "": "correct it, or leave it out, and it is estimated",
 }
 
@@ -252,63 +249,83 @@ def declared_lever_arm(declared_m: Sequence[float], found_m: Sequence[float], si
     )
 
 
+_AGAINST_TARGETS = {
+    "camera": "likeliest the declared intrinsics, which the images contradict, too",
+    "readout": "likeliest the readout, which the images contradict, too",
+    "declared": "likeliest what was declared of the IMU, which the recording contradicts, too",
+    "target": "likeliest the target's stated size: measure its squares, and compare them with [target]",
+    "accelerometer": "likeliest the accelerometer's gain: calibrate it (calibrate-imu)",
+    "": "measure the target's squares, compare them with [target], and see the reasons beside this one",
+}
+
+
+@message(example={"target": "checkerboard:8x6:0.04", "error_pct": -24.1, "sigmas": 18.0, "likely": "camera"})
+def target_contradicts_scale(target: str, error_pct: float, sigmas: float, likely: str) -> str:
+    return (
+        f"the target in the images ({target}) contradicts the scale: its lengths are {error_pct:+.1f} % off, "
+        f"{sigmas:.0f} standard deviations of both: {_AGAINST_TARGETS[likely]}"
+    )
+
+
 @message(example={"gain": 0.02, "excess": 0.015})
 def accel_gain_doubtful(gain: float, excess: float) -> str:
+    strong = "too strong" if excess > 0 else "too weak"
+    gains, lengths = ("high", "too long") if gain > 0 else ("low", "too short")
     return (
-        f"the accelerometer's gain may be off by {100 * gain:+.1f} %, which lengths follow (gravity "
-        f"reads {100 * excess:+.1f} % too long, by gain or bias): check its unit, turn the camera about "
-        "all axes while it moves, or calibrate it (calibrate-imu)"
+        f"measured gravity is {100 * abs(excess):.1f} % {strong} (gain or bias error); the accelerometer's gain may be "
+        f"{100 * abs(gain):.1f} % {gains}, and lengths {lengths} by as much: check its unit, turn the camera about all "
+        "axes while it moves, or calibrate it (calibrate-imu)"
     )
 
 
 @message(example={"found": {"code": "accel-gain-large", "values": {"gains": (0.01, 0.015, -0.01)}}})
 def counted_in_interval(found: object) -> str:
-    return f"{found} (this is in the interval)"
+    return f"{found} (included in the interval)"
 
 
 @message(example={"lag_s": 0.04})
 def accel_lags_as_filtered(lag_s: float) -> str:
     return (
-        f"the accelerometer lags by {1e3 * lag_s:.0f} ms and lacks quick changes, as if it had been low-passed at "
-        f"about {1 / (2 * math.pi * lag_s):.2g} Hz, which is in the interval: record it unfiltered (raw)"
+        f"the accelerometer lags by {1e3 * lag_s:.0f} ms, as if low-passed at about "
+        f"{1 / (2 * math.pi * lag_s):.2g} Hz (included in the interval): record it unfiltered (raw)"
     )
 
 
 @message(example={"moves_log": 0.012})
 def fit_hardly_converged(moves_log: float) -> str:
     return (
-        f"the fit of camera and IMU hardly converges: the scale still moves by {100 * moves_log:.1f} %, which is in "
-        "the interval: check that stamps are those of the samples, to a millisecond"
+        f"the fit of camera and IMU converges slowly: the scale still moves by {100 * moves_log:.1f} % (included in "
+        "the interval): check that the stamps are the sampling times, to a millisecond"
     )
 
 
 @message(example={"delay_s": 0.06})
 def accel_delay_undone(delay_s: float) -> str:
     return (
-        f"the accelerometer's stamps are {1e3 * delay_s:+.0f} ms off the gyroscope's, as the fit finds; that is "
-        "undone: stamp both sensors when they are sampled"
+        f"the accelerometer's stamps are {1e3 * delay_s:+.0f} ms off the gyroscope's, by the fit, which corrects it: "
+        "stamp both sensors when they are sampled"
     )
 
 
 @message(example={"sensor": "gyroscope", "share": 0.02})
 def readings_cut_off(sensor: str, share: float) -> str:
     return (
-        f"{100 * share:.2g} % of the {sensor}'s readings stand at the end of its range; they count as missing: "
-        "move less violently, or give the sensor a wider range"
+        f"{100 * share:.2g} % of the {sensor}'s readings are saturated and count as missing: "
+        "move less violently, or set a wider range of the sensor"
     )
 
 
 @message(example={"bias_m_s2": 2.1})
 def spectral_bias_large(bias_m_s2: float) -> str:
-    return f"the accelerometer would have a bias of {bias_m_s2:.1f} m/s2: check its axes, sign and unit"
+    return f"the fit needs an accelerometer bias of {bias_m_s2:.1f} m/s2: check its axes, sign and unit"
 
 
-state("half-without-scale", "half of the recording alone gives no scale")
+state("half-without-scale", "each half of the recording must give a scale by itself, and one does not")
 
 
 @message(example={"difference": 0.05})
 def halves_differ(difference: float) -> str:
-    return f"the second half of the recording gives a scale {100 * difference:+.1f} % from the first"
+    return f"the scale of the recording's second half differs by {100 * difference:+.1f} % from that of the first"
 
 
 # What is wrong with the accelerometer's readings.
@@ -317,17 +334,17 @@ def halves_differ(difference: float) -> str:
 @message(example={"cutoff_hz": 5.0})
 def accel_low_passed(cutoff_hz: float) -> str:
     return (
-        f"the accelerometer was low-passed at about {cutoff_hz:.2g} Hz; that is undone as far as it can be: record it "
-        "unfiltered (raw)"
+        f"the accelerometer was low-passed at about {cutoff_hz:.2g} Hz, which is corrected as far as possible: record "
+        "it unfiltered (raw)"
     )
 
 
 @message(example={"cutoff_hz": 5.0})
 def path_smoothed(cutoff_hz: float) -> str:
     return (
-        "the camera's path is smoother than what the accelerometer felt, as if low-passed at about "
-        f"{cutoff_hz:.2g} Hz: give poses that were not smoothed, and all readings of the accelerometer (under "
-        "vibration, readings that were held or left out look the same)"
+        "the camera's path is smoother than the accelerometer's, as if low-passed at about "
+        f"{cutoff_hz:.2g} Hz: give unsmoothed poses, and all readings of the accelerometer (under vibration, held or "
+        "dropped readings look the same)"
     )
 
 
@@ -335,16 +352,16 @@ def path_smoothed(cutoff_hz: float) -> str:
 def accel_axes_apart(delays_s: Sequence[float]) -> str:
     delays = ", ".join(f"{axis} {1e3 * d:+.1f}" for axis, d in zip("xyz", delays_s, strict=True))
     return (
-        f"the accelerometer's axes are not read at the same time ({delays} ms against their mean); that is "
-        "undone: give the stamps of each axis, or a recording that was not resampled axis by axis"
+        f"the accelerometer's axes are sampled at different times ({delays} ms from their mean), which is "
+        "corrected: give the stamps of each axis, or a recording that was not resampled axis by axis"
     )
 
 
 @message(example={"rate": 2e-4})
 def accel_clock_apart(rate: float) -> str:
     return (
-        f"the accelerometer's stamps run {1e6 * rate:+.0f} ppm off the gyroscope's; "
-        "that is undone: give both sensors the stamps of one clock"
+        f"the accelerometer's clock runs {1e6 * rate:+.0f} ppm off the gyroscope's, which is corrected: "
+        "stamp both sensors by one clock"
     )
 
 
@@ -355,8 +372,8 @@ def accel_clock_apart(rate: float) -> str:
 def model_stretched(stretch: float, axis: Sequence[float]) -> str:
     x, y, z = axis
     return (
-        f"the reconstruction is {100 * stretch:.1f} % longer along ({x:.2f}, "
-        f"{y:.2f}, {z:.2f}) than across; lengths are right on average: check the focal "
+        f"the reconstruction is stretched by {100 * stretch:.1f} % along ({x:.2f}, "
+        f"{y:.2f}, {z:.2f}); lengths are right on average: check the focal "
         "length and the lens, and film from more sides"
     )
 
@@ -364,26 +381,25 @@ def model_stretched(stretch: float, axis: Sequence[float]) -> str:
 @message(example={"growth": 0.03, "sigma": 0.004})
 def scale_grows(growth: float, sigma: float) -> str:
     return (
-        f"the reconstruction's scale is not the same throughout: lengths are {100 * growth:+.1f} +- {196 * sigma:.1f} "
-        f"% larger at the end than at the beginning: {_CLOSE_LOOPS}"
+        f"the reconstruction's scale drifts: lengths are {100 * growth:+.1f} +- {196 * sigma:.1f} "
+        f"% longer at the end than at the beginning: {_CLOSE_LOOPS}"
     )
 
 
 @message(example={"growth": 0.03, "sigma": 0.004, "since_s": 12.0, "first": True})
 def scale_breaks(growth: float, sigma: float, since_s: float, first: bool) -> str:
     return (
-        f"the reconstruction's scale is not the same throughout: lengths are {100 * growth:+.1f} +- "
-        f"{196 * sigma:.1f} % larger {'before' if first else 'after'} {since_s:.0f} s than in the rest, whose "
-        f"scale is used as it tells more: {_CLOSE_LOOPS}"
+        f"the reconstruction's scale jumps: lengths are {100 * growth:+.1f} +- "
+        f"{196 * sigma:.1f} % longer {'before' if first else 'after'} {since_s:.0f} s than in the rest, whose "
+        f"scale is used, as it is better known: {_CLOSE_LOOPS}"
     )
 
 
 @message(example={"lowest": -0.02, "highest": 0.03, "part_s": 10.0})
 def scale_varies(lowest: float, highest: float, part_s: float) -> str:
     return (
-        f"the reconstruction's scale is not the same throughout: from {100 * lowest:+.1f} to {100 * highest:+.1f} % in "
-        f"parts of {part_s:.0f} s (see drift in the JSON); it drifts, or a part of it "
-        f"is wrong: {_CLOSE_LOOPS}"
+        f"the reconstruction's scale varies from {100 * lowest:+.1f} to {100 * highest:+.1f} % in "
+        f"parts of {part_s:.0f} s (see drift in the JSON): {_CLOSE_LOOPS}"
     )
 
 
@@ -395,47 +411,47 @@ def poses_jump(since_s: Sequence[float]) -> str:
     places = "one place" if len(since_s) == 1 else f"{len(since_s)} places"
     since = ", ".join(f"{at_s:.1f}" for at_s in since_s[:_MOST_JUMPS])
     more = " s, ..." if len(since_s) > _MOST_JUMPS else " s"
-    return f"poses jump at {places} ({since}{more}), which hardly counts"
+    return f"poses jump at {places} ({since}{more}); negligible"
 
 
 @message(example={"offset_s": 120.5})
 def clocks_without_common_time(offset_s: float) -> str:
-    return f"the stamps of camera and IMU have no time in common; the rotations give an offset of {offset_s:.2f} s"
+    return f"camera and IMU clocks do not overlap; the rotations give an offset of {offset_s:.2f} s"
 
 
 @message(example={"sensor": "gyroscope", "count": 3, "total_s": 0.5, "longest_s": 0.2})
 def sensor_pauses(sensor: str, count: int, total_s: float, longest_s: float) -> str:
     times = "once" if count == 1 else f"{count} times"
-    longest = "" if count == 1 else f", {longest_s:.2f} s at the longest"
+    longest = "" if count == 1 else f", at most {longest_s:.2f} s at once"
     return f"the {sensor} pauses {times}, for {total_s:.2f} s in all{longest}"
 
 
 @message(example={"covered": 280, "frames": 300})
 def frames_without_imu(covered: int, frames: int) -> str:
-    return f"the IMU runs along with {covered} of {frames} frames only; the scale rests on those"
+    return f"IMU data cover {covered} of {frames} frames; the scale is estimated from those"
 
 
 @message(example={"calibrated_c": 20.0, "recorded_c": 41.0, "gain_change": 0.004})
 def imu_warmer(calibrated_c: float, recorded_c: float, gain_change: float) -> str:
     return (
-        f"the IMU was calibrated at {calibrated_c:.0f} °C and was {recorded_c:.0f} °C warm here: its gains may have "
-        f"changed by {100 * gain_change:.1f} %, which the interval counts; calibrate it as warm as you film"
+        f"the IMU was calibrated at {calibrated_c:.0f} °C and recorded at {recorded_c:.0f} °C: its gains may have "
+        f"changed by {100 * gain_change:.1f} % (included in the interval); calibrate it at the temperature of use"
     )
 
 
 @message(example={"sensor": "gyroscope", "scatter_s": 0.002})
 def stamps_scatter(sensor: str, scatter_s: float) -> str:
     return (
-        f"the {sensor}'s stamps scatter by {1e3 * scatter_s:.1f} ms about an even rate: give the stamps of the "
-        "samples, not of when they arrived"
+        f"the {sensor}'s stamps jitter by {1e3 * scatter_s:.1f} ms: stamp samples when they are taken, not when they "
+        "arrive"
     )
 
 
 @message(example={"sensor": "accelerometer", "share": 0.5})
 def readings_repeat(sensor: str, share: float) -> str:
     return (
-        f"{100 * share:.0f} % of the {sensor}'s readings repeat the one before: they were held, or read more "
-        "often than the sensor samples; record at the sensor's own rate"
+        f"{100 * share:.0f} % of the {sensor}'s readings repeat the previous one (held, or read faster than the sensor "
+        "samples): record at the sensor's own rate"
     )
 
 
@@ -456,16 +472,14 @@ def cameras_left_out(names: Sequence[str], deviations_deg: Sequence[float], came
 @message(example={"names": ("0007.jpg",), "cameras": 60})
 def cameras_misplaced(names: Sequence[str], cameras: int) -> str:
     return (
-        f"{len(names)} of {cameras} cameras are in another place than the accelerometer says and were left "
+        f"the positions of {len(names)} of {cameras} cameras contradict the accelerometer; these were left "
         f"out: {_name_some(names)}"
     )
 
 
 @message(example={"before": "0030.jpg", "after": "0031.jpg", "turn_deg": 25.0})
 def model_torn(before: str, after: str, turn_deg: float) -> str:
-    return (
-        f"the model is torn between {before} and {after}: its parts are turned by {turn_deg:.0f} deg against each other"
-    )
+    return f"the model breaks between {before} and {after}: its parts are rotated by {turn_deg:.0f} deg to each other"
 
 
 @message(example={"joined": 20, "kept": 40, "cameras": 60})
@@ -475,7 +489,7 @@ def torn_parts_joined(joined: int, kept: int, cameras: int) -> str:
 
 @message(example={"kept": 40, "cameras": 60})
 def largest_part_kept(kept: int, cameras: int) -> str:
-    return f"the scale rests on the largest part, {kept} of {cameras} cameras; the other parts were left out"
+    return f"the scale is that of the largest part, {kept} of {cameras} cameras; the other parts were left out"
 
 
 state("other-parts-left-out", "the other parts were left out")
@@ -483,7 +497,7 @@ state("other-parts-left-out", "the other parts were left out")
 
 @message(example={"names": ("0007.jpg",)})
 def cameras_registered_again(names: Sequence[str]) -> str:
-    return f"registered again, and right now: {', '.join(names)}"
+    return f"registered again, now consistent: {', '.join(names)}"
 
 
 @message(example={"reasons": ("the camera hardly accelerates",)})
@@ -505,33 +519,33 @@ def cameras_judged(facts: Sequence[Any]) -> str:
 @message(example={"gains": (0.02, 0.03, -0.02)})
 def refinement_gain_large(gains: Sequence[float]) -> str:
     said = ", ".join(f"{100 * gain:+.1f}" for gain in gains)
-    return f"the refinement finds the accelerometer off in gain by {said} % on its axes: calibrate it"
+    return f"the refinement finds accelerometer gain errors of {said} % (x, y, z): calibrate it"
 
 
 @message(example={"difference": 0.05, "half_width": 0.02})
 def refined_scale_differs(difference: float, half_width: float) -> str:
     return (
-        f"the refinement's scale is {100 * difference:+.1f} % from the first one, which said "
-        f"+-{100 * half_width:.1f} %: the reconstruction bends or drifts, or the accelerometer's "
-        "gain is off; a target, or a distance that is known, tells which is right"
+        f"the refinement changes the scale by {100 * difference:+.1f} %, beyond the +-{100 * half_width:.1f} % of the "
+        "first estimate: the reconstruction bends or drifts, or the accelerometer's gain is off; a target or a known "
+        "distance tells which is right"
     )
 
 
 @message(example={"declared_px": 700.0, "found_px": 530.0, "sigma_px": 4.0})
 def declared_focal_length(declared_px: float, found_px: float, sigma_px: float) -> str:
     return (
-        f"the declared focal length is {declared_px:.0f} px, and the images fit another better (towards {found_px:.0f} "
-        f"+-{2 * sigma_px:.0f} px), which bends the model and changes its size: leave out [camera] to let COLMAP "
-        "calibrate, or give the intrinsics of this very video mode"
+        f"the declared focal length is {declared_px:.0f} px, but the images fit {found_px:.0f} "
+        f"+-{2 * sigma_px:.0f} px better; a wrong one bends the model and changes its size: leave out [camera] to let "
+        "COLMAP calibrate, or give the intrinsics of this video mode"
     )
 
 
 @message(example={"readout_s": 0.02, "sigma_s": 0.001, "direction": "down"})
 def rolling_shutter_ignored(readout_s: float, sigma_s: float, direction: str, declared_global: bool = False) -> str:
-    found = f"exposed line by line within {1e3 * readout_s:.1f} +- {1e3 * sigma_s:.1f} ms ({direction})"
+    found = f"read out line by line in {1e3 * readout_s:.1f} +- {1e3 * sigma_s:.1f} ms ({direction})"
     if declared_global:
         return (
-            f"the declared readout is 0, a global shutter, and the images were {found}: correct readout_s and "
+            f"the declared readout is 0 (global shutter), but the images were {found}: correct readout_s and "
             "readout_direction, or leave them out"
         )
     return (
@@ -543,16 +557,14 @@ def rolling_shutter_ignored(readout_s: float, sigma_s: float, direction: str, de
 @message(example={"readout_s": 0.03, "half_width": 0.4})
 def rolling_shutter_possible(readout_s: float, half_width: float | None) -> str:
     return (
-        f"a rolling shutter of up to {1e3 * readout_s:.0f} ms, which the points of the "
-        f"model do not rule out, leaves the scale open by {100 * _number(half_width):.0f} %: declare readout_s, "
-        "0 for a global shutter"
+        f"a rolling shutter of up to {1e3 * readout_s:.0f} ms cannot be ruled out, which makes the scale uncertain by "
+        f"{100 * _number(half_width):.0f} %: declare readout_s (0 for a global shutter)"
     )
 
 
 state(
     "rolling-shutter-unknown",
-    "too little is seen to tell whether the images have a rolling shutter that the model ignores: declare readout_s, 0 "
-    "for a global shutter",
+    "the images show too little to detect a rolling shutter: declare readout_s (0 for a global shutter)",
 )
 
 
@@ -563,7 +575,7 @@ def joined_part_weak(colmap_index: int, images: int, why: Sequence[Any]) -> str:
 
 @message(example={"half_width": 0.12})
 def part_scale_wide(half_width: float | None) -> str:
-    return f"its scale is known to +-{100 * _number(half_width):.1f} % only"
+    return f"its scale is only known to +-{100 * _number(half_width):.1f} %"
 
 
 @message(example={"images": 12, "frames": 60})
@@ -584,7 +596,7 @@ state("fragment", "a fragment of few images")
 
 @message(example={"images": 4})
 def fragment_too_small(images: int) -> str:
-    return f"a fragment of {images} images: too small to be made metric (--fragments does it all the same)"
+    return f"a fragment of {images} images: too small to be made metric (--fragments scales it anyway)"
 
 
 # Static calibration of an IMU.
@@ -606,15 +618,15 @@ state("rests-without-accelerometer", "the recording has no accelerometer; record
 @message(example={"attitudes": 4, "needed": 6})
 def attitudes_too_few(attitudes: int, needed: int) -> str:
     rested = (
-        "no rest was found" if attitudes == 0 else f"it lay still in {attitudes} attitude{'s' * (attitudes > 1)} only"
+        "no rest was found" if attitudes == 0 else f"the device rested in {attitudes} attitude{'s' * (attitudes > 1)}"
     )
-    return f"{rested}, and at least {needed} are needed (twelve are good): {_LAY_STILL}"
+    return f"{rested}; at least {needed} are needed (twelve are good): {_LAY_STILL}"
 
 
 @message(example={"axes": ("x", "z")})
 def attitudes_alike(axes: Sequence[str]) -> str:
     return (
-        f"the attitudes are too much alike: the accelerometer's gain along {_list_axes(axes)} stays unknown. Each "
+        f"the attitudes are too similar to determine the accelerometer's gain along {_list_axes(axes)}. Each "
         f"axis must point up once and down once: {_LAY_STILL}"
     )
 
@@ -622,8 +634,8 @@ def attitudes_alike(axes: Sequence[str]) -> str:
 @message(example={"attitudes": 7, "misalignment": 0.01, "needed": 9})
 def misalignments_unknown(attitudes: int, misalignment: float, needed: int) -> str:
     return (
-        f"{attitudes} attitudes determine gains and biases of the accelerometer, not its misalignments, which stay "
-        f"unknown to {100 * misalignment:.1f} %; from {needed} on, they are determined, too"
+        f"{attitudes} attitudes determine the accelerometer's gains and biases, not its misalignments (known to "
+        f"{100 * misalignment:.1f} %); {needed} attitudes would"
     )
 
 
@@ -632,45 +644,48 @@ state("misalignment-unknown", f"the attitudes leave a misalignment of the accele
 
 @message(example={"axis": "x", "sigma": 0.004})
 def accel_gain_unsure(axis: str, sigma: float) -> str:
-    return f"the accelerometer's gain along {axis} is known to +-{196 * sigma:.2g} % only: {_LAY_STILL}"
+    return f"the accelerometer's gain along {axis} is only known to +-{196 * sigma:.2g} %: {_LAY_STILL}"
 
 
 state(
     "gyro-contradicts-rests",
-    "the gyroscope does not turn as the accelerometer says, whatever its gains: its axes or its unit differ "
-    "(colmap-inertial diagnose tells), and it was left as it is",
+    "the gyroscope contradicts the rests whatever its gains: its axes or its unit are wrong "
+    "(run colmap-inertial diagnose); it was not calibrated",
 )
 
 
 @message(example={"axes": ("y",)})
 def gyro_gain_unsure(axes: Sequence[str]) -> str:
     return (
-        f"the turns between the rests say little of the gyroscope's gain about {_list_axes(axes)}: it keeps what is "
-        "assumed of any gyroscope; turn the device about that axis, lying on its side, from one rest to the next"
+        f"the rotations between the rests do not determine the gyroscope's gain about {_list_axes(axes)}, "
+        f"which keeps its "
+        "prior; rotate the device about that axis, lying on its side, from one rest to the next"
     )
 
 
 @message(example={"of": "turns", "times": 5.0})
 def rests_disagree(of: str, times: float) -> str:
     return (
-        f"{of} agree {times:.0f} times less well than the sensor's noise allows: "
-        "something moved or gave way, or the sensor clips or warms up; the intervals count it"
+        f"{of} scatter {times:.0f} times more than the sensor's noise: the device moved or the support gave "
+        f"way, or the "
+        "sensor clips or warms up (included in the intervals)"
     )
 
 
 @message(example={"drift_m_s2": 0.02})
 def accel_bias_drifted(drift_m_s2: float) -> str:
     return (
-        f"the accelerometer's bias drifted by {drift_m_s2:.2g} m/s2 during the "
-        "recording, as that of a device that warms up: let it warm up for some minutes, then record again"
+        f"the accelerometer's bias drifted by {drift_m_s2:.2g} m/s2 during the recording, probably while "
+        f"warming up: let "
+        "the device warm up for some minutes, then record again"
     )
 
 
 @message(example={"sigma": 0.001})
 def gravity_assumed(sigma: float) -> str:
     return (
-        f"the strength of gravity is assumed, which alone makes the gains uncertain by +-{196 * sigma:.1g} %: give the "
-        "latitude (and the height) of the place"
+        f"the strength of gravity is assumed, which makes the gains uncertain by +-{196 * sigma:.1g} %: give the "
+        "latitude (and height) of the place"
     )
 
 

@@ -12,7 +12,7 @@ from colmap_inertial.messages import Said, message, state
     example={"path": "log.csv", "example": "3/4/2024"},
 )
 def date_order_unknown(path: str, example: str) -> str:
-    return f"{path}: nothing tells the day from the month in dates such as {example}"
+    return f"{path}: day and month cannot be told apart in dates such as {example}"
 
 
 state("rows-of-several-sensors", "has rows of several sensors")

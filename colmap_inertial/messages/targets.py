@@ -114,7 +114,7 @@ def check_points_too_few(path: str, count: int, needed: int) -> str:
 
 @message(example={"target": "aruco:4X4_50:0.1"})
 def corners_of_target_too_few(target: str) -> str:
-    return f"too few corners of {target} were measured to tell its middle"
+    return f"too few corners of {target} were measured to find its centre"
 
 
 @message(example={"marker": 3, "measured": (1, 2)})
@@ -139,7 +139,7 @@ def marker_of_table_not_measured(marker: str, measured: Sequence[int]) -> str:
 
 # its place in the model
 
-state("target-behind-camera", "the target was placed behind a camera that saw it")
+state("target-behind-camera", "the fit placed the target behind a camera that sees it")
 
 
 @message(example={"count": 5, "unknowns": 9})
@@ -147,11 +147,11 @@ def corners_too_few(count: int, unknowns: int) -> str:
     return f"{count} corner observations are too few for {unknowns} unknowns"
 
 
-state("target-fit-unsettled", "the fit of the target does not settle; the views may be too close together")
+state("target-fit-unsettled", "the fit of the target does not converge; the views may be too close together")
 
-state("image-gone", "the image cannot be read any more")
+state("image-gone", "the image can no longer be read")
 
-state("picture-not-written", "the picture cannot be written")
+state("picture-not-written", "the image cannot be written")
 
 
 @message(advice="give one of them", joint=": ", example={"folders": ("0", "1")})

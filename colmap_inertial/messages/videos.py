@@ -39,7 +39,7 @@ def frame_size_changes(old: tuple[int, int], new: tuple[int, int], frame_s: floa
 
 
 state("no-video-stream", "holds no video stream")
-state("cover-picture-alone", "holds only a cover picture, no video stream")
+state("cover-picture-alone", "holds only a cover image, no video stream")
 
 
 @message(example={"after_s": 1.0, "detail": "Invalid data found when processing input"})
@@ -125,7 +125,7 @@ def frames_of_one_stamp(path: str, stamp_s: float) -> str:
 
 @message(example={"frame_s": 1.0})
 def frame_damaged(frame_s: float) -> str:
-    return f"is damaged: the frame at {frame_s:.3f} s cannot be decoded whole"
+    return f"is damaged: the frame at {frame_s:.3f} s cannot be fully decoded"
 
 
 @message(example={"missing": 3, "wanted": 100, "first_s": 1.0})
@@ -140,7 +140,7 @@ def pyav_missing(path: str) -> str:
 
 @message(example={"detail": "Invalid data found when processing input"})
 def not_read_by_ffmpeg(detail: str) -> str:
-    return f"is no video that FFmpeg reads: {detail}"
+    return f"is not a video that FFmpeg reads: {detail}"
 
 
 @message(

@@ -29,17 +29,21 @@ def read_all_the_same(file: str, found: Said) -> str:
 message(
     code="git-lfs-pointer",
     advice="run git lfs pull there, or leave it out with --keep or by moving it away",
-)(lambda: "is a Git LFS pointer: this clone holds only a note of where the file is")
+)(lambda: "is a Git LFS pointer: the file itself is not in this clone")
 message(code="git-annex-pointer", advice="run git annex get there, or move it away")(
-    lambda: "is a git-annex pointer: this clone holds only a note of where the file is"
+    lambda: "is a git-annex pointer: the file itself is not in this clone"
 )
 state(
     "apple-double",
-    "is what macOS leaves beside a file on foreign drives and in archives (AppleDouble), not the file itself",
+    "is a macOS metadata file (AppleDouble), not the file itself",
     advice="remove it: find . -name '._*' -delete",
 )
-state("web-page", "is a web page, as a download without access gives in place of the file", advice="download it again")
-state("zeros", "holds nothing but zeros, as an interrupted copy or download leaves", advice="copy it again")
+state(
+    "web-page",
+    "is a web page, probably saved in place of the file by a download without access",
+    advice="download it again",
+)
+state("zeros", "holds only zeros, probably from an interrupted copy or download", advice="copy it again")
 
 
 @message(advice="unpack it first", example={"kind": "gzip"})
@@ -49,7 +53,7 @@ def packed_file(kind: str) -> str:
 
 @message(advice="convert it to PNG or JPEG", example={"kind": "HEIF or AVIF"})
 def picture_format(kind: str) -> str:
-    return f"is a {kind} picture, a format that is not read here"
+    return f"is a {kind} image, a format that is not supported"
 
 
 # models
@@ -58,34 +62,35 @@ def picture_format(kind: str) -> str:
 @message(example={"count": 3, "points": 2})
 def lost_points(count: int, points: int) -> str:
     return (
-        f"{_of(count, 'key point')} {'names' if count == 1 else 'name'} {_of(points, 'point')} that the model lacks or "
-        "that do not name them: they count as key points without a point"
+        f"{_of(count, 'keypoint')} {'refers' if count == 1 else 'refer'} to {_of(points, 'point')} that the "
+        f"model lacks "
+        "or that do not refer back: read as keypoints without a point"
     )
 
 
 @message(example={"count": 3})
 def lost_observations(count: int) -> str:
-    return f"{_of(count, 'entry' if count == 1 else 'entrie')} of points' tracks name no such key point: left out"
+    return f"{_of(count, 'entry' if count == 1 else 'entrie')} of points' tracks refer to missing keypoints: left out"
 
 
 @message(example={"count": 30})
 def tracks_from_images(count: int) -> str:
-    return f"the points name no images: their tracks are taken from the {count} key points that name them"
+    return f"the points have no tracks: these are taken from the {count} keypoints that refer to them"
 
 
 @message(example={"count": 3, "frames": 1})
 def lost_images(count: int, frames: int) -> str:
-    return f"frames name {_of(count, 'image')} that the model lacks: left out"
+    return f"frames refer to {_of(count, 'image')} that the model lacks: left out"
 
 
 @message(example={"stated": 12, "found": 10, "what": "images"})
 def other_count(stated: int, found: int, what: str) -> str:
-    return f"its head states {stated} {what}, and {found} are there: was the file cut off or edited?"
+    return f"its header states {stated} {what}, but it holds {found}: was the file cut off or edited?"
 
 
 @message(example={"count": 10})
 def images_without_second_line(count: int) -> str:
-    return f"{_of(count, 'image')} lack{'s' if count == 1 else ''} the second line, of key points: taken as empty"
+    return f"{_of(count, 'image')} lack{'s' if count == 1 else ''} the second line, of keypoints: read as empty"
 
 
 @message(example={"count": 10})
@@ -94,22 +99,22 @@ def decimal_commas(count: int) -> str:
 
 
 @message(
-    advice="names join everything: rename them where the model was made (names with blanks are cut by some readers of "
-    "text models)",
+    advice="names must be unique: rename them where the model was made (some readers of text models cut "
+    "names at blanks)",
     example={"count": 10, "name": "A-DJI_2024"},
 )
 def repeated_name(count: int, name: str) -> str:
     return f"{count} images have the name {name!r}"
 
 
-@message(advice="the file was damaged or put together of two models", example={"what": "image", "number": 3})
+@message(advice="the file is damaged or was merged from two models", example={"what": "image", "number": 3})
 def repeated_number(what: str, number: int) -> str:
-    return f"{what} {number} is there twice"
+    return f"{what} {number} appears twice"
 
 
 @message(advice="write the model again where it was made", example={"image": "a.jpg", "camera": 3})
 def unknown_camera(image: str, camera: int) -> str:
-    return f"its image {image!r} is of camera {camera}, which cameras lacks"
+    return f"its image {image!r} is of camera {camera}, which the model lacks"
 
 
 @message(example={"expects": "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", "text": "1, 2"})
@@ -123,13 +128,14 @@ def text_line(expects: str, text: str) -> str:
 )
 def folded_lens(camera: int, model: str, radius_px: float, corner_px: float) -> str:
     return (
-        f"the lens of camera {camera} ({model}) folds back {radius_px:.0f} px from the middle, while pictures reach "
-        f"{corner_px:.0f} px: nothing is known of what lies beyond"
+        f"the distortion of camera {camera} ({model}) is not invertible beyond {radius_px:.0f} px from the "
+        f"centre, and its "
+        f"images reach {corner_px:.0f} px"
     )
 
 
 @message(
-    advice="its parameters may be of another size of picture",
+    advice="its parameters may be for another image size",
     example={"camera": 1, "width": 640, "height": 480, "cx": 1280.0, "cy": 960.0},
 )
 def odd_principal_point(camera: int, width: int, height: int, cx: float, cy: float) -> str:
@@ -159,12 +165,12 @@ def kept_in_cloud(names: tuple[str, ...]) -> str:
 
 @message(example={"kinds": ("2 .las", "1 .splat")})
 def carried_lengths(kinds: tuple[str, ...]) -> str:
-    return f"copied in their old units, as their formats are not transformed: {', '.join(kinds)}"
+    return f"copied in their old units (formats that are not transformed): {', '.join(kinds)}"
 
 
 @message(example={"kinds": ("3 .ckpt (outputs/step.ckpt)",)})
 def possible_lengths(kinds: tuple[str, ...]) -> str:
-    return f"copied as they are, and may hold lengths, as nothing is known of them: {', '.join(kinds)}"
+    return f"copied unchanged (unknown formats, which may hold lengths): {', '.join(kinds)}"
 
 
 def _depth_advice(count: int, example: str, factors: tuple[float, ...]) -> str:
@@ -176,42 +182,44 @@ def _depth_advice(count: int, example: str, factors: tuple[float, ...]) -> str:
 @message(advice=_depth_advice, example={"count": 10, "example": "depth/frame_00001.png", "factors": (2.5,)})
 def unmoved_depths(count: int, example: str, factors: tuple[float, ...]) -> str:
     times = (
-        f"{factors[0]:.9g} times as much as before" if len(factors) == 1 else "as much more as its model's scale says"
+        f"{factors[0]:.9g} times its former length"
+        if len(factors) == 1
+        else "its former length times its model's scale"
     )
-    return f"depths in {_of(count, 'picture')} of whole numbers ({example}) stay as they are: a step means {times}"
+    return f"depths in {_of(count, 'integer image')} ({example}) are unchanged: one step is now {times}"
 
 
 @message(
-    advice="it is right where it is in metres already",
+    advice="nothing to do if it is already in metres",
     example={"path": "rig_config.json", "ratio": 2.5},
 )
 def rig_elsewhere(path: str, ratio: float | None) -> str:
     if ratio is None:
-        return f"{path}: copied as it is, as no model here has images of its cameras"
-    return f"{path}: copied as it is, as its cameras are {ratio:.4g} times as far apart as a model had them"
+        return f"{path}: copied unchanged, as no model here has images of its cameras"
+    return f"{path}: copied unchanged, as its cameras are {ratio:.4g} times as far apart as in the model"
 
 
 @message(
-    advice="look whether they are lengths",
+    advice="check whether they are lengths",
     example={"path": "transforms.json", "fields": ("aabb", "scene_radius")},
 )
 def fields_unmoved(path: str, fields: tuple[str, ...]) -> str:
-    return f"{path}: {', '.join(fields)} stay as they are, as nothing is known of them"
+    return f"{path}: {', '.join(fields)} are unchanged, as their meaning is unknown"
 
 
 @message(example={"path": "outputs/dataparser_transforms.json"})
 def training_of_another_model(path: str) -> str:
-    return f"{path}: copied as it is, as it does not lead from a model here to where nerfstudio puts its cameras"
+    return f"{path}: copied unchanged, as it does not transform a model here to nerfstudio's cameras"
 
 
 @message(example={"path": "exports/splat.ply", "by": "outputs/dataparser_transforms.json"})
 def frame_of_training(path: str, by: str) -> str:
-    return f"{path}: copied as it is, as its points are in the frame of a training; {by} leads from metres to that"
+    return f"{path}: copied unchanged, as its points are in a training's own frame; {by} transforms metres to it"
 
 
 @message(example={"path": "transforms.json"})
 def cameras_elsewhere_in_file(path: str) -> str:
-    return f"{path}: copied as it is, as its cameras do not stand where those of a model do"
+    return f"{path}: copied unchanged, as its cameras are not those of a model"
 
 
 @message(
@@ -220,19 +228,20 @@ def cameras_elsewhere_in_file(path: str) -> str:
 )
 def other_frame(path: str, share_pct: float) -> str:
     return (
-        f"{path}: moved with the model, although its points are {share_pct:.0f} % of the model's size away from the "
-        "model's: it may be of another frame"
+        f"{path}: transformed with the model, although its points are {share_pct:.0f} % of the model's size "
+        f"away from the "
+        "model's: it may be in another frame"
     )
 
 
 @message(example={"path": "sparse_pc.ply", "by": "transforms.json"})
 def frame_of_transforms(path: str, by: str) -> str:
-    return f"{path} is in the world of {by}, and moved in it"
+    return f"{path} is in the world frame of {by}, and transformed in it"
 
 
 @message(advice="a pattern is a name, or a path in the project", example={"pattern": "old"})
 def idle_pattern(pattern: str) -> str:
-    return f"--keep {pattern} is none of the project's paths"
+    return f"--keep {pattern} matches no path of the project"
 
 
 @message(
@@ -240,7 +249,7 @@ def idle_pattern(pattern: str) -> str:
     example={"provenance": ""},
 )
 def foreign_record(provenance: str = "") -> str:
-    return "is not a record of colmap-inertial, which writes its own by this name"
+    return "is not a record of colmap-inertial, which writes its own under this name"
 
 
 # where a model lies, and whose scale it is given
@@ -248,14 +257,11 @@ def foreign_record(provenance: str = "") -> str:
 
 @message(example={"folder": "sparse/0", "pivot": (432100.0, 5664700.0, 120.0)})
 def about_place(folder: str, pivot: tuple[float, ...]) -> str:
-    return (
-        f"{folder} lies far from the origin: it is turned and scaled about {', '.join(f'{x:.9g}' for x in pivot)}, "
-        "which stays where it is"
-    )
+    return f"{folder} lies far from the origin: it is rotated and scaled about {', '.join(f'{x:.9g}' for x in pivot)}"
 
 
 @message(
-    advice="leave out --dense, and make the cloud of an export, which is about a point in its middle",
+    advice="leave out --dense, and make the cloud from an export, which is centred",
     example={"folder": "project/sparse/0"},
 )
 def dense_far_away(folder: str) -> str:
@@ -267,11 +273,11 @@ def dense_far_away(folder: str) -> str:
     example={"folder": "sparse/0", "distance": 28000.0},
 )
 def moved_away(folder: str, distance: float) -> str:
-    return f"{folder} lies far from the origin, about which the similarity acts, and moves by {distance:.6g}"
+    return f"{folder} lies far from the origin, so the similarity moves it by {distance:.6g}"
 
 
 @message(
-    advice="measure this model with scale; --any-model takes it all the same",
+    advice="estimate this model's own scale; --any-model applies it anyway",
     example={"folder": "sparse/0", "difference": "12 images instead of 10"},
 )
 def scale_of_another_model(folder: str, difference: str) -> str:
@@ -280,10 +286,10 @@ def scale_of_another_model(folder: str, difference: str) -> str:
 
 @message(example={"difference": "12 images instead of 10"})
 def scale_taken_all_the_same(difference: str) -> str:
-    return f"the scale is of another model ({difference}), and taken all the same"
+    return f"the scale is of another model ({difference}), applied anyway"
 
 
-state("scale-without-identity", "the scale does not say of which model it is: it is taken for that of this one")
+state("scale-without-identity", "the scale does not name its model: it is assumed to be this one")
 
 
 # exports
@@ -293,19 +299,19 @@ state("scale-without-identity", "the scale does not say of which model it is: it
 def recentred(offset: tuple[float, ...]) -> str:
     where = ", ".join(f"{x:.9g}" for x in offset)
     return (
-        f"the model lies too far from the origin for single precision: {where} is taken off all coordinates, and "
-        "stands in metadata.xml (SRSOrigin) and export.json"
+        f"the model lies too far from the origin for single precision: {where} is subtracted from all coordinates, and "
+        "written to metadata.xml (SRSOrigin) and export.json"
     )
 
 
 @message(example={"folder": "project/masks"})
 def masks_left(folder: str) -> str:
-    return f"the masks in {folder} are of the pictures before they were undistorted, and are not exported"
+    return f"the masks in {folder} belong to the distorted images and are not exported"
 
 
 @message(example={"direction": "up"})
 def no_row_poses(direction: str) -> str:
-    return f"these pictures are read out {direction}: there is no viewmats_rs.json, which is of rows from the top"
+    return f"these images are read out {direction}: viewmats_rs.json, for rows from the top, is not written"
 
 
 # targets
@@ -320,7 +326,7 @@ def _contradiction_advice(
     likely_gap: float | None = None,
 ) -> str:
     if kind == "aprilgrid":
-        likely = "" if likely_gap is None else f"; the pictures show {likely_gap:.3g}"
+        likely = "" if likely_gap is None else f"; the images show {likely_gap:.3g}"
         return (
             f"check the gap, which is {gap:g} in its description: the distance between two tags divided by a tag's "
             f"side{likely}"
@@ -348,7 +354,7 @@ def lengths_contradict(
     likely_gap: float | None = None,
 ) -> str:
     listed = ", ".join(
-        f"{length:.4g} mm in a {line} {off:+.2g} %"
+        f"{length:.4g} mm in a {line} {off:+.{0 if abs(off) >= 100 else 1}f} %"
         for length, off, line in zip(lengths_mm, off_pct, along, strict=True)
     )
-    return f"its lengths contradict each other, all of a kind alike: {listed}"
+    return f"its lengths contradict each other systematically: {listed}"

@@ -41,14 +41,14 @@ def pair_centres(model: PlacedModel, written: Sequence[tuple[str, Array]]) -> li
         candidates = [name for stem in stems for name in images.get(stem, [])]
         if not candidates:
             continue
-        shared = {name: _shared(PurePosixPath(name).parts[:-1], parts[:-1]) for name in candidates}
+        shared = {name: _count_shared_folders(PurePosixPath(name).parts[:-1], parts[:-1]) for name in candidates}
         best = [name for name, count in shared.items() if count == max(shared.values())]
         nearest = min(best, key=lambda name: float(np.linalg.norm(model.centres[name] - centre)))
         pairs.append((model.centres[nearest], centre))
     return pairs
 
 
-def _shared(a: tuple[str, ...], b: tuple[str, ...]) -> int:
+def _count_shared_folders(a: tuple[str, ...], b: tuple[str, ...]) -> int:
     """Number of last folders that two paths share."""
     count = 0
     for x, y in zip(reversed(a), reversed(b), strict=False):

@@ -154,7 +154,7 @@ def read_layout(root: Path, folders: Sequence[Path], *, one_for_all: bool) -> La
     known = {Path(), *folders}
     dense = [f for f in known if f / "stereo" in known and any(m.is_relative_to(f / "sparse") for m in models)]
     submodels = _submodels(root, models, dense, one_for_all=one_for_all)
-    placed = {folder: _placed(root / folder, index) for index, folder in submodels.items()}
+    placed = {folder: _place_model(root / folder, index) for index, folder in submodels.items()}
     owners = {folder: index for index, folder in submodels.items()}
     for folder in models:
         if folder not in owners:
@@ -212,7 +212,7 @@ def _nearest_to_root(folders: list[Path]) -> list[Path]:
 _POINTS = 20_000
 
 
-def _placed(folder: Path, index: int) -> PlacedModel:
+def _place_model(folder: Path, index: int) -> PlacedModel:
     model = read_model(folder, unique_names=False)
     images = [model.image(i) for i in model.reg_image_ids()]
     sensors: dict[tuple[int, int], Array] = {}
@@ -231,7 +231,7 @@ def _placed(folder: Path, index: int) -> PlacedModel:
 
 def _owner(root: Path, folder: Path, submodels: Mapping[Path, PlacedModel]) -> int:
     """The sub-model that shares images with a model, their cameras in the same places."""
-    model = _placed(root / folder, -1)
+    model = _place_model(root / folder, -1)
     fits: list[Path] = []
     elsewhere: list[Path] = []
     for other, placed in submodels.items():

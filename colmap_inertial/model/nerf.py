@@ -62,7 +62,7 @@ def cameras_are_those_of(path: Path, placed: Sequence[PlacedModel]) -> bool:
     values = _frames(path)
     if values is None:
         return False
-    back = np.linalg.inv(_applied(path, values))
+    back = np.linalg.inv(_read_applied_transform(path, values))
     written = [
         (str(frame.get("file_path", "")), (back @ _matrix(path, frame["transform_matrix"]))[:3, 3])
         for frame in values["frames"]
@@ -73,7 +73,7 @@ def cameras_are_those_of(path: Path, placed: Sequence[PlacedModel]) -> bool:
 def read_applied_transform(path: Path) -> Array | None:
     """(4, 4) what was done to the model's world in a ``transforms.json``; ``None`` for any other file."""
     values = _frames(path)
-    return None if values is None else _applied(path, values)
+    return None if values is None else _read_applied_transform(path, values)
 
 
 def depth_pictures(path: Path) -> tuple[set[str], bool]:
@@ -119,7 +119,7 @@ def transform_transforms(source: Path, target: Path, similarity: Similarity) -> 
     values = _frames(source)
     if values is None:
         return ()
-    applied, moving = _applied(source, values), np.eye(4)
+    applied, moving = _read_applied_transform(source, values), np.eye(4)
     moving[:3, :3] = similarity.scale * matrix_from_quat(similarity.rotation_xyzw)
     moving[:3, 3] = similarity.translation_m
     moving = applied @ moving @ np.linalg.inv(applied)
@@ -260,7 +260,7 @@ def _frames(path: Path) -> dict[str, Any] | None:
     return values if cameras else None
 
 
-def _applied(path: Path, values: Mapping[str, Any]) -> Array:
+def _read_applied_transform(path: Path, values: Mapping[str, Any]) -> Array:
     """(4, 4) what was done to the model's world before the cameras were written: nerfstudio scales last."""
     given = values.get("applied_transform")
     scale: Any = values.get("applied_scale")

@@ -56,7 +56,7 @@ def average_rotations(count: int, first: IndexArray, second: IndexArray, first_f
 
     if not len(first):
         return np.full((count - 1, 3), np.nan)
-    world_from_cam = _chained(count, first, second, first_from_second)
+    world_from_cam = _chain_rotations(count, first, second, first_from_second)
     rows, ones = np.arange(len(first)), np.ones(len(first))
     columns = np.concatenate([second, first])
     change = coo_matrix(
@@ -79,7 +79,7 @@ def average_rotations(count: int, first: IndexArray, second: IndexArray, first_f
     return np.where((part[:-1] == part[1:])[:, None], turn_rad, np.nan)
 
 
-def _chained(count: int, first: IndexArray, second: IndexArray, first_from_second: Array) -> Array:
+def _chain_rotations(count: int, first: IndexArray, second: IndexArray, first_from_second: Array) -> Array:
     """(N, 3, 3) rotations ``world_from_cam`` along the shortest step to an earlier frame; of none, the one before."""
     nearest: dict[int, int] = {}
     for pair in np.argsort(first - second, kind="stable").tolist():  # the longest steps first

@@ -18,7 +18,7 @@ from colmap_inertial.core.arrays import Array, IndexArray
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import cross, quat_exp, quat_multiply
-from colmap_inertial.core.types import ReadoutDirection
+from colmap_inertial.core.types import FrameTiming, ReadoutDirection
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.imaging.rolling_shutter import append_unit_depth
 from colmap_inertial.motion.flow import VisualRotation
@@ -70,7 +70,7 @@ class ReadoutLimits:
     clear_sigmas: float = 3.0
     #: one that is seen the other way, too, must be clear and this share of it.
     beside_share: float = 0.2
-    #: Added to what scatter shows (``scripts/study_readout.py``): seconds,
+    #: Added to what scatter shows (``scripts/studies/readout.py``): seconds,
     floor_s: float = 2e-4
     #: and the share of a readout by which it comes out too short where depths are of all sizes.
     floor_share: float = 0.02
@@ -102,6 +102,45 @@ class ReadoutEstimate:
 
     def __str__(self) -> str:
         return f"{1e3 * self.readout_s:.1f} +- {1e3 * self.sigma_s:.1f} ms"
+
+
+def compare_readout(
+    declared: FrameTiming,
+    readout_s: float,
+    sigma_s: float,
+    direction: ReadoutDirection,
+    *,
+    least_s: float,
+    sigmas: float,
+) -> Fact | None:
+    """A declared readout that is not the one which was found without it; ``None`` where it agrees, or none is.
+
+    Parameters
+    ----------
+    declared
+        Readout and direction of the frames.
+    readout_s, sigma_s, direction
+        What was found, and its standard deviation.
+    least_s, sigmas
+        They are at least so far apart, and by so many standard deviations.
+    """
+    stated_s, towards = declared.readout_s, declared.readout_direction
+    if stated_s is None:
+        return None
+    opposite = {towards, direction} in ({"down", "up"}, {"right", "left"})
+    across = not opposite and towards != direction
+    along_s = -readout_s if opposite else readout_s
+    off_s = max(stated_s, readout_s) if across else abs(stated_s - along_s)
+    if off_s <= max(least_s, sigmas * sigma_s):
+        return None
+    return Fact(
+        "declared-readout",
+        declared_s=stated_s,
+        declared_direction=towards,
+        readout_s=readout_s,
+        sigma_s=sigma_s,
+        direction=direction,
+    )
 
 
 def estimate_readout(rotation: VisualRotation, motion: GyroCamera) -> ReadoutEstimate:

@@ -27,6 +27,8 @@ largest values, ``null`` for gaps; three lines are x, y, z.
                    ``duration_s``, ``interval_s``, ``median_exposure_s``, ``readout_s``); ``null`` where unknown
 ``blur``           ``note``, ``counts`` by action, ``median_px``, ``largest_px``, ``frames`` (``name``, ``t_s``,
                    ``blur_px``, ``action``, ``reason``), or missing
+``frame_table``    ``count``, and ``rows`` of the most blurred frames (``name``, ``t_s``, ``blur_px``, ``action``,
+                   ``sharpened``, ``rectified``, ``reason``, ``image``: path of its image), or missing
 ``crops``          ``pairs`` (``name``, ``blur_px``, ``reason``, and the paths ``before`` and ``after``), or missing
 ``rolling_shutter``  ``note``, ``readout_s``, ``t_s``, ``median_px``, ``largest_px`` (movement of keypoints in each of
                    some frames), ``worst`` (``name``, ``width``, ``height``, ``at_px``, ``shift_px`` over a grid), or

@@ -10,10 +10,10 @@ import numpy as np
 
 from colmap_inertial import __version__
 from colmap_inertial.core.types import Action
-from colmap_inertial.io.files import read_json, read_text
+from colmap_inertial.io.files import path_in, read_json, read_text
 from colmap_inertial.io.toml_section import parse_toml
 from colmap_inertial.report.folders import CROPS_FOLDER, DATA_FOLDER, model_file, recording_file
-from colmap_inertial.report.series import SIZES, strided
+from colmap_inertial.report.series import SIZES, stride_indices
 from colmap_inertial.report.words import (
     describe_joined,
     describe_mapping,
@@ -94,6 +94,7 @@ def gather(
         "recording": None if recording is None else _summarise_recording(recording),
         "made": None if recording is None else recording.get("made"),
         "blur": _blur(done, recording, project=project),
+        "frame_table": _frame_table(out, done, recording, project=project),
         "crops": _crops(out, done),
         "rolling_shutter": _rolling_shutter(done, recording),
         "project_metric": done.get("project_metric"),
@@ -182,7 +183,7 @@ def _validation(out: Path, model: Content, *, project: bool) -> Content:
         return _mark_missing(f"The target could not be measured: {validation['error']}.")
     folder = out / "validation" / str(model["index"])
     images = sorted(folder.glob("*.jpg")) if folder.is_dir() else []
-    chosen = [str(images[i].relative_to(out)) for i in strided(len(images), SIZES.target_images)]
+    chosen = [str(images[i].relative_to(out)) for i in stride_indices(len(images), SIZES.target_images)]
     return {**validation, "pictures": chosen}
 
 
@@ -210,7 +211,7 @@ def _blur(done: Content, recording: Content | None, *, project: bool) -> Content
         return _mark_missing(f"No blur to show: {note}.")
     time_of = dict(zip(recording["frames"]["names"], recording["frames"]["t_s"], strict=True))
     blur_px = np.array([frame["blur_px"] for frame in known])
-    some = strided(len(known), SIZES.blur_frames)
+    some = stride_indices(len(known), SIZES.blur_frames)
     worst = np.argsort(-blur_px, kind="stable")[: SIZES.blur_frames // 10] if len(some) < len(known) else some[:0]
     return {
         "note": note,
@@ -222,6 +223,35 @@ def _blur(done: Content, recording: Content | None, *, project: bool) -> Content
             for i in np.union1d(some, worst).tolist()
         ],
     }
+
+
+def _frame_table(out: Path, done: Content, recording: Content | None, *, project: bool) -> Content:
+    """What was done to each frame, the most blurred first; of many frames, only those."""
+    if project:
+        return _mark_missing("The images of an existing project are left as they are.")
+    if not done["frames"]:
+        return _mark_missing("The run did not get as far as the frames.")
+    time_of: dict[str, float] = {}
+    if recording is not None:
+        time_of = dict(zip(recording["frames"]["names"], recording["frames"]["t_s"], strict=True))
+    by_blur = sorted(done["frames"], key=lambda frame: (-(frame["blur_px"] or 0.0), frame["name"]))
+    return {
+        "count": len(by_blur),
+        "rows": [
+            {
+                "t_s": time_of.get(frame["name"]),
+                "image": _image_of_frame(out, frame["name"]),
+                **{key: frame.get(key) for key in ("name", "blur_px", "action", "sharpened", "rectified", "reason")},
+            }
+            for frame in by_blur[: SIZES.frame_rows]
+        ],
+    }
+
+
+def _image_of_frame(out: Path, name: str) -> str | None:
+    """Path of the image that COLMAP saw, or of the one that agrees with the model; ``None`` where neither is there."""
+    paths = (f"{folder}/{name}" for folder in ("colmap/images", "images"))
+    return next((path for path in paths if path_in(out, path).is_file()), None)
 
 
 def _crops(out: Path, done: Content) -> Content:

@@ -21,6 +21,7 @@ from colmap_inertial.inertial.scale.verdict import TRUSTED_HALF_WIDTH, WEAK_HALF
 from colmap_inertial.io.files import path_in, read_bytes
 from colmap_inertial.io.images import require_modest
 from colmap_inertial.report.figures import Figure
+from colmap_inertial.report.series import SIZES
 from colmap_inertial.report.still import draw_still
 from colmap_inertial.report.still_3d import StillView, draw_scene_still
 from colmap_inertial.report.words import digits, signed
@@ -79,14 +80,19 @@ def render_page(template: str, *, out: Path | None = None, **values: Any) -> str
             links.append((anchor, short))
         return ""
 
-    def embedded(paths: Sequence[str], captions: Sequence[str] | None = None) -> list[tuple[str, str]]:
+    def embed(paths: Sequence[str], captions: Sequence[str] | None = None) -> list[tuple[str, str]]:
         return [] if out is None else embed_images(out, paths, captions)
+
+    def thumbnail(path: str | None) -> str | None:
+        """Data URL of a small image; ``None`` where there is none."""
+        return None if out is None or path is None else _data_url(path_in(out, path), SIZES.thumbnail_px)
 
     shared = {
         "plot": plot,
         "picture": picture,
         "add_link": add_link,
-        "embedded": embedded,
+        "embedded": embed,
+        "thumbnail": thumbnail,
         "figures_drawn": figures,
         "links": links,
     }
@@ -113,7 +119,7 @@ def _environment() -> Environment:
         "digits": digits,
         "signed": signed,
         "degrees": math.degrees,
-        "packed_json": lambda value: _packed(json.dumps(value, separators=(",", ":"), allow_nan=False).encode()),
+        "packed_json": _pack_json,
     }
     environment.globals |= {
         "library": _plotly_library,
@@ -151,20 +157,21 @@ def embed_images(out: Path, paths: Sequence[str], captions: Sequence[str] | None
     return [(caption, url) for caption, url in embedded if url is not None]
 
 
-def _data_url(path: Path) -> str | None:
+def _data_url(path: Path, widest_px: int = _IMAGE["width_px"]) -> str | None:
+    """Data URL of an image, no wider than so many pixels."""
     import cv2
 
     if not path.is_file():
         return None
     data = read_bytes(path)
     require_modest(path, data)
-    image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR) if data else None
+    decode = cv2.IMREAD_REDUCED_COLOR_2 if widest_px < _IMAGE["width_px"] else cv2.IMREAD_COLOR
+    image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), decode) if data else None
     if image is None:
         return None
     height, width = image.shape[:2]
-    widest = _IMAGE["width_px"]
-    if width > widest:
-        image = cv2.resize(image, (widest, round(height * widest / width)), interpolation=cv2.INTER_AREA)
+    if width > widest_px:
+        image = cv2.resize(image, (widest_px, round(height * widest_px / width)), interpolation=cv2.INTER_AREA)
         data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _IMAGE["jpeg_quality"]])[1].tobytes()
     return f"data:image/jpeg;base64,{base64.b64encode(data).decode('ascii')}"
 
@@ -174,8 +181,12 @@ def _plotly_library() -> str:
     """plotly.js, packed: it is five megabytes long."""
     from plotly.offline import get_plotlyjs
 
-    return _packed(get_plotlyjs().encode())
+    return _compress_to_base64(get_plotlyjs().encode())
 
 
-def _packed(data: bytes) -> str:
+def _pack_json(value: Any) -> str:
+    return _compress_to_base64(json.dumps(value, separators=(",", ":"), allow_nan=False).encode())
+
+
+def _compress_to_base64(data: bytes) -> str:
     return base64.b64encode(gzip.compress(data, 6, mtime=0)).decode("ascii")

@@ -14,7 +14,7 @@ from colmap_inertial.core.arrays import Array, IndexArray, UInt8Array
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_rotate, rotation_between
 from colmap_inertial.core.types import CameraTrajectory
 from colmap_inertial.model.readout import intrinsics_sigma
-from colmap_inertial.report.series import SIZES, rounded, strided
+from colmap_inertial.report.series import SIZES, round_values, stride_indices
 
 if TYPE_CHECKING:
     import pycolmap
@@ -48,7 +48,7 @@ def photogrammetry_record(
     upright = quat_rotate(display_from_model_xyzw, xyz) if len(xyz) else xyz
     seen = [
         _observe(reconstruction.camera(images[i].camera_id), images[i], place)
-        for i in strided(len(images), SIZES.residual_images)
+        for i in stride_indices(len(images), SIZES.residual_images)
     ]
     sigma, longest = intrinsics_sigma(reconstruction), SIZES.longest_track
     return {
@@ -128,7 +128,7 @@ def _describe_camera(
         "images": sum(reconstruction.image(i).camera_id == camera_id for i in image_ids),
         "params": dict(zip(names, (float(p) for p in camera.params), strict=True)),
         "sigma": {n: float(s) for n, s in zip(names, () if sigma is None else sigma, strict=False) if np.isfinite(s)},
-        "field_of_view_deg": rounded(np.array(field), 2),
+        "field_of_view_deg": round_values(np.array(field), 2),
         "distortion": {
             "at_px": np.round(at[good], 1).tolist(),
             "shift_px": np.round((at - pinhole)[good], 3).tolist(),
@@ -188,7 +188,7 @@ def _count_from_above(upright: Array, tracks: list[Any]) -> dict[str, Any] | Non
     place = ((upright[:, :2] - low) / step).astype(np.intp)
     inside = np.flatnonzero(np.all((upright[:, :2] >= low) & (upright[:, :2] <= high), axis=1))
     seen: dict[tuple[int, int], set[int]] = {}
-    for i in inside[strided(len(inside), 60_000)].tolist():
+    for i in inside[stride_indices(len(inside), 60_000)].tolist():
         key = (min(int(place[i, 1]), rows - 1), min(int(place[i, 0]), columns - 1))
         seen.setdefault(key, set()).update(element.image_id for element in tracks[i].elements)
     counts: IndexArray = np.zeros((rows, columns), dtype=np.intp)
@@ -235,8 +235,8 @@ def scene_record(
     centres = quat_rotate(upright, trajectory.cam_in_world)
     xyz, rgb = _choose_points(reconstruction, trajectory.cam_in_world)
     xyz = quat_rotate(upright, xyz) if len(xyz) else xyz
-    some = strided(len(centres), SIZES.scene_cameras)
-    poses = strided(len(centres), SIZES.scene_poses)
+    some = stride_indices(len(centres), SIZES.scene_cameras)
+    poses = stride_indices(len(centres), SIZES.scene_poses)
     shown = np.concatenate([xyz, centres])
     size = float(np.ptp(shown, axis=0).max()) if len(shown) else 0.0
     digits = int(np.clip(4 - np.floor(np.log10(size)), 0, 9)) if size > 0 else 6
@@ -278,7 +278,7 @@ def _choose_points(reconstruction: pycolmap.Reconstruction, centres: Array) -> t
     chosen = []
     ids = sorted(reconstruction.point3D_ids())
     # a first choice bounds the work for models of millions of points
-    for i in np.array(ids)[strided(len(ids), 6 * SIZES.scene_points)].tolist() if ids else []:
+    for i in np.array(ids)[stride_indices(len(ids), 6 * SIZES.scene_points)].tolist() if ids else []:
         point = reconstruction.points3D[i]
         seen_well = point.track.length() >= SIZES.fewest_views and not point.error > SIZES.worst_point_px
         if seen_well and np.isfinite(point.xyz).all():
@@ -289,5 +289,5 @@ def _choose_points(reconstruction: pycolmap.Reconstruction, centres: Array) -> t
     middle = np.median(np.concatenate([xyz, centres]), axis=0)
     away = np.linalg.norm(xyz - middle, axis=1)
     near = np.flatnonzero(away < SIZES.farthest_medians * max(float(np.median(away)), 1e-12))
-    near = near[strided(len(near), SIZES.scene_points)]
+    near = near[stride_indices(len(near), SIZES.scene_points)]
     return xyz[near], np.array([chosen[i].color for i in near], dtype=np.uint8).reshape(-1, 3)

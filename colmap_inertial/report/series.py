@@ -18,6 +18,9 @@ class ReportSizes:
     models: int = 3
     #: Frames in the plot of blur, images of the target, distances of the target.
     blur_frames: int = 3000
+    #: Rows of the table of frames, and the width of their thumbnails.
+    frame_rows: int = 120
+    thumbnail_px: int = 112
     target_images: int = 4
     target_distances: int = 1500
     #: Points of a line: more than a screen has columns.
@@ -59,7 +62,7 @@ def nice_length(value: float) -> float:
     return next((m * power for m in (1, 2, 5) if m * power >= value * 0.999), 10 * power)
 
 
-def rounded(values: Array, digits: int = 5) -> list[float | None]:
+def round_values(values: Array, digits: int = 5) -> list[float | None]:
     """Numbers with so many significant digits; ``None`` for those that are not finite."""
     values = np.asarray(values, dtype=np.float64).ravel()
     finite = np.isfinite(values)
@@ -69,7 +72,7 @@ def rounded(values: Array, digits: int = 5) -> list[float | None]:
     return [value if known else None for value, known in zip(short.tolist(), finite.tolist(), strict=True)]
 
 
-def thinned(t_s: Array, values: Array, most: int = SIZES.line_points) -> dict[str, list[float | None]]:
+def thin_line(t_s: Array, values: Array, most: int = SIZES.line_points) -> dict[str, list[float | None]]:
     """A line of at most ``most`` points: of each of equally long parts, its smallest and its largest value.
 
     Parameters
@@ -85,7 +88,7 @@ def thinned(t_s: Array, values: Array, most: int = SIZES.line_points) -> dict[st
     """
     keep = np.arange(len(t_s)) if len(t_s) <= most else _extremes(np.asarray(values), most // 2)
     times = np.round(np.asarray(t_s)[keep], 4).tolist()
-    return {"t_s": times, "values": rounded(np.asarray(values)[keep])}
+    return {"t_s": times, "values": round_values(np.asarray(values)[keep])}
 
 
 def _extremes(values: Array, parts: int) -> IndexArray:
@@ -99,7 +102,7 @@ def _extremes(values: Array, parts: int) -> IndexArray:
     return np.unique(np.concatenate(kept))
 
 
-def strided(count: int, most: int) -> IndexArray:
+def stride_indices(count: int, most: int) -> IndexArray:
     """At most ``most`` of ``count`` indices, evenly, first and last among them."""
     if count <= most:
         return np.arange(count)

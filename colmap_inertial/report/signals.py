@@ -25,7 +25,7 @@ from colmap_inertial.core.types import (
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.inertial.scale import check_units
 from colmap_inertial.motion.smooth import WorldAcceleration, smooth_attitude
-from colmap_inertial.report.series import rounded, thinned
+from colmap_inertial.report.series import round_values, thin_line
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,7 +96,7 @@ def signal_record(
     if estimate.rotations is not None:
         consensus = estimate.rotations
         deviation = np.where(consensus.judged, consensus.deviation_deg, np.nan)
-        record["rotation"]["deviation_deg"] = thinned(consensus.t_s - start_s, deviation)
+        record["rotation"]["deviation_deg"] = thin_line(consensus.t_s - start_s, deviation)
     no_accel = "The recording has no accelerometer."
     if aligned is None or calibration is None:
         why = "Camera and IMU could not be aligned, so their {} cannot be compared."
@@ -157,14 +157,14 @@ def _compare_rotations(
         "same_clock_origin": bool(overlap),
         "deviation_deg": None,
         "before": {
-            "camera": [thinned(before_s, column) for column in rates.rate_rad_s.T],
-            "gyroscope": [thinned(raw_s[near], column[near]) for column in raw.T] if near.sum() > 1 else [],
+            "camera": [thin_line(before_s, column) for column in rates.rate_rad_s.T],
+            "gyroscope": [thin_line(raw_s[near], column[near]) for column in raw.T] if near.sum() > 1 else [],
         },
         "after": None,
     }
     if aligned is None:
-        record["before"]["camera_size"] = thinned(before_s, np.linalg.norm(rates.rate_rad_s, axis=1))
-        record["before"]["gyroscope_size"] = thinned(raw_s[near], np.linalg.norm(raw[near], axis=1))
+        record["before"]["camera_size"] = thin_line(before_s, np.linalg.norm(rates.rate_rad_s, axis=1))
+        record["before"]["gyroscope_size"] = thin_line(raw_s[near], np.linalg.norm(raw[near], axis=1))
         return record
     by_gyro = rates.by_gyroscope(aligned)
     both = np.isfinite(by_gyro).all(axis=1)
@@ -172,8 +172,8 @@ def _compare_rotations(
         return record
     difference = (rates.rate_rad_s - by_gyro)[both]
     record["after"] = {
-        "camera": [thinned(times, column) for column in rates.rate_rad_s.T],
-        "gyroscope": [thinned(times, column) for column in by_gyro.T],
+        "camera": [thin_line(times, column) for column in rates.rate_rad_s.T],
+        "gyroscope": [thin_line(times, column) for column in by_gyro.T],
         "rms_difference_rad_s": _rms(difference),
         "rms_rate_rad_s": _rms(by_gyro[both]),
     }
@@ -261,8 +261,8 @@ class _Accelerations:
         x, y = (a[both] - a[both].mean(axis=0) for a in (by_camera, by_imu))
         power = float(np.sqrt(np.sum(x**2) * np.sum(y**2)))
         return {
-            "camera": [thinned(times, column) for column in by_camera.T],
-            "accelerometer": [thinned(times, column) for column in by_imu.T],
+            "camera": [thin_line(times, column) for column in by_camera.T],
+            "accelerometer": [thin_line(times, column) for column in by_imu.T],
             "camera_unit": "m/s2" if self._metric else "units/s2",
             "averaged_over_s": 2 * reach * self._step_s,
             "correlation": float(np.sum(x * y)) / power if power > 0 else None,
@@ -324,7 +324,7 @@ def _estimate_spectrum(t_s: Array, values: Array) -> Record | None:
     place = np.searchsorted(edges, hz, side="right")
     bins, index, members = np.unique(place, return_inverse=True, return_counts=True)
     mean = np.sqrt(np.bincount(index, density**2, len(bins)) / members)
-    return {"hz": rounded(np.bincount(index, hz, len(bins)) / members, 4), "density": rounded(mean, 4)}
+    return {"hz": round_values(np.bincount(index, hz, len(bins)) / members, 4), "density": round_values(mean, 4)}
 
 
 def _welch(values: Array, step_s: float, count: int) -> tuple[Array, Array]:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from colmap_inertial.report.figures import IMU, Figure
-from colmap_inertial.report.series import thinned
+from colmap_inertial.report.series import thin_line
 from colmap_inertial.report.still_axes import Axis, choose_axis, equalise
 
 #: A polygon's or line's corners (px).
@@ -162,7 +162,7 @@ def _thin(trace: Figure) -> Figure:
     x, y = (np.array(trace[name], dtype=np.float64) for name in "xy")
     if not np.all(np.diff(x) >= 0):
         return trace
-    line = thinned(x, y, STYLE.line_points)
+    line = thin_line(x, y, STYLE.line_points)
     return {**trace, "x": line["t_s"], "y": line["values"]}
 
 

@@ -18,23 +18,23 @@ Fact = tuple[str, str]
 _LITTLE_M_S2, _USUAL = 0.3, "0.5 to 2 m/s²"
 
 _MOVE = (
-    "Film again, and move the camera itself: swing it by 20 cm or more, to and fro and up and down, about once a "
-    "second, all through the recording, for 10 s or longer. Rotation on the spot, a tripod, or motion at constant "
-    "speed does not determine the scale."
+    "Film again and move the camera itself: swing it by 20 cm or more, sideways and up and down, about once a "
+    "second, throughout the recording, for 10 s or longer. Rotation on the spot, a tripod or motion at constant "
+    "speed do not determine the scale."
 )
 _RAW = (
     "Record the raw gyroscope and accelerometer (with gravity), from before the first frame to after the last, with "
     "the camera's stabilisation switched off."
 )
 _TARGET = (
-    "To be independent of motion, put a printed board into the scene and name it in capture.toml ([target]), or give "
-    "metres by a length you measured: reconstruct OUT/colmap NEW_FOLDER --scale-from distance, or --scale-from target."
+    "For a scale that does not depend on motion, put a printed board into the scene and name it in capture.toml "
+    "([target]), or measure a length: reconstruct OUT/colmap NEW_FOLDER --scale-from distance, or --scale-from target."
 )
 _MODEL = (
-    "Resolve the reasons above: look at the model first (wrong or torn poses show as jumps of the camera's path), then "
-    "at the axes, units and time stamps of the IMU."
+    "Resolve the reasons listed: check the model first (wrong poses show as jumps of the camera's path), then "
+    "the axes, units and time stamps of the IMU."
 )
-_CHECK = "Resolve the reasons above; until then, check the model against a known length before you measure in it."
+_CHECK = "Resolve the reasons listed; until then, check a known length before you measure in the model."
 
 
 def digits(value: float, count: int = 4) -> str:
@@ -73,7 +73,7 @@ def length_error(pct: float) -> str:
 def length_in_words(verdict: str, pct: float) -> str:
     """The error of a length of ten metres, by the half-width of the scale's interval."""
     if verdict == "trusted":
-        return f"lengths of 10 m are right to within {length_error(pct)}"
+        return f"lengths of 10 m are accurate to {length_error(pct)}"
     return (
         f"lengths of 10 m may be off by {length_error(pct)}, or by more for the reasons below: check a known length "
         "before you measure"
@@ -164,7 +164,7 @@ def place_facts(place: Mapping[str, Any] | None) -> Iterator[Fact]:
     errors = place.get("errors")
     if errors is not None:
         assumed = " (assumed: the positions do not show it)" if errors.get("alike_assumed") else ""
-        sizes = f"{digits(errors['white_m'], 2)} m from one to the next, {digits(errors['slow_m'], 2)} m that are alike"
+        sizes = f"{digits(errors['white_m'], 2)} m independent, {digits(errors['slow_m'], 2)} m correlated"
         yield "errors of positions", f"{sizes} over {digits(errors['alike_s'], 2)} s{assumed}"
     if delay is not None:
         yield "lag of positions", f"{digits(delay['seconds'], 2)} s +-{digits(delay['ci95_s'], 2)} s"
@@ -239,7 +239,7 @@ def outcome_of_model(model: dict[str, Any]) -> dict[str, Any]:
     """
     verdict, scale, ci95 = model["verdict"], model["metres_per_unit"], model["ci95"]
     if scale is None or ci95 is None:
-        return _refused(model)
+        return _describe_refused_model(model)
     pct = half_width_pct(scale, ci95)
     extent = model.get("photogrammetry", {}).get("extent")
     sides = [length(side, 3 if verdict == "trusted" else 2) for side in extent or ()]
@@ -253,7 +253,7 @@ def outcome_of_model(model: dict[str, Any]) -> dict[str, Any]:
     ]
     if model.get("parts"):
         made_of = describe_parts(model["parts"])
-        summary.append(f"What makes the interval so wide: {made_of}. To narrow it most, {made_of.advice}.")
+        summary.append(f"Parts of the uncertainty: {made_of}. To reduce it most, {made_of.advice}.")
     return {
         "verdict": verdict,
         "headline": headline,
@@ -290,8 +290,8 @@ def _describe_trust(model: dict[str, Any]) -> str:
         if place == "outside":
             return f"not until this is resolved: {against}"
     if model["verdict"] == "trusted":
-        return f"yes; {against}" if against else "yes: the IMU determines the scale, and all checks were passed"
-    rough = "no, it is rough for the reasons below: check a known length before you measure"
+        return f"yes; {against}" if against else "yes: the IMU determines the scale, and all checks passed"
+    rough = "no, for the reasons below: check a known length before you measure"
     return f"{rough}; {against}" if against else rough
 
 
@@ -315,9 +315,9 @@ def _next_steps(model: dict[str, Any], pct: float) -> list[str]:
         steps = [_MOVE if pct > 100 * TRUSTED_HALF_WIDTH else _CHECK, *([] if checked else [_TARGET])]
     elif checked and checked.get("scale_error_pct") is not None and not checked["within_tolerance"]:
         steps = ["Measure the board's squares, compare them with [target], and see below which images hold it."]
-    steps.append("Turn it, and measure in it: `colmap-inertial view .`, in this folder.")
+    steps.append("Explore and measure: `colmap-inertial view .`, in this folder.")
     if model["verdict"] == "trusted":
-        steps.append("Take it to other programs in metres: `colmap-inertial export . ../export`; `--for` names one.")
+        steps.append("Export to other programs, in metres: `colmap-inertial export . ../export`; `--for` names one.")
         dense = model.get("dense")
         if dense:
             made = " and ".join(f"`{dense[kind]}`" for kind in ("fused", "mesh") if dense.get(kind))
@@ -335,13 +335,13 @@ def _describe_attempt(model: dict[str, Any]) -> list[str]:
     if signals.get("alignment") == "found" and rotation.get("after"):
         apart, rate = (math.degrees(rotation["after"][f"rms_{name}_rad_s"]) for name in ("difference", "rate"))
         tried.append(
-            "Camera and gyroscope were brought onto one clock and into one frame: they differ by "
-            f"{digits(apart, 2)} °/s where the camera rotates at {digits(rate, 2)} °/s (rms)."
+            "Camera and gyroscope were aligned: their rates differ by "
+            f"{digits(apart, 2)} °/s (rms), at {digits(rate, 2)} °/s of rotation."
         )
     elif signals.get("alignment") == "failed":
         tried.append("No time offset and no rotation between camera and IMU make their rotations agree.")
     elif signals.get("alignment") == "not tried":
-        tried.append("Camera and IMU were not aligned: the recording does not permit it.")
+        tried.append("Camera and IMU were not aligned: the recording does not allow it.")
     if "correlation" in acceleration:
         tried.append(
             "The scale was fitted to all measurements; the accelerations of camera and accelerometer have a "
@@ -350,8 +350,8 @@ def _describe_attempt(model: dict[str, Any]) -> list[str]:
     return tried
 
 
-def _refused(model: dict[str, Any]) -> dict[str, Any]:
-    summary = ["The recording does not determine the scale, so no number is given rather than a wrong one."]
+def _describe_refused_model(model: dict[str, Any]) -> dict[str, Any]:
+    summary = ["The recording does not determine the scale, so none is given."]
     signals, findings = model.get("signals", {}), model.get("findings", ())
     causes = [finding for finding in findings if finding["severity"] == "error"]
     summary += [f"Found beforehand ({finding['code']}): {finding['evidence']}." for finding in causes]
@@ -362,8 +362,8 @@ def _refused(model: dict[str, Any]) -> dict[str, Any]:
     summary.append(f"COLMAP's own model ({model['sparse']}) is complete: only its size is unknown.")
     return {
         "verdict": "refused",
-        "headline": "No scale could be found",
-        "answers": [("Trusted", "no; nothing here is in metres")],
+        "headline": "The scale could not be determined",
+        "answers": [("Trusted", "no; the model is not in metres")],
         "summary": summary,
         "tried": _describe_attempt(model),
         "todo": [*todo, _TARGET],
@@ -383,9 +383,9 @@ def _describe_refusal(signals: Mapping[str, Any]) -> list[str]:
     if accel_m_s2 is None or accel_m_s2 >= _LITTLE_M_S2:
         return []
     return [
-        f"The device hardly sped up or slowed down: its accelerometer measured {digits(accel_m_s2, 2)} m/s² beside "
-        f"gravity, where filming by hand usually has {_USUAL}. Motion at constant speed leaves no trace in "
-        "an accelerometer, so there was nothing to compare with the images."
+        f"The device hardly accelerated: {digits(accel_m_s2, 2)} m/s² without gravity, where hand-held filming "
+        f"usually has {_USUAL}. An accelerometer cannot sense motion at constant speed, so nothing could be compared "
+        "with the images."
     ]
 
 
@@ -413,5 +413,5 @@ def outcome_of_stop(reason: str, *, findings: bool) -> dict[str, Any]:
         "answers": [],
         "tried": [],
         "summary": [reason[:1].upper() + reason[1:]],
-        "todo": ["The findings are listed below, each with what to do about it."] if findings else [],
+        "todo": ["See the findings below, each with its remedy."] if findings else [],
     }

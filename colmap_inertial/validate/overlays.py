@@ -70,9 +70,9 @@ def _write_frame(view: ViewResiduals, source: Path, path: Path) -> None:
     line, radius = max(1, round(1.2 * size)), max(3, round(5 * size))
     seen, expected = opencv_px_from_colmap(view.observed_px), opencv_px_from_colmap(view.projected_px)
     for a, b in zip(seen, expected, strict=True):
-        cv2.circle(image, *_fixed(a, radius), _GREEN, line, cv2.LINE_AA, _SHIFT)
+        cv2.circle(image, *_convert_to_fixed_point(a, radius), _GREEN, line, cv2.LINE_AA, _SHIFT)
         end = a + MAGNIFIED * (b - a)
-        cv2.line(image, _fixed(a)[0], _fixed(end)[0], _RED, line, cv2.LINE_AA, _SHIFT)
+        cv2.line(image, _convert_to_fixed_point(a)[0], _convert_to_fixed_point(end)[0], _RED, line, cv2.LINE_AA, _SHIFT)
     for a in opencv_px_from_colmap(view.rejected_px):
         cv2.drawMarker(image, (round(a[0]), round(a[1])), _ORANGE, cv2.MARKER_TILTED_CROSS, 3 * radius, 2 * line)
     words = f"{view.name}: {len(view.corner)} corners, rms {view.rms_px:.2f} px, residuals x{MAGNIFIED}"
@@ -92,7 +92,7 @@ def _write_frame(view: ViewResiduals, source: Path, path: Path) -> None:
 _SHIFT = 4
 
 
-def _fixed(xy: Array, radius: int = 0) -> tuple[tuple[int, int], int]:
+def _convert_to_fixed_point(xy: Array, radius: int = 0) -> tuple[tuple[int, int], int]:
     """Position and radius in OpenCV's fixed-point drawing coordinates."""
     return (round(float(xy[0]) * 2**_SHIFT), round(float(xy[1]) * 2**_SHIFT)), radius * 2**_SHIFT
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -398,22 +398,39 @@ class Validation:
 
     @property
     def doubts(self) -> tuple[Fact, ...]:
-        """Why the target may not be the stated one: few images agree, or its lengths do not."""
+        """Why the target may not be the stated one: few images agree, or its lengths contradict each other."""
         doubts = []
         if self.views_used < FIT.enough_views:
             doubts.append(Fact("target-size-not-proved", used=self.views_used, searched=self.views_searched))
-        lengths = self.lengths
-        if lengths is not None and abs(lengths.largest_m) > self.tolerance_pct / 100 * lengths.longest_m:
+        # a factor that all lengths share is no contradiction between them
+        distances = [self._scaled(distance) for distance in self.distances]
+        largest_m = max((distance.residual_m for distance in distances), key=abs, default=0.0)
+        longest_m = max((distance.known_m for distance in distances), default=0.0)
+        if abs(largest_m) > self.tolerance_pct / 100 * longest_m:
             doubts.append(
                 Fact(
                     "target-lengths-disagree",
-                    largest_m=lengths.largest_m,
+                    largest_m=largest_m,
                     tolerance_share=self.tolerance_pct / 100,
-                    longest_m=lengths.longest_m,
+                    longest_m=longest_m,
                 )
             )
-        found = find_contradictions(self.target, self.distances, self.views, self.tolerance_pct)
+        found = find_contradictions(self.target, distances, self.views, self.tolerance_pct)
         return (*doubts, *(Fact("noted-with-advice", found=fact) for fact in found))
+
+    @property
+    def mismatch(self) -> Fact | None:
+        """The size of the target that would fit a model whose lengths are all off alike; ``None`` where none is."""
+        error_pct = self.scale_error_pct
+        if error_pct is None or abs(error_pct) <= self.tolerance_pct or self.doubts:
+            return None
+        stated_m = self.target.length_m
+        fits_m = stated_m * (1 + error_pct / 100)
+        return Fact("target-or-scale-wrong", kind=self.target.kind, stated_m=stated_m, fits_m=fits_m)
+
+    def _scaled(self, distance: Distance) -> Distance:
+        """A distance as it is once the model has the scale of the target."""
+        return replace(distance, residual_m=distance.measured * self.metres_per_unit - distance.known_m)
 
     def as_json(self) -> dict[str, Any]:
         """Everything but pixel coordinates, ready for ``json.dump``."""
@@ -424,7 +441,7 @@ class Validation:
             if field.name == "tolerance_pct":
                 values["within_tolerance"] = self.within_tolerance
         values["target"] = self.target.spec
-        values["reasons"] = (*self.doubts, *self.reasons)
+        values["reasons"] = (*self.doubts, *filter(None, [self.mismatch]), *self.reasons)
         values["doubts"] = self.doubts
         values["views"] = [{"name": v.name, "corners": len(v.corner), "rms_px": v.rms_px} for v in self.views]
         json: dict[str, Any] = convert_to_plain(with_sentences(values))
@@ -455,7 +472,7 @@ def validation_table(result: Validation) -> Group:
             rejected.add_row(str(count), str(reason))
         parts.append(rejected)
     proved = [] if result.lengths is None else [f"the check proves that {result.lengths.proves}"]
-    parts += [Text(f"not proved: {text}", "bold red") for text in result.doubts]
+    parts += [Text(f"- {text}", "bold red") for text in (*result.doubts, *filter(None, [result.mismatch]))]
     parts += [Text(f"- {text}") for text in (*proved, *result.reasons)]
     return Group(*parts)
 

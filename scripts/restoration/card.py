@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from restoration.network import DOWN, UP, WIDTHS, RestorationNet, parameters
+from scripts.restoration.network import DOWN, UP, WIDTHS, RestorationNet, parameters
 
 _PURPOSE = {
     "deepgyro": """\
@@ -68,7 +68,7 @@ def write_card(
 To make it again, with folders of photographs and recorded motion:
 
 ```sh
-python scripts/train_restoration.py {name} --photos PHOTOS --motion MOTION --work WORK \\
+python -m scripts.restoration.train {name} --photos PHOTOS --motion MOTION --work WORK \\
     --samples {samples} --steps {options["steps"]} --batch {options["batch"]} --rate {options["rate"]} \\
     --seed {options["seed"]}{begin}
 ```
@@ -85,7 +85,7 @@ Of photographs and motion that it was never trained on, at all strengths of blur
 | --- | --- | --- | --- |
 {rows}
 
-What it does to whole frames, features and reconstructions: `scripts/bench_restoration.py`.
+What it does to whole frames, features and reconstructions: `python -m scripts.benchmarks.restoration`.
 """
     )
 

@@ -13,7 +13,7 @@ import torch
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor
 
-from restoration.network import RestorationNet, ThesisNet
+from scripts.restoration.network import RestorationNet, ThesisNet
 
 #: The package's folder of weights.
 WEIGHTS = Path(__file__).parents[2] / "colmap_inertial" / "imaging" / "restoration" / "weights"

@@ -18,7 +18,7 @@ from torch.nn import functional
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import matrix_from_quat
-from restoration.handheld import Handheld
+from scripts.restoration.handheld import Handheld
 
 #: Instants, evenly over an exposure and the readout of a piece, between which turning and moving are interpolated.
 _STEPS = 96

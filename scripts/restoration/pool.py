@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from rich.progress import track
 
 from colmap_inertial.core.arrays import IndexArray
-from restoration.photographs import photographs
-from restoration.samples import BLUR_CHANNELS, MARGIN, SIDE, Maker, Material, Samples
+from scripts.restoration.photographs import photographs
+from scripts.restoration.samples import BLUR_CHANNELS, MARGIN, SIDE, Maker, Material, Samples
 
 #: Samples that are made together: they have much the same blur, and as many instants are rendered for each.
 BATCH = 16

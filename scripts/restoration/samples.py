@@ -16,10 +16,10 @@ from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath, middles, samples_for
 from colmap_inertial.imaging.path_filters import DeblurOptions, path_wiener
 from colmap_inertial.imaging.restoration._tiles import Span, blur_feed, path_feed
-from restoration.camera import jpeg, light_of, noisy, sharpened, srgb
-from restoration.handheld import Handheld, recorded, simulated
-from restoration.optics import ShotOptions, Shots, draw_shots
-from restoration.photographs import Album, photographs
+from scripts.restoration.camera import jpeg, light_of, noisy, sharpened, srgb
+from scripts.restoration.handheld import Handheld, recorded, simulated
+from scripts.restoration.optics import ShotOptions, Shots, draw_shots
+from scripts.restoration.photographs import Album, photographs
 
 #: Pieces are made so large, and lose this much at each edge, so that few see an edge as only pictures' edges are.
 SIDE, MARGIN = 256, 32

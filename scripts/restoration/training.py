@@ -17,8 +17,8 @@ from rich.console import Console
 from torch import Tensor, nn
 from torch.nn import functional
 
-from restoration.pool import Pool
-from restoration.samples import Samples
+from scripts.restoration.pool import Pool
+from scripts.restoration.samples import Samples
 
 console = Console(stderr=True)
 #: A squared error below this (in codes 0 to 1) counts linearly no more.

@@ -183,6 +183,6 @@ def test_an_error_as_a_fact_says_what_the_error_says():
 
 
 def test_a_stage_of_a_user_says_words_and_no_action_of_its_own():
-    assert Treatment(stage="mine", reason="as asked for").reason == as_fact("as asked for")
+    assert Treatment(stage="mine", reason="as requested").reason == as_fact("as requested")
     with pytest.raises(ValueError, match="brightened"):
-        Treatment(stage="mine", reason="as asked for", action="brightened")
+        Treatment(stage="mine", reason="as requested", action="brightened")

@@ -125,6 +125,22 @@ def test_a_wrong_lever_arm_is_named_and_left_out(device: Device) -> None:
     assert abs(np.log(wrong.metres_per_unit / truth)) < 1.96 * wrong.sigma_log
 
 
+@pytest.mark.parametrize("likely", ["inverse", "sign", "millimetres", ""])
+def test_a_wrong_lever_arm_is_named_by_what_it_is(device: Device, likely: str) -> None:
+    arm_m = {
+        "inverse": -matrix_from_quat(device.rotation).T @ device.arm_m,
+        "sign": -device.arm_m,
+        "millimetres": 1e3 * device.arm_m,
+        "": np.array([0.3, -0.9, 0.2]),
+    }[likely]
+    _, wrong = with_arm(device, arm_m)
+    (reason,) = (reason for reason in wrong.reasons if reason.code == "declared-lever-arm")
+    assert reason.values["likely"] == likely and wrong.reasons[0] == reason
+    assert np.array(reason.values["found_m"]) == pytest.approx(device.arm_m, abs=3 * reason.values["sigma_m"])
+    truth = device.made.truth.metres_per_unit
+    assert wrong.verdict == "weak" and abs(np.log(wrong.metres_per_unit / truth)) < 1.96 * wrong.sigma_log
+
+
 def test_gains_of_another_imu_are_named(device: Device) -> None:
     assert device.recorded.trajectory is not None and device.recorded.imu is not None
     other = ImuCalibration(

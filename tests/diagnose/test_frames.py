@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import pytest
 
 from colmap_inertial.core.errors import NotObservableError
-from colmap_inertial.diagnose.frames import _readout
+from colmap_inertial.diagnose.frames import _estimate_readout
 
 
 def test_pictures_far_apart_tell_no_readout():
     with pytest.raises(NotObservableError, match="far apart"):
-        _readout(SimpleNamespace(rotation=object(), aligned=None, imu=None, is_dense=False))
+        _estimate_readout(SimpleNamespace(rotation=object(), aligned=None, imu=None, is_dense=False))

@@ -4,12 +4,12 @@ import json
 
 import numpy as np
 import pytest
-from test_columns import ACCEL, COUNT, GYRO, T_S, G, check
 
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.io.json_rows import rows_of_json
 from colmap_inertial.io.tables import read_table
+from tests.io.test_columns import ACCEL, COUNT, GYRO, T_S, G, check
 
 
 def rows_of(values, name):

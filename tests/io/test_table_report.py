@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from test_columns import ACCEL, COUNT, GYRO, T_S, check, floats, ints, write
 
 from colmap_inertial.cli import main
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.io.table_report import report_table
+from tests.io.test_columns import ACCEL, COUNT, GYRO, T_S, check, floats, ints, write
 
 
 def run(*words):

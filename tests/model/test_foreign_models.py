@@ -5,7 +5,6 @@ import struct
 import numpy as np
 import pycolmap
 import pytest
-from foreign_models import build, centres, points, save, write_points
 
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.model import num_registered, read_model
@@ -15,6 +14,7 @@ from colmap_inertial.model.pose_covariances import pose_covariances
 from colmap_inertial.model.project import apply_to_project
 from colmap_inertial.model.rigs import list_posed_frames
 from colmap_inertial.model.similarities import plain_factor
+from tests.helpers.foreign_models import build, centres, points, save, write_points
 
 
 def read(folder, **how):
@@ -236,7 +236,7 @@ def test_what_is_there_twice_is_refused(tmp_path):
         path = again / f"{name}.txt"
         first = without_comments(path.read_text().splitlines())
         path.write_text("\n".join([*first, *first[: 2 if name == "images" else 1]]) + "\n")
-        with pytest.raises(FormatError, match=f"{what}.* is there twice"):
+        with pytest.raises(FormatError, match=f"{what}.* appears twice"):
             read_model(again)
 
 

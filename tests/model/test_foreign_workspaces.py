@@ -7,7 +7,17 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from foreign_models import (
+
+from colmap_inertial.cli import main
+from colmap_inertial.core.errors import AlreadyMetricError, FormatError, InertialError
+from colmap_inertial.core.geometry import matrix_from_quat
+from colmap_inertial.core.types import ScaleEstimate, Similarity
+from colmap_inertial.model import read_model
+from colmap_inertial.model.identity import ModelIdentity
+from colmap_inertial.model.project import apply_to_project, undo_project
+from colmap_inertial.model.similarities import plain_factor, read_scales
+from colmap_inertial.tools.export.whole import export_model
+from tests.helpers.foreign_models import (
     COUNT,
     HEIGHT,
     WIDTH,
@@ -19,17 +29,15 @@ from foreign_models import (
     write_json,
     write_ply as ply,
 )
-from other_files import in_order, into_training, read_mvsnet, read_rig, training_of, write_mvsnet, write_rig
-
-from colmap_inertial.cli import main
-from colmap_inertial.core.errors import AlreadyMetricError, FormatError, InertialError
-from colmap_inertial.core.geometry import matrix_from_quat
-from colmap_inertial.core.types import ScaleEstimate, Similarity
-from colmap_inertial.model import read_model
-from colmap_inertial.model.identity import ModelIdentity
-from colmap_inertial.model.project import apply_to_project, undo_project
-from colmap_inertial.model.similarities import plain_factor, read_scales
-from colmap_inertial.tools.export.whole import export_model
+from tests.helpers.other_files import (
+    in_order,
+    into_training,
+    read_mvsnet,
+    read_rig,
+    training_of,
+    write_mvsnet,
+    write_rig,
+)
 
 QUAT = np.array([0.5, -0.1, 0.3, 0.8062257748298549])
 SIM3 = Similarity(
@@ -141,7 +149,7 @@ def test_cameras_elsewhere_are_left_and_named(tmp_path):
         frame["transform_matrix"][0][3] += 2.0
     write_json(tmp_path / "p" / "transforms.json", content)
     applied = apply_to_project(tmp_path / "p", tmp_path / "out", SIM3)
-    assert any("transforms.json: copied as it is" in note for note in map(str, applied.notes))
+    assert any("transforms.json: copied unchanged" in note for note in map(str, applied.notes))
 
 
 def test_points_of_another_frame_are_named(tmp_path):
@@ -149,7 +157,7 @@ def test_points_of_another_frame_are_named(tmp_path):
     save(model, tmp_path / "p" / "sparse" / "0")
     ply(tmp_path / "p" / "exports" / "splat.ply", 0.1 * xyz_of(model) + [4.0, 0, 0])
     applied = apply_to_project(tmp_path / "p", tmp_path / "out", SIM3)
-    assert any("exports/splat.ply: moved with the model" in note for note in map(str, applied.notes))
+    assert any("exports/splat.ply: transformed with the model" in note for note in map(str, applied.notes))
 
 
 def inria(root, model, sparse=None):
@@ -287,9 +295,9 @@ POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12
         (POINTER, "is a Git LFS pointer.*git lfs pull"),
         (b"/annex/objects/SHA256E-s1--1.bin\n", "is a git-annex pointer"),
         (b"<!DOCTYPE html><html><body>Sign in</body></html>", "is a web page"),
-        (bytes(5000), "holds nothing but zeros"),
+        (bytes(5000), "holds only zeros"),
         (b"\x1f\x8b\x08\x00" + bytes(90), r"is packed \(gzip\)"),
-        (b"\x00\x05\x16\x07\x00\x02\x00\x00Mac OS X        ", "is what macOS leaves"),
+        (b"\x00\x05\x16\x07\x00\x02\x00\x00Mac OS X        ", "is a macOS metadata file"),
     ],
 )
 @pytest.mark.parametrize("name", ["sparse/0/points3D.bin", "sparse/0/images.txt", "mesh.ply", "database.db"])
@@ -429,7 +437,7 @@ def test_a_scale_is_that_of_its_model(tmp_path):
     assert apply_to_project(tmp_path / "text", tmp_path / "out_text", own).notes == ()
     assert ModelIdentity.of(read_model(text)).poses == ModelIdentity.of(model).poses
     nameless = apply_to_project(tmp_path / "p", tmp_path / "out2", write_scale(tmp_path / "nameless.json"))
-    assert any("does not say of which model" in note for note in map(str, nameless.notes))
+    assert any("does not name its model" in note for note in map(str, nameless.notes))
 
 
 @pytest.mark.parametrize(
@@ -437,9 +445,9 @@ def test_a_scale_is_that_of_its_model(tmp_path):
     [
         (lambda: build(["a.png", "b.png", "c.png"]), "3 images instead of 8"),
         (lambda: build([f"other{i}.png" for i in range(COUNT)]), "other names"),
-        (lambda: mapped_again(build()), "stand elsewhere"),
-        (lambda: build(offset=(0.0, 0.0, 1.0)), "stand elsewhere"),
-        (lambda: turned(build()), "stand elsewhere"),
+        (lambda: mapped_again(build()), "are elsewhere"),
+        (lambda: build(offset=(0.0, 0.0, 1.0)), "are elsewhere"),
+        (lambda: turned(build()), "are elsewhere"),
     ],
 )
 def test_a_scale_of_another_model_is_refused(tmp_path, other, match):
@@ -448,7 +456,7 @@ def test_a_scale_of_another_model_is_refused(tmp_path, other, match):
     with pytest.raises(InertialError, match=rf"of another model than sparse/0: .*{match}.*--any-model"):
         apply_to_project(tmp_path / "p", tmp_path / "out", scales)
     applied = apply_to_project(tmp_path / "p", tmp_path / "out", scales, any_model=True)
-    assert any("taken all the same" in note for note in map(str, applied.notes))
+    assert any("applied anyway" in note for note in map(str, applied.notes))
 
 
 def mapped_again(model):
@@ -562,7 +570,7 @@ def test_everything_at_once_moves_and_comes_back(tmp_path):
         assert is_free or {path.suffix, f"depths ({path.suffix})"} & named or path.parts[0] == "exports", path
     notes = " ".join(map(str, applied.notes))
     assert "depths in 8 pictures" in notes and "2.5 times as large" in notes
-    assert "exports/splat.ply: copied as it is" in notes and "rig_of_another_unit.json: copied as it is" in notes
+    assert "exports/splat.ply: copied unchanged" in notes and "rig_of_another_unit.json: copied as it is" in notes
     undo_project(out, back)
     assert_lengths(back, *given, lambda xyz: np.asarray(xyz), 1e-14)
     made = {path.relative_to(back) for path in back.rglob("*") if path.is_file()}

@@ -5,8 +5,13 @@ import json
 import cv2
 import numpy as np
 import pytest
-from foreign_models import HEIGHT, WIDTH, build, ply_points, save, write_json, write_ply
-from other_files import (
+
+from colmap_inertial.core.geometry import matrix_from_quat
+from colmap_inertial.core.types import Similarity
+from colmap_inertial.model.project import apply_to_project, undo_project
+from colmap_inertial.model.similarities import ModelScale
+from tests.helpers.foreign_models import HEIGHT, WIDTH, build, ply_points, save, write_json, write_ply
+from tests.helpers.other_files import (
     in_order,
     into_training,
     mvsnet_text,
@@ -16,11 +21,6 @@ from other_files import (
     write_mvsnet,
     write_rig,
 )
-
-from colmap_inertial.core.geometry import matrix_from_quat
-from colmap_inertial.core.types import Similarity
-from colmap_inertial.model.project import apply_to_project, undo_project
-from colmap_inertial.model.similarities import ModelScale
 
 QUAT = np.array([0.5, -0.1, 0.3, 0.8062257748298549])
 SIM3 = Similarity(
@@ -157,7 +157,7 @@ def test_a_training_stays_where_it_is(project, tmp_path, centre, fills, applied)
     np.testing.assert_allclose(into_training(after, moved(xyz_of(model))), splats, atol=1e-13)
     same = [(folder / "exports" / "splat.ply").read_bytes() for folder in (root, tmp_path / "out")]
     assert same[0] == same[1]
-    assert any("in the frame of a training" in str(note) for note in done.notes)
+    assert any("in a training's own frame" in str(note) for note in done.notes)
     undo_project(tmp_path / "out", tmp_path / "back")
     back = json.loads((tmp_path / "back" / run.relative_to(root) / "dataparser_transforms.json").read_text())
     np.testing.assert_allclose(back["transform"], values["transform"], atol=4e-15)
@@ -172,7 +172,7 @@ def test_a_training_of_something_else_is_named(project, tmp_path):
     write_json(root / "dataparser_transforms.json", values)
     done = apply_to_project(root, tmp_path / "out", SIM3)
     assert [group.kind for group in done.unmoved] == ["dataparser_transforms.json"]
-    assert any("dataparser_transforms.json: copied as it is" in str(note) for note in done.notes)
+    assert any("dataparser_transforms.json: copied unchanged" in str(note) for note in done.notes)
 
 
 @pytest.mark.parametrize(("unit", "frame"), [("integer_depth_scale", "depth_path"), (None, "depth_file_path")])

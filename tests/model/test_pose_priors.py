@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pycolmap
 import pytest
-from foreign_models import build, save
 
 from colmap_inertial.core.types import Similarity
 from colmap_inertial.model.pose_priors import PriorComparison
 from colmap_inertial.model.project import apply_to_project, undo_project
 from colmap_inertial.model.similarities import plain_factor
+from tests.helpers.foreign_models import build, save
 
 #: Of the sphere that touches WGS84's ellipsoid at the place: metres a degree, by the radii of curvature there.
 LATITUDE, LONGITUDE = 51.0, 8.0

@@ -43,7 +43,7 @@ def test_a_wrong_gap_is_named_with_the_right_one(gap):
     assert fact.code == "lengths-contradict"
     assert fact.values["likely_gap"] == pytest.approx(0.3, abs=0.01)
     assert fact.values["lengths_mm"][0] == pytest.approx(40 * gap)
-    assert "the pictures show 0.3" in fact.advice
+    assert "the images show 0.3" in fact.advice
 
 
 def test_a_board_that_was_printed_stretched_is_named():

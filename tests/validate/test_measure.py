@@ -26,5 +26,5 @@ def test_a_fifth_of_the_images_that_show_a_target_agree_where_it_is(images, agre
     if agree:
         assert measure._require_agreement(search, placed) is None
     else:
-        with pytest.raises(TargetNotFoundError, match=rf"found in {images} images, but only 2 of them agree"):
+        with pytest.raises(TargetNotFoundError, match=rf"detected in {images} images, but only 2 of them agree"):
             measure._require_agreement(search, placed)

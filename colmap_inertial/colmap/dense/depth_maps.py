@@ -314,10 +314,10 @@ def fusion_options(maker: Maker, context: RunContext) -> pycolmap.StereoFusionOp
     options = pycolmap.StereoFusionOptions()
     options.num_threads = context.num_threads
     if maker == "plane sweep":
-        # uncertain depths are dropped already; 5, COLMAP's own, loses more points than it mends (bench_dense.py: F at
-        # 5 mm 0.861 instead of 0.846 on photographs, 0.900 instead of 0.894 on the example scene), and within 2 px too
-        # much becomes one point that is not (0.80 instead of 0.83 on photographs; within 1 px meshing takes longer, for
-        # the same)
+        # uncertain depths are dropped already; 5, COLMAP's own, loses more points than it mends (benchmarks/dense.py: F
+        # at 5 mm 0.861 instead of 0.846 on photographs, 0.900 instead of 0.894 on the example scene), and within 2 px
+        # too much becomes one point that is not (0.80 instead of 0.83 on photographs; within 1 px meshing takes longer,
+        # for the same)
         options.min_num_pixels, options.max_reproj_error = 3, 1.4
     return context.colmap.apply(options)
 

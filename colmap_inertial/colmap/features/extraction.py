@@ -28,7 +28,7 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, InertialError, MappingError, OutputError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import MappingOptions
-from colmap_inertial.core.progress import counting, silent
+from colmap_inertial.core.progress import make_counter, silent
 from colmap_inertial.core.types import CameraModel, Keypoints, Treatment
 from colmap_inertial.hooks import KeypointStage
 from colmap_inertial.io.disk import remove, require_room
@@ -182,7 +182,7 @@ def extract_features(
     if works:
         context.progress("features", 0, count)
         with writing_database(database):
-            told = counting(context.progress, "features", count)
+            told = make_counter(context.progress, "features", count)
             find_elsewhere(works, database, images, context.scratch / CHUNKS_FOLDER, context.executor, told)
         context.progress("features", count, count)
     records = apply_keypoint_stages(database, keypoint_stages)
@@ -386,7 +386,7 @@ def match_pairs(
     )
     if is_worth_chunks(pairs, context.executor):
         require_room(database, len(pairs) * _PAIR_BYTES, copies=2)
-        matched = counting(context.progress, "matches", total, begin=done, steps=own, of=len(pairs))
+        matched = make_counter(context.progress, "matches", total, begin=done, steps=own, of=len(pairs))
         with writing_database(database):
             match_elsewhere(work, context.scratch / CHUNKS_FOLDER, context.executor, matched)
         batches, done = [], done + own
@@ -412,7 +412,7 @@ def matching_work(pairs: Sequence[tuple[str, str]]) -> int:
     """Cost of matching pairs after others, in pairs: to index an image's features for a batch costs as much as two.
 
     With that, batches of 20 to 570 pairs of the example scene take the same time a unit within 10 %
-    (``scripts/study_progress.py``).
+    (``scripts/studies/progress.py``).
     """
     return sum(map(_batch_work, growing_batches(pairs, first=_MATCHING_BATCH)))
 

@@ -55,8 +55,8 @@ class LoopClosureLimits:
     #: that are made of parts, they end where one takes less than this share of what remains.
     least_gain: float = 1e-6
     #: In Ceres's first trust region, of 1e4, a chain bends only a little in each round; in one so much larger, rounds
-    #: are those of Gauss and Newton, and few (``bench_whole.py --long 500 --density 8.55 --seeds 101``: 7.2 mm after 18
-    #: s of processor time with 1e4 and 1e-7, 6.7 mm after 12 s with these two).
+    #: are those of Gauss and Newton, and few (``scripts.benchmarks.whole --long 500 --density 8.55 --seeds 101``: 7.2
+    #: mm after 18 s of processor time with 1e4 and 1e-7, 6.7 mm after 12 s with these two).
     trust_region_radius: float = 1e10
 
 

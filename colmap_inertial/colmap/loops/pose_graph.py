@@ -262,12 +262,12 @@ def select_loops(
         By loops.
     """
     selected: set[FramePair] = set()
-    for part in _parts(track, poses):
-        loops, depth, matches = _attach(track, orientations, part)
+    for part in _split_by_part(track, poses):
+        loops, depth, matches = _attach_loops(track, orientations, part)
         graph = _Graph.of(track, orientations, part.nodes)
-        best, group = _group(graph.residuals(loops)[0], loops, matches)
+        best, group = _group_agreeing(graph.residuals(loops)[0], loops, matches)
         groups, behind = loops.only(best), np.asarray(np.bincount(group, matches), dtype=np.float64)
-        graph, accepted = _close(graph, groups, depth[best], behind)
+        graph, accepted = _accept_loops(graph, groups, depth[best], behind)
         covariance = graph.covariances(groups)[group]
         # what is neither accepted nor predicted well has rivals
         decided = accepted[group] | (_place_sigma(covariance) < _NOISE.sure * depth)
@@ -281,8 +281,8 @@ def select_likely_loops(
 ) -> set[FramePair]:
     """Select loops that agree with the track, each by itself; parameters as of :func:`select_loops`."""
     selected: set[FramePair] = set()
-    for part in _parts(track, poses):
-        loops, _, _ = _attach(track, orientations, part)
+    for part in _split_by_part(track, poses):
+        loops, _, _ = _attach_loops(track, orientations, part)
         graph = _Graph.of(track, orientations, part.nodes).adjusted(loops.only(slice(0)))
         selected |= part.where(_agree(graph.residuals(loops)[0], graph.covariances(loops) + loops.covariance))
     return selected
@@ -299,7 +299,7 @@ class _Part:
         return set(itertools.compress(self.poses, which.tolist()))
 
 
-def _parts(track: RelativeTrack, poses: Mapping[FramePair, LoopPose]) -> Iterator[_Part]:
+def _split_by_part(track: RelativeTrack, poses: Mapping[FramePair, LoopPose]) -> Iterator[_Part]:
     for part in sorted({int(track.part[i]) for i, _ in poses}):
         own = np.flatnonzero(track.part == part)
         yield _Part(
@@ -308,7 +308,7 @@ def _parts(track: RelativeTrack, poses: Mapping[FramePair, LoopPose]) -> Iterato
         )
 
 
-def _attach(track: RelativeTrack, orientations: Orientations, part: _Part) -> tuple[_Edges, Array, Array]:
+def _attach_loops(track: RelativeTrack, orientations: Orientations, part: _Part) -> tuple[_Edges, Array, Array]:
     """Loops as edges between the nodes nearest to their frames, (M,) depths and (M,) numbers of matches."""
     frames, several = np.array(list(part.poses), dtype=np.intp), list(part.poses.values())
     place = np.searchsorted((part.nodes[1:] + part.nodes[:-1]) / 2, frames)
@@ -330,7 +330,7 @@ def _attach(track: RelativeTrack, orientations: Orientations, part: _Part) -> tu
     return edges, depth, np.array([pose.matches for pose in several], dtype=np.float64)
 
 
-def _group(off: Array, loops: _Edges, matches: Array) -> tuple[IndexArray, IndexArray]:
+def _group_agreeing(off: Array, loops: _Edges, matches: Array) -> tuple[IndexArray, IndexArray]:
     """Group M loops between the same nodes that agree: (G,) those with the most matches of each, and (M,) groups."""
     best, group = np.zeros(0, dtype=np.intp), np.zeros(len(matches), dtype=np.intp)
     left = np.argsort(-matches, kind="stable")
@@ -345,37 +345,42 @@ def _group(off: Array, loops: _Edges, matches: Array) -> tuple[IndexArray, Index
     return best, group
 
 
-def _close(graph: _Graph, loops: _Edges, depth: Array, matches: Array) -> tuple[_Graph, BoolArray]:
+def _accept_loops(graph: _Graph, loops: _Edges, depth: Array, matches: Array) -> tuple[_Graph, BoolArray]:
     """Accept loops, the surest ones first, as long as there are any that agree; the graph with them, and which."""
     accepted, dropped = np.zeros((2, len(depth)), dtype=np.bool_)
     graph = graph.adjusted(loops.only(accepted))
     for _ in range(2 * len(depth)):
         off, _ = graph.residuals(loops)
-        worst = np.argmax(np.where(accepted, _squared(off, loops.covariance), 0.0))
+        worst = np.argmax(np.where(accepted, _squared_mahalanobis(off, loops.covariance), 0.0))
         if accepted[worst] and not _agree(off[worst], loops.covariance[worst]):
             # others moved it too far away; it stays out, so that the rounds end
             accepted[worst], dropped[worst] = False, True
-            graph = graph.adjusted(loops.only(accepted))
-            continue
-        left = np.flatnonzero(~accepted & ~dropped)
-        if not len(left):
-            break
-        covariance = graph.covariances(loops.only(left))
-        agree = _agree(off[left], covariance + loops.only(left).covariance)
-        left, covariance = left[agree], covariance[agree]
-        sigma = _place_sigma(covariance)
-        chosen = np.flatnonzero(sigma < _NOISE.sure * depth[left])
-        if not len(chosen) and len(left):
-            sigma = sigma * np.exp(graph.log_length[loops.a[left]])  # all in one length
-            chosen = np.argsort(sigma, kind="stable")[: _NOISE.rivals]
-            chosen = chosen[sigma[chosen] <= _NOISE.alike * sigma[chosen[0]]]
-            rest = loops.only(left)
-            chosen = chosen[_prevail(graph, rest, (off[left], covariance + rest.covariance), chosen, matches[left])]
-        if not len(chosen):
-            break
-        accepted[left[chosen]] = True
+        else:
+            left = np.flatnonzero(~accepted & ~dropped)
+            chosen = left[_choose_loops(graph, loops.only(left), off[left], depth[left], matches[left])]
+            if not len(chosen):
+                break
+            accepted[chosen] = True
         graph = graph.adjusted(loops.only(accepted))
     return graph, accepted
+
+
+def _choose_loops(graph: _Graph, loops: _Edges, off: Array, depth: Array, matches: Array) -> IndexArray:
+    """Which of M loops to accept next: all whose place the graph predicts well, else the best without a rival."""
+    if not len(depth):
+        return np.zeros(0, dtype=np.intp)
+    predicted = graph.covariances(loops)
+    agree = np.flatnonzero(_agree(off, predicted + loops.covariance))
+    sigma = _place_sigma(predicted[agree])
+    sure = agree[sigma < _NOISE.sure * depth[agree]]
+    if len(sure) or not len(agree):
+        return sure
+    sigma = sigma * np.exp(graph.log_length[loops.a[agree]])  # all in one length
+    surest = np.argsort(sigma, kind="stable")[: _NOISE.rivals]
+    surest = surest[sigma[surest] <= _NOISE.alike * sigma[surest[0]]]
+    rest = loops.only(agree)
+    expected = off[agree], predicted[agree] + rest.covariance
+    return agree[surest[_prevail(graph, rest, expected, surest, matches[agree])]]
 
 
 def _place_sigma(covariance: Array) -> Array:
@@ -403,9 +408,9 @@ def _prevail(
 
 def _agree(off: Array, covariance: Array) -> BoolArray:
     """(...,) whether vectors (..., 7) are as small as their covariances (..., 7, 7) say."""
-    return np.asarray(_squared(off, covariance) < _NOISE.agree_7)
+    return np.asarray(_squared_mahalanobis(off, covariance) < _NOISE.agree_7)
 
 
-def _squared(off: Array, covariance: Array) -> Array:
+def _squared_mahalanobis(off: Array, covariance: Array) -> Array:
     """(...,) squares of vectors (..., 7) over their covariances (..., 7, 7)."""
     return np.asarray(np.sum(off * np.linalg.solve(covariance, off[..., None])[..., 0], axis=-1))

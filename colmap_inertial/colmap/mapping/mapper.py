@@ -16,7 +16,7 @@ from colmap_inertial.colmap.mapping.submaps import join_runs, map_runs, split_ca
 from colmap_inertial.core.errors import MappingError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import MappingOptions
-from colmap_inertial.core.progress import counting
+from colmap_inertial.core.progress import make_counter
 from colmap_inertial.io.disk import remove, require_room
 from colmap_inertial.io.sqlite import open_foreign
 from colmap_inertial.model import find_models
@@ -115,7 +115,7 @@ def map_images(
             record = _map_in_parts(capture, images, sparse, context, parts, near=near, loops=judged)
         else:
             nearest = None if judged and not every_pair else near
-            counted = counting(context.progress, "mapping", num_images)
+            counted = make_counter(context.progress, "mapping", num_images)
             if context.executable is None:
                 models = pycolmap.incremental_mapping(
                     str(database), str(images), str(sparse), options=pipeline, next_image_callback=counted
@@ -166,7 +166,7 @@ def _map_in_parts(
 ) -> MapRecord:
     # neighbouring parts have some images both
     several = sum(end - begin for begin, end in parts)
-    counted = counting(context.progress, "mapping", len(capture.names), of=several)
+    counted = make_counter(context.progress, "mapping", len(capture.names), of=several)
     scratch = context.scratch / CHUNKS_FOLDER
     made = map_runs(capture, images, scratch, parts, executor=context.executor, registered=counted)
     models, seams = join_runs(capture, made, near=near, loops=loops) if made else ([], [])

@@ -47,7 +47,10 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class PartSizes:
-    """Sizes of parts, in images (``scripts/bench_whole.py --long 500 --density 8.55`` and ``--long 1000``)."""
+    """Sizes of parts, in images.
+
+    Measured by ``python -m scripts.benchmarks.whole --long 500 --density 8.55`` and ``--long 1000``.
+    """
 
     #: A capture of fewer images is mapped in one go.
     least: int = 300
@@ -83,7 +86,8 @@ class RemappingLimits:
     """Limits for mapping a part again, with another random seed.
 
     Of two views of a plane there are two poses. A model that begins with the wrong one never gets rid of it: of 13
-    parts of ``bench_whole.py --long 2000 --streets``, one had 1.12 px and was 2 m off; the others had .58 to .59.
+    parts of ``scripts.benchmarks.whole --long 2000 --streets``, one had 1.12 px and was 2 m off; the others had .58 to
+    .59.
     """
 
     #: Its mean residual is larger than so many times that of the usual part, of so many at least.

@@ -33,6 +33,7 @@ from colmap_inertial.core.types.imu import (
     ImuCalibration,
     ImuNoise,
     ImuRecording,
+    ImuSource,
 )
 from colmap_inertial.core.types.recorded import (
     Action,
@@ -77,6 +78,7 @@ __all__ = [
     "ImuCalibration",
     "ImuNoise",
     "ImuRecording",
+    "ImuSource",
     "JoinedPart",
     "Keypoints",
     "LengthUnit",

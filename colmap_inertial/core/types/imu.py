@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from colmap_inertial.core.arrays import Array, check_fields, set_fields
+from colmap_inertial.core.axes import Axes
 from colmap_inertial.core.facts import Fact, as_fact
 from colmap_inertial.core.summary import prints_in_lines
 
@@ -304,6 +307,30 @@ class ImuCalibration:
         return np.asarray(gyro @ undo_gyro), np.asarray(accel @ undo_accel)
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ImuSource:
+    """Where readings come from, for messages.
+
+    Attributes
+    ----------
+    path
+        File or folder.
+    accel_path
+        Where the accelerometer's come from, if not from there.
+    gyro_axes, accel_axes
+        Mappings of axes that were applied, so that a message can name the ones to write in their place.
+    """
+
+    path: Path = Path("IMU")
+    accel_path: Path | None = None
+    gyro_axes: Axes | None = None
+    accel_axes: Axes | None = None
+
+    def path_of(self, quantity: Literal["gyro", "accel"]) -> Path:
+        """Where a sensor's readings come from."""
+        return self.accel_path if quantity == "accel" and self.accel_path is not None else self.path
+
+
 @prints_in_lines
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ImuRecording:
@@ -330,6 +357,8 @@ class ImuRecording:
         What the readings were corrected by (``ImuCalibration.corrected``); ``None`` where they are the sensor's own.
     temperature_c
         How warm the sensors were (median), degrees Celsius, where it was logged.
+    source
+        Where it comes from, for messages; nothing is decided by it.
     """
 
     gyro_t_s: Array
@@ -342,6 +371,7 @@ class ImuRecording:
     noise: ImuNoise | None = None
     calibration: ImuCalibration | None = None
     temperature_c: float | None = None
+    source: ImuSource = field(default=ImuSource(), compare=False, repr=False)
 
     def __post_init__(self) -> None:
         check_fields(self, gyro_t_s=("N",), accel_t_s=("M",), gyro_rad_s=("N", 3), accel_m_s2=("M", 3))

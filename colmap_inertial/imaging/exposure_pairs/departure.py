@@ -14,8 +14,8 @@ from colmap_inertial.imaging.exposure_pairs.pair import average_channels
 class DepartureLimits:
     """Limits of the departure of a fused image from its short exposure.
 
-    By pairs of ``scripts/bench_exposures.py``, seeds 101 and 102, 480 px wide: the worst one of 101 rises from 2.2 dB
-    below its short exposure to level with it, and none loses more than 0.01 dB.
+    By pairs of ``scripts/benchmarks/exposures.py``, seeds 101 and 102, 480 px wide: the worst one of 101 rises
+    from 2.2 dB below its short exposure to level with it, and none loses more than 0.01 dB.
     """
 
     #: Side of the squares over which the mean squares are taken, px.

@@ -16,9 +16,9 @@ from colmap_inertial.imaging.plane_sweep.pinhole import ROWS_AT_ONCE, Pinhole
 class SigmaModel:
     """Logarithm of twice the standard deviation in pixels of the partners: a sum of factors times measures.
 
-    ``scripts/fit_depth_sigma.py`` fits the factors on photographic worlds, as the 95 % quantile of errors. Beside these
-    measures, texture along the epipolar lines (its factor is 0.001), the share of views that agree closely and the
-    spread of their depths told nothing more; in all classes of texture 92 to 96 % of errors are within.
+    ``scripts/studies/fit_depth_sigma.py`` fits the factors on photographic worlds, as the 95 % quantile of
+    errors. Beside these measures, texture along the epipolar lines (its factor is 0.001), the share of views that agree
+    closely and the spread of their depths told nothing more; in all classes of texture 92 to 96 % of errors are within.
     """
 
     constant: float = 0.883
@@ -48,8 +48,8 @@ class ConfidenceLimits:
     #: A distance from the plane counts as at most this one.
     most_away_px: float = 10.0
     #: Depths with a larger standard deviation, as a share of the depth, are left out. On a photographic world
-    #: (``scripts/bench_dense.py FOLDER --world photo --seeds 0``) 81 % of the near pixels keep a depth, 90.8 % of these
-    #: within 1 %; with 0.04, a hundredth fewer and 0.4 % more.
+    #: (``python -m scripts.benchmarks.dense FOLDER --world photo --seeds 0``) 81 % of the near pixels keep a depth,
+    #: 90.8 % of these within 1 %; with 0.04, a hundredth fewer and 0.4 % more.
     most_share: float = 0.045
 
 

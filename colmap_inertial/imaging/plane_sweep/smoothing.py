@@ -37,7 +37,8 @@ class SmoothingLimits:
     blur_px: float = 0.8
     #: A depth counts in full up to this standard deviation.
     certain_px: float = 0.75
-    #: The smaller one of two standard deviations is too small by so much (``scripts/fit_depth_sigma.py``, last table).
+    #: The smaller one of two standard deviations is too small by so much (``scripts/studies/fit_depth_sigma.py``, last
+    #: table).
     chosen: float = 1.2
     #: Coordinates are counted in so many pixels, and their standard deviation is at least this.
     unit_px: float = 100.0

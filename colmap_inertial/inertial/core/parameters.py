@@ -184,10 +184,10 @@ class Estimate(InertialStates):
             gravity_m_s2=self.gravity_m_s2 + z[GRAVITY],
             cam_from_imu=so3_exp(z[ROTATION]) @ self.cam_from_imu,
             **{name: getattr(self, name) + states[:, columns] for name, columns in _ADDED_STATES.items()},
-            **{name: self._added(name, z[columns]) for name, columns in _ADDED_GLOBALS.items()},
+            **{name: self._add(name, z[columns]) for name, columns in _ADDED_GLOBALS.items()},
         )
 
-    def _added(self, name: str, change: Array) -> Any:
+    def _add(self, name: str, change: Array) -> Any:
         before = getattr(self, name)
         return before + change.reshape(np.shape(before))
 

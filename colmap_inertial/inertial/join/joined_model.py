@@ -91,9 +91,9 @@ def join_models(
         )
     numbers, images = [model.colmap_index for model in members], sum(part.images for part in about)
     reason = Fact("models-joined", numbers=numbers, images=images)
-    scale = _scale_of(members, about, float(np.linalg.norm(placed.gravity_m_s2)) * DOWN_IN_WORLD[world])
+    scale = _combine_scales(members, about, float(np.linalg.norm(placed.gravity_m_s2)) * DOWN_IN_WORLD[world])
     return replace(
-        _merged(members, moves, fitted, group, placed_images),
+        _merge_members(members, moves, fitted, group, placed_images),
         scale=replace(scale, notes=(*scale.notes, Fact("model-was", done=reason))),
         similarity=replace(about[0].similarity, provenance=f"{first.similarity.provenance}; {reason}"),
         treatments=(
@@ -113,7 +113,7 @@ def _metric_move(placed: Placed, k: int, world: WorldAxes) -> Similarity:
     return Similarity(scale=scale, rotation_xyzw=quat_from_matrix(rotation), translation_m=shift, cov=np.zeros((7, 7)))
 
 
-def _merged(
+def _merge_members(
     members: Sequence[Model],
     moves: Sequence[Similarity],
     fitted: Sequence[FittedSubmodel],
@@ -183,7 +183,7 @@ def _sigma_log(model: Model, submodel: FittedSubmodel, placed: Placed, k: int) -
     return float((min(submodel.path.scale[1], joined) + _scale_variance_beside(model, submodel)) ** 0.5)
 
 
-def _scale_of(members: Sequence[Model], parts: Sequence[JoinedPart], down: Array) -> ScaleEstimate:
+def _combine_scales(members: Sequence[Model], parts: Sequence[JoinedPart], down: Array) -> ScaleEstimate:
     """The scale of a joined model: that of its first part, constrained by the others."""
     first, similarity, sigma_log = members[0].scale, parts[0].similarity, parts[0].sigma_log
     assert first is not None and first.gravity_in_world_m_s2 is not None and first.sigma_log is not None

@@ -107,7 +107,7 @@ class _Judgement:
         evidence, gap = self.evidence, _gap(self.evidence, pair)
         if pair in evidence.incompatible:
             gap = replace(gap, reason=evidence.incompatible[pair])
-        elif not _of(evidence.shared, pair) and not _of(evidence.usable, pair):
+        elif not _select_ties(evidence.shared, pair) and not _select_ties(evidence.usable, pair):
             gap = replace(gap, reason=_why_unlinked(evidence, pair))
         else:
             trial = self.trials[pair] = _try_with_matches(evidence, pair, evidence.matched)
@@ -207,7 +207,9 @@ def join_submodels(
     return Joined(groups=groups, gaps=tuple(judgement.gaps.values()))
 
 
-def _of(ties: Sequence[ImuLink] | Sequence[SimilarityConstraint], pair: Pair) -> list[ImuLink | SimilarityConstraint]:
+def _select_ties(
+    ties: Sequence[ImuLink] | Sequence[SimilarityConstraint], pair: Pair
+) -> list[ImuLink | SimilarityConstraint]:
     return [tie for tie in ties if pair_of(tie) == pair]
 
 

@@ -159,42 +159,42 @@ def refine(
         raise NotObservableError("refinement", Fact("refine-too-large", size_bytes=needed))
     alone = pictures_alone(problem, at_once_px)
     noise = measure_picture_noise(alone, start)
-    problem, alone = (apply_noise(each, noise) for each in (problem, alone))
-    whole, whole_start = problem, start
-    if (points := draw_points(problem.observations, len(t_s))) is not None:
-        problem, alone = (select_points(each, points) for each in (problem, alone))
+    whole, whole_start = apply_noise(problem, noise), start
+    problem, alone = whole, apply_noise(alone, noise)
+    points = draw_points(problem.observations, len(t_s))
+    if points is not None:
+        problem, alone = select_points(problem, points), select_points(alone, points)
         start = replace(start, points_m=start.points_m[points])
-    kept = ~_chosen(problem.observations)
-    seen_alone, seen = solve(_part(alone, kept), start), solve(_part(problem, kept), start)
-    # pictures alone may fit worse than with a rolling shutter: the IMU's own squares are the least that it costs
-    freedom = _freedom(problem)
-    chi2 = max(2 * (seen.cost - seen_alone.cost), seen.squares["imu"]) / freedom
+    # docs/dev/refinement.md#acceptance: two solutions without a tenth of the observations
+    kept = ~_choose_held_out(problem.observations)
+    seen_alone = solve(_select_observations(alone, kept), start)
+    seen = solve(_select_observations(problem, kept), start)
     steps = seen_alone.steps + seen.steps
+    # pictures alone may fit worse than with a rolling shutter: the IMU's own squares are the least that it costs
+    chi2 = max(2 * (seen.cost - seen_alone.cost), seen.squares["imu"]) / _count_freedom(problem)
     readout = None
     if seen.converged and not readout_declared:
         readout, problem, seen = _test_readout(problem, kept, seen)
         steps += seen.steps
     if seen.converged and chi2 <= LIMITS.largest_chi2:
         # a false IMU would find itself noisy: it is judged by what was known before
-        problem = _measured(problem, kept, seen.estimate)
-        seen = solve(_part(problem, kept), seen.estimate)
+        problem = _measure_accel_noise(problem, kept, seen.estimate)
+        seen = solve(_select_observations(problem, kept), seen.estimate)
         steps += seen.steps
     before = evaluate_held_out(alone, seen_alone.estimate, alone.observations.select(~kept))
     after = evaluate_held_out(problem, seen.estimate, problem.observations.select(~kept))
-    change, count = after - before, len(before)
-    mean = float(change.mean()) if count else 0.0
-    spread = float(change.std(ddof=1) / count**0.5) if count > 1 else np.inf
-    reason = _doubt(seen_alone, seen, chi2, mean, spread) or _too_late(problem, seen.estimate)
+    change, change_sigma = _average_change(before, after)
+    reason = _find_doubt(seen_alone, seen, chi2, change, change_sigma) or _find_late_clock(problem, seen.estimate)
     assert problem.inertial is not None
     judged = Judged(
         estimate=whole_start,
         accepted=False,
         reason=reason,
-        held_out=count,
+        held_out=len(before),
         before_px=_convert_cost_to_px(before, problem.sigma_px),
         after_px=_convert_cost_to_px(after, problem.sigma_px),
-        change=mean,
-        change_sigma=spread,
+        change=change,
+        change_sigma=change_sigma,
         chi2=chi2,
         sigma_px=noise.sigma_px,
         accel_noise_m_s2_rthz=problem.inertial.noise.accel_density_m_s2_rthz,
@@ -208,6 +208,13 @@ def refine(
     if points is not None:
         problem, x = restore_points(whole, problem), carry_points(whole.observations, whole_start, x)
     return _solve_all(judged, problem, x, t_s)
+
+
+def _average_change(before: Array, after: Array) -> tuple[float, float]:
+    """Mean change of the costs (M,) of what was held out, and its standard deviation."""
+    change, count = after - before, len(before)
+    mean = float(change.mean()) if count else 0.0
+    return mean, float(change.std(ddof=1) / count**0.5) if count > 1 else np.inf
 
 
 def _solve_all(judged: Judged, problem: Problem, x: Estimate, t_s: Array) -> Judged:
@@ -241,7 +248,7 @@ def _solve_all(judged: Judged, problem: Problem, x: Estimate, t_s: Array) -> Jud
     )
 
 
-def _chosen(observations: Observations) -> BoolArray:
+def _choose_held_out(observations: Observations) -> BoolArray:
     """(M,) what is held out: every tenth observation of points that keep three or more."""
     lengths = np.diff(observations.first)
     often = np.flatnonzero(lengths[observations.point] >= LIMITS.fewest)
@@ -250,26 +257,26 @@ def _chosen(observations: Observations) -> BoolArray:
     return out
 
 
-def _part(problem: Problem, keep: BoolArray) -> Problem:
+def _select_observations(problem: Problem, keep: BoolArray) -> Problem:
     return replace(problem, observations=problem.observations.select(keep))
 
 
-def _measured(problem: Problem, kept: BoolArray, x: Estimate) -> Problem:
+def _measure_accel_noise(problem: Problem, kept: BoolArray, x: Estimate) -> Problem:
     """The problem with the accelerometer's noise re-estimated, from the solution on nine tenths of the observations."""
     try:
-        return replace(problem, inertial=apply_measured_noise(_part(problem, kept), x).inertial)
+        return replace(problem, inertial=apply_measured_noise(_select_observations(problem, kept), x).inertial)
     except np.linalg.LinAlgError:  # the solution says why not
         return problem
 
 
-def _freedom(problem: Problem) -> float:
+def _count_freedom(problem: Problem) -> float:
     """Residuals minus unknowns that the IMU adds: rows and priors, less velocities, biases and the rest."""
     assert problem.inertial is not None
     # biases walk, or are known beforehand: as many residuals as unknowns
     return float(max(1, 9 * int(problem.inertial.linked.sum()) - 3 * int(problem.inertial.touched.sum())))
 
 
-def _readout(problem: Problem, x: Estimate) -> tuple[float, float] | None:
+def _estimate_readout(problem: Problem, x: Estimate) -> tuple[float, float] | None:
     """Estimated readout and its standard deviation, in seconds; None where there is no standard deviation."""
     try:
         cov = factored(problem, x).shared_cov()
@@ -290,8 +297,8 @@ def _test_readout(
         observations=replace(observations, line=np.zeros_like(observations.line)),
         prior=replace(problem.prior, info=info, mean=replace(problem.prior.mean, readout_s=0.0)),
     )
-    without = solve(_part(still, kept), replace(seen.estimate, readout_s=0.0))
-    readout = _readout(_part(problem, kept), seen.estimate)
+    without = solve(_select_observations(still, kept), replace(seen.estimate, readout_s=0.0))
+    readout = _estimate_readout(_select_observations(problem, kept), seen.estimate)
     if readout is None or abs(readout[0]) < max(SHUTTER_LIMITS.least_s, SHUTTER_LIMITS.sure_sigma * readout[1]):
         return None, still, without
     better = evaluate_held_out(still, without.estimate, still.observations.select(~kept)) - evaluate_held_out(
@@ -302,7 +309,7 @@ def _test_readout(
     return (readout[0], float(np.hypot(readout[1], SHUTTER_LIMITS.cut_share * readout[0]))), problem, seen
 
 
-def _doubt(alone: Solution, seen: Solution, chi2: float, change: float, spread: float) -> Fact | None:
+def _find_doubt(alone: Solution, seen: Solution, chi2: float, change: float, spread: float) -> Fact | None:
     """Why a refinement is not believed; ``None`` where it is."""
     if not alone.converged:
         return Fact("pictures-not-converged")
@@ -315,7 +322,7 @@ def _doubt(alone: Solution, seen: Solution, chi2: float, change: float, spread: 
     return None
 
 
-def _too_late(problem: Problem, x: Estimate) -> Fact | None:
+def _find_late_clock(problem: Problem, x: Estimate) -> Fact | None:
     """Why clocks are too far apart, or a readout too long; ``None`` where readings were looked up as far."""
     assert problem.inertial is not None
     inertial = problem.inertial

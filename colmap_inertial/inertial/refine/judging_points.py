@@ -14,8 +14,8 @@ from colmap_inertial.inertial.refine.values import Estimate, Observations, Probl
 class JudgingLimits:
     """Observations that judge: so many, and at least so many a frame.
 
-    ``study_refine.py --points-per-m 2000 --metres 60``, and ``250``: 0.24 and 0.31 of the time of COLMAP's adjustment,
-    and the errors that all observations give.
+    ``scripts.studies.refine --points-per-m 2000 --metres 60``, and ``250``: 0.24 and 0.31 of the time of COLMAP's
+    adjustment, and the errors that all observations give.
     """
 
     observations: int = 50_000

@@ -252,24 +252,24 @@ def make_problem(
         camera_of=seen.camera_of,
         inertial=inertial,
         prior=Prior(
-            mean=_expected(start, known),
+            mean=_put_declared_back(start, known),
             info=_information(start, known, imu, timing),
             gyro_bias_sigma_rad_s=0.1,
             accel_bias_sigma_m_s2=PRIORS.accel_bias_m_s2,
         ),
         sigma_px=1.0,
-        distances=_distances(seen),
+        distances=_measure_distances(seen),
     )
     return problem, start
 
 
-def _distances(seen: Seen) -> Distances:
+def _measure_distances(seen: Seen) -> Distances:
     """How far points are from the first camera that sees each, in the model."""
     camera = seen.cam_in_world[seen.observations.frame[seen.observations.first[:-1]]]
     return Distances(camera_in_world_m=camera, distance_m=np.linalg.norm(seen.points - camera, axis=1))
 
 
-def _expected(start: Estimate, known: Known) -> Estimate:
+def _put_declared_back(start: Estimate, known: Known) -> Estimate:
     """The start, with what was declared beforehand in place of what was estimated since."""
     declared, refined = known.prior, known.calibration
     delay_s = declared.accel_delay_s - refined.accel_delay_s

@@ -6,6 +6,7 @@ steps of the refinement with the readout as an unknown tell it, each line at its
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,6 +27,7 @@ from colmap_inertial.inertial.refine.solve import factored, solve
 from colmap_inertial.inertial.refine.values import FIRST_INTRINSIC, READOUT, Estimate, Problem
 from colmap_inertial.inertial.scale.verdict import finite, half_width, verdict_of, without_width
 from colmap_inertial.model import colmap_camera
+from colmap_inertial.motion.shutter import compare_readout
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,17 +38,19 @@ class ShutterLimits:
     least_s: float = 1e-3
     sure_sigma: float = 3.0
     #: COLMAP leaves out observations that its global shutter misses by 4 px, and keeps those whose noise brings them
-    #: nearer: found readouts are 2 to 10 % short, 5 % rms, and right with all observations (``study_refine_real.py``).
+    #: nearer: found readouts are 2 to 10 % short, 5 % rms, and right with all observations
+    #: (``scripts/studies/refine_real.py``).
     cut_share: float = 0.05
     #: Images in a row that are looked at: a readout is the camera's, not the recording's.
     most_images: int = 300
     #: Observations, at least, and about how many are looked at: more take longer and tell it no better than the model.
     fewest: int = 500
     most: int = 15_000
-    #: Steps of the refinement: from a global shutter, three come within 3 to 11 % of 20 ms (``study_refine_real.py``).
+    #: Steps of the refinement: from a global shutter, three come within 3 to 11 % of 20 ms
+    #: (``scripts/studies/refine_real.py``).
     steps: int = 3
-    #: A declared global shutter is contradicted by a readout of at least so many standard deviations and this length; a
-    #: declared focal length by one that is as surely another, and by this share.
+    #: A declared readout is contradicted by one that is off by so many standard deviations, and by this; a declared
+    #: focal length by one that is as surely another, and by this share.
     contradicts_sigmas: float = 5.0
     contradicts_s: float = 3e-3
     contradicts_focal: float = 0.03
@@ -116,11 +120,17 @@ class SeenReadout:
         """Whether lines were exposed one after the other, as surely as the refinement asks for."""
         return self.readout_s >= max(SHUTTER_LIMITS.least_s, SHUTTER_LIMITS.sure_sigma * self.sigma_s)
 
-    @property
-    def contradicts_global(self) -> bool:
-        """Whether lines were exposed one after the other though a global shutter was declared."""
+    def compared(self, declared: FrameTiming) -> Fact | None:
+        """A declared readout that it contradicts; ``None`` where they agree."""
         limits = SHUTTER_LIMITS
-        return self.readout_s >= max(limits.contradicts_s, limits.contradicts_sigmas * self.sigma_s)
+        return compare_readout(
+            declared,
+            self.readout_s,
+            self.sigma_s,
+            self.direction,
+            least_s=limits.contradicts_s,
+            sigmas=limits.contradicts_sigmas,
+        )
 
     def as_fact(self, *, declared_global: bool = False) -> Fact:
         """What is wrong with the model's scale then."""
@@ -161,8 +171,17 @@ class SeenReadout:
         )
 
 
-def find_readout(seen: Seen, timing: FrameTiming, imu: ImuRecording, known: Known) -> SeenReadout | None:
+def find_readout(
+    seen: Seen,
+    timing: FrameTiming,
+    imu: ImuRecording,
+    known: Known,
+    *,
+    exposed_px: Callable[[Seen], Array] | None = None,
+) -> SeenReadout | None:
     """The readout of a metric model's images, down or across, whatever is declared; ``None`` where too little is seen.
+
+    Of rectified keypoints, along what is declared, from which the model was made.
 
     Parameters
     ----------
@@ -170,6 +189,8 @@ def find_readout(seen: Seen, timing: FrameTiming, imu: ImuRecording, known: Know
         The model, or a part of it.
     timing, imu, known
         As the refinement has them.
+    exposed_px
+        Where the shutter had the observations of a model whose keypoints were rectified.
 
     Raises
     ------
@@ -183,26 +204,30 @@ def find_readout(seen: Seen, timing: FrameTiming, imu: ImuRecording, known: Know
     if count < SHUTTER_LIMITS.fewest:
         return None
     seen = select_points(seen, np.arange(len(seen.points)) % -(-count // SHUTTER_LIMITS.most) == 0)
+    if exposed_px is not None:
+        return _measure(seen, timing, imu, known, exposed_px(seen), rounds=SHUTTER_LIMITS.rounds)
+    at_once_px = seen.observations.xy_px
     directions: tuple[ReadoutDirection, ...] = ("down", "right")
     found = [
-        _measure(seen, replace(timing, readout_s=None, readout_direction=direction), imu, known)
+        _measure(seen, replace(timing, readout_s=None, readout_direction=direction), imu, known, at_once_px)
         for direction in directions
     ]
     likelier = max(found, key=lambda one: one.readout_s / one.sigma_s)
     if not likelier.is_found:
         return likelier
     timing = replace(timing, readout_s=None, readout_direction=likelier.direction)
-    return _measure(seen, timing, imu, known, rounds=SHUTTER_LIMITS.rounds)
+    return _measure(seen, timing, imu, known, at_once_px, rounds=SHUTTER_LIMITS.rounds)
 
 
 _OPPOSITE: dict[ReadoutDirection, ReadoutDirection] = {"down": "up", "up": "down", "right": "left", "left": "right"}
 
 
-def _measure(seen: Seen, timing: FrameTiming, imu: ImuRecording, known: Known, rounds: int = 1) -> SeenReadout:
+def _measure(
+    seen: Seen, timing: FrameTiming, imu: ImuRecording, known: Known, exposed_px: Array, rounds: int = 1
+) -> SeenReadout:
     """The readout with lines that run as the timing says, or the other way."""
-    at_once_px = seen.observations.xy_px
-    problem, start = make_problem(seen, timing, imu, known, at_once_px)
-    problem = apply_noise(problem, measure_picture_noise(pictures_alone(problem, at_once_px), start))
+    problem, start = make_problem(seen, timing, imu, known, exposed_px)
+    problem = apply_noise(problem, measure_picture_noise(pictures_alone(problem, seen.observations.xy_px), start))
     x = start
     for _ in range(rounds):
         before_s = x.readout_s

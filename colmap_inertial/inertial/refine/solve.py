@@ -45,6 +45,8 @@ class SolveLimits:
 
 
 SOLVE = SolveLimits()
+#: A step counts where the cost falls by more than this share of what it promised.
+_GAINS = 1e-4
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -102,7 +104,7 @@ def _evaluate(problem: Problem, x: Estimate, observations: Observations) -> _Poi
     return _Point(estimate=x, projected=projected, rows=rows, offset=offset, cost=cost)
 
 
-def _weighted(problem: Problem, at: _Point, informs: float = 1.0) -> tuple[Derivatives, Array]:
+def _weight_rows(problem: Problem, at: _Point, informs: float = 1.0) -> tuple[Derivatives, Array]:
     """Derivatives and residuals of a problem's rows over their standard deviations, times the roots of their robust
     weights.
 
@@ -127,59 +129,88 @@ def _weighted(problem: Problem, at: _Point, informs: float = 1.0) -> tuple[Deriv
     return by, np.insert(residual, ends, away, axis=0)
 
 
-def _built(problem: Problem, layout: Layout, at: _Point, by: Derivatives, residual: Array, damping: float) -> System:
+def _build_system(
+    problem: Problem, layout: Layout, at: _Point, by: Derivatives, residual: Array, damping: float
+) -> System:
     info = problem.prior.info
     return System.build(layout, problem.rows, by, residual, at.rows, (info, -info @ at.offset), damping=damping)
 
 
+@dataclass(kw_only=True)
+class _Damping:
+    """Damping by Nielsen's rule (Madsen, Nielsen, Tingleff, *Methods for non-linear least squares*, 2004)."""
+
+    value: float = SOLVE.first_damping
+    growth: float = 2.0
+
+    @property
+    def is_exhausted(self) -> bool:
+        """Whether more of it is of no use."""
+        return self.value >= SOLVE.most_damping
+
+    def grow(self) -> None:
+        """After a step that leads nowhere."""
+        self.value, self.growth = self.value * self.growth, 2 * self.growth
+
+    def shrink(self, ratio: float) -> None:
+        """After a step that brought so many times what it promised."""
+        self.value = max(self.value * max(0.1, 1 - (2 * ratio - 1) ** 3), SOLVE.least_damping)
+        self.growth = 2.0
+
+
 def solve(problem: Problem, start: Estimate, *, most_steps: int = SOLVE.steps) -> Solution:
-    """Refine an estimate."""
+    """Refine an estimate (``docs/dev/refinement.md``, Solver)."""
     observations, rows = problem.observations, problem.rows
     layout = Layout.of(observations, len(start.velocity_m_s))
-    at, damping, growth = _evaluate(problem, start, observations), SOLVE.first_damping, 2.0
-    converged, steps, stretch = False, 0, 1.0
+    at, damping = _evaluate(problem, start, observations), _Damping()
+    steps, stretch = 0, 1.0
     for steps in range(1, most_steps + 1):
-        by, residual = _weighted(problem, at)
+        by, residual = _weight_rows(problem, at)
         gained = pushed = False
-        while not gained and damping < SOLVE.most_damping:
-            system = _built(problem, layout, at, by, residual, damping)
-            step = _step(system, rows, by)
-            if step is None:
-                damping, growth = damping * growth, 2 * growth
+        while not gained and not damping.is_exhausted:
+            system = _build_system(problem, layout, at, by, residual, damping.value)
+            step = _find_step(system, rows, by)
+            if step is None or not _is_plausible(start, step.taken(at.estimate, stretch, problem.distances)):
+                damping.grow()
                 continue
-            if not _plausible(start, step.taken(at.estimate, stretch, problem.distances)):
-                damping, growth = damping * growth, 2 * growth
+            promised = _predict_decrease(problem, at, residual, step)
+            if promised - _predict_decrease_by_points(system) < SOLVE.settled:
+                if damping.value <= SOLVE.rest_damping or pushed:
+                    return _make_solution(at, steps, converged=damping.value <= SOLVE.rest_damping)
+                damping, pushed = _Damping(value=SOLVE.rest_damping), True
                 continue
-            promised = _promised(problem, at, residual, step)
-            of_points = 0.5 * float(np.einsum("pi,pij,pj->", system.pull, system.inverse, system.pull))
-            of_points = min(of_points, SOLVE.settled_point * len(system.pull))
-            if promised - of_points < SOLVE.settled:
-                if damping <= SOLVE.rest_damping or pushed:
-                    return _solution(at, steps, converged=damping <= SOLVE.rest_damping)
-                damping, growth, pushed = SOLVE.rest_damping, 2.0, True
+            tried, length = _try_step(problem, at, step, stretch, promised)
+            ratio = (at.cost - tried.cost) / promised
+            gained, stretch = ratio > _GAINS, 1.0
+            if not gained:
+                damping.grow()
                 continue
-            for length in (stretch, 1.0) if stretch > 1 else (1.0,):
-                tried = _evaluate(problem, step.taken(at.estimate, length, problem.distances), observations)
-                ratio = (at.cost - tried.cost) / promised
-                gained = ratio > 1e-4
-                if gained:
-                    break
-            stretch = 1.0
-            if gained:
-                at = tried
-                damping = max(damping * max(0.1, 1 - (2 * ratio - 1) ** 3), SOLVE.least_damping)
-                growth = 2.0
-                # of the curvature by the weights, the share that this step met
-                share = (2 * length - ratio) / length**2
-                stretch = 1 / min(max(share, 1 / SOLVE.longest_stretch), 1.0)
-            else:
-                damping, growth = damping * growth, 2 * growth
+            at = tried
+            damping.shrink(ratio)
+            # of the curvature by the weights, the share that this step met
+            share = (2 * length - ratio) / length**2
+            stretch = 1 / min(max(share, 1 / SOLVE.longest_stretch), 1.0)
         if not gained:
             break
-    return _solution(at, steps, converged=converged)
+    return _make_solution(at, steps, converged=False)
 
 
-def _step(system: System, observations: Observations, by: Derivatives) -> Step | None:
+def _try_step(problem: Problem, at: _Point, step: Step, stretch: float, promised: float) -> tuple[_Point, float]:
+    """What a step leads to, and its length: stretched, or as it is where that brings nothing."""
+    for length in (stretch, 1.0) if stretch > 1 else (1.0,):
+        tried = _evaluate(problem, step.taken(at.estimate, length, problem.distances), problem.observations)
+        if (at.cost - tried.cost) / promised > _GAINS:
+            break
+    return tried, length
+
+
+def _predict_decrease_by_points(system: System) -> float:
+    """Decrease of the cost that points by themselves promise, as far as a false one that creeps on may hide it."""
+    of_points = 0.5 * float(np.einsum("pi,pij,pj->", system.pull, system.inverse, system.pull))
+    return min(of_points, SOLVE.settled_point * len(system.pull))
+
+
+def _find_step(system: System, observations: Observations, by: Derivatives) -> Step | None:
     """Step of the system; ``None`` where it needs more damping to be solved."""
     try:
         step = system.factored().step(system, observations, by)
@@ -188,13 +219,13 @@ def _step(system: System, observations: Observations, by: Derivatives) -> Step |
     return step if all(np.isfinite(part).all() for part in (step.states, step.shared, step.points)) else None
 
 
-def _plausible(start: Estimate, moved: Estimate) -> bool:
+def _is_plausible(start: Estimate, moved: Estimate) -> bool:
     """Whether a step leaves a camera that can be one: a focal length keeps its sign and size."""
     away = np.abs(moved.intrinsics - start.intrinsics)
     return bool(np.all(away <= SOLVE.largest_change * np.maximum(np.abs(start.intrinsics), 1.0)))
 
 
-def _promised(problem: Problem, at: _Point, residual: Array, step: Step) -> float:
+def _predict_decrease(problem: Problem, at: _Point, residual: Array, step: Step) -> float:
     """Decrease of the cost by a step, if all were linear."""
     total = -float(np.sum(step.change * residual)) - 0.5 * float(np.sum(step.change**2))
     for block in at.rows.values():
@@ -209,7 +240,7 @@ def _promised(problem: Problem, at: _Point, residual: Array, step: Step) -> floa
     return total - float(step.shared @ info @ (at.offset + 0.5 * step.shared))
 
 
-def _solution(at: _Point, steps: int, *, converged: bool) -> Solution:
+def _make_solution(at: _Point, steps: int, *, converged: bool) -> Solution:
     squares = {name: float(np.sum(block.residual**2)) for name, block in at.rows.items()}
     return Solution(estimate=at.estimate, cost=at.cost, squares=squares, steps=steps, converged=converged)
 
@@ -218,7 +249,7 @@ def factored(problem: Problem, x: Estimate, *, damping: float = 0.0) -> Factored
     """The information at an estimate, for covariances."""
     layout = Layout.of(problem.observations, len(x.velocity_m_s))
     at = _evaluate(problem, x, problem.observations)
-    return _built(problem, layout, at, *_weighted(problem, at, problem.informs), damping).factored()
+    return _build_system(problem, layout, at, *_weight_rows(problem, at, problem.informs), damping).factored()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -241,7 +272,7 @@ class Linearised:
             offset=prior_offset(problem, x),
             cost=np.nan,
         )
-        system = _built(problem, self.layout, at, self.by, self.residual, 0.0)
+        system = _build_system(problem, self.layout, at, self.by, self.residual, 0.0)
         solved = system.factored()
         step = solved.step(system, problem.rows, self.by)
         return solved, step.states, step.shared
@@ -250,7 +281,7 @@ class Linearised:
 def linearised(problem: Problem, x: Estimate) -> Linearised:
     """The observations at an estimate."""
     at = _evaluate(problem, x, problem.observations)
-    by, residual = _weighted(problem, at, problem.informs)
+    by, residual = _weight_rows(problem, at, problem.informs)
     layout = Layout.of(problem.observations, len(x.velocity_m_s))
     return Linearised(layout=layout, projected=at.projected, by=by, residual=residual, estimate=x)
 
@@ -319,7 +350,7 @@ def _level_step(problem: Problem, x: Estimate, at: Linearised, change: float) ->
     own = rows.share @ left
     squares = float(np.sum(left * own))
     signs = np.random.default_rng(_SEED).choice([-1.0, 1.0], (*rows.residual.shape, _PROBES))
-    along = _followed(rows, np.concatenate([signs, own], axis=2), solved)
+    along = _project_on_fit(rows, np.concatenate([signs, own], axis=2), solved)
     explained = float(np.sum(signs * (rows.share @ along[:, :, :-1]))) / _PROBES
     count = float(np.trace(rows.share, axis1=1, axis2=2).sum())
     right = max(count - explained, 0.01 * count)
@@ -337,7 +368,7 @@ def _apply_rows(rows: Rows, states: Array, shared: Array) -> Array:
     return np.asarray(rows.here @ states[:-1] + rows.after @ states[1:] + rows.by_shared @ shared)
 
 
-def _followed(rows: Rows, values: Array, solved: Factored) -> Array:
+def _project_on_fit(rows: Rows, values: Array, solved: Factored) -> Array:
     """(N, r, k) of values the part that the fit follows: derivatives, covariance, derivatives."""
     assert rows.after is not None and rows.by_shared is not None
     place, count = solved.layout.place, values.shape[2]

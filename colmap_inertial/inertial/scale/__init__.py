@@ -50,7 +50,7 @@ class MovedLimits:
     #: ... or a block of up to this share at an end, which is sought where the scale is known no better (standard
     #: deviation), and believed where this is less than so much of it without the block, and grows no more than this
     #: with the nearer part of it: cameras that COLMAP put before the copy of a wall
-    #: (``scripts/study_wrong_cameras.py``: a hundredth).
+    #: (``scripts/studies/wrong_cameras.py``: a hundredth).
     most_share: float = 0.34
     poor_log: float = 0.05
     shrinks_much: float = 0.33
@@ -107,16 +107,16 @@ def find_remarks(trajectory: CameraTrajectory, timed: CameraTimedImu) -> tuple[F
     gyro_s, accel_s = timed.gyro_t_s, timed.accel_t_s
     covered = (max(gyro_s[0], accel_s[0]), min(gyro_s[-1], accel_s[-1]))
     remarks = (
-        _far_apart(trajectory, timed),
-        _pauses("gyroscope", gyro_s, trajectory),
-        _pauses("accelerometer", accel_s, trajectory),
-        _uncovered(trajectory, covered),
-        _warmer(timed.imu),
+        _note_separate_clocks(trajectory, timed),
+        _note_pauses("gyroscope", gyro_s, trajectory),
+        _note_pauses("accelerometer", accel_s, trajectory),
+        _note_uncovered_frames(trajectory, covered),
+        _note_warmth(timed.imu),
     )
     return tuple(remark for remark in remarks if remark is not None)
 
 
-def _far_apart(trajectory: CameraTrajectory, timed: CameraTimedImu) -> Fact | None:
+def _note_separate_clocks(trajectory: CameraTrajectory, timed: CameraTimedImu) -> Fact | None:
     shift_s = epoch_shift_s(timed.imu, trajectory.epoch_ns)
     begin_s, end_s = timed.imu.gyro_t_s[0] + shift_s, timed.imu.gyro_t_s[-1] + shift_s
     if begin_s < trajectory.t_s[-1] and end_s > trajectory.t_s[0]:
@@ -124,7 +124,7 @@ def _far_apart(trajectory: CameraTrajectory, timed: CameraTimedImu) -> Fact | No
     return Fact("clocks-without-common-time", offset_s=timed.calibration.clock_offset_s)
 
 
-def _pauses(sensor: str, t_s: Array, trajectory: CameraTrajectory) -> Fact | None:
+def _note_pauses(sensor: str, t_s: Array, trajectory: CameraTrajectory) -> Fact | None:
     step_s = np.diff(t_s)
     inside = (t_s[1:] > trajectory.t_s[0]) & (t_s[:-1] < trajectory.t_s[-1])
     long_s = step_s[inside & is_gap(t_s, _PAUSE_S, steps=PAUSE_STEPS)]
@@ -133,7 +133,7 @@ def _pauses(sensor: str, t_s: Array, trajectory: CameraTrajectory) -> Fact | Non
     return Fact("sensor-pauses", sensor=sensor, count=len(long_s), total_s=long_s.sum(), longest_s=long_s.max())
 
 
-def _uncovered(trajectory: CameraTrajectory, covered_s: tuple[float, float]) -> Fact | None:
+def _note_uncovered_frames(trajectory: CameraTrajectory, covered_s: tuple[float, float]) -> Fact | None:
     # A frame or so at either end is nothing to speak of.
     slack_s = 2 * float(np.median(np.diff(trajectory.t_s)))
     if covered_s[0] <= trajectory.t_s[0] + slack_s and covered_s[1] >= trajectory.t_s[-1] - slack_s:
@@ -142,7 +142,7 @@ def _uncovered(trajectory: CameraTrajectory, covered_s: tuple[float, float]) -> 
     return Fact("frames-without-imu", covered=count, frames=len(trajectory))
 
 
-def _warmer(imu: ImuRecording) -> Fact | None:
+def _note_warmth(imu: ImuRecording) -> Fact | None:
     if imu.calibration is None or imu.warmer_k is None or abs(imu.warmer_k) < _WARMER_K:
         return None
     return Fact(
@@ -269,7 +269,7 @@ def _estimate_or_refuse(
         timed, consensus = align_recording(trajectory, imu, calibration, options)
         trajectory = trajectory.select(consensus.kept)
         stretched = timed.imu.repairs[len(imu.repairs) :]
-        estimate, moved = _estimate_without_moved(trajectory, timed, options)
+        estimate, moved = _estimate_without_moved_cameras(trajectory, timed, options)
         consensus = replace(consensus, moved=moved)
         return replace(
             estimate,
@@ -282,7 +282,7 @@ def _estimate_or_refuse(
         return ScaleEstimate.refused(options.method, Fact("not-observable", quantity=error.quantity, why=error.fact))
 
 
-def _estimate_without_moved(
+def _estimate_without_moved_cameras(
     trajectory: CameraTrajectory, timed: CameraTimedImu, options: ScaleOptions
 ) -> tuple[ScaleEstimate, tuple[str, ...]]:
     """The scale, and what it does without.
@@ -302,11 +302,11 @@ def _estimate_without_moved(
             break
         estimate, moved = without, names
     if estimate.cov is not None and (estimate.verdict == "refused" or estimate.cov[0, 0] > _MOVED.poor_log**2):
-        return _estimate_without_end(trajectory, timed, options, (estimate, moved))
+        return _estimate_without_moved_end(trajectory, timed, options, (estimate, moved))
     return estimate, moved
 
 
-def _estimate_without_end(
+def _estimate_without_moved_end(
     trajectory: CameraTrajectory,
     timed: CameraTimedImu,
     options: ScaleOptions,
@@ -321,23 +321,29 @@ def _estimate_without_end(
     for from_end in (number, number[::-1]):
         few, many = 0, int(_MOVED.most_share * len(trajectory))
         without = _estimate(trajectory.select(sound & (from_end >= many)), timed, options)
-        if without.cov is None or without.verdict == "refused" or without.cov[0, 0] > limit:
+        if not _is_known_within(without, limit):
             continue
+        assert without.cov is not None
         limit = min(limit, _MOVED.grows**2 * float(without.cov[0, 0]))
+        # the fewest that it takes, by halving
         while many - few > 1:
             between = (few + many) // 2
             trial = _estimate(trajectory.select(sound & (from_end >= between)), timed, options)
-            if trial.cov is None or trial.verdict == "refused" or trial.cov[0, 0] > limit:
-                few = between
-            else:
+            if _is_known_within(trial, limit):
                 many, without = between, trial
+            else:
+                few = between
         best, kept = without, sound & (from_end >= many)
-        beyond = set(moved) - set(trajectory.names)
         left_out = (
-            *(name for name in moved if name in beyond),
+            *(name for name in moved if name not in trajectory.names),
             *(name for name, is_kept in zip(trajectory.names, kept.tolist(), strict=True) if not is_kept),
         )
     return best, left_out
+
+
+def _is_known_within(estimate: ScaleEstimate, variance: float) -> bool:
+    """Whether a scale is given, and its logarithm has no larger variance."""
+    return estimate.cov is not None and estimate.verdict != "refused" and not estimate.cov[0, 0] > variance
 
 
 def _estimate(trajectory: CameraTrajectory, timed: CameraTimedImu, options: ScaleOptions) -> ScaleEstimate:

@@ -54,14 +54,14 @@ def find_jumps(t_s: Array, centre: Array) -> BoolArray:
     """
     dt_s = np.diff(t_s)
     velocity = np.diff(centre, axis=0) / dt_s[:, None]
-    around = _beside(velocity, _LIMITS.beside)
+    around = _stack_neighbours(velocity, _LIMITS.beside)
     around[_LIMITS.beside] = np.nan
     surprise = np.linalg.norm(velocity - np.nanmedian(around, axis=0), axis=1) * dt_s
-    nearby = np.nanmedian(_beside(surprise[:, None], _LIMITS.near)[:, :, 0], axis=0)
+    nearby = np.nanmedian(_stack_neighbours(surprise[:, None], _LIMITS.near)[:, :, 0], axis=0)
     return np.asarray(surprise > _LIMITS.jump * np.maximum(nearby, np.median(surprise)))
 
 
-def _beside(values: Array, reach: int) -> Array:
+def _stack_neighbours(values: Array, reach: int) -> Array:
     """(2 reach + 1, N, q) the rows (N, q) and those around them; not a number beyond the ends."""
     padded = np.pad(values, ((reach, reach), (0, 0)), constant_values=np.nan)
     return np.stack([padded[k : k + len(values)] for k in range(2 * reach + 1)])

@@ -112,6 +112,8 @@ class Fit:
 
     Attributes
     ----------
+    t_s
+        (K,) camera times of the states.
     estimate, noise
         Parameters and levels.
     cov
@@ -151,6 +153,7 @@ class Fit:
         information is the prior's.
     """
 
+    t_s: Array
     estimate: Estimate
     noise: Noise
     cov: Array
@@ -202,7 +205,7 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
     imu.pull_back(own, ends[:, :, 4:], ends_z[:, 4:])
     states, z = inverse.solve(ends, ends_z)
     suspicions = sus.suspicions(where, own, imu.apply(states[:, :, 4:], z[:, 4:]), residual, z[par.SCALE, 4:])
-    variance_parts = _variance_parts(groups, at.prior, x, at.pre.cov_gaps, states[:, :, 3:4], z[:, 3])
+    variance_parts = _split_variance(groups, at.prior, x, at.pre.cov_gaps, states[:, :, 3:4], z[:, 3])
     level_variance, freedom = search.scale_variance(groups, states[:, :, 3:4], z[:, 3:4])
     states, z = states[:, :, :3], z[:, :3]
     inflation = max(1.0, *(squares / expected for squares, expected in sums.values()))
@@ -211,6 +214,7 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
     weights = [groups[name].weight for name in ("rotation", "centre")]
     weight = np.min([each for each in weights if each is not None], axis=0)
     return Fit(
+        t_s=data.t_s,
         estimate=x,
         noise=noise,
         cov=cov,
@@ -227,7 +231,7 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         pose_weight=weight,
         jumped_s=data.t_s[np.append(False, data.broken) | (weight < _HARDLY)],
         gain_chi2=prior.gain_chi2(x),
-        gain_surprise=_gain_surprise(at.prior, x, cov),
+        gain_surprise=_measure_gain_surprise(at.prior, x, cov),
         variance_parts=variance_parts,
         suspicions=suspicions,
         shape=_find_shape_faults(data, noise, at, taken),
@@ -258,8 +262,8 @@ class _Optimum:
 
 def _find_optimum(data: Data, prior: Prior, search: LevelSearch) -> tuple[_Optimum, float]:
     """Gauss-Newton with the noise levels along; also what the scale moved by in the end, 0 where it came to rest."""
-    x = _rotations_first(data, search.noise, prior)
-    scale = _moment_scale(data, x)
+    x = _fit_rotations(data, search.noise, prior)
+    scale = _guess_scale(data, x)
     x = replace(x, metres_per_unit=scale, imu_in_world_m=data.groups.centre * scale)
     settled, signed, steps = False, 0.0, [0.0]
     integrated, there = res.integrate(data, x), x
@@ -320,7 +324,7 @@ def _find_shape_faults(data: Data, noise: Noise, at: _Optimum, taken: float) -> 
     return shape.find_faults(kinds, scores, shaken=levels.vibrates(data), t_s=data.t_s, taken=taken)
 
 
-def _gain_surprise(prior: Prior, x: Estimate, cov: Array) -> float:
+def _measure_gain_surprise(prior: Prior, x: Estimate, cov: Array) -> float:
     """Squared distance of the gains from their prior beyond chance; see :class:`Fit`.
 
     What of the gains the data do not determine stays at the prior's mean: ``9 - trace(information covariance)`` of them
@@ -331,7 +335,7 @@ def _gain_surprise(prior: Prior, x: Estimate, cov: Array) -> float:
     return max(1.0, prior.gain_chi2(x) / (determined + (2 * determined) ** 0.5))
 
 
-def _variance_parts(
+def _split_variance(
     groups: dict[str, fac.Group | fac.Direct], prior: Prior, x: Estimate, cov_gaps: Array, states: Array, z: Array
 ) -> dict[str, float]:
     """The scale's variance, by the errors it comes from.
@@ -369,7 +373,7 @@ def _variance_parts(
     return {name: variance * float(z[par.SCALE]) / sum(left.values()) for name, variance in left.items()}
 
 
-def _rotations_first(data: Data, noise: Noise, prior: Prior) -> Estimate:
+def _fit_rotations(data: Data, noise: Noise, prior: Prior) -> Estimate:
     """Rotations, gyroscope bias and time offset from gyroscope and visual rotations alone."""
     x = prior.mean
     for _ in range(_MAX_ROTATION_ITERATIONS):
@@ -388,7 +392,7 @@ def _rotations_first(data: Data, noise: Noise, prior: Prior) -> Estimate:
     return x
 
 
-def _moment_scale(data: Data, x: Estimate) -> float:
+def _guess_scale(data: Data, x: Estimate) -> float:
     """Metres per unit at which visual and inertial second differences, less gravity and bias, are equally large."""
     pre = res.integrate(data, x)
     dt = pre.dt_s[:, None]

@@ -279,7 +279,7 @@ def prepare(
     pose_cov = None
     if trajectory.pose_cov is not None:
         pose_cov = np.add.reduceat(trajectory.pose_cov[inside], groups.first, axis=0) / groups.count[:, None, None]
-    rotation_shape, centre_shape, coupling = _pose_shapes(pose_cov, world_from_cam)
+    rotation_shape, centre_shape, coupling = _whiten_poses(pose_cov, world_from_cam)
     data = Data(
         groups=groups,
         origin=centre.mean(axis=0),
@@ -302,7 +302,7 @@ def prepare(
     )
     prior = Prior(
         mean=mean,
-        info=_information(calibration, imu),
+        info=_prior_information(calibration, imu),
         gravity_m_s2=gravity_m_s2,
         gravity_sigma_m_s2=gravity_sigma_m_s2,
     )
@@ -338,7 +338,7 @@ def _group_poses(
     return groups
 
 
-def _information(calibration: CameraImuCalibration, imu: ImuRecording) -> Array:
+def _prior_information(calibration: CameraImuCalibration, imu: ImuRecording) -> Array:
     """(79, 79) prior information of the globals; none for scale and gravity.
 
     The readings of a calibrated IMU are corrected already: the mean of its gains stays 0, and what is left of them is
@@ -368,7 +368,7 @@ def _information(calibration: CameraImuCalibration, imu: ImuRecording) -> Array:
     return info
 
 
-def _pose_shapes(pose_cov: Array | None, world_from_cam: Array) -> tuple[Array, Array, Array]:
+def _whiten_poses(pose_cov: Array | None, world_from_cam: Array) -> tuple[Array, Array, Array]:
     """Relative covariances of frames from covariances of the poses; their overall levels are estimated."""
     k = len(world_from_cam)
     if pose_cov is None:
@@ -379,10 +379,10 @@ def _pose_shapes(pose_cov: Array | None, world_from_cam: Array) -> tuple[Array, 
     carried = cross @ np.linalg.inv(rotation + slack)
     rest = centre - carried @ cross.transpose(0, 2, 1)
     coupling = world_from_cam.transpose(0, 2, 1) @ carried
-    return _shape(rotation), _shape(rest), coupling
+    return _whiten_relative(rotation), _whiten_relative(rest), coupling
 
 
-def _shape(cov: Array) -> Array:
+def _whiten_relative(cov: Array) -> Array:
     """Square roots of the information relative to the median level; no direction counts more than tenfold."""
     level = float(np.median(np.trace(cov, axis1=1, axis2=2))) / 3
     if not level > 0:

@@ -129,7 +129,7 @@ class ShapeFault:
         log_scale = float(self.value[0]) * _profile(t_s, self.kind, self.at_s)
         if self.keeps_after:
             log_scale = log_scale - float(self.value[0])
-        return np.asarray(centre[0] + _grown(centre, np.exp(log_scale)))
+        return np.asarray(centre[0] + _scale_steps(centre, np.exp(log_scale)))
 
     def as_fact(self, t_s: Array, widened: float) -> Fact:
         """What is wrong; ``t_s`` are the nodes' times, ``widened`` the factor on variances."""
@@ -153,7 +153,7 @@ def _profile(t_s: Array, kind: str, at_s: float) -> Array:
     return np.asarray((middle_s - 0.5 * (t_s[0] + t_s[-1])) / (t_s[-1] - t_s[0]))
 
 
-def _grown(path: Array, factor: Array) -> Array:
+def _scale_steps(path: Array, factor: Array) -> Array:
     """(K, 3) a path from the origin whose steps are so many times as long."""
     return np.concatenate([np.zeros((1, 3)), np.cumsum(np.diff(path, axis=0) * factor[:, None], axis=0)])
 
@@ -204,7 +204,7 @@ def shape_columns(t_s: Array, path: Array) -> tuple[list[tuple[Kind, float]], Ar
     count = int(np.clip((last_s - first_s) // LIMITS.spacing_s + 1, 0, LIMITS.most_breaks))
     kinds: list[tuple[Kind, float]] = [("break", float(at_s)) for at_s in np.linspace(first_s, last_s, count)]
     kinds += [("drift", float("nan")), ("stretch", float("nan"))]
-    grown = [_grown(path, _profile(t_s, kind, at_s)) for kind, at_s in kinds[:-1]]
+    grown = [_scale_steps(path, _profile(t_s, kind, at_s)) for kind, at_s in kinds[:-1]]
     strained = [(path - path.mean(axis=0)) @ strain for strain in _STRAINS]
     return kinds, np.stack([*grown, *strained], axis=2)
 
@@ -255,13 +255,13 @@ def bias_of_break(variance: float, after: float, taken: Array) -> float:
     return float(np.diff(parts * taken)[0])
 
 
-def suspect(faults: Sequence[ShapeFault], widened: float) -> ShapeFault | None:
+def find_likeliest_fault(faults: Sequence[ShapeFault], widened: float) -> ShapeFault | None:
     """The likeliest of those that are worth another fit."""
     worth = [one for one in faults if one.chi2(widened) > LIMITS.worth_a_fit * one.limit]
     return max(worth, key=lambda one: one.chi2(widened, 0.0), default=None)
 
 
-def confirmed(fault: ShapeFault, left: Sequence[ShapeFault], widened: float) -> ShapeFault | None:
+def confirm_fault(fault: ShapeFault, left: Sequence[ShapeFault], widened: float) -> ShapeFault | None:
     """A fault that was undone, with what is left of it, if it counts against noise that it no longer swells."""
     for one in left:
         if one.kind == fault.kind and (one.kind != "break" or one.at_s == fault.at_s):

@@ -142,7 +142,9 @@ def suspicions(
     return out
 
 
-def worst(suspicions: list[Suspicion], accel: SensorStream, known: Collection[str] = ()) -> Suspicion | None:
+def find_strongest_suspicion(
+    suspicions: list[Suspicion], accel: SensorStream, known: Collection[str] = ()
+) -> Suspicion | None:
     """The strongest suspicion that is more than chance, None where there is none.
 
     Of what is ``known`` to be wrong already, more than half a standard deviation that is left counts. Stamps that part
@@ -178,7 +180,7 @@ class LagLimits:
 _LAG = LagLimits()
 
 
-def filter_of_lag(suspicions: list[Suspicion], delay_s: float, sigma_s: float) -> float:
+def find_filter_of_lag(suspicions: list[Suspicion], delay_s: float, sigma_s: float) -> float:
     """Time constant of the filter that an accelerometer's lag looks like; 0 where it does not.
 
     A filter of the first order makes readings late by its time constant, and takes half its square times the second
@@ -218,7 +220,7 @@ class Faults:
         """Whether it is the camera's path, and not the accelerometer, that lacks what is quick."""
         return "bandwidth" in self.values and float(self.values["bandwidth"][0]) > 0
 
-    def loosened(self, prior: Prior) -> Prior:
+    def loosen_delay(self, prior: Prior) -> Prior:
         """The prior where the delay of a filter is not known: it may be none, or all of its time constant."""
         if "bandwidth" not in self.values:
             return prior
@@ -226,7 +228,7 @@ class Faults:
         info[at, at] = 1 / (1 / info[at, at] + self._time_constant_s**2)
         return replace(prior, info=info)
 
-    def undone(self, data: Data) -> Data:
+    def undo(self, data: Data) -> Data:
         """The data of a recording with the readings that a sound accelerometer would have given.
 
         A filter is taken as one of the first order, which applications' are: the reading plus its time constant times

@@ -34,23 +34,29 @@ from colmap_inertial.core.types import (
 )
 from colmap_inertial.inertial.core import parameters as par
 from colmap_inertial.inertial.core.parameters import Prior
-from colmap_inertial.inertial.core.priors import PRIORS, AccelPart, accel_part, clock_scale_sigma
-from colmap_inertial.inertial.scale._declared import find_contradicted_lever, open_lever
+from colmap_inertial.inertial.core.priors import PRIORS, AccelPart, accel_part
+from colmap_inertial.inertial.scale._declared import doubts_lever, find_contradicted_lever, leave_out_lever
 from colmap_inertial.inertial.scale._fit import Fit, fit_jointly
-from colmap_inertial.inertial.scale._gain import WrongGain, exceeds_usual, judge_gain
+from colmap_inertial.inertial.scale._gain import WrongGain, exceeds_usual
 from colmap_inertial.inertial.scale._setup import Data, prepare
-from colmap_inertial.inertial.scale._shape import LIMITS as SHAPE_LIMITS, ShapeFault, confirmed, suspect
-from colmap_inertial.inertial.scale._suspects import Faults, filter_of_lag, worst
-from colmap_inertial.inertial.scale.verdict import check_clocks, scale_drifts, student_factor, verdict_of
+from colmap_inertial.inertial.scale._shape import (
+    LIMITS as SHAPE_LIMITS,
+    ShapeFault,
+    confirm_fault,
+    find_likeliest_fault,
+)
+from colmap_inertial.inertial.scale._suspects import Faults, find_filter_of_lag, find_strongest_suspicion
+from colmap_inertial.inertial.scale.interval import (
+    find_wrong_gain,
+    metres_per_unit_of,
+    scale_variances,
+    variance_factor,
+)
+from colmap_inertial.inertial.scale.verdict import check_clocks, scale_drifts, verdict_of
+from colmap_inertial.io.calibration import SIGMAS
 
 #: So many times at most is something wrong with the accelerometer looked for, undone, and the rest fitted again.
 _MOST_FAULTS = 6
-#: Real visual errors are not those of the model (alike over .1 to 1 s and longer), which counts the more the shorter a
-#: clip is: standard deviations grow by this over its length. Measured on handheld and flown recordings with motion
-#: capture, cut to 3 to 20 s.
-_UNMODELLED_S = 1.5
-#: Standard deviation of what lies anywhere between none and all.
-_UNIFORM = 12**-0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,49 +135,46 @@ def estimate_joint(
     """
     options = options or JointOptions()
     accel, expected_s = accel_part(timed.imu), timed.calibration.accel_delay_s
+    shape = ShapeFaults()
     try:
-        timed, data, prior, fit = _fit_in_step(trajectory, timed, options)
-        lever = find_contradicted_lever(fit, prior)
-        if lever is not None:
-            prior = open_lever(prior)
-            fit = fit_jointly(data, prior, timed.imu.noise)
-        fit, faults = _fit_soundly(fit, data, prior, timed.imu.noise)
-        shape = Shape()
+        timed, data, prior, fit, lever = _fit_without_contradicted_lever(trajectory, timed, options)
+        fit, faults = _fit_undoing_accel_faults(fit, data, prior, timed.imu.noise)
         # a path that was smoothed has no shape to speak of
         if not faults.path_is_smoothed:
-            fit, shape = _fit_shapely(fit, faults.undone(data), faults.loosened(prior), timed.imu.noise, accel=accel)
+            sound, loose = faults.undo(data), faults.loosen_delay(prior)
+            fit, shape = _fit_undoing_shape_faults(fit, sound, loose, timed.imu.noise)
     except NotObservableError as error:
         return ScaleEstimate.refused("joint", error.fact)
     except np.linalg.LinAlgError:
         return ScaleEstimate.refused("joint", Fact("fit-singular"))
-    left_open = sum(suspicion.scale_variance for suspicion in fit.suspicions if suspicion.name in faults.values)
     moved_s = timed.calibration.accel_delay_s - expected_s
     lags, taken_log = _find_lag(fit, moved_s) if "bandwidth" not in faults.values else ([], 0.0)
+    left_open = sum(suspicion.scale_variance for suspicion in fit.suspicions if suspicion.name in faults.values)
     fit = replace(fit, variance_parts={**fit.variance_parts, "accel_faults": left_open + taken_log**2})
     declared = [] if lever is None else [lever]
-    wrong = [*declared, *faults.as_facts(), *lags, *_cut_off(data)]
+    wrong = [*declared, *faults.as_facts(), *lags, *_check_saturation(data)]
     # what was taken from a path nobody can put back: its scale is too large by more than any interval says
-    estimate = _judged(fit, data.t_s, timed.calibration, accel, wrong, shape, worthless=faults.path_is_smoothed)
-    notes = (*estimate.notes, *_out_of_step(moved_s))
-    return replace(estimate, notes=notes, jumped=_name_jumped(fit, data, trajectory))
+    estimate = _judge_fit(fit, timed.calibration, accel, wrong, shape, worthless=faults.path_is_smoothed)
+    notes = (*estimate.notes, *_note_moved_stamps(moved_s))
+    return replace(estimate, notes=notes, jumped=_name_jumped_images(fit, data, trajectory))
 
 
 def _find_lag(fit: Fit, moved_s: float) -> tuple[list[Fact], float]:
     """A doubt where the accelerometer lags as if it had been filtered, and what that would take from the scale."""
     sigma_s = float(fit.cov[par.ACCEL_DELAY, par.ACCEL_DELAY]) ** 0.5
-    constant_s = filter_of_lag(fit.suspicions, -(moved_s + fit.estimate.accel_delay_s), sigma_s)
+    constant_s = find_filter_of_lag(fit.suspicions, -(moved_s + fit.estimate.accel_delay_s), sigma_s)
     if constant_s == 0:
         return [], 0.0
     by_scale = next(one.by_scale for one in fit.suspicions if one.name == "bandwidth")
     return [Fact("accel-lags-as-filtered", lag_s=constant_s)], 0.5 * constant_s**2 * float(by_scale[0])
 
 
-def _out_of_step(moved_s: float) -> list[Fact]:
+def _note_moved_stamps(moved_s: float) -> list[Fact]:
     """A note where the accelerometer's stamps were moved."""
     return [] if moved_s == 0 else [Fact("accel-delay-undone", delay_s=-moved_s)]
 
 
-def _name_jumped(fit: Fit, data: Data, trajectory: CameraTrajectory) -> tuple[str, ...]:
+def _name_jumped_images(fit: Fit, data: Data, trajectory: CameraTrajectory) -> tuple[str, ...]:
     """Images by themselves that hardly count, or at which the path jumps, those that count least first.
 
     Behind a break the drift is free.
@@ -183,7 +186,8 @@ def _name_jumped(fit: Fit, data: Data, trajectory: CameraTrajectory) -> tuple[st
     return tuple(trajectory.names[int(np.argmin(np.abs(trajectory.t_s - t)))] for t in data.t_s[least_first])
 
 
-def _prepared(trajectory: CameraTrajectory, timed: CameraTimedImu, options: JointOptions) -> tuple[Data, Prior]:
+def _prepare(trajectory: CameraTrajectory, timed: CameraTimedImu, options: JointOptions) -> tuple[Data, Prior]:
+    """Measurements and prior of the fit."""
     return prepare(
         trajectory,
         timed,
@@ -205,17 +209,35 @@ def fit_path(
     numpy.linalg.LinAlgError
         When the data leave the system singular.
     """
-    timed, data, prior, fit = _fit_in_step(trajectory, timed, options)
-    fit, faults = _fit_soundly(fit, data, prior, timed.imu.noise)
-    accel = accel_part(timed.imu)
-    sound = faults.undone(data), faults.loosened(prior)
-    _, shape = _fit_shapely(fit, *sound, timed.imu.noise, accel=accel)
-    widened = scale_of(fit, data.t_s, accel).widened
-    wrong = (*shape.undone, *shape.said)
-    return data, fit, (*faults.as_facts(), *(fault.as_fact(data.t_s, widened) for fault in wrong))
+    timed, data, prior, fit = _fit_moving_stamps(trajectory, timed, options)
+    fit, faults = _fit_undoing_accel_faults(fit, data, prior, timed.imu.noise)
+    _, shape = _fit_undoing_shape_faults(fit, faults.undo(data), faults.loosen_delay(prior), timed.imu.noise)
+    widened = variance_factor(fit)
+    return data, fit, (*faults.as_facts(), *(fault.as_fact(data.t_s, widened) for fault in shape.found))
 
 
-def _fit_in_step(
+def _fit_without_contradicted_lever(
+    trajectory: CameraTrajectory, timed: CameraTimedImu, options: JointOptions
+) -> tuple[CameraTimedImu, Data, Prior, Fit, Fact | None]:
+    """As :func:`_fit_moving_stamps`, without a declared lever arm that a fit without it contradicts; then that fact."""
+
+    def fit_without(length_m: float) -> tuple[CameraTimedImu, Data, Prior, Fit]:
+        calibration = leave_out_lever(timed.calibration, length_m=length_m)
+        return _fit_moving_stamps(trajectory, replace(timed, calibration=calibration), options)
+
+    believed = _fit_moving_stamps(trajectory, timed, options)
+    _, _, prior, fit = believed
+    if not doubts_lever(fit, prior, is_refused=bool(_find_refusals(fit))):
+        return *believed, None
+    length_m = float(np.linalg.norm(prior.mean.imu_in_cam_m))
+    alone = fit_without(length_m)
+    lever = None if _find_refusals(alone[-1]) else find_contradicted_lever(alone[-1], prior)
+    if lever is None:
+        return *believed, None
+    return *(alone if length_m <= SIGMAS.unknown_lever_arm_m else fit_without(0.0)), lever
+
+
+def _fit_moving_stamps(
     trajectory: CameraTrajectory, timed: CameraTimedImu, options: JointOptions
 ) -> tuple[CameraTimedImu, Data, Prior, Fit]:
     """The recording, its measurements and their fit; with the accelerometer's stamps moved where they are far off.
@@ -223,14 +245,14 @@ def _fit_in_step(
     A delay beyond its prior is pulled towards it, and frames were averaged by readings of another moment: the fit
     starts again from what was found, which is as little known as that of an unknown device.
     """
-    data, prior = _prepared(trajectory, timed, options)
+    data, prior = _prepare(trajectory, timed, options)
     fit = fit_jointly(data, prior, timed.imu.noise)
     delay_s, expected_s = fit.estimate.accel_delay_s, float(prior.info[par.ACCEL_DELAY, par.ACCEL_DELAY]) ** -0.5
     sigma_s = float(fit.cov[par.ACCEL_DELAY, par.ACCEL_DELAY]) ** 0.5
     if not is_out_of_step(delay_s, sigma_s, expected_s):
         return timed, data, prior, fit
     timed = replace(timed, calibration=timed.calibration.shift_clock_offsets(0.0, delay_s))
-    data, prior = _prepared(trajectory, timed, options)
+    data, prior = _prepare(trajectory, timed, options)
     info, at = prior.info.copy(), par.ACCEL_DELAY
     info[at, at] = max(expected_s, _LIMITS.unknown_delay_s) ** -2
     prior = replace(prior, info=info)
@@ -251,57 +273,67 @@ def is_out_of_step(delay_s: float, sigma_s: float, expected_s: float) -> bool:
     return abs(delay_s) > max(known, _LIMITS.small_delay_s)
 
 
-def _fit_soundly(fit: Fit, data: Data, prior: Prior, sheet: ImuNoise | None) -> tuple[Fit, Faults]:
+def _fit_undoing_accel_faults(fit: Fit, data: Data, prior: Prior, sheet: ImuNoise | None) -> tuple[Fit, Faults]:
     """The fit, with what shows to be wrong with the accelerometer undone, and what that was."""
     faults, sound = Faults(values={}), data
     for _ in range(_MOST_FAULTS):
         if fit.gain_chi2 > par.LARGEST_GAIN_CHI2 and not prior.heavy_gains:
             # not from the start: on its way a fit passes gains that it would not find back from
             prior = replace(prior, heavy_gains=True)
-            fit = fit_jointly(sound, faults.loosened(prior), sheet)
-        suspicion = worst(fit.suspicions, data.streams.accel, faults.values)
+            fit = fit_jointly(sound, faults.loosen_delay(prior), sheet)
+        suspicion = find_strongest_suspicion(fit.suspicions, data.streams.accel, faults.values)
         # a fit of what does not belong together explains nothing
-        if suspicion is None or _refusals(fit, data.t_s):
+        if suspicion is None or _find_refusals(fit):
             break
         faults = faults.with_found(suspicion)
         if faults.path_is_smoothed:
             break
-        sound = faults.undone(data)
-        fit = fit_jointly(sound, faults.loosened(prior), sheet)
+        sound = faults.undo(data)
+        fit = fit_jointly(sound, faults.loosen_delay(prior), sheet)
     return fit, faults
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Shape:
+class ShapeFaults:
     """What seems to be wrong with a model's shape: what was undone, and what is only said."""
 
     undone: tuple[ShapeFault, ...] = ()
     said: tuple[ShapeFault, ...] = ()
 
     @property
+    def found(self) -> tuple[ShapeFault, ...]:
+        """All of them."""
+        return (*self.undone, *self.said)
+
+    @property
+    def harmless(self) -> tuple[ShapeFault, ...]:
+        """Those that make no scale weak: a stretch that is said alone leaves lengths right on average."""
+        return tuple(fault for fault in self.said if fault.kind == "stretch")
+
+    @property
     def doubtful(self) -> tuple[ShapeFault, ...]:
-        """Those that make a scale weak: a stretch that is said alone leaves lengths right on average."""
-        return (*self.undone, *(fault for fault in self.said if fault.kind != "stretch"))
+        """All others."""
+        return tuple(fault for fault in self.found if fault not in self.harmless)
 
 
-def _fit_shapely(fit: Fit, data: Data, prior: Prior, sheet: ImuNoise | None, *, accel: AccelPart) -> tuple[Fit, Shape]:
+def _fit_undoing_shape_faults(fit: Fit, data: Data, prior: Prior, sheet: ImuNoise | None) -> tuple[Fit, ShapeFaults]:
     """The fit of a model without what shows to be wrong with its shape, and what that was.
 
     What it does to the scale, or would do where there is too little evidence to undo it, is in the interval.
     """
-    shape, before = Shape(), fit
+    shape, before = ShapeFaults(), fit
     open_variance = 0.0
     # wrong gains look like a stretch
-    sound = fit.gain_chi2 <= par.LARGEST_GAIN_CHI2 and not _refusals(fit, data.t_s)
+    sound = fit.gain_chi2 <= par.LARGEST_GAIN_CHI2 and not _find_refusals(fit)
     while sound and len(shape.undone) < SHAPE_LIMITS.most:
-        suspected = suspect(fit.shape, scale_of(fit, data.t_s, accel).widened)
+        suspected = find_likeliest_fault(fit.shape, variance_factor(fit))
         if suspected is None:
             break
         mended = replace(data.groups, centre=suspected.undo(data.t_s, data.groups.centre))
         trial_data = replace(data, groups=mended)
         trial = fit_jointly(trial_data, prior, sheet)
-        widened = scale_of(trial, data.t_s, accel).widened
-        fault = confirmed(suspected, trial.shape, widened)
+        widened = variance_factor(trial)
+        fault = confirm_fault(suspected, trial.shape, widened)
         if fault is None:
             break
         if fault.chi2(widened) <= fault.undone_limit:
@@ -321,55 +353,39 @@ def _log_ratio(fit: Fit, before: Fit) -> float:
     return float(np.log(fit.estimate.metres_per_unit / before.estimate.metres_per_unit))
 
 
-def _cut_off(data: Data) -> list[Fact]:
-    out = []
-    for sensor, share in (("gyroscope", data.gyro_cut_share), ("accelerometer", data.accel_cut_share)):
-        if share > MUCH_CUT:
-            out.append(Fact("readings-cut-off", sensor=sensor, share=share))
-    return out
+def _check_saturation(data: Data) -> list[Fact]:
+    """Sensors of which much is cut off at the end of the range."""
+    shares = {"gyroscope": data.gyro_cut_share, "accelerometer": data.accel_cut_share}
+    return [
+        Fact("readings-cut-off", sensor=sensor, share=share) for sensor, share in shares.items() if share > MUCH_CUT
+    ]
 
 
-def _judged(
+def _judge_fit(
     fit: Fit,
-    t_s: Array,
     calibration: CameraImuCalibration,
     accel: AccelPart,
     wrong: Sequence[Fact],
-    shape: Shape,
+    shape: ShapeFaults,
     *,
     worthless: bool,
 ) -> ScaleEstimate:
-    x = fit.estimate
-    squares = sum(s for s, _ in fit.sums.values())
-    expected = sum(e for _, e in fit.sums.values())
-    clock_rate = calibration.clock_rate + x.clock_rate
-    scale = scale_of(fit, t_s, accel, clock_rate)
-    metres_per_unit, sigma_log = scale.metres_per_unit, scale.sigma_log
-    refusals = [*_refusals(fit, t_s), *(wrong if worthless else ())]
+    """The estimate with its interval and verdict; with ``worthless``, ``wrong`` refuses it."""
+    clock_rate = calibration.clock_rate + fit.estimate.clock_rate
+    variances = scale_variances(fit, accel, clock_rate)
+    metres_per_unit, sigma_log = metres_per_unit_of(fit), sum(variances.values()) ** 0.5
+    refusals = [*_find_refusals(fit), *(wrong if worthless else ())]
     verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, refusals=refusals)
-    notes: tuple[Fact, ...] = ()
+    counted: tuple[Fact, ...] = ()
     if verdict == "refused":
         reasons = (*reasons, *(() if worthless else wrong))
     else:
-        bent = [fault.as_fact(t_s, scale.widened) for fault in shape.doubtful] or _check_drift(fit.drift)
-        large, usual = _check_gains(fit, scale, accel)
-        doubts = [*wrong, *check_clocks(clock_rate), *_check_length(t_s), *_check_rest(fit), *large, *bent]
+        doubts, within = _find_doubts(fit, accel, clock_rate, wrong, shape)
         verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, doubts)
-        # what is in the interval makes nothing weak by itself; where the interval is wide, it may be why
-        said = [fault for fault in shape.said if fault not in shape.doubtful]
-        within = [*usual, *(fault.as_fact(t_s, scale.widened) for fault in said)]
-        counted = tuple(Fact("counted-in-interval", found=one) for one in within)
-        if verdict == "trusted":
-            notes = counted
-        else:
-            reasons = (*reasons, *counted)
-    if len(fit.jumped_s):
-        notes = (*notes, Fact("poses-jump", since_s=[at_s - t_s[0] for at_s in fit.jumped_s]))
+        counted = tuple(Fact("counted-in-interval", found=fact) for fact in within)
+    # what is in the interval makes nothing weak by itself; where the interval is wide, it may be why
+    reasons, notes = (reasons, counted) if verdict == "trusted" else ((*reasons, *counted), ())
     refused = verdict == "refused"
-    keep = [par.SCALE, *range(par.GRAVITY.start, par.ACCEL_BIAS.stop)]
-    signs = np.array([-1.0, *[1.0] * 6])
-    cov = fit.cov[np.ix_(keep, keep)] * signs[:, None] * signs
-    cov[0, 0] = sigma_log**2
     return ScaleEstimate(
         metres_per_unit=None if refused else metres_per_unit,
         sigma_log=None if refused else sigma_log,
@@ -377,85 +393,49 @@ def _judged(
         verdict=verdict,
         method="joint",
         reasons=reasons,
-        notes=notes,
-        gravity_in_world_m_s2=x.gravity_m_s2,
-        accel_bias_m_s2=x.accel_bias_m_s2,
-        calibration=_refined(fit, calibration),
-        cov=cov,
-        chi2=squares,
-        dof=max(1, round(expected)),
+        notes=(*notes, *_note_jumps(fit)),
+        gravity_in_world_m_s2=fit.estimate.gravity_m_s2,
+        accel_bias_m_s2=fit.estimate.accel_bias_m_s2,
+        calibration=_refine_calibration(fit, calibration),
+        cov=_estimate_cov(fit, sigma_log),
+        chi2=sum(squares for squares, _ in fit.sums.values()),
+        dof=max(1, round(sum(expected for _, expected in fit.sums.values()))),
         excitation_m_s2=fit.excitation_m_s2,
         drift=fit.drift,
-        parts=None if refused else scale.parts,
+        parts=None if refused else {cause: variance**0.5 for cause, variance in variances.items()},
         noise=fit.noise.imu_over_seconds(),
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class FoundScale:
-    """Scale of a fit.
-
-    Attributes
-    ----------
-    metres_per_unit, sigma_log, parts
-        As :class:`ScaleEstimate` has them.
-    shift
-        Of the logarithm of the scale, for noise that the fitted path follows; it is in ``metres_per_unit``.
-    widened
-        Factor on variances of the fit: squares beyond their expectation, few degrees of freedom, what no model has.
-    wrong_gain
-        Whether the accelerometer is off in gain; ``None`` of a calibrated one that nothing contradicts.
-    """
-
-    metres_per_unit: float
-    sigma_log: float
-    parts: dict[str, float]
-    shift: float
-    widened: float
-    wrong_gain: WrongGain | None
+def _find_doubts(
+    fit: Fit, accel: AccelPart, clock_rate: float, wrong: Sequence[Fact], shape: ShapeFaults
+) -> tuple[list[Fact], list[Fact]]:
+    """Findings that make a scale weak, what was declared first, and others that are in its interval."""
+    widened, wrong_gain = variance_factor(fit), find_wrong_gain(fit, accel)
+    declared = _check_calibrated_gains(fit, wrong_gain) if accel.calibrated else []
+    large, usual = ([], []) if accel.calibrated else _check_gains(fit, wrong_gain)
+    bent = [fault.as_fact(fit.t_s, widened) for fault in shape.doubtful] or _check_drift(fit.drift)
+    others = [*check_clocks(clock_rate), *_check_length(fit.t_s), *_check_rest(fit)]
+    doubts = [*declared, *wrong, *others, *large, *bent]
+    return doubts, [*usual, *(fault.as_fact(fit.t_s, widened) for fault in shape.harmless)]
 
 
-def scale_of(fit: Fit, t_s: Array, accel: AccelPart, clock_rate: float = 0.0) -> FoundScale:
-    """The scale and the standard deviation of its logarithm, with what the fit takes for granted put right.
-
-    The scale makes residuals orthogonal to the fitted path. That path follows the visual noise with as many degrees of
-    freedom as the states take from the centres; where the accelerometer is less noisy than the fit says, it follows
-    too willingly, which lowers the scale by ``share * (1 - true variance / fitted variance)``. Part of the fitted noise
-    is no white noise at all, but slow (rotors), and the rest is in the accelerometer's own stream or data sheet.
-    """
-    worst = max(s / e for s, e in fit.sums.values())
-    bare = float(fit.cov[par.SCALE, par.SCALE])
-    taken = 3 * len(t_s) - fit.sums["centre_m"][1] - fit.sums["drift_m_rts"][1]
-    # A gain follows the noise the other way, so that what both have in common stays where it is
-    gains = fit.cov[par.SCALE, par.ACCEL_GAIN].reshape(3, 3)
-    share = max(0.0, bare + float(np.trace(gains)) / 3) * max(0.0, taken)
-    overstated = max(0.0, 1 - (fit.expected_accel_m_s2_rthz / fit.noise.accel_density_m_s2_rthz) ** 2)
-    # To first order only: not by more than what the recording leaves open
-    shift = min(overstated * share, (bare * max(1.0, worst)) ** 0.5)
-    student = student_factor(fit.freedom)
-    widened = max(1.0, worst) * (student * (1 + _UNMODELLED_S / float(t_s[-1] - t_s[0]))) ** 2
-    variances = {name: widened * variance for name, variance in fit.variance_parts.items()}
-    variances["accel_gain"] *= fit.gain_surprise
-    variances["noise_levels"] = (student * _UNIFORM * share) ** 2 + fit.level_variance
-    variances["accel_gain"] += accel.model_sigma**2
-    wrong_gain: WrongGain | None = judge_gain(fit.estimate, fit.cov, fit.prior_info, widened)
-    if accel.calibrated and wrong_gain is not None and not wrong_gain.is_likely:
-        wrong_gain = None  # what was calibrated is believed unless it is contradicted
-    variances["accel_gain"] += 0.0 if wrong_gain is None else wrong_gain.variance
-    variances["accel_gain"] *= accel.factor**2
-    variances["lens"] = PRIORS.lens**2
-    variances["clocks"] = clock_scale_sigma(clock_rate) ** 2
-    return FoundScale(
-        metres_per_unit=fit.estimate.metres_per_unit * float(np.exp(shift)),
-        sigma_log=sum(variances.values()) ** 0.5,
-        parts={name: variance**0.5 for name, variance in variances.items()},
-        shift=shift,
-        widened=widened,
-        wrong_gain=wrong_gain,
-    )
+def _note_jumps(fit: Fit) -> list[Fact]:
+    """A note where poses jump."""
+    return [Fact("poses-jump", since_s=[at_s - fit.t_s[0] for at_s in fit.jumped_s])] if len(fit.jumped_s) else []
 
 
-def _refusals(fit: Fit, t_s: Array) -> list[Fact]:
+def _estimate_cov(fit: Fit, sigma_log: float) -> Array:
+    """(7, 7) of log scale, gravity and accelerometer bias; of the scale, only its own variance is the interval's."""
+    kept = [par.SCALE, *range(par.GRAVITY.start, par.ACCEL_BIAS.stop)]
+    # the fit's unknown is u, the inverse of the metres per unit
+    signs = np.array([-1.0, *[1.0] * 6])
+    cov = np.asarray(fit.cov[np.ix_(kept, kept)] * signs[:, None] * signs)
+    cov[0, 0] = sigma_log**2
+    return cov
+
+
+def _find_refusals(fit: Fit) -> list[Fact]:
     """Findings that make the number worthless."""
     out = []
     x = fit.estimate
@@ -469,7 +449,7 @@ def _refusals(fit: Fit, t_s: Array) -> list[Fact]:
     if gain > _LIMITS.gain:
         out.append(Fact("accel-gain-impossible", gain=gain))
     # Noise of the accelerometer averaged between states, against the acceleration that it should measure
-    unexplained = fit.noise.accel_m_s2(float(np.median(np.diff(t_s))))
+    unexplained = fit.noise.accel_m_s2(float(np.median(np.diff(fit.t_s))))
     if unexplained > _LIMITS.unexplained * fit.excitation_m_s2:
         out.append(Fact("accel-contradicts-motion", unexplained_m_s2=unexplained, motion_m_s2=fit.excitation_m_s2))
     return out
@@ -488,22 +468,24 @@ def _check_rest(fit: Fit) -> list[Fact]:
     return [] if fit.converged else [Fact("fit-hardly-converged", moves_log=fit.unsettled_log)]
 
 
-def _check_gains(fit: Fit, scale: FoundScale, accel: AccelPart) -> tuple[list[Fact], list[Fact]]:
-    """Gains of the accelerometer: larger than any sensor's, and others that are worth a word.
-
-    Of a calibrated one they are zero, and others contradict the calibration.
-    """
-    gains, wrong_gain = fit.estimate.accel_gain, scale.wrong_gain
-    if fit.gain_chi2 > par.LARGEST_GAIN_CHI2 and accel.calibrated:
-        return [Fact("calibrated-gain-contradicted", gains=-np.diagonal(gains))], []
+def _check_calibrated_gains(fit: Fit, wrong_gain: WrongGain | None) -> list[Fact]:
+    """A doubt where a calibrated accelerometer has gains, which contradict the calibration."""
     if fit.gain_chi2 > par.LARGEST_GAIN_CHI2:
-        sigma = np.sqrt(scale.widened * np.diagonal(fit.cov[par.ACCEL_GAIN, par.ACCEL_GAIN])).reshape(3, 3)
+        return [Fact("calibrated-gain-contradicted", gains=-np.diagonal(fit.estimate.accel_gain))]
+    if wrong_gain is not None and wrong_gain.is_likely:
+        return [Fact("calibrated-gain-contradicted", gains=(wrong_gain.gain,) * 3)]
+    return []
+
+
+def _check_gains(fit: Fit, wrong_gain: WrongGain | None) -> tuple[list[Fact], list[Fact]]:
+    """Gains of an accelerometer that was not calibrated: larger than any sensor's, and others that are worth a word."""
+    gains = fit.estimate.accel_gain
+    if fit.gain_chi2 > par.LARGEST_GAIN_CHI2:
+        sigma = np.sqrt(variance_factor(fit) * np.diagonal(fit.cov[par.ACCEL_GAIN, par.ACCEL_GAIN])).reshape(3, 3)
         found = Fact("accel-gain-large", gains=-np.diagonal(gains))
         return ([found], []) if exceeds_usual(gains, sigma).any() else ([], [found])
     if wrong_gain is None or not wrong_gain.is_likely:
         return [], []
-    if accel.calibrated:
-        return [Fact("calibrated-gain-contradicted", gains=(wrong_gain.gain,) * 3)], []
     found = Fact("accel-gain-doubtful", gain=wrong_gain.gain, excess=wrong_gain.excess)
     return ([found], []) if wrong_gain.is_large else ([], [found])
 
@@ -518,7 +500,8 @@ def _check_drift(drift: ScaleDrift) -> list[Fact]:
     return out
 
 
-def _refined(fit: Fit, calibration: CameraImuCalibration) -> CameraImuCalibration:
+def _refine_calibration(fit: Fit, calibration: CameraImuCalibration) -> CameraImuCalibration:
+    """The calibration as the fit refines it; the readout stays."""
     x = fit.estimate
     # Rows of CALIBRATION_PARAMETERS from the globals and the mean gyroscope bias
     jacobian = np.zeros((CAL.COUNT, par.N_GLOBALS))

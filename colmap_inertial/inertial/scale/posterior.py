@@ -24,7 +24,8 @@ from colmap_inertial.inertial.core.priors import accel_part, clock_scale_sigma, 
 from colmap_inertial.inertial.scale._fit import Fit
 from colmap_inertial.inertial.scale._inputs import align_recording, strength_of_gravity
 from colmap_inertial.inertial.scale._setup import Data
-from colmap_inertial.inertial.scale.joint import JointOptions, fit_path, scale_of
+from colmap_inertial.inertial.scale.interval import metres_per_unit_of, variance_factor
+from colmap_inertial.inertial.scale.joint import JointOptions, fit_path
 
 # Columns of a node: rotation (right, body frame), position, velocity, biases of gyroscope and accelerometer.
 NODE = 15
@@ -137,7 +138,6 @@ class FittedPath:
         if wrong:
             raise NotObservableError("place", Fact("path-with-faults", faults=wrong))
         clock_rate = timed.calibration.clock_rate + fit.estimate.clock_rate
-        scale = scale_of(fit, data.t_s, accel_part(imu), clock_rate)
         ends = (0, -1)
         return cls(
             origin=data.origin,
@@ -146,8 +146,8 @@ class FittedPath:
             _fit=fit,
             _aligned=timed.calibration,
             _stamps_s=np.array([[timed.gyro_t_s[i], imu.gyro_t_s[i]] for i in ends]),
-            _widened=scale.widened,
-            _shift_log=float(np.log(scale.metres_per_unit / fit.estimate.metres_per_unit)),
+            _widened=variance_factor(fit),
+            _shift_log=float(np.log(metres_per_unit_of(fit) / fit.estimate.metres_per_unit)),
         )
 
     @property

@@ -107,13 +107,13 @@ def fit_spectra(spectra: Spectra, calibration: CameraImuCalibration, gravity_m_s
         raise NotObservableError("scale", Fact("camera-still-in-spectra"))
     # lengths normalised: accelerations of the camera have a mean square of one
     data = replace(spectra, visual=spectra.visual / unit, visual_noise=spectra.visual_noise / unit**2)
-    prior = _prior(calibration)
+    prior = _make_prior(calibration)
     state, noise = _linear_start(data, prior, gravity_m_s2)
     for _ in range(3):
         state = _descend(data, noise, prior, state)
-        noise = _noise_of(data, state, noise)
+        noise = _estimate_noise(data, state, noise)
     state = _descend(data, noise, prior, state)
-    residual, jacobian = _magnitudes(data, noise, prior, state)
+    residual, jacobian = _compare_magnitudes(data, noise, prior, state)
     dof = len(residual) - _N
     chi2 = float(residual @ residual)
     cov = np.linalg.inv(jacobian.T @ jacobian) * max(1.0, chi2 / dof)
@@ -146,7 +146,7 @@ class _Prior:
     root: Array
 
 
-def _prior(calibration: CameraImuCalibration) -> _Prior:
+def _make_prior(calibration: CameraImuCalibration) -> _Prior:
     cov = np.zeros((6, 6))
     lever = calibration.cov[CAL.LEVER_ARM, CAL.LEVER_ARM].copy()
     along = min(1.0, _LEVER_ALONG_AXIS_M / max(float(np.sqrt(lever[2, 2])), 1e-9))
@@ -165,7 +165,7 @@ def _tangent(gravity: Array) -> Array:
     return np.stack([np.linalg.norm(gravity) * across, np.cross(gravity, across)], axis=1)
 
 
-def _sides(data: Spectra, state: _State) -> tuple[ComplexArray, ComplexArray]:
+def _predict_accelerations(data: Spectra, state: _State) -> tuple[ComplexArray, ComplexArray]:
     """(F, 3), (F, 3): the IMU's acceleration according to the camera, and according to the accelerometer."""
     visual = state.scale * data.visual + data.lever_by @ state.lever
     inertial = data.inertial - data.bias_by @ state.bias + data.gravity_by @ state.gravity
@@ -190,11 +190,11 @@ def _linear_start(data: Spectra, prior: _Prior, gravity_m_s2: float) -> tuple[_S
             raise NotObservableError("scale", Fact("motion-not-felt"))
         state = _State(scale=float(x[0]), lever=x[1:4], bias=x[4:7], gravity=x[7:])
         scale = state.scale
-        noise = _noise_of(data, state, noise)
+        noise = _estimate_noise(data, state, noise)
     return replace(state, gravity=state.gravity * (gravity_m_s2 / np.linalg.norm(state.gravity))), noise
 
 
-def _noise_of(data: Spectra, state: _State, before: _Noise) -> _Noise:
+def _estimate_noise(data: Spectra, state: _State, before: _Noise) -> _Noise:
     """Noise of both sides from what the fit leaves, by Whittle's likelihood.
 
     The camera's has the spectrum of twice differentiated white noise and at least the power that the smoother found
@@ -202,7 +202,7 @@ def _noise_of(data: Spectra, state: _State, before: _Noise) -> _Noise:
     """
     from scipy.optimize import minimize
 
-    visual, inertial = _sides(data, state)
+    visual, inertial = _predict_accelerations(data, state)
     power = np.sum(np.abs(visual - inertial) ** 2, axis=1)
     white = state.scale**2 * data.visual_noise
 
@@ -223,13 +223,13 @@ def _noise_of(data: Spectra, state: _State, before: _Noise) -> _Noise:
     return _Noise(inertial=np.full(len(power), level), visual=factor * data.visual_noise)
 
 
-def _magnitudes(data: Spectra, noise: _Noise, prior: _Prior, state: _State) -> tuple[Array, Array]:
+def _compare_magnitudes(data: Spectra, noise: _Noise, prior: _Prior, state: _State) -> tuple[Array, Array]:
     """Whitened differences of magnitudes and of the prior, with derivatives by the nine parameters.
 
     The noise that belongs to the camera's side grows with the scale: as in total least squares, dividing by it keeps
     the scale from shrinking towards where there would be less of it.
     """
-    visual, inertial = _sides(data, state)
+    visual, inertial = _predict_accelerations(data, state)
     # a constant has a sign, not a phase: it keeps it, whatever the clocks do
     constant = (data.frequency_hz == 0)[:, None]
     visual_by = np.concatenate([(state.scale * data.visual)[:, :, None], data.lever_by], axis=2)
@@ -254,14 +254,14 @@ def _magnitudes(data: Spectra, noise: _Noise, prior: _Prior, state: _State) -> t
 def _descend(data: Spectra, noise: _Noise, prior: _Prior, state: _State) -> _State:
     """Levenberg-Marquardt on the differences of magnitudes."""
     damping = 1e-3
-    residual, jacobian = _magnitudes(data, noise, prior, state)
+    residual, jacobian = _compare_magnitudes(data, noise, prior, state)
     for _ in range(40):
         normal = jacobian.T @ jacobian
         gradient = jacobian.T @ residual
         step = -np.asarray(np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient), dtype=np.float64)
         step[_SCALE] = np.clip(step[_SCALE], -0.3, 0.3)
         trial = state.moved(step)
-        after, jacobian_after = _magnitudes(data, noise, prior, trial)
+        after, jacobian_after = _compare_magnitudes(data, noise, prior, trial)
         if after @ after < residual @ residual:
             state, residual, jacobian, damping = trial, after, jacobian_after, damping / 5
             if np.all(np.abs(step) < 1e-6):
@@ -333,7 +333,7 @@ def estimate_spectral(
         fit = fit_spectra(signals.spectra(options.highest_hz), calibration, options.gravity_m_s2)
     except NotObservableError as error:
         return ScaleEstimate.refused("spectral", error.fact, calibration=calibration)
-    checks, refusals = _checks(signals, calibration, options, fit)
+    checks, refusals = _check_fit(signals, calibration, options, fit)
     verdict, ci95, reasons = verdict_of(fit.metres_per_unit, fit.sigma_log, checks, refusals=refusals)
     if verdict == "refused":
         return ScaleEstimate.refused("spectral", *reasons, calibration=calibration)
@@ -354,7 +354,7 @@ def estimate_spectral(
     )
 
 
-def _checks(
+def _check_fit(
     signals: Signals, calibration: CameraImuCalibration, options: SpectralOptions, fit: SpectralFit
 ) -> tuple[list[Fact], list[Fact]]:
     """Findings that lower the verdict, and findings that refuse the scale."""

@@ -124,7 +124,7 @@ def calibrate_imu(
         fit = of_accel
     name = imu.device if device is None else device
     calibration = replace(_calibration(fit, rests, gravity_m_s2, name), temperature_c=imu.temperature_c)
-    verdict, reasons = _judged(calibration, fit, rests, gravity_sigma_m_s2, apart=apart)
+    verdict, reasons = _judge_calibration(calibration, fit, rests, gravity_sigma_m_s2, apart=apart)
     return RestCalibration(
         calibration=calibration,
         verdict=verdict,
@@ -167,7 +167,7 @@ def _calibration(fit: RestFit, rests: Rests, gravity_m_s2: float, device: str) -
     )
 
 
-def _judged(
+def _judge_calibration(
     calibration: ImuCalibration, fit: RestFit, rests: Rests, gravity_sigma_m_s2: float, *, apart: bool
 ) -> tuple[Literal["good", "weak"], tuple[Fact, ...]]:
     """The verdict on a calibration: whether the attitudes were spread enough, and what stays unknown.

@@ -195,7 +195,7 @@ def fit_rests(
             freedom[i] = _LIMITS.freedom_before + redundancy
             variances.append((_LIMITS.freedom_before + factor**2 * float(residual @ residual)) / freedom[i])
         before, (factor_a, factor_t) = (factor_a, factor_t), np.sqrt(variances)
-        prior_sigma = beforehand * _widened(state.errors(gravity_m_s2) / beforehand)
+        prior_sigma = beforehand * _find_prior_factor(state.errors(gravity_m_s2) / beforehand)
         if np.allclose(before, (factor_a, factor_t), rtol=_LIMITS.settled):
             break
     fit = _result(state, rests, turns, cov, freedom, (factor_a, factor_t), gravity_m_s2)
@@ -236,7 +236,7 @@ def _prior_sigma(gravity_sigma_m_s2: float) -> Array:
     return sigma
 
 
-def _widened(ratio: Array) -> Array:
+def _find_prior_factor(ratio: Array) -> Array:
     """Factor, at least 1, by which the priors of each kind of error are too narrow for this device."""
     factor = np.ones(_COUNT)
     for kind in (_ACCEL, _BIAS, _GYRO):

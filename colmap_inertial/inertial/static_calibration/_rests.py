@@ -94,7 +94,7 @@ def candidate_rests(imu: ImuRecording) -> list[Rests]:
         still &= gyro_var <= min(multiple**2 * quiet_gyro, _LIMITS.held_rad_s**2)
         spans = _spans(t_s, still)
         if len(spans) > 0:
-            rests.append(_averaged(imu, spans))
+            rests.append(_average_rests(imu, spans))
     return rests
 
 
@@ -122,7 +122,7 @@ def _spans(t_s: Array, still: BoolArray) -> Array:
     return np.asarray(spans[spans[:, 1] - spans[:, 0] >= _LIMITS.shortest_rest_s])
 
 
-def _averaged(imu: ImuRecording, spans: Array) -> Rests:
+def _average_rests(imu: ImuRecording, spans: Array) -> Rests:
     accel, accel_sigma, accel_deviation = _means(imu.accel_t_s, imu.accel_m_s2, spans)
     gyro, gyro_sigma, gyro_deviation = _means(imu.gyro_t_s, imu.gyro_rad_s, spans)
     return Rests(

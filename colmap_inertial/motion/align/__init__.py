@@ -45,9 +45,9 @@ _PART_S, _PARTS, _FASTEST_DRIFT, _UNSTEADY_S = 15.0, 8, 0.02, 0.2
 #: nats) at most.
 _LEAST_SOUND, _GAIN_WITHIN, _MOST_MIRRORED = 0.5, 1.5, 3.0
 
-#: Offsets are searched within so many standard deviations of a known one; it counts at most so many nats: what is known
-#: may be wrong six times in a million, as often as an offset that is accepted.
-_REACH_SIGMAS, _MOST_PRIOR = 10, 12.0
+#: Offsets are searched within so many standard deviations of a known one, and this; it counts at most so many nats:
+#: what is known may be wrong six times in a million, as often as an offset that is accepted.
+_REACH_SIGMAS, _REACH_S, _MOST_PRIOR = 10, 0.05, 12.0
 
 #: Rotation within a second, rms, below which the camera counts as still: what noise of poses looks like.
 _STILL_RAD_RTS = 0.015
@@ -210,11 +210,15 @@ def _range(
     lowest_s, highest_s = -np.inf, np.inf
     if options.max_offset_s is not None:
         lowest_s, highest_s = shift_s - options.max_offset_s, shift_s + options.max_offset_s
-    sigma_s = prior.clock_sigma_s
-    if sigma_s < OFFSET_UNKNOWN_FROM_S:
-        centre_s, reach_s = prior.clock_offset_s + shift_s, _REACH_SIGMAS * sigma_s + 0.05
-        lowest_s, highest_s = max(lowest_s, centre_s - reach_s), min(highest_s, centre_s + reach_s)
-    return lowest_s, highest_s
+    centre_s, reach_s = prior.clock_offset_s + shift_s, searched_around_s(prior)
+    return max(lowest_s, centre_s - reach_s), min(highest_s, centre_s + reach_s)
+
+
+def searched_around_s(prior: CameraImuCalibration) -> float:
+    """How far from a known offset the clocks are searched; infinite where none is known."""
+    if prior.clock_sigma_s >= OFFSET_UNKNOWN_FROM_S:
+        return float(np.inf)
+    return _REACH_SIGMAS * prior.clock_sigma_s + _REACH_S
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -328,4 +332,5 @@ __all__ = [
     "align_clocks",
     "align_trimmed",
     "coarse_fit",
+    "searched_around_s",
 ]

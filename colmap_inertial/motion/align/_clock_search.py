@@ -21,7 +21,7 @@ from colmap_inertial.core.arrays import Array, BoolArray, ComplexArray, IndexArr
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_from_matrix, quat_log, quat_multiply
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory
-from colmap_inertial.motion.align._robust import Mixture, fit_mixture
+from colmap_inertial.motion.align._robust import MIXTURE, Mixture, fit_mixture
 
 #: Frames this close together sample the rotation densely enough to be correlated on a grid.
 DENSE_S = 0.25
@@ -251,7 +251,7 @@ def _correlate(
     offset_s = np.asarray(begin_s - imu_begin_s - lag * _GRID_S, dtype=np.float64)
     enough = cells[:, 0] >= max(1.0, min_overlap * min(visual_ok.sum(), inertial_ok.sum()))
     kept = np.argsort(-lag)
-    kept = kept[(enough & _allowed(offset_s, offsets_s, _GRID_S))[kept]]
+    kept = kept[(enough & _select_offsets(offset_s, offsets_s, _GRID_S))[kept]]
     count, sum_v, sum_g = cells[kept], correlate(v, g_ok)[kept], correlate(v_ok, g)[kept]
     energy_v = correlate(spectrum(np.sum(visual**2, axis=1))[:, None], g_ok)[kept, 0]
     energy_g = correlate(v_ok, spectrum(np.sum(inertial**2, axis=1))[:, None])[kept, 0]
@@ -264,7 +264,7 @@ def _correlate(
     return offset_s[kept], _gain(energy_v, left, per_second * _GRID_S * count[:, 0]), per_second
 
 
-def _allowed(offset_s: Array, offsets_s: tuple[float, float], step_s: float) -> BoolArray:
+def _select_offsets(offset_s: Array, offsets_s: tuple[float, float], step_s: float) -> BoolArray:
     return (offset_s >= offsets_s[0] - step_s) & (offset_s <= offsets_s[1] + step_s)
 
 
@@ -328,7 +328,7 @@ def _scan(
     offset_s = begin_s - grid[0] - lag * _SCAN_S
     needed_s = min_overlap * min(float(end_s - begin_s), float(path.t_s[-1] - path.t_s[0])) * some.dt_s.sum()
     needed_s /= float(end_s - begin_s)
-    allowed = _allowed(offset_s, offsets_s, _SCAN_S)
+    allowed = _select_offsets(offset_s, offsets_s, _SCAN_S)
     offset_s, lag = offset_s[allowed], lag[allowed]
     effective = _effective_intervals(some)
     gain = np.full(len(lag), np.nan)
@@ -337,16 +337,18 @@ def _scan(
         i, j = start + lag[at, None], end + lag[at, None]
         inside = (i >= 0) & (j < len(grid))
         inside &= path.covers(grid[np.clip(i, 0, len(grid) - 1)], grid[np.clip(j, 0, len(grid) - 1)])
+        covered_s = np.sum(inside * some.dt_s, axis=1)
+        enough = np.flatnonzero((covered_s >= needed_s) & (covered_s > 0))
+        i, j, inside, covered_s = i[enough], j[enough], inside[enough], covered_s[enough]
         i, j = np.clip(i, 0, len(grid) - 1), np.clip(j, 0, len(grid) - 1)
         inertial = quat_log(quat_multiply(quat_conjugate(attitude[i]), attitude[j]))
-        covered_s = np.sum(inside * some.dt_s, axis=1)
         if share is None:
-            mixture = _fit_mixture(some, inertial, inside, rotation)
+            mixture = _fit_mixture(some, inertial, inside, rotation, rounds=MIXTURE.choosing)
             value = mixture.log_likelihood * min(effective / len(some), 1.0)
         else:
             energy, left, _ = _fit(some, inertial, inside, rotation, share)
             value = _gain(energy, left, 3 * effective * share * covered_s / some.dt_s.sum())
-        gain[at] = np.where((covered_s >= needed_s) & (covered_s > 0), value, np.nan)
+        gain[chunk + enough] = value
     return offset_s, gain, float(3 * _effective_intervals(intervals) / intervals.dt_s.sum())
 
 
@@ -397,27 +399,40 @@ def _fit(
 
 
 def _fit_mixture(
-    intervals: Intervals, inertial_rad: Array, inside: BoolArray, rotation: Array | None, *, mirrored: bool = False
+    intervals: Intervals,
+    inertial_rad: Array,
+    inside: BoolArray,
+    rotation: Array | None,
+    *,
+    mirrored: bool = False,
+    rounds: int = MIXTURE.rounds,
 ) -> Mixture:
     free = _mirror_image if mirrored else _best_rotation
+    dt_s = intervals.dt_s
+    products = (intervals.turn_rad / dt_s[:, None])[:, :, None] * inertial_rad[:, :, None, :]
+    products = products.reshape(*inertial_rad.shape[:2], 9)
+
+    def moments(weight: Array) -> tuple[Array, Array, Array]:
+        total = np.maximum(weight @ dt_s, 1e-12)[:, None]
+        rate_v = (weight @ intervals.turn_rad) / total
+        rate_g = (weight[:, None] @ inertial_rad)[:, 0] / total
+        cross = (weight[:, None] @ products).reshape(-1, 3, 3)
+        return cross - (total * rate_v)[:, :, None] * rate_g[:, None, :], rate_v, rate_g
+
     return fit_mixture(
         intervals.turn_rad,
         inertial_rad,
-        intervals.dt_s,
+        dt_s,
         inside,
-        moments=lambda weight: _moments_and_rates(intervals, inertial_rad, weight),
+        moments=moments,
         best_rotation=free if rotation is None else lambda _: rotation[None],
+        rounds=rounds,
     )
 
 
 def _mirror_image(cross: Array) -> Array:
     """(L, 3, 3) reflections of the largest ``tr(R' cross)``."""
     return -_best_rotation(-cross)
-
-
-def _moments_and_rates(intervals: Intervals, inertial_rad: Array, weight: Array) -> tuple[Array, Array, Array]:
-    cross, _, _, (rate_v, rate_g) = _moments(intervals, inertial_rad, weight)
-    return cross, rate_v, rate_g
 
 
 def _best_rotation(cross: Array) -> Array:

@@ -170,9 +170,9 @@ def refine_alignment(
         cov = np.linalg.inv(information + prior_info)
         if iteration > 8 and np.all(np.abs(step) < 1e-3 * np.sqrt(np.diag(cov))):
             break
-    cov = _widened(cov, white_residual, white_jacobian, dt_s)
+    cov = _widen_for_correlation(cov, white_residual, white_jacobian, dt_s)
     _require_observable(cov, state.offset_s - start.offset_s)
-    fitted = _completed(prior, state.rotation, state.offset_s - shift_s, state.bias, cov[:_N, :_N])
+    fitted = _complete_calibration(prior, state.rotation, state.offset_s - shift_s, state.bias, cov[:_N, :_N])
     fitted = replace(fitted, clock_rate=float(state.nuisance[_RATE]), clock_middle_s=middle_s)
     return Alignment(calibration=fitted, clock_rate_sigma=float(np.sqrt(cov[-1, -1])))
 
@@ -320,7 +320,7 @@ def _noise_of(residual: Array, dt_s: Array, excess: Array, least_rate: float) ->
     return pose, max(least_rate, pose * float(np.exp(log_ratio)))
 
 
-def _widened(cov: Array, white_residual: Array, white_jacobian: Array, dt_s: Array) -> Array:
+def _widen_for_correlation(cov: Array, white_residual: Array, white_jacobian: Array, dt_s: Array) -> Array:
     """Covariance that also holds for errors that are not white.
 
     The scores of up to twelve parts of the recording scatter as much as the errors really do (cluster-robust
@@ -338,7 +338,7 @@ def _widened(cov: Array, white_residual: Array, white_jacobian: Array, dt_s: Arr
     return np.asarray(cov * np.outer(factor, factor))
 
 
-def _completed(
+def _complete_calibration(
     prior: CameraImuCalibration, rotation: Array, offset_s: float, bias: Array, cov: Array
 ) -> CameraImuCalibration:
     """The fitted entries with the prior's others, which follow where they are correlated."""

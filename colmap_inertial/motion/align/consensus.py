@@ -66,6 +66,7 @@ def align_by_consensus(
     *,
     prior: CameraImuCalibration | None = None,
     options: AlignOptions | None = None,
+    together: Alignment | NotObservableError | None = None,
 ) -> tuple[Alignment, RotationConsensus]:
     """Align a camera and an IMU by the cameras of a reconstruction that agree with the gyroscope.
 
@@ -76,6 +77,8 @@ def align_by_consensus(
     ----------
     trajectory, imu, prior, options
         As of :func:`align_clocks`.
+    together
+        What this found or refused by them, where that is known already.
 
     Returns
     -------
@@ -90,7 +93,9 @@ def align_by_consensus(
     aligned: Alignment | None = None
     before = np.zeros(len(trajectory), dtype=np.intp)
     try:
-        aligned = align_clocks(trajectory, imu, prior=prior, options=options)
+        if isinstance(together, NotObservableError):
+            raise together
+        aligned = together or align_clocks(trajectory, imu, prior=prior, options=options)
         calibration = aligned.calibration
     except NotObservableError:
         trimmed = align_trimmed(trajectory, imu, prior=prior, options=options)
@@ -102,7 +107,7 @@ def align_by_consensus(
         if aligned is not None and np.array_equal(consensus.part, before):
             break
         before = consensus.part
-        aligned = align_clocks(_mended(trajectory, consensus), imu, prior=prior, options=options)
+        aligned = align_clocks(_mend_rotations(trajectory, consensus), imu, prior=prior, options=options)
         calibration = aligned.calibration
     assert aligned is not None
     if not consensus.kept.all():
@@ -110,7 +115,7 @@ def align_by_consensus(
     return aligned, consensus
 
 
-def _mended(trajectory: CameraTrajectory, consensus: RotationConsensus) -> CameraTrajectory:
+def _mend_rotations(trajectory: CameraTrajectory, consensus: RotationConsensus) -> CameraTrajectory:
     """Rotations without those of wrong cameras, parts turned to fit."""
     sound = consensus.part >= 0
     part_from_ref = quat_conjugate(consensus.ref_from_part_xyzw)[consensus.part[sound]]

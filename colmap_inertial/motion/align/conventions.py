@@ -72,9 +72,9 @@ def quick_accelerations(
     mean = np.ones(len(time)) / len(time)
     force = np.stack([np.interp(t_s, imu.accel_t_s, column) for column in imu.accel_m_s2.T], axis=1)
     world_from_imu = quat_multiply(quat_conjugate(poses.cam_from_world_xyzw), calibration.cam_from_imu_xyzw)
-    inertial = _filtered(quat_rotate(world_from_imu, force), mean)
-    visual = _filtered(poses.cam_in_world, second)
-    arm = _filtered(matrix_from_quat(world_from_imu).reshape(-1, 9), second)
+    inertial = _filter_axes(quat_rotate(world_from_imu, force), mean)
+    visual = _filter_axes(poses.cam_in_world, second)
+    arm = _filter_axes(matrix_from_quat(world_from_imu).reshape(-1, 9), second)
     even = np.abs(poses.t_s[2 * half :] - poses.t_s[: -2 * half] - 2 * half * step_s) < 0.1 * step_s
     even &= (t_s[half:-half] > imu.accel_t_s[0]) & (t_s[half:-half] < imu.accel_t_s[-1])
     width = 4 * half
@@ -91,7 +91,7 @@ def quick_accelerations(
     )
 
 
-def _filtered(values: Array, kernel: Array) -> Array:
+def _filter_axes(values: Array, kernel: Array) -> Array:
     return np.stack([np.convolve(column, kernel, "valid") for column in values.T], axis=1)
 
 

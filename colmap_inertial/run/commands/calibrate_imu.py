@@ -29,7 +29,7 @@ from colmap_inertial.io.calibration import (
 )
 from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.files import read_json, read_text, reading, write_text
-from colmap_inertial.io.imu import read_raw_capture_imu, read_raw_imu
+from colmap_inertial.io.imu import read_unchecked_capture_imu, read_unchecked_imu
 from colmap_inertial.io.plausible import check_alive
 from colmap_inertial.report import require_plotly
 from colmap_inertial.report.imu_calibration import calibration_page
@@ -121,7 +121,7 @@ def read_remembered(source: Path, given: tuple[Path, ...], *, device: str | None
     try:
         capture = _capture_of(source)
         if device is None:
-            imu = read_raw_imu(source).imu if capture is None else read_raw_capture_imu(capture).imu
+            imu = read_unchecked_imu(source) if capture is None else read_unchecked_capture_imu(capture)
             device = imu.device
     except InertialError:
         return Remembered()  # whoever reads it next says what is wrong
@@ -249,14 +249,13 @@ def calibrate_source(
         raise OutputError(Fact("calibration-is-json", out=str(out)))
     if page.exists() and not out.exists():
         raise OutputExistsError(Fact("calibration-page-exists", page=str(page)))
-    raw = read_raw_imu(recording)
-    imu = raw.imu
+    imu = read_unchecked_imu(recording)
     if imu.has_accel:
-        check_alive(imu.gyro_rad_s, "gyro", raw.path)
-        check_alive(imu.accel_m_s2, "accel", raw.accel_path or raw.path)
+        check_alive(imu.gyro_rad_s, "gyro", imu.source.path)
+        check_alive(imu.accel_m_s2, "accel", imu.source.path_of("accel"))
         problems = check_units(imu)
         if problems:
-            raise FormatError(raw.path, Fact("found-together", found=problems))
+            raise FormatError(imu.source.path, Fact("found-together", found=problems))
     gravity_m_s2, sigma = strength_of_gravity(gravity or GravityOptions())
     calibration = calibrate_imu(imu, gravity_m_s2=gravity_m_s2, gravity_sigma_m_s2=sigma, device=device)
     write_imu_calibration(out, calibration.calibration)

@@ -56,7 +56,7 @@ _TRIM_LEVELS = 3
 
 @dataclass(frozen=True, kw_only=True)
 class DenseWork:
-    """Work for one image by step: its time on the example scene and on EuRoC (``scripts/study_progress.py``)."""
+    """Work for one image by step: its time on the example scene and on EuRoC (``scripts/studies/progress.py``)."""
 
     #: To find its depths by the plane sweep, 1.3 s of two cores, and to compare them with those of others.
     matched: int = 40

@@ -12,8 +12,8 @@ from colmap_inertial.io.calibration import CalibrationFiles, largest_offset_s
 from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.files import write_json, write_text
 from colmap_inertial.io.frames import read_frame_timing
-from colmap_inertial.io.imu import is_capture, read_raw_capture_imu, read_raw_imu
-from colmap_inertial.io.imu_formats import find_recording
+from colmap_inertial.io.imu import is_capture, read_unchecked_capture_imu, read_unchecked_imu
+from colmap_inertial.io.imu_formats import find_recorder_output
 from colmap_inertial.io.recording import prior_calibration
 from colmap_inertial.io.rig_frames import pair_rig_frames
 from colmap_inertial.io.table_report import TableReport, report_table
@@ -90,7 +90,7 @@ def collect(source: ScaleSource, progress: Progress) -> Recorded:
         checked = _read_capture(load_capture(path), source.calibration)
     else:
         checked = _read_imu(path)
-    if checked.raw is None and checked.trajectory is None and checked.timing is None and checked.capture is None:
+    if checked.imu is None and checked.trajectory is None and checked.timing is None and checked.capture is None:
         error = checked.refused[0]
         # a file of no known kind is bad input; one that is known and damaged is a finding
         if unreadable(error).code in ("unreadable", "untimed"):
@@ -100,7 +100,7 @@ def collect(source: ScaleSource, progress: Progress) -> Recorded:
 
 def _describes_frames(path: Path) -> bool:
     """Whether a path is a capture rather than an inertial recording alone."""
-    if is_capture(path) or find_recording(path) is not None:
+    if is_capture(path) or find_recorder_output(path) is not None:
         return True
     return any((base / "cam0" / "data.csv").is_file() for base in (path, path / "mav0"))
 
@@ -108,7 +108,7 @@ def _describes_frames(path: Path) -> bool:
 def _read_imu(path: Path) -> CheckInputs:
     reader = TolerantReader()
     # arguments are read in order: the reason for a refusal is there by the second
-    return CheckInputs(raw=reader.attempt(lambda: read_raw_imu(path)), refused=tuple(reader.refused))
+    return CheckInputs(imu=reader.attempt(lambda: read_unchecked_imu(path)), refused=tuple(reader.refused))
 
 
 def _read_capture(capture: Capture, calibration: CalibrationFiles) -> CheckInputs:
@@ -119,9 +119,9 @@ def _read_capture(capture: Capture, calibration: CalibrationFiles) -> CheckInput
     if timing is not None:
         known = timing
         reader.attempt(lambda: pair_rig_frames(capture, known))
-    raw = None if capture.imu is None else reader.attempt(lambda: read_raw_capture_imu(capture))
+    imu = None if capture.imu is None else reader.attempt(lambda: read_unchecked_capture_imu(capture))
     return CheckInputs(
-        raw=raw,
+        imu=imu,
         capture=capture,
         timing=timing,
         prior=prior_calibration(capture, calibration),

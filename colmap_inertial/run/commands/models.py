@@ -42,6 +42,7 @@ from colmap_inertial.run.commands.torn_parts import TornParts
 from colmap_inertial.run.stages.metric import gravity_in_model, metric_trajectory, write_trajectory
 from colmap_inertial.run.steps.session import Session
 from colmap_inertial.validate import Target, Validation, validate_model, write_overlays
+from colmap_inertial.validate.agreement import doubt_by_target
 
 if TYPE_CHECKING:
     import pycolmap
@@ -434,6 +435,8 @@ def run_validation(
         check = read_record(record, _Checked).outcome()
         outcome = f"scale error {check.scale_error_pct:+.3f} %" if isinstance(check, Validation) else str(check)
         log.info("model %d: %s against %s", model.index, outcome, target.spec)
+        if isinstance(check, Validation):
+            model = replace(model, scale=doubt_by_target(model.scale, check))
         checked.append(replace(model, validation=check))
     return tuple(checked)
 

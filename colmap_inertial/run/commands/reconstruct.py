@@ -22,7 +22,7 @@ from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.gyro import gravity_in_cam
 from colmap_inertial.core.options import BlurRemover, ReconstructOptions
 from colmap_inertial.core.progress import Progress, silent
-from colmap_inertial.core.types import Frame, PositionFixes
+from colmap_inertial.core.types import Frame, ImuRecording, PositionFixes
 from colmap_inertial.diagnose import Diagnosis
 from colmap_inertial.hooks import (
     FrameStage,
@@ -37,8 +37,7 @@ from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.disk import remove
 from colmap_inertial.io.files import StrPath, reading_within
 from colmap_inertial.io.frames import picture_folders, read_frames
-from colmap_inertial.io.imu import read_raw_capture_imu
-from colmap_inertial.io.plausible import RawImu
+from colmap_inertial.io.imu import read_unchecked_capture_imu
 from colmap_inertial.io.recording import Recording, correct_imu, prior_calibration
 from colmap_inertial.io.rig_frames import RigFrames, pair_rig_frames
 from colmap_inertial.model import find_models
@@ -159,7 +158,7 @@ class _Given:
     """
 
     capture: Capture
-    raw: RawImu
+    raw: ImuRecording
     recording: Recording
     frames: Iterator[Frame]
     fuser: Fuser | None
@@ -185,7 +184,7 @@ def _read(path: Path, options: ReconstructOptions, stages: Stages) -> _Given:
     pairs = ... in stages.frame and fuses_pairs(capture, options.exposures, deblur=options.deblur)
     fuser = lsd2_fuser(options.exposures) if pairs else None
     capture = capture if pairs else replace(capture, exposures=None)
-    raw = check_imu(read_raw_capture_imu(capture), force=options.force)
+    raw = check_imu(read_unchecked_capture_imu(capture), force=options.force)
     target = None if capture.target is None else parse_target(capture.target)
     given = None if options.database is None else read_given(options.database)
     _refuse_with_rig(capture, options)
@@ -205,7 +204,7 @@ def _read(path: Path, options: ReconstructOptions, stages: Stages) -> _Given:
     timing = add_stated_exposures(capture, timing)
     require_frames(len(timing.names), of=len(timing.names))
     prior = prior_calibration(capture, options.calibration)
-    imu = correct_imu(capture, raw.imu, options.calibration)
+    imu = correct_imu(capture, raw, options.calibration)
     recording = Recording.of(capture, imu, timing, prior, max_offset_s=options.scale.max_offset_s)
     insert_defaults(stages.model, default_model_stages(StageInputs(recording=recording, options=options)))
     gravity = _gravity_priors(recording, options)
@@ -298,7 +297,7 @@ def _run(session: Session, given: _Given, options: ReconstructOptions, stages: S
     records = run_frames(session, recording, frames, of_frames, workspace.colmap_images, inputs.plan, given.rig)
     used_timing = part_of(recording.timing, [record.name for record in records if record.used])
     # pairs are chosen by what the capture itself holds: a calibration that is given later maps nothing again
-    plain_imu = correct_imu(capture, given.raw.imu, None)
+    plain_imu = correct_imu(capture, given.raw, None)
     plain = Recording.of(capture, plain_imu, used_timing, prior_calibration(capture, None))
     keypoints, matching, mapping = run_colmap(session, plain, records, of_keypoints, given.gravity, options)
     rectified = keypoints.rectified()

@@ -35,10 +35,9 @@ from colmap_inertial.io.fingerprints import fingerprint
 from colmap_inertial.io.frame_sources import Video
 from colmap_inertial.io.frame_times import FrameStamps, stamps_of_pattern
 from colmap_inertial.io.frames import read_frame_times, read_frame_timing
-from colmap_inertial.io.imu import is_capture, read_raw_capture_imu, read_raw_imu
-from colmap_inertial.io.imu_formats import find_recording
+from colmap_inertial.io.imu import is_capture, read_unchecked_capture_imu, read_unchecked_imu
+from colmap_inertial.io.imu_formats import find_recorder_output
 from colmap_inertial.io.picture_names import picture_in
-from colmap_inertial.io.plausible import RawImu
 from colmap_inertial.io.recording import Recording, correct_imu, prior_calibration
 from colmap_inertial.io.video import video_stamps_ns
 from colmap_inertial.io.video_match import match_to_video
@@ -293,7 +292,7 @@ class _Given:
 
     source: ProjectOptions
     capture: Capture
-    raw: RawImu
+    raw: ImuRecording
     imu: ImuRecording
     prior: CameraImuCalibration
     calibration_files: list[dict[str, str]]
@@ -312,9 +311,9 @@ def _require_recording(project: Path, source: ProjectOptions) -> Path:
 def _read_sources(project: Path, source: ProjectOptions, options: ReconstructOptions) -> _Given:
     """Read what was given beside the project, before any work."""
     imu, times = _require_recording(project, source), source.frame_times
-    described = [p for p in (imu, times) if p is not None and (is_capture(p) or find_recording(p) is not None)]
+    described = [p for p in (imu, times) if p is not None and (is_capture(p) or find_recorder_output(p) is not None)]
     captures = [load_capture(path) for path in described]
-    raw = read_raw_capture_imu(captures[0]) if described[:1] == [imu] else read_raw_imu(imu)
+    raw = read_unchecked_capture_imu(captures[0]) if described[:1] == [imu] else read_unchecked_imu(imu)
     capture = captures[0] if captures else Capture(path=project, calibration=calibration_prior())
     frames = next((c.frames for c in captures if c.frames is not None), None)
     own_clock = source.exif_times or (source.video is not None and not isinstance(frames, Video))
@@ -331,14 +330,14 @@ def _read_sources(project: Path, source: ProjectOptions, options: ReconstructOpt
         raw=raw,
         calibration_files=describe_files(options.calibration),
         prior=prior_calibration(capture, options.calibration),
-        imu=correct_imu(capture, raw.imu, options.calibration),
+        imu=correct_imu(capture, raw, options.calibration),
     )
 
 
 def _add_video(capture: Capture, video: Path, times: Path | None) -> Capture:
     """The capture with all frames of a video; what the recorder noted about them counts where it is the recorder's."""
     frames = Video(file=video) if not isinstance(capture.frames, Video) else capture.frames
-    if not isinstance(capture.frames, Video) and (recording := find_recording(video)) is not None:
+    if not isinstance(capture.frames, Video) and (recording := find_recorder_output(video)) is not None:
         log_ = recording.log
         capture = dataclasses.replace(capture, frame_log=log_)
         if log_ is not None and capture.readout_s is None:

@@ -32,7 +32,7 @@ from colmap_inertial.model import Model
 from colmap_inertial.report import write_report
 from colmap_inertial.report.folders import model_file, recording_file
 from colmap_inertial.report.photogrammetry import photogrammetry_record, scene_record
-from colmap_inertial.report.series import rounded, strided
+from colmap_inertial.report.series import round_values, stride_indices
 from colmap_inertial.report.signals import signal_record
 from colmap_inertial.run.commands.project_output import withdraw
 from colmap_inertial.run.commands.result import ReconstructResult, result_as_json
@@ -82,7 +82,7 @@ def write_recording(
                 "interval_s": float(np.median(np.diff(timing.t_s))) if len(timing.t_s) > 1 else None,
                 "names": list(timing.names),
                 "t_s": np.round(timing.t_s - timing.t_s[0], 4).tolist(),
-                "exposure_s": None if timing.exposure_s is None else rounded(timing.exposure_s, 4),
+                "exposure_s": None if timing.exposure_s is None else round_values(timing.exposure_s, 4),
                 "readout_s": timing.readout_s,
             },
             "rolling_shutter": _shutter_record(stages, recording, rectified),
@@ -108,7 +108,7 @@ def _shutter_record(
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     shifts = []
     those = [i for i, name in enumerate(timing.names) if name in rectified]
-    for i in (those[k] for k in strided(len(those), _LIMITS.shutter_frames).tolist()):
+    for i in (those[k] for k in stride_indices(len(those), _LIMITS.shutter_frames).tolist()):
         moved = Keypoints(name=timing.names[i], xy_px=grid)
         try:
             for stage in stages:
@@ -125,8 +125,8 @@ def _shutter_record(
     worst, field = shifts[int(np.argmax(largest))]
     return {
         "t_s": np.round(timing.t_s[[i for i, _ in shifts]] - timing.t_s[0], 3).tolist(),
-        "median_px": rounded(middle, 4),
-        "largest_px": rounded(largest, 4),
+        "median_px": round_values(middle, 4),
+        "largest_px": round_values(largest, 4),
         "worst": {
             "name": timing.names[worst],
             "width": camera.width,

@@ -28,8 +28,9 @@ from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.files import write_json
 from colmap_inertial.io.frame_times import NO_RIGS
 from colmap_inertial.io.frames import read_frame_times
-from colmap_inertial.io.imu import is_capture, read_raw_imu
+from colmap_inertial.io.imu import is_capture, read_unchecked_imu
 from colmap_inertial.io.imu_text import is_inertial_scale
+from colmap_inertial.io.plausible import check_readings
 from colmap_inertial.io.pose_convention import COLMAP, INERTIAL_SCALE, TUM
 from colmap_inertial.io.trajectories import read_inertial_scale_poses, read_tum
 from colmap_inertial.model import (
@@ -121,13 +122,13 @@ def load_source(source: ScaleSource) -> TimedPoses:
     checked, notes = read_source(source)
     for error in checked.refused:
         raise error
-    raw, trajectory, timing = checked.raw, checked.trajectory, checked.timing
-    assert raw is not None and isinstance(trajectory, CameraTrajectory)
-    raw.check()
+    imu, trajectory, timing = checked.imu, checked.trajectory, checked.timing
+    assert imu is not None and isinstance(trajectory, CameraTrajectory)
+    check_readings(imu)
     files, shared_clock = _read_calibrations(source)
     return TimedPoses(
         trajectory=trajectory,
-        imu=raw.imu if files.imu is None else files.imu.corrected(raw.imu),
+        imu=imu if files.imu is None else files.imu.corrected(imu),
         checked=checked,
         shared_clock=shared_clock,
         start_s=None if timing is None else float(timing.pose_t_s()[0]),
@@ -167,11 +168,11 @@ def read_source(source: ScaleSource) -> tuple[CheckInputs, Sequence[Fact]]:
     else:
         read_as = TUM
         trajectory = reader.attempt(lambda: read_tum(path))
-    raw = reader.attempt(lambda: read_raw_imu(path if source.imu is None else source.imu))
+    imu = reader.attempt(lambda: read_unchecked_imu(path if source.imu is None else source.imu))
     files, shared_clock = _read_calibrations(source)
     prior = files.camera_imu
     checked = CheckInputs(
-        raw=raw,
+        imu=imu,
         capture=capture,
         timing=timing,
         trajectory=trajectory,
@@ -342,12 +343,12 @@ def _begin_of(recording: TimedPoses, first_s: float, max_offset_s: float | None)
         return cut
     timed = CameraTimedImu(imu=recording.imu, calibration=aligned.calibration, camera_epoch_ns=trajectory.epoch_ns)
     around_s = trajectory.t_s[0] - _AROUND_S, trajectory.t_s[-1] + _AROUND_S
-    raw = recording.checked.raw
-    if raw is not None:
-        whole = CameraTimedImu(imu=raw.imu, calibration=aligned.calibration, camera_epoch_ns=trajectory.epoch_ns)
-        raw = dataclasses.replace(raw, imu=whole.between(*around_s))
+    checked_imu = recording.checked.imu
+    if checked_imu is not None:
+        whole = CameraTimedImu(imu=checked_imu, calibration=aligned.calibration, camera_epoch_ns=trajectory.epoch_ns)
+        checked_imu = whole.between(*around_s)
     return dataclasses.replace(
-        cut, imu=timed.between(*around_s), checked=dataclasses.replace(recording.checked, raw=raw)
+        cut, imu=timed.between(*around_s), checked=dataclasses.replace(recording.checked, imu=checked_imu)
     )
 
 

@@ -26,7 +26,7 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError, OutputExistsError, fact_of
 from colmap_inertial.core.facts import Fact, with_sentences
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, ReferenceOptions, ValidateOptions
-from colmap_inertial.core.progress import Progress, counted, silent
+from colmap_inertial.core.progress import Progress, report_each, silent
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.io.capture import Capture, load_capture
@@ -403,7 +403,7 @@ def _map(
     require_features(context)
     project.mkdir()
     context.executor.require(project)
-    for _ in counted(_written(capture, names, images), len(names), "frames", progress):
+    for _ in report_each(_written(capture, names, images), len(names), "frames", progress):
         pass
     database = project / "database.db"
     extract_features(images, dict.fromkeys(names, capture.camera), database, mapping, context=context)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from colmap_inertial.core.facts import Fact
-from colmap_inertial.core.progress import Progress, counted
+from colmap_inertial.core.progress import Progress, report_each
 from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence, measure_blur_shares
 from colmap_inertial.imaging.gate import (
     GATE_LIMITS,
@@ -146,7 +146,7 @@ def _look(
     blur_px = {decision.name: factor * (decision.blur_px or 0.0) for decision in chosen}
     looked: list[Looked] = []
     frames = some_frames(capture, view.timing, [index[d.name] for d in chosen])
-    for frame in counted(frames, len(chosen), "blur", progress):
+    for frame in report_each(frames, len(chosen), "blur", progress):
         shutter, parallax = view.shutter(index[frame.name]), parallaxes.get(frame.name)
         path = blur_path(motion, camera, shutter, parallax=parallax, extent_factor=factor)
         share, mirrored = measure_blur_shares(frame.image, path)

@@ -11,15 +11,15 @@ import numpy as np
 
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError, TimingError
 from colmap_inertial.core.facts import Fact
-from colmap_inertial.core.progress import Progress, counted
+from colmap_inertial.core.progress import Progress, report_each
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, Frame, FrameTiming
+from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, Frame, FrameTiming, ImuRecording
 from colmap_inertial.diagnose import Diagnosis, FramesInVideo, Recorded, diagnose
 from colmap_inertial.imaging.detail import is_blank
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import write_json
 from colmap_inertial.io.frame_sources import ImageFolder
-from colmap_inertial.io.plausible import RawImu
+from colmap_inertial.io.plausible import check_readings
 from colmap_inertial.io.pose_convention import COLMAP, PoseConvention
 from colmap_inertial.io.recording import Recording
 from colmap_inertial.io.video import decode_grey, video_stamps_ns
@@ -57,7 +57,7 @@ class PreflightEffort:
 _EFFORT = PreflightEffort()
 
 
-def check_imu(raw: RawImu, *, force: bool) -> RawImu:
+def check_imu(imu: ImuRecording, *, force: bool) -> ImuRecording:
     """An inertial recording, refused where its numbers are implausible.
 
     Parameters
@@ -68,12 +68,12 @@ def check_imu(raw: RawImu, *, force: bool) -> RawImu:
     Raises
     ------
     FormatError
-        As ``RawImu.check``.
+        As :func:`~colmap_inertial.io.plausible.check_readings`.
     NotObservableError
         Where gravity was taken out.
     """
     try:
-        raw.check()
+        return check_readings(imu)
     except FormatError as error:
         if error.code != "gravity-removed":
             raise
@@ -81,7 +81,7 @@ def check_imu(raw: RawImu, *, force: bool) -> RawImu:
             raise NotObservableError(
                 "scale", Fact("stopped-by-file", path=str(error.path), finding=error.fact)
             ) from None
-    return raw
+        return imu
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -90,7 +90,7 @@ class CheckInputs:
 
     Attributes
     ----------
-    raw
+    imu
         The IMU before any calibration of its own: the checks are about the sensor.
     capture
         What describes the images; ``None`` for poses that were not made from them, as those of a table.
@@ -105,7 +105,7 @@ class CheckInputs:
         What could not be read, and why.
     """
 
-    raw: RawImu | None
+    imu: ImuRecording | None
     capture: Capture | None = None
     timing: FrameTiming | None = None
     trajectory: CameraTrajectory | Literal["untimed"] | None = None
@@ -136,7 +136,7 @@ def measure_recording(inputs: CheckInputs, progress: Progress) -> Recorded:
     Images that cannot be read are among what was refused; the rest is measured all the same.
     """
     reader = TolerantReader(inputs.refused)
-    capture, timing, poses, raw = inputs.capture, inputs.timing, inputs.trajectory, inputs.raw
+    capture, timing, poses = inputs.capture, inputs.timing, inputs.trajectory
     log_ = None if capture is None else capture.frame_log
     rotation = in_video = None
     looked: dict[str, bool] = {}
@@ -151,9 +151,7 @@ def measure_recording(inputs: CheckInputs, progress: Progress) -> Recorded:
         in_video = reader.attempt(lambda: find_in_video(capture, timing, progress))
     return Recorded(
         refused=tuple(reader.refused),
-        imu=None if raw is None else raw.imu,
-        gyro_axes=None if raw is None else raw.gyro_axes,
-        accel_axes=None if raw is None else raw.accel_axes,
+        imu=inputs.imu,
         timing=timing,
         log=log_,
         is_capture=capture is not None and poses is None,
@@ -172,7 +170,7 @@ def measure_recording(inputs: CheckInputs, progress: Progress) -> Recorded:
 def run_preflight(
     session: Session,
     recording: Recording,
-    raw: RawImu,
+    imu: ImuRecording,
     findings: Callable[[Diagnosis], None],
     *,
     force: bool,
@@ -190,7 +188,7 @@ def run_preflight(
         As :func:`stop_or_doubt`.
     """
     inputs = CheckInputs(
-        raw=raw,
+        imu=imu,
         capture=recording.capture,
         timing=recording.timing,
         trajectory=model,
@@ -241,7 +239,7 @@ def measure_images(
         return None
     first = max(0, (len(timing.t_s) - _EFFORT.compared) // 2)
     few = range(first, min(first + _EFFORT.compared, len(timing.t_s)))
-    frames = counted(some_frames(capture, timing, few), len(few), "check", progress)
+    frames = report_each(some_frames(capture, timing, few), len(few), "check", progress)
     if look is not None:
         frames = show_frames(frames, look)
     camera = colmap_camera(guess_camera(capture, timing))

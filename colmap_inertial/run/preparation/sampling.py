@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from colmap_inertial.core.progress import Progress, counted
+from colmap_inertial.core.progress import Progress, report_each
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import (
     CameraModel,
@@ -101,7 +101,7 @@ def measure_sampled_rotation(
 
     Each frame is shown to ``look``.
     """
-    frames = counted(some_frames(capture, timing, indices), len(indices), stage, progress)
+    frames = report_each(some_frames(capture, timing, indices), len(indices), stage, progress)
     if look is not None:
         frames = show_frames(frames, look)
     with one_blas_thread():

@@ -20,7 +20,7 @@ from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError, fact_of
 from colmap_inertial.core.facts import Fact, with_sentences
 from colmap_inertial.core.options import FrameOptions
-from colmap_inertial.core.progress import Progress, counted
+from colmap_inertial.core.progress import Progress, report_each
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import CameraModel, FrameTiming
 from colmap_inertial.imaging.gyro_camera import GyroCamera
@@ -257,7 +257,7 @@ def select_frames(recording: Recording, options: FrameOptions, progress: Progres
             start_from_cam=turning,
         )
         names = [timing.names[i] for i in looked]
-        pictures = counted(read_reduced(capture, names, _LIMITS.looked_px), len(names), "selection", progress)
+        pictures = report_each(read_reduced(capture, names, _LIMITS.looked_px), len(names), "selection", progress)
         chosen = choose_frames(
             (picture for _, picture in pictures),
             ranked,

@@ -19,7 +19,7 @@ from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.facts import sentences
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.options import ScaleOptions
-from colmap_inertial.core.progress import Progress, counted
+from colmap_inertial.core.progress import Progress, report_each
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import CameraModel, CameraTrajectory, FrameTiming
 from colmap_inertial.imaging.gyro_camera import GyroCamera
@@ -115,7 +115,7 @@ def translating_segments(
     if not firsts:
         return [False] * len(parts)
     indices = sorted({place[name] + k for name in firsts for k in (0, 1)})
-    frames = counted(some_frames(recording.capture, every, indices), len(indices), "motion", progress)
+    frames = report_each(some_frames(recording.capture, every, indices), len(indices), "motion", progress)
     projector = colmap_camera(camera)
     with one_blas_thread():
         blur_px = {

@@ -6,6 +6,7 @@ import logging
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,9 +32,10 @@ from colmap_inertial.core.types import (
     SmoothedTrajectory,
     Treatment,
 )
+from colmap_inertial.hooks import InvertibleStage, find_inverse
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.inertial.refine.motion import PictureDrift, find_drift
-from colmap_inertial.inertial.refine.setup import Known, Seen, read_seen
+from colmap_inertial.inertial.refine.setup import Known, Seen, keypoints_of, read_seen
 from colmap_inertial.inertial.refine.shutter import SHUTTER_LIMITS, SeenReadout, find_readout
 from colmap_inertial.inertial.scale import estimate_scale, strength_of_gravity
 from colmap_inertial.io.calibration import SIGMAS, calibration_prior
@@ -151,18 +153,15 @@ class InertialStage:
         estimate, trajectory = self._estimate(model)
         consensus = estimate.rotations
         if consensus is not None and not consensus.kept.all() and estimate.verdict != "refused":
-            reconstruction, placed = self._register_again(model, consensus)
-            if placed:
-                second, poses = self._estimate(replace(model, reconstruction=reconstruction))
-                if second.rotations is not None and second.verdict != "refused":
-                    estimate, trajectory, consensus = second, poses, consensus.updated(second.rotations)
+            reconstruction, registered = self._register_again(model, consensus)
+            if registered:
+                again, poses = self._estimate(replace(model, reconstruction=reconstruction))
+                if again.rotations is not None and again.verdict != "refused":
+                    estimate, trajectory, consensus = again, poses, consensus.updated(again.rotations)
             left_out = set(consensus.left_out)
             trajectory = trajectory.select(np.array([name not in left_out for name in trajectory.names]))
             model = _select_agreeing_images(model, reconstruction, consensus)
-        if model.rotations is not None and estimate.rotations is not None:
-            notes = (*without_consensus(estimate.notes), *describe_consensus(model.rotations))
-            estimate = replace(estimate, rotations=model.rotations, notes=notes)
-        return model, estimate, trajectory
+        return model, _describe_rotations_of(model, estimate), trajectory
 
     def _estimate(self, model: Model) -> tuple[ScaleEstimate, CameraTrajectory]:
         """The scale of a model as it is, and its poses; notes name images that have no time."""
@@ -178,6 +177,14 @@ class InertialStage:
         if not wrong or self.database is None or not self.database.is_file() or has_rigs(model.reconstruction):
             return model.reconstruction, ()
         return register_again(model.reconstruction, wrong, self.database)
+
+
+def _describe_rotations_of(model: Model, estimate: ScaleEstimate) -> ScaleEstimate:
+    """The estimate with what is known of the model's cameras, where more is than the estimate itself found."""
+    if model.rotations is None or estimate.rotations is None:
+        return estimate
+    notes = (*without_consensus(estimate.notes), *describe_consensus(model.rotations))
+    return replace(estimate, rotations=model.rotations, notes=notes)
 
 
 def _select_agreeing_images(
@@ -211,13 +218,20 @@ def _select_agreeing_images(
 class MetricStage(InertialStage):
     """Scale, gravity and accelerometer bias from the IMU; a refused scale leaves the model as it is.
 
-    See :class:`InertialStage` for the attributes.
+    See :class:`InertialStage` for the other attributes.
+
+    Attributes
+    ----------
+    shutter
+        What rectified the keypoints, where something did.
     """
+
+    shutter: InvertibleStage | None = None
 
     @classmethod
     def for_run(cls, inputs: StageInputs) -> MetricStage:
         """The stage of a run."""
-        return cls(**cls.fields_for(inputs))
+        return cls(**cls.fields_for(inputs), shutter=find_inverse(inputs.keypoint_stages))
 
     def __call__(self, model: Model, /) -> Model:
         """Estimate and apply the scale."""
@@ -231,11 +245,12 @@ class MetricStage(InertialStage):
     def judge_shutter(self, model: Model, estimate: ScaleEstimate) -> Model:
         """A model in metres; where its images show a rolling shutter that it ignores, its scale says so.
 
-        A declared global shutter, and declared intrinsics that were kept, are doubted where the images contradict them.
+        A declared readout, and declared intrinsics that were kept, are doubted where the images contradict them.
         """
         metric = self._apply(model, estimate)
         is_settled = model.timing.readout_s == 0 or model.rectified
-        if estimate.noise is None or (model.rectified and not self.keeps_intrinsics):
+        shows_readout = not model.rectified or self.shutter is not None
+        if estimate.noise is None or not (shows_readout or self.keeps_intrinsics):
             return metric
         try:
             readout = self._find_readout(metric)
@@ -247,11 +262,15 @@ class MetricStage(InertialStage):
         if readout is None:
             return self._apply(model, replace(estimate, notes=(*estimate.notes, Fact("rolling-shutter-unknown"))))
         found = []
-        if not is_settled or (not model.rectified and readout.contradicts_global):
+        contradicted = readout.compared(model.timing) if shows_readout else None
+        if not is_settled or (not model.rectified and contradicted is not None):
             estimate = readout.widen(estimate, declared_global=is_settled)
             found += [readout.as_fact(declared_global=is_settled)] if readout.is_found else []
         if estimate.verdict == "refused":
             return model.scaled(estimate, None)
+        if contradicted is not None and model.timing.readout_s:
+            found.append(contradicted)
+            estimate = downgraded(estimate, found[-1:])
         if self.keeps_intrinsics and readout.focal is not None and readout.focal.contradicts:
             found.append(readout.focal.as_fact())
             estimate = downgraded(estimate, found[-1:])
@@ -285,8 +304,21 @@ class MetricStage(InertialStage):
         cov[CAL.READOUT, CAL.READOUT] = SIGMAS.unknown_readout_s**2
         known = replace(known, prior=replace(known.prior, cov=cov))
         seen = read_seen(reconstruction, timing, chosen)
+        shutter = self.shutter
+        exposed_px = None if shutter is None or not model.rectified else partial(exposed_keypoints, model, shutter)
         with one_blas_thread():
-            return find_readout(seen, timing, self.imu, known)
+            return find_readout(seen, timing, self.imu, known, exposed_px=exposed_px)
+
+
+def exposed_keypoints(model: Model, shutter: InvertibleStage, seen: Seen) -> Array:
+    """(M, 2) observations of a model with rectified keypoints, in the pictures as they were exposed."""
+    keypoints = {}
+    for image_id, name in zip(seen.image_ids, seen.names, strict=True):
+        points = model.reconstruction.image(image_id).points2D
+        mapped = model.observed_px.get(name)
+        xy_px = np.array([p.xy for p in points]).reshape(-1, 2) if mapped is None else mapped
+        keypoints[name] = shutter.as_exposed(name, xy_px)
+    return keypoints_of(seen, keypoints)
 
 
 def provenance(estimate: ScaleEstimate) -> str:

@@ -16,7 +16,16 @@ from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import quat_from_matrix
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import CAL, Action, CameraImuCalibration, Similarity, SolvedMotion, Treatment
+from colmap_inertial.core.types import (
+    CAL,
+    Action,
+    CameraImuCalibration,
+    JoinedPart,
+    ScaleEstimate,
+    Similarity,
+    SolvedMotion,
+    Treatment,
+)
 from colmap_inertial.hooks import InvertibleStage, find_inverse
 from colmap_inertial.inertial.core.priors import AccelPart, accel_part, model_scale_sigma
 from colmap_inertial.inertial.refine.judge import Judged, refine
@@ -25,7 +34,6 @@ from colmap_inertial.inertial.refine.pictures import remove_extremes
 from colmap_inertial.inertial.refine.setup import (
     Seen,
     Written,
-    keypoints_of,
     make_problem,
     move_to_middle_lines,
     read_seen,
@@ -38,7 +46,7 @@ from colmap_inertial.model import Model, downgraded
 from colmap_inertial.model.rigs import has_rigs
 from colmap_inertial.model.similarities import compose
 from colmap_inertial.run.stages.inputs import StageInputs
-from colmap_inertial.run.stages.metric import InertialStage, gravity_in_model
+from colmap_inertial.run.stages.metric import InertialStage, exposed_keypoints, gravity_in_model
 
 if TYPE_CHECKING:
     import pycolmap
@@ -106,19 +114,19 @@ class RefineStage(InertialStage):
     def __call__(self, model: Model, /) -> Model:
         """Refine the model."""
         begin_s = time.perf_counter()
-        why_not = self._why_not(model)
+        why_not = self._find_obstacle(model)
         if why_not is not None:
             return _record(model, Fact("not-refined", why=why_not))
         try:
             with one_blas_thread():
-                refined = self._refined(model)
+                refined = self._refine(model)
         except (NotObservableError, np.linalg.LinAlgError) as error:
             why_not = error.fact if isinstance(error, NotObservableError) else Fact("refine-not-determined")
             return _record(model, Fact("not-refined", why=why_not))
         log.info("model %d: the refinement took %.1f s", model.colmap_index, time.perf_counter() - begin_s)
         return refined
 
-    def _why_not(self, model: Model) -> Fact | None:
+    def _find_obstacle(self, model: Model) -> Fact | None:
         """Why a model cannot be refined; ``None`` where it can."""
         estimate, reconstruction = model.scale, model.reconstruction
         if model.similarity is None or estimate is None or estimate.calibration is None:
@@ -129,7 +137,7 @@ class RefineStage(InertialStage):
             return Fact("refine-images-few", needed=_FEWEST_IMAGES)
         if reconstruction.num_points3D() < _FEWEST_POINTS:
             return Fact("refine-points-few", needed=_FEWEST_POINTS)
-        if has_rigs(reconstruction) or _alternate(model):
+        if has_rigs(reconstruction) or _takes_turns(model):
             return Fact("refine-several-cameras")
         if estimate.parts is not None and estimate.parts.get("accel_faults"):
             return Fact("refine-accel-faults")
@@ -139,65 +147,66 @@ class RefineStage(InertialStage):
             return Fact("refine-shape-in-use", made_from=self.made_from)
         return None
 
-    def _refined(self, model: Model) -> Model:
+    def _refine(self, model: Model) -> Model:
+        """The refined model, or the model with the reason why it stays as it was."""
         seen = remove_extremes(read_seen(model.reconstruction, model.timing))
         known = self.known_of(model, refine_intrinsics=self.refine_intrinsics)
-        problem, start = make_problem(seen, model.timing, self.imu, known, self._exposed_px(model, seen))
-        worth: Worth | None = None
-        if self.auto:
-            worth = expect_worth(seen, problem, start, bent=_ignores_shutter(model))
-            if worth.reason is not None:
-                return _record(model, Fact("not-refined", why=worth.reason), **_worth_figures(worth))
+        problem, start = make_problem(seen, model.timing, self.imu, known, self._expose_keypoints(model, seen))
+        worth = expect_worth(seen, problem, start, bent=_ignores_shutter(model)) if self.auto else None
+        if worth is not None and worth.reason is not None:
+            return _record(model, Fact("not-refined", why=worth.reason), **_worth_figures(worth))
         declared = model.timing.readout_s is not None
         judged = refine(problem, start, seen.observations.xy_px, seen.t_s, readout_declared=declared)
-        figures, evidence = _state_figures(judged) | _worth_figures(worth), _state_evidence(judged, worth)
+        evidence = _state_evidence(judged, worth)
+        figures = _state_figures(judged) | _worth_figures(worth)
         if not judged.accepted:
             model = _doubt_contradicted(model, judged)
             return _record(model, Fact("refinement-rejected", why=judged.reason, evidence=evidence), **figures)
-        x = judged.estimate
         figures |= {"drift": [asdict(part) for part in judged.drift]} | _calibration_figures(judged)
+        return self._apply_refinement(model, seen, problem, judged, evidence, figures)
+
+    def _apply_refinement(
+        self, model: Model, seen: Seen, problem: Problem, judged: Judged, evidence: Fact, figures: dict[str, Any]
+    ) -> Model:
+        """The model as an accepted refinement has it, in metres of its own; as it was where these are refused."""
         assert model.scale is not None and model.scale.calibration is not None
         assert model.similarity is not None and judged.world is not None
+        x, accel = judged.estimate, accel_part(self.imu)
         middle_lines = move_to_middle_lines(problem, x)
-        refined_from_before = _move_of(seen, middle_lines)
-        before = model.scale
-        if model.timing.readout_s or judged.readout:
-            # the shutter is not ignored any more
-            others = tuple(reason for reason in before.reasons if reason.code != SHUTTER_IGNORED)
-            before = replace(before, reasons=others)
-        accel = accel_part(self.imu)
+        refined_from_before = _find_similarity(seen, middle_lines)
         scale, similarity = state_scale(
-            before, model.similarity, refined_from_before, problem, x, judged.world, accel=accel
+            _forget_ignored_shutter(model.scale, model, judged),
+            model.similarity,
+            refined_from_before,
+            problem,
+            x,
+            judged.world,
+            accel=accel,
         )
         if scale.verdict == "refused":
             return _record(model, Fact("refined-scale-refused", reasons=scale.reasons, evidence=evidence), **figures)
-        figures["size_before"] = 1 / refined_from_before.scale
+        figures = figures | {"size_before": 1 / refined_from_before.scale}
+        has_readout = _has_readout(model, judged)
+        rolling = has_readout and not model.rectified
         # a motion's readout has the direction that was declared
         readout_s = x.readout_s if model.timing.readout_s or (judged.readout and x.readout_s > 0) else None
-        rolling = not model.rectified and bool(model.timing.readout_s or judged.readout)
         refined_model = replace(
             model,
             reconstruction=write_back(model.reconstruction, seen, problem, x, rectified=not rolling),
             scale=replace(scale, calibration=_make_refined_calibration(model.scale.calibration, problem, judged)),
             similarity=similarity,
-            parts=tuple(replace(part, similarity=_moved(part.similarity, refined_from_before)) for part in model.parts),
+            parts=tuple(_move_part(part, refined_from_before) for part in model.parts),
             observed_px={},
-            motion=_motion(seen, middle_lines.cam_in_world, judged, accel=accel, readout_s=readout_s),
+            motion=_make_motion(seen, middle_lines.cam_in_world, judged, accel=accel, readout_s=readout_s),
         )
-        refined = Fact("refined", evidence=evidence, rolling_readout_s=x.readout_s if rolling else None)
-        return _record(refined_model, refined, action=Action.REFINED, **figures)
+        done = Fact("refined", evidence=evidence, rolling_readout_s=x.readout_s if rolling else None)
+        return _record(refined_model, done, action=Action.REFINED, **figures)
 
-    def _exposed_px(self, model: Model, seen: Seen) -> Array:
+    def _expose_keypoints(self, model: Model, seen: Seen) -> Array:
         """(M, 2) observations in the pictures as they were exposed."""
         if not model.rectified or self.shutter is None:
             return seen.observations.xy_px
-        keypoints = {}
-        for image_id, name in zip(seen.image_ids, seen.names, strict=True):
-            points = model.reconstruction.image(image_id).points2D
-            mapped = model.observed_px.get(name)
-            xy_px = np.array([p.xy for p in points]).reshape(-1, 2) if mapped is None else mapped
-            keypoints[name] = self.shutter.as_exposed(name, xy_px)
-        return keypoints_of(seen, keypoints)
+        return exposed_keypoints(model, self.shutter, seen)
 
 
 def _doubt_contradicted(model: Model, judged: Judged) -> Model:
@@ -208,17 +217,29 @@ def _doubt_contradicted(model: Model, judged: Judged) -> Model:
     return replace(model, scale=downgraded(scale, (reason,)))
 
 
+def _has_readout(model: Model, judged: Judged) -> bool:
+    """Whether a readout was declared or found."""
+    return bool(model.timing.readout_s or judged.readout)
+
+
+def _forget_ignored_shutter(scale: ScaleEstimate, model: Model, judged: Judged) -> ScaleEstimate:
+    """The scale without the reason that the shutter is ignored, where the refinement does not."""
+    if not _has_readout(model, judged):
+        return scale
+    return replace(scale, reasons=tuple(reason for reason in scale.reasons if reason.code != SHUTTER_IGNORED))
+
+
 def _ignores_shutter(model: Model) -> bool:
     """Whether a model's images were found to have a rolling shutter that it ignores."""
     return any(treatment.reason.code == SHUTTER_IGNORED for treatment in model.treatments)
 
 
-def _alternate(model: Model) -> bool:
+def _takes_turns(model: Model) -> bool:
     """Whether cameras take turns, as two devices or an undeclared rig do; not a camera that zoomed, and back."""
     t_of = dict(zip(model.timing.names, model.timing.pose_t_s().tolist(), strict=True))
     images = [model.reconstruction.image(image_id) for image_id in model.reconstruction.reg_image_ids()]
     timed = sorted((image for image in images if image.name in t_of), key=lambda image: t_of[image.name])
-    used = _devices(model.reconstruction, timed)
+    used = _find_devices(model.reconstruction, timed)
     met = set(used[:1])
     returns = 0
     for before, device in pairwise(used):
@@ -227,7 +248,7 @@ def _alternate(model: Model) -> bool:
     return returns > _MOST_RETURNS * len(used)
 
 
-def _devices(reconstruction: pycolmap.Reconstruction, images: Sequence[pycolmap.Image]) -> list[Hashable]:
+def _find_devices(reconstruction: pycolmap.Reconstruction, images: Sequence[pycolmap.Image]) -> list[Hashable]:
     """Device of each image: its camera; where nearly each image has its own camera, those with the same folder, size
     and focus.
     """
@@ -274,7 +295,9 @@ def _state_evidence(judged: Judged, worth: Worth | None) -> Fact:
     )
 
 
-def _motion(seen: Seen, centres: Array, judged: Judged, *, accel: AccelPart, readout_s: float | None) -> SolvedMotion:
+def _make_motion(
+    seen: Seen, centres: Array, judged: Judged, *, accel: AccelPart, readout_s: float | None
+) -> SolvedMotion:
     """The camera's motion in the model that is written; with what lens and accelerometer leave of its scale."""
     velocity, with_cov = judged.velocity_m_s, np.array(list(judged.motion_covs), dtype=np.int64)
     covs = add_scale(
@@ -291,7 +314,7 @@ def _motion(seen: Seen, centres: Array, judged: Judged, *, accel: AccelPart, rea
     )
 
 
-def _move_of(seen: Seen, after: Written) -> Similarity:
+def _find_similarity(seen: Seen, after: Written) -> Similarity:
     """Similarity from the model before to the refined one: sizes, mean orientation and middles agree."""
     turns = after.cam_from_world.transpose(0, 2, 1) @ seen.cam_from_world
     u, _, vt = np.linalg.svd(turns.sum(axis=0))
@@ -305,8 +328,9 @@ def _move_of(seen: Seen, after: Written) -> Similarity:
     )
 
 
-def _moved(similarity: Similarity, move: Similarity) -> Similarity:
-    return replace(compose(move, similarity), cov=similarity.cov)
+def _move_part(part: JoinedPart, move: Similarity) -> JoinedPart:
+    """A part of a joined model where the refinement moved it; how surely it was placed stays."""
+    return replace(part, similarity=replace(compose(move, part.similarity), cov=part.similarity.cov))
 
 
 def _state_figures(judged: Judged) -> dict[str, Any]:

@@ -147,7 +147,7 @@ def run_batch(
         check_kind(f"captures[{i}]", entry, BatchCapture)
     check_unique(entries, out)
     out = out.resolve()
-    with _owned(out) as run:
+    with _own_folder(out) as run:
         at_work = _Batch([_task(entry, stages, out, run, batch.attempts) for entry in entries], watch)
         waiting = at_work.begin()
         if batch.scheduler is not None:
@@ -173,7 +173,7 @@ def run_batch(
 
 
 @contextlib.contextmanager
-def _owned(out: Path) -> Iterator[str]:
+def _own_folder(out: Path) -> Iterator[str]:
     """Keep other batches out of the folder; yields the name of this run, which stands in a file as long as it goes on.
 
     Raises

@@ -202,7 +202,7 @@ def read_source(
             up_in_world=_up(source, reconstruction),
             gravity_in_world_m_s2=down,
             motion=motion,
-            treated=_treated(Workspace(out)),
+            treated=_read_treated_frames(Workspace(out)),
         )
 
 
@@ -267,7 +267,7 @@ def _up(source: ViewSource, model: pycolmap.Reconstruction) -> Array | None:
     return max((0.0 - down for down in DOWN_IN_WORLD.values()), key=lambda up: float(up @ edges))
 
 
-def _treated(workspace: Workspace) -> dict[str, TreatedFrame]:
+def _read_treated_frames(workspace: Workspace) -> dict[str, TreatedFrame]:
     if not workspace.result.is_file():
         return {}
     with a_record_of_ours(workspace.result):

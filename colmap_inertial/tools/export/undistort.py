@@ -126,7 +126,7 @@ class Undistortion:
     def moved_px(self, xy_px: Array) -> Array:
         """(N, 2) where (N, 2) points of the old picture are in the new one; nan where they have no ray."""
         fx, fy, cx, cy = self.pinhole.params
-        return np.asarray(_normalised(self.camera, xy_px, self.fold) * [fx, fy] + [cx, cy])
+        return np.asarray(_unproject(self.camera, xy_px, self.fold) * [fx, fy] + [cx, cy])
 
     def is_same(self) -> bool:
         """Whether the camera is that pinhole already."""
@@ -148,12 +148,12 @@ class Undistortion:
         target = colmap_px_from_opencv(nodes.reshape(-1, 2))
         # a shift between pixels is the same whichever corner they are counted from
         shift = (self.source_px(target) - target).reshape(nodes.shape)
-        maps = sampling_maps(_continued(shift), width, height, _LIMITS.step_px)
+        maps = sampling_maps(_extrapolate_shifts(shift), width, height, _LIMITS.step_px)
         out = cv2.remap(image, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(out, dtype=np.uint8)
 
 
-def _continued(shift: Array) -> Array:
+def _extrapolate_shifts(shift: Array) -> Array:
     """Shifts at nodes beyond the picture's edge, which a lens may not reach, as those within go on."""
     for axis in (0, 1):
         along = np.moveaxis(shift, axis, 0)
@@ -163,7 +163,7 @@ def _continued(shift: Array) -> Array:
     return shift
 
 
-def _normalised(camera: pycolmap.Camera, xy_px: Array, fold: Fold | None) -> Array:
+def _unproject(camera: pycolmap.Camera, xy_px: Array, fold: Fold | None) -> Array:
     """(N, 2) rays at z = 1 of (N, 2) pixels; nan where the lens model does not lead there and back, or has folded."""
     if len(xy_px) == 0:
         return np.zeros((0, 2))
@@ -192,7 +192,7 @@ def _half_extent(camera: pycolmap.Camera, fold: Fold | None = None) -> Array:
     if fold is not None:
         reach = np.minimum(reach, fold.tangent)
     for (axis, sign), border in sides.items():
-        rays = sign * _normalised(camera, border, fold)[:, axis]
+        rays = sign * _unproject(camera, border, fold)[:, axis]
         rays = rays[np.isfinite(rays) & (rays > 0)]
         if len(rays):
             reach[axis] = min(reach[axis], float(rays.min()))

@@ -27,7 +27,7 @@ class HandheldSpectra:
 
     The densities are the mean of the motion-capture ground truth of TUM-VI room1, room3 and room5 (Schubert et al.
     2018, CC BY 4.0), after subtracting the capture system's noise floor (0.1 mm and 1 mrad per sample at 120 Hz).
-    ``scripts/compare_motion.py`` recomputes and compares them.
+    ``scripts/studies/compare_motion.py`` recomputes and compares them.
     """
 
     frequency_hz: Spectrum = (0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0)
@@ -263,7 +263,7 @@ def _draw_hand(n: int, rng: np.random.Generator, *, low_hz: float, vigour: float
     return vigour * np.concatenate(position, axis=1), vigour * np.concatenate(rotation, axis=1)
 
 
-def _looking(direction: Array) -> Array:
+def _orient_along(direction: Array) -> Array:
     """(N, 4) world_from_cam of a level camera (x right, y down, z forward) that looks along (N, 3) directions."""
     forward = direction / np.linalg.norm(direction, axis=1, keepdims=True)
     right = np.stack([forward[:, 1], -forward[:, 0], np.zeros(len(forward))], axis=1)
@@ -297,10 +297,10 @@ def make_motion(options: MotionOptions, rng: np.random.Generator) -> Motion:
         position = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height], axis=1)
         reach = 0.4 * options.radius_m  # the hand's deliberate swings must not reach the subject
         position = position + reach * np.tanh(shake / reach)
-        looking = _looking(-position)
+        looking = _orient_along(-position)
     else:
         look = heading + np.deg2rad(options.look_deg)
-        looking = np.broadcast_to(_looking(np.array([[np.cos(look), np.sin(look), 0.0]])), (n, 4))
+        looking = np.broadcast_to(_orient_along(np.array([[np.cos(look), np.sin(look), 0.0]])), (n, 4))
         if options.kind in ("walk", "constant_velocity"):
             position = position + options.speed_m_s * t[:, None] * along
         if options.kind == "walk":

@@ -152,7 +152,7 @@ def rolling_shutter_bias_s(readout_s: float, scene_depth_m: tuple[float, float],
     return np.linalg.solve(normal.sum(axis=0), np.einsum("n,nij->ij", readout_s * y, normal))
 
 
-def _correlated(n: int, dt_s: float, sigma: float, correlation_s: float, rng: np.random.Generator) -> Array:
+def _draw_correlated(n: int, dt_s: float, sigma: float, correlation_s: float, rng: np.random.Generator) -> Array:
     """(n, 3) samples of a stationary Ornstein-Uhlenbeck process."""
     from scipy.signal import lfilter
 
@@ -182,10 +182,10 @@ def _perturb_poses(motion: Motion, t_s: Array, options: SfmOptions, rng: np.rand
     velocity_in_cam = np.einsum("nji,nj->ni", world_from_cam, k.velocity_in_world_m_s)
     shift = np.concatenate([k.rate_in_cam_rad_s, velocity_in_cam], axis=1) @ bias_s.T
     turn = shift[:, :3] + options.rotation_white_rad * rng.standard_normal((n, 3))
-    turn += _correlated(n, dt, options.rotation_correlated_rad, options.correlation_s, rng)
+    turn += _draw_correlated(n, dt, options.rotation_correlated_rad, options.correlation_s, rng)
     position = position + np.einsum("nij,nj->ni", world_from_cam, shift[:, 3:])
     position = position + options.position_white_m * rng.standard_normal((n, 3))
-    position = position + _correlated(n, dt, options.position_correlated_m, options.correlation_s, rng)
+    position = position + _draw_correlated(n, dt, options.position_correlated_m, options.correlation_s, rng)
     return quat_multiply(rotation, quat_exp(turn)), position
 
 

@@ -76,7 +76,7 @@ def _shapes(rng: np.random.Generator, image: Float32Array, count: int, smallest_
             cv2.line(image, (int(a[0]), int(a[1])), (int(b[0]), int(b[1])), colour, max(1, int(size / 6)))
 
 
-def _writing(rng: np.random.Generator, image: Float32Array, size_px: float) -> None:
+def _draw_letters(rng: np.random.Generator, image: Float32Array, size_px: float) -> None:
     """A line of made-up letters: a few strokes each, between the points of a 3 x 4 grid."""
     import cv2
 
@@ -97,7 +97,7 @@ def poster(rng: np.random.Generator, height: int, width: int) -> Float32Array:
     )
     _shapes(rng, image, int(40 + height * width / 1500), 3, max(3.0, min(height, width) / 4))
     for _ in range(int(2 + height / 60)):
-        _writing(rng, image, size_px=float(np.exp(rng.uniform(np.log(8), np.log(max(10, height / 9))))))
+        _draw_letters(rng, image, size_px=float(np.exp(rng.uniform(np.log(8), np.log(max(10, height / 9))))))
     return image
 
 

@@ -14,7 +14,7 @@ from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.files import reader
 from colmap_inertial.io.ply import Element, read_ply_header
-from colmap_inertial.report.series import strided
+from colmap_inertial.report.series import stride_indices
 
 if TYPE_CHECKING:
     import pycolmap
@@ -77,13 +77,13 @@ def sparse_cloud(reconstruction: pycolmap.Reconstruction, most: int) -> Cloud:
     ids = np.array(sorted(reconstruction.point3D_ids()), dtype=np.uint64)
     points = reconstruction.points3D
     # a first choice bounds the work for models of millions of points
-    chosen = [points[i] for i in ids[strided(len(ids), 2 * most)].tolist()]
+    chosen = [points[i] for i in ids[stride_indices(len(ids), 2 * most)].tolist()]
     largest = float(np.finfo(np.float32).max)  # what the graphics card's numbers can hold
     chosen = [p for p in chosen if np.abs(p.xyz).max() < largest]
     good = [p for p in chosen if p.track.length() >= LIMITS.fewest_views and not p.error > LIMITS.worst_px]
     if len(good) >= LIMITS.enough_share * len(chosen):
         chosen = good
-    chosen = [chosen[i] for i in strided(len(chosen), most).tolist()]
+    chosen = [chosen[i] for i in stride_indices(len(chosen), most).tolist()]
     rgb = np.array([p.color for p in chosen], dtype=np.uint8).reshape(-1, 3)
     if not rgb.any():  # a model without colours
         rgb = np.full_like(rgb, LIMITS.grey)
@@ -103,7 +103,7 @@ def dense_cloud(path: Path, most: int, origin: Array | None = None) -> Cloud:
         For what is no binary PLY file with points.
     """
     table, _ = _vertices(path)
-    some = np.asarray(table[strided(len(table), most)])
+    some = np.asarray(table[stride_indices(len(table), most)])
     xyz = _positions(some, origin)
     finite = np.isfinite(xyz).all(axis=1)
     some, xyz = some[finite], xyz[finite]

@@ -4,7 +4,7 @@ viser serves whoever reaches its port: any web page in the same browser can open
 message can set any field of a control, its callbacks included. It has no setting for this, and a proxy before it would
 leave its own port open beside the proxy's. But viser listens by the public ``websockets.asyncio.server.serve``, so that
 what that function is given is completed here, while viser starts: every request passes :meth:`Guard.admits`, every
-message :func:`allowed`. A viser that listens in any other way is not served at all.
+message :func:`is_allowed`. A viser that listens in any other way is not served at all.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ def is_loopback(host: str) -> bool:
         return host.lower() == "localhost"
 
 
-def allowed(message: Any) -> bool:
+def is_allowed(message: Any) -> bool:
     """Whether a decoded message is one of the viewer's own page: a click, a pose, the value of a control."""
     if not isinstance(message, dict) or not isinstance(message.get("type"), str):
         return False
@@ -225,7 +225,7 @@ def _complete_settings(guard: Guard, settings: dict[str, Any]) -> dict[str, Any]
             while True:
                 data = await super().recv(decode)
                 with contextlib.suppress(ValueError, RecursionError):  # msgspec's errors are ValueErrors
-                    if isinstance(data, bytes) and allowed(msgspec.msgpack.decode(data)):
+                    if isinstance(data, bytes) and is_allowed(msgspec.msgpack.decode(data)):
                         return data
 
     def process_request(connection: Any, request: Any) -> Any:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from colmap_inertial.report.series import strided
+from colmap_inertial.report.series import stride_indices
 from colmap_inertial.report.words import place_against_tolerance
 from colmap_inertial.tools.view.measure import Measured, length_text
 from colmap_inertial.tools.view.scene import Scene
@@ -127,7 +127,7 @@ def _table(distances: Sequence[KnownDistance]) -> str:
     for distance in distances:
         by_length.setdefault(round(distance.known_m * 1e5), []).append(distance.measured_m)
     lengths = sorted(by_length)
-    lengths = [lengths[i] for i in strided(len(lengths), 8)]
+    lengths = [lengths[i] for i in stride_indices(len(lengths), 8)]
     rows = [
         f"| {length / 100:.1f} | {1000 * float(np.mean(by_length[length])):.2f} | {len(by_length[length])} |"
         for length in lengths

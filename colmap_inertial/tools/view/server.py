@@ -18,7 +18,7 @@ from colmap_inertial.core.arrays import Array, UInt8Array
 from colmap_inertial.core.errors import MissingExtraError, OutputError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import quat_rotate
-from colmap_inertial.report.series import strided
+from colmap_inertial.report.series import stride_indices
 from colmap_inertial.tools.view import panel
 from colmap_inertial.tools.view.drawing import RED, Drawing
 from colmap_inertial.tools.view.guard import Guard, guarding
@@ -204,7 +204,7 @@ class Viewer:
             self._remove("thumbnails")
             if not shown:
                 return
-            for camera in strided(len(self.scene.cameras), LIMITS.thumbnails).tolist():
+            for camera in stride_indices(len(self.scene.cameras), LIMITS.thumbnails).tolist():
                 image, _ = self._image_of(camera, LIMITS.thumbnail_px)
                 if image is not None:
                     self._temporary["thumbnails"].append(self._drawing.frustum(f"/thumbnails/{camera}", camera, image))

@@ -183,7 +183,7 @@ def _find_in_result(workspace: Workspace, index: int | None, given: tuple[Path, 
         if Path(place).is_absolute():
             raise FormatError(root, Fact("result-without-own-model", project=place))
         folder = path_in(root, place, workspace.result)
-        scale = _estimated(fields, "m" if metric else "model")
+        scale = _read_scale_facts(fields, "m" if metric else "model")
         gravity = fields["gravity_in_world_m_s2"]
         down = None if gravity is None else np.array(gravity, dtype=np.float64).reshape(3)
         if down is not None and metric:
@@ -204,11 +204,11 @@ def _find_in_result(workspace: Workspace, index: int | None, given: tuple[Path, 
             mesh=path_in(root, mesh, workspace.result) if mesh else None,
             trajectory=path_in(root, path_file, workspace.result) if path_file else None,
             target=target,
-            stretched=_stretched(fields),
+            stretched=_read_stretched_parts(fields),
         )
 
 
-def _stretched(fields: Mapping[str, Any]) -> tuple[StretchedPart, ...]:
+def _read_stretched_parts(fields: Mapping[str, Any]) -> tuple[StretchedPart, ...]:
     refined = [t for t in fields.get("treatments", []) if t["stage"] == "refine" and t["action"]]
     parts = refined[-1]["values"].get("drift", []) if refined else []
     keys = ("begin_s", "end_s", "percent")
@@ -262,7 +262,7 @@ def _choose(out: Path, sizes: Mapping[int, int], index: int | None) -> int:
     return index
 
 
-def _estimated(fields: Mapping[str, Any], unit: LengthUnit) -> ScaleFacts:
+def _read_scale_facts(fields: Mapping[str, Any], unit: LengthUnit) -> ScaleFacts:
     scale, ci95 = fields["metres_per_unit"], fields["ci95"]
     relative = None if scale is None or ci95 is None else (float(ci95[0]) / scale, float(ci95[1]) / scale)
     return ScaleFacts(

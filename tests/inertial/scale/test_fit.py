@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from colmap_inertial.inertial.core.parameters import ACCEL_GAIN, GYRO_GAIN, N_GLOBALS, Estimate, Prior
-from colmap_inertial.inertial.scale._fit import _excitation_m_s2, _gain_surprise
+from colmap_inertial.inertial.scale._fit import _excitation_m_s2, _measure_gain_surprise
 
 
 def test_gains_surprise_where_they_are_farther_off_than_chance_has_it():
@@ -20,7 +20,7 @@ def test_gains_surprise_where_they_are_farther_off_than_chance_has_it():
 
     def surprise(times, cov):
         gains = times * sigma * rng.standard_normal((400, 3, 3))
-        return np.array([_gain_surprise(prior, replace(start, accel_gain=gain), cov) for gain in gains])
+        return np.array([_measure_gain_surprise(prior, replace(start, accel_gain=gain), cov) for gain in gains])
 
     # all of the gains are known: nine squares are nine on average, and three standard deviations nine times as many
     known = np.zeros((N_GLOBALS, N_GLOBALS))

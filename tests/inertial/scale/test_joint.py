@@ -10,8 +10,9 @@ from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.types import ScaleDrift
 from colmap_inertial.inertial.core.parameters import N_GLOBALS, SCALE
 from colmap_inertial.inertial.core.priors import AccelPart
-from colmap_inertial.inertial.scale import joint
-from colmap_inertial.inertial.scale.joint import _check_drift, estimate_joint, scale_of
+from colmap_inertial.inertial.scale import interval
+from colmap_inertial.inertial.scale.interval import metres_per_unit_of, scale_shift, scale_variances
+from colmap_inertial.inertial.scale.joint import _check_drift, estimate_joint
 from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, simulate_recording
 
 
@@ -21,7 +22,7 @@ def recording():
 
 
 def test_a_fit_that_overstates_the_accelerometer_s_noise_is_corrected_by_its_share(subtests, monkeypatch):
-    monkeypatch.setattr(joint, "judge_gain", lambda *_: None)  # nothing contradicts the calibration
+    monkeypatch.setattr(interval, "find_wrong_gain", lambda *_: None)  # nothing contradicts the calibration
     for label, fitted, shift in (
         ("as expected", 1.0, 0.0),
         ("quieter", 0.5, 0.0),
@@ -34,18 +35,18 @@ def test_a_fit_that_overstates_the_accelerometer_s_noise_is_corrected_by_its_sha
             fit = SimpleNamespace(
                 # 300 centres, of which the states take 200
                 sums={"centre_m": (90.0, 90.0), "drift_m_rts": (10.0, 10.0)}, cov=cov, freedom=1e6, gain_surprise=2.0,
+                t_s=np.linspace(0, 1e4, 100),
                 expected_accel_m_s2_rthz=1e-3, noise=SimpleNamespace(accel_density_m_s2_rthz=fitted * 1e-3),
                 variance_parts={"accel_gain": 1e-6, "motion": 3e-6}, level_variance=0.0,
                 prior_info=None, estimate=SimpleNamespace(metres_per_unit=0.5),
             )  # fmt: skip
-            found = scale_of(fit, np.linspace(0, 1e4, 100), AccelPart(calibrated=True, factor=0.5), clock_rate=1e-3)
-            assert found.shift == pytest.approx(shift, rel=0.01, abs=1e-12)
-            assert found.metres_per_unit == pytest.approx(0.5 * np.exp(shift), rel=1e-4)
+            variances = scale_variances(fit, AccelPart(calibrated=True, factor=0.5), clock_rate=1e-3)
+            assert scale_shift(fit) == pytest.approx(shift, rel=0.01, abs=1e-12)
+            assert metres_per_unit_of(fit) == pytest.approx(0.5 * np.exp(shift), rel=1e-4)
             # the surprise doubles the variance of the gains, and results of the device halve their standard deviation
-            assert found.parts["accel_gain"] ** 2 == pytest.approx(0.5 * 1e-6, rel=0.02)
-            assert found.parts["motion"] ** 2 == pytest.approx(3e-6, rel=0.02)
-            assert found.parts["clocks"] == pytest.approx(2 * 1e-3)
-            assert found.sigma_log == pytest.approx(sum(part**2 for part in found.parts.values()) ** 0.5)
+            assert variances["accel_gain"] == pytest.approx(0.5 * 1e-6, rel=0.02)
+            assert variances["motion"] == pytest.approx(3e-6, rel=0.02)
+            assert variances["clocks"] == pytest.approx((2 * 1e-3) ** 2)
 
 
 def test_a_camera_that_stands_in_its_model_has_no_scale(recording):

@@ -1,0 +1,1 @@
+"""Benchmarks, studies, examples and tools of the checkout; not part of what is installed."""
