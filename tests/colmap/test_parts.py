@@ -205,7 +205,7 @@ def test_a_process_ends_with_the_one_that_started_it(ring, tmp_path):
 
 def test_the_number_of_workers_is_that_of_the_command_and_no_option_of_the_result(monkeypatch):
     given = []
-    monkeypatch.setattr(Reconstruct, "_by_imu", lambda self: given.append(RunContext().executor.number) or 0)
+    monkeypatch.setattr(Reconstruct, "_scale_by_imu", lambda self: given.append(RunContext().executor.number) or 0)
     for argv in (["--workers", "3"], []):
         with pytest.raises(SystemExit, match="0"):
             main(["reconstruct", "capture", "out", *argv])
