@@ -148,9 +148,10 @@ _MAP = """
 import sys
 from dataclasses import replace
 from pathlib import Path
-from colmap_inertial.colmap import mapping, submaps
+from colmap_inertial.colmap import chunks
+from colmap_inertial.colmap.mapping import mapper as mapping, submaps
 from colmap_inertial.core.options import MappingOptions
-from colmap_inertial.run.steps import chunks
+
 from colmap_inertial.colmap.context import RunContext
 
 submaps.SIZES = replace(submaps.SIZES, least=2, shortest=12, longest=12, shared=1 / 3)
