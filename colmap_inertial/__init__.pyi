@@ -51,8 +51,8 @@ from .hooks import (
 )
 from .imaging.blur_field import BlurField as BlurField
 from .imaging.gyro_camera import FrameShutter as FrameShutter, GyroCamera as GyroCamera
+from .imaging.path_filters import DeblurOptions as DeblurOptions, deblur as deblur
 from .imaging.psf import blur_field as blur_field, frame_blur as frame_blur
-from .imaging.wiener import DeblurOptions as DeblurOptions, deblur as deblur
 from .inertial.scale import estimate_scale as estimate_scale, gravity_at_latitude_m_s2 as gravity_at_latitude_m_s2
 from .inertial.static_calibration import RestCalibration as RestCalibration, calibrate_imu as calibrate_imu
 from .io.calibration import (

@@ -18,6 +18,7 @@ from colmap_inertial import (
     reconstruct,
     write_calibration,
 )
+from colmap_inertial.core.errors import OutputExistsError
 from colmap_inertial.hooks import insert_defaults
 from tests.helpers.desk_scene import DETERMINISTIC, contents, copy_scene
 
@@ -168,7 +169,9 @@ def test_doubts_are_enforced_after_the_stages_whoever_wrote_them(capture, bare, 
     options = ReconstructOptions(mapping=DETERMINISTIC.mapping, force=True)
     out = tmp_path / "out"  # mapped once
     for stages in ([mine], [..., mine], [...]):
-        result = reconstruct(capture, out, options, frame_stages=[], keypoint_stages=[], model_stages=stages)
+        result = reconstruct(
+            capture, out, options, frame_stages=[], keypoint_stages=[], model_stages=stages, overwrite=True
+        )
         (model,) = result.models
         assert model.scale.verdict == "weak" and str(model.scale.reasons[0]) == "the video was stabilised"
         assert stored(out)["models"][0]["verdict"] == "weak"
@@ -177,12 +180,17 @@ def test_doubts_are_enforced_after_the_stages_whoever_wrote_them(capture, bare, 
     assert [tuple(map(str, doubts)) for doubts in seen] == [("the video was stabilised",)] * 2
 
 
-def test_a_finished_run_is_gone_on_with_where_the_options_ask_for_more(capture, bare):
+def test_with_overwrite_what_depends_on_an_option_is_made_again_and_the_rest_kept(capture, bare):
     out, first, _ = bare
     before = contents(out)
     log = (out / "log.txt").read_text()
     options = dataclasses.replace(DETERMINISTIC, world="y-down")
-    second = reconstruct(capture, out, options, frame_stages=[], keypoint_stages=[])
+    with pytest.raises(OutputExistsError, match=r"step metric .* world = y-down \(was z-up\)"):
+        reconstruct(capture, out, options, frame_stages=[], keypoint_stages=[])
+    found = contents(out)
+    assert {name for name in found if found[name] != before.get(name)} == {"log.txt"}
+    log = (out / "log.txt").read_text()
+    second = reconstruct(capture, out, options, frame_stages=[], keypoint_stages=[], overwrite=True)
     assert not second.unchanged
     new = (out / "log.txt").read_text()[len(log) :]
     for step in ("frames", "matches", "mapping"):
@@ -198,7 +206,7 @@ def test_a_finished_run_is_gone_on_with_where_the_options_ask_for_more(capture, 
     assert again.unchanged
     np.testing.assert_array_equal(again.models[0].scale.cov, second.models[0].scale.cov)
     # and back
-    back = reconstruct(capture, out, DETERMINISTIC, frame_stages=[], keypoint_stages=[])
+    back = reconstruct(capture, out, DETERMINISTIC, frame_stages=[], keypoint_stages=[], overwrite=True)
     assert not back.unchanged
     assert contents(out)["sparse/0/images.bin"] == before["sparse/0/images.bin"]
 
@@ -209,7 +217,7 @@ def test_a_calibration_given_later_maps_nothing_again(capture, bare, tmp_path):
     write_calibration(tmp_path / "device.json", dataclasses.replace(known, cov=known.cov / 100))
     before, log = contents(out), (out / "log.txt").read_text()
     options = dataclasses.replace(DETERMINISTIC, calibration=tmp_path / "device.json")
-    second = reconstruct(capture, out, options, frame_stages=[], keypoint_stages=[])
+    second = reconstruct(capture, out, options, frame_stages=[], keypoint_stages=[], overwrite=True)
     new = (out / "log.txt").read_text()[len(log) :]
     assert all(f"{step}: finished in an earlier run, kept" in new for step in ("frames", "matches", "mapping"))
     assert "metric: started" in new and not second.unchanged
@@ -238,23 +246,16 @@ def test_a_run_reads_each_model_from_disk_twice_at_most(tmp_path, monkeypatch):
     assert isinstance(read(out / "colmap" / "sparse" / "0"), pycolmap.Reconstruction)
 
 
-def test_a_killed_change_of_a_finished_run_leaves_the_earlier_result(capture, bare, tmp_path):
-    """While something is made again, the folder is what it was."""
-    out = shutil.copytree(bare[0], tmp_path / "out")
-    earlier, seen = (out / "result.json").read_bytes(), []
-
-    def stop(stage, done, total, /):
-        seen.append((out / "result.json").read_bytes() == earlier)
-        if stage == "metric":
-            raise KeyboardInterrupt
-
-    options = dataclasses.replace(DETERMINISTIC, world="y-down")
-    with pytest.raises(KeyboardInterrupt):
-        reconstruct(capture, out, options, frame_stages=[], keypoint_stages=[], progress=stop)
-    assert seen and all(seen)
-    assert (out / "result.json").read_bytes() == earlier
-    assert reconstruct(capture, out, options, frame_stages=[], keypoint_stages=[]).models[0].sparse_metric is not None
-    assert (out / "result.json").read_bytes() != earlier
+def test_a_recording_that_changed_does_not_replace_a_finished_result(capture, bare, tmp_path):
+    recording, out = shutil.copytree(capture, tmp_path / "capture"), tmp_path / "out"
+    reconstruct(recording, out, DETERMINISTIC, frame_stages=[], keypoint_stages=[])
+    before = contents(out)
+    rows = (recording / "gyro.csv").read_text().splitlines(keepends=True)
+    (recording / "gyro.csv").write_text("".join(rows[:-1]))
+    with pytest.raises(OutputExistsError, match="step check would change: the recording"):
+        reconstruct(recording, out, DETERMINISTIC, frame_stages=[], keypoint_stages=[])
+    found = contents(out)
+    assert {name for name in found if found[name] != before.get(name)} == {"log.txt"}
 
 
 def test_a_frame_cannot_be_both_dropped_and_seen():

@@ -1,31 +1,42 @@
-"""The command line: arguments, one call each, errors as one line. Nothing heavy is imported before a command runs."""
+"""The command line: each command's arguments in a file named like it, one call each, errors as one line.
+
+Nothing heavy is imported before a command runs.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-import difflib
-import functools
-import itertools
 import os
-import re
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Union
 
 import tyro
-from tyro.conf import subcommand
 
 from colmap_inertial import __version__
-from colmap_inertial.cli.captures import Batch, Deblur, FuseApertures, FuseExposures, Reconstruct, Simulate
-from colmap_inertial.cli.help import options_of, print_help, print_overview
-from colmap_inertial.cli.models import Align, Apply, CalibrateImu, Diagnose, Export, Scale, Validate, View
+from colmap_inertial.cli.align import Align
+from colmap_inertial.cli.apply import Apply
+from colmap_inertial.cli.batch import Batch
+from colmap_inertial.cli.calibrate_imu import CalibrateImu
+from colmap_inertial.cli.command import Command, log_on_terminal, print_json
+from colmap_inertial.cli.deblur import Deblur
+from colmap_inertial.cli.diagnose import Diagnose
+from colmap_inertial.cli.export import Export
+from colmap_inertial.cli.fuse_apertures import FuseApertures
+from colmap_inertial.cli.fuse_exposures import FuseExposures
+from colmap_inertial.cli.help import print_help, print_overview
 from colmap_inertial.cli.process import INTERRUPTED, TERMINATED, Terminated, answering_signals, require_limits
-from colmap_inertial.cli.speech import Speaker, log_on_terminal, print_json
+from colmap_inertial.cli.reconstruct import Reconstruct
+from colmap_inertial.cli.scale import Scale
+from colmap_inertial.cli.simulate import Simulate
+from colmap_inertial.cli.validate import Validate
+from colmap_inertial.cli.view import View
 from colmap_inertial.core.errors import InertialError, describe_environment_fault, fact_of
-from colmap_inertial.core.facts import Fact, with_sentences
-from colmap_inertial.core.options import ProjectOptions, ReadLimits, ReconstructOptions, ReferenceOptions
+from colmap_inertial.core.facts import with_sentences
+from colmap_inertial.core.options import ReadLimits, ReconstructOptions
 from colmap_inertial.core.printing import say
 
 DESCRIPTION = """Metric, gravity-aligned COLMAP models from the gyroscope and accelerometer recorded beside the images.
@@ -38,11 +49,8 @@ found, 130 interrupted.
 
 --version prints the version; --tyro-print-completion bash (zsh, tcsh) a script that completes names and options."""
 
-#: Values of positional arguments go by their names; an option that is not given is left out, not given as None.
-_CONFIG = (tyro.conf.PositionalMetavarFromFieldName, tyro.conf.DisallowNone)
-
-#: By what they begin with.
-_GROUPS: dict[str, dict[str, type[Speaker]]] = {
+#: The commands, by what they begin with.
+GROUPS: dict[str, dict[str, type[Command]]] = {
     "From a recording to metres": {
         "diagnose": Diagnose,
         "reconstruct": Reconstruct,
@@ -53,173 +61,64 @@ _GROUPS: dict[str, dict[str, type[Speaker]]] = {
     "Calibrate a device": {"align": Align, "calibrate-imu": CalibrateImu},
     "Images only": {"deblur": Deblur, "fuse-apertures": FuseApertures, "fuse-exposures": FuseExposures},
 }
-_COMMANDS: dict[str, type[Speaker]] = {name: cls for group in _GROUPS.values() for name, cls in group.items()}
-#: Options that most people use, by field; in the help they come first. Without an entry all do, in their order.
-_COMMON: dict[str, tuple[str, ...]] = {
-    "reconstruct": ("dense", "calibration", "deblur", "rolling_shutter", "world", "config", "force"),
-    "batch": ("workers", "config", "dense", "allow_stages"),
-    "scale": ("imu", "frame_times", "calibration", "json"),
-    "align": ("imu", "frame_times", "out", "remember"),
-    "diagnose": ("imu", "frame_times", "json"),
-    "validate": ("images", "target", "tolerance", "pictures"),
-    "calibrate-imu": ("out", "latitude_deg", "height_m", "remember"),
-    "fuse-apertures": ("refocus", "lens_width", "depth", "disparity_px"),
-    "apply": ("scale", "factor", "sim3", "undo", "world"),
-    "export": ("program", "images", "model"),
-}
+COMMANDS = {name: command for group in GROUPS.values() for name, command in group.items()}
+
+#: Values of positional arguments go by their names; an option that is not given is left out, not given as None; one of
+#: several values is given once for each, so that it swallows no path.
+_CONFIG = (tyro.conf.PositionalMetavarFromFieldName, tyro.conf.DisallowNone, tyro.conf.UseAppendAction)
 _HELP, _HELP_ALL = ("-h", "--help"), "--help-all"
-#: Options that take several values, and what is said where none follows.
-_LISTS = {
-    "--calibration": "calibration-takes-files",
-    "--colmap": "colmap-takes-settings",
-}
-_SETTING = re.compile(r"\w+\.\w+=")
 
 
-def parse(args: Sequence[str]) -> Speaker:
+def parse(args: Sequence[str]) -> Command:
     """The command that the arguments describe; exits with code 2 and a message when they describe none.
 
-    ``--help`` prints its page and exits with code 0.
+    ``--help`` and ``--help-all`` print their pages and exit with code 0.
 
     Raises
     ------
     FormatError
         For a ``--config`` file that cannot be read.
-    InertialError
-        For ``--calibration`` without a file, for a command or an option that there is not, with the nearest one, and
-        for ``--quiet`` with ``--verbose``.
+    ValueError
+        For an option's value that is impossible, or options that do not go together.
     """
     if not args or args[0] in (*_HELP, _HELP_ALL):
-        print_overview(DESCRIPTION, _GROUPS, ReadLimits)
+        print_overview(DESCRIPTION, GROUPS, ReadLimits)
         sys.exit(0 if args else 2)
     name = args[0].replace("_", "-")
-    if name in _COMMANDS and any(word in (*_HELP, _HELP_ALL) for word in args[1:]):
-        titles = {
-            ProjectOptions: "An existing COLMAP project in place of a capture",
-            ReferenceOptions: "Metres without an IMU",
-        }
-        common, everything = _COMMON.get(name, ()), _HELP_ALL in args[1:]
-        print_help(name, _COMMANDS[name], common, titles, Speaker, everything=everything)
+    if name not in COMMANDS:  # to be told which there are, or to complete what one types
+        choices: list[Any] = [Annotated[each, tyro.conf.subcommand(name)] for name, each in COMMANDS.items()]
+        commands: Any = Union[tuple(choices)]  # noqa: UP007 (built at run time)
+        return tyro.cli(commands, prog="colmap-inertial", description=DESCRIPTION, args=args, config=_CONFIG)
+    command, options, prog = COMMANDS[name], args[1:], f"colmap-inertial {name}"
+    if not {*_HELP, _HELP_ALL}.isdisjoint(options):
+        print_help(name, command, everything=_HELP_ALL in options)
         sys.exit(0)
-    args = [*args[:1], *_expand_options(args)]
-    _require_known(args)
-    choices: list[Any] = []
-    for name, cls in _COMMANDS.items():
-        default = _read_default(cls, args) if list(args[:1]) == [name] else None
-        settings = subcommand(name) if default is None else subcommand(name, default=default)
-        choices.append(Annotated[cls, settings])
-    args = _move_lists_last(args)
-    command: Any = Union[tuple(choices)]  # noqa: UP007 (built at run time)
-    made: Speaker = tyro.cli(command, prog="colmap-inertial", description=DESCRIPTION, args=list(args), config=_CONFIG)
-    if made.quiet and made.verbose:
-        raise InertialError(Fact("quiet-and-verbose"))
-    return made
+    return tyro.cli(command, prog=prog, args=options, default=_read_default(command, options, prog), config=_CONFIG)
 
 
-def _expand_options(args: Sequence[str]) -> list[str]:
-    """Complete the abbreviated options after the command.
+@dataclass(frozen=True)
+class _WithConfig:
+    """What is read of the arguments before the others: their defaults are in that file."""
 
-    The name of an option's group may be left out, and may stand where there is none: ``--latitude-deg`` and
-    ``--scale.latitude-deg`` are the same in every command.
-
-    Raises
-    ------
-    InertialError
-        For an option that belongs to several groups.
-    """
-    command = args[0].replace("_", "-")
-    if command not in _COMMANDS:
-        return list(args[1:])
-    options = _options(command)
-    words = []
-    for word in args[1:]:
-        name, equals, value = word.partition("=")
-        plain = "--" + name.removeprefix("--").replace("_", "-")
-        if name.startswith("--") and len(name) > 2 and plain not in options:
-            last = plain.rpartition(".")[2].removeprefix("--")
-            meant = [option for option in options if option.rpartition(".")[2].removeprefix("--") == last]
-            if len(meant) > 1:
-                raise InertialError(Fact("option-ambiguous", command=args[0], options=meant, name=name))
-            grouped = "." in plain and "." in "".join(meant)
-            word = f"{meant[0]}{equals}{value}" if meant and not grouped else word
-        words.append(word)
-    return words
+    config: Path | None = None
 
 
-def _require_known(args: Sequence[str]) -> None:
-    """Refuse a command or an option that there is not, also where something else is missing."""
-    if not args or args[0].startswith("-"):
-        if args and args[0] not in (*_HELP, "--version", "--tyro-print-completion"):
-            raise InertialError(Fact("command-comes-first", word=args[0]))
-        return
-    command = args[0].replace("_", "-")
-    if command not in _COMMANDS:
-        raise InertialError(Fact("no-such-command", word=args[0], nearest=_find_nearest(args[0], _COMMANDS)))
-    words = [word.partition("=")[0] for word in args[1:] if word.startswith("--") and word != "--"]
-    options = _options(command)
-    for word in words:
-        if word.replace("_", "-") not in options:
-            raise InertialError(
-                Fact("no-such-option", command=args[0], option=word, nearest=_find_nearest(word, options))
-            )
-
-
-@functools.cache
-def _options(command: str) -> tuple[str, ...]:
-    """All options of a command, and the other form of each switch."""
-    options = ["--tyro-print-completion"]
-    for option in options_of(_COMMANDS[command], with_text=False):
-        if option.positional:
-            continue
-        first = option.names[0]
-        at = first.rfind(".") + 1 or 2
-        options += [first] if option.value else [first, f"{first[:at]}no-{first[at:]}"]
-    return tuple(options)
-
-
-def _find_nearest(word: str, choices: Iterable[str]) -> str | None:
-    like = difflib.get_close_matches(word, list(choices), n=1)
-    return like[0] if like else None
-
-
-def _move_lists_last(args: Sequence[str]) -> list[str]:
-    """The same with what follows ``--calibration`` and ``--colmap`` at the end, where it swallows no path.
-
-    The first takes one file, and a second one where that is another JSON file; the other takes settings. Each may be
-    given several times.
-    """
-    rest, remaining = list[str](), list(args)
-    lists: dict[str, list[str]] = {"--calibration": [], "--colmap": []}
-    while remaining:
-        word, equals, value = remaining[0].partition("=")
-        if word not in lists:
-            rest.append(remaining.pop(0))
-            continue
-        remaining[:1] = [value] if equals else []
-        if not remaining or remaining[0].startswith("--"):
-            raise InertialError(Fact(_LISTS[word]))
-        lists[word].append(remaining.pop(0))
-        while remaining and (
-            remaining[0].lower().endswith(".json") if word == "--calibration" else _SETTING.match(remaining[0])
-        ):
-            lists[word].append(remaining.pop(0))
-    return [*rest, *(argument for word, values in lists.items() if values for argument in (word, *values))]
-
-
-def _read_default(cls: type[Speaker], args: Sequence[str]) -> Speaker | None:
+def _read_default(command: type[Command], args: Sequence[str], prog: str) -> Any:
     """The command with its options from ``--config``, so that flags go before the file and the file before defaults."""
+    if "config" not in {f.name for f in dataclasses.fields(command)}:
+        return tyro.MISSING_NONPROP
+    file = tyro.cli(_WithConfig, prog=prog, args=args, return_unknown_args=True, add_help=False)[0].config
+    if file is None:
+        return tyro.MISSING_NONPROP
     from colmap_inertial.run.steps.config import read_config
 
-    given = [word.partition("=")[2] for word in args if word.startswith("--config=")]
-    given += [value for word, value in itertools.pairwise(args) if word == "--config"]
-    if not given or cls not in (Reconstruct, Scale, Batch):
-        return None
-    options: Any = read_config(Path(given[-1]), ReconstructOptions)
-    if cls is Scale:
-        options = options.scale
-    missing = dataclasses.MISSING
-    required = [f.name for f in dataclasses.fields(cls) if f.default is f.default_factory is missing]
-    return cls(**dict.fromkeys(required, tyro.MISSING), options=options)
+    options = read_config(file, ReconstructOptions)
+    values = {f.name: tyro.MISSING for f in dataclasses.fields(command) if _is_required(f)}
+    return command(**values, options=options.scale if command is Scale else options)  # type: ignore[call-arg]
+
+
+def _is_required(field: dataclasses.Field[Any]) -> bool:
+    return field.default is field.default_factory is dataclasses.MISSING
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -264,8 +163,7 @@ def _main(args: Sequence[str] | None) -> None:
             print_json({**with_sentences({"error": fact_of(error)}), "error": str(error), "exit_code": code})
         say("\n".join([f"error: {error}", *getattr(error, "__notes__", ())]), error=True)
     except KeyboardInterrupt as stop:
-        resumes = isinstance(command, Reconstruct | Deblur | FuseApertures | FuseExposures | Batch)
-        again = "; started again with the same arguments, it continues" if resumes else ""
+        again = "; started again with the same arguments, it continues" if command.resumes else ""
         say(f"interrupted{again}", error=True)
         code = TERMINATED if isinstance(stop, Terminated) else INTERRUPTED
     except (MemoryError, OSError, ImportError, RuntimeError) as error:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from rich.text import Text
 
     from colmap_inertial.core.types import CameraImuCalibration, ImuCalibration, ScaleEstimate
+    from colmap_inertial.core.types.evidence import CombinedScale
     from colmap_inertial.diagnose import Diagnosis
     from colmap_inertial.inertial.static_calibration import RestCalibration
     from colmap_inertial.io.table_report import TableReport
@@ -117,7 +118,20 @@ def _print_panel(title: str, lines: Iterable[Line]) -> None:
 
 def show_scale(estimate: ScaleEstimate, source: Path) -> None:
     """Print one scale estimate."""
-    _print_panel(str(source), [*scale_lines(estimate), ("method", f"{estimate.method}, {estimate.runtime_s:.2f} s")])
+    lines = [*scale_lines(estimate), ("method", f"{estimate.method}, {estimate.runtime_s:.2f} s")]
+    if estimate.sensors is not None:
+        lines += evidence_lines(estimate.sensors)
+    _print_panel(str(source), lines)
+
+
+def evidence_lines(combined: CombinedScale) -> list[Line]:
+    """What each sensor says of the scale, a line for each, and how wrong the device's own metres are."""
+    from colmap_inertial.report.evidence import device_in_words, evidence_rows
+
+    lines: list[Line] = [(row.sensor, row.text) for row in evidence_rows(combined.as_json())]
+    if combined.device is not None:
+        lines.append(("device's metres", device_in_words(combined.device.as_json())))
+    return lines
 
 
 def show_applied(applied: Applied) -> None:
@@ -249,12 +263,12 @@ def show_validation(result: Validation) -> None:
 
 def imaging_lines(frames: Sequence[FrameRecord], plan: ImagingPlan, rectified: Collection[str]) -> list[Line]:
     """Treatment of the frames, as labelled lines."""
-    from colmap_inertial.run.commands.result import shutter_note
+    from colmap_inertial.run.commands.result import describe_shutter
 
     counts = {"deblurred": sum(f.sharpened for f in frames), "dropped": sum(not f.used for f in frames)}
     done = ", ".join(f"{count} {word}" for word, count in counts.items() if count)
     view = plan.view
-    note, shutter = str(plan.deblur_note or ""), str(shutter_note(plan, rectified) or "")
+    note, shutter = str(plan.deblur_note or ""), str(describe_shutter(plan, rectified) or "")
     lines: list[Line] = [
         ("deblurring", f"{done} of {len(frames)} frames: {note}" if done else note),
         ("shutter", shutter),

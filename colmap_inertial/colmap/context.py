@@ -1,4 +1,4 @@
-"""Values that go through a run: the recording, and how the work is done."""
+"""How the work of a run is done: threads, seed, device, COLMAP's settings."""
 
 from __future__ import annotations
 

@@ -444,6 +444,8 @@ class BatchOptions(CheckedOptions):
     """Address of a Dask scheduler (tcp://host:8786), whose workers do the work instead (needs the extra `cluster`)."""
     attempts: int = 3
     """How often a capture is started in all, where its process or its worker is killed."""
+    overwrite: bool = False
+    """Where a finished capture is given other options, or was changed: make again what depends on that."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -295,6 +295,8 @@ class Recorded:
         """Agreement of a reconstruction's cameras with the gyroscope; ``None`` where either is missing."""
         if self.imu is None or self.trajectory is None:
             return None
+        if self._too_long is not None:
+            return self._too_long
         options = AlignOptions(max_offset_s=self.max_offset_s)
         try:
             return align_by_consensus(
@@ -396,6 +398,13 @@ class Recorded:
             prior = reset_for_recording(prior)
         return self._align(self.turning, imu, prior, None if any_offset else self.max_offset_s)
 
+    @property
+    def _too_long(self) -> NotObservableError | None:
+        """Why no offset is searched: there are hours of them, for frames that mostly have no gyroscope beside them."""
+        if self.clocks is None or (self.clocks.unit_factor or 0) <= 1:
+            return None
+        return NotObservableError("time offset", self.clocks.fact)
+
     def _align(
         self,
         turning: CameraTrajectory,
@@ -403,9 +412,8 @@ class Recorded:
         prior: CameraImuCalibration | None,
         max_offset_s: float | None,
     ) -> Alignment | NotObservableError:
-        if self.clocks is not None and (self.clocks.unit_factor or 0) > 1:
-            # hours of offsets to search, for frames that mostly have no gyroscope beside them
-            return NotObservableError("time offset", self.clocks.fact)
+        if self._too_long is not None:
+            return self._too_long
         options = AlignOptions(max_offset_s=max_offset_s)
         if self.trajectory is None:
             # the camera's translation is in the pixels' motion, and no gyroscope explains it

@@ -201,7 +201,7 @@ def _estimate_readout(recorded: Recorded) -> ReadoutEstimate:
         raise NotObservableError("readout", Fact("readout-without-gyroscope"))
     if recorded.stabilisation is not None and recorded.stabilisation.stabilised:
         raise NotObservableError("readout", Fact("readout-of-stabilised-video"))
-    timed = CameraTimedImu.from_recording(imu, aligned.settled(), rotation.epoch_ns)
+    timed = CameraTimedImu.from_recording(imu, aligned.settle_clock_rate(), rotation.epoch_ns)
     return estimate_readout(rotation, GyroCamera.from_timed(timed))
 
 

@@ -1,4 +1,4 @@
-"""Division of an image for deblurring: cells with one set of taps each, and borders that stay untouched."""
+"""Division of an image into cells with one blur each, and where blur is too short to be undone."""
 
 from __future__ import annotations
 
@@ -36,15 +36,10 @@ class Cells:
     along_y: BoolArray
     fade: Float32Array
 
-    @property
-    def typical_px(self) -> float:
-        """Mean length of the blur."""
-        return float(np.mean(self.extent_px * np.hypot(1, self.slope)))
-
     @classmethod
-    def of(cls, blur: BlurField, cell_px: int = CELL_PX) -> Cells:
-        """Cells of ``cell_px`` for a field."""
-        corner_y, corner_x = (np.arange(0, n + cell_px, cell_px) for n in (blur.height, blur.width))
+    def of(cls, blur: BlurField) -> Cells:
+        """Of a field."""
+        corner_y, corner_x = (np.arange(0, n + CELL_PX, CELL_PX) for n in (blur.height, blur.width))
         centre_y, centre_x = (
             (corner[:-1] + np.minimum(corner[1:], n) - 1) / 2
             for corner, n in ((corner_y, blur.height), (corner_x, blur.width))

@@ -64,11 +64,11 @@ def split_colours(image: AnyArray, threads: int) -> tuple[Float32Array, Float32A
 
 def join_colours(luma: Float32Array, chroma: Float32Array, threads: int) -> Float32Array:
     """(H, W, 3) RGB from luma and chroma as :func:`split_colours` gives them; detail of chroma follows that of luma."""
-    from colmap_inertial._kernels import _wiener
+    from colmap_inertial._kernels import _light
 
     result = np.empty((*luma.shape, 3), dtype=np.float32)
     red, blue = CHROMA_MODEL.red, CHROMA_MODEL.blue
-    _wiener.join(luma, _fit_lines(luma, chroma), result, red=red, blue=blue, threads=threads)
+    _light.join(luma, _fit_lines(luma, chroma), result, red=red, blue=blue, threads=threads)
     return result
 
 

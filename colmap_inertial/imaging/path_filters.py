@@ -9,21 +9,45 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.core.arrays import Array, Float32Array
+from colmap_inertial.core.choices import CheckedOptions
 from colmap_inertial.core.threads import usable_processors
 from colmap_inertial.imaging._cells import Cells
 from colmap_inertial.imaging._chroma import join_colours, split_colours
 from colmap_inertial.imaging._tiles import TILING, TiledPaths, Tiling
+from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.transfer import decode_table, encode_table, linearise, srgb_from_linear
-from colmap_inertial.imaging.wiener import DeblurOptions, lowest_saturated_code, require_planes
 
 Code = TypeVar("Code", np.uint8, np.uint16)
+
+#: Pixels as bright as this share of the largest code may have been clipped.
+SATURATED = 250 / 255
+#: Longer blurs leave nothing to restore.
+LONGEST_PX = 500.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeblurOptions(CheckedOptions):
+    """Options of the deconvolution."""
+
+    noise: float | None = None
+    """Standard deviation of the image noise in linear light, full scale = 1; estimated from each image where absent."""
+
+    threads: int | None = None
+    """Threads for one image; as many as the process may use where absent."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.noise is not None and not 0 <= self.noise < 1:
+            raise ValueError("noise must be at least 0 and below 1")
+        if self.threads is not None and self.threads < 1:
+            raise ValueError("threads must be at least 1")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +81,31 @@ class PathFilterModel:
 
 
 FILTER_MODEL = PathFilterModel()
+
+
+def deblur(image: NDArray[Code], blur: BlurField, options: DeblurOptions | None = None) -> NDArray[Code]:
+    """Undo motion blur along straight lines that are centred on each pixel: :func:`path_wiener` along them.
+
+    Parameters
+    ----------
+    image
+        (H, W) or (H, W, channels), uint8 or uint16, sRGB.
+    blur
+        Along which line every pixel smears; of the image's size.
+    options
+        Defaults serve.
+
+    Returns
+    -------
+    A new image of the same shape and type. Pixels whose blur is below half a pixel, and those near a clipped lamp or
+    glint (two blur lengths), are the input's, bit for bit.
+
+    Raises
+    ------
+    ValueError
+        Where the image is of another type, the blur of another size, or longer than `LONGEST_PX`.
+    """
+    return path_wiener(image, BlurPath.straight(blur), options)
 
 
 def path_wiener(image: NDArray[Code], path: BlurPath, options: DeblurOptions | None = None) -> NDArray[Code]:
@@ -105,12 +154,12 @@ def smoothed(image: NDArray[Code], sigma_px: float) -> NDArray[Code]:
     """An image smoothed by a Gaussian in linear light, as feature extraction likes it after a filter."""
     import cv2
 
-    from colmap_inertial._kernels import _wiener
+    from colmap_inertial._kernels import _light
 
     light = np.asarray(cv2.GaussianBlur(linearise(image), (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT_101))
     if image.dtype == np.uint8:  # the table is fine enough for 256 codes
         codes = np.empty(light.size, dtype=np.uint8)
-        _wiener.encode(light.reshape(-1), codes, encode=encode_table(image.dtype))
+        _light.encode(light.reshape(-1), codes, encode=encode_table(image.dtype))
         return np.asarray(codes.reshape(image.shape), dtype=image.dtype)
     exact = np.iinfo(image.dtype).max * srgb_from_linear(light.astype(np.float64)).astype(np.float32)
     return np.rint(exact).astype(image.dtype)
@@ -235,7 +284,7 @@ def _filter_light(
 def _filter_image(
     image: NDArray[Code], path: BlurPath, options: DeblurOptions, splitting: Sequence[float]
 ) -> NDArray[Code]:
-    planes = require_planes(image, path, "path", path.extent_px())
+    planes = _require_planes(image, path)
     threads = options.threads or usable_processors()
     if planes.shape[2] == 3:
         luma, chroma = split_colours(planes, threads)
@@ -249,12 +298,24 @@ def _filter_image(
     return blend_where_blurred(planes, sharp, path, threads).reshape(image.shape)
 
 
+def _require_planes(image: NDArray[Code], path: BlurPath) -> NDArray[Code]:
+    """The image as (H, W, channels); ``ValueError`` where it or its blur is not one that can be undone."""
+    if image.dtype not in (np.uint8, np.uint16) or image.ndim not in (2, 3) or 0 in image.shape:
+        raise ValueError(f"image: (H, W) or (H, W, channels) of uint8 or uint16, not {image.shape} of {image.dtype}")
+    height, width = image.shape[:2]
+    if (height, width) != (path.height, path.width):
+        raise ValueError(f"blur: for {path.width} x {path.height} px, the image has {width} x {height}")
+    if path.extent_px() > LONGEST_PX:
+        raise ValueError(f"blur: {path.extent_px():.0f} px long; at most {LONGEST_PX:.0f} can be undone")
+    return np.ascontiguousarray(image).reshape(height, width, -1)
+
+
 def blend_where_blurred(planes: NDArray[Code], sharp: Float32Array, path: BlurPath, threads: int) -> NDArray[Code]:
     """Put filtered light into an image (H, W, C), without what is saturated or hardly blurred; in the image's codes."""
-    from colmap_inertial._kernels import _wiener
+    from colmap_inertial._kernels import _light
 
     cells, result = Cells.of(path.field()), np.empty_like(planes)
-    _wiener.blend(
+    _light.blend(
         planes,
         sharp,
         result,
@@ -264,7 +325,12 @@ def blend_where_blurred(planes: NDArray[Code], sharp: Float32Array, path: BlurPa
         fade=cells.fade,
         decode=decode_table(planes.dtype),
         encode=encode_table(planes.dtype),
-        saturated=lowest_saturated_code(planes.dtype),
+        saturated=_lowest_saturated_code(planes.dtype),
         threads=threads,
     )
     return result
+
+
+def _lowest_saturated_code(dtype: np.dtype[Any]) -> int:
+    """The first code of an image type that may have been clipped."""
+    return int(np.ceil(SATURATED * np.iinfo(dtype).max))

@@ -50,7 +50,7 @@ class Camera(Projector, Protocol):
 def frame_blur(
     name: str, imu: ImuRecording, calibration: CameraImuCalibration, timing: FrameTiming, camera: Camera
 ) -> BlurField:
-    """The motion blur of one frame of a recording, which :func:`~colmap_inertial.imaging.wiener.deblur` undoes.
+    """The motion blur of one frame of a recording, which :func:`~colmap_inertial.imaging.path_filters.deblur` undoes.
 
     For many frames, make the :class:`GyroCamera` once and call :func:`blur_field` for each.
 

@@ -5,8 +5,9 @@ specific force is +9.8 m/s2. Gyroscopes agree everywhere.
 
 Stray Scanner writes a folder: ``imu.csv`` (``timestamp, a_x, a_y, a_z, alpha_x, alpha_y, alpha_z``: seconds, what
 CoreMotion gave, rad/s), ``odometry.csv`` with the time of each frame of ``rgb.mp4`` on the same clock and ARKit's
-poses, ``camera_matrix.csv``. Its description says m/s2, its source writes CoreMotion's g, which is what counts
-(github.com/strayrobots/scanner, DatasetEncoder.swift).
+poses, ``camera_matrix.csv``. Versions of the app differ: one wrote CoreMotion's g as they are, one times 9.81, the
+latest again as they are, and no file says of which it is (github.com/strayrobots/scanner, DatasetEncoder.swift).
+Gravity tells these two apart; any other length is refused as ever.
 
 ScanCapture of the LaMAR benchmark writes ``gyroscope.txt`` and ``accelerometer.txt`` with comments ``# timestamp, rx,
 ry, rz`` and ``# timestamp, ax, ay, az``: microseconds since boot, rad/s, CoreMotion's g
@@ -37,11 +38,15 @@ from colmap_inertial.io.files import first_line, read_bytes
 from colmap_inertial.io.frame_times import frame_log
 from colmap_inertial.io.imu_text import build_recording, order_rows
 from colmap_inertial.io.mp4 import is_mp4, read_movie
+from colmap_inertial.io.plausible import PLAUSIBLE
 from colmap_inertial.io.samples import Samples
 from colmap_inertial.io.tables import Table, head_of, members_of, parse_table, read_table, text_of
-from colmap_inertial.io.units import DeclaredUnits, seconds
+from colmap_inertial.io.units import STANDARD_GRAVITY_M_S2, DeclaredUnits, seconds
 
 # --- Stray Scanner ---------------------------------------------------------------------------------------------------
+
+#: What one version of the app multiplied CoreMotion's g by; it is not the standard gravity.
+_STRAY_FACTOR = 9.81
 
 
 def is_stray_scanner(path: Path) -> bool:
@@ -57,11 +62,22 @@ def read_stray_scanner(path: Path, units: DeclaredUnits) -> ImuRecording:
     t_ns = table.stamps_ns(table.column("timestamp"), "s")
     gyro = table.numbers([table.column(f"alpha_{axis}") for axis in "xyz"])
     accel = -table.numbers([table.column(f"a_{axis}") for axis in "xyz"])
+    if units.accel is None and _is_times_gravity(accel):
+        accel = accel / _STRAY_FACTOR
     return build_recording(
         order_rows(table, "gyro", units.gyro or "rad/s", t_ns, gyro),
         order_rows(table, "accel", units.accel or "g", t_ns, accel),
         device="Stray Scanner",
     )
+
+
+def _is_times_gravity(accel: Array) -> bool:
+    """Whether accelerations are those of the version that multiplied g by 9.81."""
+    length = float(np.nanmedian(np.linalg.norm(accel, axis=1))) if len(accel) else 0.0
+    low, high = (
+        limit / STANDARD_GRAVITY_M_S2 for limit in (PLAUSIBLE.smallest_gravity_m_s2, PLAUSIBLE.largest_gravity_m_s2)
+    )
+    return low <= length / _STRAY_FACTOR <= high
 
 
 def read_stray_scanner_frames(path: Path) -> FrameLog | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from colmap_inertial.messages import Said, message, state
 
@@ -20,6 +20,21 @@ def install_again(package: str) -> str:
 @message(example={"package": "libgl1"})
 def install_on_debian(package: str) -> str:
     return f"on Debian: apt install {package}"
+
+
+@message(
+    advice=lambda installed, keep, **_: f"keep one of them: pip uninstall {' '.join(installed)}; pip install {keep}",
+    example={
+        "module": "pycolmap",
+        "installed": {"pycolmap": "4.0.0", "pycolmap-cuda12": "4.1.0"},
+        "keep": "pycolmap-cuda12",
+    },
+)
+def packages_of_one_module(module: str, installed: Mapping[str, str], keep: str) -> str:
+    named = " and ".join(f"{name} {version}" for name, version in installed.items())
+    return (
+        f"{named} are installed, and each brings the module {module}: the files of the last one overwrote the others'"
+    )
 
 
 @message(advice=lambda mend, **_: str(mend), example={"package": "open3d", **_BY_LOADING, "mend": _INSTALLED})

@@ -16,37 +16,7 @@ _MORE_MEMORY = {
 _AGAIN = "install colmap-inertial again"
 
 
-def _did_you_mean(nearest: str | None) -> str:
-    return "" if nearest is None else f"; did you mean {nearest}?"
-
-
-state("calibration-takes-files", "--calibration takes a file, or two: from `align --out`, from `calibrate-imu --out`")
-state("colmap-takes-settings", "--colmap takes SECTION.option=value, such as Mapper.init_num_trials=100")
-
 # the command line
-
-state("quiet-and-verbose", "give one of --quiet and --verbose")
-
-
-@message(example={"command": "reconstruct", "options": ("--scale.seed", "--mapping.seed"), "name": "--seed"})
-def option_ambiguous(command: str, options: Sequence[str], name: str) -> str:
-    return f"{command}: which of {' and '.join(options)} is meant by {name}?"
-
-
-@message(example={"word": "--json"})
-def command_comes_first(word: str) -> str:
-    return f"a command comes first, before {word} (--help lists them)"
-
-
-@message(example={"word": "recontruct", "nearest": "reconstruct"})
-def no_such_command(word: str, nearest: str | None) -> str:
-    return f"there is no command {word}{_did_you_mean(nearest)} (--help lists them)"
-
-
-@message(example={"command": "reconstruct", "option": "--imu-offset", "nearest": "--imu"})
-def no_such_option(command: str, option: str, nearest: str | None) -> str:
-    return f"{command} has no option {option}{_did_you_mean(nearest)} ({command} --help lists them)"
-
 
 state("gravity-is-of-rests", "the place is for recordings of rests only: leave it out with results")
 
@@ -266,11 +236,6 @@ def folder_exists(folder: str) -> str:
 
 
 # how a capture of a batch ended
-
-
-@message(advice="remove it or choose another folder", example={"out": "out/walk", "what": "set of options"})
-def result_of_another(out: str, what: str) -> str:
-    return f"{out} holds the result of another {what}"
 
 
 @message(

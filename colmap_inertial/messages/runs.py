@@ -389,11 +389,6 @@ def found_on_page(page: str) -> str:
     return f"findings and remedies: {page}"
 
 
-@message(example={"out": "out"})
-def earlier_result_stays(out: str) -> str:
-    return f"the earlier result in {out} stays as it was"
-
-
 # the folder of a run
 
 
@@ -424,6 +419,25 @@ def run_of_another_version(out: str) -> str:
 @message(advice="choose another folder or remove it", example={"out": "out", "what": "capture", "named": "/data/walk"})
 def run_of_another_kind(out: str, what: str, named: object) -> str:
     return f"{out} holds a run of another {what} ({named})"
+
+
+@message(example={"option": "world", "now": "y-down", "before": "z-up"})
+def option_changed(option: str, now: object, before: object) -> str:
+    now, before = ("not given" if value is None else value for value in (now, before))
+    return f"{option} = {now} (was {before})"
+
+
+@message(
+    advice="choose another folder, or give --overwrite to redo what depends on it",
+    example={
+        "out": "out",
+        "step": "metric",
+        "changes": ({"code": "option-changed", "values": {"option": "world", "now": "y-down", "before": "z-up"}},),
+    },
+)
+def result_is_finished(out: str, step: str, changes: Sequence[Said]) -> str:
+    why = "; ".join(map(str, changes)) or "the recording, a stage, the program, or an option that is not in config.toml"
+    return f"{out} holds a finished result, and its step {step.replace('_', ' ')} would change: {why}"
 
 
 state("device-in-output", "is a device, a pipe or a socket in an output folder", advice="remove it", joint=": ")
@@ -469,7 +483,7 @@ def owner_unreadable(found: Said, out: str) -> str:
 
 
 @message(
-    advice="run that again, which makes it again",
+    advice="start that again, which makes it again",
     joint=": ",
     example={"found": {"code": "not-a-result", "values": {}}, "lost": "scale.json"},
 )

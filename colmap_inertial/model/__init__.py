@@ -104,10 +104,11 @@ class Model:
     motion: SolvedMotion | None = None
 
     def __post_init__(self) -> None:
-        set_fields(self, doubts=tuple(map(as_fact, self.doubts)))
+        doubts = tuple(map(as_fact, self.doubts))
+        set_fields(self, doubts=doubts, scale=None if self.scale is None else add_doubts(self.scale, doubts))
 
     def scaled(self, estimate: ScaleEstimate, similarity: Similarity | None) -> Model:
-        """Apply a scale estimate, unless its units were refused; doubts make it weak at most.
+        """Apply a scale estimate, unless its units were refused.
 
         Raises
         ------
@@ -122,22 +123,18 @@ class Model:
         return replace(
             self,
             reconstruction=reconstruction,
-            scale=downgraded(estimate, self.doubts),
+            scale=estimate,
             similarity=similarity,
         )
 
 
-def downgraded(estimate: ScaleEstimate, doubts: Sequence[Fact]) -> ScaleEstimate:
-    """An estimate from a recording with doubts: they are among its reasons, and it is not trusted."""
+def add_doubts(estimate: ScaleEstimate, doubts: Sequence[Fact]) -> ScaleEstimate:
+    """An estimate that is weak at most where there are doubts, which are its first reasons."""
     if not doubts:
         return estimate
-    facts = tuple(map(as_fact, doubts))
-    has_doubts = estimate.reasons[: len(facts)] == facts
-    return replace(
-        estimate,
-        verdict="weak" if estimate.verdict == "trusted" else estimate.verdict,
-        reasons=estimate.reasons if has_doubts else (*facts, *estimate.reasons),
-    )
+    verdict = "weak" if estimate.verdict == "trusted" else estimate.verdict
+    new = [fact for fact in map(as_fact, doubts) if fact not in estimate.reasons]
+    return replace(estimate, verdict=verdict, reasons=(*new, *estimate.reasons))
 
 
 def model_format(folder: Path) -> str | None:

@@ -72,6 +72,27 @@ class Applied:
     notes: tuple[Fact, ...]
     unmoved: tuple[Unmoved, ...] = ()
 
+    def as_json(self) -> dict[str, object]:
+        """The same for programs."""
+        models = [
+            {
+                "index": index,
+                "folder": folder,
+                "scale": None if scale.similarity is None else scale.similarity.scale,
+                "verdict": scale.verdict,
+                **with_sentences({"reasons": list(scale.reasons)}),
+            }
+            for index, (folder, scale) in self.models.items()
+        ]
+        return {
+            "out": self.out,
+            "models": models,
+            "changes": self.changes,
+            "files_kept": self.unchanged,
+            "unmoved": self.unmoved,
+            **with_sentences({"notes": list(self.notes)}),
+        }
+
 
 def apply_to_project(
     project: StrPath,

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Literal
 
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import ScaleEstimate
-from colmap_inertial.model import downgraded
+from colmap_inertial.model import add_doubts
 from colmap_inertial.validate.result import Validation
 
 _CODE = "target-contradicts-scale"
@@ -40,7 +41,13 @@ def doubt_by_target(estimate: ScaleEstimate, validation: Validation) -> ScaleEst
         Of a target in this model.
     """
     fact = contradict_scale(estimate, validation)
-    return estimate if fact is None else downgraded(estimate, (fact,))
+    if fact is None:
+        return estimate
+    # what is likeliest wrong comes before what it does
+    named = {code for code, _ in _NAMED}
+    first = tuple(reason for reason in estimate.reasons if reason.code in named)
+    rest = tuple(reason for reason in estimate.reasons if reason.code not in {_CODE, *named})
+    return replace(add_doubts(estimate, (fact,)), reasons=(*first, fact, *rest))
 
 
 def contradict_scale(estimate: ScaleEstimate, validation: Validation) -> Fact | None:

@@ -39,8 +39,7 @@ from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.evidence import blur_evidence
 from colmap_inertial.imaging.gate import GateOptions, RecordingVerdict, judge_frame, judge_recording
-from colmap_inertial.imaging.path_filters import half_quadratic, path_wiener
-from colmap_inertial.imaging.wiener import deblur
+from colmap_inertial.imaging.path_filters import deblur, half_quadratic
 from scripts.common import (
     imaging_baselines as baselines,
     imaging_colmap,
@@ -66,7 +65,7 @@ console = Console(stderr=True)
 T = TypeVar("T")
 #: The package's filters, by the names that ``--deblur`` gives them.
 FILTERS: dict[str, Callable[[UInt8Array, BlurField], UInt8Array]] = {
-    "wiener": lambda image, blur: path_wiener(image, BlurPath.straight(blur)),
+    "wiener": deblur,
     "path": lambda image, blur: half_quadratic(image, BlurPath.straight(blur)),
 }
 

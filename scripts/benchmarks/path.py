@@ -30,7 +30,7 @@ the correct matches the gate leaves, with each of the package's methods.
 
 ``short``: what 1 to 3 px of blur in pictures of 640 px gain or lose by being treated.
 
-``cost``: processor time of a grey 1080p frame at 10, 20 and 40 px, as a ratio to the straight filter's in the same run.
+``cost``: processor time of a grey 1080p frame at 10, 20 and 40 px, as a ratio to `wiener`'s in the same run.
 
 ``colour``: colour frames as luma in full and chroma at half the size, against each channel by itself: PSNR gained, and
 processor time and time of a 1080p frame with one and two threads.

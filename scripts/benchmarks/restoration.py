@@ -52,7 +52,7 @@ from colmap_inertial.core.errors import InertialError
 from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath
-from colmap_inertial.imaging.path_filters import path_wiener
+from colmap_inertial.imaging.path_filters import deblur
 from colmap_inertial.imaging.restoration import Network, deepgyro, load_network
 from scripts.benchmarks.imaging import BLURS_PX, SIZE, about
 from scripts.common import imaging_colmap, imaging_metrics as metrics, restoration_cost, restoration_exposures
@@ -191,7 +191,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _filtered(image: UInt8Array, blur: BlurField) -> UInt8Array:
-    return path_wiener(image, BlurPath.straight(blur))
+    return deblur(image, blur)
 
 
 def _restored(image: UInt8Array, blur: BlurField, *, network: Network) -> UInt8Array:

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.core.arrays import UInt8Array, UInt16Array
+from colmap_inertial.imaging import path_filters
 from colmap_inertial.imaging.blur_field import BlurField
-from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.gate import GateOptions, RecordingVerdict, judge_frame, keep_sharp
-from colmap_inertial.imaging.path_filters import path_wiener
 
 Code = TypeVar("Code", np.uint8, np.uint16)
 
@@ -63,7 +62,7 @@ def deblur_gated(
         What its frames say together (:func:`judge_recording`). Without it, only frames that show the blur clearly by
         themselves are deblurred.
     deblur
-        ``path_wiener`` along the field's lines by default.
+        ``path_filters.deblur`` by default.
     options
         Thresholds.
     """
@@ -73,6 +72,6 @@ def deblur_gated(
         return GatedFrame(image=image, deblurred=False, kept_share=1.0, extent_factor=1.0, reason=reason)
     if factor != 1.0:
         blur = blur.times(factor)
-    restored = path_wiener(image, BlurPath.straight(blur)) if deblur is None else deblur(image, blur)
+    restored = (deblur or path_filters.deblur)(image, blur)
     out, kept = keep_sharp(image, restored, blur)
     return GatedFrame(image=out, deblurred=True, kept_share=kept, extent_factor=factor, reason=reason)

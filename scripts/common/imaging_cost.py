@@ -1,4 +1,4 @@
-"""What deblurring a grey 1080p frame costs: processor time on one core, against other ways and the core's own peak."""
+"""What deblurring a grey 1080p frame costs: processor time on one core, against other ways."""
 
 from __future__ import annotations
 
@@ -8,14 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from colmap_inertial._kernels import _wiener
-from colmap_inertial.core.arrays import AnyArray, UInt8Array
-from colmap_inertial.imaging import wiener
-from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.evidence import blur_evidence
 from colmap_inertial.imaging.gate import judge_recording
-from colmap_inertial.imaging.transfer import decode_table
-from colmap_inertial.imaging.wiener import DeblurOptions, deblur
+from colmap_inertial.imaging.path_filters import DeblurOptions, deblur
 from scripts.common import imaging_baselines as baselines
 from scripts.common.gated_deblur import deblur_gated
 from scripts.common.imaging_metrics import extract
@@ -23,7 +18,7 @@ from scripts.common.imaging_scenes import Pair
 
 
 def measure(pairs: Sequence[Pair], repeat: int = 15) -> dict[str, Any]:
-    """Times in ms of one frame, 8 bit to 8 bit; the shares of the peak; what COLMAP takes.
+    """Times in ms of one frame, 8 bit to 8 bit; what COLMAP takes.
 
     Of the first frames, that counts whose blur is longest in the median: where the camera rolls, the middle is sharp.
     """
@@ -34,8 +29,8 @@ def measure(pairs: Sequence[Pair], repeat: int = 15) -> dict[str, Any]:
     one = DeblurOptions(threads=1)
     verdict = judge_recording([blur_evidence(image, blur)] * 3)
     ways: dict[str, tuple[Callable[[], object], int]] = {
-        "directional": (lambda: deblur(image, blur, one), repeat),
-        "directional_gated": (
+        "wiener": (lambda: deblur(image, blur, one), repeat),
+        "wiener_gated": (
             lambda: deblur_gated(image, blur, recording=verdict, deblur=lambda i, b: deblur(i, b, one)),
             repeat,
         ),
@@ -46,17 +41,16 @@ def measure(pairs: Sequence[Pair], repeat: int = 15) -> dict[str, Any]:
         "colmap_sift": (lambda: extract(image, -1), 2),
     }
     ms = {name: round(1e3 * least_cpu_s(run, count), 2) for name, (run, count) in ways.items()}
-    ours = ms["directional"]
+    ours = ms["wiener"]
     return {
         "blur_px": round(float(np.percentile(blur.extent_px(), 90)), 1),
         "median_blur_px": round(float(np.median(blur.extent_px())), 1),
         "ms_cpu": ms,
         "times_faster": {
-            name: round(value / ours, 1) for name, value in ms.items() if not name.startswith("directional")
+            name: round(value / ours, 1) for name, value in ms.items() if name not in ("wiener", "wiener_gated")
         },
         "share_of_colmap_sift": round(ours / ms["colmap_sift"], 5),
-        "share_of_colmap_sift_gated": round(ms["directional_gated"] / ms["colmap_sift"], 5),
-        "instruction_sets": {name: roofline(image, blur, name, repeat) for name in _wiener.instruction_sets()},
+        "share_of_colmap_sift_gated": round(ms["wiener_gated"] / ms["colmap_sift"], 5),
     }
 
 
@@ -69,37 +63,3 @@ def least_cpu_s(run: Callable[[], object], repeat: int) -> float:
         run()
         times.append(time.process_time() - start)
     return min(times)
-
-
-def roofline(image: UInt8Array, blur: BlurField, name: str, repeat: int) -> dict[str, float]:
-    """Times of the stages, ms, and the multiply-adds a second as a share of the processor's peak.
-
-    The filter is timed on light that needs no decoding, less the time of the same pass with a single tap: what is left
-    is the filter and not the copying in and out. The peak is that of a loop of independent multiply-adds, just before.
-    """
-    planes, cells, noise = wiener._prepare(image, blur, DeblurOptions())
-    table = wiener._table(cells, noise)
-    single = wiener.TapTable(
-        first=table.first, weights=table.weights, reach=np.zeros_like(table.reach), smoothing=table.smoothing
-    )
-    light = decode_table(image.dtype)[planes]
-    row, _ = table.at(cells.extent_px)
-    taps = 2 * table.reach[row + 1] + 1
-    # Two multiply-adds a tap and pixel (two rows, or columns, are interpolated), one in the middle.
-    count = float(np.mean(2 * taps - 1)) * cells.extent_px.size * 256
-
-    def seconds(what: AnyArray, with_taps: wiener.TapTable) -> Any:
-        runs = [wiener._compiled(what, cells, with_taps, threads=1, instruction_set=name)[1] for _ in range(repeat)]
-        return np.min(runs, axis=0)
-
-    peak = _wiener.peak_multiply_adds(name)
-    decode_s, encode_s = seconds(planes, table)
-    filter_s = seconds(light, table)[1] - seconds(light, single)[1]
-    return {
-        "decode_ms": round(1e3 * decode_s, 2),
-        "filter_and_encode_ms": round(1e3 * encode_s, 2),
-        "filter_ms": round(1e3 * filter_s, 2),
-        "peak_gflops": round(2e-9 * peak, 1),
-        "share_of_peak": round(count / filter_s / peak, 3),
-        "share_of_peak_with_encoding": round(count / encode_s / peak, 3),
-    }

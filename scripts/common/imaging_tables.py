@@ -103,12 +103,6 @@ def _cost(cost: dict[str, Any], console: Console) -> None:
     console.print(table)
     share = cost["share_of_colmap_sift"]
     console.print(f"share of COLMAP's SIFT: {100 * share:.2f} % {verdict(100 * share, 1.0, least=False)}")
-    for name, row in cost["instruction_sets"].items():
-        of_peak = row["share_of_peak"]
-        console.print(
-            f"{name}: {of_peak:.0%} of a core's {row['peak_gflops']:.0f} Gflop/s in the filter "
-            f"({row['share_of_peak_with_encoding']:.0%} with encoding) {verdict(of_peak, 0.35)}"
-        )
 
 
 def _treated(kind: str, by_blur: dict[str, Any], console: Console) -> None:

@@ -22,6 +22,7 @@ from colmap_inertial.imaging._tiles import TiledPaths, Tiling
 from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.path_filters import (
     FILTER_MODEL,
+    DeblurOptions,
     blend_where_blurred,
     filter_along,
     half_quadratic,
@@ -30,7 +31,6 @@ from colmap_inertial.imaging.path_filters import (
 )
 from colmap_inertial.imaging.psf import blur_path
 from colmap_inertial.imaging.transfer import linearise, srgb_from_linear
-from colmap_inertial.imaging.wiener import DeblurOptions
 from scripts.common import imaging_metrics as metrics
 from scripts.common.imaging_scenes import photographed_walls
 from scripts.common.path_methods import COST_SIZE, with_blur

@@ -18,10 +18,9 @@ from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.evidence import blur_evidence
 from colmap_inertial.imaging.gate import GateOptions, RecordingVerdict, judge_frame, judge_recording, keep_sharp
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
-from colmap_inertial.imaging.path_filters import half_quadratic, path_wiener, smoothed
+from colmap_inertial.imaging.path_filters import DeblurOptions, half_quadratic, path_wiener, smoothed
 from colmap_inertial.imaging.psf import blur_field, blur_path
 from colmap_inertial.imaging.restoration import Network, deepgyro, load_network
-from colmap_inertial.imaging.wiener import DeblurOptions, deblur
 from colmap_inertial.run.stages.deblur import SMOOTHING, smoothing_for
 from scripts.common import imaging_metrics as metrics
 from scripts.common.path_scenes import Known, Moment, Pair, Take, blur_px, shortened
@@ -61,16 +60,6 @@ def _smoothed_alone(image: UInt8Array, motion: GyroCamera, camera: Projector, sh
     return _both(image, blur_field(motion, camera, shutter))
 
 
-def _straight(image: UInt8Array, motion: GyroCamera, camera: Projector, shutter: FrameShutter) -> Made:
-    out = deblur(image, blur_field(motion, camera, shutter), _ONE)
-    return Made(for_features=out, for_people=out)
-
-
-def _straight_smoothed(image: UInt8Array, motion: GyroCamera, camera: Projector, shutter: FrameShutter) -> Made:
-    blur = blur_field(motion, camera, shutter)
-    return _both(deblur(image, blur, _ONE), blur)
-
-
 def _wiener(image: UInt8Array, motion: GyroCamera, camera: Projector, shutter: FrameShutter) -> Made:
     path = blur_path(motion, camera, shutter)
     return _both(path_wiener(image, path, _ONE), path.field())
@@ -86,11 +75,9 @@ def _deepgyro(image: UInt8Array, motion: GyroCamera, camera: Projector, shutter:
     return _both(deepgyro.deblur(image, path, network=_network()), path.field())
 
 
-#: ``straight`` is the filter along straight lines as it was, ``untreated, smoothed`` the frame without any filter.
+#: ``untreated, smoothed`` is the frame without any filter.
 METHODS: Mapping[str, Callable[..., Made]] = {
     "untreated, smoothed": _smoothed_alone,
-    "straight": _straight,
-    "straight, smoothed": _straight_smoothed,
     "wiener": _wiener,
     "path": _path,
     "deepgyro": _deepgyro,
@@ -169,7 +156,7 @@ def _gated(image: UInt8Array, known: Known, verdict: RecordingVerdict) -> UInt8A
 
 
 def cost(take: Take, methods: Sequence[str], repeat: int = 5) -> dict[str, Any]:
-    """Processor time of one thread, ms, of a grey 1080p frame; ratios to the straight filter as it was."""
+    """Processor time of one thread, ms, of a grey 1080p frame; ratios to Wiener's filter."""
     camera = replace(take.pairs[0].camera, size=COST_SIZE, focal_px=1.5 * take.pairs[0].camera.focal_px)
     out: dict[str, Any] = {}
     for wanted_px in COSTS_PX:
@@ -177,19 +164,18 @@ def cost(take: Take, methods: Sequence[str], repeat: int = 5) -> dict[str, Any]:
         facing = replace(camera, wall_from_world=camera.facing(moment))
         pair = Pair(camera=facing, moments=(moment, moment), blur_px=wanted_px, seed=1, cache=None)
         image, known = pair.frame(0), pair.known(0, "exact")
-        path, field = blur_path(*known), blur_field(*known)
+        path = blur_path(*known)
         works: dict[str, Callable[[], object]] = {
-            "straight": lambda image=image, field=field: deblur(image, field, _ONE),
             "wiener": lambda image=image, path=path: path_wiener(image, path, _ONE),
             "path": lambda image=image, path=path: half_quadratic(image, path, _ONE),
             "deepgyro": lambda image=image, path=path: deepgyro.deblur(image, path, network=_network()),
         }
         ms = {"smoothing": _least_ms(lambda image=image: smoothed(image, SMOOTHING.most_px), repeat)}
-        ms |= {name: _least_ms(work, repeat) for name, work in works.items() if name in ("straight", *methods)}
+        ms |= {name: _least_ms(work, repeat) for name, work in works.items() if name in ("wiener", *methods)}
         ms["finding the path"] = _least_ms(lambda known=known: blur_path(*known), repeat)
         out[f"{wanted_px:g}"] = {
             "ms": ms,
-            "times_straight": {name: value / ms["straight"] for name, value in ms.items()},
+            "times_wiener": {name: value / ms["wiener"] for name, value in ms.items()},
             "departure_px": path.departure_px(),
         }
     return out

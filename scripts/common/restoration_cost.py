@@ -15,9 +15,8 @@ import numpy as np
 
 from colmap_inertial.core.arrays import UInt8Array
 from colmap_inertial.imaging.blur_path import BlurPath
-from colmap_inertial.imaging.path_filters import path_wiener
+from colmap_inertial.imaging.path_filters import DeblurOptions, path_wiener
 from colmap_inertial.imaging.restoration import deepgyro, load_network
-from colmap_inertial.imaging.wiener import DeblurOptions
 from scripts.common.imaging_metrics import extract
 from scripts.common.imaging_scenes import Pair
 from scripts.common.restoration_weights import use_weights

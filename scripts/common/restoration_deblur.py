@@ -1,4 +1,4 @@
-"""DeepGyro against the directional Wiener filter, with a gyroscope that is right and with one that is not."""
+"""DeepGyro against the Wiener filter, with a gyroscope that is right and with one that is not."""
 
 from __future__ import annotations
 

@@ -17,7 +17,6 @@ from rich.console import Console
 from rich.progress import track
 
 from colmap_inertial.core.arrays import AnyArray, Float32Array, UInt8Array
-from colmap_inertial.imaging import wiener
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.exposure_pairs import (
     ExposurePair,
@@ -29,6 +28,7 @@ from colmap_inertial.imaging.exposure_pairs import (
     gyro_shift,
 )
 from colmap_inertial.imaging.gyro_camera import FrameShutter
+from colmap_inertial.imaging.path_filters import deblur
 from colmap_inertial.imaging.psf import blur_field
 from colmap_inertial.imaging.restoration import Network
 from colmap_inertial.imaging.restoration.lsd2 import fuse
@@ -249,7 +249,7 @@ def ways(
         "short": lambda: short,
         "long": lambda: long,
         "non-local means on short": lambda: denoised(short, strength),
-        "Wiener on long": lambda: wiener.deblur(long, scene.true_blur()),
+        "Wiener on long": lambda: deblur(long, scene.true_blur()),
         "LSD2": lambda: codes(fused),
         "LSD2, no gyroscope": without_gyro,
         "Mertens of short and LSD2": mertens,

@@ -9,9 +9,8 @@ import cv2
 import numpy as np
 
 from colmap_inertial.core.arrays import Float32Array, UInt8Array
+from colmap_inertial.imaging import path_filters
 from colmap_inertial.imaging.blur_field import BlurField
-from colmap_inertial.imaging.blur_path import BlurPath
-from colmap_inertial.imaging.path_filters import path_wiener
 from colmap_inertial.imaging.restoration import Network
 from colmap_inertial.imaging.restoration.lsd2 import fuse
 from scripts.common.imaging_scenes import make_pairs
@@ -42,7 +41,7 @@ def write_sheet(
         pair = make_pairs([walls[i % len(walls)]], blur_px, size=size, seed=seed + 100 + i)[0]
         image, blur, truth = pair.frame(0), pair.blur(0, errors[i]), pair.sharp(0)
         assert deblur is not None
-        pictures = [image, path_wiener(image, BlurPath.straight(blur)), deblur(image, blur), truth]
+        pictures = [image, path_filters.deblur(image, blur), deblur(image, blur), truth]
         rows.append(([f"blurred, {blur_px:g} px", "Wiener", "DeepGyro", "truth"], _crops(pictures, pair.blur(0))))
     for i, (blur_px, ratio, noise) in enumerate(PAIRS if lsd2 else ()):
         k = i + len(BLURS_PX)

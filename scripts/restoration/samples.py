@@ -14,9 +14,8 @@ from torch import Tensor
 from colmap_inertial.core.arrays import Array, Float32Array, UInt8Array
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath, middles, samples_for
-from colmap_inertial.imaging.path_filters import path_wiener
+from colmap_inertial.imaging.path_filters import DeblurOptions, path_wiener
 from colmap_inertial.imaging.restoration._tiles import Span, blur_feed, path_feed
-from colmap_inertial.imaging.wiener import DeblurOptions
 from scripts.restoration.camera import jpeg, light_of, noisy, sharpened, srgb
 from scripts.restoration.handheld import Handheld, recorded, simulated
 from scripts.restoration.optics import ShotOptions, Shots, draw_shots

@@ -47,7 +47,7 @@ from colmap_inertial.cli import main
 main(sys.argv[7:])
 """
 #: How the last thing said begins, or all of it where a batch says which captures failed.
-SENTENCE = re.compile(r"error: \S+.{10,}|\d+ .*|what was found, and what to do: .*")
+SENTENCE = re.compile(r"error: \S+.{10,}|\d+ .*|findings and remedies: .*")
 
 
 @dataclasses.dataclass(frozen=True)

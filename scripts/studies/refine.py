@@ -51,7 +51,7 @@ from colmap_inertial.inertial.refine.setup import (
     move_to_middle_lines,
     read_seen,
 )
-from colmap_inertial.inertial.refine.solve import factored, solve
+from colmap_inertial.inertial.refine.solve import factor_information, solve
 from colmap_inertial.inertial.refine.values import Estimate, Problem
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.model import Model
@@ -156,7 +156,7 @@ def ring() -> TrackOptions:
 
 def centres_cov(problem: Problem, x: Estimate, some: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """(3 K, 3 K) covariance of K camera centres but for one similarity."""
-    cov = factored(problem, x).centres_cov(some, moving(problem, x))
+    cov = factor_information(problem, x).centres_cov(some, moving(problem, x))
     away, count = truth - truth.mean(axis=0), len(some)
     free = np.zeros((count, 3, 7))
     free[:, :, :3], free[:, :, 3] = np.eye(3), away

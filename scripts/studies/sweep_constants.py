@@ -165,8 +165,8 @@ def run_blur(shared: Path) -> Figures:
 
 
 BENCHMARKS = {
-    "scale": (run_scale, ("core", "motion.align", "inertial.core", "inertial.scale", "checks.diagnose")),
-    "blur": (run_blur, ("imaging", "motion", "pipeline.stages", "reconstruction.preparation")),
+    "scale": (run_scale, ("core", "motion.align", "inertial.core", "inertial.scale", "diagnose")),
+    "blur": (run_blur, ("imaging", "motion", "run.stages", "run.preparation")),
 }
 
 

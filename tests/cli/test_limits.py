@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from colmap_inertial.cli import main, process
-from colmap_inertial.cli.models import Scale
+from colmap_inertial.cli.scale import Scale
 from colmap_inertial.core.threads import usable_processors
 
 LIMITED = """

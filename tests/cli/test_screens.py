@@ -8,8 +8,13 @@ import numpy as np
 import pytest
 
 from colmap_inertial.cli import terminal
-from colmap_inertial.cli.captures import Reconstruct
-from colmap_inertial.cli.models import Apply, CalibrateImu, Export, Scale, Validate, View
+from colmap_inertial.cli.apply import Apply
+from colmap_inertial.cli.calibrate_imu import CalibrateImu
+from colmap_inertial.cli.export import Export
+from colmap_inertial.cli.reconstruct import Reconstruct
+from colmap_inertial.cli.scale import Scale
+from colmap_inertial.cli.validate import Validate
+from colmap_inertial.cli.view import View
 from colmap_inertial.core.types import CAL, Action
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.run.commands import result as results
@@ -143,7 +148,7 @@ def test_a_reconstruction_says_what_was_left_out_or_not_joined(told, tmp_path, m
 
 
 def test_deblurring_is_counted_by_what_was_done(monkeypatch):
-    monkeypatch.setattr(results, "shutter_note", lambda plan, rectified: "global")
+    monkeypatch.setattr(results, "describe_shutter", lambda plan, rectified: "global")
 
     def lines(*actions, view=None):
         plan = SimpleNamespace(view=view, deblur_note="by the gyroscope")

@@ -291,7 +291,7 @@ def test_one_that_may_not_be_run_or_hangs_is_refused(capture, tmp_path, monkeypa
     [
         (
             "printf 'one\\n\\033[31mtwo\\n\\nthree\\nfour\\n'; exit 3",
-            r"exit code 3: \\x1b\[31mtwo \| three \| four; all",
+            r"exit code 3: \\x1b\[31mtwo \| three \| four; full",
         ),
         ("kill -9 $$", r"was killed \(signal 9\): it printed nothing"),
         ("exit 0", "the database that it wrote cannot be used: no such file"),

@@ -20,7 +20,7 @@ from colmap_inertial import (
     run_batch,
 )
 from colmap_inertial.core.types import AcceptedScale, Gap, Similarity
-from colmap_inertial.imaging.wiener import DeblurOptions
+from colmap_inertial.imaging.path_filters import DeblurOptions
 from colmap_inertial.model.project import Applied
 from colmap_inertial.model.similarities import ModelScale
 from colmap_inertial.motion.align import AlignOptions

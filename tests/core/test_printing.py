@@ -57,7 +57,7 @@ def test_a_cell_is_no_formula(text, written):
 
 @loop_over("name", [f"{TITLE}.jpg", "a\nb", "a\tb", "a\0b", "a\udcff", "a/\x7f/b"])
 def test_such_names_are_not_followed(name):
-    with pytest.raises(FormatError, match="which is no UTF-8, or holds a control character"):
+    with pytest.raises(FormatError, match="which is not UTF-8, or holds a control character"):
         check_names([name], "a model")
 
 

@@ -344,7 +344,7 @@ def test_an_imu_file_alone_is_diagnosed_and_what_is_none_is_bad_input(
 ) -> None:
     table = shared_data / "euroc_v101/mav0/imu0/data.csv"
     assert run("diagnose", table) == 0
-    assert "(looked at: gyroscope, accelerometer): nothing found" in " ".join(capsys.readouterr().out.split())
+    assert "(checked: gyroscope, accelerometer): nothing found" in " ".join(capsys.readouterr().out.split())
     poem = tmp_path / "poem.txt"
     poem.write_text("Shall I compare thee to a summer's day?\n")
     assert run("diagnose", poem) == 2

@@ -7,15 +7,22 @@ import cv2
 import numpy as np
 import pytest
 
-from colmap_inertial._kernels import _path, _wiener
+from colmap_inertial._kernels import _light, _path
 from colmap_inertial.imaging import path_filters
 from colmap_inertial.imaging._chroma import join_colours, split_colours
 from colmap_inertial.imaging._tiles import TiledPaths, Tiling
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath, middles
-from colmap_inertial.imaging.path_filters import Noise, filter_along, half_quadratic, noise_along, path_wiener, smoothed
+from colmap_inertial.imaging.path_filters import (
+    DeblurOptions,
+    Noise,
+    filter_along,
+    half_quadratic,
+    noise_along,
+    path_wiener,
+    smoothed,
+)
 from colmap_inertial.imaging.transfer import decode_table, srgb_from_linear
-from colmap_inertial.imaging.wiener import DeblurOptions
 from tests.references.path_filters import filter_reference, noise_reference, shares_of, sources_of
 
 SETS = _path.instruction_sets()
@@ -224,7 +231,7 @@ def test_pixels_without_blur_and_around_what_is_clipped_stay(subtests):
 
 def test_what_does_not_fit_is_refused():
     path = BlurPath.straight(BlurField.uniform(64, 48, (9.0, 0.0)))
-    with pytest.raises(ValueError, match="path: for 64 x 48 px"):
+    with pytest.raises(ValueError, match="blur: for 64 x 48 px"):
         path_wiener(np.zeros((40, 64), np.uint8), path)
     with pytest.raises(ValueError, match="uint8 or uint16"):
         path_wiener(np.zeros((48, 64), np.float32), path)
@@ -264,10 +271,9 @@ def test_colours_come_back_from_luma_and_half_chroma(subtests):
             lines = rng.random((4, *chroma.shape[1:]), dtype=np.float32)
             planes = [cv2.resize(p, (2 * p.shape[1], 2 * p.shape[0]))[:height, :width] for p in lines]
             r, b = (planes[i] * luma + planes[i + 1] for i in (0, 2))
-            for name in _wiener.instruction_sets():
-                _wiener.join(luma, lines, joined := np.empty_like(one), red=0.3, blue=0.2, instruction_set=name)
-                green = luma - 0.3 * r - 0.2 * b
-                np.testing.assert_allclose(joined, np.stack([green + r, green, green + b], axis=-1), atol=1e-5)
+            _light.join(luma, lines, joined := np.empty_like(one), red=0.3, blue=0.2)
+            green = luma - 0.3 * r - 0.2 * b
+            np.testing.assert_allclose(joined, np.stack([green + r, green, green + b], axis=-1), atol=1e-5)
             # what is coarser than the window comes back, and a place stays where it was
             assert np.abs(one - light).mean() < 2e-3
             shifted = np.roll(one, 1, axis=1)

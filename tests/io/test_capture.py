@@ -138,7 +138,7 @@ def test_a_video_capture(tmp_path: Path) -> None:
         ('[images]\nfolder = "a"\ntimes = "name"\n', r"line 3: \[images\] times: .*time_unit"),
         ('[images]\nfolder = "a"\ntimes = "name"\ntime_unit = "min"\n', r"line 4: .*'s', 'ms', 'us', 'ns'.*'min'"),
         ('[images]\nfolder = "a"\npattern = "../*"\n', r"line 3: .*stay inside"),
-        ("[images]\nfolder = 3\n", r"line 2: .*text in quotes"),
+        ("[images]\nfolder = 3\n", r"line 2: .*string in quotes"),
         ('[video]\nfile = "a"\nframes_per_s = 0\n', r"line 3: .*above 0"),
         (IMU + "[timing]\nreadout_s = 25\n", r"line 4: \[timing\] readout_s: must be from 0 to 0.5"),
         (IMU + "[timing]\nexposure_s = nan\n", r"line 4: .*finite"),

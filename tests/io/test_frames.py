@@ -105,7 +105,7 @@ def test_a_csv_times_frames(subtests: pytest.Subtests, tmp_path_factory: pytest.
     ("text", "said"),
     [
         ("name,t_s\na.png,0.5\n", "no row for 1 of 2 pictures .first: b.png"),
-        ("name,t\na.png,0.5\nb.png,1\n", "does not say the unit"),
+        ("name,t\na.png,0.5\nb.png,1\n", "does not state the unit"),
         ("a.png,0.5\nb.png,1\n", "no header"),
         ("name,when\na.png,0.5\nb.png,1\n", "no column of times"),
         ("who,t_s\na.png,0.5\nb.png,1\n", "no column of names"),

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from colmap_inertial.cli import _COMMANDS, main
+from colmap_inertial.cli import COMMANDS, main
 from colmap_inertial.core.errors import FormatError, InertialError
 from colmap_inertial.core.options import ReadLimits, ReconstructOptions
 from colmap_inertial.core.threads import map_in_order
@@ -51,7 +51,7 @@ def png(width, height):
 def test_a_text_of_yaml_is_no_longer_than_calibrations_are(tmp_path):
     path = tmp_path / "a.yaml"
     path.write_text("a: [" + "1," * 300_000 + "1]\n")
-    with pytest.raises(FormatError, match="is no calibration: its 600007 characters are more than any has"):
+    with pytest.raises(FormatError, match="is not a calibration: its 600007 characters are too many"):
         read_yaml(path, "a calibration")
 
 
@@ -327,7 +327,7 @@ def test_every_command_takes_them(tmp_path, capsys):
     # as in the processes of a batch, which read what their capture is given
     with pytest.raises(FormatError, match="more than 3 columns"):
         reconstruct(scene, out, ReconstructOptions(limits=ReadLimits(table_columns=3)))
-    for command in _COMMANDS.values():
+    for command in COMMANDS.values():
         assert hasattr(command, "limits") or "limits" in {f.name for f in fields(command)}
 
 

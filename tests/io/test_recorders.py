@@ -263,7 +263,7 @@ def test_a_recorder_s_folder_is_a_capture(tmp_path: Path, one_clock: ImuRecordin
     assert len(read_capture_imu(capture).gyro_t_s) == len(one_clock.gyro_t_s)
 
     imu_files.write_video_imu_capture(tmp_path, one_clock, frame_ns[:-1])
-    with pytest.raises(TimingError, match="has 12 frames, its recorder noted the times of 11"):
+    with pytest.raises(TimingError, match="has 12 frames, but its recorder noted the times of 11"):
         read_frame_timing(tmp_path)
 
 
@@ -370,17 +370,25 @@ def test_sensor_logger_without_its_platform_or_gravity_is_refused(tmp_path: Path
         read_imu(folder)
 
 
-def test_the_unit_of_stray_scanner_is_its_recorder_s_and_not_that_of_a_size(tmp_path: Path, one_clock) -> None:
+def test_stray_scanner_is_read_in_g_and_in_g_times_9_81_and_in_no_other_unit(tmp_path: Path, one_clock) -> None:
     folder = imu_files.write_stray_scanner(tmp_path, one_clock, FRAME_NS)
     lines = (folder / "imu.csv").read_text().splitlines()
     rows = [line.split(", ") for line in lines[1:]]
-    in_m_s2 = [", ".join([t, *(repr(9.80665 * float(a)) for a in row[:3]), *row[3:]]) for t, *row in rows]
-    (folder / "imu.csv").write_text("\n".join([lines[0], *in_m_s2]) + "\n")
-    with pytest.raises(FormatError, match="m/s2"):
-        read_imu(folder)
+
+    def write(factor: float) -> None:
+        scaled = [", ".join([t, *(repr(factor * float(a)) for a in row[:3]), *row[3:]]) for t, *row in rows]
+        (folder / "imu.csv").write_text("\n".join([lines[0], *scaled]) + "\n")
+
+    write(9.81)
+    np.testing.assert_allclose(read_imu(folder).accel_m_s2, one_clock.accel_m_s2, atol=1e-9)
+    write(9.80665)
     toml = tmp_path / "capture.toml"
     toml.write_text('[imu]\npath = "imu.csv"\n[imu.accel]\nunit = "m/s2"\n')
     np.testing.assert_allclose(read_imu(toml).accel_m_s2, one_clock.accel_m_s2, atol=1e-9)
+    toml.unlink()
+    write(3.0)
+    with pytest.raises(FormatError, match=r"9\.8 m/s2"):
+        read_imu(folder)
 
 
 def test_a_rosbag_without_rosbags_names_the_extra(tmp_path: Path, monkeypatch, one_clock: ImuRecording) -> None:

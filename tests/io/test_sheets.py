@@ -133,7 +133,7 @@ def test_a_film_without_a_wanted_frame_is_refused(monkeypatch: pytest.MonkeyPatc
     assert wanted([frame(20), frame(40, 32)], 20) == [20]
     for frames, times, said in (
         (film, (20, 50, 70), "2 of 3 frames cannot be decoded .first: at 0.050000 s"),
-        ([frame(60), frame(77), frame(90)], (60, 90), "the frame at 0.077 s cannot be decoded whole"),
+        ([frame(60), frame(77), frame(90)], (60, 90), "the frame at 0.077 s cannot be fully decoded"),
         ([frame(20), frame(40, 32)], (20, 40), "changes its size from 64x48 to 32x48 at 0.040 s"),
     ):
         with pytest.raises(FormatError, match=said):

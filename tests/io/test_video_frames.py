@@ -90,7 +90,7 @@ def test_a_recorders_own_frame_times_replace_the_stamps(tmp_path: Path) -> None:
         timing, frames = read_frames(capture_of(tmp_path, f'file = "a.mp4"\n{log}'))
         assert [timing.epoch_ns + round(t * 1e9) for t in timing.t_s] == stamps
         assert [frame.t_s for frame in frames] == timing.t_s.tolist()
-    with pytest.raises(TimingError, match="does not say the unit"):
+    with pytest.raises(TimingError, match="does not state the unit"):
         read_frame_timing(capture_of(tmp_path, 'file = "a.mp4"\nframe_times = "bare.txt"'))
     (tmp_path / "bare.txt").write_text("\n".join(map(str, stamps[:-1])) + "\n")
     with pytest.raises(TimingError, match=r"has 11 times, the video .* has 12 frames"):
@@ -362,7 +362,7 @@ def test_a_rotation_mark_leaves_the_sensor_s_rows_alone(
                 np.testing.assert_array_equal(frame.image, expected)
             camera = '[camera]\nmodel = "SIMPLE_PINHOLE"\nwidth = 240\nheight = 320\nparams = [300, 120, 160]\n'
             camera += 'pixel_origin = "corner"'
-            with pytest.raises(FormatError, match=r"is 320x240.* declared as 240x320.*not turned by 90 degrees"):
+            with pytest.raises(FormatError, match=r"is 320x240.* declared as 240x320.*not rotated by 90 deg"):
                 list(read_frames(capture_of(tmp_path, 'file = "a.mp4"', camera))[1])
 
 

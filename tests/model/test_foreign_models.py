@@ -243,7 +243,7 @@ def test_what_is_there_twice_is_refused(tmp_path):
 def test_images_of_a_camera_that_is_gone_are_refused_by_name(tmp_path):
     folder = save(build(), tmp_path / "m", text=True)
     (folder / "cameras.txt").write_text("7 PINHOLE 160 120 140 140 80 60\n")
-    with pytest.raises(FormatError, match=r"its image '000\.png' is of camera 1, which cameras lacks"):
+    with pytest.raises(FormatError, match=r"its image '000\.png' is of camera 1, which the model lacks"):
         read_model(folder)
 
 

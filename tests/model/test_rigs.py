@@ -190,7 +190,7 @@ def test_the_path_is_that_of_the_reference_camera_also_where_it_took_no_image(ri
 
 def test_refinement_says_that_it_does_not_take_rigs(rig, metric, tmp_path):
     (said,) = [t for t in metric.models[0].treatments if t.stage == "refine"]
-    assert str(said.reason).startswith("not refined: several cameras took its images") and not said.action
+    assert str(said.reason).startswith("not refined: its images are of several cameras") and not said.action
     asked = ReconstructOptions(refine="inertial")
     with pytest.raises(InertialError, match="models with rigs cannot be refined"):
         reconstruct_project(rig.root, tmp_path / "out", rig.source(), asked)

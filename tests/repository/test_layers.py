@@ -48,6 +48,7 @@ ROWS = [
     ("io", "imaging"),
     ("model", "motion"),
     ("inertial",),
+    ("evidence",),
     ("diagnose", "report"),
     ("validate", "hooks"),
     ("colmap",),
@@ -74,8 +75,8 @@ ROW_INSIDE = {
 #: The only importers of pycolmap.
 COLMAP = ("model", "inertial.refine", "diagnose", "validate", "report", "hooks", "colmap", "run", "tools", "cli")
 #: What computes touches no file.
-COMPUTES = ("core", "_kernels", "imaging", "motion", "inertial")
-TOUCHES_FILES = ("core.errors", "core.options", "core.progress", "core.threads")
+COMPUTES = ("core", "_kernels", "imaging", "motion", "inertial", "evidence")
+TOUCHES_FILES = ("core.errors", "core.options", "core.progress", "core.threads", "core.types.imu")
 
 
 def inside(module: str, places: tuple[str, ...]) -> bool:

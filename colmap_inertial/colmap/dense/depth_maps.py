@@ -121,11 +121,6 @@ class DenseResult:
         return vars(self) | paths | {"waiting": None if self.waiting is None else str(self.waiting)}
 
 
-def has_depth_maps(folder: Path) -> bool:
-    """Whether a dense workspace holds depth or normal maps."""
-    return any(file.is_file() for file in (folder / "stereo").glob("*_maps/**/*"))
-
-
 def digest_of_model(model: Path) -> str:
     """Digest of a model's poses and cameras."""
     digest = hashlib.sha256()
@@ -147,7 +142,7 @@ def choose_maker(
     """Decide who makes a workspace's depth maps, and tell whether some are there.
 
     Whoever began goes on: maps of two makers are never mixed. Maps of patch-match may have taken hours, or came from
-    elsewhere; they are never removed, and never used with another model. Our own are removed where they do not fit.
+    elsewhere; they are never used with another model, nor replaced. Those of the sweep that do not fit do not count.
 
     Parameters
     ----------
@@ -180,8 +175,6 @@ def choose_maker(
         return wanted, True
     if maker == "patch-match":
         raise OutputExistsError(Fact("maps-of-another-model", stereo=str(folder / "stereo"), folder=str(folder)))
-    for file in maps:
-        remove(file)
     return _plan_maps(model, max_image_size, here, settings), False
 
 

@@ -31,10 +31,10 @@ from colmap_inertial.model.submodels.graph import (
     Placements,
     SimilarityConstraint,
     among,
-    chained,
+    chain_placements,
     columns_of,
-    connected,
-    minimised,
+    find_connected,
+    minimise_placements,
 )
 from colmap_inertial.model.submodels.matches import Submodel, constrain_by_points, find_common_features, matches_between
 from colmap_inertial.model.submodels.merging import merge_models
@@ -231,7 +231,7 @@ def join_runs(
     nearest: dict[Pair, int | None] = dict.fromkeys([*ties, *((k, k) for k in range(len(parts)))], farthest)
     joined: list[pycolmap.Reconstruction] = []
     seams: list[LoopClosure] = []
-    waiting = connected(range(len(parts)), ties)
+    waiting = find_connected(range(len(parts)), ties)
     while waiting:
         members = waiting.pop(0)
         if len(members) == 1:
@@ -243,7 +243,7 @@ def join_runs(
         of_group = {number: members[k] for number, k in part_of.items()}
         overlap = merge_overlaps(capture, whole, part_of=of_group, nearest=nearest)
         fitting = [pair for pair, seam in overlap.seams.items() if seam.joined]
-        all_fit = len(fitting) == len(overlap.seams) and len(connected(members, fitting)) == 1
+        all_fit = len(fitting) == len(overlap.seams) and len(find_connected(members, fitting)) == 1
         if all_fit and overlap.kept >= LEAST_KEPT_SHARE:
             joined.append(whole)
             seams += overlap.seams.values()
@@ -260,7 +260,7 @@ def join_runs(
                 ties[worst] = nearby[worst]
             if worst in nearby or worst[0] == worst[1]:
                 nearest[worst] = near
-        waiting = connected(members, ties) + waiting
+        waiting = find_connected(members, ties) + waiting
     return sorted(joined, key=lambda model: -int(model.num_reg_images())), seams
 
 
@@ -296,7 +296,7 @@ def find_ties(
 def place_parts(count: int, ties: Sequence[SimilarityConstraint]) -> Placements:
     """Place connected parts in the first one's world, by all constraints at once."""
     order = sorted(ties, key=lambda tie: -float(np.trace(tie.info)))
-    start = chained(
+    start = chain_placements(
         Placements.at_origin(np.ones(count)), 0, order, lambda state, tie, new: tie.attach(state, new, scaled=True)
     )
 
@@ -308,7 +308,7 @@ def place_parts(count: int, ties: Sequence[SimilarityConstraint]) -> Placements:
         return out
 
     try:
-        return minimised(start, equations, _CONVERGENCE)[0]
+        return minimise_placements(start, equations, _CONVERGENCE)[0]
     except np.linalg.LinAlgError as error:
         log.info("parts lie one after the other: %s", error)
         return start

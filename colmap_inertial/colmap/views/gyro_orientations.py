@@ -221,7 +221,8 @@ def estimate_gyro_orientations(
         epoch_ns=timing.epoch_ns,
     )
     options = AlignOptions(max_offset_s=recording.max_offset_s)
-    aligned = align_clocks(visual.trajectory(), recording.imu, prior=recording.prior, options=options).settled()
+    alignment = align_clocks(visual.trajectory(), recording.imu, prior=recording.prior, options=options)
+    aligned = alignment.settle_clock_rate()
     motion = GyroCamera.from_timed(CameraTimedImu.from_recording(recording.imu, aligned, timing.epoch_ns))
     t_s = timing.pose_t_s()
     covered = motion.covers(t_s[pairs.first], t_s[pairs.second])

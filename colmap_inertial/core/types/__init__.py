@@ -20,8 +20,8 @@ from colmap_inertial.core.types.estimated import (
     Similarity,
     SmoothedTrajectory,
     SolvedMotion,
-    Verdict,
 )
+from colmap_inertial.core.types.evidence import Verdict
 from colmap_inertial.core.types.imu import (
     CAL,
     CALIBRATION_PARAMETERS,

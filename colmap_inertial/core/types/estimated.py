@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
@@ -16,10 +15,9 @@ from colmap_inertial.core.geometry import matrix_from_quat, rotation_between, sk
 from colmap_inertial.core.options import WorldAxes
 from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.core.types.consensus import RotationConsensus
+from colmap_inertial.core.types.evidence import CombinedScale, Verdict
 from colmap_inertial.core.types.imu import CameraImuCalibration, ImuCalibration, ImuNoise
 from colmap_inertial.core.types.recorded import LengthUnit, ReadoutDirection
-
-Verdict = Literal["trusted", "weak", "refused"]
 
 #: The direction of gravity in a metric world with these axes: ``y-down`` is COLMAP's and computer vision's habit.
 DOWN_IN_WORLD = {"z-up": np.array([0.0, 0.0, -1.0]), "y-down": np.array([0.0, 1.0, 0.0])}
@@ -184,6 +182,8 @@ class ScaleEstimate:
         Keyframes whose positions may be wrong, as they count little, or as the path jumps there.
     method
         ``"spectral"`` or ``"joint"``; ``"none"`` where nothing could be estimated.
+    sensors
+        What each sensor says; the scale is then that of all together. ``None`` where the IMU alone was asked.
     """
 
     metres_per_unit: float | None
@@ -205,6 +205,7 @@ class ScaleEstimate:
     noise: ImuNoise | None = None
     rotations: RotationConsensus | None = None
     jumped: tuple[str, ...] = ()
+    sensors: CombinedScale | None = None
     runtime_s: float = 0.0
     notes: tuple[Fact, ...] = ()
 
@@ -269,6 +270,7 @@ class ScaleEstimate:
             "drift": None if self.drift is None else self.drift.as_json(self.metres_per_unit),
             "parts": None if self.parts is None else dict(self.parts),
             "rotations": None if self.rotations is None else self.rotations.as_json(),
+            "sensors": None if self.sensors is None else self.sensors.as_json(),
             "method": self.method,
             "runtime_s": self.runtime_s,
         }

@@ -17,9 +17,8 @@ from colmap_inertial.imaging._bilinear import bilinear
 from colmap_inertial.imaging._cells import CELL_PX, Cells
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath
-from colmap_inertial.imaging.path_filters import path_wiener
+from colmap_inertial.imaging.path_filters import DeblurOptions, path_wiener
 from colmap_inertial.imaging.restoration.network import Network
-from colmap_inertial.imaging.wiener import DeblurOptions
 
 Code = TypeVar("Code", np.uint8, np.uint16)
 

@@ -91,7 +91,7 @@ class ArrowSystem:
         factor.substitute(rest)
         return rest * unit[:, :, None], x_globals, cov
 
-    def inverted(self) -> Inverse:
+    def invert(self) -> Inverse:
         """The inverse, as far as the system has blocks.
 
         Raises

@@ -74,7 +74,7 @@ class Group:
             flat = self.by_globals.reshape(-1, self.by_globals.shape[2])
             z[self.columns] += flat.T @ values.reshape(len(flat), -1)
 
-    def explained(self, inverse: Inverse) -> float:
+    def count_explained(self, inverse: Inverse) -> float:
         """Degrees of freedom of the residuals that the fit takes: the trace of their covariance after it."""
         n = len(self.residual)
         here, after = inverse.here[self.first :], inverse.here[self.first + 1 :]
@@ -145,8 +145,8 @@ class Direct:
             pulled = -self._kept(pulled)
         states[self.first : self.first + n, self.columns] += pulled
 
-    def explained(self, inverse: Inverse) -> float:
-        """See :meth:`Group.explained`; only the diagonal of the share."""
+    def count_explained(self, inverse: Inverse) -> float:
+        """See :meth:`Group.count_explained`; only the diagonal of the share."""
         last = self.first + len(self.info)
         own = np.s_[:, self.columns, self.columns]
         cov = np.diagonal(inverse.here[self.first : last][own], axis1=1, axis2=2)
@@ -177,7 +177,7 @@ def rotate(matrices: Array, vectors: Array) -> Array:
 
 
 def still_near(then: Estimate, x: Estimate, t_s: Array, tolerance: float = 1.0) -> bool:
-    """Whether :func:`corrected` turns the increments of an earlier estimate into those of this one well enough.
+    """Whether :func:`correct_increments` brings the increments of an earlier estimate near enough to those of this one.
 
     At a tolerance of one the difference is far below the noise.
     """
@@ -190,7 +190,7 @@ def still_near(then: Estimate, x: Estimate, t_s: Array, tolerance: float = 1.0) 
     )
 
 
-def corrected(pre: Preintegrated, then: Estimate, x: Estimate) -> Preintegrated:
+def correct_increments(pre: Preintegrated, then: Estimate, x: Estimate) -> Preintegrated:
     """Correct increments that were integrated for the estimate ``then`` to first order for ``x``."""
     gyro_gain, accel_gain = x.gyro_gain - then.gyro_gain, x.accel_gain - then.accel_gain
     gyro_bias = x.gyro_bias_rad_s - then.gyro_bias_rad_s
@@ -212,7 +212,7 @@ def corrected(pre: Preintegrated, then: Estimate, x: Estimate) -> Preintegrated:
 
 
 def imu_group(noise: ImuNoise, x: InertialStates, pre: Preintegrated, *, rotation_only: bool = False) -> Group:
-    """Rows: rotation, velocity, position between consecutive nodes."""
+    """``r_R, r_v, r_p`` of ``docs/dev/scale.md#imu-factor`` between consecutive nodes, whitened."""
     k, dt = len(pre.dt_s), pre.dt_s[:, None]
     body_from_world = x.world_from_imu[:-1].transpose(0, 2, 1)
     step_velocity = x.velocity_m_s[1:] - x.velocity_m_s[:-1] - x.gravity_m_s2 * dt

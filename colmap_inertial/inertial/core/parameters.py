@@ -132,7 +132,7 @@ class Estimate(InertialStates):
     delay_s: float  # of the IMU's stamps, beyond the first guess
     clock_rate: float  # growth of that delay per second, about the middle of the recording
     shutter: Array  # (4, 3, 3): rotation by rate, rotation by velocity, centre by rate, centre by velocity
-    coupling_m: Array  # (3, 3): beyond Data.coupling
+    coupling_m: Array  # (3, 3): beyond Measurements.coupling
 
     @classmethod
     def at_start(

@@ -21,7 +21,7 @@ from colmap_inertial.core.geometry import (
 from colmap_inertial.core.options import WorldAxes
 from colmap_inertial.core.types import DOWN_IN_WORLD, Action, JoinedPart, ScaleEstimate, Similarity, Treatment
 from colmap_inertial.inertial.join.placement import FittedSubmodel, Placed
-from colmap_inertial.inertial.join.relative_poses import JoinedGroup, relative_cov, worst
+from colmap_inertial.inertial.join.relative_poses import JoinedGroup, relative_cov, worst_sigmas
 from colmap_inertial.inertial.scale.verdict import TRUSTED_HALF_WIDTH, finite, half_width, verdict_of
 from colmap_inertial.model import Model, transformed
 from colmap_inertial.model.similarities import compose
@@ -72,7 +72,7 @@ def join_models(
             cov = cov + by @ shared @ by.T
             cov = 0.5 * (cov + cov.T)
             middles = [member.trajectory.cam_in_world.mean(axis=0) for member in (fitted[0], submodel)]
-            sigma_m, sigma_rad = worst(relative_cov(fitted, placed, middles, (0, k)))
+            sigma_m, sigma_rad = worst_sigmas(relative_cov(fitted, placed, middles, (0, k)))
         else:
             # the first one's up and scale are as uncertain as before, at most
             cov = _reduce_scale_sigma(first.similarity.cov, sigma_log)

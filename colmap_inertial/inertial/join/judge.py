@@ -23,7 +23,7 @@ from colmap_inertial.inertial.join.evidence import (
     times_counted,
 )
 from colmap_inertial.inertial.join.placement import FittedSubmodel, ImuLink, Placed, Problem, place_submodels
-from colmap_inertial.inertial.join.relative_poses import JoinedGroup, end_images, tie_cov, worst
+from colmap_inertial.inertial.join.relative_poses import JoinedGroup, end_images, tie_cov, worst_sigmas
 from colmap_inertial.model.submodels.graph import Pair, SimilarityConstraint, among, pair_of
 from colmap_inertial.model.submodels.matches import PlacedImages
 
@@ -77,7 +77,7 @@ class Trial:
     matched: tuple[SimilarityConstraint, ...] = ()
     left_out: frozenset[Pair] = frozenset()
 
-    def described(self, gap: Gap, pair: Pair) -> Gap:
+    def describe(self, gap: Gap, pair: Pair) -> Gap:
         """A gap with its standard deviations and matches as submodels lie in this trial."""
         gap = replace(gap, matched_images=_count_images(self.matched, pair))
         if pair not in self.sigmas:
@@ -111,7 +111,7 @@ class _Judgement:
             gap = replace(gap, reason=_why_unlinked(evidence, pair))
         else:
             trial = self.trials[pair] = _try_with_matches(evidence, pair, evidence.matched)
-            gap = trial.described(replace(gap, chi2=trial.chi2, dof=trial.dof), pair)
+            gap = trial.describe(replace(gap, chi2=trial.chi2, dof=trial.dof), pair)
             if trial.contradiction is not None:
                 # with matches and without: these have no part in it
                 self.against.add(pair)
@@ -133,7 +133,7 @@ class _Judgement:
             kept = [constraint for constraint in self.evidence.matched if pair_of(constraint) not in self.left_out]
             self.trials[members] = _try_with_matches(self.evidence, members, kept)
         trial = self.trials[members]
-        inside = (trial.described(gap, pair) for pair, gap in self.gaps.items() if gap.joined and pair in pairs)
+        inside = (trial.describe(gap, pair) for pair, gap in self.gaps.items() if gap.joined and pair in pairs)
         return trial.contradiction or next(filter(None, (_unsure(gap, self.limits) for gap in inside)), None)
 
     def merge_groups(self) -> list[tuple[int, ...]]:
@@ -162,7 +162,7 @@ class _Judgement:
         trial, submodels = self.trials[members], self.evidence.submodels
         assert trial.placed is not None
         for pair in set(combinations(members, 2)) & self.gaps.keys():
-            gap = trial.described(self.gaps[pair], pair)
+            gap = trial.describe(self.gaps[pair], pair)
             reason = trial.reason(gap, pair) if gap.joined else Fact("gap-joined-by-others")
             self.gaps[pair] = replace(gap, joined=True, reason=reason)
         return JoinedGroup(
@@ -295,7 +295,7 @@ def _try(evidence: Evidence, members: Sequence[int], matched: Collection[Similar
         farthest = max(farthest, float(misfit @ np.linalg.solve(cov, misfit)))
         a, b = pair_of(tie)
         pair = members[a], members[b]
-        sigmas[pair] = tuple(np.maximum(sigmas.get(pair, (0.0, 0.0)), worst(cov)).tolist())
+        sigmas[pair] = tuple(np.maximum(sigmas.get(pair, (0.0, 0.0)), worst_sigmas(cov)).tolist())
     why: Fact | None = None
     if device_chi2 > chi2_limit(device_dof, real=True):
         why = Fact("other-imu")

@@ -27,9 +27,9 @@ from colmap_inertial.model.submodels.graph import (
     Equations,
     Placements,
     SimilarityConstraint,
-    chained,
+    chain_placements,
     columns_of,
-    minimised,
+    minimise_placements,
 )
 
 #: Stamps are no better than this.
@@ -203,12 +203,12 @@ class Problem:
                 tie.attach(state, new, scaled=False)
 
         ties: list[SimilarityConstraint | ImuLink] = [*self.constraints, *self.links]
-        return chained(origin, self.held, ties, attach)
+        return chain_placements(origin, self.held, ties, attach)
 
     def _attach_by_imu(self, state: Placements, link: ImuLink, new: int) -> None:
         """Place one end's submodel by the other's and the IMU between; gravity stays down."""
         begin, end = (Node.of(self, state, k, node) for k, node in link.ends)
-        pre = self.preintegrated(state, begin, end)
+        pre = self.preintegrate_between(state, begin, end)
         dt_s, (gravity, _) = float(pre.dt_s[0]), self.gravity(state, self.held)
         turn = begin.world_from_imu @ pre.rotation[0] @ end.world_from_imu.T
         rotation = turn if new == link.second else turn.T
@@ -234,7 +234,7 @@ class Problem:
         change = state.change[self.shared :][post.ACCEL_GAIN].reshape(3, 3)
         return np.asarray(self.fits[self.held].accel_gain + change)
 
-    def preintegrated(self, state: Placements, begin: Node, end: Node) -> Preintegrated:
+    def preintegrate_between(self, state: Placements, begin: Node, end: Node) -> Preintegrated:
         """Preintegrated motion with the current parameters of the device."""
         reference, change = self.fits[self.held], state.change[self.shared :]
         errors = SensorErrors(
@@ -295,7 +295,7 @@ class Problem:
             gravity_m_s2=gravity,
             accel_gain=self.accel_gain(state),
         )
-        group = imu_group(noise, both, self.preintegrated(state, begin, end))
+        group = imu_group(noise, both, self.preintegrate_between(state, begin, end))
         assert group.after is not None and group.by_globals is not None and group.root is not None
         # the mean of both ends' biases is that of the time between
         here, after = (of_end[0][:, : post.NODE].copy() for of_end in (group.here, group.after))
@@ -316,7 +316,7 @@ class Problem:
         step_s, sides = PLACEMENT_OPTIONS.stamp_step_s, []
         for sign in (-1, 1):
             moved = replace(begin if first else end, stamp_s=(begin if first else end).stamp_s + sign * step_s)
-            sides.append(self.preintegrated(state, *((moved, end) if first else (begin, moved))))
+            sides.append(self.preintegrate_between(state, *((moved, end) if first else (begin, moved))))
         before, after = sides
         change = [so3_log(after.rotation[0] @ before.rotation[0].T)]
         change += [after.velocity[0] - before.velocity[0], after.position[0] - before.position[0]]
@@ -404,7 +404,9 @@ def place_submodels(problem: Problem, *, by_imu: bool = True) -> Placed:
     numpy.linalg.LinAlgError
         Where it does not converge.
     """
-    state, cov, squares = minimised(problem.start(), lambda state: problem.equations(state, by_imu=by_imu), CONVERGENCE)
+    state, cov, squares = minimise_placements(
+        problem.start(), lambda state: problem.equations(state, by_imu=by_imu), CONVERGENCE
+    )
     count, own = len(problem.submodels), problem.own(problem.held)
     change = state.change[own + post.GRAVITY.start : own + post.GRAVITY.stop]
     return Placed(

@@ -101,7 +101,7 @@ def relative_cov(
     return np.asarray(cov)
 
 
-def worst(cov: Array) -> tuple[float, float]:
+def worst_sigmas(cov: Array) -> tuple[float, float]:
     """Standard deviations (m, rad) along the worst directions, of a pose's covariance: rotation, position."""
     largest = [float(np.linalg.eigvalsh(cov[part, part])[-1]) for part in (slice(3, 6), slice(0, 3))]
     return largest[0] ** 0.5, largest[1] ** 0.5

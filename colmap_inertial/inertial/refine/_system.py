@@ -127,7 +127,7 @@ class System:
         if rows.by_shared is not None:
             self.border[columns] += derivative.transpose(0, 2, 1) @ rows.by_shared
 
-    def factored(self) -> Factored:
+    def factor(self) -> Factored:
         """The system solved for.
 
         Raises
@@ -161,7 +161,7 @@ class Step:
     points: Array
     change: Array
 
-    def taken(self, x: Estimate, length: float, distances: Distances | None) -> Estimate:
+    def apply_to(self, x: Estimate, length: float, distances: Distances | None) -> Estimate:
         """The estimate after so many times the step."""
         moved = x.moved(length * self.states, length * self.shared, length * self.points)
         if distances is None:

@@ -18,7 +18,13 @@ from colmap_inertial.inertial.refine.motion import find_motion_covs
 from colmap_inertial.inertial.refine.pictures import apply_noise, measure_picture_noise, pictures_alone
 from colmap_inertial.inertial.refine.setup import NO_READOUT_S, move_to_middle_lines
 from colmap_inertial.inertial.refine.shutter import SHUTTER_LIMITS
-from colmap_inertial.inertial.refine.solve import Solution, apply_measured_noise, evaluate_held_out, factored, solve
+from colmap_inertial.inertial.refine.solve import (
+    Solution,
+    apply_measured_noise,
+    evaluate_held_out,
+    factor_information,
+    solve,
+)
 from colmap_inertial.inertial.refine.values import READOUT, Estimate, Observations, Problem
 from colmap_inertial.inertial.refine.world import (
     FoundWorld,
@@ -224,7 +230,7 @@ def _solve_all(judged: Judged, problem: Problem, x: Estimate, t_s: Array) -> Jud
     if not whole.converged:
         return replace(judged, reason=Fact("refinement-not-converged-whole"))
     try:
-        solved = factored(problem, whole.estimate)
+        solved = factor_information(problem, whole.estimate)
     except np.linalg.LinAlgError:
         return replace(judged, reason=Fact("refinement-unsure"))
     assert problem.inertial is not None
@@ -279,7 +285,7 @@ def _count_freedom(problem: Problem) -> float:
 def _estimate_readout(problem: Problem, x: Estimate) -> tuple[float, float] | None:
     """Estimated readout and its standard deviation, in seconds; None where there is no standard deviation."""
     try:
-        cov = factored(problem, x).shared_cov()
+        cov = factor_information(problem, x).shared_cov()
     except np.linalg.LinAlgError:
         return None
     return x.readout_s, float(cov[READOUT, READOUT]) ** 0.5

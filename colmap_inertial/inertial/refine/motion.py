@@ -15,7 +15,7 @@ from colmap_inertial.inertial.refine._system import Factored
 from colmap_inertial.inertial.refine.judging_points import JUDGING
 from colmap_inertial.inertial.refine.pictures import apply_noise, make_pictures, measure_picture_noise, pictures_alone
 from colmap_inertial.inertial.refine.setup import Seen
-from colmap_inertial.inertial.refine.solve import factored
+from colmap_inertial.inertial.refine.solve import factor_information
 from colmap_inertial.inertial.refine.values import N_STATE, Estimate, Problem
 from colmap_inertial.inertial.refine.world import (
     derive_log_size,
@@ -148,7 +148,7 @@ def find_drift(seen: Seen, down: Array) -> PictureDrift | None:
     if Layout.of(problem.observations, len(seen.names)).size_bytes > _LIMITS.most_bytes:
         return None
     problem = apply_noise(problem, measure_picture_noise(problem, x))
-    solved, by = factored(problem, x), moving(problem, x)
+    solved, by = factor_information(problem, x), moving(problem, x)
     return PictureDrift(names=seen.names, cam_in_world=seen.cam_in_world, cov=_drift_covs(seen, down, solved, by))
 
 
@@ -201,14 +201,14 @@ def expect_worth(seen: Seen, problem: Problem, start: Estimate, *, bent: bool = 
         return Worth(share=share, reason=Fact("refine-takes-long", share=share))
     pictures, x = make_pictures(seen)
     pictures = apply_noise(pictures, measure_picture_noise(pictures, x))
-    alone, size_m = _shape_cov(seen, factored(pictures, x), moving(pictures, x))
+    alone, size_m = _shape_cov(seen, factor_information(pictures, x), moving(pictures, x))
     worth = Worth(alone_m=_sigma(alone), share=share)
     if worth.alone_m < _LIMITS.least_drift * size_m and not bent:
         held = Fact("refine-shape-held", alone_m=worth.alone_m, share=worth.alone_m / size_m)
         return replace(worth, reason=held)
     noise = measure_picture_noise(pictures_alone(problem, seen.observations.xy_px), start)
     problem = apply_noise(problem, noise)
-    refined, _ = _shape_cov(seen, factored(problem, start), moving(problem, start))
+    refined, _ = _shape_cov(seen, factor_information(problem, start), moving(problem, start))
     worth = replace(worth, refined_m=_sigma(refined), risk=_risk(alone, refined))
     if worth.risk <= _LIMITS.most_risk or bent:
         return worth

@@ -23,7 +23,7 @@ from colmap_inertial.inertial.refine.pictures import (
     select_points,
 )
 from colmap_inertial.inertial.refine.setup import Known, Seen, make_problem
-from colmap_inertial.inertial.refine.solve import factored, solve
+from colmap_inertial.inertial.refine.solve import factor_information, solve
 from colmap_inertial.inertial.refine.values import FIRST_INTRINSIC, READOUT, Estimate, Problem
 from colmap_inertial.inertial.scale.verdict import finite, half_width, verdict_of, without_width
 from colmap_inertial.model import colmap_camera
@@ -232,7 +232,7 @@ def _measure(
     for _ in range(rounds):
         before_s = x.readout_s
         x = solve(problem, x, most_steps=SHUTTER_LIMITS.steps).estimate
-        cov = factored(problem, x, damping=SHUTTER_LIMITS.damping).shared_cov()
+        cov = factor_information(problem, x, damping=SHUTTER_LIMITS.damping).shared_cov()
         variance = float(cov[READOUT, READOUT])
         if abs(x.readout_s - before_s) < SHUTTER_LIMITS.settled_sigma * variance**0.5:
             break

@@ -170,7 +170,7 @@ def solve(problem: Problem, start: Estimate, *, most_steps: int = SOLVE.steps) -
         while not gained and not damping.is_exhausted:
             system = _build_system(problem, layout, at, by, residual, damping.value)
             step = _find_step(system, rows, by)
-            if step is None or not _is_plausible(start, step.taken(at.estimate, stretch, problem.distances)):
+            if step is None or not _is_plausible(start, step.apply_to(at.estimate, stretch, problem.distances)):
                 damping.grow()
                 continue
             promised = _predict_decrease(problem, at, residual, step)
@@ -198,7 +198,7 @@ def solve(problem: Problem, start: Estimate, *, most_steps: int = SOLVE.steps) -
 def _try_step(problem: Problem, at: _Point, step: Step, stretch: float, promised: float) -> tuple[_Point, float]:
     """What a step leads to, and its length: stretched, or as it is where that brings nothing."""
     for length in (stretch, 1.0) if stretch > 1 else (1.0,):
-        tried = _evaluate(problem, step.taken(at.estimate, length, problem.distances), problem.observations)
+        tried = _evaluate(problem, step.apply_to(at.estimate, length, problem.distances), problem.observations)
         if (at.cost - tried.cost) / promised > _GAINS:
             break
     return tried, length
@@ -213,7 +213,7 @@ def _predict_decrease_by_points(system: System) -> float:
 def _find_step(system: System, observations: Observations, by: Derivatives) -> Step | None:
     """Step of the system; ``None`` where it needs more damping to be solved."""
     try:
-        step = system.factored().step(system, observations, by)
+        step = system.factor().step(system, observations, by)
     except np.linalg.LinAlgError:
         return None
     return step if all(np.isfinite(part).all() for part in (step.states, step.shared, step.points)) else None
@@ -245,11 +245,11 @@ def _make_solution(at: _Point, steps: int, *, converged: bool) -> Solution:
     return Solution(estimate=at.estimate, cost=at.cost, squares=squares, steps=steps, converged=converged)
 
 
-def factored(problem: Problem, x: Estimate, *, damping: float = 0.0) -> Factored:
+def factor_information(problem: Problem, x: Estimate, *, damping: float = 0.0) -> Factored:
     """The information at an estimate, for covariances."""
     layout = Layout.of(problem.observations, len(x.velocity_m_s))
     at = _evaluate(problem, x, problem.observations)
-    return _build_system(problem, layout, at, *_weight_rows(problem, at, problem.informs), damping).factored()
+    return _build_system(problem, layout, at, *_weight_rows(problem, at, problem.informs), damping).factor()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -262,7 +262,7 @@ class Linearised:
     residual: Array
     estimate: Estimate
 
-    def solved(self, problem: Problem) -> tuple[Factored, Array, Array]:
+    def solve(self, problem: Problem) -> tuple[Factored, Array, Array]:
         """The information, and the steps (F, 15) and (Q,) to the solution with a problem's noise."""
         x = self.estimate
         at = _Point(
@@ -273,12 +273,12 @@ class Linearised:
             cost=np.nan,
         )
         system = _build_system(problem, self.layout, at, self.by, self.residual, 0.0)
-        solved = system.factored()
+        solved = system.factor()
         step = solved.step(system, problem.rows, self.by)
         return solved, step.states, step.shared
 
 
-def linearised(problem: Problem, x: Estimate) -> Linearised:
+def linearise_observations(problem: Problem, x: Estimate) -> Linearised:
     """The observations at an estimate."""
     at = _evaluate(problem, x, problem.observations)
     by, residual = _weight_rows(problem, at, problem.informs)
@@ -328,7 +328,7 @@ def apply_measured_noise(problem: Problem, x: Estimate) -> Problem:
     known, change = inertial.noise, 0.0
     assumed = known.accel_density_m_s2_rthz
     least = min(0.0, max(-float(np.log(_MOST_LEVEL)), float(np.log(_LEAST_LEVEL_M_S2_RTHZ / assumed))))
-    at = linearised(problem, x)
+    at = linearise_observations(problem, x)
     for _ in range(_LEVEL_STEPS):
         noise = replace(known, accel_density_m_s2_rthz=assumed * float(np.exp(change)))
         problem = replace(problem, inertial=replace(inertial, noise=noise))
@@ -343,7 +343,7 @@ def apply_measured_noise(problem: Problem, x: Estimate) -> Problem:
 
 def _level_step(problem: Problem, x: Estimate, at: Linearised, change: float) -> float:
     """Newton's step of the logarithm of the level, which has changed by so much from what was known."""
-    solved, states, shared = at.solved(problem)
+    solved, states, shared = at.solve(problem)
     rows = imu_rows(problem, x)
     assert rows.share is not None
     left = rows.residual[:, :, None] + _apply_rows(rows, states[:, :, None], shared[:, None])

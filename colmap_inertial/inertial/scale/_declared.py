@@ -50,7 +50,7 @@ def doubts_lever(fit: Fit, prior: Prior, *, is_refused: bool) -> bool:
     covariances of prior and fit. A fit that is refused, and one with an arm that no usual device has, tell nothing.
     """
     at = par.LEVER
-    before = np.linalg.inv(prior.info[at, at])
+    before = np.asarray(np.linalg.inv(prior.info[at, at]), dtype=np.float64)
     if float(np.diagonal(before).max()) ** 0.5 > _LIMITS.known_m:
         return False
     declared = np.asarray(prior.mean.imu_in_cam_m)
@@ -66,7 +66,8 @@ def doubts_lever(fit: Fit, prior: Prior, *, is_refused: bool) -> bool:
     inverse = (vectors[:, telling] / values[telling]) @ vectors[:, telling].T
     off = before @ inverse @ (fit.estimate.imu_in_cam_m - declared)
     of_fit = before @ inverse @ before - before if telling.all() else 1e3 * before
-    chi2 = float(off @ np.linalg.solve(_cov_between(before, of_fit), off))
+    cov = _cov_between(before, np.asarray(of_fit, dtype=np.float64))
+    chi2 = float(off @ np.linalg.solve(cov, off))
     return bool(np.linalg.norm(off) > _LIMITS.matters_m and chi2 > _LIMITS.chi2_of_mistakes)
 
 
@@ -82,7 +83,8 @@ def find_contradicted_lever(alone: Fit, prior: Prior) -> Fact | None:
     """
     at = par.LEVER
     declared, found = np.asarray(prior.mean.imu_in_cam_m), alone.estimate.imu_in_cam_m
-    cov = _cov_between(np.linalg.inv(prior.info[at, at]), alone.cov[at, at])
+    before = np.asarray(np.linalg.inv(prior.info[at, at]), dtype=np.float64)
+    cov = _cov_between(before, alone.cov[at, at])
 
     def chi2(arm_m: Array) -> float:
         return float((found - arm_m) @ np.linalg.solve(cov, found - arm_m))

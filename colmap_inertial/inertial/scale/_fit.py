@@ -16,7 +16,7 @@ from colmap_inertial.inertial.core.preintegration import Preintegrated
 from colmap_inertial.inertial.core.priors import model_scale_sigma
 from colmap_inertial.inertial.scale import _noise as levels, _residuals as res, _shape as shape, _suspects as sus
 from colmap_inertial.inertial.scale._noise import Expected, LevelSearch
-from colmap_inertial.inertial.scale._setup import Data
+from colmap_inertial.inertial.scale._setup import Measurements
 
 #: Length of a part, and how many there are at most.
 _PART_S, _MOST_PARTS = 10.0, 12
@@ -36,7 +36,7 @@ def chi2_tail(chi2: float, dof: int) -> float:
     return total
 
 
-def scale_drift(data: Data, noise: Noise, optimum: _Optimum, inflation: float, taken: float) -> ScaleDrift:
+def scale_drift(data: Measurements, noise: Noise, optimum: _Optimum, inflation: float, taken: float) -> ScaleDrift:
     """Scales of parts of the recording, and a test of whether they are the same.
 
     Each part gets a scale of its own, to first order about the joint fit; all other parameters follow. A deviation of a
@@ -179,7 +179,7 @@ class Fit:
     prior_info: Array
 
 
-def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
+def fit_jointly(data: Measurements, prior: Prior, sheet: ImuNoise | None) -> Fit:
     """Gauss-Newton on all states and globals, with noise levels from the residuals.
 
     Raises
@@ -193,21 +193,24 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
     cov = inverse.cov
     noise, sums = search.noise, search.sums
 
-    # Once more: the mean gyroscope bias, the scale's variance, suspicions, and scales of the parts
+    # Solved once more, for the mean gyroscope bias, the scale, and the suspicions
     k = len(data.t_s)
     imu = groups["imu"]
     assert isinstance(imu, fac.Group)
-    where, own = sus.columns(data, x, imu)
+    where, columns = sus.derive_columns(data, x, imu)
+    of_bias, of_scale, of_suspicions = slice(0, 3), slice(3, 4), slice(4, None)
+    count = of_suspicions.start + columns.shape[2]
+    rhs, rhs_z = np.zeros((k, par.N_STATE, count)), np.zeros((par.N_GLOBALS, count))
+    rhs[:, par.GYRO_BIAS, of_bias] = np.eye(3) / k
+    rhs_z[par.SCALE, of_scale] = 1.0
+    imu.pull_back(columns, rhs[:, :, of_suspicions], rhs_z[:, of_suspicions])
+    states, z = inverse.solve(rhs, rhs_z)
+    explained = imu.apply(states[:, :, of_suspicions], z[:, of_suspicions])
     residual = (imu.residual[:, :, None] + imu.apply(*at.step))[:, :, 0]
-    ends, ends_z = np.zeros((k, par.N_STATE, 4 + own.shape[2])), np.zeros((par.N_GLOBALS, 4 + own.shape[2]))
-    ends[:, par.GYRO_BIAS, :3] = np.eye(3) / k
-    ends_z[par.SCALE, 3] = 1.0
-    imu.pull_back(own, ends[:, :, 4:], ends_z[:, 4:])
-    states, z = inverse.solve(ends, ends_z)
-    suspicions = sus.suspicions(where, own, imu.apply(states[:, :, 4:], z[:, 4:]), residual, z[par.SCALE, 4:])
-    variance_parts = _split_variance(groups, at.prior, x, at.pre.cov_gaps, states[:, :, 3:4], z[:, 3])
-    level_variance, freedom = search.scale_variance(groups, states[:, :, 3:4], z[:, 3:4])
-    states, z = states[:, :, :3], z[:, :3]
+    suspicions = sus.score_suspicions(where, columns, explained, residual, z[par.SCALE, of_suspicions])
+    by_scale, by_scale_z = states[:, :, of_scale], z[:, of_scale]
+    variance_parts = _split_variance(groups, at.prior, x, at.pre.cov_gaps, by_scale, by_scale_z[:, 0])
+    level_variance, freedom = search.scale_variance(groups, by_scale, by_scale_z)
     inflation = max(1.0, *(squares / expected for squares, expected in sums.values()))
     taken = max(0.0, 3 * k - sums["centre_m"][1] - sums["drift_m_rts"][1])
     drift = scale_drift(data, noise, at, inflation, taken)
@@ -218,8 +221,8 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         estimate=x,
         noise=noise,
         cov=cov,
-        gyro_bias_cov=np.mean(states[:, par.GYRO_BIAS], axis=0),
-        gyro_bias_with_globals=z,
+        gyro_bias_cov=np.mean(states[:, par.GYRO_BIAS, of_bias], axis=0),
+        gyro_bias_with_globals=z[:, of_bias],
         sums=sums,
         level_variance=level_variance + unsettled_log**2,
         freedom=freedom,
@@ -253,14 +256,14 @@ class _Optimum:
     inverse: Inverse
     step: tuple[Array, Array]
 
-    def score(self, columns: Array, data: Data, noise: Noise) -> shape.Scores:
+    def score(self, columns: Array, data: Measurements, noise: Noise) -> shape.Scores:
         """Score of the visual centres for changes (K, 3, q) of their path."""
         centre = self.groups["centre"]
         assert isinstance(centre, fac.Group)
         return shape.score_columns(columns, data, noise, centre, self.inverse, self.step)
 
 
-def _find_optimum(data: Data, prior: Prior, search: LevelSearch) -> tuple[_Optimum, float]:
+def _find_optimum(data: Measurements, prior: Prior, search: LevelSearch) -> tuple[_Optimum, float]:
     """Gauss-Newton with the noise levels along; also what the scale moved by in the end, 0 where it came to rest."""
     x = _fit_rotations(data, search.noise, prior)
     scale = _guess_scale(data, x)
@@ -270,11 +273,11 @@ def _find_optimum(data: Data, prior: Prior, search: LevelSearch) -> tuple[_Optim
     for iteration in range(_MAX_ITERATIONS):
         if settled or not fac.still_near(there, x, data.t_s, tolerance=4.0 if iteration <= _FEWEST_ITERATIONS else 1.0):
             integrated, there = res.integrate(data, x), x
-        pre = fac.corrected(integrated, there, x)
+        pre = fac.correct_increments(integrated, there, x)
         local = prior.at(x)
         groups = res.all_groups(data, search.noise, local, x, pre, robust=iteration > 2)
         system, rhs, rhs_z = fac.normal_equations(list(groups.values()), local, x)
-        inverse = system.inverted()
+        inverse = system.invert()
         states, z = inverse.solve(rhs, rhs_z)
         turned = search.at_rest and float(z[par.SCALE, 0]) * signed < -_TURNS_BACK * signed**2
         signed = float(z[par.SCALE, 0])
@@ -315,7 +318,7 @@ _CAUSE_OF_GLOBALS = {
 }
 
 
-def _find_shape_faults(data: Data, noise: Noise, at: _Optimum, taken: float) -> list[shape.ShapeFault]:
+def _find_shape_faults(data: Measurements, noise: Noise, at: _Optimum, taken: float) -> list[shape.ShapeFault]:
     """What may be wrong with the model's shape; nothing where the clip is too short to tell."""
     if data.t_s[-1] - data.t_s[0] < shape.LIMITS.shortest_s:
         return []
@@ -373,7 +376,7 @@ def _split_variance(
     return {name: variance * float(z[par.SCALE]) / sum(left.values()) for name, variance in left.items()}
 
 
-def _fit_rotations(data: Data, noise: Noise, prior: Prior) -> Estimate:
+def _fit_rotations(data: Measurements, noise: Noise, prior: Prior) -> Estimate:
     """Rotations, gyroscope bias and time offset from gyroscope and visual rotations alone."""
     x = prior.mean
     for _ in range(_MAX_ROTATION_ITERATIONS):
@@ -392,7 +395,7 @@ def _fit_rotations(data: Data, noise: Noise, prior: Prior) -> Estimate:
     return x
 
 
-def _guess_scale(data: Data, x: Estimate) -> float:
+def _guess_scale(data: Measurements, x: Estimate) -> float:
     """Metres per unit at which visual and inertial second differences, less gravity and bias, are equally large."""
     pre = res.integrate(data, x)
     dt = pre.dt_s[:, None]
@@ -415,7 +418,7 @@ def _guess_scale(data: Data, x: Estimate) -> float:
     return float(inertial_size / visual_size)
 
 
-def _excitation_m_s2(data: Data, x: Estimate) -> float:
+def _excitation_m_s2(data: Measurements, x: Estimate) -> float:
     """Standard deviation of the camera's acceleration; on its lever arm the IMU swings even where the camera stays."""
     path = shape.camera_path(x)
     dt_s = np.diff(data.t_s)[:, None]

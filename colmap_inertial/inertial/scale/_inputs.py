@@ -65,4 +65,4 @@ def align_recording(
     alignment, consensus = align_by_consensus(
         trajectory, imu, prior=calibration, options=AlignOptions(max_offset_s=options.max_offset_s)
     )
-    return CameraTimedImu.from_recording(imu, alignment.settled(), trajectory.epoch_ns), consensus
+    return CameraTimedImu.from_recording(imu, alignment.settle_clock_rate(), trajectory.epoch_ns), consensus

@@ -16,7 +16,7 @@ from colmap_inertial.core.types import JOINT_GYRO_WALK_RAD_S_RTS, TYPICAL_NOISE,
 from colmap_inertial.inertial.core.arrow import Inverse
 from colmap_inertial.inertial.core.factors import Direct, Group
 from colmap_inertial.inertial.core.parameters import Noise
-from colmap_inertial.inertial.scale._setup import Data
+from colmap_inertial.inertial.scale._setup import Measurements
 
 Groups = Mapping[str, Group | Direct]
 
@@ -83,7 +83,7 @@ _PATIENCE, _TIRING = 25, 0.6
 _AT_REST = 0.5
 
 
-def vibrates(data: Data) -> bool:
+def vibrates(data: Measurements) -> bool:
     """Whether the accelerometer feels rotors or an engine."""
     return data.accel_roughness_m_s2_rthz > _VIBRATES
 
@@ -113,7 +113,7 @@ class Expected:
     least_left: float
 
     @classmethod
-    def of(cls, data: Data, sheet: ImuNoise | None) -> Expected:
+    def of(cls, data: Measurements, sheet: ImuNoise | None) -> Expected:
         """Priors from the sensors' streams; a data sheet raises them, never lowers them.
 
         The white noise of a sensor is in its stream, and so is all that is quicker than the states: motion, and above
@@ -219,7 +219,7 @@ class LevelSearch:
             )
             if group.share is not None:
                 count = float(np.trace(group.share, axis1=1, axis2=2).sum())
-            counts[i], right[i] = count, max(count - group.explained(inverse), self.expected.least_left * count)
+            counts[i], right[i] = count, max(count - group.count_explained(inverse), self.expected.least_left * count)
             group.pull_back(own[i], rhs[:, :, i : i + 1], rhs_z[:, i : i + 1])
         # a hundredth of the residuals, or they tell nothing of how much larger than expected they are
         expected = np.maximum(right, 0.01 * counts)

@@ -18,13 +18,13 @@ from colmap_inertial.inertial.core.factors import (
 )
 from colmap_inertial.inertial.core.parameters import Estimate, Noise, Prior
 from colmap_inertial.inertial.core.preintegration import Preintegrated, SensorErrors, preintegrate
-from colmap_inertial.inertial.scale._setup import Data
+from colmap_inertial.inertial.scale._setup import Measurements
 
 #: Cauchy scale of the visual residuals, in standard deviations: a normal error loses 4 % of its weight on average.
 ROBUST_SIGMAS = 4.0
 
 
-def integrate(data: Data, x: Estimate) -> Preintegrated:
+def integrate(data: Measurements, x: Estimate) -> Preintegrated:
     """Preintegration between the nodes at the biases, gains and delays of ``x``."""
     errors = SensorErrors(
         gyro_bias_rad_s=x.gyro_bias_rad_s[:-1],
@@ -36,12 +36,14 @@ def integrate(data: Data, x: Estimate) -> Preintegrated:
     return preintegrate(node_stamps(data, x), data.streams, errors)
 
 
-def node_stamps(data: Data, x: Estimate) -> Array:
+def node_stamps(data: Measurements, x: Estimate) -> Array:
     """(K,) times of the nodes on the clock of the streams."""
     return np.asarray(data.t_s - x.delay_s - x.clock_rate * (data.t_s - par.middle_s(data.t_s)))
 
 
-def visual_groups(data: Data, noise: Noise, x: Estimate, rate_rad_s: Array, *, robust: bool) -> tuple[Group, Group]:
+def visual_groups(
+    data: Measurements, noise: Noise, x: Estimate, rate_rad_s: Array, *, robust: bool
+) -> tuple[Group, Group]:
     """Rotations, and centres given the rotations.
 
     A picture determines a camera's rotation and its centre together: what turns the camera and moves it so that the
@@ -89,8 +91,8 @@ def visual_groups(data: Data, noise: Noise, x: Estimate, rate_rad_s: Array, *, r
     )
 
 
-def _rotation_residuals(data: Data, x: Estimate, rate_rad_s: Array, rate: Array) -> tuple[Array, Array, Array]:
-    """(K, 3) visual rotations less those of the IMU, camera frame, with derivatives by states and globals.
+def _rotation_residuals(data: Measurements, x: Estimate, rate_rad_s: Array, rate: Array) -> tuple[Array, Array, Array]:
+    """``r_theta`` of ``docs/dev/scale.md#visual-factors`` (K, 3), camera frame, with derivatives by states and globals.
 
     ``rate_rad_s`` (IMU frame) at the nodes, ``rate`` (camera frame) the mean of each node's frames.
     """
@@ -110,8 +112,8 @@ def _rotation_residuals(data: Data, x: Estimate, rate_rad_s: Array, rate: Array)
     return rotation, rotation_here, rotation_z
 
 
-def _centre_residuals(data: Data, x: Estimate, rate_rad_s: Array, smear: Array) -> tuple[Array, Array, Array]:
-    """(K, 3) visual centres in metres less those of the IMU, world frame, with derivatives by states and globals.
+def _centre_residuals(data: Measurements, x: Estimate, rate_rad_s: Array, smear: Array) -> tuple[Array, Array, Array]:
+    """``s c - y - d`` of ``docs/dev/scale.md#visual-factors`` (K, 3), world frame, with derivatives as above.
 
     ``smear`` (K, 3): what the rolling shutter moves centres by, camera frame.
     """
@@ -183,7 +185,7 @@ CAUSE_OF_GROUP = {
 
 
 def all_groups(
-    data: Data, noise: Noise, prior: Prior, x: Estimate, pre: Preintegrated, *, robust: bool
+    data: Measurements, noise: Noise, prior: Prior, x: Estimate, pre: Preintegrated, *, robust: bool
 ) -> dict[str, Group | Direct]:
     """Everything but the priors of the globals."""
     rotation, centre = visual_groups(data, noise, x, pre.rate_rad_s, robust=robust)
@@ -215,7 +217,7 @@ def all_groups(
 
 
 def rotation_groups(
-    data: Data, noise: Noise, prior: Prior, x: Estimate, pre: Preintegrated
+    data: Measurements, noise: Noise, prior: Prior, x: Estimate, pre: Preintegrated
 ) -> dict[str, Group | Direct]:
     """Residuals of rotations alone; all else is held."""
     k = len(data.t_s)

@@ -68,7 +68,7 @@ class Groups:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Data:
+class Measurements:
     """Measurements at K nodes, each the mean of a few frames of the camera.
 
     Attributes
@@ -255,7 +255,7 @@ def prepare(
     gravity_m_s2: float,
     gravity_sigma_m_s2: float,
     states_hz: float,
-) -> tuple[Data, Prior]:
+) -> tuple[Measurements, Prior]:
     """Measurements at the nodes, and the prior, whose mean is the starting point.
 
     Raises
@@ -280,7 +280,7 @@ def prepare(
     if trajectory.pose_cov is not None:
         pose_cov = np.add.reduceat(trajectory.pose_cov[inside], groups.first, axis=0) / groups.count[:, None, None]
     rotation_shape, centre_shape, coupling = _whiten_poses(pose_cov, world_from_cam)
-    data = Data(
+    data = Measurements(
         groups=groups,
         origin=centre.mean(axis=0),
         rotation_shape=rotation_shape,

@@ -18,7 +18,7 @@ from colmap_inertial.core.facts import Fact
 from colmap_inertial.inertial.core import factors as fac, parameters as par
 from colmap_inertial.inertial.core.arrow import Inverse
 from colmap_inertial.inertial.core.parameters import Estimate, Noise
-from colmap_inertial.inertial.scale._setup import Data
+from colmap_inertial.inertial.scale._setup import Measurements
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,7 +168,7 @@ class Scores:
 
 
 def score_columns(
-    columns: Array, data: Data, noise: Noise, centre: fac.Group, inverse: Inverse, step: tuple[Array, Array]
+    columns: Array, data: Measurements, noise: Noise, centre: fac.Group, inverse: Inverse, step: tuple[Array, Array]
 ) -> Scores:
     """Score of the residuals at the optimum for changes of the visual path.
 

@@ -24,7 +24,7 @@ from colmap_inertial.inertial.core.preintegration import (
     preintegrate,
 )
 from colmap_inertial.inertial.scale._residuals import node_stamps
-from colmap_inertial.inertial.scale._setup import Data
+from colmap_inertial.inertial.scale._setup import Measurements
 
 #: Squared deviation in standard deviations from which a suspicion counts. 935 clean recordings, real and simulated, had
 #: 23 at most.
@@ -86,7 +86,7 @@ def perturbations(accel: SensorStream, middle_s: float) -> dict[str, list[Array]
     }
 
 
-def columns(data: Data, x: Estimate, imu: fac.Group) -> tuple[dict[str, slice], Array]:
+def derive_columns(data: Measurements, x: Estimate, imu: fac.Group) -> tuple[dict[str, slice], Array]:
     """Slices of each suspicion's unknowns, and their columns (K, 9, q) of the whitened inertial residuals ``imu``."""
     k, accel = len(data.t_s) - 1, data.streams.accel
     errors = SensorErrors(
@@ -114,15 +114,15 @@ def columns(data: Data, x: Estimate, imu: fac.Group) -> tuple[dict[str, slice], 
     return where, np.asarray(imu.root @ by)
 
 
-def suspicions(
+def score_suspicions(
     where: dict[str, slice], own: Array, explained: Array, residual: Array, by_scale: Array
 ) -> list[Suspicion]:
-    """Results of the score tests.
+    """Results of the score tests: ``p`` and its variance, of ``docs/dev/scale.md#accelerometer-faults``.
 
     Parameters
     ----------
     where, own
-        From :func:`columns`.
+        From :func:`derive_columns`.
     explained
         (K, 9, q) what of the columns the fit's own parameters can do.
     residual
@@ -228,7 +228,7 @@ class Faults:
         info[at, at] = 1 / (1 / info[at, at] + self._time_constant_s**2)
         return replace(prior, info=info)
 
-    def undo(self, data: Data) -> Data:
+    def undo(self, data: Measurements) -> Measurements:
         """The data of a recording with the readings that a sound accelerometer would have given.
 
         A filter is taken as one of the first order, which applications' are: the reading plus its time constant times

@@ -38,7 +38,7 @@ from colmap_inertial.inertial.core.priors import PRIORS, AccelPart, accel_part
 from colmap_inertial.inertial.scale._declared import doubts_lever, find_contradicted_lever, leave_out_lever
 from colmap_inertial.inertial.scale._fit import Fit, fit_jointly
 from colmap_inertial.inertial.scale._gain import WrongGain, exceeds_usual
-from colmap_inertial.inertial.scale._setup import Data, prepare
+from colmap_inertial.inertial.scale._setup import Measurements, prepare
 from colmap_inertial.inertial.scale._shape import (
     LIMITS as SHAPE_LIMITS,
     ShapeFault,
@@ -174,7 +174,7 @@ def _note_moved_stamps(moved_s: float) -> list[Fact]:
     return [] if moved_s == 0 else [Fact("accel-delay-undone", delay_s=-moved_s)]
 
 
-def _name_jumped_images(fit: Fit, data: Data, trajectory: CameraTrajectory) -> tuple[str, ...]:
+def _name_jumped_images(fit: Fit, data: Measurements, trajectory: CameraTrajectory) -> tuple[str, ...]:
     """Images by themselves that hardly count, or at which the path jumps, those that count least first.
 
     Behind a break the drift is free.
@@ -186,7 +186,7 @@ def _name_jumped_images(fit: Fit, data: Data, trajectory: CameraTrajectory) -> t
     return tuple(trajectory.names[int(np.argmin(np.abs(trajectory.t_s - t)))] for t in data.t_s[least_first])
 
 
-def _prepare(trajectory: CameraTrajectory, timed: CameraTimedImu, options: JointOptions) -> tuple[Data, Prior]:
+def _prepare(trajectory: CameraTrajectory, timed: CameraTimedImu, options: JointOptions) -> tuple[Measurements, Prior]:
     """Measurements and prior of the fit."""
     return prepare(
         trajectory,
@@ -199,7 +199,7 @@ def _prepare(trajectory: CameraTrajectory, timed: CameraTimedImu, options: Joint
 
 def fit_path(
     trajectory: CameraTrajectory, timed: CameraTimedImu, options: JointOptions
-) -> tuple[Data, Fit, tuple[Fact, ...]]:
+) -> tuple[Measurements, Fit, tuple[Fact, ...]]:
     """The measurements as they came, their fit, and what is wrong with the accelerometer or the model's shape.
 
     Raises
@@ -218,10 +218,10 @@ def fit_path(
 
 def _fit_without_contradicted_lever(
     trajectory: CameraTrajectory, timed: CameraTimedImu, options: JointOptions
-) -> tuple[CameraTimedImu, Data, Prior, Fit, Fact | None]:
+) -> tuple[CameraTimedImu, Measurements, Prior, Fit, Fact | None]:
     """As :func:`_fit_moving_stamps`, without a declared lever arm that a fit without it contradicts; then that fact."""
 
-    def fit_without(length_m: float) -> tuple[CameraTimedImu, Data, Prior, Fit]:
+    def fit_without(length_m: float) -> tuple[CameraTimedImu, Measurements, Prior, Fit]:
         calibration = leave_out_lever(timed.calibration, length_m=length_m)
         return _fit_moving_stamps(trajectory, replace(timed, calibration=calibration), options)
 
@@ -239,7 +239,7 @@ def _fit_without_contradicted_lever(
 
 def _fit_moving_stamps(
     trajectory: CameraTrajectory, timed: CameraTimedImu, options: JointOptions
-) -> tuple[CameraTimedImu, Data, Prior, Fit]:
+) -> tuple[CameraTimedImu, Measurements, Prior, Fit]:
     """The recording, its measurements and their fit; with the accelerometer's stamps moved where they are far off.
 
     A delay beyond its prior is pulled towards it, and frames were averaged by readings of another moment: the fit
@@ -273,7 +273,7 @@ def is_out_of_step(delay_s: float, sigma_s: float, expected_s: float) -> bool:
     return abs(delay_s) > max(known, _LIMITS.small_delay_s)
 
 
-def _fit_undoing_accel_faults(fit: Fit, data: Data, prior: Prior, sheet: ImuNoise | None) -> tuple[Fit, Faults]:
+def _fit_undoing_accel_faults(fit: Fit, data: Measurements, prior: Prior, sheet: ImuNoise | None) -> tuple[Fit, Faults]:
     """The fit, with what shows to be wrong with the accelerometer undone, and what that was."""
     faults, sound = Faults(values={}), data
     for _ in range(_MOST_FAULTS):
@@ -316,7 +316,9 @@ class ShapeFaults:
         return tuple(fault for fault in self.found if fault not in self.harmless)
 
 
-def _fit_undoing_shape_faults(fit: Fit, data: Data, prior: Prior, sheet: ImuNoise | None) -> tuple[Fit, ShapeFaults]:
+def _fit_undoing_shape_faults(
+    fit: Fit, data: Measurements, prior: Prior, sheet: ImuNoise | None
+) -> tuple[Fit, ShapeFaults]:
     """The fit of a model without what shows to be wrong with its shape, and what that was.
 
     What it does to the scale, or would do where there is too little evidence to undo it, is in the interval.
@@ -353,7 +355,7 @@ def _log_ratio(fit: Fit, before: Fit) -> float:
     return float(np.log(fit.estimate.metres_per_unit / before.estimate.metres_per_unit))
 
 
-def _check_saturation(data: Data) -> list[Fact]:
+def _check_saturation(data: Measurements) -> list[Fact]:
     """Sensors of which much is cut off at the end of the range."""
     shares = {"gyroscope": data.gyro_cut_share, "accelerometer": data.accel_cut_share}
     return [

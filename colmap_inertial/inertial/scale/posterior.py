@@ -23,7 +23,7 @@ from colmap_inertial.inertial.core.parameters import Noise
 from colmap_inertial.inertial.core.priors import accel_part, clock_scale_sigma, model_scale_sigma
 from colmap_inertial.inertial.scale._fit import Fit
 from colmap_inertial.inertial.scale._inputs import align_recording, strength_of_gravity
-from colmap_inertial.inertial.scale._setup import Data
+from colmap_inertial.inertial.scale._setup import Measurements
 from colmap_inertial.inertial.scale.interval import metres_per_unit_of, variance_factor
 from colmap_inertial.inertial.scale.joint import JointOptions, fit_path
 
@@ -104,7 +104,7 @@ class FittedPath:
 
     origin: Array
     floor_log: float
-    _data: Data
+    _data: Measurements
     _fit: Fit
     _aligned: CameraImuCalibration
     _stamps_s: Array

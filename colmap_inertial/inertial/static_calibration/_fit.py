@@ -146,7 +146,7 @@ class _Turns:
         empty, index = np.zeros(0), np.zeros(0, dtype=np.intp)
         return cls(before=index, first=index, last=index, t_s=empty, rate_rad_s=np.zeros((0, 3)), sigma_rad=empty)
 
-    def carried(self, gain: Array) -> tuple[Array, Array]:
+    def integrate(self, gain: Array) -> tuple[Array, Array]:
         """(T, 3, 3) ``begin_from_end``, and (T, 3, 9) how ends turn with the entries of ``gain``, in their frames."""
         if len(self.before) == 0:
             return np.zeros((0, 3, 3)), np.zeros((0, 3, 9))
@@ -321,7 +321,7 @@ def _system(
         jacobian[rows] /= sigma_a[i]
         residual[rows] = left[i] / sigma_a[i]
     for j, (i, sigma, rotation, lever) in enumerate(
-        zip(turns.before, sigma_t, *turns.carried(state.gyro_gain), strict=True)
+        zip(turns.before, sigma_t, *turns.integrate(state.gyro_gain), strict=True)
     ):
         rows = slice(3 * k + 2 * j, 3 * k + 2 * j + 2)
         carried, basis = rotation.T @ state.up[i], tangents[i + 1]
@@ -371,7 +371,7 @@ def _result(
     full[IMU_CAL.GYRO_BIAS, IMU_CAL.GYRO_BIAS] = np.eye(3) * spread / count
     left = np.linalg.norm(rests.accel_m_s2 @ (np.eye(3) + state.accel_gain).T - state.accel_bias, axis=1)
     angles = np.full(max(count - 1, 0), np.nan)
-    carried = np.einsum("tji,tj->ti", turns.carried(state.gyro_gain)[0], state.up[turns.before])
+    carried = np.einsum("tji,tj->ti", turns.integrate(state.gyro_gain)[0], state.up[turns.before])
     angles[turns.before] = np.linalg.norm(np.cross(carried, state.up[turns.before + 1]), axis=1)
     return RestFit(
         accel_gain=state.accel_gain,

@@ -35,7 +35,7 @@ def pair_of(constraint: Any) -> Pair:
     return min(constraint.first, constraint.second), max(constraint.first, constraint.second)
 
 
-def connected(members: Sequence[int], pairs: Iterable[Pair]) -> list[list[int]]:
+def find_connected(members: Sequence[int], pairs: Iterable[Pair]) -> list[list[int]]:
     """Connected components of a graph of submodels."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -138,7 +138,7 @@ class Equations:
         self.matrix[columns, columns] = np.eye(columns.stop - columns.start) * 1e12
         self.gradient[columns] = 0.0
 
-    def solved(self) -> tuple[Array, Array]:
+    def solve(self) -> tuple[Array, Array]:
         """The step, and the covariance of all unknowns.
 
         Raises
@@ -167,7 +167,7 @@ class Convergence:
     squares_share: float
 
 
-def minimised(
+def minimise_placements(
     start: Placements, equations_of: Callable[[Placements], Equations], limits: Convergence
 ) -> tuple[Placements, Array, float]:
     """The most probable placements, their covariance with all unknowns, and the sum of squares.
@@ -181,7 +181,7 @@ def minimised(
     for _ in range(limits.rounds):
         equations = equations_of(state)
         settled = abs(squares - equations.squares) < limits.squares + limits.squares_share * equations.squares
-        step, cov = equations.solved()
+        step, cov = equations.solve()
         if largest < limits.step or settled:
             return state, cov, equations.squares
         squares, state = equations.squares, state.moved(step)
@@ -323,7 +323,7 @@ class SimilarityConstraint:
 _FIT_ROUNDS = 5
 
 
-def chained(
+def chain_placements(
     start: Placements, held: int, ties: Sequence[Tie], attach: Callable[[Placements, Tie, int], None]
 ) -> Placements:
     """Placements by one constraint after the other, from the held submodel on, the first ones of ``ties`` first."""

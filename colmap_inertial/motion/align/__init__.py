@@ -162,7 +162,7 @@ def align_trimmed(
     for share in TRIMMED.shares:
         start = search.whole(trajectory, share)
         if isinstance(start, ClockFit):
-            return start.applied(search.prior, epoch_shift_s(imu, trajectory.epoch_ns))
+            return start.apply_to(search.prior, epoch_shift_s(imu, trajectory.epoch_ns))
     return None
 
 

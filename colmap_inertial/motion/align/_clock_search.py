@@ -106,7 +106,7 @@ class ClockFit:
     gain: float = 1.0
     mirrored: float = -np.inf
 
-    def applied(self, prior: CameraImuCalibration, shift_s: float) -> CameraImuCalibration:
+    def apply_to(self, prior: CameraImuCalibration, shift_s: float) -> CameraImuCalibration:
         """A calibration with what was fitted; ``shift_s`` is that of the two epochs (``epoch_shift_s``)."""
         return replace(
             prior.replace_clock_offset(self.offset_s - shift_s),
@@ -172,17 +172,17 @@ def search_offsets(
     dense = intervals.dt_s <= DENSE_S
     if share == 1 and dense.any() and intervals.dt_s[dense].sum() > 0.5 * intervals.dt_s.sum():
         intervals, step_s = intervals.select(dense), _GRID_S
-        offset_s, gain, per_second = _correlate(intervals, path, offsets_s, min_overlap, rotation)
+        offset_s, gain, per_second = _correlate_rates(intervals, path, offsets_s, min_overlap, rotation)
     else:
         step_s = _SCAN_S
-        offset_s, gain, per_second = _scan(intervals, path, offsets_s, min_overlap, rotation, share)
+        offset_s, gain, per_second = _scan_offsets(intervals, path, offsets_s, min_overlap, rotation, share)
     known = np.isfinite(gain)
     offset_s, gain = offset_s[known], gain[known]
-    compared = intervals.select(_evenly(len(intervals), _COMPARED_INTERVALS))
+    compared = intervals.select(_sample_evenly(len(intervals), _COMPARED_INTERVALS))
     fits = []
-    for peak in _peaks(offset_s, gain):
+    for peak in _find_peaks(offset_s, gain):
         nearby = np.clip(offset_s[peak] + step_s * np.linspace(-1, 1, 9), *offsets_s)
-        fits.append(_closest(compared, path, nearby, per_second * intervals.dt_s.sum(), rotation, share))
+        fits.append(_fit_nearby(compared, path, nearby, per_second * intervals.dt_s.sum(), rotation, share))
     return sorted(fits, key=lambda fit: -fit.log_likelihood)
 
 
@@ -191,10 +191,10 @@ def measure_explained_share(
 ) -> float:
     """Fraction of the camera's rotation that the gyroscope explains at one offset."""
     rotation = None if cam_from_imu_xyzw is None else matrix_from_quat(cam_from_imu_xyzw)
-    return _closest(_remove_jumps(intervals, path), path, np.array([offset_s]), 1.0, rotation, share).explained
+    return _fit_nearby(_remove_jumps(intervals, path), path, np.array([offset_s]), 1.0, rotation, share).explained
 
 
-def _evenly(count: int, wanted: int) -> IndexArray:
+def _sample_evenly(count: int, wanted: int) -> IndexArray:
     if count <= wanted:
         return np.arange(count)
     return np.unique(np.linspace(0, count - 1, wanted).astype(np.intp))
@@ -210,21 +210,24 @@ def _remove_jumps(intervals: Intervals, path: GyroPath) -> Intervals:
     return short.select(np.linalg.norm(turn, axis=1) < _MAX_TURN_RAD)
 
 
-def _agreement(cross: Array, rotation: Array | None) -> Array:
-    """``max_R tr(R' cross)`` over rotations (or for the one given); ``cross`` (L, 3, 3) is camera times IMU."""
+def _maximise_trace(cross: Array, rotation: Array | None) -> Array:
+    """``max_C tr(C^T M)`` over rotations, or for the one given; ``M`` (L, 3, 3) is camera times IMU."""
     if rotation is not None:
         return np.einsum("ij,lij->l", rotation, cross)
     singular = np.linalg.svd(cross, compute_uv=False)
     return singular[:, 0] + singular[:, 1] + np.sign(np.linalg.det(cross)) * singular[:, 2]
 
 
-def _gain(energy: Array, left: Array, effective: Array) -> Array:
-    """Log-likelihood gained; what is left is at least a thousandth, which no real camera and gyroscope reach."""
+def _log_likelihood_gain(energy: Array, left: Array, effective: Array) -> Array:
+    """``n/2 ln(E / S)``: log likelihood gained over unrelated recordings (``docs/dev/alignment.md#search``).
+
+    What is left is at least a thousandth, which no real camera and gyroscope reach.
+    """
     left = np.maximum(left, 1e-3 * energy)
     return 0.5 * effective * np.log(np.maximum(energy, 1e-15) / np.maximum(left, 1e-15))
 
 
-def _correlate(
+def _correlate_rates(
     intervals: Intervals,
     path: GyroPath,
     offsets_s: tuple[float, float],
@@ -259,9 +262,9 @@ def _correlate(
     energy_v -= np.sum(sum_v**2, axis=1) / count[:, 0]
     energy_g -= np.sum(sum_g**2, axis=1) / count[:, 0]
     cross -= sum_v[:, :, None] * sum_g[:, None, :] / count[:, :, None]
-    left = energy_v + energy_g - 2 * _agreement(cross, rotation)
-    per_second = 3 / (_GRID_S * _redundancy(visual[visual_ok], inertial[inertial_ok]))
-    return offset_s[kept], _gain(energy_v, left, per_second * _GRID_S * count[:, 0]), per_second
+    left = energy_v + energy_g - 2 * _maximise_trace(cross, rotation)
+    per_second = 3 / (_GRID_S * _count_repeated_cells(visual[visual_ok], inertial[inertial_ok]))
+    return offset_s[kept], _log_likelihood_gain(energy_v, left, per_second * _GRID_S * count[:, 0]), per_second
 
 
 def _select_offsets(offset_s: Array, offsets_s: tuple[float, float], step_s: float) -> BoolArray:
@@ -292,7 +295,7 @@ def _resample_on_grid(begin_s: Array, end_s: Array, turn_rad: Array) -> tuple[Ar
     return np.where(covered[:, None], rate, 0.0), covered, start_s
 
 
-def _redundancy(visual: Array, inertial: Array) -> float:
+def _count_repeated_cells(visual: Array, inertial: Array) -> float:
     """Cells per independent cell: Bartlett's sum over the products of the two autocorrelations."""
 
     def autocorrelation(x: Array) -> Array:
@@ -307,7 +310,7 @@ def _redundancy(visual: Array, inertial: Array) -> float:
     return max(1.0, float(1 + 2 * np.sum(a[1:reach] * b[1:reach])))
 
 
-def _scan(
+def _scan_offsets(
     intervals: Intervals,
     path: GyroPath,
     offsets_s: tuple[float, float],
@@ -319,7 +322,7 @@ def _scan(
     grid = np.arange(path.t_s[0], path.t_s[-1], _SCAN_S)
     offsets = len(grid) + (intervals.end_s[-1] - intervals.begin_s[0]) / _SCAN_S
     wanted = int(np.clip(_SCAN_BUDGET / offsets, _SCAN_FEWEST, _SCAN_INTERVALS))
-    some = intervals.select(_evenly(len(intervals), wanted))
+    some = intervals.select(_sample_evenly(len(intervals), wanted))
     begin_s, end_s = some.begin_s[0], some.end_s[-1]
     attitude = path.at(grid)[0]
     start = np.round((some.begin_s - begin_s) / _SCAN_S).astype(np.intp)
@@ -330,7 +333,7 @@ def _scan(
     needed_s /= float(end_s - begin_s)
     allowed = _select_offsets(offset_s, offsets_s, _SCAN_S)
     offset_s, lag = offset_s[allowed], lag[allowed]
-    effective = _effective_intervals(some)
+    effective = _count_independent_intervals(some)
     gain = np.full(len(lag), np.nan)
     for chunk in range(0, len(lag), 256):
         at = slice(chunk, chunk + 256)
@@ -346,13 +349,13 @@ def _scan(
             mixture = _fit_mixture(some, inertial, inside, rotation, rounds=MIXTURE.choosing)
             value = mixture.log_likelihood * min(effective / len(some), 1.0)
         else:
-            energy, left, _ = _fit(some, inertial, inside, rotation, share)
-            value = _gain(energy, left, 3 * effective * share * covered_s / some.dt_s.sum())
+            energy, left, _ = _fit_offsets(some, inertial, inside, rotation, share)
+            value = _log_likelihood_gain(energy, left, 3 * effective * share * covered_s / some.dt_s.sum())
         gain[chunk + enough] = value
-    return offset_s, gain, float(3 * _effective_intervals(intervals) / intervals.dt_s.sum())
+    return offset_s, gain, float(3 * _count_independent_intervals(intervals) / intervals.dt_s.sum())
 
 
-def _effective_intervals(intervals: Intervals) -> float:
+def _count_independent_intervals(intervals: Intervals) -> float:
     """Number of independent intervals: long ones weigh more, and neighbours with correlated rotations repeat each
     other.
     """
@@ -364,17 +367,17 @@ def _effective_intervals(intervals: Intervals) -> float:
     return float(dt_s.sum() ** 2 / np.sum(dt_s**2) / (1 + 2 * np.sum(np.square(correlations))))
 
 
-def _fit(
+def _fit_offsets(
     intervals: Intervals, inertial_rad: Array, inside: BoolArray, rotation: Array | None, share: float
 ) -> tuple[Array, Array, tuple[Array, Array, Array]]:
     """Energy of the intervals (L,) and what the best rotation and common rate leave of it, for L offsets.
 
     Of a share of the intervals, the energy is that of the smallest rotations: what any fit could leave at most. Also
-    returns what :func:`_moments` does of those that were fitted: cross moments and common rates.
+    returns what :func:`_sum_moments` does of those that were fitted: cross moments and common rates.
     """
     if share == 1:
-        cross, energy, energy_g, (rate_v, rate_g) = _moments(intervals, inertial_rad, inside)
-        return energy, energy + energy_g - 2 * _agreement(cross, rotation), (cross, rate_v, rate_g)
+        cross, energy, energy_g, (rate_v, rate_g) = _sum_moments(intervals, inertial_rad, inside)
+        return energy, energy + energy_g - 2 * _maximise_trace(cross, rotation), (cross, rate_v, rate_g)
     dt_s = intervals.dt_s
     wanted = np.maximum(np.round(share * inside.sum(axis=1)), 1).astype(np.intp)
 
@@ -390,8 +393,8 @@ def _fit(
     lengths = np.linalg.norm(intervals.turn_rad, axis=1) - np.linalg.norm(inertial_rad, axis=2)
     kept, left = smallest(lengths**2)
     for _ in range(TRIMMED.concentrations):
-        cross, _, _, (rate_v, rate_g) = _moments(intervals, inertial_rad, kept)
-        fitted = _best_rotation(cross) if rotation is None else rotation[None]
+        cross, _, _, (rate_v, rate_g) = _sum_moments(intervals, inertial_rad, kept)
+        fitted = _find_rotation(cross) if rotation is None else rotation[None]
         visual = intervals.turn_rad - dt_s[:, None] * rate_v[:, None, :]
         inertial = (inertial_rad - dt_s[:, None] * rate_g[:, None, :]) @ np.swapaxes(fitted, 1, 2)
         kept, left = smallest(np.sum((visual - inertial) ** 2, axis=2))
@@ -407,7 +410,7 @@ def _fit_mixture(
     mirrored: bool = False,
     rounds: int = MIXTURE.rounds,
 ) -> Mixture:
-    free = _mirror_image if mirrored else _best_rotation
+    free = _find_reflection if mirrored else _find_rotation
     dt_s = intervals.dt_s
     products = (intervals.turn_rad / dt_s[:, None])[:, :, None] * inertial_rad[:, :, None, :]
     products = products.reshape(*inertial_rad.shape[:2], 9)
@@ -430,22 +433,22 @@ def _fit_mixture(
     )
 
 
-def _mirror_image(cross: Array) -> Array:
+def _find_reflection(cross: Array) -> Array:
     """(L, 3, 3) reflections of the largest ``tr(R' cross)``."""
-    return -_best_rotation(-cross)
+    return -_find_rotation(-cross)
 
 
-def _best_rotation(cross: Array) -> Array:
+def _find_rotation(cross: Array) -> Array:
     """(L, 3, 3) rotations ``R`` of the largest ``tr(R' cross)``."""
     u, _, vt = np.linalg.svd(cross)
     u[:, :, 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
     return np.asarray(u @ vt)
 
 
-def _moments(
+def _sum_moments(
     intervals: Intervals, inertial_rad: Array, inside: BoolArray | Array
 ) -> tuple[Array, Array, Array, tuple[Array, Array]]:
-    """Cross moments (L, 3, 3) and energies (L,), (L,) of the interval rotations after a common rate is taken out.
+    """``M`` (L, 3, 3), ``E`` and ``G`` (L,) of ``docs/dev/alignment.md#search``, after a common rate is taken out.
 
     ``inertial_rad`` (L, K, 3) and ``inside`` (L, K), or weights, for L offsets. Intervals weigh by 1 / dt, as for a
     random walk. Also returns the two common rates (L, 3), camera and IMU.
@@ -467,7 +470,7 @@ def _moments(
     )
 
 
-def _peaks(offset_s: Array, gain: Array) -> list[int]:
+def _find_peaks(offset_s: Array, gain: Array) -> list[int]:
     """The highest local maxima, each at least half a second from any higher one."""
     if not len(gain):
         return []
@@ -482,7 +485,7 @@ def _peaks(offset_s: Array, gain: Array) -> list[int]:
     return chosen
 
 
-def _closest(
+def _fit_nearby(
     intervals: Intervals, path: GyroPath, offset_s: Array, effective: float, rotation: Array | None, share: float | None
 ) -> ClockFit:
     """The best of a few neighbouring offsets, with its rotation and bias."""
@@ -503,12 +506,15 @@ def _closest(
             reflected = _fit_mixture(intervals, inertial[at], mask[at], None, mirrored=True)
             mirrored = independent * float(reflected.log_likelihood[0])
     else:
-        energy, left, (cross, rate_v, rate_g) = _fit(intervals, inertial, mask, rotation, share)
+        energy, left, (cross, rate_v, rate_g) = _fit_offsets(intervals, inertial, mask, rotation, share)
         covered = np.sum(mask * intervals.dt_s, axis=1) / intervals.dt_s.sum()
-        gain, explained = _gain(energy, left, effective * share * covered), 1 - left / np.maximum(energy, 1e-15)
+        gain, explained = (
+            _log_likelihood_gain(energy, left, effective * share * covered),
+            1 - left / np.maximum(energy, 1e-15),
+        )
     best = int(np.argmax(gain))
     if rotation is None:
-        rotation = _best_rotation(cross[best : best + 1])[0]
+        rotation = _find_rotation(cross[best : best + 1])[0]
     return ClockFit(
         offset_s=float(offset_s[best]),
         log_likelihood=float(gain[best]),

@@ -76,7 +76,7 @@ class Alignment:
         """
         return abs(self.calibration.clock_rate) > max(_SIGNIFICANT * self.clock_rate_sigma, faster_than)
 
-    def settled(self) -> CameraImuCalibration:
+    def settle_clock_rate(self) -> CameraImuCalibration:
         """The calibration to continue with: its clock rate is zero unless the clocks drift apart (:meth:`drifts`)."""
         return self.calibration if self.drifts() else replace(self.calibration, clock_rate=0.0)
 
@@ -132,7 +132,7 @@ def refine_alignment(
         Where the rotation about some axis, or the offset, stays open.
     """
     shift_s = epoch_shift_s(imu, trajectory.epoch_ns)
-    (prior_rotation, prior_offset_s, prior_bias), prior_info = _prior_of_fitted(prior, start, shift_s)
+    (prior_rotation, prior_offset_s, prior_bias), prior_info = _make_prior(prior, start, shift_s)
     state = _State(start.cam_from_imu_xyzw, start.offset_s, start.gyro_bias_rad_s, np.zeros(_N_NUISANCE))
     state.nuisance[_RATE] = clock_rate
     middle_s = middle_of_overlap(trajectory, imu.gyro_t_s, start.offset_s)
@@ -141,7 +141,7 @@ def refine_alignment(
     for iteration in range(25):
         if iteration in (0, 2, 6):  # the path is linear enough in the bias between these
             path, path_bias = GyroPath(imu.gyro_t_s, imu.gyro_rad_s, state.bias), state.bias
-        residual, jacobian, dt_s = _residuals(trajectory, path, state, state.bias - path_bias, middle_s)
+        residual, jacobian, dt_s = _compare_rotations(trajectory, path, state, state.bias - path_bias, middle_s)
         if len(residual) < 4:
             raise NotObservableError("time offset", Fact("too-few-intervals"))
         if noise is None:
@@ -152,7 +152,7 @@ def refine_alignment(
             sigmas = np.sqrt(np.sum(residual**2, axis=1) / (2 * noise[0] + noise[1] * dt_s))
             excess = np.minimum(np.maximum(sigmas / _OUTLIER_SIGMAS, 1.0) ** 4, 1e8)
         if iteration in (2, 3, 5, 8):
-            noise = _noise_of(residual, dt_s, excess, least_density**2)
+            noise = _estimate_noise(residual, dt_s, excess, least_density**2)
         white_residual, white_jacobian = _whiten(residual, jacobian, dt_s, excess, noise)
         from_prior = np.concatenate(
             [
@@ -193,7 +193,7 @@ def middle_of_overlap(trajectory: CameraTrajectory, imu_t_s: Array, offset_s: fl
     return float(0.5 * (begin_s + end_s))
 
 
-def _prior_of_fitted(
+def _make_prior(
     prior: CameraImuCalibration, start: ClockFit, shift_s: float
 ) -> tuple[tuple[Array, float, Array], Array]:
     """Mean (rotation, offset, bias) and information of what is fitted; what is unknown starts at the search's."""
@@ -218,12 +218,12 @@ def _prior_of_fitted(
     return mean, info
 
 
-def _residuals(
+def _compare_rotations(
     trajectory: CameraTrajectory, path: GyroPath, state: _State, bias_change: Array, middle_s: float
 ) -> tuple[Array, Array, Array]:
-    """Gyroscope against camera over the covered intervals: residuals (K, 3) rad, derivatives (K, 3, 26), lengths (K,).
+    """``r_k`` of ``docs/dev/alignment.md#fit``: residuals (K, 3) rad, derivatives (K, 3, 26), lengths (K,).
 
-    World frame. Columns: rotation, offset, bias, nuisance parameters.
+    Of covered intervals, in the world frame. Columns: rotation, offset, bias, nuisance parameters.
     """
     since_s = trajectory.t_s - middle_s
     t_s = trajectory.t_s - state.offset_s - state.nuisance[_RATE] * since_s
@@ -267,11 +267,11 @@ def _whiten(
 ) -> tuple[Array, Array]:
     """Residuals and derivatives divided by the Cholesky factor of the covariance of the residuals."""
     both = np.concatenate([residual[:, :, None], jacobian], axis=2)
-    _divide(both.reshape(len(both), -1), dt_s, excess, noise)
+    _whiten_sides(both.reshape(len(both), -1), dt_s, excess, noise)
     return both[:, :, 0], both[:, :, 1:]
 
 
-def _divide(sides: Array, dt_s: Array, excess: Array, noise: tuple[float, float]) -> float:
+def _whiten_sides(sides: Array, dt_s: Array, excess: Array, noise: tuple[float, float]) -> float:
     """Whiten ``sides`` (K, c) in place; returns half the logarithm of the determinant of the covariance (K, K).
 
     The covariance: pose noise shared by neighbours, gyroscope noise, outliers.
@@ -283,7 +283,7 @@ def _divide(sides: Array, dt_s: Array, excess: Array, noise: tuple[float, float]
     return half_log_det
 
 
-def _noise_of(residual: Array, dt_s: Array, excess: Array, least_rate: float) -> tuple[float, float]:
+def _estimate_noise(residual: Array, dt_s: Array, excess: Array, least_rate: float) -> tuple[float, float]:
     """Variance of a pose (rad2) and density of the rate (rad2/s), by maximum likelihood.
 
     The density is at least the sensor's: a few poses could not tell it from nothing, and the bias would look too good.
@@ -293,7 +293,7 @@ def _noise_of(residual: Array, dt_s: Array, excess: Array, least_rate: float) ->
     def best(log_ratio: float) -> tuple[float, float]:
         """Cost and pose variance where the density is ``exp(log_ratio)`` times the latter: a closed form."""
         white, ratio = residual.copy(), float(np.exp(log_ratio))
-        half_log_det = _divide(white, dt_s, excess, (1.0, ratio))
+        half_log_det = _whiten_sides(white, dt_s, excess, (1.0, ratio))
         squares = float(np.sum(white**2))
         pose = min(max(squares / count, least_pose, least_rate / ratio), 1.0, 1 / ratio)
         return 0.5 * squares / pose + 0.5 * count * float(np.log(pose)) + residual.shape[1] * half_log_det, pose

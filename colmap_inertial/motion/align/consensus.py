@@ -199,7 +199,7 @@ def judge_rotations(
     gaps = np.flatnonzero(~path.covers(recorded.t_s[:-1], recorded.t_s[1:])) + 1
     parts = _Parts.none()
     for stretch in np.split(np.arange(len(inside)), gaps):
-        parts = parts.joined(_find_parts(recorded.select(stretch), recorded.agreement_deg, len(inside)))
+        parts = parts.join(_find_parts(recorded.select(stretch), recorded.agreement_deg, len(inside)))
     deviation, part = np.zeros(len(trajectory)), np.full(len(trajectory), -2)
     deviation[inside], part[inside] = parts.deviation_deg, parts.number
     judged = part != -2
@@ -267,7 +267,7 @@ class _Parts:
         """The parts of no cameras, with a largest part of none."""
         return cls(number=np.zeros(0, int), deviation_deg=np.zeros(0), ref_from_part_xyzw=np.array([[0.0, 0, 0, 1]]))
 
-    def joined(self, later: _Parts) -> _Parts:
+    def join(self, later: _Parts) -> _Parts:
         """Those of a later stretch, too; the largest part of each is the largest of all."""
         shifted = np.where(later.number > 0, later.number + len(self.ref_from_part_xyzw) - 1, later.number)
         return _Parts(

@@ -265,7 +265,7 @@ def _evaluate_candidate(
 ) -> _Candidate:
     quick = None
     if imu.has_accel:
-        quick = quick_accelerations(read, imu, fit.applied(prior, epoch_shift_s(imu, read.epoch_ns)))
+        quick = quick_accelerations(read, imu, fit.apply_to(prior, epoch_shift_s(imu, read.epoch_ns)))
     if quick is None:
         return _Candidate(convention=convention, rotation=fit.log_likelihood)
     # one independent vector in each window

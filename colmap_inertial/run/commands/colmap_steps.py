@@ -113,7 +113,7 @@ def run_colmap(
         remove(context.scratch / CHUNKS_FOLDER)
 
     def models(partial: Sequence[Path]) -> None:
-        database, images, own = workspace.colmap_database, workspace.colmap_images, _keep_poses(context, rig)
+        database, images, own = workspace.colmap_database, workspace.colmap_images, _keep_declared_poses(context, rig)
         in_time = () if rig else recording.timing.names
         judged = read_record(workspace.matches, MatchRecord).judged
         record = map_images(database, images, partial[0], mapping, own, in_time=in_time, judged=judged)
@@ -135,7 +135,7 @@ def _decide_refinement(mapping: MappingOptions, cameras: Mapping[str, CameraMode
     return mapping if mapping.refine_intrinsics is not None else replace(mapping, refine_intrinsics=unknown)
 
 
-def _keep_poses(context: RunContext, rig: Sequence[RigCamera]) -> RunContext:
+def _keep_declared_poses(context: RunContext, rig: Sequence[RigCamera]) -> RunContext:
     """The context in which the mapper keeps declared poses of a rig's cameras, unless the user set otherwise."""
     known = bool(rig) and poses_are_known(rig)
     return replace(context, colmap=context.colmap.after(FIXED_POSES)) if known else context

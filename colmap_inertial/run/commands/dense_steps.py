@@ -102,12 +102,12 @@ def run_dense(session: Session, indices: Sequence[int], images: Path, options: D
         session.progress("dense", done, total)
 
     for index in indices:
-        _undistort(session, index, images, prepared[index])
+        _undistort_images(session, index, images, prepared[index])
         count(_WORK.undistorted * images_of[index])
     results: dict[int, DenseResult] = {}
     for index in indices:
         end = done + by_image * images_of[index]
-        results[index] = _densify(session, index, prepared[index], options, count)
+        results[index] = _reconstruct_densely(session, index, prepared[index], options, count)
         # what was kept, or was not needed, counts as done
         count(end - done)
     return results
@@ -132,7 +132,7 @@ class _Prepared:
     has_maps: bool
 
 
-def _densify(
+def _reconstruct_densely(
     session: Session, index: int, prepared: _Prepared, options: DenseOptions, count: Callable[[int], None]
 ) -> DenseResult:
     """Everything after undistortion."""
@@ -142,9 +142,9 @@ def _densify(
     folder, names, maker = session.workspace.dense / str(index), prepared.names, prepared.made_from.maps
     before = [f"dense_{index}_undistorted"]
     if maker == "plane sweep":
-        _sweep(session, index, prepared, count)
+        _sweep_depths(session, index, prepared, count)
     elif pycolmap.has_cuda:
-        _patch_match(session, index, prepared, count)
+        _match_patches(session, index, prepared, count)
     kind, mapped = find_maps(folder, names)
     result = DenseResult(folder=folder, images=len(names), depth_maps=len(mapped), maps=maker)
     if not mapped:
@@ -161,7 +161,7 @@ def _densify(
         fuse_maps(folder, mapped, targets, maker=maker, kind=kind, scratch=scratch, context=context)
         write_json(partial[2], {"coverage": coverage(folder, mapped, kind)})
 
-    maps = [fingerprint(place) for place in _map_folders(folder)]
+    maps = [fingerprint(place) for place in _list_map_folders(folder)]
     record = session.workspace.stamps / f"dense_{index}_measured.json"
     outputs = [fused, folder / "fused.ply.vis", record]
     chosen = fusion_options(maker, context)
@@ -172,10 +172,8 @@ def _densify(
     with a_record_of_ours(record):
         covered = float(read_json(record)["coverage"])
     result = replace(result, fused=fused, points=_count_elements(fused, "vertex"), coverage=covered)
-    for other in folder.glob("meshed-*.ply"):
-        if other != mesh or not result.points:
-            remove(other)
     if options.mesh == "none" or not result.points:
+        runner.discard(*folder.glob("meshed-*.ply"))
         return result
     if options.mesh == "tsdf":
         depends: dict[str, object] = {"maps": maps}
@@ -184,17 +182,21 @@ def _densify(
         depth, trim = _choose_octree(fused, read_model(folder / "sparse"))
         depends = {"depth": depth, "trim": trim}
         make_mesh = partial(mesh_points, fused, depth=depth, trim=trim, context=context)
+
+    def write_mesh(partial: Sequence[Path]) -> None:
+        make_mesh(partial[0])
+        for other in set(folder.glob("meshed-*.ply")) - {partial[0]}:
+            remove(other)
+
     # its time does not follow from that of the depth maps: 0.4 to 4.6 times as long on two scenes
     session.progress("mesh", 0, 1)
-    runner.run(
-        f"dense_{index}_mesh", depends, [mesh], lambda outputs: make_mesh(outputs[0]), after=[f"dense_{index}_fused"]
-    )
+    runner.run(f"dense_{index}_mesh", depends, [mesh], write_mesh, after=[f"dense_{index}_fused"])
     session.progress("mesh", 1, 1)
     return replace(result, mesh=mesh, faces=_count_elements(mesh, "face"))
 
 
 def _prepare_model(session: Session, index: int, images: Path, options: DenseOptions) -> _Prepared:
-    """Look at what there is, and decide who makes the depth maps; removes old ones of our own."""
+    """Look at what there is, and decide who makes the depth maps."""
     model, folder = session.workspace.sparse / str(index), session.workspace.dense / str(index)
     reconstruction = read_model(model)
     names = tuple(sorted(reconstruction.image(i).name for i in reconstruction.reg_image_ids()))
@@ -203,12 +205,13 @@ def _prepare_model(session: Session, index: int, images: Path, options: DenseOpt
     return _Prepared(names=names, made_from=made_from, has_maps=has_maps)
 
 
-def _sweep(session: Session, index: int, prepared: _Prepared, count: Callable[[int], None]) -> None:
+def _sweep_depths(session: Session, index: int, prepared: _Prepared, count: Callable[[int], None]) -> None:
     """Depth maps by our own sweep; those that a run made that was cut off are kept."""
     folder, stamps = session.workspace.dense / str(index), session.workspace.stamps
     record, raw = stamps / f"dense_{index}_depth_maps.json", stamps / f"sweep_{index}"
 
     def work(partial: Sequence[Path]) -> None:
+        prepared.made_from.write(folder)
         swept = SweptWorkspace(folder, raw)
         swept.begin({"made_from": prepared.made_from, "images": fingerprint(folder / "images")})
         threads = session.context.num_threads
@@ -219,10 +222,10 @@ def _sweep(session: Session, index: int, prepared: _Prepared, count: Callable[[i
 
     depends = {"maps": prepared.made_from.maps}
     after, step = [f"dense_{index}_undistorted"], f"dense_{index}_depth"
-    session.runner.run(step, depends, [record], work, after=after, beside=partial(_map_folders, folder))
+    session.runner.run(step, depends, [record], work, after=after, beside=partial(_list_map_folders, folder))
 
 
-def _patch_match(session: Session, index: int, prepared: _Prepared, count: Callable[[int], None]) -> None:
+def _match_patches(session: Session, index: int, prepared: _Prepared, count: Callable[[int], None]) -> None:
     """Depth maps by COLMAP's patch-match, of each image a photometric one and a geometric one."""
     folder, made_from = session.workspace.dense / str(index), prepared.made_from
     whole, counted = len(prepared.names) * (_WORK.matched + _WORK.confirmed), 0
@@ -235,29 +238,29 @@ def _patch_match(session: Session, index: int, prepared: _Prepared, count: Calla
             counted = now
 
     def work(_: Sequence[Path]) -> None:
+        made_from.write(folder)
         patch_match(folder, made_from.max_image_size, session.context.colmap, count_maps)
 
     decided = {"maps": made_from.maps, "settings": made_from.settings}
     after, step = [f"dense_{index}_undistorted"], f"dense_{index}_depth"
-    session.runner.run(step, decided, [], work, after=after, beside=partial(_map_folders, folder))
+    session.runner.run(step, decided, [], work, after=after, beside=partial(_list_map_folders, folder))
     count(whole - counted)
 
 
-def _map_folders(folder: Path) -> list[Path]:
+def _list_map_folders(folder: Path) -> list[Path]:
     return [folder / "stereo" / f"{what}_maps" for what in ("depth", "normal")]
 
 
-def _undistort(session: Session, index: int, images: Path, prepared: _Prepared) -> None:
+def _undistort_images(session: Session, index: int, images: Path, prepared: _Prepared) -> None:
     """Write the dense workspace without depth maps."""
     import pycolmap
 
     runner, workspace = session.runner, session.workspace
     model, folder = workspace.sparse / str(index), workspace.dense / str(index)
-    folder.mkdir(parents=True, exist_ok=True)
     names, made_from = prepared.names, prepared.made_from
-    made_from.write(folder)  # before there is anything that must not outlive the model
 
     def work(partial: Sequence[Path]) -> None:
+        made_from.write(folder)  # before there is anything that must not outlive the model
         scratch = workspace.stamps / "dense"
         remove(scratch)
         scratch.mkdir(parents=True)

@@ -13,7 +13,6 @@ from colmap_inertial.core.options import WorldAxes
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import DOWN_IN_WORLD, FrameTiming, PositionFixes
 from colmap_inertial.inertial.georeference import Georeference
-from colmap_inertial.io.disk import remove
 from colmap_inertial.io.files import read_record, write_json, write_record
 from colmap_inertial.model import read_model, trajectory_from_model
 from colmap_inertial.run.commands.result import ModelResult, error_as_json
@@ -56,7 +55,7 @@ def run_georeference(
     """Metric models with their place on Earth, where positions were asked for; ``georeference.json`` holds it."""
     workspace = session.workspace
     if fixes is None:
-        remove(workspace.georeference)
+        session.runner.discard(workspace.georeference)
         return tuple(models)
     metric = {model.index: model.sparse_metric for model in models if model.sparse_metric is not None}
     record = workspace.stamps / "georeferenced.json"

@@ -26,7 +26,6 @@ from colmap_inertial.hooks import FrameStage
 from colmap_inertial.imaging.multi_aperture import refocus, require_colours
 from colmap_inertial.io.calibration import CalibrationFiles, list_paths
 from colmap_inertial.io.capture import Capture, load_capture
-from colmap_inertial.io.disk import remove
 from colmap_inertial.io.files import StrPath, path_in, read_json, structured, write_json
 from colmap_inertial.io.fingerprints import fingerprint
 from colmap_inertial.io.frame_sources import ImageFolder, image_names
@@ -59,13 +58,15 @@ _SHEET = "sheet.json"
 
 
 def _open_session(
-    out: StrPath, capture: Capture, options: object, progress: Progress, command: str, decides: object
+    out: StrPath, capture: Capture, options: object, command: str, *, overwrite: bool, progress: Progress
 ) -> contextlib.AbstractContextManager[Session]:
     context, pictures = RunContext(progress=progress), picture_folders(capture)
-    return open_session(Path(out), capture.path, options, context, pictures=pictures, decides=decides, command=command)
+    return open_session(
+        Path(out), capture.path, options, context, pictures=pictures, command=command, overwrite=overwrite
+    )
 
 
-def _finish(session: Session, capture: Capture, content: Mapping[str, object]) -> bool:
+def _write_result(session: Session, capture: Capture, content: Mapping[str, object]) -> bool:
     """Write ``result.json``; returns whether it stood already."""
     source = capture.image_folder
     return session.finish(
@@ -124,6 +125,7 @@ def deblur_capture(
     calibration: CalibrationFiles = None,
     rectify: bool = False,
     sheet: Path | None = None,
+    overwrite: bool = False,
     progress: Progress = silent,
 ) -> DeblurResult:
     """Write the frames of a capture deblurred, with their names, sizes, formats and metadata.
@@ -145,7 +147,7 @@ def deblur_capture(
         Write the images without their rolling shutter, and beside them, in ``colmap/images/``, with it.
     sheet
         Where to write a PNG with parts of the most blurred frames before and after.
-    progress
+    overwrite, progress
         As for ``reconstruct``.
 
     Raises
@@ -170,21 +172,21 @@ def deblur_capture(
     )
     imu = correct_imu(loaded, imu, calibration)
     recording = Recording.of(loaded, imu, timing, prior_calibration(loaded, calibration))
-    with _open_session(out, loaded, options, progress, "deblur", recording.identity()) as session:
+    with _open_session(out, loaded, options, "deblur", overwrite=overwrite, progress=progress) as session:
         workspace = session.workspace
         plan = run_plan(session, recording, Treatments(deblur=method, rolling_shutter=options.rolling_shutter))
         for_matching = purpose == "matching"
         inputs = StageInputs(recording=recording, options=options, plan=plan, maps=False, matching=for_matching)
         deblurred = workspace.colmap_images if rectify else workspace.images
         if not rectify:
-            remove(workspace.colmap)
+            session.runner.discard(workspace.colmap)
             session.runner.forget("images")
         records = run_frames(session, recording, frames, default_frame_stages(inputs), deblurred)
         movers = default_keypoint_stages(inputs)
         rectified = rectifiable(movers, timing.names)
         if rectify:
             run_images(session, records, rectified, movers, smoothed=for_matching)
-        shown = _shown(records)
+        shown = _list_deblurred(records)
         if sheet is not None and shown and plan.view is not None:
             write_json(workspace.stamps / _SHEET, {"sheet": str(sheet.resolve())})
             write_contact_sheet(sheet, loaded, plan, deblurred, shown)
@@ -192,8 +194,8 @@ def deblur_capture(
             "imaging": imaging_as_json(plan, rectified),
             "frames": [frame_as_json(record, plan, rectified) for record in records],
         }
-        unchanged = _finish(session, loaded, content)
-        made = DeblurResult(
+        unchanged = _write_result(session, loaded, content)
+        return DeblurResult(
             workspace=workspace,
             frames=note_rectified(records, rectified),
             imaging=plan,
@@ -201,7 +203,6 @@ def deblur_capture(
             unchanged=unchanged,
             rectified=rectified,
         )
-        return session.in_place(made)
 
 
 def _require_free_sheet(sheet: Path, out: Path) -> None:
@@ -218,7 +219,7 @@ def _require_free_sheet(sheet: Path, out: Path) -> None:
         raise InertialError(Fact("contact-sheet-is-png", path=str(sheet)))
 
 
-def _shown(records: Sequence[FrameRecord]) -> list[str]:
+def _list_deblurred(records: Sequence[FrameRecord]) -> list[str]:
     """Names of the deblurred frames, the most blurred first."""
     deblurred = [record for record in records if record.sharpened]
     return [record.name for record in sorted(deblurred, key=lambda record: -(record.value("blur_px") or 0.0))]
@@ -229,6 +230,7 @@ def fuse_captured(
     out: StrPath,
     options: FuseAperturesOptions | None = None,
     *,
+    overwrite: bool = False,
     progress: Progress = silent,
 ) -> tuple[Path, ...]:
     """Fuse every exposure of a capture, for images alone: no times and no IMU are needed.
@@ -242,6 +244,8 @@ def fuse_captured(
         where asked for ``refocused/``, ``disparity/``, ``depth/``.
     options
         Defaults serve.
+    overwrite
+        As for ``reconstruct``.
     progress
         Called with stage, exposures done and exposures in all.
 
@@ -286,16 +290,15 @@ def fuse_captured(
     inputs = [
         fingerprint(path) for path in (*(path_in(folder, name) for name in names), *loaded.apertures.files(names))
     ]
-    with _open_session(out, loaded, options, progress, "fuse-apertures", (loaded, inputs)) as session:
+    with _open_session(out, loaded, options, "fuse-apertures", overwrite=overwrite, progress=progress) as session:
         root = session.workspace.root
-        for kind in {"disparity", "depth", "refocused"} - set(kinds):
-            remove(root / kind)
+        session.runner.discard(*(root / kind for kind in ("depth", "disparity", "refocused") if kind not in kinds))
         frames = (Frame(name=name, image=read_image(path_in(folder, name)), t_s=0.0) for name in names)
         depends = {"capture": loaded, "options": options, "inputs": inputs}
         outputs = [root / kind for kind in kinds]
         records = _run_fusion(session, folder, frames, names, lambda to: partial(fuse_into, to), depends, outputs)
-        _finish(session, loaded, {"frames": [record.name for record in records]})
-        return session.in_place(tuple(session.workspace.images / name for name in names))
+        _write_result(session, loaded, {"frames": [record.name for record in records]})
+        return tuple(session.workspace.images / name for name in names)
 
 
 def fuse_exposures_captured(
@@ -305,6 +308,7 @@ def fuse_exposures_captured(
     *,
     calibration: CalibrationFiles = None,
     fuser: Fuser | None = None,
+    overwrite: bool = False,
     progress: Progress = silent,
 ) -> tuple[FusedPair, ...]:
     """Fuse every pair of a capture; without times or an IMU, the pixels alone align them.
@@ -322,6 +326,8 @@ def fuse_exposures_captured(
         Calibration files of this device, as of ``ReconstructOptions``.
     fuser
         In place of the network that comes with the package.
+    overwrite
+        As for ``reconstruct``.
     progress
         Called with stage, pairs done and pairs in all.
 
@@ -353,8 +359,7 @@ def fuse_exposures_captured(
         imu = correct_imu(loaded, read_capture_imu(loaded), calibration)
         recording = Recording.of(loaded, imu, timing, prior)
     inputs = [fingerprint(path) for path in (*(path_in(folder, name) for name in names), *long)]
-    decides = loaded, timing, prior, inputs, fuser.identity
-    with _open_session(out, loaded, options, progress, "fuse-exposures", decides) as session:
+    with _open_session(out, loaded, options, "fuse-exposures", overwrite=overwrite, progress=progress) as session:
         plan = ImagingPlan(deblur_note=Fact("exposures-aligned", no_gyro=no_gyro))
         if recording is not None:
             plan = run_plan(session, recording, Treatments(deblur="off", rolling_shutter="off", pairs=True))
@@ -371,7 +376,7 @@ def fuse_exposures_captured(
             "stage": stage,
             "inputs": inputs,
         }
-        frames = _frames(loaded, timing, names)
+        frames = _read_short_exposures(loaded, timing, names)
         records = _run_fusion(session, folder, frames, names, lambda _: stage, depends)
         pairs = tuple(structured(FusedPair, record.value("pair")) for record in records)
         content = {
@@ -380,11 +385,11 @@ def fuse_exposures_captured(
             "fusion": options.fusion,
             "frames": [with_sentences(vars(pair)) for pair in pairs],
         }
-        _finish(session, loaded, content)
+        _write_result(session, loaded, content)
         return pairs
 
 
-def _frames(capture: Capture, timing: FrameTiming | None, names: Sequence[str]) -> Iterator[Frame]:
+def _read_short_exposures(capture: Capture, timing: FrameTiming | None, names: Sequence[str]) -> Iterator[Frame]:
     assert isinstance(capture.frames, ImageFolder)
     for i, name in enumerate(names):
         exposures_s = None if timing is None else timing.exposure_s

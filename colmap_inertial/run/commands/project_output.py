@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from colmap_inertial.colmap.dense.depth_maps import digest_of_model, has_depth_maps, model_of
+from colmap_inertial.colmap.dense.depth_maps import digest_of_model, model_of
 from colmap_inertial.core.errors import OutputError, OutputExistsError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ProjectOptions
@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Placed:
+class _PlacedPaths:
     """Paths in the output folder that came from the project."""
 
     paths: tuple[str, ...]
@@ -79,13 +79,13 @@ def place_project(
             log.info("%s", note)
         folders = {index: submodels[index].relative_to(project) for index in applied.models}
         _correct_record(scratch / TRANSFORM_FILE, workspace, folders)
-        moves = _moves(workspace, scratch, folders)
+        moves = _plan_moves(workspace, scratch, folders)
         remove_placed(workspace)
         for target in moves:
             if os.path.lexists(target):
                 raise OutputExistsError(Fact("place-taken", path=str(target)))
         paths = [target.relative_to(workspace.root).as_posix() for target in moves]
-        write_record(workspace.placed, _Placed(paths=tuple(paths)))
+        write_record(workspace.placed, _PlacedPaths(paths=tuple(paths)))
         for target, moved in moves.items():
             target.parent.mkdir(parents=True, exist_ok=True)
             os.replace(moved, target)
@@ -104,7 +104,7 @@ def list_placed_paths(workspace: Workspace) -> list[Path]:
     """Paths in the folder that came from the project; a killed run may have left part of it."""
     if not workspace.placed.is_file():
         return []
-    names = read_record(workspace.placed, _Placed).paths
+    names = read_record(workspace.placed, _PlacedPaths).paths
     check_names(names, workspace.placed)
     for folder in {PurePosixPath(name).parent.as_posix() for name in names} - {"."}:
         path_in(workspace.root, folder, workspace.placed)
@@ -130,7 +130,7 @@ def _correct_record(path: Path, workspace: Workspace, folders: Mapping[int, Path
     write_json(path, {**record, "beside": list(workspace.own_names)})
 
 
-def _moves(workspace: Workspace, scratch: Path, folders: Mapping[int, Path]) -> dict[Path, Path]:
+def _plan_moves(workspace: Workspace, scratch: Path, folders: Mapping[int, Path]) -> dict[Path, Path]:
     """Destination of each part of the transformed project, without the metric models.
 
     A model that is there in the other format, too, is written again: a model stage may have changed it.
@@ -160,10 +160,6 @@ def _moves(workspace: Workspace, scratch: Path, folders: Mapping[int, Path]) -> 
     return moves
 
 
-#: In a reconstruction that is set aside: which of its steps are finished.
-_STEPS = ".stages"
-
-
 def withdraw(workspace: Workspace) -> None:
     """Take away everything metric: there is no accepted scale, or none any more."""
     remove_stale_dense(workspace, {})
@@ -173,10 +169,7 @@ def withdraw(workspace: Workspace) -> None:
 
 
 def remove_stale_dense(workspace: Workspace, models: Mapping[int, Path]) -> None:
-    """Leave no dense reconstruction beside a model that it was not made from.
-
-    One with depth maps, which may have taken hours, is kept in ``earlier/``, and comes back when its model does (as
-    with ``--world`` to and fro); any other of ours is removed. What somebody else made there is left alone.
+    """Remove each dense reconstruction of ours that was made from another model than the one that is there.
 
     Parameters
     ----------
@@ -185,55 +178,14 @@ def remove_stale_dense(workspace: Workspace, models: Mapping[int, Path]) -> None
     models
         The metric models that are there, by their numbers.
     """
-    places = [place for place in (workspace.dense, workspace.earlier) if place.is_dir()]
-    if not places or workspace.dense in list_placed_paths(workspace):  # the project's own goes with its models
+    if workspace.dense in list_placed_paths(workspace):  # the project's own goes with its models
         return
-    digests = {index: digest_of_model(model) for index, model in models.items()}
+    digests = {str(index): digest_of_model(model) for index, model in models.items()}
     for folder in sorted(workspace.dense.glob("*")):
-        made_from, index = model_of(folder), folder.name
-        number = int(index) if index.isdecimal() and index.isascii() else -1
-        if made_from is not None and made_from != digests.get(number):
-            _set_dense_aside(workspace, folder)
-    for number, made_from in digests.items():
-        _restore_dense(workspace, number, made_from)
-    for folder in (workspace.earlier / workspace.dense.name, workspace.earlier, workspace.dense):
-        if folder.is_dir() and not any(folder.iterdir()):
-            folder.rmdir()
-
-
-def _set_dense_aside(workspace: Workspace, folder: Path) -> None:
-    """Keep a dense reconstruction with depth maps in ``earlier/``, with its stamps; remove one without."""
-    steps = list(workspace.stamps.glob(f"dense_{folder.name}_*.json"))
-    if not has_depth_maps(folder):
-        for path in (*steps, workspace.stamps / f"sweep_{folder.name}", folder):
-            remove(path)
-        return
-    (folder / _STEPS).mkdir(exist_ok=True)
-    for step in steps:
-        os.replace(step, folder / _STEPS / step.name)
-    aside = _free_name(workspace.earlier / workspace.dense.name / folder.name)
-    aside.parent.mkdir(parents=True, exist_ok=True)
-    os.replace(folder, aside)
-    log.warning("the depth maps in %s are not of the model that is there now: kept in %s", folder, aside)
-
-
-def _restore_dense(workspace: Workspace, index: int, model_digest: str) -> None:
-    """Put back the dense reconstruction that was made from a model, where there is none, and its stamps."""
-    place = workspace.dense / str(index)
-    kept = (path for path in sorted(workspace.earlier.glob("*/*")) if model_of(path) == model_digest)
-    if not place.exists() and (aside := next(kept, None)) is not None:
-        place.parent.mkdir(exist_ok=True)
-        os.replace(aside, place)
-        log.info("the dense reconstruction in %s is of the model that is there now: %s", aside, place)
-    if (place / _STEPS).is_dir() and model_of(place) == model_digest:
-        for step in (place / _STEPS).glob(f"dense_{index}_*.json"):
-            os.replace(step, workspace.stamps / step.name)
-        remove(place / _STEPS)
-
-
-def _free_name(path: Path) -> Path:
-    """The path, or the first of it with a number behind that is free."""
-    count = 1
-    while (named := path if count == 1 else path.with_name(f"{path.name}-{count}")).exists():
-        count += 1
-    return named
+        made_from = model_of(folder)
+        if made_from is not None and made_from != digests.get(folder.name):
+            steps = workspace.stamps.glob(f"dense_{folder.name}_*.json")
+            for path in (*steps, workspace.stamps / f"sweep_{folder.name}", folder):
+                remove(path)
+    if workspace.dense.is_dir() and not any(workspace.dense.iterdir()):
+        workspace.dense.rmdir()

@@ -22,7 +22,7 @@ from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.gyro import gravity_in_cam
 from colmap_inertial.core.options import BlurRemover, ReconstructOptions
 from colmap_inertial.core.progress import Progress, silent
-from colmap_inertial.core.types import Frame, ImuRecording, PositionFixes
+from colmap_inertial.core.types import Frame, FrameTiming, ImuRecording, PositionFixes
 from colmap_inertial.diagnose import Diagnosis
 from colmap_inertial.hooks import (
     FrameStage,
@@ -54,6 +54,7 @@ from colmap_inertial.run.commands.reporting import report_result, reporting_stop
 from colmap_inertial.run.commands.result import ReconstructResult
 from colmap_inertial.run.commands.unplaced import note_unplaced
 from colmap_inertial.run.preparation.geolocation import positions_of
+from colmap_inertial.run.preparation.packages import warn_of_conflicts
 from colmap_inertial.run.preparation.plan import add_stated_exposures, ask_for_plan, run_plan
 from colmap_inertial.run.preparation.preflight import check_imu, run_preflight
 from colmap_inertial.run.preparation.selection import part_of, run_selection
@@ -66,7 +67,7 @@ from colmap_inertial.run.stages.defaults import (
 from colmap_inertial.run.stages.exposures import fuses_pairs
 from colmap_inertial.run.stages.frame_folder import note_rectified, require_frames
 from colmap_inertial.run.stages.inputs import Fuser, StageInputs, lsd2_fuser
-from colmap_inertial.run.steps.session import Session, open_session, warn_of_conflicts
+from colmap_inertial.run.steps.session import Session, open_session
 from colmap_inertial.validate import Target, parse_target
 
 log = logging.getLogger(__name__)
@@ -83,6 +84,7 @@ def reconstruct(
     frame_stages: Sequence[FrameStage | EllipsisType] = (...,),
     keypoint_stages: Sequence[KeypointStage | EllipsisType] = (...,),
     model_stages: Sequence[ModelStage | EllipsisType] = (...,),
+    overwrite: bool = False,
     progress: Progress = silent,
     findings: Callable[[Diagnosis], None] = lambda _: None,
 ) -> ReconstructResult:
@@ -93,8 +95,7 @@ def reconstruct(
     capture
         A ``capture.toml``, a folder that holds one, or a dataset folder that ``load_capture`` knows.
     out
-        A folder that does not exist, or holds a run of the same capture, which is then continued: only what the
-        options, the recording or the stages changed is made again.
+        A folder that does not exist, or holds a run of the same capture, which is then continued.
     options
         See :class:`ReconstructOptions`.
     frame_stages, keypoint_stages, model_stages
@@ -103,6 +104,9 @@ def reconstruct(
         :class:`RollingShutterStage`; :class:`ReadoutStage`, :class:`MetricStage`, :class:`JoinStage` and
         :class:`RefineStage`, where the options and the recording allow them. The model stages must include one that
         makes the model metric.
+    overwrite
+        Where ``out`` holds a finished result of other options, stages or another recording: make again in place what
+        depends on them. Without it, options may only add steps to a finished result, such as ``dense``.
     progress
         Called with stage, steps done and steps in all.
     findings
@@ -118,7 +122,7 @@ def reconstruct(
     FormatError, TimingError
         For a capture that cannot be read.
     OutputExistsError
-        When ``out`` holds something else.
+        When ``out`` holds something else, or a finished result that would not stay as it is.
     MappingError
         When COLMAP finds no model.
     NotObservableError
@@ -128,11 +132,11 @@ def reconstruct(
     check_kind("options", options, ReconstructOptions)
     stages = Stages(frame=tuple(frame_stages), keypoint=tuple(keypoint_stages), model=tuple(model_stages))
     with reading_within(options.limits):
-        return _reconstruct(Path(capture), Path(out), options, stages, progress, findings)
+        return _reconstruct(Path(capture), Path(out), options, stages, overwrite, progress, findings)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _Given:
+class _CheckedCapture:
     """A capture that was read and checked.
 
     Attributes
@@ -168,7 +172,7 @@ class _Given:
     rig: RigFrames | None
 
 
-def _read(path: Path, options: ReconstructOptions, stages: Stages) -> _Given:
+def _read_capture(path: Path, options: ReconstructOptions, stages: Stages) -> _CheckedCapture:
     """Read a capture; what is wrong with it, the options or the stages is said before any work."""
     for kind in (stages.frame, stages.keypoint, stages.model):
         insert_defaults(kind, [])
@@ -186,21 +190,8 @@ def _read(path: Path, options: ReconstructOptions, stages: Stages) -> _Given:
     capture = capture if pairs else replace(capture, exposures=None)
     raw = check_imu(read_unchecked_capture_imu(capture), force=options.force)
     target = None if capture.target is None else parse_target(capture.target)
-    given = None if options.database is None else read_given(options.database)
     _refuse_with_rig(capture, options)
-    timing, frames = read_frames(capture)
-    rig = None
-    if capture.rig:
-        rig = pair_rig_frames(capture, timing)
-        if rig.alone:
-            log.warning("%d frames are left out: a camera of the rig has no image of them", len(rig.alone))
-        timing = part_of(timing, rig.own_names[0].keys() - set(rig.alone))
-        _, frames = read_frames(capture, only=timing.names)
-    if given is not None:
-        timing = part_of(timing, given.names_in_time(timing.names))
-        first = next(read_frames(capture, only=timing.names[:1])[1])
-        given.require_size(first.name, first.image.shape[1], first.image.shape[0])
-        _, frames = read_frames(capture, only=timing.names)
+    timing, frames, rig = _read_used_frames(capture, options)
     timing = add_stated_exposures(capture, timing)
     require_frames(len(timing.names), of=len(timing.names))
     prior = prior_calibration(capture, options.calibration)
@@ -209,7 +200,7 @@ def _read(path: Path, options: ReconstructOptions, stages: Stages) -> _Given:
     insert_defaults(stages.model, default_model_stages(StageInputs(recording=recording, options=options)))
     gravity = _gravity_priors(recording, options)
     check_pair_names(timing.names)
-    return _Given(
+    return _CheckedCapture(
         capture=capture,
         raw=raw,
         recording=recording,
@@ -220,6 +211,27 @@ def _read(path: Path, options: ReconstructOptions, stages: Stages) -> _Given:
         fixes=positions_of(capture, timing.names) if options.georeference else None,
         rig=rig,
     )
+
+
+def _read_used_frames(
+    capture: Capture, options: ReconstructOptions
+) -> tuple[FrameTiming, Iterator[Frame], RigFrames | None]:
+    """The frames of a capture: of a rig, those that all cameras took; with a given database, those that it has."""
+    timing, frames = read_frames(capture)
+    rig = None
+    if capture.rig:
+        rig = pair_rig_frames(capture, timing)
+        if rig.alone:
+            log.warning("%d frames are left out: a camera of the rig has no image of them", len(rig.alone))
+        timing = part_of(timing, rig.own_names[0].keys() - set(rig.alone))
+        _, frames = read_frames(capture, only=timing.names)
+    if options.database is not None:
+        given = read_given(options.database)
+        timing = part_of(timing, given.names_in_time(timing.names))
+        first = next(read_frames(capture, only=timing.names[:1])[1])
+        given.require_size(first.name, first.image.shape[1], first.image.shape[0])
+        _, frames = read_frames(capture, only=timing.names)
+    return timing, frames, rig
 
 
 def _refuse_with_rig(capture: Capture, options: ReconstructOptions) -> None:
@@ -244,33 +256,35 @@ def _reconstruct(
     out: Path,
     options: ReconstructOptions,
     stages: Stages,
+    overwrite: bool,
     progress: Progress,
     findings: Callable[[Diagnosis], None],
 ) -> ReconstructResult:
-    given = _read(path, options, stages)
+    given = _read_capture(path, options, stages)
     capture, used_calibration = given.capture, describe_files(options.calibration)
     device: Device = "cpu"  # of pycolmap, which only verifies where an installed COLMAP does the rest
     if options.colmap_executable is None:
         device = mapping_device(options.mapping, deterministic=options.deterministic)
     context = RunContext.of(options, device=device, progress=progress)
     require_features(context)
-    decides, pictures = (given.recording.identity(), stages), picture_folders(capture)
+    pictures = picture_folders(capture)
     with (
-        open_session(out, capture.path, options, context, pictures=pictures, decides=decides) as session,
-        reporting_stops(session.workspace, capture),
+        open_session(out, capture.path, options, context, pictures=pictures, overwrite=overwrite) as session,
+        reporting_stops(session, capture, given.recording),
     ):
         session.context.executor.require(session.context.scratch)
-        write_recording(session, given.recording)  # a run that stops reports it, too
         doubts = run_preflight(session, given.recording, given.raw, findings, force=options.force)
         given = replace(given, recording=replace(given.recording, doubts=doubts))
-        result = _run(session, given, options, stages)
+        result = _run_steps(session, given, options, stages)
         result = report_result(session, result, capture, used_calibration)
         remove(session.workspace.colmap_features)
         session.runner.forget("features")
-    return session.in_place(result)
+    return result
 
 
-def _run(session: Session, given: _Given, options: ReconstructOptions, stages: Stages) -> ReconstructResult:
+def _run_steps(
+    session: Session, given: _CheckedCapture, options: ReconstructOptions, stages: Stages
+) -> ReconstructResult:
     """The steps of a run, from the choice of frames to the dense reconstruction."""
     workspace, capture = session.workspace, given.capture
     recording, frames, timing = given.recording, given.frames, given.recording.timing
@@ -281,7 +295,7 @@ def _run(session: Session, given: _Given, options: ReconstructOptions, stages: S
         recording = recording.using(part_of(timing, selection.names))
         _, frames = read_frames(capture, only=selection.names)
     if not options.apertures.depth:
-        remove(workspace.apertures)  # of an earlier run that kept them
+        session.runner.discard(workspace.apertures)
     asked = ask_for_plan(options, stages.frame, stages.keypoint, pairs=given.fuser is not None)
     inputs = StageInputs(
         recording=recording,

@@ -172,7 +172,7 @@ def report_result(
 
     Returns
     -------
-    The result with the path of its report; ``None`` where that failed.
+    The result with the path of its report, ``None`` where that failed, and whether there was nothing to do.
     """
     workspace = result.workspace
     content = {**result_as_json(result, capture), "calibration_files": list(calibration_files)}
@@ -181,32 +181,38 @@ def report_result(
             key: value.resolve() if isinstance(value, Path) else value
             for key, value in dataclasses.asdict(project).items()
         }
-    if session.stands(content):
-        session.finish(content)
-        report = workspace.report if workspace.report.is_file() else None
-        return dataclasses.replace(result, report=report, unchanged=True)
-    with _failures_logged("the report"):
-        # what a stopped run left there must not stand for this one
-        pages = workspace.report, workspace.report.with_suffix(".json")
-        for old in pages:
-            remove(old)
-        result = dataclasses.replace(result, report=write_report(workspace.root, result=content))
-        session.runner.record("report", [*pages, workspace.diagnosis])
-    session.finish(content)
-    return result
+
+    def write() -> None:
+        with _failures_logged("the report"):
+            # what a stopped run left there must not stand for this one
+            pages = workspace.report, workspace.report.with_suffix(".json")
+            for old in pages:
+                remove(old)
+            write_report(workspace.root, result=content)
+            session.runner.record_files("report", pages)
+
+    unchanged = session.finish(content, write)
+    report = workspace.report if workspace.report.is_file() else None
+    return dataclasses.replace(result, report=report, unchanged=unchanged)
 
 
 @contextlib.contextmanager
-def reporting_stops(workspace: Workspace, capture: Capture) -> Iterator[None]:
+def reporting_stops(session: Session, capture: Capture, recording: Recording | None = None) -> Iterator[None]:
     """Write a report where the recording gives no scale, or COLMAP no model; for other errors there is none.
 
-    What an earlier run made metric no longer stands. The error carries a note that names the page.
+    What an earlier run made metric no longer stands, unless that is a finished result that is to stay. The error
+    carries a note that names the page.
     """
     try:
         yield
     except (NotObservableError, MappingError) as error:
+        if session.runner.keeps_result:
+            raise
+        workspace = session.workspace
         workspace.unfinish()
         withdraw(workspace)
+        if recording is not None:
+            write_recording(session, recording)
         with _failures_logged("the report of the stop"):
             page = write_report(workspace.root, stopped=str(error), capture=str(capture.path.resolve()))
             error.add_note(str(Fact("found-on-page", page=str(page))))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -92,10 +92,12 @@ class ModelResult(ScaledModel):
     georeference: Georeference | InertialError | None = None
     dense: DenseResult | None = None
 
-    def within(self, root: Path) -> ModelResult:
-        """The same with paths that count from ``root`` made whole."""
-        paths = {name: getattr(self, name) for name in ("sparse", "sparse_metric", "trajectory")}
-        return replace(self, **{name: root / path for name, path in paths.items() if path is not None})
+    @classmethod
+    def of(cls, model: ScaledModel, root: Path) -> ModelResult:
+        """A model of the record, whose paths count from ``root``, before it is measured."""
+        values = {f.name: getattr(model, f.name) for f in fields(model)}
+        paths = {name: root / value for name, value in values.items() if isinstance(value, Path)}
+        return cls(**{**values, **paths})
 
 
 @prints_in_lines
@@ -233,11 +235,11 @@ def imaging_as_json(plan: ImagingPlan, rectified: Collection[str]) -> dict[str, 
         for key, value in plan.as_json().items()
         if key.removesuffix(DETAILS) not in ("decisions", "parallaxes", "sign_doubt", "rolling_shutter")
     }
-    values |= {"rectify": bool(rectified), **note_as_json("rolling_shutter", shutter_note(plan, rectified))}
+    values |= {"rectify": bool(rectified), **note_as_json("rolling_shutter", describe_shutter(plan, rectified))}
     return {**values, "frames_with_translation": len(plan.parallaxes)}
 
 
-def shutter_note(plan: ImagingPlan, rectified: Collection[str]) -> Fact | None:
+def describe_shutter(plan: ImagingPlan, rectified: Collection[str]) -> Fact | None:
     """Describe the treatment of a rolling shutter, from the images whose keypoints were rectified."""
     if rectified and not plan.rectify:
         return Fact("keypoints-rectified-by-stages", planned=plan.rolling_shutter_note, count=len(rectified))
@@ -262,7 +264,9 @@ def frame_as_json(record: FrameRecord, plan: ImagingPlan, rectified: Collection[
     }
 
 
-def _change(first: CameraImuCalibration, refined: CameraImuCalibration | None) -> dict[str, object] | None:
+def _compare_calibrations(
+    first: CameraImuCalibration, refined: CameraImuCalibration | None
+) -> dict[str, object] | None:
     """Change of the calibration by the scale estimate, against the one that frames were treated with."""
     if refined is None:
         return None
@@ -323,7 +327,7 @@ def result_as_json(result: ReconstructResult, capture: Capture) -> dict[str, obj
                 **({} if model.identity is None else {OF_MODEL: model.identity.as_json()}),
                 "calibration_change": None
                 if plan.view is None
-                else _change(plan.view.calibration, model.scale.calibration),
+                else _compare_calibrations(plan.view.calibration, model.scale.calibration),
                 "validation": measurement_as_json(model.validation),
                 "georeference": measurement_as_json(model.georeference),
                 "readout_translation": next((t.values for t in model.treatments if t.stage == "readout"), None),

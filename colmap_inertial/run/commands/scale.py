@@ -25,6 +25,7 @@ from colmap_inertial.io.calibration import (
     write_calibration,
 )
 from colmap_inertial.io.capture import Capture, load_capture
+from colmap_inertial.io.device_folders import is_device_folder, read_device_folder
 from colmap_inertial.io.files import write_json
 from colmap_inertial.io.frame_times import NO_RIGS
 from colmap_inertial.io.frames import read_frame_times
@@ -35,7 +36,7 @@ from colmap_inertial.io.pose_convention import COLMAP, INERTIAL_SCALE, TUM
 from colmap_inertial.io.trajectories import read_inertial_scale_poses, read_tum
 from colmap_inertial.model import (
     Model,
-    downgraded,
+    add_doubts,
     is_metric,
     read_model,
     trajectory_from_model,
@@ -47,6 +48,7 @@ from colmap_inertial.motion.align import AlignOptions
 from colmap_inertial.motion.align.consensus import align_by_consensus
 from colmap_inertial.motion.align.conventions import likely_convention
 from colmap_inertial.run.commands.paths import check_output, only_model
+from colmap_inertial.run.commands.sensors import scale_by_sensors
 from colmap_inertial.run.preparation.preflight import CheckInputs, TolerantReader, measure_recording
 from colmap_inertial.run.stages.metric import MetricStage
 from colmap_inertial.run.steps.workspace import refuse_links_around
@@ -106,7 +108,9 @@ def brings_imu(source: ScaleSource) -> bool:
     if not path.exists():
         raise FormatError(path, Fact("no-such-file", what="file or folder"))
     refuse_links_around(path)
-    return path.is_dir() and is_inertial_scale(path)
+    if not path.is_dir():
+        return False
+    return is_inertial_scale(path) or (is_device_folder(path) and read_device_folder(path).imu is not None)
 
 
 def load_source(source: ScaleSource) -> TimedPoses:
@@ -147,7 +151,10 @@ def read_source(source: ScaleSource) -> tuple[CheckInputs, Sequence[Fact]]:
     path, reader = source.source, TolerantReader()
     trajectory = timing = capture = None
     notes: Sequence[Fact] = ()
-    if brings_imu(source):
+    if path.is_dir() and is_device_folder(path):
+        read_as = TUM
+        trajectory = reader.attempt(lambda: read_device_folder(path).trajectory)
+    elif brings_imu(source):
         read_as = INERTIAL_SCALE
         trajectory = reader.attempt(lambda: read_inertial_scale_poses(path))
     elif path.is_dir():
@@ -193,7 +200,7 @@ def _captures(source: ScaleSource) -> list[Capture]:
 def _read_calibrations(source: ScaleSource) -> tuple[Calibrations, bool]:
     """Calibrations of a device, of the given files or else the first capture; whether camera and IMU share a clock."""
     captures = _captures(source)
-    shared_clock = any(capture.shared_clock for capture in captures)
+    shared_clock = any(capture.shared_clock for capture in captures) or is_device_folder(source.source)
     files = read_for_recording(source.calibration, shared_clock=shared_clock)
     for capture in captures[:1]:
         of_device = files.camera_imu or capture.calibration
@@ -291,6 +298,38 @@ def scale_source(
     """
     if json is not None:
         check_output(json, [source.source, source.imu, source.frame_times, *list_paths(source.calibration)])
+    if is_device_folder(source.source):
+        estimate = scale_device(source, options, first_s=first_s, force=force)
+    else:
+        estimate = _scale_by_imu(source, options, first_s=first_s, force=force)
+    if json is not None:
+        write_json(json, scale_as_json(estimate, source.calibration, source.source))
+    return estimate
+
+
+def scale_device(
+    source: ScaleSource, options: ScaleOptions, *, first_s: float | None = None, force: bool = False
+) -> ScaleEstimate:
+    """How much longer the true path is than a device's own, by all sensors that its export holds.
+
+    Raises
+    ------
+    FormatError, TimingError
+        For what is missing or cannot be read.
+    """
+    brings_imu(source)
+    folder = read_device_folder(source.source)
+    if folder.imu is not None or source.imu is not None:
+        by_imu = _scale_by_imu(source, options, first_s=first_s, force=force)
+    else:
+        by_imu = ScaleEstimate.refused("none", Fact("scale-without-accelerometer"))
+    trajectory = folder.trajectory
+    if first_s is not None:
+        trajectory = first_seconds(trajectory, first_s)
+    return scale_by_sensors(by_imu, trajectory, folder)
+
+
+def _scale_by_imu(source: ScaleSource, options: ScaleOptions, *, first_s: float | None, force: bool) -> ScaleEstimate:
     recording = load_source(source)
     limit_s = largest_offset_s(recording.shared_clock, options.max_offset_s)
     options = dataclasses.replace(options, max_offset_s=limit_s)
@@ -320,12 +359,9 @@ def scale_source(
             options=options,
             read_as=recording.checked.read_as,
         )
-        estimate = downgraded(_judge_shutter(source.source, recording, options, estimate), doubts)
+        estimate = add_doubts(_judge_shutter(source.source, recording, options, estimate), doubts)
     notes = (*left_out, *estimate.notes, *recording.imu.repairs, *recording.notes)
-    estimate = dataclasses.replace(estimate, notes=notes)
-    if json is not None:
-        write_json(json, scale_as_json(estimate, source.calibration, source.source))
-    return estimate
+    return dataclasses.replace(estimate, notes=notes)
 
 
 #: What is kept of the IMU before and after frames that are cut.
@@ -378,6 +414,6 @@ def scale_as_json(
 
 def _identify(source: Path) -> ModelIdentity | None:
     """The model in a folder; ``None`` for poses of any other kind."""
-    if not source.is_dir() or is_inertial_scale(source):
+    if not source.is_dir() or is_inertial_scale(source) or is_device_folder(source):
         return None
     return ModelIdentity.of(read_model(only_model(source)))

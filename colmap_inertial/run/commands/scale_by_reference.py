@@ -176,7 +176,7 @@ def check_reference(reference: ReferenceOptions) -> None:
     if reference.scale_from == "distance":
         if reference.between is None or reference.distance is None:
             raise InertialError(Fact("distance-not-given"))
-        _length(reference.distance)
+        _parse_length(reference.distance)
         if reference.target is None and not all("," in end for end in reference.between):
             raise InertialError(Fact("markers-not-given"))
     if reference.target is not None:
@@ -198,8 +198,8 @@ def _scale_by_distance(reference: ReferenceOptions, validation: Validation | Non
     between, distance = reference.between, reference.distance
     if between is None or distance is None:
         raise InertialError(Fact("distance-not-given"))
-    metres, sigma_m = _length(distance)
-    places, noise = zip(*(_place(text, validation) for text in between), strict=True)
+    metres, sigma_m = _parse_length(distance)
+    places, noise = zip(*(_find_place(text, validation) for text in between), strict=True)
     measured = float(np.linalg.norm(places[0] - places[1]))
     if not measured > 0:
         raise NotObservableError("scale", Fact("one-place", first=between[0], second=between[1]))
@@ -207,7 +207,7 @@ def _scale_by_distance(reference: ReferenceOptions, validation: Validation | Non
     return metres / measured, sigma_log, f"distance of {distance} m between {between[0]} and {between[1]}"
 
 
-def _length(text: str) -> tuple[float, float]:
+def _parse_length(text: str) -> tuple[float, float]:
     try:
         metres, sigma_m = (float(part) for part in text.split("+-"))
     except ValueError:
@@ -217,7 +217,7 @@ def _length(text: str) -> tuple[float, float]:
     return metres, sigma_m
 
 
-def _place(text: str, validation: Validation | None) -> tuple[Array, float]:
+def _find_place(text: str, validation: Validation | None) -> tuple[Array, float]:
     """(3,) a marker's centre or a point, and its standard deviation; model units."""
     parts = text.split(",")
     if len(parts) == 3:
@@ -235,10 +235,10 @@ def _place(text: str, validation: Validation | None) -> tuple[Array, float]:
     centres = marker_centres(validation)
     if int(text) not in centres:
         raise NotObservableError("distance", Fact("marker-not-measured", marker=text, measured=sorted(centres)))
-    return centres[int(text)], _noise(validation, int(text))
+    return centres[int(text)], _estimate_marker_noise(validation, int(text))
 
 
-def _noise(validation: Validation, marker: int) -> float:
+def _estimate_marker_noise(validation: Validation, marker: int) -> float:
     """Standard deviation of a marker's centre along a line: from how far its corners are from a square's."""
     corners: Sequence[Array] = [c.in_model for c in validation.corners if c.name.startswith(f"marker{marker}.")]
     measured, square = np.array(corners), validation.target.corners_m[:4] / validation.metres_per_unit
@@ -297,15 +297,15 @@ def reconstruct_by(
         raise InertialError(Fact("for-metres-of-the-imu", option="--database"))
     if any("," in end for end in reference.between or ()):
         raise InertialError(Fact("points-need-a-model"))
-    pictures = _pictures(capture)
-    names = _names(pictures)
+    pictures = _load_pictures(capture)
+    names = _list_names(pictures)
     made_from = {"capture": str(capture.resolve()), "pictures": len(names), **dataclasses.asdict(options.mapping)}
     if settings := read_settings(options.colmap, options.colmap_project).settings:
         made_from["colmap"] = list(settings)
     if not _is_mapped(out, made_from):
         with new_folder(out) as work:
-            left_out = _map(pictures, names, work / "colmap", options, progress)
-            files = _contents(work / "colmap")
+            left_out = _map_pictures(pictures, names, work / "colmap", options, progress)
+            files = _list_contents(work / "colmap")
             write_json(work / "colmap" / _MADE_FROM, {**made_from, "left_out": left_out, "files": files})
     left_out = read_json(out / "colmap" / _MADE_FROM)["left_out"]
     metric = out / "metric"
@@ -342,13 +342,13 @@ def _is_mapped(out: Path, made_from: dict[str, object]) -> bool:
         raise OutputExistsError(Fact("record-unreadable", found=fact_of(error), out=str(out))) from None
     if any(known.get(key) != value for key, value in made_from.items()):
         raise OutputExistsError(Fact("output-of-another-run", path=str(out)))
-    contents = _contents(record.parent)
+    contents = _list_contents(record.parent)
     if changed := sorted(name for name in kept | contents if kept.get(name) != contents.get(name)):
         raise OutputExistsError(Fact("output-changed", path=str(record.parent / changed[0]), out=str(out)))
     return True
 
 
-def _contents(project: Path) -> dict[str, list[object]]:
+def _list_contents(project: Path) -> dict[str, list[object]]:
     """Size and digest of a project's files, without the record of what it was made from."""
     rows: Any = fingerprint(project)
     contents = {Path(path).relative_to(project.resolve()).as_posix(): [size, digest] for path, size, _, digest in rows}
@@ -356,7 +356,7 @@ def _contents(project: Path) -> dict[str, list[object]]:
     return contents
 
 
-def _pictures(path: Path) -> Capture:
+def _load_pictures(path: Path) -> Capture:
     """A capture, a folder of pictures, or a video."""
     if not path.exists():
         raise FormatError(path, Fact("no-such-file", what="file or folder"))
@@ -379,7 +379,7 @@ def _pictures(path: Path) -> Capture:
     return capture
 
 
-def _names(capture: Capture) -> list[str]:
+def _list_names(capture: Capture) -> list[str]:
     if isinstance(capture.frames, ImageFolder):
         names = image_names(capture.frames)
     else:
@@ -389,7 +389,7 @@ def _names(capture: Capture) -> list[str]:
     return names
 
 
-def _map(
+def _map_pictures(
     capture: Capture, names: list[str], project: Path, options: ReconstructOptions, progress: Progress
 ) -> list[int]:
     """Make a COLMAP project of pictures; how many images the models have that are left out, the largest first."""
@@ -403,7 +403,7 @@ def _map(
     require_features(context)
     project.mkdir()
     context.executor.require(project)
-    for _ in report_each(_written(capture, names, images), len(names), "frames", progress):
+    for _ in report_each(_copy_pictures(capture, names, images), len(names), "frames", progress):
         pass
     database = project / "database.db"
     extract_features(images, dict.fromkeys(names, capture.camera), database, mapping, context=context)
@@ -420,7 +420,7 @@ def _map(
     return [sizes[folder] for folder in ranked[1:]]
 
 
-def _written(capture: Capture, names: list[str], images: Path) -> Iterator[None]:
+def _copy_pictures(capture: Capture, names: list[str], images: Path) -> Iterator[None]:
     """Put every picture into a folder: files as they are, frames of a video as PNG."""
     if isinstance(capture.frames, ImageFolder):
         for name in names:

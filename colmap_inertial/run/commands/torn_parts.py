@@ -1,4 +1,8 @@
-"""Parts of torn models on their way through a stage that joins models."""
+"""Parts of torn models on their way through a stage that joins models.
+
+A model is torn where all cameras after some image are turned against those before. Its largest part goes on as the
+model; each other part becomes a model of its own, with a free number, so that the stage may join it again.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from colmap_inertial.core.facts import Fact
-from colmap_inertial.core.types import Action, Treatment
+from colmap_inertial.core.types import Action, RotationConsensus, Treatment
 from colmap_inertial.model import Model
 from colmap_inertial.model.deregistration import deregister_images
 from colmap_inertial.motion.align.consensus import describe_consensus, without_consensus
@@ -29,45 +33,63 @@ class TornParts:
 
     def __init__(self, first: int) -> None:
         self._next = first
-        self._images: dict[int, tuple[int, tuple[str, ...]]] = {}
+        self._torn_off: dict[int, int] = {}  # the number of the model that a part was torn off, by the part's number
+        self._names: dict[int, tuple[str, ...]] = {}  # of a part's images
 
     def __bool__(self) -> bool:
-        return bool(self._images)
+        return bool(self._torn_off)
 
-    def split(self, before: Model, made: Model) -> Iterator[Model]:
-        """The smaller parts of a model as COLMAP made it; ``made`` is what the stages made of it, and names them."""
-        images = [before.reconstruction.image(number).name for number in before.reconstruction.reg_image_ids()]
-        for names in made.torn_off:
+    def split(self, model: Model, staged: Model) -> Iterator[Model]:
+        """Make models of the smaller parts of a torn one.
+
+        Parameters
+        ----------
+        model
+            As COLMAP made it.
+        staged
+            The same after the stages, which names the images of its smaller parts.
+        """
+        images = {model.reconstruction.image(number).name for number in model.reconstruction.reg_image_ids()}
+        for names in staged.torn_off:
             number, self._next = self._next, self._next + 1
-            self._images[number] = before.colmap_index, names
-            log.info("%d images that were torn off model %d are model %d", len(names), before.colmap_index, number)
-            part = deregister_images(before.reconstruction, set(images) - set(names))
-            yield replace(before, reconstruction=part, colmap_index=number)
+            self._torn_off[number], self._names[number] = model.colmap_index, names
+            log.info("%d images that were torn off model %d are model %d", len(names), model.colmap_index, number)
+            part = deregister_images(model.reconstruction, images - set(names))
+            yield replace(model, reconstruction=part, colmap_index=number)
 
     def describe_joined(self, models: Sequence[Model]) -> list[Model]:
-        """Models without parts that stayed apart; where a model got its own parts back, it says so."""
-        return [self._describe(model) for model in models if model.parts or model.colmap_index not in self._images]
+        """Leave out parts that stayed apart; where a model got its own parts back, have it say so."""
+        return [
+            self._describe_regained(model)
+            for model in models
+            if model.parts or model.colmap_index not in self._torn_off
+        ]
 
-    def _describe(self, model: Model) -> Model:
-        before, scale = model.rotations, model.scale
-        back = [self._images.get(part.colmap_index) for part in model.parts]
-        names = tuple(name for one in back if one and one[0] == model.colmap_index for name in one[1])
-        if not names or before is None or scale is None:
+    def _describe_regained(self, model: Model) -> Model:
+        """A joined model whose cameras are judged anew, with the parts that were torn off it and are back."""
+        own = [p.colmap_index for p in model.parts if self._torn_off.get(p.colmap_index) == model.colmap_index]
+        names = tuple(name for number in own for name in self._names[number])
+        if not names or model.rotations is None or model.scale is None:
             return model
-        now = replace(before, joined=names)
-        description = describe_consensus(now)
-        treatments = (
-            Treatment(
-                stage=done.stage,
-                reason=Fact(_JUDGED, facts=(*description, *without_consensus(done.reason.values["facts"]))),
-                action=Action.LEFT_OUT if now.left_out else Action.JOINED,
-                values={**done.values, "left_out": now.left_out},
-            )
-            if done.reason.code == _JUDGED
-            else done
-            for done in model.treatments
-        )
-        notes = (*without_consensus(scale.notes), *description)
+        rotations = replace(model.rotations, joined=names)
+        notes = (*without_consensus(model.scale.notes), *describe_consensus(rotations))
         return replace(
-            model, rotations=now, scale=replace(scale, rotations=now, notes=notes), treatments=tuple(treatments)
+            model,
+            rotations=rotations,
+            scale=replace(model.scale, rotations=rotations, notes=notes),
+            treatments=tuple(
+                _judge_again(treatment, rotations) if treatment.reason.code == _JUDGED else treatment
+                for treatment in model.treatments
+            ),
         )
+
+
+def _judge_again(treatment: Treatment, rotations: RotationConsensus) -> Treatment:
+    """The stages' record of a model's cameras, as these are judged now."""
+    other_facts = without_consensus(treatment.reason.values["facts"])
+    return Treatment(
+        stage=treatment.stage,
+        reason=Fact(_JUDGED, facts=(*describe_consensus(rotations), *other_facts)),
+        action=Action.LEFT_OUT if rotations.left_out else Action.JOINED,
+        values={**treatment.values, "left_out": rotations.left_out},
+    )

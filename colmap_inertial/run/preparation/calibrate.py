@@ -251,7 +251,11 @@ def _aligned(trajectory: CameraTrajectory, recording: Recording, camera: CameraM
             Fact("calibration-too-loose", rotation_sigma_rad=rotation_rad, offset_sigma_s=offset_s),
         )
     return GyroView(
-        imu=recording.imu, timing=recording.timing, calibration=alignment.settled(), camera=camera, source=source
+        imu=recording.imu,
+        timing=recording.timing,
+        calibration=alignment.settle_clock_rate(),
+        camera=camera,
+        source=source,
     )
 
 

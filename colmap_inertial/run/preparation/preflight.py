@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Literal, TypeVar
 
 import numpy as np
@@ -17,7 +18,7 @@ from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, F
 from colmap_inertial.diagnose import Diagnosis, FramesInVideo, Recorded, diagnose
 from colmap_inertial.imaging.detail import is_blank
 from colmap_inertial.io.capture import Capture
-from colmap_inertial.io.files import write_json
+from colmap_inertial.io.files import read_record, write_json, write_record
 from colmap_inertial.io.frame_sources import ImageFolder
 from colmap_inertial.io.plausible import check_readings
 from colmap_inertial.io.pose_convention import COLMAP, PoseConvention
@@ -195,11 +196,25 @@ def run_preflight(
         prior=recording.prior,
         max_offset_s=recording.max_offset_s,
     )
-    recorded = measure_recording(inputs, session.progress)
-    diagnosis = diagnose(recorded)
-    write_json(session.workspace.diagnosis, diagnosis.as_json())
-    for error in recorded.refused:
-        raise error
+    record = session.workspace.stamps / "checked.json"
+
+    def work(partial: Sequence[Path]) -> None:
+        recorded = measure_recording(inputs, session.progress)
+        diagnosis = diagnose(recorded)
+        if recorded.refused:
+            write_json(session.workspace.diagnosis, diagnosis.as_json())
+            raise recorded.refused[0]
+        write_json(partial[0], diagnosis.as_json())
+        write_record(partial[1], diagnosis)
+
+    depends = {
+        "imu": imu,
+        "recording": {name: getattr(recording, name) for name in ("timing", "prior", "max_offset_s")},
+        "capture": replace(recording.capture, target=None),
+        "looked at": recording.inputs() if model is None else model,
+    }
+    session.runner.run("check", depends, [session.workspace.diagnosis, record], work)
+    diagnosis = read_record(record, Diagnosis)
     findings(diagnosis)
     return stop_or_doubt(diagnosis, force=force)
 

@@ -25,11 +25,10 @@ from colmap_inertial.imaging.gate import (
 )
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.parallax import Parallax
-from colmap_inertial.imaging.path_filters import half_quadratic, path_wiener
+from colmap_inertial.imaging.path_filters import LONGEST_PX, DeblurOptions, half_quadratic, path_wiener
 from colmap_inertial.imaging.psf import blur_field, blur_path
 from colmap_inertial.imaging.restoration import deepgyro, load_network, require_network
 from colmap_inertial.imaging.restoration.shipped import checksum
-from colmap_inertial.imaging.wiener import LONGEST_PX, DeblurOptions
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.run.stages.imaging_plan import GyroView, ImagingPlan
 from colmap_inertial.run.stages.inputs import StageInputs

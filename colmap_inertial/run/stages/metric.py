@@ -41,7 +41,7 @@ from colmap_inertial.inertial.scale import estimate_scale, strength_of_gravity
 from colmap_inertial.io.calibration import SIGMAS, calibration_prior
 from colmap_inertial.io.files import write_record
 from colmap_inertial.io.trajectories import write_tum
-from colmap_inertial.model import Model, downgraded, trajectory_from_model
+from colmap_inertial.model import Model, add_doubts, trajectory_from_model
 from colmap_inertial.model.deregistration import deregister_images
 from colmap_inertial.model.own_place import OwnPlace
 from colmap_inertial.model.rigs import has_rigs
@@ -237,7 +237,6 @@ class MetricStage(InertialStage):
         """Estimate and apply the scale."""
         model, estimate, _ = self.estimate_scale(model)
         estimate = replace(estimate, notes=(*estimate.notes, *self.imu.repairs))
-        estimate = downgraded(estimate, model.doubts)
         if estimate.verdict == "refused":
             return model.scaled(estimate, None)
         return self.judge_shutter(model, estimate)
@@ -270,10 +269,10 @@ class MetricStage(InertialStage):
             return model.scaled(estimate, None)
         if contradicted is not None and model.timing.readout_s:
             found.append(contradicted)
-            estimate = downgraded(estimate, found[-1:])
+            estimate = add_doubts(estimate, found[-1:])
         if self.keeps_intrinsics and readout.focal is not None and readout.focal.contradicts:
             found.append(readout.focal.as_fact())
-            estimate = downgraded(estimate, found[-1:])
+            estimate = add_doubts(estimate, found[-1:])
         metric = self._apply(model, estimate)
         for fact in found:
             done = Treatment(stage="shutter", reason=fact, values=dict(fact.values))
@@ -282,7 +281,10 @@ class MetricStage(InertialStage):
         return metric
 
     def _apply(self, model: Model, estimate: ScaleEstimate) -> Model:
-        similarity = Similarity.from_scale(estimate, world=self.world, provenance=provenance(estimate))
+        """A model in metres, whose provenance has the verdict with the model's doubts."""
+        model = replace(model, scale=estimate)
+        assert model.scale is not None
+        similarity = Similarity.from_scale(model.scale, world=self.world, provenance=provenance(model.scale))
         return model.scaled(estimate, similarity)
 
     def _find_readout(self, model: Model) -> SeenReadout | None:

@@ -42,7 +42,7 @@ from colmap_inertial.inertial.refine.setup import (
 from colmap_inertial.inertial.refine.shutter import SHUTTER_IGNORED
 from colmap_inertial.inertial.refine.values import FIRST_INTRINSIC, LEVER, OFFSET, READOUT, ROTATION, Estimate, Problem
 from colmap_inertial.inertial.refine.world import size_of, state_scale
-from colmap_inertial.model import Model, downgraded
+from colmap_inertial.model import Model, add_doubts
 from colmap_inertial.model.rigs import has_rigs
 from colmap_inertial.model.similarities import compose
 from colmap_inertial.run.stages.inputs import StageInputs
@@ -214,7 +214,9 @@ def _doubt_contradicted(model: Model, judged: Judged) -> Model:
     reason, scale = judged.reason, model.scale
     if reason is None or reason.code != "imu-contradicts-pictures" or judged.chi2 <= _GROSS_CHI2 or scale is None:
         return model
-    return replace(model, scale=downgraded(scale, (reason,)))
+    # what is contradicted by itself, as declared intrinsics are, is likelier its cause, and comes before
+    doubted = add_doubts(scale, (reason,))
+    return replace(model, scale=replace(doubted, reasons=(*scale.reasons, reason)))
 
 
 def _has_readout(model: Model, judged: Judged) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import tomllib
 import typing
 from collections.abc import Mapping
 from pathlib import Path
@@ -42,6 +43,27 @@ def _plain_item(item: object) -> object:
     return str(item.resolve()) if isinstance(item, Path) else item
 
 
+def list_changed_options(earlier: Path, config: str) -> tuple[Fact, ...]:
+    """Each option whose value differs in an earlier configuration; none where that file cannot be read."""
+    try:
+        before = _flatten(read_values(earlier))
+    except FormatError:
+        return ()
+    now = _flatten(tomllib.loads(config))
+    return tuple(
+        Fact("option-changed", option=name, now=now.get(name), before=before.get(name))
+        for name in sorted(before.keys() | now.keys())
+        if before.get(name) != now.get(name)
+    )
+
+
+def _flatten(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in table.items():
+        flat |= _flatten(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {prefix + key: value}
+    return flat
+
+
 @reader("options")
 def read_config(path: StrPath, cls: type[Options]) -> Options:
     """Options of type ``cls`` from a TOML file; what it does not name keeps its default.
@@ -52,7 +74,7 @@ def read_config(path: StrPath, cls: type[Options]) -> Options:
         For a file that is no TOML, an unknown key (the nearest known one is named), or a value of the wrong type.
     """
     path = Path(path)
-    return _build(path, cls, read_values(path), "")
+    return _replace(cls(), read_values(path), path)
 
 
 def read_values(path: Path) -> dict[str, Any]:
@@ -76,60 +98,38 @@ def override_options(options: Options, values: Mapping[str, Any], path: Path) ->
     FormatError
         As :func:`read_config`.
     """
-    stated = _build(path, type(options), values, "")  # by themselves first: a wrong one is named as it was written
-    plain = _merged(_plain(options), _resolve_paths(stated, values, path.parent))
-    return _build(path, type(options), plain, "")
+    return _replace(options, values, path, folder=path.parent)
 
 
-def _resolve_paths(stated: Any, values: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    absolute: dict[str, Any] = {}
+def _replace(
+    options: Any, values: Mapping[str, Any], path: Path, *, folder: Path | None = None, prefix: str = ""
+) -> Any:
+    """Replace some values, checked by their annotations; paths are resolved from ``folder`` where one is given."""
+    known = [f.name for f in dataclasses.fields(options)]
+    hints = typing.get_type_hints(type(options))
+    tables: dict[str, Any] = {}
     for key, value in values.items():
-        built = getattr(stated, key)
-        if dataclasses.is_dataclass(built):
-            absolute[key] = _resolve_paths(built, value, folder)
-        else:
-            absolute[key] = _absolute(built, value, folder)
-    return absolute
-
-
-def _absolute(built: object, value: object, folder: Path) -> object:
-    if isinstance(built, tuple):
-        return [_absolute(item, item, folder) for item in built]
-    return str((folder / built).resolve()) if isinstance(built, Path) else value
-
-
-def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    merged = dict(below)
-    for key, value in above.items():
-        deeper = isinstance(value, Mapping) and isinstance(merged.get(key), Mapping)
-        merged[key] = _merged(merged[key], value) if deeper else value
-    return merged
-
-
-def _build(path: Path, cls: type[Options], values: Mapping[str, Any], prefix: str) -> Options:
-    hints = typing.get_type_hints(cls)
-    known = [f.name for f in dataclasses.fields(cls)]  # type: ignore[arg-type]
-    built: dict[str, Any] = {}
-    for key, value in values.items():
+        name = f"{prefix}{key}"
         if key not in known:
             near = difflib.get_close_matches(key, known, n=1)
-            raise FormatError(
-                path,
-                Fact(
-                    "unknown-option",
-                    option=f"{prefix}{key}",
-                    nearest=f"{prefix}{near[0]}" if near else None,
-                    known=known,
-                ),
-            )
-        hint_type = hints[key]
-        if dataclasses.is_dataclass(hint_type):
+            nearest = f"{prefix}{near[0]}" if near else None
+            raise FormatError(path, Fact("unknown-option", option=name, nearest=nearest, known=known))
+        if dataclasses.is_dataclass(getattr(options, key)):
             if not isinstance(value, Mapping):
-                raise FormatError(path, Fact("option-is-a-table", option=f"{prefix}{key}"))
-            built[key] = _build(path, typing.cast(type, hint_type), value, f"{prefix}{key}.")
-        else:
-            built[key] = value
+                raise FormatError(path, Fact("option-is-a-table", option=name))
+            tables[key] = _replace(getattr(options, key), value, path, folder=folder, prefix=f"{name}.")
+    plain = {key: value for key, value in values.items() if key not in tables}
     try:
-        return cls(**{key: check_value(f"{prefix}{key}", value, hints[key]) for key, value in built.items()})
+        checked = {key: check_value(f"{prefix}{key}", value, hints[key]) for key, value in plain.items()}
+        resolved = {key: _resolve(value, folder) for key, value in checked.items()}
+        return dataclasses.replace(options, **tables, **resolved)
     except ValueError as error:
         raise FormatError(path, Fact("invalid-values", detail=str(error))) from error
+
+
+def _resolve(value: object, folder: Path | None) -> object:
+    if folder is None:
+        return value
+    if isinstance(value, tuple):
+        return tuple(_resolve(item, folder) for item in value)
+    return (folder / value).resolve() if isinstance(value, Path) else value

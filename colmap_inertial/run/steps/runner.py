@@ -1,116 +1,47 @@
-"""Steps in order, those that are done already skipped, each output whole or absent."""
+"""Steps of a run: each is done once, its output is whole or absent, and a finished result is not replaced unasked."""
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
-import enum
-import functools
 import hashlib
 import json
 import logging
 import os
 import time
-import types
-import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from colmap_inertial import __version__
-from colmap_inertial.core.errors import FormatError, InertialError, fact_of
+from colmap_inertial.core.errors import FormatError, InertialError, OutputExistsError, fact_of
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.progress import HearsSteps, Progress, silent, tell
 from colmap_inertial.io.disk import remove
 from colmap_inertial.io.files import read_record, write_record
 from colmap_inertial.io.fingerprints import digest_of_file
+from colmap_inertial.run.steps.hashing import as_json_types
 from colmap_inertial.run.steps.workspace import Workspace
 
 log = logging.getLogger(__name__)
-
-
-def canonical(value: object) -> object:
-    """A value in JSON types, for hashing: dataclasses by field, paths as text, functions by name, body and closure.
-
-    A field that is declared with ``compare=False`` decides nothing and is left out.
-    """
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = {f.name: canonical(getattr(value, f.name)) for f in dataclasses.fields(value) if f.compare}
-        kind = type(value)
-        return {"type": f"{kind.__module__}.{kind.__qualname__}", "methods": _methods(kind), **fields}
-    if isinstance(value, Mapping):
-        return {str(k): canonical(v) for k, v in value.items()}
-    if isinstance(value, enum.Enum):
-        return value.value
-    if isinstance(value, np.ndarray):
-        return hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
-    if isinstance(value, np.generic):
-        return value.item()
-    if isinstance(value, (list, tuple)):
-        return [canonical(v) for v in value]
-    if isinstance(value, (set, frozenset)):
-        return sorted((canonical(v) for v in value), key=repr)
-    if isinstance(value, Path):
-        return str(value.resolve())  # however it was spelt
-    if value is None or isinstance(value, (bool, int, float, str)):
-        return value
-    if value is ...:
-        return "..."
-    return _canonical_callable(value)
-
-
-def hash_values(*values: object) -> str:
-    """Hash of values."""
-    return hashlib.sha256(json.dumps(canonical(values), sort_keys=True).encode()).hexdigest()
-
-
-def _canonical_callable(value: object) -> object:
-    if isinstance(value, functools.partial):
-        return ["partial", canonical(value.func), canonical(value.args), canonical(value.keywords)]
-    if isinstance(value, types.FunctionType):
-        cells = [canonical(cell.cell_contents) for cell in value.__closure__ or ()]
-        defaults = canonical([value.__defaults__, value.__kwdefaults__])
-        return [f"{value.__module__}.{value.__qualname__}", _code(value.__code__), cells, defaults]
-    if isinstance(value, types.MethodType):
-        return [canonical(value.__func__), canonical(value.__self__)]
-    # Anything else may hide what decides its result: a key of its own, so that nothing made with it is ever kept.
-    return f"{type(value).__module__}.{type(value).__qualname__} {uuid.uuid4()}"
-
-
-def _code(code: types.CodeType) -> list[object]:
-    """A function's body, without names of files and numbers of lines."""
-    constants = [_code(c) if isinstance(c, types.CodeType) else _constant(c) for c in code.co_consts]
-    return [code.co_code.hex(), list(code.co_names), constants]
-
-
-def _constant(value: object) -> object:
-    """A constant of a function, the same in every process: the order of a set is not."""
-    if isinstance(value, tuple | frozenset):
-        parts = [_constant(part) for part in value]
-        return parts if isinstance(value, tuple) else sorted(parts, key=repr)
-    return repr(value)
-
-
-def _methods(kind: type) -> dict[str, object]:
-    """The code of a visitor's class; our own is known by our version."""
-    if kind.__module__.split(".")[0] == __package__.split(".")[0]:
-        return {}
-    own = {name: value for name, value in vars(kind).items() if name == "__call__" or not name.startswith("__")}
-    return {name: canonical(value) for name, value in own.items() if isinstance(value, types.FunctionType)}
 
 
 @dataclass(frozen=True, kw_only=True)
 class _File:
     """A file or folder that a step wrote, as it was then.
 
-    Path in the output folder, size, change of the inode, and what it is: digest of a file, target of a link.
+    Attributes
+    ----------
+    name
+        Its path in the output folder.
+    size, modified_ns
+        Of a file.
+    digest
+        Of a file's content; ``"folder"``, or the target of a link.
     """
 
     name: str
     size: int
-    changed_ns: int
+    modified_ns: int
     digest: str
 
     @classmethod
@@ -119,24 +50,22 @@ class _File:
         if path.is_symlink():
             digest = f"link to {path.readlink()}"
         elif path.is_dir():
-            return cls(name=name, size=0, changed_ns=0, digest="folder")
+            return cls(name=name, size=0, modified_ns=0, digest="folder")
         else:
             digest = digest_of_file(path, stat)
-        return cls(name=name, size=stat.st_size, changed_ns=stat.st_ctime_ns, digest=digest)
+        return cls(name=name, size=stat.st_size, modified_ns=stat.st_mtime_ns, digest=digest)
 
-    def now(self, root: Path) -> _File | None:
-        """The same as it is now; ``None`` where it is missing or damaged.
-
-        Its content is read only where something happened to the inode.
-        """
+    def is_unchanged(self, root: Path) -> bool:
+        """Whether it is there and the same; read only where its size is, and its time is not."""
         path = root / self.name
         try:
             stat = path.lstat()
-            same = (stat.st_size, stat.st_ctime_ns) == (self.size, self.changed_ns)
-            current = self if same else _File.of(root, path)
+            if (stat.st_size, stat.st_mtime_ns) == (self.size, self.modified_ns):
+                return True
+            now = _File.of(root, path)
         except (OSError, FormatError):
-            return None
-        return current if (current.size, current.digest) == (self.size, self.digest) else None
+            return False
+        return (now.size, now.digest) == (self.size, self.digest)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,12 +77,19 @@ class _Stamp:
     inner: dict[str, float]
     files: tuple[_File, ...]
 
-    def lost(self, root: Path) -> str:
+    def find_loss(self, root: Path) -> str:
         """The first of its files that is missing or damaged; empty where there is none."""
-        return next((file.name for file in self.files if file.now(root) is None), "")
+        return next((file.name for file in self.files if not file.is_unchanged(root)), "")
 
 
-def _files_in(root: Path, paths: Iterable[Path]) -> tuple[_File, ...]:
+def _read_stamp(path: Path) -> _Stamp | None:
+    try:
+        return read_record(path, _Stamp)
+    except FormatError:
+        return None
+
+
+def _list_files(root: Path, paths: Iterable[Path]) -> tuple[_File, ...]:
     """Some files and folders, which need not be there, and the files in them."""
     files = {path for path in paths if os.path.lexists(path)}
     for folder in [path for path in files if path.is_dir() and not path.is_symlink()]:
@@ -162,44 +98,25 @@ def _files_in(root: Path, paths: Iterable[Path]) -> tuple[_File, ...]:
     return tuple(_File.of(root, path) for path in sorted(files))
 
 
-def find_loss(workspace: Workspace, steps: Iterable[str], *, but: Iterable[Path] = ()) -> str:
-    """The first file of finished steps that is missing or damaged; empty where there is none.
-
-    Folders ``but`` may be gone as a whole.
-    """
-    gone = tuple(path.relative_to(workspace.root).as_posix() for path in but if not path.exists())
-    stamps = filter(None, (_read_stamp(workspace.stamps / f"{step}.json") for step in steps))
-    files = (file for stamp in stamps for file in stamp.files if not file.name.startswith(gone))
-    return next((file.name for file in files if file.now(workspace.root) is None), "")
-
-
-@contextlib.contextmanager
-def explaining_losses(workspace: Workspace) -> Iterator[None]:
-    """Have a complaint about an output folder say what its run would make again."""
-    try:
-        yield
-    except FormatError as error:
-        lost = find_loss(workspace, (path.stem for path in workspace.stamps.glob("*.json")))
-        if not lost:
-            raise
-        raise FormatError(workspace.root, Fact("lost-since-its-run", found=fact_of(error), lost=lost)) from None
-
-
-def find_change(workspace: Workspace, paths: Iterable[Path]) -> Path | None:
-    """The first of some files that is not as a step wrote it."""
-    stamps = filter(None, map(_read_stamp, workspace.stamps.glob("*.json")))
-    known = {file.name: file for stamp in stamps for file in stamp.files}
-    root, inside = workspace.root, (path for path in paths if path.is_relative_to(workspace.root))
-    pairs = ((path, known.get(path.relative_to(root).as_posix())) for path in inside)
-    return next((path for path, file in pairs if file is not None and file.now(root) is None), None)
-
-
 class StepRunner:
-    """Runs steps in order and skips those whose inputs and options are those of an earlier, finished run.
+    """Runs steps in order, and keeps those whose record still holds.
 
-    A step's key hashes its options, its inputs, what it writes and the keys and outputs of the steps that it takes the
-    output of, so that a change anywhere makes again what depends on it, and nothing else. A folder's existence proves
-    nothing: only a stamp does that has the right key, and whose files are all as the step wrote them.
+    A step's key hashes what decides its output: options, inputs, and the output of the steps before it. Its record
+    (``.stages/STEP.json``) holds the key and every file that it wrote, and holds as long as both are the same.
+
+    A finished result (there is a ``result.json``) may be added to and repaired. A step of it whose key is another one
+    now is made again only where that was asked for.
+
+    Parameters
+    ----------
+    workspace
+        The output folder.
+    progress
+        Hears of steps.
+    overwrite
+        Make steps of a finished result again.
+    changes
+        Options that differ from those of the finished result.
 
     Attributes
     ----------
@@ -209,26 +126,27 @@ class StepRunner:
         The steps that this run did, in order.
     """
 
-    def __init__(self, workspace: Workspace, heard_by: Progress = silent) -> None:
+    def __init__(
+        self,
+        workspace: Workspace,
+        progress: Progress = silent,
+        *,
+        overwrite: bool = False,
+        changes: Sequence[Fact] = (),
+    ) -> None:
         self._workspace = workspace
-        self._progress = heard_by
-        self._heard_by = heard_by if isinstance(heard_by, HearsSteps) else None
-        self._keys: dict[str, str] = {}
+        self._progress = progress
+        self._heard_by = progress if isinstance(progress, HearsSteps) else None
+        self._overwrite = overwrite
+        self._changes = tuple(changes)
+        self._outputs: dict[str, str] = {}
         self.seconds: dict[str, float] = {}
         self.worked: list[str] = []
 
-    def of(self, *steps: str) -> list[str]:
-        """Those of the steps that belong to this run."""
-        return [step for step in steps if step in self._keys]
-
-    def forget(self, name: str) -> None:
-        """Have a step made again: what it made is gone."""
-        (self._workspace.stamps / f"{name}.json").unlink(missing_ok=True)
-
-    def record(self, name: str, paths: Iterable[Path]) -> None:
-        """Remember files that are made with every result."""
-        files = _files_in(self._workspace.root, paths)
-        write_record(self._workspace.stamps / f"{name}.json", _Stamp(key="", seconds=0.0, inner={}, files=files))
+    @property
+    def keeps_result(self) -> bool:
+        """Whether there is a finished result that this run may not replace."""
+        return self._workspace.result.is_file() and not self._overwrite
 
     def run(
         self,
@@ -240,7 +158,7 @@ class StepRunner:
         after: Sequence[str] = (),
         beside: Callable[[], Iterable[Path]] = tuple,
     ) -> None:
-        """Run ``work`` unless its stamp holds.
+        """Run a step, unless its record holds.
 
         Parameters
         ----------
@@ -257,29 +175,104 @@ class StepRunner:
             Steps whose output it takes.
         beside
             What else it has written, by names of its own: files and folders that must stay as they are, too.
+
+        Raises
+        ------
+        OutputExistsError
+            Where that would replace a finished result.
         """
-        root, stamp = self._workspace.root, self._workspace.stamps / f"{name}.json"
-        upstream = [self._keys[step] for step in after]
+        key, record = self._hash(name, depends, outputs, after), self._record(name)
+        stamp = _read_stamp(record)
+        if stamp is not None and stamp.key == key:
+            lost = stamp.find_loss(self._workspace.root)
+            if not lost:
+                self._keep(name, stamp)
+                return
+            self._require_repairable(name)
+            tell(self._progress, f"{name.replace('_', ' ')}: made again, as {lost} is missing or damaged")
+        elif stamp is not None:
+            self._require_replaceable(name)
+        if stamp is not None or any(map(os.path.lexists, outputs)):
+            self._workspace.unfinish()
+        record.unlink(missing_ok=True)
+        files, inner = self._work(name, outputs, work, beside)
+        stamp = _Stamp(key=key, seconds=self.seconds[name], inner=inner, files=files)
+        write_record(record, stamp)
+        self._outputs[name] = _hash_output(stamp)
+        log.info("%s: finished in %.1f s", name, self.seconds[name])
+
+    def list_own(self, *steps: str) -> list[str]:
+        """Those of the steps that belong to this run."""
+        return [step for step in steps if step in self._outputs]
+
+    def forget(self, name: str) -> None:
+        """Have a step made again: what it made is gone."""
+        self._record(name).unlink(missing_ok=True)
+
+    def discard(self, *paths: Path) -> None:
+        """Remove what an earlier run made and this one does not.
+
+        Raises
+        ------
+        OutputExistsError
+            Where it belongs to a finished result.
+        """
+        for path in filter(os.path.lexists, paths):
+            self._require_replaceable(path.name)
+            self._workspace.unfinish()
+            remove(path)
+
+    def leave_out(self, steps: Iterable[str]) -> None:
+        """Raise :class:`OutputExistsError` where steps that this run does not have belong to a finished result."""
+        for step in steps:
+            self._require_replaceable(step)
+
+    def record_files(self, name: str, paths: Iterable[Path]) -> None:
+        """Write down files that are made with every result."""
+        files = _list_files(self._workspace.root, paths)
+        write_record(self._record(name), _Stamp(key="", seconds=0.0, inner={}, files=files))
+
+    def _record(self, name: str) -> Path:
+        return self._workspace.stamps / f"{name}.json"
+
+    def _hash(self, name: str, depends: Mapping[str, object], outputs: Sequence[Path], after: Sequence[str]) -> str:
+        """The key of a step; the same wherever the output folder is."""
+        before = [self._outputs[step] for step in after]
         written = [path.name for path in outputs]
-        text = json.dumps([name, __version__, upstream, canonical(depends), written], sort_keys=True)
-        text = text.replace(json.dumps(f"{root.resolve()}{os.sep}")[1:-1], "")  # wherever the folder is
-        key = hashlib.sha256(text.encode()).hexdigest()
-        done = _read_stamp(stamp)
-        if done is not None and done.key == key and self._stands(name, done):
-            self.seconds |= {**done.inner, name: done.seconds}
-            self._depend_on(name, done)
-            log.info("%s: finished in an earlier run, kept", name)
-            if self._heard_by is not None:
-                self._heard_by.kept(name)
-            return
-        self._workspace.unfinish()
-        self.worked.append(name)
-        stamp.unlink(missing_ok=True)
-        for path in outputs:
-            path.parent.mkdir(parents=True, exist_ok=True)
+        text = json.dumps([name, __version__, before, as_json_types(depends), written], sort_keys=True)
+        root = json.dumps(f"{self._workspace.root.resolve()}{os.sep}")[1:-1]
+        return hashlib.sha256(text.replace(root, "").encode()).hexdigest()
+
+    def _keep(self, name: str, stamp: _Stamp) -> None:
+        self.seconds |= {**stamp.inner, name: stamp.seconds}
+        self._outputs[name] = _hash_output(stamp)
+        log.info("%s: finished in an earlier run, kept", name)
+        if self._heard_by is not None:
+            self._heard_by.kept(name)
+
+    def _require_repairable(self, name: str) -> None:
+        """What was lost of a finished result comes again with the options that it was made with."""
+        if self._changes:
+            self._require_replaceable(name)
+
+    def _require_replaceable(self, name: str) -> None:
+        if self.keeps_result:
+            out = str(self._workspace.root)
+            raise OutputExistsError(Fact("result-is-finished", out=out, step=name, changes=self._changes))
+
+    def _work(
+        self,
+        name: str,
+        outputs: Sequence[Path],
+        work: Callable[[list[Path]], None],
+        beside: Callable[[], Iterable[Path]],
+    ) -> tuple[tuple[_File, ...], dict[str, float]]:
+        """Do a step, under temporary names until it is done: the files it wrote, and the seconds of steps in it."""
         partial = [path.with_name(f"{path.stem}.partial{path.suffix}") for path in outputs]
         for path in (*outputs, *partial):
+            path.parent.mkdir(parents=True, exist_ok=True)
             remove(path)
+        self.worked.append(name)
         log.info("%s: started", name)
         if self._heard_by is not None:
             self._heard_by.began(name, partial)
@@ -294,34 +287,45 @@ class StepRunner:
             os.replace(source, target)
         inner = {step: self.seconds[step] for step in self.worked[begun:]}
         self.seconds[name] = time.perf_counter() - start - sum(inner.values())
-        files = _files_in(root, [*outputs, *beside()])
-        done = _Stamp(key=key, seconds=self.seconds[name], inner=inner, files=files)
-        write_record(stamp, done)
-        self._depend_on(name, done)
-        log.info("%s: finished in %.1f s", name, self.seconds[name])
-
-    def settle(self) -> None:
-        """Have the records say how files are at the end, as later steps may have linked them or opened a database."""
-        for name in self._keys:
-            path = self._workspace.stamps / f"{name}.json"
-            if (stamp := _read_stamp(path)) is not None:
-                files = tuple(file.now(self._workspace.root) or file for file in stamp.files)
-                write_record(path, dataclasses.replace(stamp, files=files))
-
-    def _stands(self, name: str, done: _Stamp) -> bool:
-        lost = done.lost(self._workspace.root)
-        if lost:
-            tell(self._progress, f"{name.replace('_', ' ')}: made again, as {lost} is missing or damaged")
-        return not lost
-
-    def _depend_on(self, name: str, stamp: _Stamp) -> None:
-        """Have later steps depend on what a step wrote."""
-        text = json.dumps([stamp.key, [(file.name, file.size, file.digest) for file in stamp.files]])
-        self._keys[name] = hashlib.sha256(text.encode()).hexdigest()
+        return _list_files(self._workspace.root, [*outputs, *beside()]), inner
 
 
-def _read_stamp(stamp: Path) -> _Stamp | None:
+def _hash_output(stamp: _Stamp) -> str:
+    """What later steps depend on: how a step was made, and what came of it."""
+    text = json.dumps([stamp.key, [(file.name, file.size, file.digest) for file in stamp.files]])
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+# --- questions about an output folder ---------------------------------------------------------------------------------
+
+
+def find_loss(workspace: Workspace, steps: Iterable[str], *, but: Iterable[Path] = ()) -> str:
+    """The first file of finished steps that is missing or damaged; empty where there is none.
+
+    Folders ``but`` may be gone as a whole.
+    """
+    gone = tuple(path.relative_to(workspace.root).as_posix() for path in but if not path.exists())
+    stamps = filter(None, (_read_stamp(workspace.stamps / f"{step}.json") for step in steps))
+    files = (file for stamp in stamps for file in stamp.files if not file.name.startswith(gone))
+    return next((file.name for file in files if not file.is_unchanged(workspace.root)), "")
+
+
+def find_change(workspace: Workspace, paths: Iterable[Path]) -> Path | None:
+    """The first of some files that is not as a step wrote it."""
+    stamps = filter(None, map(_read_stamp, workspace.stamps.glob("*.json")))
+    known = {file.name: file for stamp in stamps for file in stamp.files}
+    root, inside = workspace.root, (path for path in paths if path.is_relative_to(workspace.root))
+    pairs = ((path, known.get(path.relative_to(root).as_posix())) for path in inside)
+    return next((path for path, file in pairs if file is not None and not file.is_unchanged(root)), None)
+
+
+@contextlib.contextmanager
+def explaining_losses(workspace: Workspace) -> Iterator[None]:
+    """Have a complaint about an output folder say what its run would make again."""
     try:
-        return read_record(stamp, _Stamp)
-    except FormatError:
-        return None
+        yield
+    except FormatError as error:
+        lost = find_loss(workspace, (path.stem for path in workspace.stamps.glob("*.json")))
+        if not lost:
+            raise
+        raise FormatError(workspace.root, Fact("lost-since-its-run", found=fact_of(error), lost=lost)) from None

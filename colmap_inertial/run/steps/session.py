@@ -1,21 +1,19 @@
-"""A run from its lock to its log: what every driver does around its own steps."""
+"""A run from its lock to its log: what every command does around its own steps."""
 
 from __future__ import annotations
 
 import contextlib
-import importlib.metadata
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 
 from colmap_inertial import __version__
 from colmap_inertial.colmap.context import RunContext
 from colmap_inertial.core.errors import FormatError, InertialError
-from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.printing import PrintableFormatter
-from colmap_inertial.core.progress import Progress, tell
+from colmap_inertial.core.progress import Progress
 from colmap_inertial.io.disk import remove
 from colmap_inertial.io.files import (
     convert_to_plain,
@@ -26,22 +24,11 @@ from colmap_inertial.io.files import (
     write_text,
 )
 from colmap_inertial.model import load_pycolmap
-from colmap_inertial.run.steps.config import config_as_toml
-from colmap_inertial.run.steps.replacing import (
-    drop_beside,
-    is_finished,
-    is_made_of,
-    list_changed_options,
-    moved,
-    place_beside,
-    replace_result,
-)
-from colmap_inertial.run.steps.runner import StepRunner, find_loss, hash_values
+from colmap_inertial.run.steps.config import config_as_toml, list_changed_options
+from colmap_inertial.run.steps.runner import StepRunner, find_loss
 from colmap_inertial.run.steps.workspace import Workspace, require_apart
 
 log = logging.getLogger(__name__)
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -51,47 +38,66 @@ class Session:
     Attributes
     ----------
     workspace
-        The folder.
+        The folder: where everything lies.
     runner
         Does the steps, or keeps them from an earlier run.
     context
-        How the work is done.
-    out
-        The folder that was asked for, where that is another one until the end.
+        How the work is done: threads, seed, progress.
+    config
+        The options as TOML, for ``config.toml``.
     """
 
     workspace: Workspace
     runner: StepRunner
     context: RunContext
-    out: Path | None = None
-
-    def in_place(self, value: T) -> T:
-        """The result of a run, with its paths after the end."""
-        return value if self.out is None else moved(value, self.workspace.root, self.out)
+    config: str = ""
 
     @property
     def progress(self) -> Progress:
         """Receiver of the progress."""
         return self.context.progress
 
-    def stands(self, content: Mapping[str, object]) -> bool:
-        """Whether an earlier run's ``result.json`` holds this result already, and nothing had to be made again."""
-        if self.runner.worked or find_loss(self.workspace, ["report"]):
-            return False
-        try:
-            known = read_json(self.workspace.result)
-        except FormatError:
-            return False
-        return {**known, "seconds": {}} == convert_to_plain({**content, "seconds": {}})
+    def finish(self, content: Mapping[str, Any], write_report: Callable[[], None] = lambda: None) -> bool:
+        """Write ``result.json``, whose presence says that the run is finished, after the report.
 
-    def finish(self, content: Mapping[str, object]) -> bool:
-        """Write ``result.json``, whose presence says that the run is finished; returns whether it stood already."""
-        unchanged = self.stands(content)
+        Returns
+        -------
+        Whether there was nothing to do: all that is there is this result already.
+
+        Raises
+        ------
+        OutputExistsError
+            Where a finished result would lose steps.
+        """
+        known = _read_result(self.workspace)
+        self.runner.leave_out(sorted(_list_kinds(known) - _list_kinds(content)))
+        same = _without_times(known) == _without_times(convert_to_plain(content))
+        unchanged = same and not self.runner.worked and not find_loss(self.workspace, ["report"])
         if not unchanged:
-            self.runner.settle()
+            write_report()
+        write_text(self.workspace.config, self.config)
+        if not unchanged:
             write_json(self.workspace.result, content)
         log.info("nothing to do" if unchanged else "finished")
         return unchanged
+
+
+def _list_kinds(content: Mapping[str, Any]) -> set[str]:
+    """The kinds of a result's steps, such as ``dense``: who makes the depth maps depends on the machine."""
+    return {step.partition("_")[0] for step in content.get("seconds", ())}
+
+
+def _without_times(content: Mapping[str, Any]) -> dict[str, Any]:
+    """A result with the names of its steps alone."""
+    return {**content, "seconds": sorted(content.get("seconds", ()))}
+
+
+def _read_result(workspace: Workspace) -> dict[str, Any]:
+    """Content of ``result.json``; empty where there is none, or a damaged one."""
+    try:
+        return read_json(workspace.result)
+    except FormatError:
+        return {}
 
 
 @contextlib.contextmanager
@@ -102,8 +108,8 @@ def open_session(
     context: RunContext | None = None,
     *,
     pictures: Sequence[Path],
-    decides: object = None,
     command: str = "reconstruct",
+    overwrite: bool = False,
 ) -> Iterator[Session]:
     """A session in ``out``: locked, its options written down, its log kept.
 
@@ -119,10 +125,10 @@ def open_session(
         How the work is done; defaults serve. ``scratch`` becomes a folder in ``out``.
     pictures
         Folders that pictures are read from; ``out`` may not lie in one.
-    decides
-        What decides the result beside the options: the recording, and stages that were given.
     command
         What is done; one folder is for one command.
+    overwrite
+        Make steps of a finished result again where they differ.
 
     Raises
     ------
@@ -133,52 +139,29 @@ def open_session(
     """
     require_utf8(out, source)
     require_apart(out, pictures)
-    workspace = Workspace(out)
+    workspace, context, config = Workspace(out), context or RunContext(), config_as_toml(options)
     workspace.prepare(source, command)
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(workspace.locked())
+    with workspace.locked():
         workspace.open(source, command)
-        remove_temporaries(workspace.root, workspace.stamps, workspace.report_data)
-        replace_result(workspace)
-        for steps in workspace.stamps, workspace.stamps / "next" / workspace.stamps.name:
-            for folder in steps.glob("tmp*"):  # small models of a run that was killed
-                remove(folder)
-        stack.enter_context(logging_to(workspace.log))
-        log.info("colmap-inertial %s: %s -> %s", __version__, source, out)
-        context, config, inputs = context or RunContext(), config_as_toml(options), hash_values(decides)
-        beside = workspace
-        if is_finished(workspace) and not is_made_of(workspace, config, inputs):
-            stack.enter_context(_earlier_result_stays(out))
-            changes = (
-                "; ".join(list_changed_options(workspace.config, config))
-                or "the recording or what is made of it changed"
+        _remove_leftovers(workspace)
+        with logging_to(workspace.log):
+            log.info("colmap-inertial %s: %s -> %s", __version__, source, out)
+            if not workspace.result.is_file():
+                write_text(workspace.config, config)
+            changes = list_changed_options(workspace.config, config)
+            yield Session(
+                workspace=workspace,
+                runner=StepRunner(workspace, context.progress, overwrite=overwrite, changes=changes),
+                context=replace(context, scratch=workspace.stamps),
+                config=config,
             )
-            tell(context.progress, f"{changes}: the result in {out} stays until the new one is whole")
-            beside = place_beside(workspace, config, inputs)
-            beside.open(source, command)
-        else:
-            drop_beside(workspace)
-        if not is_made_of(beside, config, inputs):
-            beside.unfinish()
-            write_text(beside.config, config)
-            write_json(beside.inputs, {"inputs": inputs})
-        runner = StepRunner(beside, context.progress)
-        yield Session(
-            workspace=beside,
-            runner=runner,
-            context=replace(context, scratch=beside.stamps),
-            out=None if beside is workspace else out,
-        )
-        replace_result(workspace)
 
 
-@contextlib.contextmanager
-def _earlier_result_stays(out: Path) -> Iterator[None]:
-    try:
-        yield
-    except InertialError as error:
-        error.add_note(str(Fact("earlier-result-stays", out=str(out))))
-        raise
+def _remove_leftovers(workspace: Workspace) -> None:
+    """Remove what a killed run left under temporary names, such as small models."""
+    remove_temporaries(workspace.root, workspace.stamps, workspace.report_data)
+    for folder in workspace.stamps.glob("tmp*"):
+        remove(folder)
 
 
 @contextlib.contextmanager
@@ -208,43 +191,3 @@ def keep_colmap_quiet() -> None:
     import pycolmap
 
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
-
-
-#: By module, the distributions that bring it.
-_PROVIDERS: Mapping[str, tuple[str, ...]] = {
-    "pycolmap": ("pycolmap", "pycolmap-cuda12", "pycolmap-cuda11", "pycolmap-cuda"),
-    "cv2": (
-        "opencv-contrib-python-headless",
-        "opencv-contrib-python",
-        "opencv-python-headless",
-        "opencv-python",
-    ),
-}
-
-
-def conflicts() -> list[str]:
-    """A sentence for each module that several installed distributions bring, on what to do."""
-    clashes = []
-    for module, names in _PROVIDERS.items():
-        there = [f"{name} {version}" for name in names if (version := _version(name)) is not None]
-        if len(there) > 1:
-            kept = there[-1].split()[0] if module == "pycolmap" else there[0].split()[0]
-            every = " ".join(word.split()[0] for word in there)
-            clashes.append(
-                f"{' and '.join(there)} are installed, and each brings the module {module}: the files of the last one "
-                f"overwrote the others'; keep one of them: pip uninstall {every}; pip install {kept}"
-            )
-    return clashes
-
-
-def warn_of_conflicts() -> None:
-    """Log conflicts of installed packages, before they cause failures that do not name them."""
-    for sentence in conflicts():
-        log.warning("%s", sentence)
-
-
-def _version(name: str) -> str | None:
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return None

@@ -47,8 +47,6 @@ class Workspace:
     """The models in metres; none where no scale is accepted."""
     dense = _Inside("dense")
     """Dense reconstructions of the metric models."""
-    earlier = _Inside("earlier")
-    """Dense reconstructions with depth maps whose model is no longer there."""
     colmap = _Inside("colmap")
     """COLMAP's own project: what it saw and made, untouched, in its arbitrary units."""
     colmap_images = _Inside("colmap/images")
@@ -95,8 +93,6 @@ class Workspace:
     """One JSON for each finished step."""
     stage_names = _Inside(".stages/stage_names.toml")
     """Which stages it is made with, where a batch named them."""
-    inputs = _Inside(".stages/inputs.json")
-    """What tells the recording that the result is made of from others."""
     lock = _Inside(".stages/lock")
     """Held by the run that is at work in the folder."""
     unsmoothed = _Inside(".stages/unsmoothed")
@@ -119,7 +115,7 @@ class Workspace:
         """Names that are the run's own where the folder is an existing project in metres; patterns, as in a shell."""
         report = (self.report, self.report.with_suffix(".json"), self.report_data)
         files = (self.result, self.config, self.log, self.diagnosis, self.georeference, self.frames, *report)
-        names = (path.name for path in (*files, self.validation, self.earlier, self.stamps))
+        names = (path.name for path in (*files, self.validation, self.stamps))
         return (*names, "trajectory*.tum", "trajectory*_cov.npz", "trajectory*_motion.json")
 
     def is_own(self, name: str) -> bool:
@@ -244,8 +240,8 @@ def _places_of_links(workspace: Workspace) -> list[Path]:
     names: Sequence[object] = ()
     if workspace.placed.is_file() and not workspace.placed.is_symlink():
         names = read_json(workspace.placed).get("paths", ())
-    ready = (workspace.stamps / name for name in ("project", "next", "replaced"))
-    return [*(workspace.root / str(name) for name in names), *(path for path in ready if not path.is_symlink())]
+    ready = workspace.stamps / "project"
+    return [*(workspace.root / str(name) for name in names), *([] if ready.is_symlink() else [ready])]
 
 
 @dataclass(frozen=True, kw_only=True)

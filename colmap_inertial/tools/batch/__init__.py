@@ -148,7 +148,7 @@ def run_batch(
     check_unique(entries, out)
     out = out.resolve()
     with _own_folder(out) as run:
-        at_work = _Batch([_task(entry, stages, out, run, batch.attempts) for entry in entries], watch)
+        at_work = _Batch([_task(entry, stages, out, run, batch) for entry in entries], watch)
         waiting = at_work.begin()
         if batch.scheduler is not None:
             pool = dask_pool(batch.scheduler)
@@ -200,7 +200,7 @@ def _own_folder(out: Path) -> Iterator[str]:
             remove_temporaries(out, status)
 
 
-def _task(entry: BatchCapture, of_all: StageNames, out: Path, run: str, attempts: int) -> CaptureTask:
+def _task(entry: BatchCapture, of_all: StageNames, out: Path, run: str, batch: BatchOptions) -> CaptureTask:
     status = out / "status"
     config = status / f"{entry.name}.toml"
     stages = of_all if entry.stages is None else entry.stages
@@ -214,8 +214,9 @@ def _task(entry: BatchCapture, of_all: StageNames, out: Path, run: str, attempts
         log=status / f"{entry.name}.log",
         run_file=status / "run",
         run=run,
-        attempts=attempts,
+        attempts=batch.attempts,
         gpu=needs_gpu(entry.options),
+        overwrite=batch.overwrite,
     )
 
 

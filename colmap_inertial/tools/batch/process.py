@@ -86,7 +86,9 @@ def _reconstruct(task: CaptureTask, progress: Progress, findings: Callable[[Diag
     if existing and job.stages != StageNames(model=job.stages.model):
         raise InertialError(Fact("stages-before-a-model"))
     stages = load_stages(job.stages)
-    _begin(Workspace(task.out), job.stages)
+    workspace = Workspace(task.out)
+    if task.overwrite or not workspace.result.exists():
+        _write_stage_names(workspace, job.stages)
     if existing:
         reconstruct_project(
             task.capture,
@@ -94,6 +96,7 @@ def _reconstruct(task: CaptureTask, progress: Progress, findings: Callable[[Diag
             job.project,
             job.options,
             model_stages=stages.model,
+            overwrite=task.overwrite,
             progress=progress,
             findings=findings,
         )
@@ -105,6 +108,7 @@ def _reconstruct(task: CaptureTask, progress: Progress, findings: Callable[[Diag
             frame_stages=stages.frame,
             keypoint_stages=stages.keypoint,
             model_stages=stages.model,
+            overwrite=task.overwrite,
             progress=progress,
             findings=findings,
         )
@@ -116,11 +120,11 @@ def _end_with_the_parent() -> None:
     kill_with_children(os.getpid())
 
 
-def _begin(workspace: Workspace, stages: StageNames) -> None:
-    """Wait until nobody else is at work in the folder, and write down which stages are from now on.
+def _write_stage_names(workspace: Workspace, stages: StageNames) -> None:
+    """Wait until nobody else is at work in the folder, and write down which stages it is made with.
 
-    Before the work, for a process may be killed at any time. Whoever stays in the folder, or whatever else it holds,
-    ``reconstruct`` complains about.
+    Before the work, for a process may be killed at any time; of a finished result, when they are its own. Whoever stays
+    in the folder, or whatever else it holds, ``reconstruct`` complains about.
     """
     root = workspace.root
     vacant = not root.exists() or (root.is_dir() and not any(root.iterdir()))

@@ -71,6 +71,8 @@ class CaptureTask:
         How often to start it in all, where its process or worker is killed.
     gpu
         Whether it is to have a GPU to itself.
+    overwrite
+        Whether steps of a finished result may be made again.
     """
 
     name: str
@@ -83,6 +85,7 @@ class CaptureTask:
     run: str
     attempts: int
     gpu: bool = False
+    overwrite: bool = False
 
 
 @prints_in_lines
@@ -162,10 +165,9 @@ def failed(status: CaptureStatus, why: Fact, exit_code: int = 1) -> CaptureStatu
 
 
 def find_earlier_end(task: CaptureTask) -> CaptureStatus | None:
-    """The end of a capture that has one already; ``None`` where there is work to do.
+    """The end of a capture that has one already; ``None`` where there is work to do, or other options are given.
 
-    A result that was made from another capture, with other options or with other stages is an error, not this
-    capture's result.
+    What ``reconstruct`` does then with a finished result, it decides itself.
     """
     workspace, known = Workspace(task.out), read_status(task.status)
     if not workspace.result.exists():
@@ -177,20 +179,15 @@ def find_earlier_end(task: CaptureTask) -> CaptureStatus | None:
         return failed(status, fact_of(error), error.exit_code)
     try:
         result, may_go = read_json(workspace.result), (workspace.images, workspace.colmap)
-        if result.get("waiting") or find_loss(workspace, [*result.get("seconds", ()), "report"], but=may_go):
-            return None
-        made_from = Path(str(read_json(workspace.stamps / "capture.json").get("capture")))
-        project = result.get("project", _plain(ProjectOptions()))
-        options = read_config(workspace.config, ReconstructOptions)
-        differs = {
-            "capture": made_from != task.capture and task.capture not in made_from.parents,
-            "set of options": options != job.options or project != _plain(job.project),
-            "set of stages": read_stage_names(workspace) != job.stages,
-        }
-        other = next((name for name, differ in differs.items() if differ), None)
-        if other is not None:
-            return failed(status, Fact("result-of-another", out=str(task.out), what=other), FormatError.exit_code)
-        return read_end(status, workspace.result)
+        made_from = Path(str(read_json(workspace.owner).get("capture")))
+        same = (
+            (made_from == task.capture or task.capture in made_from.parents)
+            and read_config(workspace.config, ReconstructOptions) == job.options
+            and result.get("project", _plain(ProjectOptions())) == _plain(job.project)
+            and read_stage_names(workspace) == job.stages
+        )
+        lost = find_loss(workspace, [*result.get("seconds", ()), "report"], but=may_go)
+        return None if result.get("waiting") or lost or not same else read_end(status, workspace.result)
     except FormatError:
         return None  # damaged: the run makes it again, or says what to do
 

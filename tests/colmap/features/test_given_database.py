@@ -100,7 +100,7 @@ def akaze(capture, names):
 
 
 def run(capture, out, database):
-    return reconstruct(capture, out, dataclasses.replace(QUICK, database=database))
+    return reconstruct(capture, out, dataclasses.replace(QUICK, database=database), overwrite=True)
 
 
 @pytest.fixture(scope="module")
@@ -222,8 +222,8 @@ def test_damage_is_said_before_colmap_ends_the_process(subtests, akaze, tmp_path
             "1 rows of keypoints do not have their stated length",
         ),
         ("UPDATE keypoints SET cols = 3", "rows of keypoints do not have their stated length"),
-        ("UPDATE matches SET rows = rows + 1", "rows of matches are not as long"),
-        ("UPDATE descriptors SET cols = 60", "rows of descriptors are not as long"),
+        ("UPDATE matches SET rows = rows + 1", "rows of matches do not have their stated length"),
+        ("UPDATE descriptors SET cols = 60", "rows of descriptors do not have their stated length"),
         ("DELETE FROM cameras", "an image has no camera"),
         ("UPDATE images SET name = '../x.jpg' WHERE image_id = 1", r"\.\./x\.jpg"),
         ("DELETE FROM keypoints", "holds no keypoints"),

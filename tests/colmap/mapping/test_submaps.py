@@ -24,7 +24,7 @@ from colmap_inertial.model.submodels.graph import (
     Equations,
     Placements,
     SimilarityConstraint,
-    minimised,
+    minimise_placements,
 )
 from colmap_inertial.model.submodels.matches import Submodel, constrain_by_points, find_common_features
 from tests.colmap.loops.test_closure import FRAMES, NAMES, make
@@ -491,10 +491,10 @@ def test_places_that_settle_are_given_and_those_that_do_not_are_refused():
 
     limits = Convergence(rounds=5, step=1e-9, squares=1e-12, squares_share=0.0)
     start = Placements.at_origin(np.ones(1))
-    placed, cov, squares = minimised(start, drawn_to_target, limits)
+    placed, cov, squares = minimise_placements(start, drawn_to_target, limits)
     assert np.allclose(placed.translation, [[5, 6, 7]]) and np.allclose(cov, np.eye(PLACEMENT)) and squares < 1e-20
     with pytest.raises(np.linalg.LinAlgError, match="do not converge"):
-        minimised(start, fleeing, limits)
+        minimise_placements(start, fleeing, limits)
 
 
 @pytest.fixture(scope="module")

@@ -231,7 +231,7 @@ def test_residuals_are_whitened_as_by_the_dense_factor(subtests):
             assert close(white, solve_triangular(factor, residual, lower=True))
             flat = solve_triangular(factor, jacobian.reshape(count, -1), lower=True)
             assert close(white_jacobian, flat.reshape(jacobian.shape))
-            half_log_det = align_fit._divide(residual.copy(), dt_s, excess, (1e-6, 1e-7))
+            half_log_det = align_fit._whiten_sides(residual.copy(), dt_s, excess, (1e-6, 1e-7))
             assert half_log_det == pytest.approx(np.sum(np.log(np.diag(factor))))
 
 
@@ -252,7 +252,7 @@ def test_noise_levels_are_the_most_likely_ones(subtests):
                 cov = covariance(dt_s, excess, *np.exp(logs))
                 return 0.5 * np.sum(residual * np.linalg.solve(cov, residual)) + 1.5 * np.linalg.slogdet(cov)[1]
 
-            found = align_fit._noise_of(residual, dt_s, excess, least_rate)
+            found = align_fit._estimate_noise(residual, dt_s, excess, least_rate)
             assert found[0] >= 1e-12 and found[1] >= least_rate
             bounds = [(np.log(1e-12), 0.0), (np.log(least_rate), 0.0)]
             starts = np.log([[max(pose, 1e-12), max(rate, least_rate)], [1e-5, 1e-5]])

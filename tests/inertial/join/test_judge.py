@@ -13,7 +13,7 @@ from colmap_inertial.inertial.join.evidence import find_links
 from colmap_inertial.inertial.join.joined_model import _sigma_log
 from colmap_inertial.inertial.join.judge import join_submodels
 from colmap_inertial.inertial.join.placement import FittedSubmodel
-from colmap_inertial.inertial.join.relative_poses import tie_cov, worst
+from colmap_inertial.inertial.join.relative_poses import tie_cov, worst_sigmas
 from colmap_inertial.inertial.scale.posterior import FittedPath
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.run.stages.join import _cameras
@@ -71,7 +71,7 @@ def test_a_part_in_a_hole_is_held_to_the_poses_on_both_sides(walked, inside, shi
     else:
         (group,) = joined.groups
         parts = [around, inside]
-        sigmas = [worst(tie_cov(parts, group.placed, link))[0] for link in find_links(parts)]
+        sigmas = [worst_sigmas(tie_cov(parts, group.placed, link))[0] for link in find_links(parts)]
         assert gap.sigma_m == pytest.approx(max(sigmas))
 
 

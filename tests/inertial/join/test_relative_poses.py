@@ -9,7 +9,7 @@ import pytest
 from colmap_inertial.core.geometry import matrix_from_quat, quat_from_matrix, so3_exp, so3_log
 from colmap_inertial.inertial.join import joined_model
 from colmap_inertial.inertial.join.placement import ImuLink, Placed
-from colmap_inertial.inertial.join.relative_poses import end_images, relative_cov, tie_cov, worst
+from colmap_inertial.inertial.join.relative_poses import end_images, relative_cov, tie_cov, worst_sigmas
 from colmap_inertial.inertial.scale.posterior import FittedPath
 from colmap_inertial.model.similarities import compose
 from colmap_inertial.model.submodels.graph import Placements, SimilarityConstraint
@@ -146,7 +146,7 @@ def test_the_worst_direction_is_the_largest_of_many():
     cov = root @ root.T
     directions = rng.standard_normal((20_000, 3))
     directions /= np.linalg.norm(directions, axis=1)[:, None]
-    for found, part in zip(worst(cov), (slice(3, 6), slice(0, 3)), strict=True):
+    for found, part in zip(worst_sigmas(cov), (slice(3, 6), slice(0, 3)), strict=True):
         most = np.sqrt(np.einsum("ni,ij,nj->n", directions, cov[part, part], directions).max())
         assert most <= found * (1 + 1e-12) and found == pytest.approx(most, rel=2e-3)
 

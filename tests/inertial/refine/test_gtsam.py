@@ -11,7 +11,7 @@ from colmap_inertial.core.geometry import so3_exp, so3_log
 from colmap_inertial.inertial.core.preintegration import SensorErrors, preintegrate
 from colmap_inertial.inertial.refine import solve as solver
 from colmap_inertial.inertial.refine._residuals import imu_rows
-from colmap_inertial.inertial.refine.solve import factored, solve
+from colmap_inertial.inertial.refine.solve import factor_information, solve
 from colmap_inertial.inertial.refine.values import N_STATE
 from tests.helpers.refine_walk import PINHOLE, nudged, problem_of, tracks_of, walk
 
@@ -117,7 +117,7 @@ def values_of(x):
 
 def sigmas_of(problem, x):
     """(F, 15) standard deviations by the refinement's own covariance."""
-    found = factored(problem, x)
+    found = factor_information(problem, x)
     n = found.solved.shape[0]
     states, _ = found.solve(np.eye(n), np.zeros((x.columns.count, n)))
     columns = N_STATE * found.layout.place[:, None] + np.arange(N_STATE)

@@ -145,14 +145,14 @@ def test_every_tenth_of_points_that_are_seen_often_is_held_out():
 
 def test_a_sigma_of_the_readout_is_that_of_its_column(monkeypatch):
     cov = np.diag(np.arange(1.0, 41.0)) * 1e-6
-    monkeypatch.setattr(judge, "factored", lambda problem, x: SimpleNamespace(shared_cov=lambda: cov))
+    monkeypatch.setattr(judge, "factor_information", lambda problem, x: SimpleNamespace(shared_cov=lambda: cov))
     found = judge._estimate_readout(SimpleNamespace(), SimpleNamespace(readout_s=0.02))
     assert found == (0.02, pytest.approx(np.sqrt(1e-6 * (judge.READOUT + 1))))
 
     def singular(problem, x):
         raise np.linalg.LinAlgError
 
-    monkeypatch.setattr(judge, "factored", singular)
+    monkeypatch.setattr(judge, "factor_information", singular)
     assert judge._estimate_readout(SimpleNamespace(), SimpleNamespace(readout_s=0.02)) is None
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from colmap_inertial.inertial.refine import pictures, solve as solver
 from colmap_inertial.inertial.refine._residuals import imu_rows, project
-from colmap_inertial.inertial.refine.solve import apply_measured_noise, factored, solve
+from colmap_inertial.inertial.refine.solve import apply_measured_noise, factor_information, solve
 from tests.helpers.refine_walk import problem_of, tracks_of, walk
 
 TRUE = 2e-3
@@ -56,7 +56,7 @@ def test_the_level_is_that_of_the_greatest_likelihood(solved, monkeypatch):
 
     def likelihood(times):
         now = at_level(problem, times * best)
-        information = factored(now, x)
+        information = factor_information(now, x)
         halves = 0.5 * information.states.log_determinant() + np.log(np.diagonal(information.corner[0])).sum()
         noise = np.linalg.slogdet(np.eye(9) + (times**2 - 1) * share)[1].sum()
         return -solve(now, x).cost - float(halves) - 0.5 * float(noise)

@@ -11,7 +11,7 @@ from colmap_inertial.inertial.refine._residuals import moving, project
 from colmap_inertial.inertial.refine.motion import find_drift, find_motion_covs
 from colmap_inertial.inertial.refine.pictures import make_pictures
 from colmap_inertial.inertial.refine.setup import move_to_middle_lines, read_seen
-from colmap_inertial.inertial.refine.solve import factored, solve
+from colmap_inertial.inertial.refine.solve import factor_information, solve
 from colmap_inertial.inertial.refine.world import derive_log_size, find_world
 from tests.helpers.refine_walk import problem_of, tracks_of, walk
 
@@ -68,7 +68,7 @@ def test_marginals_of_a_long_walk_stay_those_of_its_solutions():
     """Rounding would grow from group to group, and make covariances of a thousand frames negative."""
     options = walk(240.0, points_per_m=30.0)
     problem, start, _ = problem_of(tracks_of(options), options)
-    states = factored(problem, start).states
+    states = factor_information(problem, start).states
     found = states.marginals()
     for k in (0, 5, 100):
         rhs = np.zeros((len(found), 15, 15))
@@ -81,7 +81,7 @@ def test_marginals_of_a_long_walk_stay_those_of_its_solutions():
 def test_a_position_s_covariance_against_the_first_is_that_of_both():
     options = walk(3.0, readout_s=0.02, points_per_m=60.0)
     problem, start, _ = problem_of(tracks_of(options), options)
-    solved, by = factored(problem, start), moving(problem, start)
+    solved, by = factor_information(problem, start), moving(problem, start)
     frames = np.array([4, 9])
     both = solved.centres_cov(np.array([0, *frames]), by).reshape(3, 3, 3, 3)
     for i, cov in enumerate(find_motion_covs(frames, solved, by), start=1):
@@ -94,7 +94,7 @@ def test_a_position_s_covariance_against_the_first_is_that_of_both():
 def test_the_world_s_covariance_is_that_of_the_centres_split_by_cause():
     options = walk(4.0, points_per_m=60.0)
     problem, start, _ = problem_of(tracks_of(options), options)
-    solved, by = factored(problem, start), moving(problem, start)
+    solved, by = factor_information(problem, start), moving(problem, start)
     centres = move_to_middle_lines(problem, start).cam_in_world
     found = find_world(problem, start, centres, solved, by)
     by_size = derive_log_size(centres, np.arange(len(centres))).ravel()
@@ -106,7 +106,7 @@ def test_the_world_s_covariance_is_that_of_the_centres_split_by_cause():
     gains, info = start.columns.accel_gain, problem.prior.info.copy()
     info[gains, gains] *= 1e8
     known = replace(problem, prior=replace(problem.prior, info=info))
-    solved = factored(known, start)
+    solved = factor_information(known, start)
     surer = find_world(known, start, centres, solved, moving(known, start))
     assert surer.parts["accel_gain"] < 1e-6 * found.parts["accel_gain"]
     assert surer.cov[0, 0] < found.cov[0, 0]

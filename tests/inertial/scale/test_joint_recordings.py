@@ -237,7 +237,7 @@ def test_increments_of_another_device_are_those_integrated_anew_to_second_order(
     then = moved(prior.mean, 0.01)
     x = moved(then, 1e-4)
     before, whole = res.integrate(data, then), res.integrate(data, x)
-    quick = fac.corrected(before, then, x)
+    quick = fac.correct_increments(before, then, x)
     for name in ("rotation", "velocity", "position", "rate_rad_s"):
         change = getattr(whole, name) - getattr(before, name)
         np.testing.assert_allclose(
@@ -694,7 +694,7 @@ def test_what_residuals_lose_to_the_fit_is_the_trace_of_a_dense_inverse(recordin
     x = replace(prior.mean, velocity_m_s=0.3 * np.random.default_rng(1).standard_normal((k, 3)))
     groups = res.all_groups(data, TYPICAL, prior, x, res.integrate(data, x), robust=True)
     system, _, _ = fac.normal_equations(list(groups.values()), prior, x)
-    inverse = system.inverted()
+    inverse = system.invert()
     dense = np.zeros((k * m + n, k * m + n))
     for i in range(k):
         at = slice(i * m, (i + 1) * m)
@@ -713,7 +713,7 @@ def test_what_residuals_lose_to_the_fit_is_the_trace_of_a_dense_inverse(recordin
         jacobian = group.apply(steps[: k * m].reshape(k, m, -1), steps[k * m :])
         after = np.einsum("kri,ij,ksj->krs", jacobian, cov, jacobian)
         share = np.eye(after.shape[1]) if group.share is None else group.share
-        assert group.explained(inverse) == pytest.approx(np.sum(after * share), rel=1e-6), name
+        assert group.count_explained(inverse) == pytest.approx(np.sum(after * share), rel=1e-6), name
 
 
 def test_a_wrong_gain_is_named():

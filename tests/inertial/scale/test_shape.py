@@ -9,9 +9,9 @@ from colmap_inertial.inertial.scale._shape import ShapeFault
 
 def test_a_scale_that_breaks_is_told_by_lengths_and_undone_in_the_part_that_tells_less(subtests):
     for at_s, keeps_after, words in (
-        (110.0, True, "+5.0 +- 2.0 % larger before 10 s"),
-        (110.0, False, "-4.8 +- 2.0 % larger after 10 s"),
-        (150.0, False, "-4.8 +- 2.0 % larger after 50 s"),
+        (110.0, True, "+5.0 +- 2.0 % longer before 10 s"),
+        (110.0, False, "-4.8 +- 2.0 % longer after 10 s"),
+        (150.0, False, "-4.8 +- 2.0 % longer after 50 s"),
     ):
         with subtests.test(at_s=at_s, keeps_after=keeps_after, words=words):
             t_s = np.linspace(100.0, 160.0, 61)
@@ -39,7 +39,7 @@ def test_a_drift_of_the_scale_is_undone_and_told_from_end_to_end():
     fault = ShapeFault(kind="drift", value=np.array([0.08]), cov=cov, by_scale=np.zeros(1))
     assert fault.undo(t_s, model) == pytest.approx(truth, abs=1e-9)
     # more metres per unit at the end: the model's lengths are smaller there
-    assert "lengths are -7.7 +- 2.8 % larger at the end" in str(fault.as_fact(t_s, 2.0))
+    assert "lengths are -7.7 +- 2.8 % longer at the end" in str(fault.as_fact(t_s, 2.0))
     tolerated = 0.01
     assert fault.chi2(2.0, tolerated) == pytest.approx(0.08**2 / (2e-4 + tolerated**2))
 

@@ -58,7 +58,7 @@ def saturated(imu, share):
         pytest.param(lambda imu: one_axis_late(imu, 0.01), r"y ([+-][\d.]+)", 6.7, 1.5, id="an-axis-late"),
         pytest.param(lambda imu: stretched(imu, 1e-3), r"runs ([+-]\d+) ppm", 1000, 60, id="a-clock-of-its-own"),
         pytest.param(
-            lambda imu: replace(imu, accel_m_s2=1.05 * imu.accel_m_s2), r"by ([+-][\d.]+),", 5.0, 1.5, id="gain"
+            lambda imu: replace(imu, accel_m_s2=1.05 * imu.accel_m_s2), r"is ([+-][\d.]+),", 5.0, 1.5, id="gain"
         ),
         pytest.param(lambda imu: saturated(imu, 0.03), r"([\d.]+) % of the accelerometer's", 3.0, 0.2, id="saturated"),
     ],

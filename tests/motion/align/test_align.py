@@ -183,7 +183,7 @@ def test_derivatives_of_the_residuals_are_those_of_finite_differences():
 
     def residuals(step):
         moved = state.moved(step)
-        return fit._residuals(trajectory, path, moved, moved.bias, middle_s)
+        return fit._compare_rotations(trajectory, path, moved, moved.bias, middle_s)
 
     count = fit._N + fit._N_NUISANCE
     residual, jacobian, _ = residuals(np.zeros(count))
@@ -319,7 +319,7 @@ def test_clocks_that_run_at_different_rates_are_followed(subtests):
             true_s = imu.gyro_t_s + simulated.truth.calibration.gyro_time_offset_s
             assert np.abs(steady.gyro_t_s - true_s).max() < 0.004
             assert steady.imu.repairs[-1] == Fact("imu-clock-stretched", clock_rate=alignment.calibration.clock_rate)
-            assert alignment.drifts() and alignment.settled() is alignment.calibration
+            assert alignment.drifts() and alignment.settle_clock_rate() is alignment.calibration
 
 
 def test_a_clock_rate_that_is_small_or_in_doubt_is_not_corrected():
@@ -330,8 +330,8 @@ def test_a_clock_rate_that_is_small_or_in_doubt_is_not_corrected():
             alignment, calibration=replace(alignment.calibration, clock_rate=rate), clock_rate_sigma=sigma
         )
         assert with_rate.drifts() == certain
-        assert with_rate.settled().clock_rate == (rate if certain else 0.0)
-        assert with_rate.settled().clock_middle_s == alignment.calibration.clock_middle_s
+        assert with_rate.settle_clock_rate().clock_rate == (rate if certain else 0.0)
+        assert with_rate.settle_clock_rate().clock_middle_s == alignment.calibration.clock_middle_s
     steady = replace(alignment.calibration, clock_rate=0.0)
     assert CameraTimedImu.from_recording(simulated.imu, steady, 0).imu is simulated.imu
 

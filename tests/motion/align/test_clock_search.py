@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.motion.align import _clock_search
-from colmap_inertial.motion.align._clock_search import Intervals, _best_rotation, _fit, search_offsets
+from colmap_inertial.motion.align._clock_search import Intervals, _find_rotation, _fit_offsets, search_offsets
 
 
 def turned_intervals(rng, noise_rad, count=240):
@@ -27,8 +27,8 @@ def turned_intervals(rng, noise_rad, count=240):
 def test_what_a_rotation_and_a_rate_leave_is_what_scipy_leaves():
     intervals, inertial, cam_from_imu = turned_intervals(np.random.default_rng(9), 0.02)
     inside = np.random.default_rng(10).random((2, len(intervals))) < 0.8
-    energy, left, _ = _fit(intervals, inertial, inside, None, 1.0)
-    held = _fit(intervals, inertial, inside, cam_from_imu, 1.0)[1]
+    energy, left, _ = _fit_offsets(intervals, inertial, inside, None, 1.0)
+    held = _fit_offsets(intervals, inertial, inside, cam_from_imu, 1.0)[1]
     for k in range(2):
         dt_s, *turns = (x[inside[k]] for x in (intervals.dt_s, intervals.turn_rad, inertial[k]))
         # weighed by one over the time, the rate that leaves least is the mean over all of it
@@ -47,10 +47,10 @@ def test_intervals_that_are_wrong_leave_nothing_where_a_share_is_believed():
     intervals = replace(intervals, turn_rad=turn)
     inside = np.ones((2, len(wrong)), dtype=bool)
     for held in (None, cam_from_imu):
-        energy, left, (cross, *_) = _fit(intervals, inertial, inside, held, 0.7)
+        energy, left, (cross, *_) = _fit_offsets(intervals, inertial, inside, held, 0.7)
         noise = noise_rad**2 * np.sum(3 / intervals.dt_s)
         assert 0.2 * noise < left[0] < 0.8 * noise < 0.01 * energy[0] and left[1] > 0.3 * energy[1]
-        assert _best_rotation(cross)[0] == pytest.approx(cam_from_imu, abs=3e-3)
+        assert _find_rotation(cross)[0] == pytest.approx(cam_from_imu, abs=3e-3)
 
 
 def test_gains_of_dense_frames_are_those_of_what_overlaps_about_its_mean():
@@ -64,7 +64,7 @@ def test_gains_of_dense_frames_are_those_of_what_overlaps_about_its_mean():
     visual = rate[late : late + 120] + [0.1, 0.2, -0.1] + 0.1 * rng.standard_normal((120, 3))
     begin_s = step_s * np.arange(120)
     intervals = Intervals(begin_s=begin_s, end_s=begin_s + step_s, turn_rad=visual * step_s)
-    offsets_s, gains, per_second = _clock_search._correlate(intervals, path, (-1.0, 1.0), 0.5, np.eye(3))
+    offsets_s, gains, per_second = _clock_search._correlate_rates(intervals, path, (-1.0, 1.0), 0.5, np.eye(3))
     assert len(offsets_s) > 30 and offsets_s[np.argmax(gains)] == pytest.approx(-late * step_s)
     for offset_s, gain in zip(offsets_s, gains, strict=True):
         shift = -round(offset_s / step_s)

@@ -221,8 +221,8 @@ def test_options_take_one_file_or_several_and_keep_them_in_the_configuration(bot
 
 def test_files_may_stand_anywhere_among_the_words_of_a_command(subtests) -> None:
     for words in (
-        "reconstruct in out --calibration a.json b.json",
-        "reconstruct --calibration a.json b.json in out",
+        "reconstruct in out --calibration a.json --calibration=b.json",
+        "reconstruct --calibration a.json --calibration b.json in out",
         "reconstruct in --calibration a.json out --calibration b.json --seed 3",
     ):
         with subtests.test(words=words):
@@ -324,7 +324,7 @@ def test_scale_takes_what_is_remembered_of_its_device_and_says_so(capsys, projec
     assert off["calibration_files"] == [] and "remembered" not in said
     code, _, err = run(
         capsys, "scale", project.model, *files, "--json", tmp_path / "s.json", "--calibration", tmp_path / "imu.json",
-        tmp_path / "imu.json",
+        "--calibration", tmp_path / "imu.json",
     )  # fmt: skip
     assert code == 2 and "both say" in err
 

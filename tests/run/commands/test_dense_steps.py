@@ -194,11 +194,15 @@ def test_a_finished_project_is_gone_on_with_by_the_sweep(tmp_path, capsys):
     away = off_the_walls(ratio * vertices(out / dense["mesh"]) @ rotation.T + shift)
     assert np.median(away) < 0.03, np.quantile(away, (0.25, 0.5, 0.75, 0.9))
     assert not list((out / ".stages").glob("sweep_*"))
-    # those of other options are replaced
+    # those of other options are replaced where that is asked for
     stereo = out / "dense" / "0" / "stereo"
     maps = sorted(path.name for path in (stereo / "depth_maps").iterdir())
     small = [*flags, *FLAGS, "--dense-options.max-image-size", "64", "--dense-options.mesh", "none"]
+    before = contents(out / "dense")
     code, _, err = run(capsys, "reconstruct", box.root, out, *small)
+    assert code == 2 and "step dense 0 undistorted would change: dense_options.max_image_size = 64" in err
+    assert contents(out / "dense") == before
+    code, _, err = run(capsys, "reconstruct", box.root, out, *small, "--overwrite")
     assert code == 0, err
     assert read_map(stereo / "depth_maps" / maps[0]).shape == (48, 64)
     # maps that somebody removed are made again; maps of the other maker are not mixed with them
@@ -250,9 +254,8 @@ def test_half_written_depth_maps_are_made_again(unfinished, box, monkeypatch):
     (unfinished / name).write_bytes(b"96&72&1&" + bytes(100))
 
     def run_colmap(code, *arguments, watch):
-        beside = unfinished / ".stages" / "next"  # as no mesh was asked for before
-        assert beside.is_dir() and not (beside / name).exists()
-        cast_depth_maps(box, beside)
+        assert not (unfinished / name).exists()
+        cast_depth_maps(box, unfinished)
         watch()
         return subprocess.CompletedProcess(code, 0, "", "")
 

@@ -35,7 +35,7 @@ from colmap_inertial.model.similarities import ModelScale, plain_factor, read_si
 from colmap_inertial.report.words import describe_joined
 from colmap_inertial.run.commands import models
 from colmap_inertial.run.commands.models import Submodels, run_models, run_validation
-from colmap_inertial.run.commands.reconstruct_project import _scales
+from colmap_inertial.run.commands.reconstruct_project import _collect_scales
 from colmap_inertial.run.commands.result import ModelResult, ReconstructResult, result_as_json
 from colmap_inertial.run.stages import readout
 from colmap_inertial.run.stages.deblur import SMOOTHING, DeblurStage, smoothing_for
@@ -237,7 +237,7 @@ def test_parts_of_a_project_s_joined_model_stand_by_themselves_as_the_stages_mad
     np.testing.assert_allclose(read_model(part).find_image_with_name(name).projection_center(), moved, atol=1e-9)
     assert read_similarity(part / "transform.json").scale == similarity.scale
     # apply --undo must know that it cannot take them apart
-    scales = _scales([one], ())
+    scales = _collect_scales([one], ())
     assert scales[0].joined_of == (0, 1) and scales[1].joined_of == ()
     # a part's folder that is gone is made again
     shutil.rmtree(part)
@@ -251,7 +251,7 @@ def test_a_project_that_was_joined_is_not_taken_back(project, tmp_path):
     shutil.copytree(project.model, tmp_path / "project" / "sparse" / "0")
     scale = ModelScale(similarity=plain_factor(2.0), joined_of=(0, 3))
     apply_to_project(tmp_path / "project", tmp_path / "metric", {0: scale})
-    with pytest.raises(FormatError, match=r"transform\.json: model 0 was joined of the models 0, 3, which cannot"):
+    with pytest.raises(FormatError, match=r"transform\.json: model 0 was joined from the models 0, 3 and cannot"):
         undo_project(tmp_path / "metric", tmp_path / "back")
     assert not (tmp_path / "back").exists()
 

@@ -65,5 +65,5 @@ def test_a_pattern_stays_in_its_folder(subtests, tmp_path_factory):
     for pattern in ("../*.png", "/etc/*.png", "a/../../*"):
         with subtests.test(pattern=pattern):
             tmp_path = tmp_path_factory.mktemp("given")
-            with pytest.raises(FormatError, match="leads out of it"):
+            with pytest.raises(FormatError, match="leads outside of it"):
                 image_names(ImageFolder(folder=tmp_path, pattern=pattern))

@@ -20,9 +20,8 @@ from colmap_inertial.core.types import FrameTiming
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.gate import GATE_LIMITS, RecordingVerdict
 from colmap_inertial.io.fingerprints import fingerprint
-from colmap_inertial.run.commands import frames as framing, project_output, reporting, validate as validation
-from colmap_inertial.run.commands.project_output import _restore_dense, _set_dense_aside
-from colmap_inertial.run.commands.scale_by_reference import _place
+from colmap_inertial.run.commands import frames as framing, reporting, validate as validation
+from colmap_inertial.run.commands.scale_by_reference import _find_place
 from colmap_inertial.run.commands.validate import ValidationOutputs, validate_source
 from colmap_inertial.run.preparation import judge as judging, sampling
 from colmap_inertial.run.preparation.plan import Treatments, plan_imaging
@@ -30,7 +29,6 @@ from colmap_inertial.run.stages.join import _beside, _spans
 from colmap_inertial.run.stages.readout import ReadoutStage
 from colmap_inertial.run.stages.refine import _takes_turns
 from colmap_inertial.run.steps import runner
-from colmap_inertial.run.steps.replacing import _flat
 from colmap_inertial.tools.batch import write_summary
 from colmap_inertial.tools.batch.task import CaptureStatus, _verdict
 
@@ -71,42 +69,6 @@ def test_of_a_large_file_pieces_over_its_whole_length_count(tmp_path):
         assert content_of(tmp_path, bytes(other)) != known
 
 
-def test_a_dense_reconstruction_goes_aside_and_comes_back_with_its_stamps(tmp_path, monkeypatch):
-    monkeypatch.setattr(project_output, "has_depth_maps", lambda folder: (folder / "depth").exists())
-    monkeypatch.setattr(project_output, "model_of", lambda folder: (folder / "made_from").read_text())
-    space = SimpleNamespace(dense=tmp_path / "dense", earlier=tmp_path / "earlier", stamps=tmp_path / "stamps")
-    space.stamps.mkdir()
-
-    def make(index, model, depth=True):
-        folder = space.dense / f"{index}"
-        folder.mkdir(parents=True)
-        (folder / "made_from").write_text(model)
-        if depth:
-            (folder / "depth").write_text(model)
-        for step in ("stereo", "fusion"):
-            (space.stamps / f"dense_{index}_{step}.json").write_text(f"{model} {step}")
-        return folder
-
-    for model in ("first", "second"):
-        _set_dense_aside(space, make(0, model))
-        assert not list(space.stamps.iterdir()) and not (space.dense / "0").exists()
-    assert sorted(path.name for path in (space.earlier / "dense").iterdir()) == ["0", "0-2"]
-    # without depth maps there is nothing to keep
-    _set_dense_aside(space, make(0, "third", depth=False))
-    assert not list(space.stamps.iterdir()) and not (space.dense / "0").exists()
-    assert len(list((space.earlier / "dense").iterdir())) == 2
-    _restore_dense(space, 0, "fourth")
-    assert not (space.dense / "0").exists()
-    _restore_dense(space, 0, "second")
-    assert (space.dense / "0" / "depth").read_text() == "second"
-    stamps = {path.name: path.read_text() for path in space.stamps.iterdir()}
-    assert stamps == {"dense_0_stereo.json": "second stereo", "dense_0_fusion.json": "second fusion"}
-    assert [path.name for path in (space.earlier / "dense").iterdir()] == ["0"]
-    # what is there stays
-    _restore_dense(space, 0, "first")
-    assert (space.dense / "0" / "depth").read_text() == "second"
-
-
 def test_gaps_lie_between_the_last_image_of_a_model_and_the_first_of_the_next():
     names = tuple(f"{k}" for k in range(9))
     timing = FrameTiming(names=names, t_s=np.arange(9.0) * 2, readout_s=0.0)
@@ -132,14 +94,14 @@ def test_gaps_lie_between_the_last_image_of_a_model_and_the_first_of_the_next():
 def test_what_is_neither_a_point_nor_a_marker_is_refused(subtests):
     for text in ("nan,1,2", "1,inf,2", "1,2,x", "1,2", "-1", "one", "1234567890"):
         with subtests.test(text=text), pytest.raises(InertialError, match="--between"):
-            _place(text, None)
+            _find_place(text, None)
 
 
 def test_a_point_is_exact_and_a_marker_needs_markers():
-    place, sigma = _place("1,-2.5,3e-1", None)
+    place, sigma = _find_place("1,-2.5,3e-1", None)
     assert place.tolist() == [1, -2.5, 0.3] and sigma == 0
     with pytest.raises(InertialError):
-        _place("7", None)
+        _find_place("7", None)
 
 
 def test_rectifying_by_name_needs_a_readout():
@@ -297,7 +259,7 @@ def test_what_was_lost_since_a_run_is_said_with_the_error(tmp_path, monkeypatch)
         raise FormatError("a.bin", Fact.stated("is damaged"))
     lost.append("sparse/0/cameras.bin")
     with (
-        pytest.raises(FormatError, match=r"out: a.bin: is damaged; sparse/0/cameras.bin is missing or damaged since"),
+        pytest.raises(FormatError, match=r"out: a.bin: is damaged; sparse/0/cameras.bin was damaged or removed since"),
         runner.explaining_losses(space),
     ):
         raise FormatError("a.bin", Fact.stated("is damaged"))
@@ -402,7 +364,6 @@ def test_a_file_that_is_not_there_has_no_identity(tmp_path):
     (tmp_path / "b").write_bytes(b"1")
     (tmp_path / "a").write_bytes(b"23")
     assert [(row[0].rpartition("/")[2], row[1]) for row in fingerprint(tmp_path)] == [("a", 2), ("b", 1)]
-    assert _flat({"a": 1, "b": {"c": 2, "d": {"e": 3}}}) == {"a": 1, "b.c": 2, "b.d.e": 3}
 
 
 def taken_by(cameras, *, focal_px=(), folders=()):

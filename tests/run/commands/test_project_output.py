@@ -133,7 +133,7 @@ def test_deblurred_images_are_rectified_where_that_is_asked_for(tmp_path, monkey
     filmed = contents(capture / "frames")
 
     def made(*, rectify):
-        done = images_alone.deblur_capture(capture, tmp_path / "out", rectify=rectify)
+        done = images_alone.deblur_capture(capture, tmp_path / "out", rectify=rectify, overwrite=True)
         return contents(done.workspace.images), done.workspace.colmap_images
 
     for _ in range(2):  # there and back
@@ -177,29 +177,11 @@ def test_a_dense_reconstruction_goes_with_its_model(workspace, colmap_project):
     remove_stale_dense(workspace, models)
     assert (folder / "fused.ply").is_file()
     remove_stale_dense(workspace, models | metric_model(workspace, colmap_project, 3.0))
-    assert not folder.exists() and not workspace.earlier.exists()
+    assert not folder.exists()
     assert not list(workspace.stamps.glob("dense_*"))  # what is gone is made again
     assert contents(mine) == {"fused.ply": b"by somebody else"}
     remove_stale_dense(workspace, {})
     assert contents(workspace.dense) == {"1/fused.ply": b"by somebody else"}
-
-
-def test_depth_maps_are_set_aside_and_come_back_with_their_model(workspace, colmap_project):
-    folder = dense_of(workspace, 0) if metric_model(workspace, colmap_project, 2.0) else None
-    (folder / "stereo" / "depth_maps" / "a.geometric.bin").write_text("hours")
-    before = contents(folder)
-    other = metric_model(workspace, colmap_project, 3.0)
-    remove_stale_dense(workspace, other)
-    assert not workspace.dense.exists()
-    assert contents(workspace.earlier / "dense" / "0") == before | {".stages/dense_0_fused.json": b"{}"}
-    assert not list(workspace.stamps.glob("dense_*"))  # another one is made whole
-    dense_of(workspace, 0, maps=True)
-    remove_stale_dense(workspace, {})  # refused
-    assert sorted(path.name for path in (workspace.earlier / "dense").iterdir()) == ["0", "0-2"]
-    remove_stale_dense(workspace, metric_model(workspace, colmap_project, 2.0))
-    assert contents(folder) == before
-    assert [path.name for path in workspace.stamps.glob("dense_*")] == ["dense_0_fused.json"]  # and is not made again
-    assert [path.name for path in (workspace.earlier / "dense").iterdir()] == ["0-2"]
 
 
 def test_a_dense_reconstruction_that_was_cut_off_early_goes_with_its_model(workspace, colmap_project, monkeypatch):
@@ -214,7 +196,7 @@ def test_a_dense_reconstruction_that_was_cut_off_early_goes_with_its_model(works
     made_from = MadeFrom(model=dense_room.digest_of_model(models[0]), max_image_size=None, maps="plane sweep")
     prepared = dense_room._Prepared(names=(), made_from=made_from, has_maps=False)
     with pytest.raises(KeyboardInterrupt):
-        dense_room._undistort(session, 0, workspace.images, prepared)
+        dense_room._undistort_images(session, 0, workspace.images, prepared)
     remove_stale_dense(workspace, models)
     assert (workspace.dense / "0").is_dir()
     (workspace.stamps / "sweep_0").mkdir()
@@ -231,8 +213,16 @@ def test_a_run_that_stops_leaves_nothing_metric_of_an_earlier_one(workspace, col
     for name in ("result.json", "trajectory.tum", "trajectory_1.tum", "trajectory_cov.npz", "trajectory_mine.txt"):
         (workspace.root / name).touch()
     capture = Capture(path=tmp_path, calibration=calibration_prior())
-    with pytest.raises(MappingError), reporting_stops(workspace, capture):
-        raise MappingError(Fact.stated("COLMAP found no model"))
+
+    def stop(session):
+        with pytest.raises(MappingError), reporting_stops(session, capture):
+            raise MappingError(Fact.stated("COLMAP found no model"))
+
+    before = contents(workspace.root)
+    stop(session_in(workspace))  # a finished result stays
+    assert contents(workspace.root) == before
+    workspace.result.unlink()
+    stop(session_in(workspace))
     left = {path.name for path in workspace.root.iterdir()}
     assert left == {"images", "colmap", "trajectory_mine.txt", "report.html", "report.json", workspace.stamps.name}
 
@@ -408,7 +398,7 @@ def test_names_that_the_run_needs_are_said_before_any_work(placing):
 
 def test_what_is_not_of_the_project_is_not_written_over(placing):
     (placing.workspace.root / "notes.txt").write_text("mine")
-    with pytest.raises(OutputExistsError, match=r"notes\.txt stands where the project's is to come"):
+    with pytest.raises(OutputExistsError, match=r"notes\.txt is in the place of the project's"):
         placing()
     assert (placing.workspace.root / "notes.txt").read_text() == "mine"
     assert "images" not in placing.names()

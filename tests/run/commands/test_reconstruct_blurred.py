@@ -264,7 +264,7 @@ def test_a_stopped_run_does_not_deblur_again(tmp_path, blurred, stopped):
         reconstruct(
             blurred, tmp_path / "out", QUICK, progress=lambda s, d, t, /: (stages.append(s), stop(s, d, t))
         )  # fmt: skip
-    assert set(stages) == {"check", "features"} and contents(tmp_path / "out" / "colmap" / "images") == before
+    assert set(stages) == {"features"} and contents(tmp_path / "out" / "colmap" / "images") == before
     log = (tmp_path / "out" / "log.txt").read_text()
     assert "imaging: finished in an earlier run" in log and "frames: finished in an earlier run" in log
     # another decision makes the frames again

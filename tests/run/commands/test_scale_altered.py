@@ -237,7 +237,7 @@ def late(force: np.ndarray) -> np.ndarray:
         ),
         pytest.param(values(ACCEL, lambda x: 1.05 * x), 40.0, "gain error is", id="gain-5-%"),
         pytest.param(values(ACCEL, lambda x: x * [1.05, 1, 1]), 30.0, "gain error is", id="gain-5-%-of-one-axis"),
-        pytest.param(values(ACCEL, lambda x: np.clip(x, -11, 11)), 30.0, "are saturated", id="saturated"),
+        pytest.param(values(ACCEL, lambda x: np.clip(x, -11, 11)), 30.0, "readings are saturated and", id="saturated"),
     ],
 )
 def test_what_is_wrong_with_the_accelerometer_is_named_and_undone(attempt, shared_data, alter, seconds, said):

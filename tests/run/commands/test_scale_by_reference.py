@@ -70,7 +70,7 @@ def test_markers_and_targets_give_their_scale(bare, tmp_path, monkeypatch):
     assert target.metres_per_unit == pytest.approx(0.5) and target.made_of.startswith("target aruco")
     doubted = dataclasses.replace(validated(0.5, unscaled=True), views_used=2)
     monkeypatch.setattr(rooms, "validate_model", lambda *_, **__: doubted)
-    with pytest.raises(NotObservableError, match="only 2 of 5 images agree on the target, which proves no size"):
+    with pytest.raises(NotObservableError, match="only 2 of 5 images agree on the target, too few to prove its size"):
         scale_project_by(bare, tmp_path / "no", ReferenceOptions(scale_from="target", target="aruco:DICT_4X4_50:0.1"))
     found = scale_project_by(bare, tmp_path / "doubted", known)
     assert any("only 2 of 5 images agree" in str(note) for note in found.notes)

@@ -384,11 +384,14 @@ def test_exposures_are_fused_to_pictures_of_the_reference_s_names(tmp_path):
     assert depth.shape == disparity.shape == (120, 160) and depth.dtype == np.float32
     assert np.nanmedian(depth * disparity) == pytest.approx(500 * 0.01, rel=1e-4)
     assert (out / "refocused" / "shot1_0.png").is_file()
-    # started again there is nothing to do; without depths, those are taken away
+    # started again there is nothing to do; without depths, those are taken away where that is asked for
     before = written[0].stat().st_mtime_ns
     assert fuse_captured(tmp_path / "capture", out, options) == written
     assert written[0].stat().st_mtime_ns == before
-    fuse_captured(tmp_path / "capture", out, replace(options, fusion=SMALL))
+    with pytest.raises(OutputExistsError, match=r"fusion.depth = False \(was True\)"):
+        fuse_captured(tmp_path / "capture", out, replace(options, fusion=SMALL))
+    assert (out / "depth").is_dir()
+    fuse_captured(tmp_path / "capture", out, replace(options, fusion=SMALL), overwrite=True)
     assert not (out / "depth").exists() and (out / "refocused").is_dir()
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.tex").write_text("years of work")

@@ -78,8 +78,8 @@ def test_a_frame_that_is_not_deblurred_keeps_its_pixels_and_says_why(subtests, t
         ({"action": "drop"}, "decided", True),
         ({"action": "drop", "trusted": None}, "decided", False),
         ({"length": 0.0}, "no exposure", False),
-        ({"length": 340.0}, "340 px of blur are too long to be undone", False),
-        ({"doubt": "no sign", "departs": GATE_LIMITS.straight_px * 1.01}, "no sign, and with the other", False),
+        ({"length": 340.0}, "340 px of blur, too long to deblur", False),
+        ({"doubt": "no sign", "departs": GATE_LIMITS.straight_px * 1.01}, "no sign, and the opposite sign", False),
         ({"factor": None}, "judged", False),
     ):
         with subtests.test(given=given, said=said, dropped=dropped):

@@ -299,7 +299,7 @@ def test_colmap_is_quiet_while_it_looks_for_the_calibration(capture, tmp_path, m
 def test_a_stated_gain_that_the_pixels_deny_is_said(capture, tmp_path):
     changed(capture, ("short_iso = 1600", "short_iso = 100"))
     pairs = fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
-    assert "say 192 times, which the pixels do not" in str(pairs[0].reason)
+    assert "give 192 times, which the pixels contradict" in str(pairs[0].reason)
     assert pairs[0].gain == pytest.approx(GAIN, rel=0.05)
 
 
@@ -331,7 +331,7 @@ def test_in_place_of_a_black_short_exposure_the_long_one_is_taken(capture, tmp_p
     cv2.imwrite(str(capture / "short" / "000.png"), np.zeros((160, 240, 3), np.uint8))
     first, second = fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
     assert not first.fused and first.used == "long" and second.fused and second.used == "both"
-    assert str(first.reason).startswith("is the long exposure as it is, and not fused: too little of the pictures")
+    assert str(first.reason).startswith("is the long exposure as it is, not fused: too few pixels")
     images = [read(folder / "000.png") for folder in (tmp_path / "out" / "images", capture / "long")]
     assert np.array_equal(*images)
 
@@ -386,12 +386,15 @@ def test_a_stopped_run_is_gone_on_with_and_ends_as_if_undisturbed(capture, tmp_p
     pairs = fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
     assert contents(tmp_path / "out" / "images") == contents(tmp_path / "whole" / "images")
     before = (tmp_path / "out" / "result.json").read_bytes()
-    # nothing is left to do; another fusion makes the pictures again
+    # nothing is left to do; another fusion makes the pictures again where that is asked for
     stages = []
     again = fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=lambda s, *_: stages.append(s))
     assert again == pairs and stages == [] and (tmp_path / "out" / "result.json").read_bytes() == before
     options = ExposureOptions(fusion="mertens")
-    fuse_exposures_captured(capture, tmp_path / "out", options, fuser=AVERAGE, progress=silent)
+    with pytest.raises(OutputExistsError, match=r"fusion = mertens \(was none\)"):
+        fuse_exposures_captured(capture, tmp_path / "out", options, fuser=AVERAGE, progress=silent)
+    assert contents(tmp_path / "out" / "images") == contents(tmp_path / "whole" / "images")
+    fuse_exposures_captured(capture, tmp_path / "out", options, fuser=AVERAGE, overwrite=True, progress=silent)
     assert contents(tmp_path / "out" / "images") != contents(tmp_path / "whole" / "images")
     with Workspace(tmp_path / "out").locked(), pytest.raises(OutputExistsError, match="another run is at work"):
         fuse_exposures_captured(capture, tmp_path / "out", options, fuser=AVERAGE, progress=silent)

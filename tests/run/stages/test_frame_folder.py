@@ -219,8 +219,8 @@ def test_times_by_exif_are_universal_where_their_offset_is_stated(tmp_path):
 
 def test_times_by_exif_that_cannot_be_compared_are_refused(subtests, tmp_path_factory):
     for wrong, error, said in (
-        ({"fraction": b"5\0"}, TimingError, "b.tif: its EXIF gives the time to tenths of a second only"),
-        ({"fraction": None}, TimingError, "b.tif: its EXIF gives the time to only to whole seconds"),
+        ({"fraction": b"5\0"}, TimingError, "b.tif: its EXIF gives the time only to tenths of a second"),
+        ({"fraction": None}, TimingError, "b.tif: its EXIF gives the time only to whole seconds"),
         ({"fraction": b"2x\0"}, TimingError, "only to whole seconds"),
         ({"date": None}, FormatError, "b.tif: its EXIF has no DateTimeOriginal"),
         ({"date": b"2024-05-01 12:30:15\0"}, FormatError, "no DateTimeOriginal"),
@@ -235,10 +235,10 @@ def test_times_by_exif_that_cannot_be_compared_are_refused(subtests, tmp_path_fa
 
 def test_pictures_without_exif_have_no_time(tmp_path):
     (tmp_path / "a.png").write_bytes(cv2.imencode(".png", np.zeros((8, 8), np.uint8))[1].tobytes())
-    with pytest.raises(FormatError, match=r"a.png: has no EXIF, which is to give its time"):
+    with pytest.raises(FormatError, match=r"a.png: has no EXIF to take its time from"):
         stamps_of_exif(tmp_path, ["a.png"])
     (tmp_path / "b.tif").write_bytes(tiff_with("<", 0x8769, [])[:24])
     with pytest.raises(FormatError, match=r"b.tif: its EXIF is damaged or empty"):
         stamps_of_exif(tmp_path, ["b.tif"])
-    with pytest.raises(FormatError, match="no such image"):
+    with pytest.raises(FormatError, match="no such picture"):
         stamps_of_exif(tmp_path, ["c.tif"])

@@ -39,7 +39,7 @@ from colmap_inertial.run.stages.metric import MetricStage, gravity_in_model
 from colmap_inertial.run.stages.readout import ReadoutStage
 from colmap_inertial.run.stages.refine import RefineStage, axes_by
 from colmap_inertial.run.stages.rolling_shutter import RollingShutterStage
-from colmap_inertial.run.steps.runner import canonical
+from colmap_inertial.run.steps.hashing import as_json_types
 from colmap_inertial.tools.simulate.tracks import TrackOptions
 from tests.helpers.json_schemas import read_schema
 from tests.helpers.refine_walk import problem_of, tracks_of, walk
@@ -246,7 +246,7 @@ def test_a_refined_model_has_the_scale_and_up_of_the_refinement(walked, factor):
     assert estimate.ci95[0] < estimate.metres_per_unit < estimate.ci95[1]
     assert sum(sigma**2 for sigma in estimate.parts.values()) == pytest.approx(estimate.sigma_log**2)
     assert estimate.cov[0, 0] == pytest.approx(estimate.sigma_log**2) == made.similarity.cov[0, 0]
-    # up, as the walk has it; how sure, by its noise
+    # up, as the walk has it; uncertainty cannot be determined, by its noise
     turn = umeyama(centres, truth)
     down = gravity_in_model(made) / np.linalg.norm(gravity_in_model(made))
     tilt_rad = np.linalg.norm(np.cross(turn @ down, [0, 0, -1]))
@@ -299,10 +299,10 @@ def test_derivatives_of_a_sensor_s_axes_are_those_of_finite_differences(walked):
 def test_a_run_goes_on_from_no_older_layout(walked):
     tracks, _ = walked
     stage = RefineStage(imu=tracks.imu, calibration=UNKNOWN, refine_intrinsics=False)
-    assert canonical(replace(stage)) == canonical(stage)
+    assert as_json_types(replace(stage)) == as_json_types(stage)
     older = replace(stage)
     object.__setattr__(older, "_writes", stage._writes - 1)
-    assert canonical(older) != canonical(stage)
+    assert as_json_types(older) != as_json_types(stage)
 
 
 def test_a_rolling_shutter_is_part_of_it(rolled):
@@ -628,7 +628,7 @@ def test_an_imu_that_contradicts_the_pictures_leaves_the_model_as_it_is(walked):
     imu = replace(tracks.imu, accel_m_s2=tracks.imu.accel_m_s2[:, [1, 0, 2]] * [1.0, 1.0, 1.0])
     made, said = refined_by(imu, model)
     assert said.action == ""
-    assert str(said.reason).startswith("refinement discarded: ")
+    assert str(said.reason).startswith("not refined, refinement discarded: ")
     assert made.reconstruction is model.reconstruction
 
 
@@ -676,9 +676,9 @@ def test_what_nothing_is_known_about_is_not_believed(walked, monkeypatch):
     def failed(problem, x):
         raise np.linalg.LinAlgError
 
-    monkeypatch.setattr(judge, "factored", failed)
+    monkeypatch.setattr(judge, "factor_information", failed)
     made, said = refined_by(tracks.imu, model)
-    assert "how sure" in str(said.reason)
+    assert "uncertainty cannot be determined" in str(said.reason)
     assert said.values["chi2"] < 1.5
     assert made.reconstruction is model.reconstruction
 

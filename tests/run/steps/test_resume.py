@@ -13,9 +13,11 @@ from colmap_inertial import AlreadyMetricError, Model, OutputExistsError, ScaleE
 from colmap_inertial.colmap.context import RunContext
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.facts import Fact
-from colmap_inertial.model import downgraded, read_model
+from colmap_inertial.core.types import FrameTiming
+from colmap_inertial.model import add_doubts, read_model
 from colmap_inertial.model.similarities import read_scales
-from colmap_inertial.run.steps.runner import StepRunner, canonical
+from colmap_inertial.run.steps.hashing import as_json_types
+from colmap_inertial.run.steps.runner import StepRunner
 from colmap_inertial.run.steps.session import Session
 from colmap_inertial.run.steps.workspace import Workspace
 
@@ -48,11 +50,23 @@ def test_scales_of_a_result_belong_to_colmap_s_numbers(tmp_path):
 
 def test_doubts_lower_a_verdict_that_was_raised_again():
     doubts = (Fact.stated("the video was stabilised"),)
-    once = downgraded(ESTIMATE, doubts)
+    once = add_doubts(ESTIMATE, doubts)
     raised = dataclasses.replace(once, verdict="trusted")
-    assert once.verdict == downgraded(raised, doubts).verdict == "weak"
-    assert downgraded(raised, doubts).reasons == once.reasons == doubts
-    assert downgraded(ESTIMATE, ()) is ESTIMATE
+    assert once.verdict == add_doubts(raised, doubts).verdict == "weak"
+    assert add_doubts(raised, doubts).reasons == once.reasons == doubts
+    assert add_doubts(ESTIMATE, ()) is ESTIMATE
+    # whatever a stage puts before them
+    other = Fact.stated("the target is bent")
+    assert add_doubts(add_doubts(once, (other,)), doubts).reasons == (other, *doubts)
+
+
+def test_no_model_of_a_doubted_recording_is_trusted(tmp_path):
+    timing = FrameTiming(names=("a", "b"), t_s=[0.0, 1.0])
+    model = Model(reconstruction=None, colmap_index=0, timing=timing, doubts=("the video was stabilised",))
+    assert model.scale is None
+    doubted = dataclasses.replace(model, scale=ESTIMATE)
+    assert doubted.scale.verdict == "weak" and [str(fact) for fact in doubted.scale.reasons] == [str(model.doubts[0])]
+    assert dataclasses.replace(doubted, rectified=True).scale.reasons == doubted.scale.reasons
 
 
 def test_a_model_is_scaled_once(project):
@@ -86,11 +100,10 @@ def test_nothing_to_do_means_that_the_same_would_be_said(tmp_path):
 
     assert not session().finish({"models": (1, 2), "seconds": {"a": 1.0}})
     assert session().finish({"models": (1, 2), "seconds": {"a": 2.0}})
-    assert not session().finish({"models": (1,), "seconds": {}})
+    assert not session().finish({"models": (1,), "seconds": {"a": 2.0}})
     again = session()
     again.runner.run("a", {}, [tmp_path / "out" / "a"], lambda partial: partial[0].write_text("x"))
-    assert not workspace.result.exists()  # what the result said no longer stands
-    assert not again.finish({"models": (1,), "seconds": {}})
+    assert not again.finish({"models": (1,), "seconds": {"a": 1.0}})
 
 
 def test_wrong_hooks_and_names_are_said_before_the_work(tmp_path):
@@ -101,10 +114,10 @@ def test_wrong_hooks_and_names_are_said_before_the_work(tmp_path):
 
 
 KEY = """
-from colmap_inertial.run.steps.runner import canonical
+from colmap_inertial.run.steps.hashing import as_json_types
 def stage(frames):
     return [f for f in frames if f.name in {"a.jpg", "b.jpg", "c.jpg", "d.jpg", "e.jpg"}]
-print(canonical(stage))
+print(as_json_types(stage))
 """
 
 
@@ -143,5 +156,5 @@ def test_the_key_of_a_visitor_s_class_knows_its_code():
 
         return Stage()
 
-    assert canonical(make(1)) == canonical(make(1))
-    assert canonical(make(1)) != canonical(make(2))
+    assert as_json_types(make(1)) == as_json_types(make(1))
+    assert as_json_types(make(1)) != as_json_types(make(2))

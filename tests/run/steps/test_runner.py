@@ -33,7 +33,8 @@ from colmap_inertial.run.commands.result import ReconstructResult
 from colmap_inertial.run.stages.frame_folder import FramePaths, read_frame_records, write_frames
 from colmap_inertial.run.stages.metric import MetricStage
 from colmap_inertial.run.steps.config import config_as_toml, read_config
-from colmap_inertial.run.steps.runner import StepRunner, canonical
+from colmap_inertial.run.steps.hashing import as_json_types
+from colmap_inertial.run.steps.runner import StepRunner
 from colmap_inertial.run.steps.session import Session
 from colmap_inertial.run.steps.workspace import Workspace
 from tests.helpers.cases import loop_over
@@ -318,6 +319,7 @@ def test_the_largest_model_comes_first_and_fragments_are_left_out_and_named(proj
     session = session_in(workspace)
     again, *_ = run_models(session, recording, [MetricStage(imu=imu, calibration=None)], Submodels(after=()))
     assert session.runner.worked == [] and [m.scale.ci95 for m in again] == [m.scale.ci95 for m in models]
+    workspace.unfinish()
     every, none, _ = run_models(
         session_in(workspace), recording, [MetricStage(imu=imu, calibration=None)], Submodels(after=()), fragments=True
     )
@@ -359,6 +361,7 @@ def test_a_sub_model_with_one_timed_image_is_refused_and_the_others_go_on(projec
     assert report_result(session, result, recording.capture).report is not None
     assert result.exit_code() == 0
     shutil.rmtree(workspace.colmap_sparse / "0")
+    workspace.unfinish()
     with pytest.raises(TimingError, match="1 of the model's 1 images"):
         run_models(session_in(workspace), recording, stages, Submodels(after=()), fragments=True)
 
@@ -370,7 +373,7 @@ def test_the_key_of_a_hook_knows_its_parameters_and_its_body():
 
         return stage
 
-    key = canonical
+    key = as_json_types
     assert key(make(1)) == key(make(1))
     assert key(make(1)) != key(make(2))
     assert key(functools.partial(max, 1)) != key(functools.partial(max, 2))

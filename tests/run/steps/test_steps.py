@@ -26,7 +26,7 @@ from colmap_inertial.colmap.features.extraction import (
     write_gravity_priors,
 )
 from colmap_inertial.colmap.mapping.mapper import MapRecord, map_images
-from colmap_inertial.core.errors import FormatError, NotObservableError, OutputError, OutputExistsError
+from colmap_inertial.core.errors import FormatError, NotObservableError, OutputExistsError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import MappingOptions, ProjectOptions, ReconstructOptions
 from colmap_inertial.core.progress import silent
@@ -48,7 +48,7 @@ from colmap_inertial.run.commands import (
     colmap_steps as steps,
     frames as framing,
     project_output,
-    reconstruct_project as existing,
+    project_sources as existing,
 )
 from colmap_inertial.run.commands.frames import run_frames, run_images
 from colmap_inertial.run.commands.paths import check_output
@@ -63,7 +63,6 @@ from colmap_inertial.run.stages.frame_folder import FramePaths, FrameRecord, wri
 from colmap_inertial.run.stages.imaging_plan import GyroView
 from colmap_inertial.run.stages.inputs import Fuser, StageInputs
 from colmap_inertial.run.stages.rolling_shutter import RollingShutterStage
-from colmap_inertial.run.steps.replacing import replace_result
 from colmap_inertial.run.steps.runner import StepRunner
 from colmap_inertial.run.steps.session import Session, open_session
 from colmap_inertial.run.steps.workspace import Workspace, refuse_links
@@ -229,14 +228,49 @@ def test_some_frames_keep_their_own_times_and_exposures():
 # --- what steps leave behind -----------------------------------------------------------------------------------------
 
 
-def test_a_result_goes_when_anything_is_made_again_and_only_then(workspace):
-    def run(option):
-        workspace.result.write_text("{}")
-        target = workspace.root / "a.txt"
-        StepRunner(workspace).run("a", {"option": option}, [target], lambda partial: partial[0].write_text("x"))
-        return workspace.result.is_file()
+def test_a_finished_result_is_added_to_and_repaired_and_replaced_only_when_asked(workspace):
+    changed = Fact("option-changed", option="option", now=2, before=1)
 
-    assert [run(1), run(1), run(2)] == [False, True, False]
+    def run(step, option, **asked):
+        target, runner = workspace.root / f"{step}.txt", StepRunner(workspace, **asked)
+        runner.run(step, {"option": option}, [target], lambda partial: partial[0].write_text(f"{option}"))
+        return runner.worked, workspace.result.is_file()
+
+    assert run("a", 1) == (["a"], False)
+    workspace.result.write_text("{}")
+    assert run("a", 1) == ([], True)
+    assert run("b", 1, changes=[changed]) == (["b"], True), "a step more leaves what there is as it is"
+    with pytest.raises(OutputExistsError, match=r"step a would change: option = 2 \(was 1\); .*--overwrite"):
+        run("a", 2, changes=[changed])
+    assert (workspace.root / "a.txt").read_text() == "1" and workspace.result.is_file()
+    (workspace.root / "a.txt").unlink()
+    with pytest.raises(OutputExistsError, match="finished result"):
+        run("a", 1, changes=[changed])
+    assert run("a", 1) == (["a"], False), "while something is made again, there is no result"
+    assert run("a", 2) == (["a"], False), "of an unfinished run, what changed is made again"
+    workspace.result.write_text("{}")
+    assert run("a", 3, overwrite=True) == (["a"], False)
+    assert (workspace.root / "b.txt").read_text() == "1"
+
+
+def test_what_a_run_does_not_make_goes_but_not_from_a_finished_result(workspace):
+    def runner(**asked):
+        return StepRunner(workspace, **asked)
+
+    workspace.validation.mkdir()
+    runner().discard(workspace.validation, workspace.georeference)
+    assert not workspace.validation.exists()
+    workspace.validation.mkdir()
+    workspace.result.write_text("{}")
+    runner().discard(workspace.georeference)
+    runner().leave_out([])
+    for ask in (lambda runner: runner.discard(workspace.validation), lambda runner: runner.leave_out(["dense"])):
+        with pytest.raises(OutputExistsError, match="finished result"):
+            ask(runner())
+    assert workspace.validation.is_dir() and workspace.result.is_file()
+    runner(overwrite=True).leave_out(["dense"])
+    runner(overwrite=True).discard(workspace.validation)
+    assert not workspace.validation.exists() and not workspace.result.exists()
 
 
 def test_a_step_without_files_that_was_interrupted_is_not_finished(workspace):
@@ -386,47 +420,13 @@ def test_links_of_a_project_may_stay_and_the_folder_itself_may_be_one(workspace,
         refuse_links(workspace.root)
     workspace.placed.write_text(json.dumps({"paths": ["mesh"]}))
     (tmp_path / "link").symlink_to(workspace.root)
-    ready = workspace.stamps / "next" / "mesh"  # of a run that was killed
+    ready = workspace.stamps / "project" / "mesh"  # of a run that was killed
     ready.mkdir(parents=True)
     (ready / "latest.ply").symlink_to("fused.ply")
     refuse_links(tmp_path / "link")
     (workspace.root / "mesh" / "other.ply").symlink_to(tmp_path)
     with pytest.raises(FormatError, match="is a link"):
         refuse_links(tmp_path / "link")
-
-
-def stopped_at(moves):
-    """Renames files, and is interrupted after so many that are part of the next result."""
-    renames, rename = itertools.count(), os.replace
-
-    def interrupted(source, target):
-        if "next" in Path(source).parts and next(renames) == moves:
-            raise KeyboardInterrupt
-        rename(source, target)
-
-    return interrupted
-
-
-def test_a_replacement_that_was_killed_is_finished_by_the_next_run(subtests, tmp_path_factory):
-    whole = {"come", "come.json", "config.toml", "images", "result.json"}
-    for moves in range(6):
-        with subtests.test(moves=moves):
-            workspace = workspace_in(tmp_path_factory.mktemp("given"))
-            beside = Workspace(workspace.stamps / "next")
-            for root, text, own in ((workspace, "old", "gone"), (beside, "new", "come")):
-                root.stamps.mkdir(parents=True, exist_ok=True)
-                for path in (root.result, root.config, root.images, root.root / own, root.stamps / f"{own}.json"):
-                    path.write_text(json.dumps(text))
-            with pytest.MonkeyPatch.context() as patched, contextlib.suppress(KeyboardInterrupt):
-                patched.setattr(os, "replace", stopped_at(moves))
-                replace_result(workspace)
-            replace_result(workspace)
-            there = {path.name: path for path in workspace.root.rglob("*") if path.is_file()}
-            assert set(there) == whole
-            assert not (workspace.root / "gone").exists() and not beside.root.exists()
-            assert {
-                path.read_text() for path in workspace.root.rglob("*") if path.is_file() and path.name in whole
-            } == {'"new"'}
 
 
 def test_what_says_whose_folder_it_is_was_damaged(workspace, tmp_path):
@@ -458,48 +458,43 @@ def test_however_a_capture_is_spelt_its_steps_are_kept(workspace, tmp_path, monk
         assert made(Path(os.path.relpath(tmp_path))) == []
 
 
-def test_a_session_is_alone_in_its_folder_and_another_configuration_keeps_the_result_until_its_own_is_whole(tmp_path):
-    def session(seed=0, recording=(1, ...)):
+def test_a_session_is_alone_in_its_folder_and_writes_its_options_with_its_result(tmp_path):
+    def session(seed=0, **asked):
         options = replace(ReconstructOptions(), seed=seed)
-        return open_session(tmp_path / "out", tmp_path / "capture.toml", options, pictures=(), decides=recording)
+        return open_session(tmp_path / "out", tmp_path / "capture.toml", options, pictures=(), **asked)
+
+    def write(session, text, step="frames"):
+        target = session.workspace.root / step
+        session.runner.run(step, {"text": text}, [target], lambda partial: partial[0].write_text(text))
+        return {"seconds": session.runner.seconds}
 
     with session() as first:
         with pytest.raises(OutputExistsError, match="another run is at work"), session():
             pass
-        first.finish({})
+        assert b"seed = 0" in first.workspace.config.read_bytes()
+        assert not first.finish(write(first, "old"))
     with session() as again:
-        assert again.finish({})
-    earlier = contents(tmp_path / "out")
-
-    def write(session, text):
-        target = session.workspace.images
-        session.runner.run("frames", {"text": text}, [target], lambda partial: partial[0].write_text(text))
-        return session.in_place(target)
-
-    for fault in (KeyboardInterrupt, OutputError):
-        with pytest.raises(fault), session(seed=1) as other:
-            assert not other.workspace.result.exists()
-            assert write(other, "new") == tmp_path / "out" / "images"
-            raise fault("stopped")
-        found = contents(tmp_path / "out")
-        assert {name: found[name] for name in earlier if name != "log.txt"} == {
-            name: data for name, data in earlier.items() if name != "log.txt"
-        }
-        assert not (tmp_path / "out" / "images").exists()
-    with session() as again:
-        assert again.finish({}) and not (again.workspace.stamps / "next").exists()
-    with session(seed=1) as other:
+        assert again.finish(write(again, "old"))
+    finished = contents(tmp_path / "out")
+    with pytest.raises(OutputExistsError, match=r"step frames .* seed = 1 \(was 0\)"), session(seed=1) as other:
         write(other, "new")
-        assert not other.finish({})
+    with pytest.raises(OutputExistsError, match=r"step frames .* seed = 1 \(was 0\)"), session(seed=1) as other:
+        other.finish({})
+    found = contents(tmp_path / "out")
+    assert {name for name in found if found[name] != finished.get(name)} == {"log.txt"}
+    with pytest.raises(KeyboardInterrupt), session(seed=1) as more:
+        write(more, "old"), write(more, "dense", "dense")
+        raise KeyboardInterrupt
+    assert all(contents(tmp_path / "out")[name] == finished[name] for name in ("result.json", "config.toml", "frames"))
+    with session(seed=1) as more:
+        write(more, "old")
+        assert not more.finish(write(more, "dense", "dense")) and more.runner.worked == []
+    assert b"seed = 1" in (tmp_path / "out" / "config.toml").read_bytes()
+    with session(seed=2, overwrite=True) as other:
+        assert not other.finish(write(other, "new"))
     out = Workspace(tmp_path / "out")
-    assert out.images.read_text() == "new" and out.result.is_file() and b"seed = 1" in out.config.read_bytes()
-    stamps = {path.name for path in out.stamps.iterdir()}
-    assert stamps - {"lock"} == {"capture.json", "frames.json", "inputs.json"}
-    with session(seed=1) as same:
-        write(same, "new")
-        assert same.finish({}) and not same.runner.worked
-    with session(seed=1, recording=(2, ...)) as other:
-        assert other.workspace.root == out.stamps / "next"
+    assert (out.root / "frames").read_text() == "new" and b"seed = 2" in out.config.read_bytes()
+    assert {path.name for path in out.stamps.iterdir()} - {"lock"} == {"capture.json", "frames.json", "dense.json"}
 
 
 def test_dropped_frames_are_not_written_and_say_why(tmp_path):
@@ -928,7 +923,7 @@ def test_the_readout_turns_with_the_pictures(subtests, tmp_path_factory, monkeyp
             )
             monkeypatch.setattr(existing, "match_to_video", lambda *args, match=match, **more: match)
             capture = recording().capture
-            timing, _ = existing._video_times(capture, tmp_path / "a.mp4", tmp_path, list(match.t_ns), silent)
+            timing, _ = existing._read_video_times(capture, tmp_path / "a.mp4", tmp_path, list(match.t_ns), silent)
             read_at = np.rot90(np.repeat(np.arange(5.0)[:, None], 5, axis=1), turns)
             down, right = read_at[-1, 2] - read_at[0, 2], read_at[2, -1] - read_at[2, 0]
             expected = {(4, 0): "down", (-4, 0): "up", (0, 4): "right", (0, -4): "left"}[int(down), int(right)]

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.path_filters import deblur
 from colmap_inertial.imaging.rolling_shutter import rectify_keypoints
-from colmap_inertial.imaging.wiener import deblur
 from colmap_inertial.tools.simulate import SceneRecipe
 from colmap_inertial.tools.simulate.render import colmap_camera
 from scripts.benchmarks.imaging import kept_share, treated, verdict_on

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
+from colmap_inertial.imaging.path_filters import deblur
 from colmap_inertial.imaging.transfer import decode_table
-from colmap_inertial.imaging.wiener import deblur
 from scripts.common import (
     imaging_metrics as metrics,
     imaging_scenes as scenes,

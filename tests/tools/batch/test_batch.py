@@ -139,11 +139,11 @@ def test_an_existing_project_names_its_recording_in_the_manifest(project, tmp_pa
         (end,) = run_batch(tmp_path / "m.toml", tmp_path / "out").captures
         assert (end.state, end.models[0]["verdict"]) == ("done", "trusted"), end.error
     assert (tmp_path / "out" / "desk" / "sparse" / "0" / "transform.json").is_file()
-    # a result of other options is not this capture's result
+    # other options do not replace a result unasked
     made = model_bytes(tmp_path / "out" / "desk")
     other = dataclasses.replace(capture, project=dataclasses.replace(capture.project, link=True))
     (end,) = run_batch([other], tmp_path / "out").captures
-    assert end.exit_code == 2 and "another set of options" in end.error
+    assert end.exit_code == 2 and "step apply would change" in end.error
     assert model_bytes(tmp_path / "out" / "desk") == made != {}
 
 
@@ -507,7 +507,7 @@ def test_a_chunk_that_a_run_has_begun_anew_is_given_up(tmp_path, monkeypatch):
     killed = [sys.executable, "-c", "import os; os.kill(os.getpid(), 9)"]
     with monkeypatch.context() as patch:
         patch.setattr(workers, "start_process", lambda *_, **__: subprocess.Popen(killed, stdin=subprocess.PIPE))
-        with pytest.raises(MappingError, match=r"signal 9\); where memory is short, give workers more of it"):
+        with pytest.raises(MappingError, match=r"signal 9\); if memory ran out, give workers more of it"):
             do_for_another(part, describe_versions(), "by the run that goes on")
     shutil.rmtree(part.folder)
     with pytest.raises(InertialError, match=r"worker tcp://a:1 does not see .*0: .* that all machines share"):

@@ -10,7 +10,7 @@ import pytest
 
 from colmap_inertial.cli import main
 from colmap_inertial.core.errors import FormatError, InertialError
-from colmap_inertial.core.options import StageNames
+from colmap_inertial.core.options import BatchOptions, StageNames
 from colmap_inertial.hooks import load_stages
 from colmap_inertial.run.steps.config import config_as_toml
 from colmap_inertial.tools.batch import BatchCapture, read_manifest, run_batch
@@ -108,7 +108,7 @@ def test_a_manifest_s_stages_run_where_they_are_allowed(capsys, hooks, capture, 
     assert frames(out / "hall") == every[1:]
     assert marks(out / "hall") == ["refine", "seen"]
 
-    # the same again is finished; with other stages, or none, it is another's result
+    # the same again is finished; other stages, or none, do not replace it unasked
     made = model_bytes(out / "hall")
     (again,) = run_batch(manifest, out, TINY, allow_stages=True).captures
     assert (again.state, again.attempts) == ("done", 1)
@@ -116,8 +116,14 @@ def test_a_manifest_s_stages_run_where_they_are_allowed(capsys, hooks, capture, 
     for other in (StageNames(), SEEN, SEEN):  # a refusal changes nothing
         (end,) = run_batch([dataclasses.replace(entry, stages=other)], out).captures
         assert (end.state, end.exit_code) == ("failed", 2)
-        assert f"{out / 'hall'} holds the result of another set of stages; remove it" in end.error
+        assert f"{out / 'hall'} holds a finished result, and its step" in end.error and "--overwrite" in end.error
     assert model_bytes(out / "hall") == made
+    (again,) = run_batch(manifest, out, TINY, allow_stages=True).captures
+    assert (again.state, again.attempts) == ("done", 1), "nothing was written down of the stages that were refused"
+    (end,) = run_batch(
+        [dataclasses.replace(entry, stages=StageNames())], out, batch=BatchOptions(overwrite=True)
+    ).captures
+    assert end.state == "done" and marks(out / "hall") == ["refine"]
 
 
 def test_a_capture_s_own_stages_go_before_those_of_all(hooks, capture, tmp_path):
@@ -172,7 +178,7 @@ def test_an_existing_project_takes_model_stages_alone(hooks, project, tmp_path):
     assert "an existing model is not mapped again" in refused.error
     assert end(SEEN).state == "done"
     assert marks(tmp_path / "out" / "desk")[-1] == "seen"
-    assert "another set of stages" in end(StageNames()).error
+    assert "step metric would change" in end(StageNames()).error
 
 
 def test_names_lead_to_functions_instances_and_the_default_stages(hooks):

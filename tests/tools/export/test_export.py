@@ -635,7 +635,7 @@ def test_what_was_deblurred_is_taken_out_of_the_capture_where_it_is_named(rollin
     for step in ("frames", "images"):
         (copy / ".stages" / f"{step}.json").unlink()
     made = export_model(copy, tmp_path / "kept", "3dgs-deblur", images="original")
-    assert any("3 pictures are deblurred" in str(note) for note in made.notes)
+    assert any("3 images are deblurred" in str(note) for note in made.notes)
     assert cv2.imread(str(tmp_path / "kept" / "images" / blurred[0])).max() == 0
     made = export_model(copy, tmp_path / "filmed", images="original", capture=out.parent / "capture")
     assert not any("deblurred" in str(note) for note in made.notes)

@@ -1,4 +1,7 @@
-"""Output of all commands: text for people, JSON for scripts, nothing, or the whole log."""
+"""Base classes of the commands: the options that several have, and the output of all.
+
+Text for people, JSON for scripts, nothing, or the whole log.
+"""
 
 from __future__ import annotations
 
@@ -10,27 +13,45 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from tyro.conf import arg
+from tyro.conf import Positional, arg, create_mutex_group
 
 from colmap_inertial.cli.screen import Screen, live_progress
 from colmap_inertial.core.options import ReadLimits, ReconstructOptions
 from colmap_inertial.core.printing import PrintableFormatter, say
 
+if TYPE_CHECKING:
+    from colmap_inertial.run.commands.scale import ScaleSource
+
 #: ``--json -``.
 _STANDARD_OUTPUT = Path("-")
+_LOUDNESS = create_mutex_group(required=False)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Speaker:
-    """The options that all commands have. Errors go to standard error, whatever they say."""
+class Command:
+    """The options that all commands have. Errors go to standard error, whatever they say.
+
+    Attributes
+    ----------
+    common
+        Fields whose options ``--help`` shows, in this order; without any, it shows all.
+    topics
+        Titles of ``--help-all`` for the other options, and the fields (or groups of them) below each.
+    resumes
+        Whether it continues where an interruption ended it.
+    """
+
+    common: ClassVar[tuple[str, ...]] = ()
+    topics: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    resumes: ClassVar[bool] = False
 
     json: Path | None = None
     """Also write the result as JSON there; - is standard output, which then holds nothing else."""
-    quiet: bool = False
+    quiet: Annotated[bool, _LOUDNESS] = False
     """Say nothing but errors: no progress, no findings, no result."""
-    verbose: bool = False
+    verbose: Annotated[bool, _LOUDNESS] = False
     """Also print the log."""
 
     if TYPE_CHECKING:  # a field of some commands, computed by others
@@ -106,7 +127,7 @@ class Speaker:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reader(Speaker):
+class ReadingCommand(Command):
     """Common options of commands without options of a reconstruction."""
 
     limits: ReadLimits = field(default_factory=ReadLimits)
@@ -114,12 +135,30 @@ class Reader(Speaker):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ConfiguredCommand(Speaker):
+class ConfiguredCommand(Command):
     """Common options of commands with options of a reconstruction."""
+
+    topics: ClassVar = {
+        "An existing COLMAP project in place of a capture": (
+            "imu", "frame_times", "name_times", "exif_times", "video", "images", "keep", "link", "follow_links",
+        ),
+        "Metres without an IMU": ("scale_from", "target", "between", "distance"),
+        "Choice of frames": ("frames",),
+        "How COLMAP builds the model": (
+            "mapping", "colmap", "colmap_project", "colmap_executable", "database", "database_images", "workers",
+            "scheduler",
+        ),
+        "How metres come from the IMU": ("scale",),
+        "Joining, refinement and place": ("join", "join_options", "refine", "georeference", "fragments"),
+        "Dense reconstruction": ("dense_options",),
+        "Calibrations kept of a device": ("device", "remembered"),
+        "Runs that can be repeated": ("deterministic", "seed"),
+    }  # fmt: skip
 
     options: Annotated[ReconstructOptions, arg(name="")] = field(default_factory=ReconstructOptions)
     config: Path | None = None
-    """TOML file with options, as OUT/config.toml of an earlier run; options given here override it."""
+    """TOML file with options, as OUT/config.toml of an earlier run; options given here override it, or add to it where
+    they may be repeated."""
 
     @property
     def limits(self) -> ReadLimits:
@@ -128,7 +167,7 @@ class ConfiguredCommand(Speaker):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DeviceCommand(Speaker):
+class DeviceCommand(Command):
     """Common options of commands that use the stored calibrations of a device."""
 
     device: str | None = None
@@ -148,6 +187,28 @@ class DeviceCommand(Speaker):
             for path, kind in kept.files:
                 say(f'{kept.device}: uses the remembered calibration "{kind}", {path} (--no-remembered leaves it out)')
         return (*calibration, *kept.paths)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceCommand(ReadingCommand):
+    """Common options of commands that read camera poses and the IMU recorded with them."""
+
+    source: Positional[Path]
+    """COLMAP model folder, trajectory in TUM format (a text file of t x y z qx qy qz qw), or InertialScale folder (text
+    files of camera and IMU)."""
+    imu: Path | None = None
+    """IMU recording: a file or folder of a known format, or a capture.toml."""
+    frame_times: Path | None = None
+    """When the images were taken: a CSV with columns name,t_s, or a capture.toml."""
+    calibration: tuple[Path, ...] = ()
+    """Calibration files of this device: from `align --out`, from `calibrate-imu --out`, or both."""
+
+    def read_from(self, calibration: tuple[Path, ...] | None = None) -> ScaleSource:
+        """Source of poses and IMU, with these calibrations or the given ones."""
+        from colmap_inertial.run.commands.scale import ScaleSource
+
+        files = self.calibration if calibration is None else calibration
+        return ScaleSource(source=self.source, imu=self.imu, frame_times=self.frame_times, calibration=files)
 
 
 def print_json(content: Mapping[str, Any]) -> None:

@@ -1,15 +1,13 @@
-"""The directional Wiener filter in numpy: slow, plain, and the truth that the compiled one is tested against."""
+"""Where the result of a filter counts, in numpy: the truth that the compiled blending is tested against."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.core.arrays import AnyArray, Array, BoolArray, IndexArray
-from colmap_inertial.imaging import wiener
+from colmap_inertial.core.arrays import AnyArray, Array, BoolArray
 from colmap_inertial.imaging._cells import CELL_PX, Cells
-from colmap_inertial.imaging._taps import Prior, TapTable, blur_spectrum
-from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.path_filters import SATURATED
 from colmap_inertial.imaging.transfer import decode_table, srgb_from_linear
 
 #: Spacing of the points at which the influence of lost light is worked out; between them it is bilinear.
@@ -22,83 +20,16 @@ LOST_LIGHT_REACH = (2.0, 2.5)
 STEEPEST = 2.0
 
 
-def deblur_reference(image: AnyArray, blur: BlurField, options: wiener.DeblurOptions | None = None) -> AnyArray:
-    """`deblur` in plain numpy; hundreds of times slower."""
-    planes, cells, noise = wiener._prepare(image, blur, options or wiener.DeblurOptions())
-    table = wiener._table(cells, noise)
+def blend_reference(image: AnyArray, light: Array, cells: Cells) -> AnyArray:
+    """Codes of the light that a filter made of an (H, W, channels) image, where its share counts."""
     top = np.iinfo(image.dtype).max
-    light = decode_table(image.dtype)[planes].astype(np.float64)
-    saturated = planes >= wiener.lowest_saturated_code(image.dtype)
-    channels = range(planes.shape[2])
-    lost = np.any([lost_light_reference(light[..., c], saturated[..., c], cells) for c in channels], axis=0)
-    share = share_reference(lost, cells)
-    result = planes.copy()
-    for c in channels:
-        blended = light[..., c] + share * (filter_reference(light[..., c], cells, table) - light[..., c])
-        codes = np.floor(top * srgb_from_linear(blended) + 0.5).astype(image.dtype)
-        result[..., c] = np.where(share == 0, planes[..., c], codes)
-    return result.reshape(image.shape)
-
-
-def filter_reference(light: Array, cells: Cells, table: TapTable, cell_px: int = CELL_PX) -> Array:
-    """Deblur one channel of linear light.
-
-    Parameters
-    ----------
-    light
-        (H, W).
-    cells
-        The blur.
-    table
-        Taps for its lengths.
-    cell_px
-        Side of the cells; 1 gives every pixel its own taps.
-
-    Returns
-    -------
-    (H, W) ``sum_j w_j g(x + j, y + j slope)`` along the major axis, linearly interpolated between rows (columns where
-    the major axis is y), ``g`` the image smoothed as the table says, mirrored about the
-    centres of its border pixels.
-    """
-    height, width = light.shape
-    light = smoothed_reference(light, table.smoothing)
-    y, x = np.mgrid[:height, :width]
-    extent, slope, along_y = (
-        a[y // cell_px, x // cell_px] for a in (cells.extent_px.astype(np.float64), cells.slope, cells.along_y)
-    )
-    slope = slope.astype(np.float64)
-    row, fraction = table.at(extent)
-    reach = table.weights.shape[1] - 1
-    result = np.zeros((height, width))
-    for j in range(-reach, reach + 1):
-        taps = table.weights[:, abs(j)].astype(np.float64)
-        weight = taps[row] * (1 - fraction) + taps[row + 1] * fraction
-        minor = j * slope
-        before = np.floor(minor).astype(np.intp)
-        part = minor - before
-        for step, share in ((before, 1 - part), (before + 1, part)):
-            source_y = mirrored(y + np.where(along_y, j, step), height)
-            source_x = mirrored(x + np.where(along_y, step, j), width)
-            result += weight * share * light[source_y, source_x]
-    return result
-
-
-def smoothed_reference(light: Array, weights: NDArray[np.floating]) -> Array:
-    """(H, W) smoothed along rows and columns with symmetric weights at the distances 0, 1, ... px; mirrored borders."""
-    for axis, size in enumerate(light.shape):
-        at, smoothed = np.arange(size), weights[0] * light
-        for k, weight in enumerate(weights[1:], 1):
-            smoothed = smoothed + weight * sum(np.take(light, mirrored(at + s * k, size), axis) for s in (-1, 1))
-        light = smoothed
-    return light
-
-
-def mirrored(index: IndexArray, size: int) -> IndexArray:
-    """Indices reflected into ``0 .. size - 1`` about the first and last element, as often as needed."""
-    if size == 1:
-        return np.zeros_like(index)
-    index = np.abs(index) % (2 * size - 2)
-    return np.minimum(index, 2 * size - 2 - index)
+    before = decode_table(image.dtype)[image].astype(np.float64)
+    saturated = image >= np.ceil(SATURATED * top)
+    channels = range(image.shape[2])
+    lost = np.any([lost_light_reference(before[..., c], saturated[..., c], cells) for c in channels], axis=0)
+    share = share_reference(lost, cells)[..., None]
+    codes = np.floor(top * srgb_from_linear(before + share * (light - before)) + 0.5).astype(image.dtype)
+    return np.where(share == 0, image, codes)
 
 
 def lost_light_reference(light: Array, saturated: BoolArray, cells: Cells) -> BoolArray:
@@ -152,12 +83,6 @@ def share_reference(lost: BoolArray, cells: Cells) -> Array:
             lengths = np.float32(NODE_PX * step) / np.maximum(extent, np.float32(1e-6))
             share = np.where(hit, np.clip((lengths - zero_to) / (one_from - zero_to), 0, 1), share)
     return _bilinear(cells.fade, CELL_PX, height, width) * _bilinear(share, NODE_PX, height, width)
-
-
-def wiener_spectrum(extent_px: float, frequency: Array, prior: Prior) -> Array:
-    """Transfer function of the unlimited Wiener filter."""
-    transfer = blur_spectrum(extent_px, frequency)
-    return np.asarray(transfer / (transfer**2 + prior.eps + prior.alpha * 4 * np.sin(np.pi * frequency) ** 2))
 
 
 def _bilinear(nodes: NDArray[np.floating], step_px: int, height: int, width: int) -> Array:

@@ -9,7 +9,7 @@ from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.run.commands.reconstruct import reconstruct
 from colmap_inertial.run.commands.reconstruct_project import reconstruct_project
-from colmap_inertial.run.steps import session
+from colmap_inertial.run.preparation import packages
 
 
 @pytest.fixture
@@ -24,23 +24,23 @@ def there(monkeypatch):
                 raise importlib.metadata.PackageNotFoundError(name)
             return known[name]
 
-        monkeypatch.setattr(session.importlib.metadata, "version", version)
+        monkeypatch.setattr(packages.importlib.metadata, "version", version)
 
     return set_to
 
 
 def test_one_package_for_each_module_is_silent(there):
     there(pycolmap="4.0.0", opencv_contrib_python_headless="4.13.0.90")
-    assert session.conflicts() == []
+    assert packages.find_conflicts() == []
     there(pycolmap_cuda12="4.0.0", opencv_python="4.10.0.84")
-    assert session.conflicts() == []
+    assert packages.find_conflicts() == []
 
 
 def test_two_packages_that_bring_one_module_are_named_with_what_to_do(there, caplog):
     there(
         pycolmap="4.0.0", pycolmap_cuda12="4.1.0", opencv_contrib_python_headless="4.13.0.90", opencv_python="4.10.0.84"
     )
-    session.warn_of_conflicts()
+    packages.warn_of_conflicts()
     first, second = (record.getMessage() for record in caplog.records)
     assert first == (
         "pycolmap 4.0.0 and pycolmap-cuda12 4.1.0 are installed, and each brings the module pycolmap: the files of the "
@@ -65,5 +65,5 @@ def test_reconstruct_says_so_first(there, caplog, tmp_path):
 
 def test_looking_costs_next_to_nothing():
     start = time.perf_counter()
-    session.conflicts()
+    packages.find_conflicts()
     assert time.perf_counter() - start < 0.5

@@ -1,0 +1,126 @@
+"""What is said of sensors beside the IMU that know of metres: depth, the device's own path, positions, references."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from colmap_inertial.messages import message, state
+
+_WALK = "move the device sideways by a tenth of the distance to what it sees, or more, while that stays in view"
+
+
+@message(advice="keep the names of depth maps and poses as the app wrote them", example={"maps": 230, "poses": 900})
+def depth_without_poses(maps: int, poses: int) -> str:
+    return f"none, or one, of the {maps} depth maps belongs to one of the {poses} poses"
+
+
+@message(advice=_WALK, example={"count": 3, "needed": 6})
+def depth_pairs_too_few(count: int, needed: int) -> str:
+    return (
+        f"only {count} pairs of depth maps show the same surfaces from places apart, and {needed} are needed: "
+        "flat walls alone, glass, and what is farther than five metres give none"
+    )
+
+
+#: Sensors by their names in ``ScaleEvidence.sensor``.
+NAMES = {
+    "imu": "IMU",
+    "depth": "depth sensor",
+    "device": "device's own path",
+    "positions": "satellite positions",
+    "target": "target",
+    "distance": "known distance",
+}
+
+
+def name_of(sensor: str) -> str:
+    """What a sensor is called."""
+    return NAMES[sensor]
+
+
+@message(example={"reasons": ()})
+def no_sensor_gives_scale(reasons: Sequence[Any]) -> str:
+    said = "; ".join(str(reason) for reason in reasons)
+    return f"no sensor gives a scale{': ' if said else ''}{said}"
+
+
+@message(example={"sensor": "imu", "why": "the camera does not move"})
+def sensor_in_doubt(sensor: str, why: Any) -> str:
+    return f"{name_of(sensor)}: {why}"
+
+
+def _advise_on_culprit(culprit: str, **_: Any) -> str:
+    return {
+        "imu": "calibrate the IMU once (calibrate-imu), and check that frame times are those of the recorder",
+        "depth": "film surfaces nearer than five metres that neither shine nor let light through",
+        "device": "its scale wanders: take the others' word",
+        "positions": "record under open sky, and over a longer way",
+        "target": "measure the printed target again",
+        "distance": "measure the distance again",
+    }[culprit]
+
+
+@message(
+    advice=_advise_on_culprit,
+    example={
+        "first": "imu",
+        "second": "depth",
+        "ratio": 1.06,
+        "chance": 0.0004,
+        "culprit": "depth",
+        "probability": 0.7,
+    },
+)
+def sensors_contradict(first: str, second: str, ratio: float, chance: float, culprit: str, probability: float) -> str:
+    return (
+        f"{name_of(first)} and {name_of(second)} contradict each other: lengths differ by "
+        f"{100 * abs(ratio - 1):.2g} %, more than chance shows ({chance:.1g}); "
+        f"likeliest wrong: {name_of(culprit)} ({100 * probability:.0f} %)"
+    )
+
+
+# Depth maps and exports.
+
+
+@message(example={"shape": (192, 256, 3)})
+def depth_not_one_channel(shape: Sequence[int]) -> str:
+    return f"holds an array of {' x '.join(map(str, shape))}, where depth is one number for each pixel"
+
+
+@message(example={"width": 256, "height": 192, "of_width": 1080, "of_height": 1920})
+def depth_of_other_shape(width: int, height: int, of_width: int, of_height: int) -> str:
+    return (
+        f"is {width} x {height}, which is no smaller version of pictures of {of_width} x {of_height}: depth and "
+        "intrinsics must belong to pictures that are turned and cut alike"
+    )
+
+
+@message(example={"shape": (96, 128), "depth": (192, 256)})
+def confidence_of_other_size(shape: Sequence[int], depth: Sequence[int]) -> str:
+    return f"is {' x '.join(map(str, shape))}, and its depth map is {' x '.join(map(str, depth))}"
+
+
+@message(example={"dtype": "object"})
+def depth_no_numbers(dtype: str) -> str:
+    return f"holds no numbers that can be depth, but {dtype}, or too many"
+
+
+state("not-lzfse", "is not compressed by LZFSE, as Record3D writes depth")
+
+
+@message(example={"path": "capture/rgbd/0.depth"})
+def lzfse_needs_package(path: str) -> str:
+    return f"{path} is compressed by LZFSE"
+
+
+@message(example={"layouts": ("Stray Scanner", "Record3D")})
+def no_device_folder(layouts: Sequence[str]) -> str:
+    return f"is no export of a device's own path that is known here ({', '.join(layouts)})"
+
+
+state(
+    "intrinsics-of-unknown-size",
+    "does not say of which picture size it is, and there is no video: its centre is not that of 1920 x 1440",
+)
+state("keyframe-name-no-number", "a keyframe is named by microseconds, such as 104563217.json")
