@@ -60,6 +60,9 @@ def open_console(**how: Any) -> Console:
             for text, style, control in super().render(renderable, options):
                 yield Segment(text if control else printable(text), style, control)
 
+        def on_broken_pipe(self) -> None:
+            raise BrokenPipeError  # rich would end with code 1
+
     return Printable(**how)
 
 

@@ -483,7 +483,7 @@ def owner_unreadable(found: Said, out: str) -> str:
 
 
 @message(
-    advice="run that again, which makes it again",
+    advice="start that again, which makes it again",
     joint=": ",
     example={"found": {"code": "not-a-result", "values": {}}, "lost": "scale.json"},
 )

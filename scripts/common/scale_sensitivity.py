@@ -31,7 +31,7 @@ from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import CameraImuCalibration
 from colmap_inertial.inertial.core import parameters, priors
 from colmap_inertial.inertial.core.priors import PRIORS
-from colmap_inertial.inertial.scale import _noise, _residuals, _setup, joint
+from colmap_inertial.inertial.scale import _noise, _residuals, _setup, interval, joint
 from colmap_inertial.motion.align import align_camera_imu
 from scripts.benchmarks import scale as bench_scale
 from scripts.benchmarks.scale import Window
@@ -44,7 +44,7 @@ _PRIVATE = {
     "_setup._COUNTED_ONCE": _setup,
     "_setup._NEAR_M": _setup,
     "_setup._FAR_M": _setup,
-    "joint._UNMODELLED_S": joint,
+    "interval._UNMODELLED_S": interval,
     "parameters.DRIFT_S": parameters,
     "_noise._LARGEST_CORRELATION": _noise,
     "_residuals.ROBUST_SIGMAS": _residuals,

@@ -164,5 +164,5 @@ def test_the_scale_of_a_transforms_file_that_is_no_number(subtests, tmp_path_fac
             path = tmp_path / "transforms.json"
             frames = [{"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}]
             path.write_text(f'{{"frames": {json.dumps(frames)}, "scale": {scale}, "offset": [0, 0, 0]}}')
-            with pytest.raises(FormatError, match="no number"):
+            with pytest.raises(FormatError, match="not a number"):
                 transform_transforms(path, tmp_path / "out.json", plain_factor(2.0))

@@ -148,9 +148,10 @@ _MAP = """
 import sys
 from dataclasses import replace
 from pathlib import Path
-from colmap_inertial.colmap import mapping, submaps
+from colmap_inertial.colmap import chunks
+from colmap_inertial.colmap.mapping import mapper as mapping, submaps
 from colmap_inertial.core.options import MappingOptions
-from colmap_inertial.run.steps import chunks
+
 from colmap_inertial.colmap.context import RunContext
 
 submaps.SIZES = replace(submaps.SIZES, least=2, shortest=12, longest=12, shared=1 / 3)
@@ -205,7 +206,7 @@ def test_a_process_ends_with_the_one_that_started_it(ring, tmp_path):
 
 def test_the_number_of_workers_is_that_of_the_command_and_no_option_of_the_result(monkeypatch):
     given = []
-    monkeypatch.setattr(Reconstruct, "_by_imu", lambda self: given.append(RunContext().executor.number) or 0)
+    monkeypatch.setattr(Reconstruct, "_scale_by_imu", lambda self: given.append(RunContext().executor.number) or 0)
     for argv in (["--workers", "3"], []):
         with pytest.raises(SystemExit, match="0"):
             main(["reconstruct", "capture", "out", *argv])

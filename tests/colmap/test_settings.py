@@ -80,7 +80,7 @@ def test_what_colmap_does_not_have_is_refused(subtests):
         ("Maper.init_num_trials=3", r"no such section; did you mean Mapper\?"),
         ("Mapper.mapper=3", "no such option"),
         ("Mapper.init_num_trials=x", "'x' is not a value of Mapper.init_num_trials"),
-        ("SiftExtraction.upright=maybe", "as false is"),
+        ("SiftExtraction.upright=maybe", "such as false"),
         ("SiftExtraction.normalization=l3", "as L1_ROOT is"),
         ("SiftExtraction.max_num_features=-5", "COLMAP refuses this value"),
         ("TwoViewGeometry.max_error=-1", "COLMAP refuses this value"),

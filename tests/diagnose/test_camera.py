@@ -21,4 +21,4 @@ def test_a_camera_that_turns_in_one_second_of_half_a_minute_turned_too_little():
     open_rad = {name: SimpleNamespace(rotation_sigma_rad=rad) for name, rad in (("known", 0.04), ("open", 0.06))}
     found = {k: list(camera._check_turned(turning, SimpleNamespace(calibration=v))) for k, v in open_rad.items()}
     assert found["known"] == [] and [finding.code for finding in found["open"]] == ["rotation-too-little"]
-    assert "most at 20 s" in found["open"][0].evidence
+    assert "fastest at 20 s" in found["open"][0].evidence

@@ -208,7 +208,7 @@ def test_counters_that_begin_anew_are_counted_on(tmp_path, bits, per_s):
     header = f"t [{unit}],gx [rad/s],gy [rad/s],gz [rad/s],ax [m/s2],ay [m/s2],az [m/s2]"
     imu = read_imu(write(tmp_path / "imu.csv", header, [counts, *floats(GYRO), *floats(ACCEL)]))
     check(imu)
-    assert any("began anew 1 times" in str(repair) for repair in imu.repairs)
+    assert any("restarted 1 times" in str(repair) for repair in imu.repairs)
 
 
 def test_a_clock_that_was_set_back_is_no_counter(tmp_path):

@@ -121,6 +121,8 @@ def test_packed_ros_recordings_are_read_as_others(
             whole = read_imu(write_packed(tmp_path, imu, kind, ""))
             packed = read_imu(write_packed(tmp_path / "packed", imu, kind, packed_by))
             for field in dataclasses.fields(ImuRecording):
+                if field.name == "source":  # where the files are
+                    continue
                 np.testing.assert_array_equal(getattr(packed, field.name), getattr(whole, field.name))
 
 

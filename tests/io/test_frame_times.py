@@ -87,7 +87,7 @@ def test_stamps_are_sorted_with_what_belongs_to_them_and_each_name_comes_once():
     found = stamps_in_order(HERE, ["b", "a", "c"], np.array([7, 5, 6]), exposure_s=np.array([0.2, 0.1, 0.3]))
     assert found.names == ("a", "c", "b") and found.t_ns.tolist() == [5, 6, 7]
     assert found.exposure_s.tolist() == [0.1, 0.3, 0.2]
-    for names, said in ((["a", "b", "a"], "the frame a comes twice"), (["a", "b", ""], "a row has no name")):
+    for names, said in ((["a", "b", "a"], "the frame a appears twice"), (["a", "b", ""], "a row has no name")):
         with pytest.raises(FormatError, match=said) as caught:
             stamps_in_order(HERE, names, np.array([7, 5, 6]), np.array([2, 3, 9]))
         assert caught.value.line == 9

@@ -99,7 +99,7 @@ def test_an_installed_package_is_seen_by_every_process(site: Path, log: Path) ->
     for path in (log, log.parent):
         done = run(site, "-m", "colmap_inertial", "diagnose", path)
         assert (done.returncode, done.stderr) == (0, "")
-        assert "looked at: gyroscope, accelerometer" in " ".join(done.stdout.split())
+        assert "checked: gyroscope, accelerometer" in " ".join(done.stdout.split())
     without = run(log.parent, "-m", "colmap_inertial", "diagnose", log)
     assert without.returncode == 2
     assert "not an inertial recording" in without.stderr

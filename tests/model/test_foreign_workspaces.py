@@ -112,7 +112,9 @@ def test_points_of_transforms_are_moved_in_their_world(tmp_path):
     assert error_px(tmp_path / "out", model) < 1e-3
     want = world_of(APPLIED) @ np.append(moved(xyz_of(model)[0]), 1.0)
     np.testing.assert_allclose(ply_points(tmp_path / "out" / "sparse_pc.ply")[0], want[:3], atol=1e-5)
-    assert any(note.startswith("depths in 8 pictures") and "2.5 times" in note for note in map(str, applied.notes))
+    assert any(
+        note.startswith("depths in 8 integer images") and "2.5 times" in note for note in map(str, applied.notes)
+    )
     assert [group.lengths for group in applied.unmoved] == ["depths"]
     undo_project(tmp_path / "out", tmp_path / "back")
     assert error_px(tmp_path / "back", model) < 1e-3
@@ -445,9 +447,9 @@ def test_a_scale_is_that_of_its_model(tmp_path):
     [
         (lambda: build(["a.png", "b.png", "c.png"]), "3 images instead of 8"),
         (lambda: build([f"other{i}.png" for i in range(COUNT)]), "other names"),
-        (lambda: mapped_again(build()), "are elsewhere"),
-        (lambda: build(offset=(0.0, 0.0, 1.0)), "are elsewhere"),
-        (lambda: turned(build()), "are elsewhere"),
+        (lambda: mapped_again(build()), "stand elsewhere"),
+        (lambda: build(offset=(0.0, 0.0, 1.0)), "stand elsewhere"),
+        (lambda: turned(build()), "stand elsewhere"),
     ],
 )
 def test_a_scale_of_another_model_is_refused(tmp_path, other, match):
@@ -569,7 +571,7 @@ def test_everything_at_once_moves_and_comes_back(tmp_path):
         is_free = str(path) in FREE or path.parts[0] in ("images", "masks") or path.name in ("pair.txt", "cameras.bin")
         assert is_free or {path.suffix, f"depths ({path.suffix})"} & named or path.parts[0] == "exports", path
     notes = " ".join(map(str, applied.notes))
-    assert "depths in 8 pictures" in notes and "2.5 times as large" in notes
+    assert "depths in 8 integer images" in notes and "2.5 times as large" in notes
     assert "exports/splat.ply: copied unchanged" in notes and "rig_of_another_unit.json: copied unchanged" in notes
     undo_project(out, back)
     assert_lengths(back, *given, lambda xyz: np.asarray(xyz), 1e-14)

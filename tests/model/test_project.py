@@ -410,7 +410,7 @@ def test_what_cannot_be_told_is_refused(two_models, tmp_path):
         apply_to_project(project, tmp_path / "out", {0: scales[0]})
     cloud = "ply\nformat ascii 1.0\nelement vertex 1\n" + "".join(f"property float {n}\n" for n in "xyz")
     (project / "scan.ply").write_text(cloud + "end_header\n1 2 3\n")
-    with pytest.raises(FormatError, match=r"scan\.ply: it cannot be told"):
+    with pytest.raises(FormatError, match=r"scan\.ply: it is not known"):
         apply_to_project(project, tmp_path / "out", scales)
     apply_to_project(project, tmp_path / "kept", scales, keep=["scan.*"])
     assert (tmp_path / "kept" / "scan.ply").read_bytes() == (project / "scan.ply").read_bytes()

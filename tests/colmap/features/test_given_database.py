@@ -100,7 +100,7 @@ def akaze(capture, names):
 
 
 def run(capture, out, database):
-    return reconstruct(capture, out, dataclasses.replace(QUICK, database=database))
+    return reconstruct(capture, out, dataclasses.replace(QUICK, database=database), overwrite=True)
 
 
 @pytest.fixture(scope="module")

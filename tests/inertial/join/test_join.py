@@ -446,6 +446,8 @@ def test_a_project_of_two_models_becomes_one(walked, tmp_path, capsys):
     made = export_model(out, tmp_path / "path", "tum")
     assert (made.model, made.unit) == (0, "m")
     # asked not to, they stay apart
-    apart = reconstruct_project(tmp_path / "project", out, source, ReconstructOptions(join="off", refine="off"))
+    apart = reconstruct_project(
+        tmp_path / "project", out, source, ReconstructOptions(join="off", refine="off"), overwrite=True
+    )
     assert [model.colmap_index for model in apart.models] == [0, 1] and apart.gaps == ()
     assert read_model(out / "sparse" / "0").num_reg_images() == models[0].num_reg_images()

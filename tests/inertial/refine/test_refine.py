@@ -423,7 +423,7 @@ def test_what_is_held_out_must_be_predicted_better_than_chance_does(small):
     rests = solver._make_solution(_evaluate(problem, start, problem.observations), 1, converged=True)
     assert judge._find_doubt(rests, rests, 1.0, -0.02, 0.01) is None
     for change, spread in ((-0.009, 0.01), (0.0, 0.0), (-1.0, np.inf)):
-        assert "no better" in str(judge._find_doubt(rests, rests, 1.0, change, spread))
+        assert "did not improve" in str(judge._find_doubt(rests, rests, 1.0, change, spread))
 
 
 def test_what_is_held_out_leaves_each_point_enough(small):

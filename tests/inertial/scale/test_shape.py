@@ -9,9 +9,9 @@ from colmap_inertial.inertial.scale._shape import ShapeFault
 
 def test_a_scale_that_breaks_is_told_by_lengths_and_undone_in_the_part_that_tells_less(subtests):
     for at_s, keeps_after, words in (
-        (110.0, True, "+5.0 +- 2.0 % larger before 10 s"),
-        (110.0, False, "-4.8 +- 2.0 % larger after 10 s"),
-        (150.0, False, "-4.8 +- 2.0 % larger after 50 s"),
+        (110.0, True, "+5.0 +- 2.0 % longer before 10 s"),
+        (110.0, False, "-4.8 +- 2.0 % longer after 10 s"),
+        (150.0, False, "-4.8 +- 2.0 % longer after 50 s"),
     ):
         with subtests.test(at_s=at_s, keeps_after=keeps_after, words=words):
             t_s = np.linspace(100.0, 160.0, 61)

@@ -127,7 +127,7 @@ def test_a_device_that_warms_up_is_named_and_not_good(subtests):
 
 
 def test_what_is_too_little_is_refused_with_what_to_do():
-    with pytest.raises(NotObservableError, match=r"still in 5 attitudes only.*six sides.*six of its edges"):
+    with pytest.raises(NotObservableError, match=r"rested in 5 attitudes.*six sides.*six of its edges"):
         calibrated(simulate_rests(RestOptions(attitudes=5), seed=1))
     shaken = laid_down(np.eye(3), rest_s=0.5, turn_s=3.0)
     with pytest.raises(NotObservableError, match="no rest was found"):
@@ -347,8 +347,8 @@ def test_a_rest_does_not_go_on_where_one_sensor_pauses():
 @pytest.mark.parametrize(
     ("entry", "sigma", "said"),
     [
-        pytest.param((0, 0), 0.003, "gain along x is known to .*0.59 % only", id="x"),
-        pytest.param((2, 2), 0.003, "gain along z is known to .*0.59 % only", id="z"),
+        pytest.param((0, 0), 0.003, "gain along x is only known to .*0.59 %", id="x"),
+        pytest.param((2, 2), 0.003, "gain along z is only known to .*0.59 %", id="z"),
         pytest.param((2, 1), 0.003, "leave a misalignment of the accelerometer unknown", id="misalignment"),
     ],
 )

@@ -277,7 +277,7 @@ def test_a_calibration_of_all_cameras_gives_intrinsics_and_poses(folders):
     ("rig", "words"),
     [
         ("[rig]\n", r"needs a table \[rig.NAME\]"),
-        ('[rig]\nreference = "cam0"\n[rig.b]\nfolder = "same"\n', "belongs to calibration"),
+        ('[rig]\nreference = "cam0"\n[rig.b]\nfolder = "same"\n', "needs calibration"),
         ('[rig.b]\nfolder = "same"\nfolders = 1\n', 'did you mean "folder"'),
         ('[rig.b]\nvideo = "b.mp4"\nfolder = "same"\n', "unknown key"),
         ("[rig.b]\n", "folder is missing"),
@@ -342,7 +342,7 @@ def test_cameras_that_are_not_fixed_or_never_together_are_refused():
     with pytest.raises(MappingError, match=r"rotates by .* deg against the main one from frame to frame"):
         find_rig_poses([apart(np.random.default_rng(3).normal(0, 0.02, (21, 3)))], RIGHT)
     few = apart(np.zeros((8, 3)), skip={f"right/{k}.png" for k in range(4)})
-    with pytest.raises(MappingError, match=r"of 4 frames in one model, too few .*give cam_from_reference"):
+    with pytest.raises(MappingError, match=r"only 4 frames have its image .*too few .*give cam_from_reference"):
         find_rig_poses([few], RIGHT)
 
 

@@ -240,5 +240,5 @@ def test_pictures_without_exif_have_no_time(tmp_path):
     (tmp_path / "b.tif").write_bytes(tiff_with("<", 0x8769, [])[:24])
     with pytest.raises(FormatError, match=r"b.tif: its EXIF is damaged or empty"):
         stamps_of_exif(tmp_path, ["b.tif"])
-    with pytest.raises(FormatError, match="no such image"):
+    with pytest.raises(FormatError, match="no such picture"):
         stamps_of_exif(tmp_path, ["c.tif"])

@@ -239,8 +239,8 @@ def test_pictures_of_other_formats_are_read(tmp_path, ending):
     ("data", "match"),
     [
         (b"\0\0\0\x18ftypheic" + bytes(90), "is a HEIF or AVIF image"),
-        (b"\xff\x0a" + bytes(range(90)), "is a JPEG XL picture"),
-        (b"GIF89a" + bytes(90), "is a GIF picture"),
+        (b"\xff\x0a" + bytes(range(90)), "is a JPEG XL image"),
+        (b"GIF89a" + bytes(90), "is a GIF image"),
         (b"version https://git-lfs.github.com/spec/v1\n", "is a Git LFS pointer"),
         (b"\x00\x05\x16\x07\x00\x02\x00\x00Mac OS X        ", "is a macOS metadata file"),
         (bytes(4000), "holds only zeros"),

@@ -538,7 +538,7 @@ def test_images_of_an_existing_project_are_found(tmp_path):
 def test_what_cannot_be_shown_is_said(tmp_path, capsys):
     with pytest.raises(FormatError, match="no such folder"):
         load_scene(tmp_path / "nothing")
-    with pytest.raises(FormatError, match="no COLMAP model"):
+    with pytest.raises(FormatError, match="nor a COLMAP model"):
         load_scene(tmp_path)
     unfinished = tmp_path / "unfinished"
     write_result(unfinished, [ESTIMATE])
