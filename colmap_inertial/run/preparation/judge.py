@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from colmap_inertial.core.arrays import AnyArray
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.progress import Progress, report_each
 from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence, measure_blur_shares
@@ -19,6 +20,7 @@ from colmap_inertial.imaging.gate import (
 )
 from colmap_inertial.imaging.parallax import Parallax
 from colmap_inertial.imaging.psf import blur_path
+from colmap_inertial.imaging.tracking import convert_to_grey
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.run.preparation.sampling import some_frames
@@ -82,8 +84,13 @@ def judge_frames(
     for exposure times that are wrong by one factor, that is corrected, and said.
     """
 
+    index = view.index()
+    decoded = some_frames(capture, view.timing, [index[decision.name] for decision in chosen])
+    # decoded once for every factor that is tried, and held in grey, which is all that is looked at
+    pictures = {frame.name: convert_to_grey(frame.image) for frame in decoded}
+
     def look(factor: float) -> list[Looked]:
-        return _look(view, capture, chosen, parallaxes, progress, factor)
+        return _look(view, pictures, chosen, parallaxes, progress, factor)
 
     looked = look(1.0)
     verdict = judged(looked)
@@ -135,7 +142,7 @@ class Looked:
 
 def _look(
     view: GyroView,
-    capture: Capture,
+    pictures: Mapping[str, AnyArray],
     chosen: Sequence[FrameDecision],
     parallaxes: Mapping[str, Parallax],
     progress: Progress,
@@ -145,12 +152,10 @@ def _look(
     motion, camera, index = view.motion(), colmap_camera(view.camera), view.index()
     blur_px = {decision.name: factor * (decision.blur_px or 0.0) for decision in chosen}
     looked: list[Looked] = []
-    frames = some_frames(capture, view.timing, [index[d.name] for d in chosen])
-    for frame in report_each(frames, len(chosen), "blur", progress):
-        shutter, parallax = view.shutter(index[frame.name]), parallaxes.get(frame.name)
-        path = blur_path(motion, camera, shutter, parallax=parallax, extent_factor=factor)
-        share, mirrored = measure_blur_shares(frame.image, path)
-        looked.append(Looked(blur_evidence(frame.image, path), share, blur_px[frame.name], mirrored))
+    for name, picture in report_each(pictures.items(), len(chosen), "blur", progress):
+        path = blur_path(motion, camera, view.shutter(index[name]), parallax=parallaxes.get(name), extent_factor=factor)
+        share, mirrored = measure_blur_shares(picture, path)
+        looked.append(Looked(blur_evidence(picture, path), share, blur_px[name], mirrored))
     return looked
 
 
