@@ -97,7 +97,7 @@ def applied(setting: Setting) -> Iterator[joint.JointOptions]:
         if name == "gravity_m_s2":
             options = joint.JointOptions(gravity_sigma_m_s2=changed.gravity_m_s2)
         with ExitStack() as stack:
-            for module in (_setup, joint, priors):
+            for module in (_setup, interval, joint, priors):
                 stack.enter_context(mock.patch.object(module, "PRIORS", changed))
             yield options
     elif place == "TYPICAL":
