@@ -81,7 +81,7 @@ def test_what_colmap_does_not_have_is_refused(subtests):
         ("Mapper.mapper=3", "no such option"),
         ("Mapper.init_num_trials=x", "'x' is not a value of Mapper.init_num_trials"),
         ("SiftExtraction.upright=maybe", "such as false"),
-        ("SiftExtraction.normalization=l3", "as L1_ROOT is"),
+        ("SiftExtraction.normalization=l3", "such as L1_ROOT"),
         ("SiftExtraction.max_num_features=-5", "COLMAP refuses this value"),
         ("TwoViewGeometry.max_error=-1", "COLMAP refuses this value"),
         ("Mapper.num_threads=3", "set by --deterministic"),

@@ -159,7 +159,7 @@ def test_a_video_capture(tmp_path: Path) -> None:
         (IMU + '[camera]\nsensor_yaml = "s.yaml"\nwidth = 4\n', "line 4: .*leave out"),
         (IMU + '[camera]\nsensor_yaml = "s.yaml"\n', "s.yaml: no such file"),
         ("[imu]\n", r"line 1: \[imu\]: needs path, or"),
-        ('[imu]\nformat = "csv"\n', r"line 2: .*belongs to path"),
+        ('[imu]\nformat = "csv"\n', r"line 2: .*needs path"),
         ('[imu]\npath = "other/capture.toml"\n', "line 2: .*not another capture"),
         (IMU + '[imu.gyro]\nfile = "a"\n', r"line 4: \[imu.gyro\] file: .*leave one out"),
         (IMU + '[imu.gyro]\nunit = "m/s2"\n', r"line 4: .*'rad/s', 'deg/s'"),

@@ -104,12 +104,12 @@ def test_a_csv_times_frames(subtests: pytest.Subtests, tmp_path_factory: pytest.
 @loop_over(
     ("text", "said"),
     [
-        ("name,t_s\na.png,0.5\n", "no row for 1 of 2 pictures .first: b.png"),
+        ("name,t_s\na.png,0.5\n", "no row for 1 of 2 images .first: b.png"),
         ("name,t\na.png,0.5\nb.png,1\n", "does not state the unit"),
         ("a.png,0.5\nb.png,1\n", "no header"),
         ("name,when\na.png,0.5\nb.png,1\n", "no column of times"),
         ("who,t_s\na.png,0.5\nb.png,1\n", "no column of names"),
-        ("name,t_s\na.png,0.5\na.png,1\n", "line 3: the frame a.png comes twice"),
+        ("name,t_s\na.png,0.5\na.png,1\n", "line 3: the frame a.png appears twice"),
         ("name,t_s\na.png,0.5\nb.png,0.5\n", "same time"),
         ("name,t_s\na.png,0.5\nb.png,x\n", "line 3: time stamp 'x'"),
         ("name,t_s,exposure\na.png,0.5,1\nb.png,1,1\n", "exposure_s or exposure_ns"),

@@ -376,7 +376,7 @@ def test_a_similarity_that_moves_a_far_model_away_is_told(tmp_path):
         provenance="file",
     )
     applied = apply_to_project(tmp_path / "p", tmp_path / "out", away)
-    assert any("moves by 284" in note for note in map(str, applied.notes))
+    assert any("moves it by 284" in note for note in map(str, applied.notes))
 
 
 @pytest.mark.parametrize("kind", ["float", "double"])

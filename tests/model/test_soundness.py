@@ -1,4 +1,4 @@
-"""A model whose numbers impossible is refused by name, whatever would have read it."""
+"""A model whose numbers cannot be is refused by name, whatever would have read it."""
 
 import numpy as np
 import pycolmap
@@ -40,7 +40,9 @@ def test_focal_lengths_are_positive_numbers(tmp_path, model, suffix, value, inde
     params = np.array(copy.camera(1).params)
     params[index] = value
     copy.camera(1).params = params
-    with refuses(r"cameras\.(bin|txt): camera 1 \(PINHOLE\) impossible fx, fy, cx, cy = ", suffix, value):
+    with refuses(
+        r"cameras\.(bin|txt): camera 1 \(PINHOLE\) has impossible parameters: fx, fy, cx, cy = ", suffix, value
+    ):
         read_model(saved(copy, tmp_path / "model", suffix))
 
 
@@ -50,7 +52,7 @@ def test_poses_are_somewhere(tmp_path, model, suffix, value):
     copy = pycolmap.Reconstruction(model)
     pose = pycolmap.Rigid3d(copy.image(3).cam_from_world().rotation, np.array([0.0, value, 1.0]))
     copy.frame(copy.image(3).frame_id).rig_from_world = pose
-    with refuses(r"images\.(bin|txt): the pose of '002.png' impossible", suffix, value):
+    with refuses(r"images\.(bin|txt): the pose of '002.png' is impossible", suffix, value):
         read_model(saved(copy, tmp_path / "model", suffix))
 
 

@@ -456,7 +456,7 @@ def test_a_project_stands_where_its_pictures_were_taken(placed, tmp_path):
     # without being asked, nothing of it stays
     source = ProjectOptions(imu=box.imu, frame_times=box.frame_times)
     out = shutil.copytree(root / "out", tmp_path / "out")
-    again = reconstruct_project(root / "project", out, source, ReconstructOptions(refine="off"))
+    again = reconstruct_project(root / "project", out, source, ReconstructOptions(refine="off"), overwrite=True)
     assert again.models[0].georeference is None and not (out / "georeference.json").exists()
 
 

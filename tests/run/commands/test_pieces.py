@@ -433,6 +433,10 @@ def test_frames_speak_for_themselves_where_too_few_confirm_the_gyroscope(subtest
             )
             found = judging.judge_each_frame(verdict, looked)
             assert found.trusted is trusted
-            assert str(found.reason) == "as it was" if trusted else f"{shown} of {telling} frames" in str(found.reason)
+            assert (
+                str(found.reason) == "as it was"
+                if trusted
+                else f"{shown} of {telling} examined frames" in str(found.reason)
+            )
             doubted = replace(verdict, trusted=False)
             assert judging.judge_each_frame(doubted, looked) is doubted
