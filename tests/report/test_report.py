@@ -1170,7 +1170,7 @@ def test_drift_before_and_after_a_refinement_is_drawn_with_its_intervals(full, t
     model["treatments"] = [*model.get("treatments", []), done]
     _, page = report_of_changed(out, result)
     assert "refined" in page.anchors()
-    assert "1 of 2 parts had drifted by more than chance explains" in page.text
+    assert "1 of 2 parts had drifted by more than chance" in page.text
     before, after = figures.refined({"signals": {"first_frame_s": 3.0}}, drift)["data"]
     assert before["x"] == after["x"] == [5.0, 15.0]
     # what was stretched was too small before

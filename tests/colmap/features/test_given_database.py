@@ -146,7 +146,9 @@ def test_binary_features_with_matches_go_on_to_metres(capture, names, akaze, mat
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        reconstruct(capture, tmp_path / "out", dataclasses.replace(QUICK, database=other), progress=stop)
+        reconstruct(
+            capture, tmp_path / "out", dataclasses.replace(QUICK, database=other), overwrite=True, progress=stop
+        )
     assert "matches" in begun
 
 
