@@ -38,7 +38,7 @@ def matched(loop, tmp_path, recording):
 
 
 def test_a_loop_is_closed_without_all_pairs(loop, tmp_path):
-    record, shares = matched(bench, loop, tmp_path, loop[2])
+    record, shares = matched(loop, tmp_path, loop[2])
     assert record.pairing == "sequential" and record.still == 0
     assert record.heading_sigma_deg is not None and record.heading_sigma_deg < 3
     assert record.matched < 0.2 * FRAMES * (FRAMES - 1) / 2
@@ -49,7 +49,7 @@ def test_a_loop_is_closed_without_all_pairs(loop, tmp_path):
 def test_returns_are_found_without_a_gyroscope(loop, tmp_path):
     recording = loop[2]
     silent = np.zeros_like(recording.imu.gyro_rad_s)
-    record, shares = matched(bench, loop, tmp_path, replace(recording, imu=replace(recording.imu, gyro_rad_s=silent)))
+    record, shares = matched(loop, tmp_path, replace(recording, imu=replace(recording.imu, gyro_rad_s=silent)))
     assert record.gyroscope.startswith("not used") and record.returns > 0 and not record.judged
     assert record.matched < 0.2 * FRAMES * (FRAMES - 1) / 2
     assert sum(share > 0.5 for share in shares.values()) >= 3
