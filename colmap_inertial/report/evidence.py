@@ -1,4 +1,4 @@
-"""What sensors say of the scale, for terminal and report: in words, as rows, and drawn."""
+"""What sensors say of the scale, in words and as rows."""
 
 from __future__ import annotations
 
