@@ -25,6 +25,19 @@ def blend(
 ) -> None:
     """Write the codes of `light`, which a filter made of the (H, W, C) image, into `result`."""
 
+def find_spoilt(
+    image: NDArray[Code],
+    spoilt: UInt8Array,
+    *,
+    extent_px: Float32Array,
+    slope: Float32Array,
+    along_y: BoolArray,
+    decode: Float32Array,
+    saturated: int,
+    threads: int = 0,
+) -> bool:
+    """Set (H, W) `spoilt` to one where `blend` keeps the image because light was clipped; False where nothing was."""
+
 def join(
     luma: Float32Array,
     lines: Float32Array,

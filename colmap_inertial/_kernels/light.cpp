@@ -106,6 +106,8 @@ class LostLight {
             }
     }
 
+    bool any() const { return any_; }
+
     // Shares of the result at the nodes of a cell; false where all of them are one.
     bool shares(int cy, int cx, float (&share)[PER_CELL + 1][PER_CELL + 1]) const {
         if (!any_) return false;
@@ -276,6 +278,18 @@ class Blend {
     LostLight lost_light_;
 };
 
+// Marks the pixels of a cell between four nodes of which none has a share.
+void mark_spoilt(const LostLight &lost_light, Image size, int cy, int cx, uint8_t *spoilt) {
+    float nodes[PER_CELL + 1][PER_CELL + 1];
+    if (!lost_light.shares(cy, cx, nodes)) return;
+    for (int y = 0; y < std::min(CELL, size.height - cy * CELL); ++y)
+        for (int x = 0; x < std::min(CELL, size.width - cx * CELL); ++x) {
+            const float *upper = &nodes[y / NODE][x / NODE], *lower = &nodes[y / NODE + 1][x / NODE];
+            spoilt[size_t(cy * CELL + y) * size_t(size.width) + size_t(cx * CELL + x)] =
+                upper[0] == 0 && upper[1] == 0 && lower[0] == 0 && lower[1] == 0;
+        }
+}
+
 // A row of colours. near and far: slopes and offsets of R - G and B - G over luma, one after the other, in the next row
 // of half the size and the one beyond, of `half` pixels. room: 10 half + 4 floats.
 void join_row(const float *__restrict luma, const float *const *near, const float *const *far, int half, int width,
@@ -309,6 +323,20 @@ void blend(const Code *image, const float *light, Code *result, Image size, cons
            int threads) {
     Blend<Code>(image, light, result, size, field, codec).run(threads);
 }
+
+template <class Code>
+bool find_spoilt(const Code *image, uint8_t *spoilt, Image size, const Field &field, const Codec &codec, int threads) {
+    LostLight lost_light(size, field);
+    lost_light.find(image, codec, threads);
+    if (!lost_light.any()) return false;
+    in_parallel(field.ny, threads, [&](int cy) {
+        for (int cx = 0; cx < field.nx; ++cx) mark_spoilt(lost_light, size, cy, cx, spoilt);
+    });
+    return true;
+}
+
+template bool find_spoilt(const uint8_t *, uint8_t *, Image, const Field &, const Codec &, int);
+template bool find_spoilt(const uint16_t *, uint8_t *, Image, const Field &, const Codec &, int);
 
 template void blend(const uint8_t *, const float *, uint8_t *, Image, const Field &, const Codec &, int);
 template void blend(const uint16_t *, const float *, uint16_t *, Image, const Field &, const Codec &, int);

@@ -33,6 +33,11 @@ template <class Code>
 void blend(const Code *image, const float *light, Code *result, Image size, const Field &field, const Codec &codec,
            int threads);
 
+// Sets spoilt (height, width) to one where the result's share is zero because of such pixels; false where there are none,
+// and spoilt stays as it is. The fade of the field is not read.
+template <class Code>
+bool find_spoilt(const Code *image, uint8_t *spoilt, Image size, const Field &field, const Codec &codec, int threads);
+
 // result (height, width, 3) = linear light of (height, width) luma, whose shares of R - G and B - G are red and blue;
 // lines: slopes and offsets of both over luma, each of half the size, rounded up.
 void join(const float *luma, const float *lines, Image size, float red, float blue, float *result, int threads);

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.core.arrays import Array, Float32Array
+from colmap_inertial.core.arrays import Array, BoolArray, Float32Array
 from colmap_inertial.core.choices import CheckedOptions
 from colmap_inertial.core.threads import usable_processors
 from colmap_inertial.imaging._cells import Cells
@@ -286,16 +286,19 @@ def _filter_image(
 ) -> NDArray[Code]:
     planes = _require_planes(image, path)
     threads = options.threads or usable_processors()
+    cells = Cells.of(path.field())
+    # A clipped lamp is no image of the scene blurred along the path: the filter would answer it with rings.
+    scene = fill_clipped(planes, cells, threads)
     if planes.shape[2] == 3:
-        luma, chroma = split_colours(planes, threads)
+        luma, chroma = split_colours(scene, threads)
         sharp_luma = _filter_light(luma[..., None], path, options, splitting, threads)
         halved = path.halved()
         sharp_chroma = [_filter_light(c[..., None], halved, options, (), threads, chroma=True)[..., 0] for c in chroma]
         sharp = join_colours(sharp_luma[..., 0], np.stack(sharp_chroma), threads)
     else:
-        light = linearise(planes).reshape(planes.shape)
+        light = linearise(scene).reshape(planes.shape)
         sharp = _filter_light(light, path, options, splitting, threads)
-    return blend_where_blurred(planes, sharp, path, threads).reshape(image.shape)
+    return blend_where_blurred(planes, sharp, cells, threads).reshape(image.shape)
 
 
 def _require_planes(image: NDArray[Code], path: BlurPath) -> NDArray[Code]:
@@ -310,11 +313,52 @@ def _require_planes(image: NDArray[Code], path: BlurPath) -> NDArray[Code]:
     return np.ascontiguousarray(image).reshape(height, width, -1)
 
 
-def blend_where_blurred(planes: NDArray[Code], sharp: Float32Array, path: BlurPath, threads: int) -> NDArray[Code]:
+def fill_clipped(planes: NDArray[Code], cells: Cells, threads: int) -> NDArray[Code]:
+    """An image (H, W, C) whose pixels within two blur lengths of a clipped lamp or glint are filled from around them.
+
+    :func:`blend_where_blurred` keeps the input there. Images without such pixels are returned themselves.
+    """
+    from colmap_inertial._kernels import _light
+
+    spoilt = np.zeros(planes.shape[:2], dtype=np.uint8)
+    any_spoilt = _light.find_spoilt(
+        planes,
+        spoilt,
+        extent_px=cells.extent_px,
+        slope=cells.slope,
+        along_y=cells.along_y,
+        decode=decode_table(planes.dtype),
+        saturated=_lowest_saturated_code(planes.dtype),
+        threads=threads,
+    )
+    if not any_spoilt:
+        return planes
+    codes = np.rint(_fill_unknown(planes.astype(np.float32), spoilt == 0))
+    return np.where(spoilt[..., None] == 1, codes.astype(planes.dtype), planes)
+
+
+def _fill_unknown(image: Float32Array, known: BoolArray) -> Float32Array:
+    """(H, W, C) image whose unknown pixels are the nearest known means of 2 x 2, 4 x 4, ... pixels, interpolated."""
+    import cv2
+
+    height, width = known.shape
+    if known.all() or max(height, width) == 1:
+        return image
+    half = ((width + 1) // 2, (height + 1) // 2)
+    weight = known.astype(np.float32)
+    share = cv2.resize(weight, half, interpolation=cv2.INTER_AREA)
+    total = cv2.resize(image * weight[..., None], half, interpolation=cv2.INTER_AREA)
+    mean = total.reshape(half[1], half[0], -1) / np.maximum(share, np.finfo(np.float32).tiny)[..., None]
+    coarse = _fill_unknown(mean, share > 0)
+    between = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR).reshape(image.shape)
+    return np.where(known[..., None], image, between)
+
+
+def blend_where_blurred(planes: NDArray[Code], sharp: Float32Array, cells: Cells, threads: int) -> NDArray[Code]:
     """Put filtered light into an image (H, W, C), without what is saturated or hardly blurred; in the image's codes."""
     from colmap_inertial._kernels import _light
 
-    cells, result = Cells.of(path.field()), np.empty_like(planes)
+    result = np.empty_like(planes)
     _light.blend(
         planes,
         sharp,

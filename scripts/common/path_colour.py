@@ -18,6 +18,7 @@ from rich.console import Console
 from rich.progress import track
 
 from colmap_inertial.core.arrays import UInt8Array
+from colmap_inertial.imaging._cells import Cells
 from colmap_inertial.imaging._tiles import TiledPaths, Tiling
 from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.path_filters import (
@@ -48,7 +49,7 @@ def _each_channel(image: UInt8Array, path: BlurPath, splitting: tuple[float, ...
     paths, light = tiling.paths(path), linearise(image)
     noise = noise_along(light, tiling, paths, threads)
     sharp = filter_along(light, tiling, TiledPaths(paths, tiling.spreads(path)), noise, splitting, threads=threads)
-    return blend_where_blurred(image, sharp, path, threads)
+    return blend_where_blurred(image, sharp, Cells.of(path.field()), threads)
 
 
 WAYS: Mapping[str, tuple[Callable[..., UInt8Array], tuple[float, ...]]] = {

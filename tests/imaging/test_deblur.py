@@ -10,7 +10,15 @@ import pytest
 from colmap_inertial.imaging._cells import Cells
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath
-from colmap_inertial.imaging.path_filters import DeblurOptions, blend_where_blurred, deblur
+from colmap_inertial.imaging.path_filters import (
+    SATURATED,
+    DeblurOptions,
+    blend_where_blurred,
+    deblur,
+    fill_clipped,
+    half_quadratic,
+    path_wiener,
+)
 from colmap_inertial.imaging.transfer import linear_from_srgb, srgb_from_linear
 from colmap_inertial.tools.simulate.textures import poster
 from tests.references.blending import blend_reference, lost_light_reference, share_reference
@@ -72,12 +80,38 @@ def test_blending_gives_the_reference_s_codes(subtests):
             channels = slice(None) if colour else slice(1, 2)
             image, made = coded(light[..., channels], dtype), np.ascontiguousarray(filtered[..., channels])
             image = np.ascontiguousarray(image)
-            result = blend_where_blurred(image, made, BlurPath.straight(field), 2)
+            result = blend_where_blurred(image, made, cells, 2)
             difference = np.abs(result.astype(int) - blend_reference(image, made.astype(np.float64), cells))
             assert 0.02 < (result == image).all(axis=2).mean() < 0.9
             # an 8-bit level is 257 of the 16-bit ones
             assert (difference <= 1).mean() > (0.999 if dtype is np.uint8 else 0.95)
             assert difference.max() <= (1 if dtype is np.uint8 else 8)
+
+
+def test_what_is_filled_is_what_blending_keeps(subtests):
+    light = 0.3 * texture(height=130, width=170)
+    light[60:63, 80:84, 1] = light[90:92, 30:32] = 1
+    cells = Cells.of(BlurPath.straight(turning(130, 170, (9, 6), 0.01)).field())
+    for colour, dtype in itertools.product((False, True), (np.uint8, np.uint16)):
+        with subtests.test(colour=colour, dtype=dtype):
+            channels = slice(None) if colour else slice(1, 2)
+            image = np.ascontiguousarray(coded(light[..., channels], dtype))
+            filled = fill_clipped(image, cells, 2)
+            # A filter that gives black everywhere shows where blending keeps the image.
+            kept = (blend_where_blurred(image, np.zeros(image.shape, np.float32), cells, 1) == image).all(axis=2)
+            assert 0.01 < kept.mean() < 0.2
+            np.testing.assert_array_equal((filled != image).any(axis=2) & ~kept, np.zeros(kept.shape, bool))
+            lamps = image[..., 0 if not colour else 1] >= SATURATED * np.iinfo(dtype).max
+            assert lamps[60:92].any() and (filled != image).any(axis=2)[lamps & kept].all() and kept[lamps].all()
+            # Nothing is brighter than what is around.
+            assert filled.max() <= image[~kept].max()
+
+
+def test_an_image_without_lamps_is_filled_nowhere():
+    image = np.ascontiguousarray(coded(0.02 + 0.98 * np.round(texture()[..., 1:2])))  # black and white
+    image = coded(smeared(np.repeat(image / 255, 3, axis=2), (20.0, 5.0)))
+    cells = Cells.of(BlurField.uniform(WIDTH, HEIGHT, (20.0, 5.0)))
+    assert (image >= 250).any() and fill_clipped(image, cells, 1) is image
 
 
 # The whole -----------------------------------------------------------------------------------------------------------
@@ -190,6 +224,33 @@ def test_a_blurred_and_noisy_picture_comes_closer_to_the_sharp_one(subtests):
                 truth = coded(light)
                 result = deblur(noisy, BlurField.uniform(WIDTH, HEIGHT, vector_px))
                 assert psnr(result, truth) > psnr(noisy, truth) + 0.2
+
+
+def test_clipped_lights_do_not_ring(subtests):
+    light = 0.1 + 0.1 * texture()
+    lamp = light.copy()
+    lamp[HEIGHT // 2, WIDTH // 2] = 400  # far beyond what the sensor holds
+    image, lampless = (coded(np.clip(smeared_by_pixels(scene, 24), 0, 1)) for scene in (lamp, light))
+    path = BlurPath.straight(BlurField.uniform(WIDTH, HEIGHT, (24.0, 0.0)))
+    x = np.abs(np.arange(WIDTH) - WIDTH // 2)
+    for restore, channels in itertools.product((path_wiener, half_quadratic), (slice(1, 2), slice(None))):
+        with subtests.test(restore=restore, channels=channels):
+            seen, without = (np.ascontiguousarray(codes[..., channels]) for codes in (image, lampless))
+            result, undisturbed = (restore(codes, path).astype(int) for codes in (seen, without))
+            # Beyond three blur lengths little is left of a lamp 2,000 times as bright as all else.
+            assert np.abs(result - undisturbed)[:, x > 72].max() <= 20
+            assert np.sqrt(np.mean((result - undisturbed)[:, x > 72] ** 2)) < 1
+            # On the lamp's trace the input stays.
+            saturated = (seen >= 250).all(axis=2)
+            assert saturated.sum() == 24
+            np.testing.assert_array_equal(result[saturated], seen[saturated])
+
+
+def smeared_by_pixels(light: np.ndarray, length_px: int) -> np.ndarray:
+    """Linear light (H, W, C) averaged over whole pixels along the rows; nothing is clipped."""
+    around = ((0, 0), (length_px // 2, length_px - length_px // 2 - 1), (0, 0))
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(light, around, mode="reflect"), length_px, axis=1)
+    return np.asarray(windows.mean(axis=-1))
 
 
 def test_white_that_the_sensor_just_holds_is_deblurred():
