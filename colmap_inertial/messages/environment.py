@@ -33,7 +33,7 @@ def install_on_debian(package: str) -> str:
 def packages_of_one_module(module: str, installed: Mapping[str, str], keep: str) -> str:
     named = " and ".join(f"{name} {version}" for name, version in installed.items())
     return (
-        f"{named} are installed, and each brings the module {module}: the files of the last one overwrote the others'"
+        f"{named} are installed, and each provides the module {module}: the files of the last one overwrote the others'"
     )
 
 
@@ -79,7 +79,7 @@ state("needs-open3d", "dense_options.mesh tsdf is made by open3d")
 
 state(
     "memory-used-up",
-    "the memory is used up",
+    "out of memory",
     advice="close other programs, or allow smaller images or fewer processes",
     joint=": ",
 )
@@ -122,7 +122,7 @@ state("needs-viser", "the viewer runs in a browser with viser")
 
 state(
     "viser-not-guarded",
-    "this version of viser cannot be kept to this machine's own user",
+    "this version of viser cannot be restricted to this machine's user",
     advice="install viser 1.1",
     joint=": ",
 )
@@ -140,4 +140,6 @@ def no_port_free(port: int, host: str) -> str:
 
 # the report
 
-state("plotly-missing", "plotly is not installed, which draws the report", advice="pip install 'plotly>=6'", joint=": ")
+state(
+    "plotly-missing", "plotly, which draws the report, is not installed", advice="pip install 'plotly>=6'", joint=": "
+)

@@ -23,7 +23,7 @@ _MAP_AGAIN = (
     "overlap between images"
 )
 _READ_AGAIN = "correct this and run diagnose again: checks that depend on it were skipped"
-_REPAIRED = "nothing: repaired while reading; if it is frequent, check the logger"
+_REPAIRED = "none (repaired while reading); if it is frequent, check the logger"
 _PAUSES = "the scale bridges it with a larger uncertainty; close other apps or log to a faster card, and record again"
 _COUNTS = "for raw counts zero and counts_per_unit, by the sensor's data sheet, in capture.toml"
 _IN_G = 'set unit = "g" under [imu.accel] in capture.toml'
@@ -43,7 +43,7 @@ def _rates(largest_rad_s: float, median_rad_s: float, sensor_ends_rad_s: float) 
     )
 
 
-_GRAVITY_MOVES = "rotated by the gyroscope, gravity does not stay fixed, but it would"
+_GRAVITY_MOVES = "gravity, rotated by the gyroscope, is not constant, but would be"
 
 
 def _advise_deg(seen_in: str, **_: float) -> str:
@@ -71,11 +71,11 @@ def gyro_in_deg(
     gain: float = 1.0,
 ) -> str:
     if seen_in == "rates":
-        return f"{_rates(largest_rad_s, median_rad_s, sensor_ends_rad_s)}: the numbers are in deg/s"
+        return f"{_rates(largest_rad_s, median_rad_s, sensor_ends_rad_s)}: the values are in deg/s"
     if seen_in == "gravity":
-        return f"{_GRAVITY_MOVES} if the gyroscope's numbers were in deg/s"
+        return f"{_GRAVITY_MOVES} if the gyroscope's values were in deg/s"
     if seen_in == "camera":
-        return f"the gyroscope turns as the camera does, but {gain:.1f} times as far: its numbers are in deg/s"
+        return f"the gyroscope turns as the camera does, but {gain:.1f} times as far: its values are in deg/s"
     return (
         f"the gyroscope's median rate is {median_rad_s:.2g} rad/s, too fast for filming: the numbers are "
         f"probably in deg/s"
@@ -88,7 +88,8 @@ def gyro_not_in_deg(seen_in: str, gain: float = 1.0, turning_rad_s: float = 0.0,
         return f"{_GRAVITY_MOVES} at 57.3 times the rate: rad/s were converted as if they were deg/s"
     if seen_in == "camera":
         return (
-            f"the gyroscope turns as the camera does, but a {1 / gain:.1f}th as far: rad/s were converted as if they "
+            f"the gyroscope turns as the camera does, but only 1/{1 / gain:.1f} as far: rad/s were converted as if "
+            "they "
             "were deg/s"
         )
     return (
@@ -111,7 +112,7 @@ def _length(median_m_s2: float) -> str:
 
 @message(advice=_IN_G, example={"median_m_s2": 1.0})
 def accel_in_g(median_m_s2: float) -> str:
-    return f"{_length(median_m_s2)}: the numbers are in g"
+    return f"{_length(median_m_s2)}: the values are in g"
 
 
 @message(advice=_IN_M_S2, example={"median_m_s2": 96.2})
@@ -151,8 +152,7 @@ def sensors_exchanged(gyro_median: float, accel_median: float) -> str:
 )
 def dead_sensor(sensor: str, table: str, reading: tuple[float, ...]) -> str:
     return (
-        f"the {sensor} never changes (it reads {_describe_vector(reading)} throughout): the sensor is dead or was not "
-        "recorded"
+        f"the {sensor} never changes ({_describe_vector(reading)} throughout): the sensor is dead or was not recorded"
     )
 
 
@@ -162,7 +162,7 @@ def dead_sensor(sensor: str, table: str, reading: tuple[float, ...]) -> str:
 )
 def dead_axis(sensor: str, table: str, axes: tuple[str, ...], reading: float) -> str:
     return (
-        f"the {sensor}'s {' and '.join(axes)} axis never changes (it reads {reading:.6g} throughout): the axis is dead "
+        f"the {sensor}'s {' and '.join(axes)} axis never changes ({reading:.6g} throughout): the axis is dead "
         "or the wrong column"
     )
 
@@ -183,11 +183,11 @@ def _describe_setting(table: str, setting: Setting) -> str:
 
 
 def _describe_others(others: tuple[tuple[Setting, ...], ...]) -> str:
-    """What is hardly less likely: axes of the gyroscope, or of the accelerometer where there is a second setting."""
+    """What is almost as likely: axes of the gyroscope, or of the accelerometer where there is a second setting."""
     said = ""
     for settings in others:
         named = (_describe_setting(table, one) for table, one in zip(("gyro", "accel"), settings, strict=False))
-        said += f"; hardly less likely: {', or '.join(named)}"
+        said += f"; almost as likely: {', or '.join(named)}"
     return said
 
 
@@ -462,7 +462,7 @@ def clock_offset(offset_s: float, max_offset_s: float | None, clocks: Said | Non
     else:
         stated = "which contradicts the given time offset"
     return (
-        f"camera and gyroscope fit with a time offset of {offset_s:+.3f} s, {stated}"
+        f"camera and gyroscope agree at a time offset of {offset_s:+.3f} s, {stated}"
         f"{'' if clocks is None else f'; {clocks}'}"
     )
 
@@ -483,9 +483,8 @@ def clock_rate(rate: float) -> str:
 @message(advice="give the video itself as [video], or times as the recorder stamped them", example={"rate": 1.25})
 def frame_rate(rate: float) -> str:
     return (
-        f"the frames fit the gyroscope at {rate:.3g} times the stated frame rate: they were timed by another "
-        f"frame rate "
-        "than they were filmed with"
+        f"the frames fit the gyroscope at {rate:.3g} times the stated frame rate: they were timed at another frame "
+        "rate than that of filming"
     )
 
 
@@ -621,7 +620,8 @@ def gyro_mirrored(gyro: Setting | None = None) -> str:
 _ROTATIONS = {
     "inverse": (
         "; its inverse fits",
-        "cam_from_imu takes coordinates of the IMU to those of the camera (T_cam_imu of Kalibr): give the inverse of "
+        "cam_from_imu transforms coordinates of the IMU to those of the camera (T_cam_imu of Kalibr): give the "
+        "inverse of "
         "the declared one, with the translation of the inverse",
     ),
     "order": (
@@ -753,7 +753,7 @@ def frames_not_in_video(pictures: int, looked_for: int) -> str:
 
 
 @message(
-    advice="nothing, where the times are right; record to a faster card or at a smaller size",
+    advice="none if the times are right; otherwise record to a faster card or at a smaller size",
     example={"lost": 4, "frames": 600, "step_s": 0.033, "longest_s": 0.13},
 )
 def frames_dropped(lost: int, frames: int, step_s: float, longest_s: float) -> str:

@@ -297,7 +297,7 @@ def quantity_not_observable(quantity: str, why: Said | str, sigma: float | None)
 state("all-frames-asked", "all frames, as requested")
 state("all-pictures", "all images of the folder")
 state("frames-as-capture-says", "as set by frames_per_s in capture.toml")
-state("one-clock", "the recorder stamped frames and gyroscope by one clock")
+state("one-clock", "the recorder stamped frames and gyroscope with one clock")
 
 _RANKS = {"blur": "predicted blur", "speed": "angular speed", "sharpness": "sharpness"}
 

@@ -20,7 +20,7 @@ def imu_format_unknown(name: str, known: Sequence[str]) -> str:
     example={"layouts": ("a table of samples", "a GoPro video")},
 )
 def no_known_recording(layouts: Sequence[str]) -> str:
-    return f"not an inertial recording known here ({'; '.join(layouts)})"
+    return f"not an inertial recording in a known format ({'; '.join(layouts)})"
 
 
 @message(
@@ -29,7 +29,7 @@ def no_known_recording(layouts: Sequence[str]) -> str:
     example={"tracks": ("vide avc1", "soun mp4a")},
 )
 def video_without_imu(tracks: Sequence[str]) -> str:
-    return f"is a video without an IMU that is known here; its tracks: {', '.join(tracks) or 'none'}"
+    return f"is a video without an IMU track in a known format; its tracks: {', '.join(tracks) or 'none'}"
 
 
 state("begins-with-text", "begins with text")
@@ -70,7 +70,10 @@ state(
 )
 state("inertial-scale-files-missing", "holds no gyroscope.txt and accelerometer.txt")
 state("euroc-files-missing", "holds no mav0/imu0/data.csv, imu0/data.csv or data.csv")
-state("no-separate-tables", "holds no single table of a gyroscope and one of an accelerometer that say their units")
+state(
+    "no-separate-tables",
+    "does not hold exactly one table of a gyroscope and one of an accelerometer, each with its unit",
+)
 state("one-pose", "holds one pose; a trajectory needs at least two")
 
 
@@ -118,7 +121,7 @@ def telemetry_parser_failed(last_words: str, signal: int | None, exit_code: int 
 state("no-frames", "holds no frames")
 state("frame-without-time", "a frame has no time")
 state("sample-not-three-numbers", "a sample that is not three numbers")
-state("frame-number-not-one", "a frame's number that is none")
+state("frame-number-not-one", "a frame's number is not a number")
 state("number-without-end", "a number that does not end")
 
 
@@ -165,7 +168,7 @@ def not_three_axes(letters: str) -> str:
     return f"{letters!r} does not name three axes"
 
 
-state("gpmf-one-payload", "one payload alone: nothing says how fast its samples follow each other")
+state("gpmf-one-payload", "a single payload does not give the sampling rate")
 state("gpmf-stamps-do-not-increase", "the stamps of the payloads do not increase")
 
 
@@ -175,7 +178,7 @@ def mars_table_missing(table: str) -> str:
 
 
 state("camm-without-gyroscope", "its CAMM track holds no gyroscope samples (type 2)")
-state("camm-sample-short", "is damaged: a sample of the camm track is shorter than its head")
+state("camm-sample-short", "is damaged: a sample of the camm track is shorter than its header")
 
 
 @message(example={"packet": 3, "type": 2})
@@ -257,13 +260,17 @@ def bag_without_moving_gyroscope(topics: tuple[str, ...]) -> str:
     return f"none of its IMU topics ({', '.join(topics)}) has a gyroscope that moves"
 
 
-state("bag-files-packed", "its files are packed whole", advice="unpack them (zstd -d) and say so in metadata.yaml")
-state("bag-messages-packed", "its messages are packed one by one", advice="convert it with rosbags-convert")
-state("bag-index-repeats", "is damaged: its index names parts of it more than once")
+state(
+    "bag-files-packed",
+    "its files are compressed as a whole",
+    advice="decompress them (zstd -d) and change metadata.yaml accordingly",
+)
+state("bag-messages-packed", "its messages are compressed individually", advice="convert it with rosbags-convert")
+state("bag-index-repeats", "is damaged: its index lists chunks more than once")
 
 
 @message(
-    advice="if it is meant, convert it with rosbags-convert, without compression and with its IMU topics only",
+    advice="if this is intended, convert it with rosbags-convert, without compression and with its IMU topics only",
     example={"most_mb": 500, "size": 100000},
 )
 def bag_out_of_proportion(most_mb: int, size: int) -> str:
@@ -275,7 +282,7 @@ def bag_compression_unknown(compression: str) -> str:
     return f"is packed by {compression!r}, which is not read"
 
 
-state("bag-chunk-followed", "is damaged: bytes follow where a chunk ends")
+state("bag-chunk-followed", "is damaged: bytes follow the end of a chunk")
 
 
 @message(example={"camera": "Insta360 OneR"})

@@ -56,12 +56,12 @@ def member_packed_otherwise(member: str, method: int) -> str:
 
 @message(example={"column": "t"})
 def no_counts(column: str) -> str:
-    return f'column "{column}" holds what is no count'
+    return f'column "{column}" holds values that are not whole counts'
 
 
 @message(example={"text": "3.4.2024"})
 def no_date_with_time(text: str) -> str:
-    return f"{text!r} is no date with a time"
+    return f"{text!r} is not a date with a time"
 
 
 @message(example={"text": "31.2.2024 10:00:00", "detail": "day is out of range for month"})

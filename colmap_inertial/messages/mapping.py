@@ -32,7 +32,7 @@ state(
 
 state(
     "colmap-executable-not-to-run",
-    "may not be run",
+    "is not executable",
     advice="make it executable (chmod +x), or give COLMAP's program",
     joint=": ",
 )

@@ -18,7 +18,7 @@ _AGAIN = "install colmap-inertial again"
 
 # the command line
 
-state("gravity-is-of-rests", "the place is for recordings of rests only: leave it out with results")
+state("gravity-is-of-rests", "latitude and height are for recordings of rests only; leave them out with results")
 
 
 @message(
@@ -125,11 +125,11 @@ def frame_not_in_capture(frame: str) -> str:
 
 state(
     "changed-since-its-run",
-    "was changed since its run: start that again to restore it, or give the images by --image-folder",
+    "was changed since its run: run it again to restore it, or give the images by --image-folder",
 )
 
 
-@message(advice="say where: --image-folder", example={"image": "0007.jpg", "folders": ("images",)})
+@message(advice="give its folder with --image-folder", example={"image": "0007.jpg", "folders": ("images",)})
 def picture_missing(image: str, folders: Sequence[str]) -> str:
     return f"the image of its image {image!r} is missing (in {', '.join(folders) or 'no folder of images'})"
 
@@ -163,7 +163,7 @@ def readout_not_told(direction: str) -> str:
 
 @message(example={"camera": 1, "model": "SPHERICAL"})
 def sees_all_around(camera: int, model: str) -> str:
-    return f"camera {camera} ({model}) sees all around, which no pinhole camera does"
+    return f"camera {camera} ({model}) is a panoramic camera, not a pinhole camera"
 
 
 @message(example={"camera": 1, "model": "OPENCV"})
@@ -271,7 +271,7 @@ def no_worker_finished(detail: str) -> str:
 
 state("mesh-without-faces", "a mesh without faces")
 
-state("faces-with-more", "the faces of this mesh are more than lists of vertices")
+state("faces-with-more", "the faces of this mesh have properties besides their lists of vertices")
 
 state("mesh-truncated", "truncated, or a mesh with faces other than triangles")
 
@@ -293,7 +293,7 @@ state(
 )
 
 
-@message(advice="start its run again, which writes it again", example={"detail": "result.json: no models"})
+@message(advice="run it again", example={"detail": "result.json: no models"})
 def result_damaged(detail: str) -> str:
     return f"its result is damaged ({detail})"
 

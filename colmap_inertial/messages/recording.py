@@ -52,7 +52,7 @@ def imu_corrected(attitudes: int) -> str:
 @message(example={"accel_factor": 0.5, "compared": 4})
 def imu_compared(accel_factor: float, compared: int) -> str:
     return (
-        f"the accelerometer's part of the interval is {accel_factor:.2f} times that of an unknown device, "
+        f"the accelerometer's contribution to the interval is {accel_factor:.2f} times that of an unknown device, "
         f"from {compared} results of this device with targets"
     )
 
@@ -155,7 +155,7 @@ state(
     joint=": ",
 )
 state("too-few-pairs-of-frames", "too few pairs of frames to compare with the gyroscope")
-state("camera-hardly-turned", "the camera hardly turned between frames")
+state("camera-hardly-turned", "the camera hardly rotated between frames")
 
 
 @message(example={"explained": 0.4, "flipped": ("x",)})
@@ -226,7 +226,7 @@ def readout_too_loose(readout_sigma_s: float) -> str:
 
 state(
     "readout-not-of-lines",
-    "the distortion runs neither along nor across the rows: the frames were warped, rotated or stabilised",
+    "the distortion is neither along nor across the rows: the frames were warped, rotated or stabilised",
 )
 
 
@@ -240,7 +240,7 @@ def readout_of_even_rotation(change_rad_s: float) -> str:
     return f"the angular rate changes by {change_rad_s:.2g} rad/s from frame to frame, too little to estimate it"
 
 
-state("readout-of-sparse-pictures", "images this far apart in time do not show it; a video does")
+state("readout-of-sparse-pictures", "images this far apart in time do not determine it; a video does")
 state("readout-without-gyroscope", "it needs a video and a gyroscope that fit each other")
 state("readout-of-stabilised-video", "a stabilised video does not show it")
 

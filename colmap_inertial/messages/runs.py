@@ -37,7 +37,7 @@ state("capture-has-no-frames", "has no frames", advice="add [images] or [video]"
 
 @message(advice="leave it out, or take [rig] out", example={"option": "--database"})
 def not_for_rigs(option: str) -> str:
-    return f"{option}: not done for cameras of a rig"
+    return f"{option}: not supported for cameras of a rig"
 
 
 state(
@@ -132,7 +132,7 @@ state("scale-of-another-method", "its scale is not that of the joint method")
 state("device-without-name", "a device needs a name")
 
 
-@message(advice="name it so, as the page beside it ends in .html", example={"out": "phone.html"})
+@message(advice="give a name that ends in .json; the page beside it ends in .html", example={"out": "phone.html"})
 def calibration_is_json(out: str) -> str:
     return f"{out}: the calibration is a JSON file"
 
@@ -267,7 +267,7 @@ def dense_comes_along(folder: str) -> str:
 
 @message(advice="rename or remove it", example={"path": "out/sparse"})
 def place_taken(path: str) -> str:
-    return f"{path} is in the place of the project's"
+    return f"{path} has the name of the project's"
 
 
 @message(advice="choose another output folder", example={"path": "out"})
@@ -302,7 +302,7 @@ def record_unreadable(found: Said, out: str) -> str:
 
 # targets, distances and markers
 
-state("apply-needs-unscaled", "--apply scales a model that claims no unit", advice="add --unscaled", joint=": ")
+state("apply-needs-unscaled", "--apply needs a model without a unit", advice="add --unscaled", joint=": ")
 
 state(
     "markers-needed",
@@ -357,7 +357,7 @@ def marker_not_measured(marker: str, measured: Sequence[int]) -> str:
 
 state(
     "points-need-a-model",
-    "--between with points needs the model that they are of",
+    "--between with points needs the model that they belong to",
     advice="map first (with a target or two markers), or give a COLMAP project",
     joint=": ",
 )
@@ -483,7 +483,7 @@ def owner_unreadable(found: Said, out: str) -> str:
 
 
 @message(
-    advice="start that again, which makes it again",
+    advice="run it again",
     joint=": ",
     example={"found": {"code": "not-a-result", "values": {}}, "lost": "scale.json"},
 )

@@ -10,12 +10,12 @@ from colmap_inertial.messages import message, state
 
 _RECORD_INSTEAD = (
     "move the camera itself back and forth by 20 cm or more, in several directions and briskly, for 10 s or longer, "
-    "while it sees texture; panning, walking straight at one speed and a tripod cannot give a scale"
+    "while it sees texture; panning, walking straight at constant speed, or a tripod cannot give a scale"
 )
 _SWING = "swing the camera back and forth by 20 cm or more, for 10 s or longer, while it sees texture"
 _TURN = "turn the camera about all of its axes while it moves"
 _LONGER = "record longer, with brisker movements of the camera itself in several directions"
-_CLOSE_LOOPS = "close loops while recording, or scale its parts apart"
+_CLOSE_LOOPS = "close loops while recording, or scale its parts separately"
 #: So many places where poses jump, and so many cameras, are said by themselves.
 _MOST_JUMPS, _MOST_CAMERAS = 5, 5
 #: Intervals wider than this are none.
@@ -82,7 +82,7 @@ def scale_unknown(half_width: float | None) -> str:
 
 @message(example={"half_width": 0.05})
 def scale_interval_wide(half_width: float) -> str:
-    return f"the 95 % interval is +-{100 * half_width:.1f} %: more or livelier motion would narrow it"
+    return f"the 95 % interval is +-{100 * half_width:.1f} %: more vigorous or longer motion would narrow it"
 
 
 @message(example={"rate": 0.002})
@@ -104,7 +104,7 @@ def not_observable(quantity: str, why: Any) -> str:
 
 state("scale-without-accelerometer", "the recording has no accelerometer, which a metric scale needs; record it too")
 state("scale-not-estimated", "not estimated")
-state("fit-singular", f"camera and IMU do not determine a scale together: {_RECORD_INSTEAD}")
+state("fit-singular", f"camera and IMU together do not determine the scale: {_RECORD_INSTEAD}")
 state("motion-not-determined", "camera and IMU do not determine its motion")
 state("camera-still", "the camera does not move in the model: move it, do not only turn it")
 state("recording-too-short", "the recording is too short: record at least five seconds")
@@ -135,7 +135,7 @@ def frames_too_sparse_to_differentiate(step_s: float) -> str:
 
 @message(example={"needed_s": 5.0})
 def never_covered(needed_s: float) -> str:
-    needed = f"camera and accelerometer never run together for {needed_s:g} s without a pause"
+    needed = f"camera and accelerometer never overlap for {needed_s:g} s without a pause"
     return f"{needed}: record longer"
 
 
@@ -171,8 +171,8 @@ def poses_not_in_seconds(poses_s: float, imu_s: float, factor: float) -> str:
 
 state(
     "fit-not-converged",
-    "the fit of camera and IMU does not converge: check that stamps are those of the samples, to a "
-    f"millisecond, or {_RECORD_INSTEAD}",
+    "the fit of camera and IMU does not converge: check that the stamps are the sampling times, to a millisecond, or "
+    "{_RECORD_INSTEAD}",
 )
 
 
@@ -195,8 +195,8 @@ def accel_gain_impossible(gain: float) -> str:
 @message(example={"unexplained_m_s2": 1.2, "motion_m_s2": 1.5})
 def accel_contradicts_motion(unexplained_m_s2: float, motion_m_s2: float) -> str:
     return (
-        f"the accelerometer and the camera's motion disagree by {unexplained_m_s2:.2f} m/s2, where the motion itself "
-        f"is {motion_m_s2:.2f} m/s2: check the accelerometer's sign and axes and that both recordings belong "
+        f"the accelerometer and the camera's motion disagree by {unexplained_m_s2:.2f} m/s2 (the motion itself is "
+        f"{motion_m_s2:.2f} m/s2): check the accelerometer's sign and axes and that both recordings belong "
         f"together, or {_RECORD_INSTEAD}"
     )
 
@@ -302,8 +302,8 @@ def fit_hardly_converged(moves_log: float) -> str:
 @message(example={"delay_s": 0.06})
 def accel_delay_undone(delay_s: float) -> str:
     return (
-        f"the accelerometer's stamps are {1e3 * delay_s:+.0f} ms off the gyroscope's, by the fit, which corrects it: "
-        "stamp both sensors when they are sampled"
+        f"the accelerometer's stamps are {1e3 * delay_s:+.0f} ms off the gyroscope's (corrected by the fit): stamp "
+        "both sensors when they are sampled"
     )
 
 
@@ -352,7 +352,7 @@ def path_smoothed(cutoff_hz: float) -> str:
 def accel_axes_apart(delays_s: Sequence[float]) -> str:
     delays = ", ".join(f"{axis} {1e3 * d:+.1f}" for axis, d in zip("xyz", delays_s, strict=True))
     return (
-        f"the accelerometer's axes are sampled at different times ({delays} ms from their mean), which is "
+        f"the accelerometer's axes are sampled at different times ({delays} ms from their mean), which was "
         "corrected: give the stamps of each axis, or a recording that was not resampled axis by axis"
     )
 
@@ -360,8 +360,8 @@ def accel_axes_apart(delays_s: Sequence[float]) -> str:
 @message(example={"rate": 2e-4})
 def accel_clock_apart(rate: float) -> str:
     return (
-        f"the accelerometer's clock runs {1e6 * rate:+.0f} ppm off the gyroscope's, which is corrected: "
-        "stamp both sensors by one clock"
+        f"the accelerometer's clock runs {1e6 * rate:+.0f} ppm off the gyroscope's (corrected): stamp both sensors "
+        "by one clock"
     )
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from colmap_inertial.messages import message, state
 
-_WALK = "move the device sideways by a tenth of the distance to what it sees, or more, while that stays in view"
+_WALK = "move the device sideways by a tenth of the distance to the scene or more, and keep the scene in view"
 
 
 @message(advice="keep the names of depth maps and poses as the app wrote them", example={"maps": 230, "poses": 900})
@@ -18,8 +18,8 @@ def depth_without_poses(maps: int, poses: int) -> str:
 @message(advice=_WALK, example={"count": 3, "needed": 6})
 def depth_pairs_too_few(count: int, needed: int) -> str:
     return (
-        f"only {count} pairs of depth maps show the same surfaces from places apart, and {needed} are needed: "
-        "flat walls alone, glass, and what is farther than five metres give none"
+        f"only {count} pairs of depth maps show the same surfaces from different places; {needed} are needed: "
+        "bare walls, glass and surfaces beyond five metres do not count"
     )
 
 
@@ -53,7 +53,7 @@ def sensor_in_doubt(sensor: str, why: Any) -> str:
 def _advise_on_culprit(culprit: str, **_: Any) -> str:
     return {
         "imu": "calibrate the IMU once (calibrate-imu), and check that frame times are those of the recorder",
-        "depth": "film surfaces nearer than five metres that neither shine nor let light through",
+        "depth": "film matt, opaque surfaces within five metres",
         "device": "its scale wanders: take the others' word",
         "positions": "record under open sky, and over a longer way",
         "target": "measure the printed target again",
@@ -92,13 +92,13 @@ def depth_not_one_channel(shape: Sequence[int]) -> str:
 def depth_of_other_shape(width: int, height: int, of_width: int, of_height: int) -> str:
     return (
         f"is {width} x {height}, which is no smaller version of pictures of {of_width} x {of_height}: depth and "
-        "intrinsics must belong to pictures that are turned and cut alike"
+        "intrinsics must belong to pictures with the same rotation and crop"
     )
 
 
 @message(example={"shape": (96, 128), "depth": (192, 256)})
 def confidence_of_other_size(shape: Sequence[int], depth: Sequence[int]) -> str:
-    return f"is {' x '.join(map(str, shape))}, and its depth map is {' x '.join(map(str, depth))}"
+    return f"is {' x '.join(map(str, shape))}, but its depth map is {' x '.join(map(str, depth))}"
 
 
 @message(example={"dtype": "object"})
@@ -116,7 +116,7 @@ def lzfse_needs_package(path: str) -> str:
 
 @message(example={"layouts": ("Stray Scanner", "Record3D")})
 def no_device_folder(layouts: Sequence[str]) -> str:
-    return f"is no export of a device's own path that is known here ({', '.join(layouts)})"
+    return f"is not a supported export of a device's own path ({', '.join(layouts)})"
 
 
 state(

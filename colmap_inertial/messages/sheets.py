@@ -67,8 +67,8 @@ def no_camera_of_name(name: str, cameras: tuple[str, ...]) -> str:
 
 state("kalibr-pose-missing", "T_cn_cnm1 (its pose against the camera before it) is missing")
 state("sheet-without-intrinsics", "holds no intrinsics")
-state("lens-model-unknown-to-colmap", "prism or tilt coefficients are not known to COLMAP's cameras")
-state("calibration-of-another-kind", "holds no calibration of a camera and an IMU (its kind is another)")
+state("lens-model-unknown-to-colmap", "COLMAP has no camera model with prism or tilt coefficients")
+state("calibration-of-another-kind", "holds no calibration of a camera and an IMU (it is of another kind)")
 state("calibration-cov-order", "cov_parameters: the order of cov is not the one of this version")
 state("no-imu-calibration", "holds no calibration of an IMU (colmap-inertial calibrate-imu writes one)")
 

@@ -214,7 +214,7 @@ def training_of_another_model(path: str) -> str:
 
 @message(example={"path": "exports/splat.ply", "by": "outputs/dataparser_transforms.json"})
 def frame_of_training(path: str, by: str) -> str:
-    return f"{path}: copied unchanged, as its points are in a training's own frame; {by} transforms metres to it"
+    return f"{path}: copied unchanged, as its points are in the frame of a training run; {by} transforms metres to it"
 
 
 @message(example={"path": "transforms.json"})
