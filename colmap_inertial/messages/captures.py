@@ -86,7 +86,7 @@ def not_numbers(count: int | None, found: str) -> str:
 @message(example={"near": ("path",), "known": ("path", "format")})
 def unknown_key(near: Sequence[str], known: Sequence[str]) -> str:
     hint = f'; did you mean "{near[0]}"?' if near else ""
-    return f"unknown key{hint} (known here: {', '.join(known)})"
+    return f"unknown key{hint} (known: {', '.join(known)})"
 
 
 @message(example={"found": "inf"})

@@ -69,11 +69,11 @@ def module_missing(detail: str) -> str:
     },
 )
 def extra_missing(what: Said, extra: str, packages: Sequence[str]) -> str:
-    return f"{what}, which needs the extra `{extra}`"
+    return f"{what} (the extra `{extra}`)"
 
 
-state("needs-onnxruntime", "networks run in onnxruntime")
-state("needs-open3d", "dense_options.mesh tsdf is made by open3d")
+state("needs-onnxruntime", "networks need onnxruntime")
+state("needs-open3d", "dense_options.mesh tsdf needs open3d")
 
 # memory and files
 
@@ -114,11 +114,11 @@ def too_few_files_allowed(allowed: int, needed: int) -> str:
 
 # tools
 
-state("needs-pygltflib", "glTF files are written by pygltflib")
+state("needs-pygltflib", "glTF files need pygltflib")
 
-state("needs-laspy", "LAS files are written by laspy, and put on the map by pyproj")
+state("needs-laspy", "LAS files need laspy and pyproj")
 
-state("needs-viser", "the viewer runs in a browser with viser")
+state("needs-viser", "the viewer needs viser")
 
 state(
     "viser-not-guarded",

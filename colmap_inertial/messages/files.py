@@ -129,7 +129,7 @@ state(
     advice="put the file itself there", joint=": ", example={"name": "a.jpg", "folder": "images", "real": "/data/a.jpg"}
 )
 def link_leads_out(name: str, folder: str, real: str) -> str:
-    return f"names the file {name!r}, which a link leads out of {folder} to {real}; links are not followed"
+    return f"names the file {name!r}, a link out of {folder} to {real}; such links are not followed"
 
 
 state("sqlite-cannot-read", "SQLite cannot read it")

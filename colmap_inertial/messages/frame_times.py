@@ -195,7 +195,7 @@ def pictures_without_row(times: str, untimed: int, count: int, first: str) -> st
     advice="give frame_times under [video] in a capture.toml", example={"video": "a.mp4", "frames": 100, "noted": 99}
 )
 def recorder_noted_other_count(video: str, frames: int, noted: int) -> str:
-    return f"{video} has {frames} frames, but its recorder noted the times of {noted}"
+    return f"{video} has {frames} frames, but its recorder logged the times of {noted}"
 
 
 @message(example={"times_file": "times.csv", "times": 99, "video": "a.mp4", "frames": 100})

@@ -12,7 +12,7 @@ state("frames-not-readable", "describes frames that cannot be read")
 
 @message(example={"name": "gopro", "known": ("auto", "gopro")})
 def imu_format_unknown(name: str, known: Sequence[str]) -> str:
-    return f'unknown IMU format "{name}"; known are {", ".join(known)}'
+    return f'unknown IMU format "{name}"; known: {", ".join(known)}'
 
 
 @message(
@@ -38,7 +38,7 @@ state("no-mp4-index", "has no index of an MP4 or QuickTime file")
 
 @message(example={"fault": {"code": "begins-with-text", "values": {}}})
 def named_like_a_video(fault: Said) -> str:
-    return f"is named like a video and is none that is known here: it {fault}"
+    return f"has the name of a video, but not a known video format: it {fault}"
 
 
 @message(example={"name": "mine", "package": "my-formats", "detail": "KeyError: 'a'"})
@@ -169,7 +169,7 @@ def not_three_axes(letters: str) -> str:
 
 
 state("gpmf-one-payload", "a single payload does not give the sampling rate")
-state("gpmf-stamps-do-not-increase", "the stamps of the payloads do not increase")
+state("gpmf-stamps-do-not-increase", "the timestamps of the payloads do not increase")
 
 
 @message(example={"table": "gyro_accel.csv"})
@@ -204,14 +204,14 @@ def gopro_positions_channels(key: str, channels: int) -> str:
     return f"the {key} stream has {channels} channels"
 
 
-@message(example={"key": "GYRO", "detail": "the stamps of the payloads do not increase"})
+@message(example={"key": "GYRO", "detail": "the timestamps of the payloads do not increase"})
 def gopro_stream_untimed(key: str, detail: str) -> str:
     return f"the {key} stream cannot be timed: {detail}"
 
 
 @message(example={"key": "GYRO", "unit": "rpm", "known": ("rad/s", "deg/s")})
 def gopro_unit(key: str, unit: str, known: tuple[str, ...]) -> str:
-    return f"the {key} stream is in {unit!r}; known here are {', '.join(known)}"
+    return f"the {key} stream is in {unit!r}; known: {', '.join(known)}"
 
 
 @message(example={"key": "GYRO", "detail": "'YY' does not name three axes"})
@@ -240,7 +240,7 @@ state("sensor-logger-rows-missing", "holds no rows of Sensor Logger with sensor,
 state("sensor-logger-without-gyroscope", "holds no gyroscope of Sensor Logger")
 state(
     "sensor-logger-platform-of-rows-unknown",
-    "no row of metadata says whether this is from iOS or Android, and the accelerometer's sign differs",
+    "the row of metadata that tells iOS from Android is missing; the accelerometer's sign differs between the two",
     advice=(
         'describe its rows under [imu.gyro] and [imu.accel] in a capture.toml, with where = ["sensor", '
         '"Gyroscope"] (["name", "gyroscope"] in messages), time = "time", time_unit = "ns", columns = ["x", '
@@ -249,7 +249,7 @@ state(
 )
 state(
     "sensor-logger-platform-unknown",
-    "no Metadata.csv says whether this is from iOS or Android, and the accelerometer's sign differs",
+    "Metadata.csv, which tells iOS from Android, is missing; the accelerometer's sign differs between the two",
     advice="add it, or describe the tables under [imu.gyro] and [imu.accel] in a capture.toml",
 )
 state("bag-without-imu", "holds no sensor_msgs/Imu messages")
@@ -274,12 +274,12 @@ state("bag-index-repeats", "is damaged: its index lists chunks more than once")
     example={"most_mb": 500, "size": 100000},
 )
 def bag_out_of_proportion(most_mb: int, size: int) -> str:
-    return f"unpacks to more than {most_mb} MB, out of proportion to its {size} bytes"
+    return f"unpacks from {size} bytes to more than {most_mb} MB"
 
 
 @message(example={"compression": "snappy"})
 def bag_compression_unknown(compression: str) -> str:
-    return f"is packed by {compression!r}, which is not read"
+    return f"is compressed by {compression!r}, which is not supported"
 
 
 state("bag-chunk-followed", "is damaged: bytes follow the end of a chunk")
@@ -290,7 +290,7 @@ def telemetry_without_gyroscope(camera: str) -> str:
     return f"holds no gyroscope; {camera} writes one where gyro data is switched on"
 
 
-state("counts-without-gyroscope", "holds no gyroscope; its camera writes one where gyro data is switched on")
+state("counts-without-gyroscope", "holds no gyroscope; its camera writes one if gyro data is switched on")
 
 
 @message(example={"sensor": "gyroscope", "detail": "'Unit'"})

@@ -84,7 +84,7 @@ def database_not_usable_here(program: str, version: str, detail: str) -> str:
 
 @message(example={"program": "/usr/bin/colmap", "image": "0007.jpg", "others": 3})
 def features_missing(program: str, image: str, others: int) -> str:
-    return f"{program}: no features of {image}, nor of {others} other images"
+    return f"{program}: no features were written for {image} and {others} other images"
 
 
 state(
@@ -419,7 +419,7 @@ def setting_not_taken(setting: str, why: Said) -> str:
 
 @message(example={"option": "mapping.maper", "nearest": "mapping.mapper", "known": ("mapper", "pairing")})
 def unknown_option(option: str, nearest: str | None, known: Sequence[str]) -> str:
-    return f"unknown option {option}{_did_you_mean(nearest) or '; known here: ' + ', '.join(known)}"
+    return f"unknown option {option}{_did_you_mean(nearest) or '; known: ' + ', '.join(known)}"
 
 
 # workers
@@ -486,7 +486,7 @@ def work_not_wanted(work: str) -> str:
     return f"{work}: cancelled"
 
 
-state("work-needs-dask", "--scheduler runs work on a Dask cluster")
+state("work-needs-dask", "--scheduler uses a Dask cluster")
 state("captures-need-dask", "--scheduler runs captures on a Dask cluster")
 
 

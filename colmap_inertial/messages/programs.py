@@ -9,7 +9,7 @@ from colmap_inertial.messages import Said, message, state
 _MORE_MEMORY = {
     "cuda": "if memory is short, close other programs that use the GPU, or hide it (CUDA_VISIBLE_DEVICES=) to "
     "use the processor",
-    "cpu": "if memory is short, free some: each image in work takes about half a gigabyte",
+    "cpu": "if memory is short, free some: each image in progress takes about half a gigabyte",
 }
 
 
@@ -78,8 +78,8 @@ def not_a_network(detail: str) -> str:
 )
 def wrong_network(takes: Sequence[str], gives: Sequence[str], wanted_takes: Sequence[str], wanted_gives: str) -> str:
     return (
-        f"takes {', '.join(takes)} and gives {', '.join(gives)}; a network that restores images takes "
-        f"{', '.join(wanted_takes)}, all tensor(float), and gives {wanted_gives}"
+        f"has the inputs {', '.join(takes)} and the outputs {', '.join(gives)}; a network that restores images has "
+        f"the inputs {', '.join(wanted_takes)}, all tensor(float), and the output {wanted_gives}"
     )
 
 
@@ -90,7 +90,7 @@ def network_does_not_run(width: int, height: int, detail: str) -> str:
 
 @message(advice="an image must keep its size", example={"made": (1, 3, 16, 24), "given": (1, 3, 32, 48)})
 def network_changes_size(made: Sequence[int], given: Sequence[int]) -> str:
-    return f"makes {made} of {given}"
+    return f"returns {made} for an input of {given}"
 
 
 @message(advice=_AGAIN, example={"network": "lsd2"})
@@ -131,7 +131,7 @@ state(
 
 @message(advice="give its folder with --image-folder", example={"image": "0007.jpg", "folders": ("images",)})
 def picture_missing(image: str, folders: Sequence[str]) -> str:
-    return f"the image of its image {image!r} is missing (in {', '.join(folders) or 'no folder of images'})"
+    return f"the file of its image {image!r} is missing (in {', '.join(folders) or 'no folder of images'})"
 
 
 @message(advice="--unscaled exports it in its own units", example={"reasons": ("the camera hardly accelerates",)})
@@ -158,7 +158,7 @@ state(
 
 @message(advice="export the rectified ones, or rotate the images", example={"direction": "up"})
 def readout_not_told(direction: str) -> str:
-    return f"these images are read out {direction}, which the program does not support"
+    return f"these images are read out in the direction {direction}, which the program does not support"
 
 
 @message(example={"camera": 1, "model": "SPHERICAL"})
@@ -173,7 +173,9 @@ def not_undistorted(camera: int, model: str) -> str:
 
 @message(example={"width": 640, "height": 480, "camera_width": 1920, "camera_height": 1080})
 def picture_of_another_size(width: int, height: int, camera_width: int, camera_height: int) -> str:
-    return f"has {width} x {height} pixels, its camera {camera_width} x {camera_height}: no image of the model"
+    return (
+        f"has {width} x {height} pixels, its camera {camera_width} x {camera_height}: it is not an image of this model"
+    )
 
 
 @message(advice="choose a folder elsewhere", example={"folder": "project", "out": "project/export"})

@@ -69,7 +69,7 @@ def priors_agree(file: str, count: int, kind: str, ratio: float, sigma: float) -
 
 
 @message(
-    advice="the scale or the positions are wrong, or these are no metres; do not give both to one adjustment",
+    advice="the scale or the positions are wrong, or these are not metres; do not give both to one adjustment",
     example={**_PRIORS, "ratio": 3.2, "sigma": 0.1},
 )
 def priors_contradict(file: str, count: int, kind: str, ratio: float, sigma: float) -> str:

@@ -31,7 +31,7 @@ def rows_merged(file: str, sensor: str, count: int) -> str:
 
 @message(example={"file": "imu.csv", "sensor": "gyroscope", "count": 4})
 def rows_averaged(file: str, sensor: str, count: int) -> str:
-    return f"{file}: averaged {count} {sensor} rows that repeat a stamp with other values"
+    return f"{file}: averaged {count} {sensor} rows that repeat a timestamp with other values"
 
 
 @message(example={"file": "imu.csv", "line": 400})
@@ -60,7 +60,7 @@ def imu_compared(accel_factor: float, compared: int) -> str:
 @message(example={"clock_rate": 2.5e-4})
 def imu_clock_stretched(clock_rate: float) -> str:
     return (
-        f"the IMU's clock is {-1e6 * clock_rate:+.0f} ppm off the camera's; the IMU's stamps were rescaled (if the "
+        f"the IMU's clock is {-1e6 * clock_rate:+.0f} ppm off the camera's; the IMU's timestamps were rescaled (if the "
         "camera's clock is wrong, as with a nominal frame rate, lengths are off by twice that)"
     )
 
@@ -302,4 +302,4 @@ def target_doubtful(doubts: tuple[str, ...]) -> str:
 
 @message(example={"file": "imu.csv", "times": 2})
 def clock_began_anew(file: str, times: int) -> str:
-    return f"{file}: the clock restarted {times} times; the stamps were continued"
+    return f"{file}: the clock restarted {times} times; the timestamps were continued"

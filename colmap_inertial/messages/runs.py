@@ -42,8 +42,8 @@ def not_for_rigs(option: str) -> str:
 
 state(
     "database-of-which-images",
-    "--database: the rolling shutter is corrected here. Say --database-images filmed if its keypoints "
-    "were found in the images as filmed, rectified if in those of `deblur --rectify`; or disable the "
+    "--database: the rolling shutter is corrected here. Give --database-images filmed if its keypoints were found in "
+    "the images as filmed, rectified if in those of `deblur --rectify`; or disable the "
     "correction with --rolling-shutter off",
 )
 
@@ -84,12 +84,17 @@ state("capture-has-no-pictures", "has no images", advice="add [images] or [video
 
 state(
     "scale-from-plain-pictures",
-    "--scale-from target or distance takes plain images",
+    "--scale-from target or distance is for plain images",
     advice="fuse them first",
     joint=": ",
 )
 
-state("scale-from-one-camera", "--scale-from target or distance takes one camera", advice="take [rig] out", joint=": ")
+state(
+    "scale-from-one-camera",
+    "--scale-from target or distance is for a single camera",
+    advice="take [rig] out",
+    joint=": ",
+)
 
 # what a device's store takes
 

@@ -71,17 +71,17 @@ def table_open(source: str, open: Sequence[tuple[str, str]], header: str | None,
     begin = f"it does not say {', '.join(said)}"
     if not said:
         begin = (
-            f"it is to be confirmed that this is from {source}"
+            f"it must be confirmed that this is from {source}"
             if source
-            else "holds one sensor, a table beside it the other"
+            else "holds one sensor; a table beside it holds the other"
         )
     return begin + (f"; the header is: {header}" if header else "")
 
 
 def _arrival_advice(jitter_ms: float, hint: str, **_: object) -> str:
     return (
-        f"let the driver stamp its messages, or use their arrival times (uneven by {jitter_ms:.2g} ms; delays "
-        f"stay) by a capture.toml:\n{hint}"
+        f"let the driver timestamp its messages, or use their arrival times (jitter {jitter_ms:.2g} ms; delays "
+        f"remain) by a capture.toml:\n{hint}"
     )
 
 
@@ -106,8 +106,8 @@ def bag_stamps_repeated(path: str, topic: str, count: int, total: int, jitter_ms
 @message(advice=_arrival_advice, example={**_BAG, "count": 7})
 def bag_stamps_jump_back(path: str, topic: str, count: int, total: int, jitter_ms: float, hint: str) -> str:
     return (
-        f"{path}: the header.stamp of {count} of {total} messages of {topic} lies more than half a second behind one "
-        "before it: the driver's clock was set, or drivers with two clocks publish on the topic"
+        f"{path}: the header.stamp of {count} of {total} messages of {topic} is more than half a second before that "
+        "of an earlier message: the driver's clock was set, or drivers with two clocks publish on the topic"
     )
 
 
@@ -117,8 +117,8 @@ def bag_stamps_jump_back(path: str, topic: str, count: int, total: int, jitter_m
 )
 def bag_stamps_jump_ahead(path: str, topic: str, count: int, jump_s: float, jitter_ms: float, hint: str) -> str:
     return (
-        f"{path}: the header.stamp of {count} messages of {topic} jumps ahead, by up to {jump_s:.3g} s more than they "
-        "arrived later: the driver's clock was set"
+        f"{path}: the header.stamp of {count} messages of {topic} jumps ahead by up to {jump_s:.3g} s against their "
+        "times of arrival: the driver's clock was set"
     )
 
 
@@ -133,7 +133,7 @@ def bag_stamps_jump_ahead(path: str, topic: str, count: int, jump_s: float, jitt
     },
 )
 def bag_of_two_clocks(path: str, topics: Sequence[str], apart_s: float, jitter_ms: float, hint: str) -> str:
-    return f"{path}: the header.stamp of {' and '.join(topics)} are of two clocks, {apart_s:.3g} s apart"
+    return f"{path}: the header.stamp of {' and '.join(topics)} come from two clocks, {apart_s:.3g} s apart"
 
 
 @message(

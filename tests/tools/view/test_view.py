@@ -384,7 +384,7 @@ def test_what_is_no_mesh_of_triangles_is_refused(subtests, tmp_path_factory):
         ({"faces": [[0, 1, 2, 4]]}, "faces other than triangles"),
         ({"faces": [[0, 1, 5]]}, "faces other than triangles"),
         ({"cut": 1}, "truncated"),
-        ({"lists": "list uchar int vertex_indices; list uchar int more"}, "more than lists of vertices"),
+        ({"lists": "list uchar int vertex_indices; list uchar int more"}, "besides their lists of vertices"),
         ({"order": None}, "only binary PLY"),
         ({"axes": "xyw"}, "holds no points"),
         ({"vertices": VERTICES[:0]}, "holds no points"),
