@@ -69,7 +69,7 @@ def module_missing(detail: str) -> str:
     },
 )
 def extra_missing(what: Said, extra: str, packages: Sequence[str]) -> str:
-    return f"{what} (the extra `{extra}`)"
+    return f"{what}; install the extra `{extra}`"
 
 
 state("needs-onnxruntime", "networks need onnxruntime")

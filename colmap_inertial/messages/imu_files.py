@@ -295,7 +295,7 @@ state("counts-without-gyroscope", "holds no gyroscope; its camera writes one if 
 
 @message(example={"sensor": "gyroscope", "detail": "'Unit'"})
 def telemetry_not_understood(sensor: str, detail: str) -> str:
-    return f"telemetry-parser gives a {sensor} that is not understood here: {detail}"
+    return f"telemetry-parser gives {sensor} data in an unknown form: {detail}"
 
 
 state("no-gyroscope-samples", "holds no gyroscope samples")
@@ -316,4 +316,4 @@ def ros_recording(path: str) -> str:
 
 @message(example={"path": "a.insv"})
 def needs_telemetry_parser(path: str) -> str:
-    return f"{path} is read by telemetry-parser"
+    return f"{path} needs telemetry-parser"

@@ -229,7 +229,7 @@ def test_intrinsics_count_from_the_corner_or_the_centre_of_the_first_pixel(tmp_p
         ('columns = ["gx", "gy"]', "three names"),
         ("columns = [1, 2, 3]", "none of them the time"),
         ("columns = [0, 2, 3]", "counted from 1"),
-        ("columns = [2, 3, 40]", "there is no column 40"),
+        ("columns = [2, 3, 40]", "column 40 does not exist"),
         ('columns = ["gx", "gy", "gz"]', 'has no column "gx"; the header is'),
     ],
 )

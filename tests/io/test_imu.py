@@ -285,7 +285,7 @@ def test_no_path_and_no_known_layout_are_format_errors(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="not an inertial recording"):
         read_imu(tmp_path)
     (tmp_path / "a.csv").write_text("x")
-    with pytest.raises(FormatError, match="known are auto, euroc"):
+    with pytest.raises(FormatError, match="known: auto, euroc"):
         read_imu(tmp_path / "a.csv", format="eurok")
 
 

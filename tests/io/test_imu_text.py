@@ -70,8 +70,8 @@ def test_a_table_has_its_header_numbers_and_lines(subtests):
             assert cut == Fact("last-line-cut-off", file="a.csv", line=7)
             assert (table.column(1), table.column(3), table.column("y")) == (0, 2, 2)
             for name, said in (
-                (0, "no column 0: columns count from 1 to 3"),
-                (4, "no column 4"),
+                (0, "column 0 does not exist: columns are counted from 1 to 3"),
+                (4, "column 4 does not exist"),
                 ("z", 'no column "z"'),
             ):
                 with pytest.raises(FormatError, match=said):

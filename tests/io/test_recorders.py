@@ -263,7 +263,7 @@ def test_a_recorder_s_folder_is_a_capture(tmp_path: Path, one_clock: ImuRecordin
     assert len(read_capture_imu(capture).gyro_t_s) == len(one_clock.gyro_t_s)
 
     imu_files.write_video_imu_capture(tmp_path, one_clock, frame_ns[:-1])
-    with pytest.raises(TimingError, match="has 12 frames, but its recorder noted the times of 11"):
+    with pytest.raises(TimingError, match="has 12 frames, but its recorder logged the times of 11"):
         read_frame_timing(tmp_path)
 
 
