@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from colmap_inertial.messages import Said, message, state
+from colmap_inertial.messages.shared import say_not_loaded
 
 # packages
 
@@ -39,7 +40,7 @@ def packages_of_one_module(module: str, installed: Mapping[str, str], keep: str)
 
 @message(advice=lambda mend, **_: str(mend), example={"package": "open3d", **_BY_LOADING, "mend": _INSTALLED})
 def package_not_loaded(package: str, detail: str, mend: Said) -> str:
-    return f"{package} cannot be loaded ({detail})"
+    return say_not_loaded(package, detail)
 
 
 @message(
@@ -47,7 +48,7 @@ def package_not_loaded(package: str, detail: str, mend: Said) -> str:
     example={**_BY_LOADING, "mend": _INSTALLED},
 )
 def open3d_not_loaded(detail: str, mend: Said) -> str:
-    return f"open3d cannot be loaded ({detail})"
+    return say_not_loaded("open3d", detail)
 
 
 @message(

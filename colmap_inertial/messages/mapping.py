@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from colmap_inertial.messages import Said, message, state
+from colmap_inertial.messages.shared import say_missing
 
 
 def _give_pose(camera: str, **_: object) -> str:
@@ -25,7 +26,7 @@ def not_an_option_of_colmap(setting: str, version: str, program: str, nearest: s
 
 state(
     "colmap-executable-missing",
-    "no such file",
+    say_missing("file"),
     advice="--colmap-executable takes the path of COLMAP's program (`which colmap`)",
     joint=": ",
 )
@@ -188,7 +189,7 @@ def given_image_of_another_size(image: str, width: int, height: int, capture_wid
     return f"{image} is {width}x{height} there and {capture_width}x{capture_height} in the capture"
 
 
-state("no-given-database", "no such file", advice="--database takes a COLMAP database", joint=": ")
+state("no-given-database", say_missing("file"), advice="--database takes a COLMAP database", joint=": ")
 
 state(
     "database-in-use", "another program has it open, or was stopped while writing", advice="close it there", joint=": "

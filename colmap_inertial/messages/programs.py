@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from colmap_inertial.messages import Said, message, state
+from colmap_inertial.messages.shared import say_existing, say_missing
 
 _MORE_MEMORY = {
     "cuda": "if memory is short, close other programs that use the GPU, or hide it (CUDA_VISIBLE_DEVICES=) to "
@@ -234,7 +235,7 @@ state("not-a-result", "is not the result of a reconstruction")
 
 @message(advice="name a new folder", example={"folder": "scene"})
 def folder_exists(folder: str) -> str:
-    return f"{folder} exists already"
+    return say_existing(folder)
 
 
 # how a capture of a batch ended
@@ -284,9 +285,9 @@ state("ply-not-shown", "only binary PLY files that begin with vertices can be sh
 
 state("holds-no-points", "holds no points")
 
-state("nothing-to-view", "no such folder", advice="give what reconstruct or apply wrote, or a COLMAP model")
+state("nothing-to-view", say_missing("folder"), advice="give what reconstruct or apply wrote, or a COLMAP model")
 
-state("no-folder-of-images", "no such folder of images")
+state("no-folder-of-images", say_missing("folder of images"))
 
 state(
     "run-not-finished",

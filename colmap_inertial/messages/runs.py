@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from colmap_inertial.messages import Said, message, state
+from colmap_inertial.messages.shared import say_existing, say_metric, say_missing
 
 _HOW_TIMES = (
     "give --frame-times (a CSV with name,t_s), --name-times (times in the file names), --exif-times, or --video (the "
@@ -168,7 +169,7 @@ state(
     "them out for a capture, which has its own description",
 )
 
-state("no-folder-of-pictures", "no such folder of images", advice="give the project's images with --images DIR")
+state("no-folder-of-pictures", say_missing("folder of images"), advice="give the project's images with --images DIR")
 
 state(
     "model-without-times",
@@ -233,12 +234,12 @@ def output_is_foreign(path: str) -> str:
 
 @message(advice="choose another name or remove it", example={"path": "capture.toml"})
 def output_exists(path: str) -> str:
-    return f"{path} exists"
+    return say_existing(path)
 
 
 @message(advice="choose another name for the contact sheet", example={"path": "sheet.png"})
 def contact_sheet_exists(path: str) -> str:
-    return f"{path} exists"
+    return say_existing(path)
 
 
 @message(advice="name it so", example={"path": "sheet.jpg"})
@@ -250,7 +251,7 @@ def contact_sheet_is_png(path: str) -> str:
     advice="give COLMAP's own project, or leave the folder as it is with --keep", example={"folder": "project/sparse/0"}
 )
 def already_metric(folder: str) -> str:
-    return f"{folder} already holds a metric scale"
+    return say_metric(folder)
 
 
 @message(advice="leave it out", example={"model": "sparse/0"})
@@ -292,12 +293,12 @@ def output_changed(path: str, out: str) -> str:
 
 @message(advice="name a new folder for the images", example={"path": "pictures"})
 def pictures_exist(path: str) -> str:
-    return f"{path} exists"
+    return say_existing(path)
 
 
 @message(advice="name a new folder for the metric model", example={"path": "metric"})
 def metric_model_exists(path: str) -> str:
-    return f"{path} exists"
+    return say_existing(path)
 
 
 @message(advice=_remove_or_choose, example={"found": {"code": "not-a-result", "values": {}}, "out": "out"})
