@@ -29,10 +29,11 @@ class Scale(DeviceCommand, SourceCommand):
     first_s: float | None = None
     """Use only this many seconds from the start of the camera's recording, and the IMU's samples around them."""
     force: bool = False
-    """Go on where `diagnose` finds an error; the scale is weak at most."""
+    """Continue where `diagnose` finds an error; the scale is then weak at most."""
     options: Annotated[ScaleOptions, arg(name="")] = dataclasses.field(default_factory=ScaleOptions)
     config: Path | None = None
-    """TOML file as OUT/config.toml of a reconstruction: its [scale] table counts; options given here override it."""
+    """TOML file as OUT/config.toml of a reconstruction: only its [scale] table is used; options given here
+    override it."""
 
     def __post_init__(self) -> None:
         if self.first_s is not None and not self.first_s > 0:
