@@ -200,15 +200,28 @@ class SourceCommand(ReadingCommand):
     """IMU recording: a file or folder of a known format, or a capture.toml."""
     frame_times: Path | None = None
     """When the images were taken: a CSV with columns name,t_s, or a capture.toml."""
+    name_times: str | None = None
+    """Times are in the file names: the unit (s, ms, us, ns) of the longest number, its place as in
+    cam0_{ns}_*, or a date as in PXL_%Y%m%d_%H%M%S%f."""
     calibration: tuple[Path, ...] = ()
     """Calibration files of this device: from `align --out`, from `calibrate-imu --out`, or both."""
+
+    def __post_init__(self) -> None:
+        if self.frame_times is not None and self.name_times is not None:
+            raise ValueError("give one of --frame-times and --name-times")
 
     def read_from(self, calibration: tuple[Path, ...] | None = None) -> ScaleSource:
         """Source of poses and IMU, with these calibrations or the given ones."""
         from colmap_inertial.run.commands.scale import ScaleSource
 
         files = self.calibration if calibration is None else calibration
-        return ScaleSource(source=self.source, imu=self.imu, frame_times=self.frame_times, calibration=files)
+        return ScaleSource(
+            source=self.source,
+            imu=self.imu,
+            frame_times=self.frame_times,
+            name_times=self.name_times,
+            calibration=files,
+        )
 
 
 def print_json(content: Mapping[str, Any]) -> None:

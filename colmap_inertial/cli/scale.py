@@ -18,13 +18,13 @@ from colmap_inertial.core.options import ScaleOptions
 class Scale(DeviceCommand, SourceCommand):
     """Metres per unit of an existing model or trajectory.
 
-    SOURCE is a COLMAP model folder (needs --imu and --frame-times), a trajectory in TUM format (needs --imu), or an
-    InertialScale folder. Exit code 3 when the recording does not determine the scale; the reasons say why.
+    SOURCE is a COLMAP model folder (needs --imu, and --frame-times or --name-times), a trajectory in TUM
+    format (needs --imu), or an InertialScale folder. Exit code 3 when the recording does not determine the scale; the reasons say why.
 
     Example: colmap-inertial scale project/sparse/0 --imu imu.csv --frame-times frames.csv --json scale.json
     """
 
-    common: ClassVar = ("imu", "frame_times", "calibration", "json")
+    common: ClassVar = ("imu", "frame_times", "name_times", "calibration", "json")
 
     first_s: float | None = None
     """Use only this many seconds from the start of the camera's recording, and the IMU's samples around them."""
@@ -36,6 +36,7 @@ class Scale(DeviceCommand, SourceCommand):
     override it."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.first_s is not None and not self.first_s > 0:
             raise ValueError(f"first_s must be positive, not {self.first_s:g}")
 

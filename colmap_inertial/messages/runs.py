@@ -174,7 +174,7 @@ state("no-folder-of-pictures", say_missing("folder of images"), advice="give the
 state(
     "model-without-times",
     "a COLMAP model has no frame times",
-    advice="give --frame-times, a CSV with name,t_s",
+    advice="give --frame-times (a CSV with name,t_s) or --name-times (times in the file names)",
     joint=": ",
 )
 
@@ -187,7 +187,10 @@ def not_for_an_existing_model(options: Sequence[str]) -> str:
 state("imu-missing", "the IMU recording: give --imu PATH")
 
 
-state("times-missing", "the times of its images: give --frame-times, a CSV with name,t_s")
+state(
+    "times-missing",
+    "the times of its images: give --frame-times (a CSV with name,t_s) or --name-times (times in the file names)",
+)
 
 
 @message(example={"missing": ({"code": "imu-missing", "values": {}}, {"code": "times-missing", "values": {}})})
