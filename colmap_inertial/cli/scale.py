@@ -19,7 +19,8 @@ class Scale(DeviceCommand, SourceCommand):
     """Metres per unit of an existing model or trajectory.
 
     SOURCE is a COLMAP model folder (needs --imu, and --frame-times or --name-times), a trajectory in TUM
-    format (needs --imu), or an InertialScale folder. Exit code 3 when the recording does not determine the scale; the reasons say why.
+    format (needs --imu), or an InertialScale folder. Exit code 3 when the recording does not determine the scale; the
+    reasons say why.
 
     Example: colmap-inertial scale project/sparse/0 --imu imu.csv --frame-times frames.csv --json scale.json
     """
