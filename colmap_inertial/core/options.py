@@ -320,7 +320,32 @@ class ExposureOptions(CheckedOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class ReconstructOptions(CheckedOptions):
-    """Everything that decides the result of a reconstruction, beside the capture itself."""
+    """Everything that decides the result of a reconstruction, beside the capture itself.
+
+    Each field is the option of ``colmap-inertial reconstruct`` of the same name; ``reconstruct --help-all`` explains
+    them with their defaults.
+
+    Attributes
+    ----------
+    frames, deblur, rolling_shutter
+        Which frames are used, and how blur and rolling shutter are removed.
+    apertures, exposures
+        Of special cameras.
+    mapping, colmap, colmap_project, colmap_executable, database, database_images
+        How COLMAP builds the model.
+    scale, world, georeference
+        The scale, the axes of the metric model, and its position on Earth.
+    join, join_options, refine, fragments
+        Which models are joined, refined and scaled.
+    dense, dense_options
+        The dense reconstruction.
+    calibration
+        Calibration files of the device.
+    deterministic, seed
+        For runs that can be repeated bit by bit.
+    force, limits
+        What stops a run.
+    """
 
     frames: FrameOptions = field(default_factory=FrameOptions)
     """Which frames are used."""
