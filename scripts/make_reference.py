@@ -1,13 +1,15 @@
-"""Write the generated pages: fields of JSON files, messages, scripts.
+"""Write the generated pages: fields of JSON files, messages, scripts, and the tables of the API reference.
 
-    python scripts/make_reference.py            # writes docs/reference/*.md and docs/dev/scripts.md
+    python scripts/make_reference.py            # writes docs/reference/*.md, docs/api.md and docs/dev/scripts.md
     python scripts/make_reference.py --check    # exit code 1 where one of them is stale
 
 Fields come from ``docs/schemas/*.schema.json``, messages from ``colmap_inertial/messages``, scripts
-from the first sentences of their docstrings.
+from the first sentences of their docstrings. ``docs/api.md`` lists its names by hand, section by section; the table
+above each list is made of the names' docstrings.
 """
 
 import ast
+import inspect
 import json
 import re
 import sys
@@ -15,6 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import colmap_inertial
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.messages import all_messages
 
@@ -163,9 +166,33 @@ def messages_page() -> str:
     return "\n".join(lines) + "\n"
 
 
+# --- the API ---------------------------------------------------------------------------------------------------------
+
+
+def api_page(page: str) -> str:
+    """The API reference with a table of the names above each list of ``:::`` lines, which only the site renders."""
+    parts = []
+    for part in re.split(r"(?=^## )", page, flags=re.MULTILINE):
+        names = re.findall(r"^::: colmap_inertial\.(\w+)$", part, re.MULTILINE)
+        if names:
+            rows = ["| name | |", "|---|---|", *(f"| `{name}` | {first_sentence(name)} |" for name in names)]
+            listed = [f"::: colmap_inertial.{name}" for name in names]
+            part = "\n".join([part.splitlines()[0], "", *rows, "", *listed, "", ""])
+        parts.append(part)
+    return "".join(parts).rstrip("\n") + "\n"
+
+
+def first_sentence(name: str) -> str:
+    """The first sentence of a public name's docstring, as Markdown."""
+    text = (inspect.getdoc(getattr(colmap_inertial, name)) or "").split("\n\n")[0].replace("\n", " ")
+    text = re.sub(r":\w+:`~?([^`]+)`", r"`\1`", text.replace("``", "`")).replace("|", "\\|")
+    return re.split(r"\.(?= [A-Z])|\.$", text)[0]
+
+
 def pages() -> dict[Path, str]:
     """Every generated page and its text."""
     made = {DOCS / "dev" / "scripts.md": scripts_page(), DOCS / "reference" / "messages.md": messages_page()}
+    made[DOCS / "api.md"] = api_page((DOCS / "api.md").read_text())
     for path in sorted(DOCS.glob("schemas/*.schema.json")):
         made[DOCS / "reference" / f"{path.name.removesuffix('.schema.json')}.md"] = reference_page(path)
     return made

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Union
+from typing import Annotated, Any, Literal, Union
 
 import tyro
 
@@ -27,13 +27,14 @@ from colmap_inertial.cli.diagnose import Diagnose
 from colmap_inertial.cli.export import Export
 from colmap_inertial.cli.fuse_apertures import FuseApertures
 from colmap_inertial.cli.fuse_exposures import FuseExposures
-from colmap_inertial.cli.help import print_help, print_overview
+from colmap_inertial.cli.help import list_options, print_help, print_overview
 from colmap_inertial.cli.process import INTERRUPTED, TERMINATED, Terminated, answering_signals, require_limits
 from colmap_inertial.cli.reconstruct import Reconstruct
 from colmap_inertial.cli.scale import Scale
 from colmap_inertial.cli.simulate import Simulate
 from colmap_inertial.cli.validate import Validate
 from colmap_inertial.cli.view import View
+from colmap_inertial.core.choices import check_value
 from colmap_inertial.core.errors import InertialError, describe_environment_fault, fact_of
 from colmap_inertial.core.facts import with_sentences
 from colmap_inertial.core.options import ReadLimits, ReconstructOptions
@@ -93,7 +94,23 @@ def parse(args: Sequence[str]) -> Command:
     if not {*_HELP, _HELP_ALL}.isdisjoint(options):
         print_help(name, command, everything=_HELP_ALL in options)
         sys.exit(0)
+    _require_choices(command, options)
     return tyro.cli(command, prog=prog, args=options, default=_read_default(command, options, prog), config=_CONFIG)
+
+
+def _require_choices(command: type[Command], args: Sequence[str]) -> None:
+    """Refuse a value that is not among an option's choices, in the words in which a --config file is refused.
+
+    Raises
+    ------
+    ValueError
+    """
+    choices = {option.label.split()[0]: option.choices for option in list_options(command) if option.choices}
+    for given, following in zip(args, [*args[1:], ""], strict=True):
+        name, equals, value = given.partition("=")
+        name = name.replace("_", "-")
+        if name in choices:
+            check_value(name, value if equals else following, Literal[choices[name]])
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ class Align(SourceCommand):
     out: Path
     """Where to write the calibration (JSON)."""
     remember: str | None = None
-    """Keep the calibration under this name of the device: `reconstruct` and `scale` then use it by themselves."""
+    """Remember the calibration under this device name; `reconstruct` and `scale` then use it automatically."""
 
     def run(self) -> int:
         """Run the command; returns the exit code."""

@@ -34,7 +34,7 @@ class Apply(ReadingCommand):
     """What `colmap-inertial scale --json` wrote; with several sub-models one for each, as NUMBER=FILE, or the
     result.json of a reconstruction."""
     factor: float | None = None
-    """Lengths times this; axes and origin stay."""
+    """Multiply lengths by this; axes and origin stay."""
     sim3: Path | None = None
     """JSON with scale, rotation_xyzw, translation_m (and cov, provenance): x' = scale * R x + translation."""
     undo: bool = False
@@ -46,9 +46,9 @@ class Apply(ReadingCommand):
     keep: tuple[str, ...] = ()
     """Patterns of names or paths in PROJECT that are copied as they are, such as "old/*" or "*.bak"."""
     follow_links: bool = False
-    """Take what symbolic links out of PROJECT lead to into the copy; without, they are refused."""
+    """Copy what symbolic links out of PROJECT point to; otherwise such links are refused."""
     any_model: bool = False
-    """Take a scale that was measured on another model; without, it is refused."""
+    """Apply a scale that was estimated for another model; otherwise it is refused."""
 
     def __post_init__(self) -> None:
         given = (bool(self.scale), self.factor is not None, self.sim3 is not None, self.undo)

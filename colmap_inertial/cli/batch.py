@@ -35,7 +35,7 @@ class Batch(ConfiguredCommand):
     """A new folder, or that of an earlier run."""
     batch: Annotated[BatchOptions, arg(name="")] = dataclasses.field(default_factory=BatchOptions)
     allow_stages: bool = False
-    """Import and run the stages that the manifest names: they are code that its author chose."""
+    """Import and run the stages that the manifest names: they are code of the manifest's author."""
     config: Path | None = None
     """TOML file with options for all captures; options given here override it, the manifest's override both."""
 

@@ -45,7 +45,7 @@ class CalibrateImu(ReadingCommand):
     it."""
     gravity: Annotated[GravityOptions, arg(name="")] = dataclasses.field(default_factory=GravityOptions)
     remember: str | None = None
-    """Keep the calibration under this name of the device: `reconstruct` and `scale` then use it by themselves."""
+    """Remember the calibration under this device name; `reconstruct` and `scale` then use it automatically."""
 
     def __post_init__(self) -> None:
         if not self.recording:

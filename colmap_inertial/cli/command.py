@@ -50,7 +50,7 @@ class Command:
     json: Path | None = None
     """Also write the result as JSON there; - is standard output, which then holds nothing else."""
     quiet: Annotated[bool, _LOUDNESS] = False
-    """Say nothing but errors: no progress, no findings, no result."""
+    """Print errors only: no progress, no findings, no result."""
     verbose: Annotated[bool, _LOUDNESS] = False
     """Also print the log."""
 
@@ -131,7 +131,7 @@ class ReadingCommand(Command):
     """Common options of commands without options of a reconstruction."""
 
     limits: ReadLimits = field(default_factory=ReadLimits)
-    """How large a file may be that is read."""
+    """Limits on files that are read."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,7 +143,7 @@ class ConfiguredCommand(Command):
             "imu", "frame_times", "name_times", "exif_times", "video", "images", "keep", "link", "follow_links",
         ),
         "Metres without an IMU": ("scale_from", "target", "between", "distance"),
-        "Choice of frames": ("frames",),
+        "Frame selection": ("frames",),
         "How COLMAP builds the model": (
             "mapping", "colmap", "colmap_project", "colmap_executable", "database", "database_images", "workers",
             "scheduler",
@@ -151,14 +151,14 @@ class ConfiguredCommand(Command):
         "How metres come from the IMU": ("scale",),
         "Joining, refinement and place": ("join", "join_options", "refine", "georeference", "fragments"),
         "Dense reconstruction": ("dense_options",),
-        "Calibrations kept of a device": ("device", "remembered"),
-        "Runs that can be repeated": ("deterministic", "seed"),
+        "Remembered calibrations of a device": ("device", "remembered"),
+        "Reproducible runs": ("deterministic", "seed"),
     }  # fmt: skip
 
     options: Annotated[ReconstructOptions, arg(name="")] = field(default_factory=ReconstructOptions)
     config: Path | None = None
-    """TOML file with options, as OUT/config.toml of an earlier run; options given here override it, or add to it where
-    they may be repeated."""
+    """TOML file with options, such as OUT/config.toml of an earlier run; options given here override it, or
+    add to it where they may be repeated."""
 
     @property
     def limits(self) -> ReadLimits:
@@ -171,7 +171,7 @@ class DeviceCommand(Command):
     """Common options of commands that use the stored calibrations of a device."""
 
     device: str | None = None
-    """Name under which calibrations of the device were kept by --remember (default: what the recording says)."""
+    """Device name that --remember was given (default: the name in the recording)."""
     remembered: bool = True
     """Use the calibrations that `align` and `calibrate-imu` kept of the device by --remember, where neither
     --calibration nor the capture gives one; never with --deterministic."""
@@ -200,15 +200,28 @@ class SourceCommand(ReadingCommand):
     """IMU recording: a file or folder of a known format, or a capture.toml."""
     frame_times: Path | None = None
     """When the images were taken: a CSV with columns name,t_s, or a capture.toml."""
+    name_times: str | None = None
+    """Times are in the file names: the unit (s, ms, us, ns) of the longest number, its place as in
+    cam0_{ns}_*, or a date as in PXL_%Y%m%d_%H%M%S%f."""
     calibration: tuple[Path, ...] = ()
     """Calibration files of this device: from `align --out`, from `calibrate-imu --out`, or both."""
+
+    def __post_init__(self) -> None:
+        if self.frame_times is not None and self.name_times is not None:
+            raise ValueError("give one of --frame-times and --name-times")
 
     def read_from(self, calibration: tuple[Path, ...] | None = None) -> ScaleSource:
         """Source of poses and IMU, with these calibrations or the given ones."""
         from colmap_inertial.run.commands.scale import ScaleSource
 
         files = self.calibration if calibration is None else calibration
-        return ScaleSource(source=self.source, imu=self.imu, frame_times=self.frame_times, calibration=files)
+        return ScaleSource(
+            source=self.source,
+            imu=self.imu,
+            frame_times=self.frame_times,
+            name_times=self.name_times,
+            calibration=files,
+        )
 
 
 def print_json(content: Mapping[str, Any]) -> None:

@@ -32,7 +32,7 @@ class Deblur(ReadingCommand):
     """A new folder for the results, or that of an earlier run on the same capture, which is continued."""
     method: BlurRemover = "wiener"
     """wiener: a Wiener filter along the path of each pixel. path: along the same path, a filter that expects few and
-    strong edges (slower). deepgyro: a network, which also sees what a filter makes of the picture (slower;
+    strong edges (slower). deepgyro: a network, which is also given the result of a filter (slower;
     needs the extra `restore`)."""
     purpose: Annotated[DeblurPurpose, arg(name="for")] = "viewing"
     """viewing: as sharp as the method makes them. matching: smoothed a little, as `reconstruct` shows them to
@@ -44,7 +44,7 @@ class Deblur(ReadingCommand):
     sheet: Path | None = None
     """Write a PNG with parts of the most blurred frames before and after."""
     overwrite: bool = False
-    """Where OUT holds a finished result of other options: make it again."""
+    """If OUT holds a finished result of other options, make it again."""
 
     def run(self) -> int:
         """Run the command; returns the exit code."""

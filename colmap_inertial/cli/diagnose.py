@@ -33,7 +33,7 @@ class Diagnose(SourceCommand):
     """What would be reconstructed: a capture.toml, a video or a recorder's folder. Or an IMU recording alone; or a
     COLMAP model folder, TUM trajectory or InertialScale folder."""
     capture: Path | None = None
-    """Of a table of samples: write the capture.toml that describes it; what it does not say stays "?"."""
+    """For a table of samples: write the capture.toml that describes it, with "?" for what the table does not state."""
 
     def run(self) -> int:
         """Run the command; returns the exit code."""

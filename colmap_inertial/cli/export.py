@@ -46,10 +46,10 @@ class Export(ReadingCommand):
     """The capture that the run was made of: with --images original for frames that it deblurred or changed, with
     --georeference for its positions."""
     georeference: bool = False
-    """Also say where on Earth everything is (georeference.json, columns of cameras.csv, LAS points in UTM): as the run
-    found it, else by the positions (GPS) of the capture or in the pictures' EXIF."""
+    """Also write the position on Earth (georeference.json, columns of cameras.csv, LAS points in UTM): as the run
+    found it, else by the positions (GPS) of the capture or in the images' EXIF."""
     unscaled: bool = False
-    """Export a model without a scale, too: its units are not metres."""
+    """Also export a model without a scale, whose units are not metres."""
 
     def __post_init__(self) -> None:
         if self.capture is not None and self.images != "original" and not self.georeference:

@@ -16,7 +16,7 @@ from colmap_inertial.core.options import ApertureOptions, FuseAperturesOptions
 
 @dataclass(frozen=True, kw_only=True)
 class FuseApertures(ReadingCommand):
-    """Make RGB pictures of a multi-aperture camera's sub-images.
+    """Make RGB images from the sub-images of a multi-aperture camera.
 
     One disparity map from all apertures takes their parallax out. Writes OUT/images, seen through the first aperture,
     with the names of its pictures; with --refocus OUT/refocused; with --depth OUT/disparity and OUT/depth.
@@ -32,12 +32,12 @@ class FuseApertures(ReadingCommand):
     out: Positional[Path]
     """A new folder, or that of an earlier run on the same capture, which is continued."""
     refocus: float | None = None
-    """Also write pictures that are sharp at this depth only, in metres."""
+    """Also write images that are sharp at this depth only, in metres."""
     lens_width: float = 1.0
-    """Width of the lens that refocused pictures show, in distances between the first two apertures."""
+    """Width of the lens that refocused images show, in distances between the first two apertures."""
     fusion: Annotated[ApertureOptions, arg(name="")] = dataclasses.field(default_factory=ApertureOptions)
     overwrite: bool = False
-    """Where OUT holds a finished result of other options: make it again."""
+    """If OUT holds a finished result of other options, make it again."""
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
@@ -48,7 +48,7 @@ class FuseApertures(ReadingCommand):
         self.check_json(self.capture)
         with self.progress() as screen:
             written = fuse_captured(self.capture, self.out, options, overwrite=self.overwrite, progress=screen)
-        lines = [f"{len(written)} pictures in {self.out / 'images'}"]
+        lines = [f"{len(written)} images in {self.out / 'images'}"]
         self.tell(
             lambda: show_fused(lines, screen),
             Workspace(self.out).result,

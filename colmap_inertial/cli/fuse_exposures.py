@@ -15,10 +15,10 @@ from colmap_inertial.core.options import ExposureOptions
 
 @dataclass(frozen=True, kw_only=True)
 class FuseExposures(ReadingCommand):
-    """Make one clean, sharp picture of each short and long exposure.
+    """Make one clean, sharp image of each short and long exposure.
 
     The long one is brought to the short one's geometry, by the gyroscope where there is one and by the pixels; a
-    network makes one picture of the two (needs the extra `restore`). Writes OUT/images with the short ones' names,
+    network makes one image of the two (needs the extra `restore`). Writes OUT/images with the short ones' names,
     sizes, formats and metadata, as bright as the long ones, and OUT/result.json with what was done to each.
 
     Example: colmap-inertial fuse-exposures my_capture/capture.toml out --fusion mertens
@@ -27,17 +27,17 @@ class FuseExposures(ReadingCommand):
     resumes: ClassVar = True
 
     capture: Positional[Path]
-    """A capture.toml with [images] and [exposures], or a folder that holds one; times and an IMU are welcome."""
+    """A capture.toml with [images] and [exposures], or a folder that holds one; times and an IMU are optional."""
     out: Positional[Path]
     """A new folder, or that of an earlier run on the same capture, which is continued."""
     fusion: Literal["none", "mertens"] = "none"
-    """Blend the fused picture with the short exposure, which shows what clips in the long one."""
+    """Blend the fused image with the short exposure, which shows what clips in the long one."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """What the network runs on; auto: CUDA where onnxruntime has it."""
     calibration: tuple[Path, ...] = ()
     """Calibration files of this device: from `align --out`, from `calibrate-imu --out`, or both."""
     overwrite: bool = False
-    """Where OUT holds a finished result of other options: make it again."""
+    """If OUT holds a finished result of other options, make it again."""
 
     def run(self) -> int:
         """Run the command; returns the exit code."""

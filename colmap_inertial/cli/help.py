@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 _TYPES = {Path: "PATH", int: "INT", float: "FLOAT", str: "TEXT"}
 _WIDEST, _LABEL_WIDTH, _LONG = 100, 30, 120
-_ARGUMENTS, _OPTIONS, _REST, _EVERYWHERE = "Arguments", "Options", "Less common", "Of every command"
+_ARGUMENTS, _OPTIONS, _REST, _EVERYWHERE = "Arguments", "Options", "Less common", "Options of every command"
 _PAGES = (("-h, --help", "The common options."), ("--help-all", "All options, by topic."))
 #: Groups of options that special cameras have; commands of their own explain them.
 _SPECIAL = ("apertures", "exposures")
@@ -53,6 +53,8 @@ class Option:
         Whether it is an argument, and whether it must be there.
     source
         The class that has it.
+    choices
+        The values that it takes; empty where they are not listed.
     """
 
     label: str
@@ -62,6 +64,7 @@ class Option:
     positional: bool
     required: bool
     source: type[Any]
+    choices: tuple[str, ...]
 
 
 def list_options(cls: type[Any], group: str = "") -> Iterator[Option]:
@@ -93,13 +96,20 @@ def list_options(cls: type[Any], group: str = "") -> Iterator[Option]:
             positional=positional,
             required=required,
             source=next(base for base in reversed(cls.__mro__) if f.name in vars(base).get("__annotations__", ())),
+            choices=get_args(_leave_out_none(kind)) if get_origin(_leave_out_none(kind)) is Literal else (),
         )
+
+
+def _leave_out_none(kind: Any) -> Any:
+    """The type of an option's value where it is given."""
+    if get_origin(kind) in (Union, UnionType):
+        (kind,) = (part for part in get_args(kind) if part is not NoneType)
+    return kind
 
 
 def _describe_value(kind: Any) -> str:
     """What follows an option of a type; nothing follows a switch."""
-    if get_origin(kind) in (Union, UnionType):
-        (kind,) = (part for part in get_args(kind) if part is not NoneType)
+    kind = _leave_out_none(kind)
     if get_origin(kind) is Literal:
         choices = f"{{{','.join(map(str, get_args(kind)))}}}"
         return choices if len(choices) <= _LABEL_WIDTH else choices.replace(",", ", ")
@@ -184,7 +194,7 @@ def print_overview(description: str, groups: Mapping[str, Mapping[str, type[Comm
         _print_section(console, title, first.items())
     _print_section(
         console,
-        "How large files may be that any command reads",
+        "Limits on files that any command reads",
         [(option.label, option.text) for option in list_options(limits, "limits")],
     )
 

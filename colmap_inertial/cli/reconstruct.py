@@ -44,10 +44,10 @@ class Reconstruct(DeviceCommand, ConfiguredCommand):
     project: Annotated[ProjectOptions, arg(name="")] = dataclasses.field(default_factory=ProjectOptions)
     reference: Annotated[ReferenceOptions, arg(name="")] = dataclasses.field(default_factory=ReferenceOptions)
     workers: int | None = None
-    """Processes that map the parts of a long capture; by default one for each processor. Their number does not change
+    """Processes that map the parts of a long capture (default: one per processor). Their number does not change
     the result."""
     overwrite: bool = False
-    """Where OUT holds a finished result of other options, or of a recording that was changed since: make again in place
+    """If OUT holds a finished result of other options, or of a recording that was changed since, make again in place
     what depends on that, and keep the rest."""
     scheduler: str | None = None
     """Address of a Dask scheduler (tcp://host:8786), whose workers find features, match pairs and map parts (needs the

@@ -18,23 +18,26 @@ from colmap_inertial.core.options import ScaleOptions
 class Scale(DeviceCommand, SourceCommand):
     """Metres per unit of an existing model or trajectory.
 
-    SOURCE is a COLMAP model folder (needs --imu and --frame-times), a trajectory in TUM format (needs --imu), or an
-    InertialScale folder. Exit code 3 when the recording does not determine the scale; the reasons say why.
+    SOURCE is a COLMAP model folder (needs --imu, and --frame-times or --name-times), a trajectory in TUM
+    format (needs --imu), or an InertialScale folder. Exit code 3 when the recording does not determine the scale; the
+    reasons say why.
 
     Example: colmap-inertial scale project/sparse/0 --imu imu.csv --frame-times frames.csv --json scale.json
     """
 
-    common: ClassVar = ("imu", "frame_times", "calibration", "json")
+    common: ClassVar = ("imu", "frame_times", "name_times", "calibration", "json")
 
     first_s: float | None = None
     """Use only this many seconds from the start of the camera's recording, and the IMU's samples around them."""
     force: bool = False
-    """Go on where `diagnose` finds an error; the scale is weak at most."""
+    """Continue where `diagnose` finds an error; the scale is then weak at most."""
     options: Annotated[ScaleOptions, arg(name="")] = dataclasses.field(default_factory=ScaleOptions)
     config: Path | None = None
-    """TOML file as OUT/config.toml of a reconstruction: its [scale] table counts; options given here override it."""
+    """TOML file as OUT/config.toml of a reconstruction: only its [scale] table is used; options given here
+    override it."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.first_s is not None and not self.first_s > 0:
             raise ValueError(f"first_s must be positive, not {self.first_s:g}")
 

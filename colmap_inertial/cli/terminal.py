@@ -236,11 +236,11 @@ def show_table(report: TableReport, written: Path | None) -> None:
         table.add_row(str(column.number), Text(column.name), kind, Text(column.unit), *numbers, rate)
     open_console().print(table)
     for reason in report.why:
-        say(f"read so because {reason}")
+        say(f"interpreted so because {reason}")
     if written is not None:
-        say(f"{written} describes it{'; fill in what is ?' if report.is_open else ''}")
+        say(f"{written} describes it{'; replace each ?' if report.is_open else ''}")
         return
-    fill = ", ? is to be filled in" if report.is_open else ""
+    fill = "; replace each ?" if report.is_open else ""
     say(f"as a capture.toml (--capture FILE writes it{fill}):\n{report.toml}")
 
 
@@ -249,7 +249,7 @@ _KINDS = {
     "gyro": "gyroscope",
     "accel": "accelerometer",
     "linear": "acceleration without gravity",
-    "axis": "an axis of something",
+    "axis": "an axis, quantity unknown",
 }
 
 
@@ -432,6 +432,6 @@ def show_view(out: Path, url: str, host: str) -> None:
     say(f"{out} is shown at {url} (Ctrl-C ends this)")
     if not is_loopback(host):
         say(
-            f"listening at {host}: everybody on the network who knows this address sees the model and its images, "
+            f"listening on {host}: anyone on the network who knows this address sees the model and its images, "
             "unencrypted; from elsewhere, ssh -L to this machine is safer"
         )

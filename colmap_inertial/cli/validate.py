@@ -32,7 +32,8 @@ class Validate(ReadingCommand):
     images: Path
     """Folder with the model's images (OUT/images of a reconstruction)."""
     target: str
-    """What to look for, as above."""
+    """What to look for: checkerboard:COLSxROWS:SQUARE_M (inner corners), or a charuco, aprilgrid or aruco target
+    (--help-all has their forms)."""
     pictures: Path | None = None
     """Folder for frames with the corners drawn in and a plot of the distances."""
     tolerance: float = 2.0

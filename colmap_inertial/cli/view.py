@@ -31,9 +31,9 @@ class View(ReadingCommand):
     max_points: int = 400_000
     """Show no more points than this, evenly chosen."""
     port: int = 8080
-    """Port to listen at; one that is taken makes way for the next free one, 0 takes any."""
+    """Port to listen on; the next free one if it is taken, any free one for 0."""
     host: str = "127.0.0.1"
-    """Address to listen at: this machine alone, or 0.0.0.0 for everybody on the network who knows the address shown."""
+    """Address to listen on: this machine alone, or 0.0.0.0 for anyone on the network who knows the address shown."""
 
     def __post_init__(self) -> None:
         if self.max_points < 1:

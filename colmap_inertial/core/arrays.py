@@ -81,7 +81,7 @@ def check_increasing(name: str, t_s: Array) -> None:
     if len(t_s) > 1 and t_s[-1] - t_s[0] > LONGEST_S:
         raise ValueError(
             f"{name}: spans {t_s[-1] - t_s[0]:.3g}, in seconds {(t_s[-1] - t_s[0]) / 86400:.3g} days; give seconds, "
-            "not nanoseconds, microseconds or milliseconds (the first stamp as epoch_ns, where there is one)"
+            "not nanoseconds, microseconds or milliseconds (the first timestamp as epoch_ns, where there is one)"
         )
 
 

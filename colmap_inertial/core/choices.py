@@ -108,7 +108,7 @@ def _shorten(value: object) -> str:
     return text if len(text) <= 80 else f"a {type(value).__name__}"
 
 
-_KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
+_KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a string"}
 
 
 def _describe(kinds: tuple[Any, ...]) -> str:
@@ -118,7 +118,9 @@ def _describe(kinds: tuple[Any, ...]) -> str:
             words.append("one of " + ", ".join(map(repr, typing.get_args(kind))))
         elif typing.get_origin(kind) is tuple:
             arguments = typing.get_args(kind)
-            words.append("a list of texts" if arguments[-1] is ... else f"{len(arguments)} of {arguments[0].__name__}")
+            words.append(
+                "a list of strings" if arguments[-1] is ... else f"{len(arguments)} of {arguments[0].__name__}"
+            )
         elif kind is not type(None):
             words.append(_KINDS.get(kind, f"a {getattr(kind, '__name__', kind)}"))
     return " or ".join(words)

@@ -56,11 +56,11 @@ class ReadLimits(CheckedOptions):
     """Limits on the size of files: above those of any camera or recorder, below what exhausts the memory."""
 
     megapixels: float = 250
-    """Pictures of more pixels (millions) are not decoded."""
+    """Images with more pixels (millions) are not decoded."""
     table_columns: int = 10_000
-    """Tables of more columns are not read."""
+    """Tables with more columns are not read."""
     file_gib: float = 4
-    """Texts, tables and pictures in larger files (GiB) are not read."""
+    """Larger text, table and image files (GiB) are not read."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -86,7 +86,7 @@ class MappingOptions(CheckedOptions):
     first_octave: int = -1
     """SIFT: -1 starts at twice the image size (COLMAP's default), 0 at the image size (three times faster)."""
     features: Literal["sift", "aliked"] = "sift"
-    """What is found and matched. aliked (experimental): learned features with LightGlue, where pycolmap is built with
+    """Features to find and match. aliked (experimental): learned features with LightGlue, where pycolmap is built with
     ONNX; other features come by --database."""
     mapper: Literal["incremental", "global"] = "incremental"
     """COLMAP's mapper."""
@@ -207,10 +207,10 @@ class FrameOptions(CheckedOptions):
     """auto: as many frames as the motion needs, each the sharpest of its neighbours. Not given: auto for a video, all
     images of a folder."""
     min_fps: float = 4.0
-    """At least so many frames a second, while the picture moves. The scale's error does not grow down to 4; at 2 it
+    """Lowest number of frames per second, while the image moves. The scale's error does not grow down to 4; at 2 it
     doubles, at 1 it is three times as large."""
     max_fps: float = 10.0
-    """At most so many frames a second."""
+    """Highest number of frames per second."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -282,17 +282,17 @@ class ApertureOptions(CheckedOptions):
     """Options of the fusion of a multi-aperture camera's pictures."""
 
     cost: Literal["census", "mutual-information"] = "census"
-    """What pixels of different colour are compared by: the order of brightness around them, or how their brightness
-    goes together over the whole picture."""
+    """How pixels of different colour are compared: by the order of brightness around them, or by the joint
+    statistics of brightness over the whole image."""
     disparity_px: tuple[float, float] | None = None
     """Least and largest shift between the reference and its partner to search, in pixels, below zero for what lies
-    behind infinity (default: found for each exposure in a smaller picture)."""
+    behind infinity (default: found for each exposure in a smaller image)."""
     step_px: float = 0.5
     """Spacing of the shifts that are tried; between them a parabola is fitted."""
     luminance_cost: bool = True
-    """Also compare the luminance aperture with what the colours add up to, where there are all four."""
+    """Also compare the luminance aperture with the sum of the colours, where all four are there."""
     use_luminance: bool = True
-    """Let an aperture without colour filter lend its lower noise to the colours."""
+    """Reduce the noise of the colours by an aperture without colour filter."""
     depth: bool = False
     """Also keep disparities (pixels) and depths (metres) as NumPy files; nan where they were not measured."""
     threads: int | None = None
@@ -313,14 +313,39 @@ class ExposureOptions(CheckedOptions):
     fuse: bool = True
     """Fuse them; otherwise the short ones are used as they were filmed."""
     fusion: Literal["none", "mertens"] = "none"
-    """Blend the fused picture with the short exposure, which shows what clips in the long one."""
+    """Blend the fused image with the short exposure, which shows what clips in the long one."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """What the network runs on; auto: CUDA where onnxruntime has it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReconstructOptions(CheckedOptions):
-    """Everything that decides the result of a reconstruction, beside the capture itself."""
+    """Everything that decides the result of a reconstruction, beside the capture itself.
+
+    Each field is the option of ``colmap-inertial reconstruct`` of the same name; ``reconstruct --help-all`` explains
+    them with their defaults.
+
+    Attributes
+    ----------
+    frames, deblur, rolling_shutter
+        Which frames are used, and how blur and rolling shutter are removed.
+    apertures, exposures
+        Of special cameras.
+    mapping, colmap, colmap_project, colmap_executable, database, database_images
+        How COLMAP builds the model.
+    scale, world, georeference
+        The scale, the axes of the metric model, and its position on Earth.
+    join, join_options, refine, fragments
+        Which models are joined, refined and scaled.
+    dense, dense_options
+        The dense reconstruction.
+    calibration
+        Calibration files of the device.
+    deterministic, seed
+        For runs that can be repeated bit by bit.
+    force, limits
+        What stops a run.
+    """
 
     frames: FrameOptions = field(default_factory=FrameOptions)
     """Which frames are used."""
@@ -339,7 +364,7 @@ class ReconstructOptions(CheckedOptions):
     colmap: tuple[str, ...] = ()
     """Options of COLMAP's own, each as SECTION.option=value, such as Mapper.init_num_trials=100."""
     colmap_project: Path | None = None
-    """A project.ini of COLMAP: what differs in it from COLMAP's defaults is used; --colmap goes before it."""
+    """A project.ini of COLMAP: its values that differ from COLMAP's defaults are used; --colmap overrides it."""
     colmap_executable: Path | None = None
     """An installed COLMAP (3.8 or newer), such as one with CUDA, which finds and matches features and maps. pycolmap
     verifies matches, and maps long captures (in parts) and with --mapping.mapper global."""
@@ -355,7 +380,7 @@ class ReconstructOptions(CheckedOptions):
     """inertial: where COLMAP made several models of one recording, join those whose relative pose the IMU determines
     well enough (see --join-options); off: keep them apart."""
     join_options: JoinOptions = field(default_factory=JoinOptions)
-    """Up to where they are joined."""
+    """Limits up to which they are joined."""
     refine: RefineMethod = "auto"
     """inertial: fit image observations, rolling shutter and IMU together, which reduces bending and drift of the metric
     model; kept only where it predicts observations better. auto: where that is expected to bring the path closer with
@@ -363,8 +388,8 @@ class ReconstructOptions(CheckedOptions):
     world: WorldAxes = "z-up"
     """Axes of the metric model: z away from the ground, or y towards it, as COLMAP's own cameras have it."""
     georeference: bool = False
-    """Find out where on Earth the model stands, by the positions (GPS) in the video's telemetry or the pictures' EXIF:
-    heading and place, never the scale."""
+    """Find the model's position on Earth by the positions (GPS) in the video's telemetry or the images'
+    EXIF: heading and place, never the scale."""
     dense: bool = False
     """Also compute depth maps (faster with CUDA), a fused point cloud and a mesh, in metres."""
     dense_options: DenseOptions = field(default_factory=DenseOptions)
@@ -382,7 +407,7 @@ class ReconstructOptions(CheckedOptions):
     """Continue where the check of the recording finds an error that makes metres meaningless; the verdict is then at
     most weak."""
     limits: ReadLimits = field(default_factory=ReadLimits)
-    """How large a file may be that is read."""
+    """Limits on files that are read."""
 
     def __post_init__(self) -> None:
         given: Any = self.calibration
@@ -439,13 +464,13 @@ class BatchOptions(CheckedOptions):
     """Workers of a batch."""
 
     workers: int | None = None
-    """Captures in work at once on this machine. Not given: what processors and free memory allow."""
+    """Captures processed at once on this machine (default: as many as processors and free memory allow)."""
     scheduler: str | None = None
     """Address of a Dask scheduler (tcp://host:8786), whose workers do the work instead (needs the extra `cluster`)."""
     attempts: int = 3
-    """How often a capture is started in all, where its process or its worker is killed."""
+    """How many times a capture is started in all, if its process or its worker is killed."""
     overwrite: bool = False
-    """Where a finished capture is given other options, or was changed: make again what depends on that."""
+    """If a finished capture is given other options, or was changed, make again what depends on that."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -462,9 +487,9 @@ class FuseAperturesOptions(CheckedOptions):
     fusion: ApertureOptions = field(default_factory=ApertureOptions)
     """How they are fused."""
     refocus: float | None = None
-    """Also write pictures that are sharp at this depth only, in metres (or in the calibration's own unit)."""
+    """Also write images that are sharp at this depth only, in metres (or in the calibration's own unit)."""
     lens_width: float = 1.0
-    """Width of the lens that refocused pictures show, in distances between the reference and its partner."""
+    """Width of the lens that refocused images show, in distances between the reference and its partner."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -86,7 +86,7 @@ def not_numbers(count: int | None, found: str) -> str:
 @message(example={"near": ("path",), "known": ("path", "format")})
 def unknown_key(near: Sequence[str], known: Sequence[str]) -> str:
     hint = f'; did you mean "{near[0]}"?' if near else ""
-    return f"unknown key{hint} (known here: {', '.join(known)})"
+    return f"unknown key{hint} (known: {', '.join(known)})"
 
 
 @message(example={"found": "inf"})
@@ -211,7 +211,7 @@ def long_exposure_far(times: str, short: str, late_s: float) -> str:
     )
 
 
-state("delay-beside-times", "stands in place of times", advice="leave one of them out")
+state("delay-beside-times", "excludes times", advice="leave one of them out")
 state("rig-without-cameras", "needs a table [rig.NAME] for each camera but the main one")
 state("pose-of-some-cameras", "give cam_from_reference of each camera, or of none")
 state("calibration-without-unit", "holds lengths without a unit", advice='give unit = "m" or "mm"')
@@ -271,12 +271,12 @@ def not_a_row_choice(found: str) -> str:
     example={"axes": "-x,y,z"},
 )
 def axes_mirror(axes: str) -> str:
-    return f'"{axes}" turn a right-handed frame into a left-handed one'
+    return f'"{axes}" turns a right-handed frame into a left-handed one'
 
 
 @message(example={"axes": "x,y,z"})
 def axes_do_not_mirror(axes: str) -> str:
-    return f'is true, but axes = "{axes}" keep the handedness'
+    return f'is true, but axes = "{axes}" keeps the handedness'
 
 
 @message(example={"model": "PINHOLE", "count": 4, "found": 3})

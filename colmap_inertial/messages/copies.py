@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from colmap_inertial.messages import Said, message, state
+from colmap_inertial.messages.shared import say_existing, say_metric, say_missing
 
 _KEEP = "leave the file out with --keep"
 
@@ -34,12 +35,12 @@ state("no-registered-image", "the model has no registered image")
 
 @message(advice="apply it to COLMAP's own model", example={"folder": "sparse/0", "provenance": "inertial scale"})
 def metric_already(folder: str, provenance: str) -> str:
-    return f"{folder} already holds a metric scale ({provenance})"
+    return say_metric(folder, provenance)
 
 
 @message(advice="choose another folder or remove it", example={"path": "metric"})
 def target_exists(path: str) -> str:
-    return f"{path} exists already"
+    return say_existing(path)
 
 
 @message(example={"why": {"code": "records-claimed", "values": {"count": 3}}})
@@ -211,14 +212,14 @@ state("neither-file-nor-folder", "neither a file nor a folder", advice="move it 
     example={"folder": "project/sparse/0", "provenance": "inertial scale"},
 )
 def metric_already_in_project(folder: str, provenance: str) -> str:
-    return f"{folder} already holds a metric scale ({provenance})"
+    return say_metric(folder, provenance)
 
 
 state("not-a-record-of-apply", "not the record of a project that colmap-inertial apply wrote")
 
 state("models-not-as-recorded", "the models of the project are not those that it records")
 
-state("no-such-folder", "no such folder")
+state("no-such-folder", say_missing("folder"))
 
 state(
     "owner-unknown",

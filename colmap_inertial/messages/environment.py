@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from colmap_inertial.messages import Said, message, state
+from colmap_inertial.messages.shared import say_not_loaded
 
 # packages
 
@@ -33,13 +34,13 @@ def install_on_debian(package: str) -> str:
 def packages_of_one_module(module: str, installed: Mapping[str, str], keep: str) -> str:
     named = " and ".join(f"{name} {version}" for name, version in installed.items())
     return (
-        f"{named} are installed, and each brings the module {module}: the files of the last one overwrote the others'"
+        f"{named} are installed, and each provides the module {module}: the files of the last one overwrote the others'"
     )
 
 
 @message(advice=lambda mend, **_: str(mend), example={"package": "open3d", **_BY_LOADING, "mend": _INSTALLED})
 def package_not_loaded(package: str, detail: str, mend: Said) -> str:
-    return f"{package} cannot be loaded ({detail})"
+    return say_not_loaded(package, detail)
 
 
 @message(
@@ -47,7 +48,7 @@ def package_not_loaded(package: str, detail: str, mend: Said) -> str:
     example={**_BY_LOADING, "mend": _INSTALLED},
 )
 def open3d_not_loaded(detail: str, mend: Said) -> str:
-    return f"open3d cannot be loaded ({detail})"
+    return say_not_loaded("open3d", detail)
 
 
 @message(
@@ -69,17 +70,17 @@ def module_missing(detail: str) -> str:
     },
 )
 def extra_missing(what: Said, extra: str, packages: Sequence[str]) -> str:
-    return f"{what}, which needs the extra `{extra}`"
+    return f"{what}; install the extra `{extra}`"
 
 
-state("needs-onnxruntime", "networks run in onnxruntime")
-state("needs-open3d", "dense_options.mesh tsdf is made by open3d")
+state("needs-onnxruntime", "networks need onnxruntime")
+state("needs-open3d", "dense_options.mesh tsdf needs open3d")
 
 # memory and files
 
 state(
     "memory-used-up",
-    "the memory is used up",
+    "out of memory",
     advice="close other programs, or allow smaller images or fewer processes",
     joint=": ",
 )
@@ -114,15 +115,15 @@ def too_few_files_allowed(allowed: int, needed: int) -> str:
 
 # tools
 
-state("needs-pygltflib", "glTF files are written by pygltflib")
+state("needs-pygltflib", "glTF files need pygltflib")
 
-state("needs-laspy", "LAS files are written by laspy, and put on the map by pyproj")
+state("needs-laspy", "LAS files need laspy and pyproj")
 
-state("needs-viser", "the viewer runs in a browser with viser")
+state("needs-viser", "the viewer needs viser")
 
 state(
     "viser-not-guarded",
-    "this version of viser cannot be kept to this machine's own user",
+    "this version of viser cannot be restricted to this machine's user",
     advice="install viser 1.1",
     joint=": ",
 )
@@ -140,4 +141,6 @@ def no_port_free(port: int, host: str) -> str:
 
 # the report
 
-state("plotly-missing", "plotly is not installed, which draws the report", advice="pip install 'plotly>=6'", joint=": ")
+state(
+    "plotly-missing", "plotly, which draws the report, is not installed", advice="pip install 'plotly>=6'", joint=": "
+)

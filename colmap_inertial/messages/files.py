@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from colmap_inertial.messages import Said, message, state
+from colmap_inertial.messages.shared import say_missing
 
 # what the gate of all readers says
 
@@ -86,7 +87,7 @@ def file_too_large(largest_gib: float, what: str) -> str:
 
 @message(example={"what": "file"})
 def no_such_file(what: str) -> str:
-    return f"no such {what}"
+    return say_missing(what)
 
 
 @message(example={"detail": "Permission denied"})
@@ -129,7 +130,7 @@ state(
     advice="put the file itself there", joint=": ", example={"name": "a.jpg", "folder": "images", "real": "/data/a.jpg"}
 )
 def link_leads_out(name: str, folder: str, real: str) -> str:
-    return f"names the file {name!r}, which a link leads out of {folder} to {real}; links are not followed"
+    return f"names the file {name!r}, a link out of {folder} to {real}; such links are not followed"
 
 
 state("sqlite-cannot-read", "SQLite cannot read it")

@@ -23,7 +23,7 @@ _MAP_AGAIN = (
     "overlap between images"
 )
 _READ_AGAIN = "correct this and run diagnose again: checks that depend on it were skipped"
-_REPAIRED = "nothing: repaired while reading; if it is frequent, check the logger"
+_REPAIRED = "none (repaired while reading); if it is frequent, check the logger"
 _PAUSES = "the scale bridges it with a larger uncertainty; close other apps or log to a faster card, and record again"
 _COUNTS = "for raw counts zero and counts_per_unit, by the sensor's data sheet, in capture.toml"
 _IN_G = 'set unit = "g" under [imu.accel] in capture.toml'
@@ -38,12 +38,12 @@ _UNITS = {"gyroscope": "rad/s", "accelerometer": "m/s2"}
 
 def _rates(largest_rad_s: float, median_rad_s: float, sensor_ends_rad_s: float) -> str:
     return (
-        f"the gyroscope reads up to {largest_rad_s:.4g} rad/s, with a median of {median_rad_s:.3g} (hand-held motion "
-        f"reaches about 5, a sensor's range ends at {sensor_ends_rad_s:g})"
+        f"the gyroscope's rate is up to {largest_rad_s:.4g} rad/s, with a median of {median_rad_s:.3g} (hand-held "
+        f"motion reaches about 5, sensors measure up to {sensor_ends_rad_s:g})"
     )
 
 
-_GRAVITY_MOVES = "rotated by the gyroscope, gravity does not stay fixed, but it would"
+_GRAVITY_MOVES = "gravity, rotated by the gyroscope, is not constant, but would be"
 
 
 def _advise_deg(seen_in: str, **_: float) -> str:
@@ -51,7 +51,7 @@ def _advise_deg(seen_in: str, **_: float) -> str:
 
 
 def _advise_rad(seen_in: str, **_: float) -> str:
-    return f"{_IN_RAD}, if the camera was in a hand" if seen_in == "scatter" else _IN_RAD
+    return f"{_IN_RAD}, if the camera was hand-held" if seen_in == "scatter" else _IN_RAD
 
 
 def _join_by(seen_in: str, **_: float) -> str:
@@ -71,14 +71,14 @@ def gyro_in_deg(
     gain: float = 1.0,
 ) -> str:
     if seen_in == "rates":
-        return f"{_rates(largest_rad_s, median_rad_s, sensor_ends_rad_s)}: the numbers are in deg/s"
+        return f"{_rates(largest_rad_s, median_rad_s, sensor_ends_rad_s)}: the values are in deg/s"
     if seen_in == "gravity":
-        return f"{_GRAVITY_MOVES} if the gyroscope's numbers were in deg/s"
+        return f"{_GRAVITY_MOVES} if the gyroscope's values were in deg/s"
     if seen_in == "camera":
-        return f"the gyroscope turns as the camera does, but {gain:.1f} times as far: its numbers are in deg/s"
+        return f"the gyroscope follows the camera's rotation at {gain:.1f} times its rate: its values are in deg/s"
     return (
-        f"the gyroscope's median rate is {median_rad_s:.2g} rad/s, too fast for filming: the numbers are "
-        f"probably in deg/s"
+        f"the gyroscope's median rate is {median_rad_s:.2g} rad/s, too fast for filming: the values are probably in "
+        "deg/s"
     )
 
 
@@ -88,7 +88,8 @@ def gyro_not_in_deg(seen_in: str, gain: float = 1.0, turning_rad_s: float = 0.0,
         return f"{_GRAVITY_MOVES} at 57.3 times the rate: rad/s were converted as if they were deg/s"
     if seen_in == "camera":
         return (
-            f"the gyroscope turns as the camera does, but a {1 / gain:.1f}th as far: rad/s were converted as if they "
+            f"the gyroscope follows the camera's rotation at 1/{1 / gain:.1f} of its rate: rad/s were converted as if "
+            "they "
             "were deg/s"
         )
     return (
@@ -106,12 +107,12 @@ def gyro_unit(largest_rad_s: float, median_rad_s: float, sensor_ends_rad_s: floa
 
 
 def _length(median_m_s2: float) -> str:
-    return f"the accelerometer's median length is {median_m_s2:.4g} where gravity gives about 9.8 m/s2"
+    return f"the accelerometer's median magnitude is {median_m_s2:.4g}; gravity is about 9.8 m/s2"
 
 
 @message(advice=_IN_G, example={"median_m_s2": 1.0})
 def accel_in_g(median_m_s2: float) -> str:
-    return f"{_length(median_m_s2)}: the numbers are in g"
+    return f"{_length(median_m_s2)}: the values are in g"
 
 
 @message(advice=_IN_M_S2, example={"median_m_s2": 96.2})
@@ -140,7 +141,7 @@ def gravity_removed(median_m_s2: float) -> str:
 )
 def sensors_exchanged(gyro_median: float, accel_median: float) -> str:
     return (
-        f"the gyroscope's median length is {gyro_median:.2f} and the accelerometer's {accel_median:.2f}: the two "
+        f"the gyroscope's median magnitude is {gyro_median:.2f} and the accelerometer's {accel_median:.2f}: the two "
         "sensors are exchanged"
     )
 
@@ -151,8 +152,7 @@ def sensors_exchanged(gyro_median: float, accel_median: float) -> str:
 )
 def dead_sensor(sensor: str, table: str, reading: tuple[float, ...]) -> str:
     return (
-        f"the {sensor} never changes (it reads {_describe_vector(reading)} throughout): the sensor is dead or was not "
-        "recorded"
+        f"the {sensor} never changes ({_describe_vector(reading)} throughout): the sensor is dead or was not recorded"
     )
 
 
@@ -162,7 +162,7 @@ def dead_sensor(sensor: str, table: str, reading: tuple[float, ...]) -> str:
 )
 def dead_axis(sensor: str, table: str, axes: tuple[str, ...], reading: float) -> str:
     return (
-        f"the {sensor}'s {' and '.join(axes)} axis never changes (it reads {reading:.6g} throughout): the axis is dead "
+        f"the {sensor}'s {' and '.join(axes)} axis never changes ({reading:.6g} throughout): the axis is dead "
         "or the wrong column"
     )
 
@@ -183,11 +183,11 @@ def _describe_setting(table: str, setting: Setting) -> str:
 
 
 def _describe_others(others: tuple[tuple[Setting, ...], ...]) -> str:
-    """What is hardly less likely: axes of the gyroscope, or of the accelerometer where there is a second setting."""
+    """What is almost as likely: axes of the gyroscope, or of the accelerometer where there is a second setting."""
     said = ""
     for settings in others:
         named = (_describe_setting(table, one) for table, one in zip(("gyro", "accel"), settings, strict=False))
-        said += f"; hardly less likely: {', or '.join(named)}"
+        said += f"; almost as likely: {', or '.join(named)}"
     return said
 
 
@@ -269,29 +269,31 @@ def low_passed(sensor: str, scatter: float, moving: float) -> str:
     example={"sensor": "gyroscope", "step": 0.01, "different_on_x": 40, "rounding_share_of_signal": 0.02},
 )
 def coarse_resolution(sensor: str, step: float, different_on_x: int, rounding_share_of_signal: float) -> str:
-    return f"the {sensor} reads in steps of {step:.3g} {_UNITS[sensor]} ({different_on_x} different values on x)"
+    return f"the {sensor}'s values have steps of {step:.3g} {_UNITS[sensor]} ({different_on_x} different values on x)"
 
 
 @message(
-    advice="stamp both sensors by one clock, when they were sampled and not when they were written",
+    advice="timestamp both sensors with one clock, when they are sampled and not when they are written",
     example={"delay_s": 0.08, "delay_sigma_s": 0.004, "correlation": 0.8},
 )
 def sensors_offset(delay_s: float, delay_sigma_s: float, correlation: float) -> str:
     return (
-        f"the accelerometer's stamps are {1e3 * delay_s:+.0f} +- {1e3 * delay_sigma_s:.0f} ms off the gyroscope's "
+        f"the accelerometer's timestamps are {1e3 * delay_s:+.0f} +- {1e3 * delay_sigma_s:.0f} ms off the gyroscope's "
         f"(gravity follows the gyroscope with a correlation of {correlation:.2f} there)"
     )
 
 
-@message(advice="give two files of one recording, stamped by one clock", example={"together_s": 3.0, "shorter_s": 20.0})
+@message(
+    advice="give two files of one recording, timestamped with one clock", example={"together_s": 3.0, "shorter_s": 20.0}
+)
 def sensors_apart(together_s: float, shorter_s: float) -> str:
     return f"gyroscope and accelerometer overlap for {max(together_s, 0):.1f} s of {shorter_s:.1f} s"
 
 
 def _pauses(sensor: str, pauses: int, longest_s: float, total_s: float, step_s: float, share: float) -> str:
     return (
-        f"the {sensor} pauses {pauses} times, at most {longest_s:.3f} s, {total_s:.2f} s in all; its samples are "
-        f"{1e3 * step_s:.1f} ms apart"
+        f"the {sensor} pauses {pauses} times (longest {longest_s:.3f} s, {total_s:.2f} s in all; sampled every "
+        f"{1e3 * step_s:.1f} ms)"
     )
 
 
@@ -361,8 +363,8 @@ def rotation_too_little(
     if why is not None:
         return str(why)
     return (
-        f"the camera hardly rotates (median {median_rad_s:.3f} rad/s, fastest at {fastest_s:.0f} s), which leaves the "
-        f"rotation between camera and gyroscope uncertain by {degrees(rotation_sigma_rad):.0f} deg"
+        f"the camera hardly rotates (median {median_rad_s:.3f} rad/s, fastest at {fastest_s:.0f} s), so the rotation "
+        f"between camera and gyroscope is uncertain by {degrees(rotation_sigma_rad):.0f} deg"
     )
 
 
@@ -376,7 +378,7 @@ def offset_undecided(seconds: float) -> str:
 
 @message(advice=_READ_AGAIN, example={"path": "imu.csv", "sensor": "gyroscope"})
 def stamps_reversed(path: str, sensor: str) -> str:
-    return f"{path}: {sensor} stamps run backwards; is the file written in reverse order?"
+    return f"{path}: {sensor} timestamps run backwards; is the file written in reverse order?"
 
 
 @message(
@@ -385,8 +387,8 @@ def stamps_reversed(path: str, sensor: str) -> str:
 )
 def stamps_jump_back(path: str, counted: str, number: int, sensor: str, behind_s: float) -> str:
     return (
-        f"{path}, {counted} {number}: the {sensor} stamp is {behind_s:.3f} s before an earlier one; the "
-        "clock was set back or a stamp is damaged: split or correct the file there"
+        f"{path}, {counted} {number}: the {sensor} timestamp is {behind_s:.3f} s before an earlier one; the "
+        "clock was set back or a timestamp is damaged: split or correct the file there"
     )
 
 
@@ -396,15 +398,16 @@ def stamps_jump_back(path: str, counted: str, number: int, sensor: str, behind_s
 )
 def stamps_too_coarse(path: str, counted: str, number: int, sensor: str, repeated: int, samples: int) -> str:
     return (
-        f"{path}, {counted} {number}: {repeated} of {samples} {sensor} samples repeat the previous stamp "
-        "with other values; the stamps are too coarse, or this is not the time column"
+        f"{path}, {counted} {number}: {repeated} of {samples} {sensor} samples repeat the previous timestamp "
+        "with other values; the timestamps are too coarse, or this is not the time column"
     )
 
 
 @message(advice=_READ_AGAIN, example={"path": "imu.csv", "sensor": "gyroscope", "pause_s": 4000.0, "after_s": 3.0})
 def stamps_damaged(path: str, sensor: str, pause_s: float, after_s: float) -> str:
     return (
-        f"{path}: the {sensor} pauses for {pause_s:.0f} s after {after_s:.3f} s; a stamp is damaged, or this is more "
+        f"{path}: the {sensor} pauses for {pause_s:.0f} s after {after_s:.3f} s; a timestamp is damaged, or this is "
+        "more "
         "than one recording"
     )
 
@@ -431,13 +434,14 @@ def time_unit(
     if sensor:
         direction = "smaller" if step_s > slowest_s else "larger"
         return (
-            f"{path}: {sensor} samples are {step_s:.3g} s apart, which is implausible; the stamps are probably in a "
+            f"{path}: {sensor} samples are {step_s:.3g} s apart, which is implausible; the timestamps are probably "
+            "in a "
             f"{direction} unit: set time_unit in capture.toml"
         )
     return (
         f"{spans_and_rates(frames_s, frame_hz, imu_s, imu_hz)}: the frames' times are {factor:g} times too "
-        f"{'long' if factor > 1 else 'short'}, and are in {_TIME_UNITS.get(factor, 'another unit')} where seconds were "
-        "read"
+        f"{'long' if factor > 1 else 'short'}: they are in {_TIME_UNITS.get(factor, 'another unit')}, but were read "
+        "as seconds"
     )
 
 
@@ -452,7 +456,8 @@ def untimed(detail: str) -> str:
 
 
 @message(
-    advice="leave out shared_clock = true under [timing] in capture.toml (and any time offset), or correct the stamps; "
+    advice="leave out shared_clock = true under [timing] in capture.toml (and any time offset), or correct the "
+    "timestamps; "
     "a known offset goes under [calibration]",
     example={"offset_s": 12.3, "max_offset_s": 1.0, "clocks": None},
 )
@@ -462,14 +467,14 @@ def clock_offset(offset_s: float, max_offset_s: float | None, clocks: Said | Non
     else:
         stated = "which contradicts the given time offset"
     return (
-        f"camera and gyroscope fit with a time offset of {offset_s:+.3f} s, {stated}"
+        f"camera and gyroscope agree at a time offset of {offset_s:+.3f} s, {stated}"
         f"{'' if clocks is None else f'; {clocks}'}"
     )
 
 
 @message(
-    advice="give frame times as the recorder stamped them, not a frame number divided by a nominal rate; then check "
-    "the stamps of the IMU; up to 1 % is corrected",
+    advice="give frame times as the recorder timestamped them, not a frame number divided by a nominal rate; then "
+    "check the timestamps of the IMU; up to 1 % is corrected",
     example={"rate": 0.004},
 )
 def clock_rate(rate: float) -> str:
@@ -480,12 +485,11 @@ def clock_rate(rate: float) -> str:
     )
 
 
-@message(advice="give the video itself as [video], or times as the recorder stamped them", example={"rate": 1.25})
+@message(advice="give the video itself as [video], or times as the recorder timestamped them", example={"rate": 1.25})
 def frame_rate(rate: float) -> str:
     return (
-        f"the frames fit the gyroscope at {rate:.3g} times the stated frame rate: they were timed by another "
-        f"frame rate "
-        "than they were filmed with"
+        f"the frames fit the gyroscope at {rate:.3g} times the stated frame rate: they were timed at another frame "
+        "rate than that of filming"
     )
 
 
@@ -516,7 +520,7 @@ def stabilised(share: float | None = None, recorder_notes: str = "") -> str:
 
 
 @message(
-    advice="check that this IMU recording belongs to these images, both time stamps and their units, and the "
+    advice="check that this IMU recording belongs to these images, both timestamps and their units, and the "
     "gyroscope's columns, axes and unit",
     example={"seconds": 20.0, "why": {"code": "no-offset-fits", "values": {"explained": 0.2}}, "clocks": None},
 )
@@ -621,21 +625,23 @@ def gyro_mirrored(gyro: Setting | None = None) -> str:
 _ROTATIONS = {
     "inverse": (
         "; its inverse fits",
-        "cam_from_imu takes coordinates of the IMU to those of the camera (T_cam_imu of Kalibr): give the inverse of "
+        "cam_from_imu transforms coordinates of the IMU to those of the camera (T_cam_imu of Kalibr): give the "
+        "inverse of "
         "the declared one, with the translation of the inverse",
     ),
     "order": (
-        "; with w first read as w last it fits",
-        "cam_from_imu_xyzw has w last: move the first number behind the others",
+        "; it fits if w comes first, and was taken for last",
+        "cam_from_imu_xyzw has w last: move the first number to the end",
     ),
     "axes": (
-        "; with the camera's y and z the other way it fits",
-        "the camera's axes are x right, y down and z forward: the declared rotation is to axes with y up and z back",
+        "; it fits with the camera's y and z axes reversed",
+        "the camera's axes are x right, y down and z forward: the declared rotation is to axes x right, y up and z "
+        "back",
     ),
     "": (
         "",
-        "correct cam_from_imu under [calibration], or leave it out, and it is estimated; frames that were turned "
-        "upright are not in the sensor's orientation: cut them without (ffmpeg -noautorotate)",
+        "correct cam_from_imu under [calibration], or leave it out to have it estimated; frames that were rotated "
+        "upright are not in the sensor's orientation: extract them with ffmpeg -noautorotate",
     ),
 }
 
@@ -654,12 +660,13 @@ def declared_rotation(angle_deg: float, sigma_deg: float, likely: str) -> str:
 def _advise_offset(declared_s: float, likely: str, **_: float) -> str:
     if likely == "sign":
         return (
-            "time offsets are those of the camera's clock less the sensor's (minus timeshift_cam_imu of Kalibr): give "
+            "time offsets are those of the camera's clock minus the sensor's (the negative of Kalibr's "
+            "timeshift_cam_imu): give "
             f"{-declared_s:.9g}"
         )
     if likely == "milliseconds":
         return f"time offsets are in seconds: give {1e-3 * declared_s:.9g}"
-    return "leave out gyro_time_offset_s and accel_time_offset_s, and they are estimated"
+    return "leave out gyro_time_offset_s and accel_time_offset_s to have them estimated"
 
 
 @message(
@@ -667,7 +674,7 @@ def _advise_offset(declared_s: float, likely: str, **_: float) -> str:
     example={"declared_s": 0.0641, "found_s": -0.0705, "sigma_s": 0.002, "likely": "sign"},
 )
 def declared_offset(declared_s: float, found_s: float, sigma_s: float, likely: str) -> str:
-    other = {"sign": "; with the other sign it fits", "milliseconds": "; as milliseconds it fits"}.get(likely, "")
+    other = {"sign": "; it fits with the other sign", "milliseconds": "; it fits in milliseconds"}.get(likely, "")
     return (
         f"the declared time offset is {declared_s:.4f} s, but the recording shows {found_s:.4f} s "
         f"(+-{2e3 * sigma_s:.0f} ms){other}"
@@ -699,12 +706,12 @@ def accel_flipped(correlation: float, correlation_sigma: float) -> str:
 
 # frames
 
-_TIMES = "give the presentation stamps of the frames, or the video itself as [video]"
+_TIMES = "give the presentation timestamps of the frames, or the video itself as [video]"
 
 
 @message(
-    advice="time frames by the video's presentation stamps or the recorder's own times, never by counting; frames that "
-    "were dropped or repeated must not shift the rest",
+    advice="time frames by the video's presentation timestamps or the recorder's own times, never by counting; frames "
+    "that were dropped or repeated must not shift the rest",
     example={"wander_s": 0.2, "worst_s": 12.0, "parts": 6, "sigmas": 8.0},
 )
 def frame_times_uneven(wander_s: float, worst_s: float, parts: int, sigmas: float) -> str:
@@ -717,7 +724,7 @@ def frame_times_uneven(wander_s: float, worst_s: float, parts: int, sigmas: floa
 @message(advice=_TIMES, example={"wander_s": 0.02})
 def frame_times_counted(wander_s: float) -> str:
     return (
-        f"the frame times drift by up to {1e3 * wander_s:.0f} ms against the video's presentation stamps, as "
+        f"the frame times drift by up to {1e3 * wander_s:.0f} ms against the video's presentation timestamps, as "
         f"times counted "
         "at a nominal frame rate do"
     )
@@ -753,7 +760,7 @@ def frames_not_in_video(pictures: int, looked_for: int) -> str:
 
 
 @message(
-    advice="nothing, where the times are right; record to a faster card or at a smaller size",
+    advice="none if the times are right; otherwise record to a faster card or at a smaller size",
     example={"lost": 4, "frames": 600, "step_s": 0.033, "longest_s": 0.13},
 )
 def frames_dropped(lost: int, frames: int, step_s: float, longest_s: float) -> str:

@@ -79,7 +79,7 @@ def rig_names_differ(camera: str, found: int, frames: int, folder: str, main: st
 
 
 @message(
-    advice="correct the times, or reconstruct cameras that are not synchronised one by one",
+    advice="correct the times, or reconstruct cameras that are not synchronised separately",
     joint=": ",
     example={"camera": "left", "found": 3, "frames": 100, "within_ms": 1.0, "images": 90, "apart_ms": 12.0},
 )
@@ -135,7 +135,7 @@ def rig_images_apart(source: str, first: str, last: str, apart_ms: float) -> str
 
 @message(example={"path": "images", "folder": "cam0"})
 def no_image_in_folder(path: str, folder: str) -> str:
-    return f"{path}: no image lies in a folder {folder!r}, as --name-times has it"
+    return f"{path}: no image lies in a folder {folder!r}, as --name-times states"
 
 
 @message(example={"path": "images/a.jpg", "pattern": "cam0_{ns}"})
@@ -195,7 +195,7 @@ def pictures_without_row(times: str, untimed: int, count: int, first: str) -> st
     advice="give frame_times under [video] in a capture.toml", example={"video": "a.mp4", "frames": 100, "noted": 99}
 )
 def recorder_noted_other_count(video: str, frames: int, noted: int) -> str:
-    return f"{video} has {frames} frames, but its recorder noted the times of {noted}"
+    return f"{video} has {frames} frames, but its recorder logged the times of {noted}"
 
 
 @message(example={"times_file": "times.csv", "times": 99, "video": "a.mp4", "frames": 100})

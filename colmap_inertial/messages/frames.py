@@ -77,7 +77,7 @@ def exposures_off_by_factor(support_sigmas: float, factor: float) -> str:
 
 @message(example={"support_sigmas": 4.0})
 def blur_confirmed_below_sky(support_sigmas: float) -> str:
-    return f"the images below the sky confirm the gyroscope's blur ({support_sigmas:.0f} standard deviations)"
+    return f"the images confirm the gyroscope's blur below the sky ({support_sigmas:.0f} standard deviations)"
 
 
 @message(example={"confirming": 8, "count": 12})
@@ -231,8 +231,8 @@ def frames_untreated(why: Said) -> str:
 
 @message(example={"most_px": 1.4, "by_sliding": True})
 def blur_nowhere(most_px: float, by_sliding: bool) -> str:
-    why_not = f"no frame has more than {most_px:.1f} px of blur, from the fastest rotation measured"
-    return f"{why_not} and the motion of pixels between frames" if by_sliding else why_not
+    why_not = f"no frame has more than {most_px:.1f} px of blur by the fastest measured rotation"
+    return f"{why_not} and the optical flow between frames" if by_sliding else why_not
 
 
 @message(example={"most_px": 2.1})
@@ -297,14 +297,14 @@ def quantity_not_observable(quantity: str, why: Said | str, sigma: float | None)
 state("all-frames-asked", "all frames, as requested")
 state("all-pictures", "all images of the folder")
 state("frames-as-capture-says", "as set by frames_per_s in capture.toml")
-state("one-clock", "the recorder stamped frames and gyroscope by one clock")
+state("one-clock", "the recorder timestamped frames and gyroscope with one clock")
 
 _RANKS = {"blur": "predicted blur", "speed": "angular speed", "sharpness": "sharpness"}
 
 
 @message(example={"sigma_s": 0.005})
 def offset_of_capture(sigma_s: float) -> str:
-    return f"the time offset is the capture's, to {1e3 * sigma_s:.0f} ms"
+    return f"the time offset is that of the capture (to {1e3 * sigma_s:.0f} ms)"
 
 
 @message(example={"why": "clock offset is not observable: the camera hardly turns"})
@@ -314,7 +314,7 @@ def offset_unknown_beforehand(why: Said) -> str:
 
 @message(example={"sigma_s": 0.0012, "rate": 2e-5, "rate_sigma": 4e-6})
 def offset_by_pixels(sigma_s: float, rate: float | None, rate_sigma: float) -> str:
-    rates = "" if rate is None else f", with clock rates {1e6 * rate:+.0f} ppm apart (to {1e6 * rate_sigma:.0f} ppm)"
+    rates = "" if rate is None else f", and clock rates differ by {1e6 * rate:+.0f} ppm (to {1e6 * rate_sigma:.0f} ppm)"
     return f"the time offset was found from optical flow, to {1e3 * sigma_s:.1f} ms{rates}"
 
 
@@ -323,7 +323,7 @@ def offset_by_pixels(sigma_s: float, rate: float | None, rate_sigma: float) -> s
         "used": 120,
         "frames": 900,
         "ranked_by": ("blur",),
-        "clocks": "the clocks' offset is the capture's, to 5 ms",
+        "clocks": "the time offset is that of the capture (to 5 ms)",
     }
 )
 def frames_selected(used: int, frames: int, ranked_by: tuple[str, ...], clocks: Said) -> str:

@@ -12,7 +12,7 @@ state("frames-not-readable", "describes frames that cannot be read")
 
 @message(example={"name": "gopro", "known": ("auto", "gopro")})
 def imu_format_unknown(name: str, known: Sequence[str]) -> str:
-    return f'unknown IMU format "{name}"; known are {", ".join(known)}'
+    return f'unknown IMU format "{name}"; known: {", ".join(known)}'
 
 
 @message(
@@ -20,7 +20,7 @@ def imu_format_unknown(name: str, known: Sequence[str]) -> str:
     example={"layouts": ("a table of samples", "a GoPro video")},
 )
 def no_known_recording(layouts: Sequence[str]) -> str:
-    return f"not an inertial recording known here ({'; '.join(layouts)})"
+    return f"not an inertial recording in a known format ({'; '.join(layouts)})"
 
 
 @message(
@@ -29,7 +29,7 @@ def no_known_recording(layouts: Sequence[str]) -> str:
     example={"tracks": ("vide avc1", "soun mp4a")},
 )
 def video_without_imu(tracks: Sequence[str]) -> str:
-    return f"is a video without an IMU that is known here; its tracks: {', '.join(tracks) or 'none'}"
+    return f"is a video without an IMU track in a known format; its tracks: {', '.join(tracks) or 'none'}"
 
 
 state("begins-with-text", "begins with text")
@@ -38,7 +38,7 @@ state("no-mp4-index", "has no index of an MP4 or QuickTime file")
 
 @message(example={"fault": {"code": "begins-with-text", "values": {}}})
 def named_like_a_video(fault: Said) -> str:
-    return f"is named like a video and is none that is known here: it {fault}"
+    return f"has the name of a video, but not a known video format: it {fault}"
 
 
 @message(example={"name": "mine", "package": "my-formats", "detail": "KeyError: 'a'"})
@@ -70,7 +70,10 @@ state(
 )
 state("inertial-scale-files-missing", "holds no gyroscope.txt and accelerometer.txt")
 state("euroc-files-missing", "holds no mav0/imu0/data.csv, imu0/data.csv or data.csv")
-state("no-separate-tables", "holds no single table of a gyroscope and one of an accelerometer that say their units")
+state(
+    "no-separate-tables",
+    "does not hold exactly one table of a gyroscope and one of an accelerometer, each with its unit",
+)
 state("one-pose", "holds one pose; a trajectory needs at least two")
 
 
@@ -118,7 +121,7 @@ def telemetry_parser_failed(last_words: str, signal: int | None, exit_code: int 
 state("no-frames", "holds no frames")
 state("frame-without-time", "a frame has no time")
 state("sample-not-three-numbers", "a sample that is not three numbers")
-state("frame-number-not-one", "a frame's number that is none")
+state("frame-number-not-one", "a frame's number is not a number")
 state("number-without-end", "a number that does not end")
 
 
@@ -165,8 +168,8 @@ def not_three_axes(letters: str) -> str:
     return f"{letters!r} does not name three axes"
 
 
-state("gpmf-one-payload", "one payload alone: nothing says how fast its samples follow each other")
-state("gpmf-stamps-do-not-increase", "the stamps of the payloads do not increase")
+state("gpmf-one-payload", "a single payload does not give the sampling rate")
+state("gpmf-stamps-do-not-increase", "the timestamps of the payloads do not increase")
 
 
 @message(example={"table": "gyro_accel.csv"})
@@ -175,7 +178,7 @@ def mars_table_missing(table: str) -> str:
 
 
 state("camm-without-gyroscope", "its CAMM track holds no gyroscope samples (type 2)")
-state("camm-sample-short", "is damaged: a sample of the camm track is shorter than its head")
+state("camm-sample-short", "is damaged: a sample of the camm track is shorter than its header")
 
 
 @message(example={"packet": 3, "type": 2})
@@ -201,14 +204,14 @@ def gopro_positions_channels(key: str, channels: int) -> str:
     return f"the {key} stream has {channels} channels"
 
 
-@message(example={"key": "GYRO", "detail": "the stamps of the payloads do not increase"})
+@message(example={"key": "GYRO", "detail": "the timestamps of the payloads do not increase"})
 def gopro_stream_untimed(key: str, detail: str) -> str:
     return f"the {key} stream cannot be timed: {detail}"
 
 
 @message(example={"key": "GYRO", "unit": "rpm", "known": ("rad/s", "deg/s")})
 def gopro_unit(key: str, unit: str, known: tuple[str, ...]) -> str:
-    return f"the {key} stream is in {unit!r}; known here are {', '.join(known)}"
+    return f"the {key} stream is in {unit!r}; known: {', '.join(known)}"
 
 
 @message(example={"key": "GYRO", "detail": "'YY' does not name three axes"})
@@ -237,7 +240,7 @@ state("sensor-logger-rows-missing", "holds no rows of Sensor Logger with sensor,
 state("sensor-logger-without-gyroscope", "holds no gyroscope of Sensor Logger")
 state(
     "sensor-logger-platform-of-rows-unknown",
-    "no row of metadata says whether this is from iOS or Android, and the accelerometer's sign differs",
+    "the row of metadata that tells iOS from Android is missing; the accelerometer's sign differs between the two",
     advice=(
         'describe its rows under [imu.gyro] and [imu.accel] in a capture.toml, with where = ["sensor", '
         '"Gyroscope"] (["name", "gyroscope"] in messages), time = "time", time_unit = "ns", columns = ["x", '
@@ -246,7 +249,7 @@ state(
 )
 state(
     "sensor-logger-platform-unknown",
-    "no Metadata.csv says whether this is from iOS or Android, and the accelerometer's sign differs",
+    "Metadata.csv, which tells iOS from Android, is missing; the accelerometer's sign differs between the two",
     advice="add it, or describe the tables under [imu.gyro] and [imu.accel] in a capture.toml",
 )
 state("bag-without-imu", "holds no sensor_msgs/Imu messages")
@@ -257,25 +260,29 @@ def bag_without_moving_gyroscope(topics: tuple[str, ...]) -> str:
     return f"none of its IMU topics ({', '.join(topics)}) has a gyroscope that moves"
 
 
-state("bag-files-packed", "its files are packed whole", advice="unpack them (zstd -d) and say so in metadata.yaml")
-state("bag-messages-packed", "its messages are packed one by one", advice="convert it with rosbags-convert")
-state("bag-index-repeats", "is damaged: its index names parts of it more than once")
+state(
+    "bag-files-packed",
+    "its files are compressed as a whole",
+    advice="decompress them (zstd -d) and change metadata.yaml accordingly",
+)
+state("bag-messages-packed", "its messages are compressed individually", advice="convert it with rosbags-convert")
+state("bag-index-repeats", "is damaged: its index lists chunks more than once")
 
 
 @message(
-    advice="if it is meant, convert it with rosbags-convert, without compression and with its IMU topics only",
+    advice="if this is intended, convert it with rosbags-convert, without compression and with its IMU topics only",
     example={"most_mb": 500, "size": 100000},
 )
 def bag_out_of_proportion(most_mb: int, size: int) -> str:
-    return f"unpacks to more than {most_mb} MB, out of proportion to its {size} bytes"
+    return f"unpacks from {size} bytes to more than {most_mb} MB"
 
 
 @message(example={"compression": "snappy"})
 def bag_compression_unknown(compression: str) -> str:
-    return f"is packed by {compression!r}, which is not read"
+    return f"is compressed by {compression!r}, which is not supported"
 
 
-state("bag-chunk-followed", "is damaged: bytes follow where a chunk ends")
+state("bag-chunk-followed", "is damaged: bytes follow the end of a chunk")
 
 
 @message(example={"camera": "Insta360 OneR"})
@@ -283,12 +290,12 @@ def telemetry_without_gyroscope(camera: str) -> str:
     return f"holds no gyroscope; {camera} writes one where gyro data is switched on"
 
 
-state("counts-without-gyroscope", "holds no gyroscope; its camera writes one where gyro data is switched on")
+state("counts-without-gyroscope", "holds no gyroscope; its camera writes one if gyro data is switched on")
 
 
 @message(example={"sensor": "gyroscope", "detail": "'Unit'"})
 def telemetry_not_understood(sensor: str, detail: str) -> str:
-    return f"telemetry-parser gives a {sensor} that is not understood here: {detail}"
+    return f"telemetry-parser gives {sensor} data in an unknown form: {detail}"
 
 
 state("no-gyroscope-samples", "holds no gyroscope samples")
@@ -309,4 +316,4 @@ def ros_recording(path: str) -> str:
 
 @message(example={"path": "a.insv"})
 def needs_telemetry_parser(path: str) -> str:
-    return f"{path} is read by telemetry-parser"
+    return f"{path} needs telemetry-parser"

@@ -14,7 +14,7 @@ def other_columns(width: int, layout: str) -> str:
 
 @message(example={"number": 9, "width": 7})
 def no_column_number(number: int, width: int) -> str:
-    return f"there is no column {number}: columns count from 1 to {width}"
+    return f"column {number} does not exist: columns are counted from 1 to {width}"
 
 
 @message(advice="give its number, counted from 1", example={"name": "t"})
@@ -56,28 +56,28 @@ def member_packed_otherwise(member: str, method: int) -> str:
 
 @message(example={"column": "t"})
 def no_counts(column: str) -> str:
-    return f'column "{column}" holds what is no count'
+    return f'column "{column}" holds values that are not whole counts'
 
 
 @message(example={"text": "3.4.2024"})
 def no_date_with_time(text: str) -> str:
-    return f"{text!r} is no date with a time"
+    return f"{text!r} is not a date with a time"
 
 
 @message(example={"text": "31.2.2024 10:00:00", "detail": "day is out of range for month"})
 def not_a_date(text: str, detail: str) -> str:
-    return f"{text!r} is no date ({detail})"
+    return f"{text!r} is not a date ({detail})"
 
 
 @message(example={"stamp": "abc"})
 def stamp_not_a_number(stamp: str) -> str:
-    return f"time stamp {stamp!r} is not a number"
+    return f"timestamp {stamp!r} is not a number"
 
 
 @message(advice="check the time unit", example={"path": "imu.csv", "line": 7, "stamp": "9e99", "unit": "ns"})
 def stamp_too_far(path: str, line: int | None, stamp: str, unit: str) -> str:
     place = "" if line is None else f", line {line}"
-    return f"{path}{place}: time stamp {stamp} {unit} is beyond 142 years"
+    return f"{path}{place}: timestamp {stamp} {unit} is beyond 142 years"
 
 
 @message(example={"count": 1, "sensor": "gyroscope"})
@@ -87,7 +87,7 @@ def too_few_samples(count: int, sensor: str) -> str:
 
 @message(example={"path": "imu.csv", "sensor": "gyroscope"})
 def one_stamp_for_all(path: str, sensor: str) -> str:
-    return f"{path}: all {sensor} samples have one stamp; this is not the time column"
+    return f"{path}: all {sensor} samples have one timestamp; this is not the time column"
 
 
 state("gcsv-times-damaged", "a time is not a number, or beyond 142 years", advice="check tscale")
@@ -175,7 +175,7 @@ def rows_lack_values(count: int, rows: int, sensor: str) -> str:
 
 @message(example={"column": "gyro_x [rpm]", "unit": "rpm", "known": ("rad/s", "deg/s")})
 def column_of_unknown_unit(column: str, unit: str, known: Sequence[str]) -> str:
-    return f'column "{column}" has the unit [{unit}]; known here are {", ".join(known)}'
+    return f'column "{column}" has the unit [{unit}]; known: {", ".join(known)}'
 
 
 state("no-time-of-day", "no time of day")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from colmap_inertial.messages import Said, message, state
+from colmap_inertial.messages.shared import say_missing
 
 
 def _give_pose(camera: str, **_: object) -> str:
@@ -25,14 +26,14 @@ def not_an_option_of_colmap(setting: str, version: str, program: str, nearest: s
 
 state(
     "colmap-executable-missing",
-    "no such file",
+    say_missing("file"),
     advice="--colmap-executable takes the path of COLMAP's program (`which colmap`)",
     joint=": ",
 )
 
 state(
     "colmap-executable-not-to-run",
-    "may not be run",
+    "is not executable",
     advice="make it executable (chmod +x), or give COLMAP's program",
     joint=": ",
 )
@@ -84,7 +85,7 @@ def database_not_usable_here(program: str, version: str, detail: str) -> str:
 
 @message(example={"program": "/usr/bin/colmap", "image": "0007.jpg", "others": 3})
 def features_missing(program: str, image: str, others: int) -> str:
-    return f"{program}: no features of {image}, nor of {others} other images"
+    return f"{program}: no features were written for {image} and {others} other images"
 
 
 state(
@@ -188,7 +189,7 @@ def given_image_of_another_size(image: str, width: int, height: int, capture_wid
     return f"{image} is {width}x{height} there and {capture_width}x{capture_height} in the capture"
 
 
-state("no-given-database", "no such file", advice="--database takes a COLMAP database", joint=": ")
+state("no-given-database", say_missing("file"), advice="--database takes a COLMAP database", joint=": ")
 
 state(
     "database-in-use", "another program has it open, or was stopped while writing", advice="close it there", joint=": "
@@ -419,7 +420,7 @@ def setting_not_taken(setting: str, why: Said) -> str:
 
 @message(example={"option": "mapping.maper", "nearest": "mapping.mapper", "known": ("mapper", "pairing")})
 def unknown_option(option: str, nearest: str | None, known: Sequence[str]) -> str:
-    return f"unknown option {option}{_did_you_mean(nearest) or '; known here: ' + ', '.join(known)}"
+    return f"unknown option {option}{_did_you_mean(nearest) or '; known: ' + ', '.join(known)}"
 
 
 # workers
@@ -486,7 +487,7 @@ def work_not_wanted(work: str) -> str:
     return f"{work}: cancelled"
 
 
-state("work-needs-dask", "--scheduler runs work on a Dask cluster")
+state("work-needs-dask", "--scheduler uses a Dask cluster")
 state("captures-need-dask", "--scheduler runs captures on a Dask cluster")
 
 

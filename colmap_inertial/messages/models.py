@@ -118,17 +118,27 @@ def not_refined(why: Any) -> str:
     return f"not refined: {_say(why)}"
 
 
-@message(example={"why": "the refinement does not converge", "evidence": "the IMU costs 1.10"})
+@message(
+    example={
+        "why": "the refinement does not converge",
+        "evidence": "IMU residuals are 1.10 times the expected variance",
+    }
+)
 def refinement_rejected(why: Any, evidence: Any) -> str:
     return f"not refined, refinement discarded: {why} ({evidence})"
 
 
-@message(example={"reasons": ("the scale is not known at all",), "evidence": "the IMU costs 1.10"})
+@message(
+    example={
+        "reasons": ("the scale is not known at all",),
+        "evidence": "IMU residuals are 1.10 times the expected variance",
+    }
+)
 def refined_scale_refused(reasons: Sequence[Any], evidence: Any) -> str:
     return f"not refined, refinement discarded: with it, {'; '.join(map(str, reasons))} ({evidence})"
 
 
-@message(example={"evidence": "the IMU costs 1.10", "rolling_readout_s": 0.02})
+@message(example={"evidence": "IMU residuals are 1.10 times the expected variance", "rolling_readout_s": 0.02})
 def refined(evidence: Any, rolling_readout_s: float | None) -> str:
     if rolling_readout_s is None:
         return f"refined by the IMU ({evidence})"

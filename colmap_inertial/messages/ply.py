@@ -38,7 +38,7 @@ def splats_lack_fields(names: Sequence[str]) -> str:
 
 
 state("splats-without-position", "have no position")
-state("splats-not-float", "are no floating-point numbers")
+state("splats-not-float", "are not floating-point numbers")
 
 
 @message(example={"count": 7})
@@ -76,7 +76,7 @@ def ply_part_of_vector(label: str, present: str) -> str:
 
 @message(example={"name": "x"})
 def ply_field_not_float(name: str) -> str:
-    return f"the vertices' {name} is no floating-point number: it cannot be transformed"
+    return f"the vertices' {name} is not a floating-point number: it cannot be transformed"
 
 
 state(

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from colmap_inertial.messages import Said, message, state
+from colmap_inertial.messages.shared import say_existing, say_missing
 
 _MORE_MEMORY = {
     "cuda": "if memory is short, close other programs that use the GPU, or hide it (CUDA_VISIBLE_DEVICES=) to "
     "use the processor",
-    "cpu": "if memory is short, free some: each image in work takes about half a gigabyte",
+    "cpu": "if memory is short, free some: each image in progress takes about half a gigabyte",
 }
 
 
@@ -18,7 +19,7 @@ _AGAIN = "install colmap-inertial again"
 
 # the command line
 
-state("gravity-is-of-rests", "the place is for recordings of rests only: leave it out with results")
+state("gravity-is-of-rests", "latitude and height are for recordings of rests only; leave them out with results")
 
 
 @message(
@@ -78,8 +79,8 @@ def not_a_network(detail: str) -> str:
 )
 def wrong_network(takes: Sequence[str], gives: Sequence[str], wanted_takes: Sequence[str], wanted_gives: str) -> str:
     return (
-        f"takes {', '.join(takes)} and gives {', '.join(gives)}; a network that restores images takes "
-        f"{', '.join(wanted_takes)}, all tensor(float), and gives {wanted_gives}"
+        f"has the inputs {', '.join(takes)} and the outputs {', '.join(gives)}; a network that restores images has "
+        f"the inputs {', '.join(wanted_takes)}, all tensor(float), and the output {wanted_gives}"
     )
 
 
@@ -90,7 +91,7 @@ def network_does_not_run(width: int, height: int, detail: str) -> str:
 
 @message(advice="an image must keep its size", example={"made": (1, 3, 16, 24), "given": (1, 3, 32, 48)})
 def network_changes_size(made: Sequence[int], given: Sequence[int]) -> str:
-    return f"makes {made} of {given}"
+    return f"returns {made} for an input of {given}"
 
 
 @message(advice=_AGAIN, example={"network": "lsd2"})
@@ -125,13 +126,13 @@ def frame_not_in_capture(frame: str) -> str:
 
 state(
     "changed-since-its-run",
-    "was changed since its run: start that again to restore it, or give the images by --image-folder",
+    "was changed since its run: run it again to restore it, or give the images by --image-folder",
 )
 
 
-@message(advice="say where: --image-folder", example={"image": "0007.jpg", "folders": ("images",)})
+@message(advice="give its folder with --image-folder", example={"image": "0007.jpg", "folders": ("images",)})
 def picture_missing(image: str, folders: Sequence[str]) -> str:
-    return f"the image of its image {image!r} is missing (in {', '.join(folders) or 'no folder of images'})"
+    return f"the file of its image {image!r} is missing (in {', '.join(folders) or 'no folder of images'})"
 
 
 @message(advice="--unscaled exports it in its own units", example={"reasons": ("the camera hardly accelerates",)})
@@ -158,12 +159,12 @@ state(
 
 @message(advice="export the rectified ones, or rotate the images", example={"direction": "up"})
 def readout_not_told(direction: str) -> str:
-    return f"these images are read out {direction}, which the program does not support"
+    return f"these images are read out in the direction {direction}, which the program does not support"
 
 
 @message(example={"camera": 1, "model": "SPHERICAL"})
 def sees_all_around(camera: int, model: str) -> str:
-    return f"camera {camera} ({model}) sees all around, which no pinhole camera does"
+    return f"camera {camera} ({model}) is a panoramic camera, not a pinhole camera"
 
 
 @message(example={"camera": 1, "model": "OPENCV"})
@@ -173,7 +174,9 @@ def not_undistorted(camera: int, model: str) -> str:
 
 @message(example={"width": 640, "height": 480, "camera_width": 1920, "camera_height": 1080})
 def picture_of_another_size(width: int, height: int, camera_width: int, camera_height: int) -> str:
-    return f"has {width} x {height} pixels, its camera {camera_width} x {camera_height}: no image of the model"
+    return (
+        f"has {width} x {height} pixels, its camera {camera_width} x {camera_height}: it is not an image of this model"
+    )
 
 
 @message(advice="choose a folder elsewhere", example={"folder": "project", "out": "project/export"})
@@ -232,7 +235,7 @@ state("not-a-result", "is not the result of a reconstruction")
 
 @message(advice="name a new folder", example={"folder": "scene"})
 def folder_exists(folder: str) -> str:
-    return f"{folder} exists already"
+    return say_existing(folder)
 
 
 # how a capture of a batch ended
@@ -271,7 +274,7 @@ def no_worker_finished(detail: str) -> str:
 
 state("mesh-without-faces", "a mesh without faces")
 
-state("faces-with-more", "the faces of this mesh are more than lists of vertices")
+state("faces-with-more", "the faces of this mesh have properties besides their lists of vertices")
 
 state("mesh-truncated", "truncated, or a mesh with faces other than triangles")
 
@@ -282,9 +285,9 @@ state("ply-not-shown", "only binary PLY files that begin with vertices can be sh
 
 state("holds-no-points", "holds no points")
 
-state("nothing-to-view", "no such folder", advice="give what reconstruct or apply wrote, or a COLMAP model")
+state("nothing-to-view", say_missing("folder"), advice="give what reconstruct or apply wrote, or a COLMAP model")
 
-state("no-folder-of-images", "no such folder of images")
+state("no-folder-of-images", say_missing("folder of images"))
 
 state(
     "run-not-finished",
@@ -293,7 +296,7 @@ state(
 )
 
 
-@message(advice="start its run again, which writes it again", example={"detail": "result.json: no models"})
+@message(advice="run it again", example={"detail": "result.json: no models"})
 def result_damaged(detail: str) -> str:
     return f"its result is damaged ({detail})"
 

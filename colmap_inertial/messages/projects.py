@@ -29,7 +29,7 @@ def images_untimed_by_video(count: int, images: int, why: Said, first: str) -> s
 )
 def video_of_other_images(video: str, found: int, images: int, name: str, why: Said | None) -> str:
     return (
-        f"{video}: {found} of {images} images are one of its frames beyond doubt ({name} "
+        f"{video}: {found} of {images} images were identified with certainty among its frames ({name} "
         f"{why or ''}): give the video that the images were taken from, or --frame-times"
     )
 
@@ -69,7 +69,7 @@ def priors_agree(file: str, count: int, kind: str, ratio: float, sigma: float) -
 
 
 @message(
-    advice="the scale or the positions are wrong, or these are no metres; do not give both to one adjustment",
+    advice="the scale or the positions are wrong, or these are not metres; do not give both to one adjustment",
     example={**_PRIORS, "ratio": 3.2, "sigma": 0.1},
 )
 def priors_contradict(file: str, count: int, kind: str, ratio: float, sigma: float) -> str:
@@ -96,7 +96,7 @@ def target_proves(proof: Said) -> str:
 
 @message(example={"error": 0.004})
 def check_corners_off(error: float) -> str:
-    return f"corners that the scale does not rest on are {100 * error:+.2g} % off"
+    return f"the check corners, which the scale does not use, are {100 * error:+.2g} % off"
 
 
 @message(example={"images": (5, 3)})
@@ -257,8 +257,8 @@ state(
 )
 state(
     "aprilgrid-in-doubt",
-    "expected are the tags of Kalibr (36h11 from number 0 on, black border of two bits): are these yours, and is "
-    "the target large and sharp enough in the images?",
+    "the tags of Kalibr are expected (36h11 from number 0 on, black border of two bits): check that these are yours, "
+    "and that the target is large and sharp enough in the images",
 )
 state(
     "inner-corners",
@@ -314,7 +314,10 @@ def other_board_likelier(spec: str, used: int, searched: int, columns: int, rows
 state("up-is-not-z", "up is not z in this model (see up_in_world), while most trainers' viewers assume z")
 state("never-scaled", "this model was never scaled")
 state("blur-not-modelled", "exposure times are unknown and taken as 0: blur is not modelled")
-state("one-exposure-for-all", "exposure times differ between images; the program takes one for all, their median")
+state(
+    "one-exposure-for-all",
+    "exposure times differ between images; the program needs a single one: their median is given",
+)
 state("one-pose-each", "no velocities are known: each image has one pose, as with a global shutter")
 
 

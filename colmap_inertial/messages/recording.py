@@ -31,7 +31,7 @@ def rows_merged(file: str, sensor: str, count: int) -> str:
 
 @message(example={"file": "imu.csv", "sensor": "gyroscope", "count": 4})
 def rows_averaged(file: str, sensor: str, count: int) -> str:
-    return f"{file}: averaged {count} {sensor} rows that repeat a stamp with other values"
+    return f"{file}: averaged {count} {sensor} rows that repeat a timestamp with other values"
 
 
 @message(example={"file": "imu.csv", "line": 400})
@@ -52,7 +52,7 @@ def imu_corrected(attitudes: int) -> str:
 @message(example={"accel_factor": 0.5, "compared": 4})
 def imu_compared(accel_factor: float, compared: int) -> str:
     return (
-        f"the accelerometer's part of the interval is {accel_factor:.2f} times that of an unknown device, "
+        f"the accelerometer's contribution to the interval is {accel_factor:.2f} times that of an unknown device, "
         f"from {compared} results of this device with targets"
     )
 
@@ -60,7 +60,7 @@ def imu_compared(accel_factor: float, compared: int) -> str:
 @message(example={"clock_rate": 2.5e-4})
 def imu_clock_stretched(clock_rate: float) -> str:
     return (
-        f"the IMU's clock is {-1e6 * clock_rate:+.0f} ppm off the camera's; the IMU's stamps were rescaled (if the "
+        f"the IMU's clock is {-1e6 * clock_rate:+.0f} ppm off the camera's; the IMU's timestamps were rescaled (if the "
         "camera's clock is wrong, as with a nominal frame rate, lengths are off by twice that)"
     )
 
@@ -155,7 +155,7 @@ state(
     joint=": ",
 )
 state("too-few-pairs-of-frames", "too few pairs of frames to compare with the gyroscope")
-state("camera-hardly-turned", "the camera hardly turned between frames")
+state("camera-hardly-turned", "the camera hardly rotated between frames")
 
 
 @message(example={"explained": 0.4, "flipped": ("x",)})
@@ -226,7 +226,7 @@ def readout_too_loose(readout_sigma_s: float) -> str:
 
 state(
     "readout-not-of-lines",
-    "the distortion runs neither along nor across the rows: the frames were warped, rotated or stabilised",
+    "the distortion is neither along nor across the rows: the frames were warped, rotated or stabilised",
 )
 
 
@@ -240,7 +240,7 @@ def readout_of_even_rotation(change_rad_s: float) -> str:
     return f"the angular rate changes by {change_rad_s:.2g} rad/s from frame to frame, too little to estimate it"
 
 
-state("readout-of-sparse-pictures", "images this far apart in time do not show it; a video does")
+state("readout-of-sparse-pictures", "images this far apart in time do not determine it; a video does")
 state("readout-without-gyroscope", "it needs a video and a gyroscope that fit each other")
 state("readout-of-stabilised-video", "a stabilised video does not show it")
 
@@ -302,4 +302,4 @@ def target_doubtful(doubts: tuple[str, ...]) -> str:
 
 @message(example={"file": "imu.csv", "times": 2})
 def clock_began_anew(file: str, times: int) -> str:
-    return f"{file}: the clock restarted {times} times; the stamps were continued"
+    return f"{file}: the clock restarted {times} times; the timestamps were continued"

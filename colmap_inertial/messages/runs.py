@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from colmap_inertial.messages import Said, message, state
+from colmap_inertial.messages.shared import say_existing, say_metric, say_missing
 
 _HOW_TIMES = (
     "give --frame-times (a CSV with name,t_s), --name-times (times in the file names), --exif-times, or --video (the "
@@ -37,13 +38,13 @@ state("capture-has-no-frames", "has no frames", advice="add [images] or [video]"
 
 @message(advice="leave it out, or take [rig] out", example={"option": "--database"})
 def not_for_rigs(option: str) -> str:
-    return f"{option}: not done for cameras of a rig"
+    return f"{option}: not supported for cameras of a rig"
 
 
 state(
     "database-of-which-images",
-    "--database: the rolling shutter is corrected here. Say --database-images filmed if its keypoints "
-    "were found in the images as filmed, rectified if in those of `deblur --rectify`; or disable the "
+    "--database: the rolling shutter is corrected here. Give --database-images filmed if its keypoints were found in "
+    "the images as filmed, rectified if in those of `deblur --rectify`; or disable the "
     "correction with --rolling-shutter off",
 )
 
@@ -84,12 +85,17 @@ state("capture-has-no-pictures", "has no images", advice="add [images] or [video
 
 state(
     "scale-from-plain-pictures",
-    "--scale-from target or distance takes plain images",
+    "--scale-from target or distance is for plain images",
     advice="fuse them first",
     joint=": ",
 )
 
-state("scale-from-one-camera", "--scale-from target or distance takes one camera", advice="take [rig] out", joint=": ")
+state(
+    "scale-from-one-camera",
+    "--scale-from target or distance is for a single camera",
+    advice="take [rig] out",
+    joint=": ",
+)
 
 # what a device's store takes
 
@@ -132,7 +138,7 @@ state("scale-of-another-method", "its scale is not that of the joint method")
 state("device-without-name", "a device needs a name")
 
 
-@message(advice="name it so, as the page beside it ends in .html", example={"out": "phone.html"})
+@message(advice="give a name that ends in .json; the page beside it ends in .html", example={"out": "phone.html"})
 def calibration_is_json(out: str) -> str:
     return f"{out}: the calibration is a JSON file"
 
@@ -163,12 +169,12 @@ state(
     "them out for a capture, which has its own description",
 )
 
-state("no-folder-of-pictures", "no such folder of images", advice="give the project's images with --images DIR")
+state("no-folder-of-pictures", say_missing("folder of images"), advice="give the project's images with --images DIR")
 
 state(
     "model-without-times",
     "a COLMAP model has no frame times",
-    advice="give --frame-times, a CSV with name,t_s",
+    advice="give --frame-times (a CSV with name,t_s) or --name-times (times in the file names)",
     joint=": ",
 )
 
@@ -181,7 +187,10 @@ def not_for_an_existing_model(options: Sequence[str]) -> str:
 state("imu-missing", "the IMU recording: give --imu PATH")
 
 
-state("times-missing", "the times of its images: give --frame-times, a CSV with name,t_s")
+state(
+    "times-missing",
+    "the times of its images: give --frame-times (a CSV with name,t_s) or --name-times (times in the file names)",
+)
 
 
 @message(example={"missing": ({"code": "imu-missing", "values": {}}, {"code": "times-missing", "values": {}})})
@@ -228,12 +237,12 @@ def output_is_foreign(path: str) -> str:
 
 @message(advice="choose another name or remove it", example={"path": "capture.toml"})
 def output_exists(path: str) -> str:
-    return f"{path} exists"
+    return say_existing(path)
 
 
 @message(advice="choose another name for the contact sheet", example={"path": "sheet.png"})
 def contact_sheet_exists(path: str) -> str:
-    return f"{path} exists"
+    return say_existing(path)
 
 
 @message(advice="name it so", example={"path": "sheet.jpg"})
@@ -245,7 +254,7 @@ def contact_sheet_is_png(path: str) -> str:
     advice="give COLMAP's own project, or leave the folder as it is with --keep", example={"folder": "project/sparse/0"}
 )
 def already_metric(folder: str) -> str:
-    return f"{folder} already holds a metric scale"
+    return say_metric(folder)
 
 
 @message(advice="leave it out", example={"model": "sparse/0"})
@@ -267,7 +276,7 @@ def dense_comes_along(folder: str) -> str:
 
 @message(advice="rename or remove it", example={"path": "out/sparse"})
 def place_taken(path: str) -> str:
-    return f"{path} is in the place of the project's"
+    return f"{path} has the name of the project's"
 
 
 @message(advice="choose another output folder", example={"path": "out"})
@@ -287,12 +296,12 @@ def output_changed(path: str, out: str) -> str:
 
 @message(advice="name a new folder for the images", example={"path": "pictures"})
 def pictures_exist(path: str) -> str:
-    return f"{path} exists"
+    return say_existing(path)
 
 
 @message(advice="name a new folder for the metric model", example={"path": "metric"})
 def metric_model_exists(path: str) -> str:
-    return f"{path} exists"
+    return say_existing(path)
 
 
 @message(advice=_remove_or_choose, example={"found": {"code": "not-a-result", "values": {}}, "out": "out"})
@@ -302,7 +311,7 @@ def record_unreadable(found: Said, out: str) -> str:
 
 # targets, distances and markers
 
-state("apply-needs-unscaled", "--apply scales a model that claims no unit", advice="add --unscaled", joint=": ")
+state("apply-needs-unscaled", "--apply needs a model without a unit", advice="add --unscaled", joint=": ")
 
 state(
     "markers-needed",
@@ -357,7 +366,7 @@ def marker_not_measured(marker: str, measured: Sequence[int]) -> str:
 
 state(
     "points-need-a-model",
-    "--between with points needs the model that they are of",
+    "--between with points needs the model that they belong to",
     advice="map first (with a target or two markers), or give a COLMAP project",
     joint=": ",
 )
@@ -483,7 +492,7 @@ def owner_unreadable(found: Said, out: str) -> str:
 
 
 @message(
-    advice="start that again, which makes it again",
+    advice="run it again",
     joint=": ",
     example={"found": {"code": "not-a-result", "values": {}}, "lost": "scale.json"},
 )

@@ -10,12 +10,12 @@ from colmap_inertial.messages import message, state
 
 _RECORD_INSTEAD = (
     "move the camera itself back and forth by 20 cm or more, in several directions and briskly, for 10 s or longer, "
-    "while it sees texture; panning, walking straight at one speed and a tripod cannot give a scale"
+    "while it sees texture; panning, walking straight at constant speed, or a tripod cannot give a scale"
 )
 _SWING = "swing the camera back and forth by 20 cm or more, for 10 s or longer, while it sees texture"
 _TURN = "turn the camera about all of its axes while it moves"
 _LONGER = "record longer, with brisker movements of the camera itself in several directions"
-_CLOSE_LOOPS = "close loops while recording, or scale its parts apart"
+_CLOSE_LOOPS = "close loops while recording, or scale its parts separately"
 #: So many places where poses jump, and so many cameras, are said by themselves.
 _MOST_JUMPS, _MOST_CAMERAS = 5, 5
 #: Intervals wider than this are none.
@@ -33,7 +33,7 @@ PARTS: dict[str, tuple[str, str]] = {
     "accel_bias": ("the accelerometer's bias", _TURN),
     "camera_path": (
         "the camera's path",
-        f"{_LONGER}; sharper frames, more texture and more frames a second make the path better",
+        f"{_LONGER}; sharper frames, more texture and more frames per second improve the path",
     ),
     "gyro": ("the gyroscope", _TURN),
     "camera_imu": (
@@ -42,7 +42,7 @@ PARTS: dict[str, tuple[str, str]] = {
     ),
     "clocks": (
         "the camera's or the IMU's clock rate",
-        "give frames and IMU times of one clock, not of a nominal frame rate",
+        "time frames and IMU with one clock, not by a nominal frame rate",
     ),
     "gravity": ("the strength of gravity", "give the latitude"),
     "accel_faults": ("the corrected accelerometer faults", "record without the faults named in the notes"),
@@ -82,15 +82,15 @@ def scale_unknown(half_width: float | None) -> str:
 
 @message(example={"half_width": 0.05})
 def scale_interval_wide(half_width: float) -> str:
-    return f"the 95 % interval is +-{100 * half_width:.1f} %: more or livelier motion would narrow it"
+    return f"the 95 % interval is +-{100 * half_width:.1f} %: more vigorous or longer motion would narrow it"
 
 
 @message(example={"rate": 0.002})
 def clocks_run_apart(rate: float) -> str:
     return (
-        f"the clocks of camera and IMU run {100 * rate:.2g} % apart; if it is the camera's that is wrong, "
-        f"lengths are {200 * rate:.2g} % off: check first that frame times are those of the recorder, not "
-        "counted at a nominal frame rate, then the stamps of the IMU"
+        f"the clock rates of camera and IMU differ by {100 * rate:.2g} %; if the camera's is wrong, lengths are "
+        f"{200 * rate:.2g} % off: check first that frame times are those of the recorder, not "
+        "counted at a nominal frame rate, then the timestamps of the IMU"
     )
 
 
@@ -104,7 +104,7 @@ def not_observable(quantity: str, why: Any) -> str:
 
 state("scale-without-accelerometer", "the recording has no accelerometer, which a metric scale needs; record it too")
 state("scale-not-estimated", "not estimated")
-state("fit-singular", f"camera and IMU do not determine a scale together: {_RECORD_INSTEAD}")
+state("fit-singular", f"camera and IMU together do not determine the scale: {_RECORD_INSTEAD}")
 state("motion-not-determined", "camera and IMU do not determine its motion")
 state("camera-still", "the camera does not move in the model: move it, do not only turn it")
 state("recording-too-short", "the recording is too short: record at least five seconds")
@@ -135,7 +135,7 @@ def frames_too_sparse_to_differentiate(step_s: float) -> str:
 
 @message(example={"needed_s": 5.0})
 def never_covered(needed_s: float) -> str:
-    needed = f"camera and accelerometer never run together for {needed_s:g} s without a pause"
+    needed = f"camera and accelerometer never overlap for {needed_s:g} s without a pause"
     return f"{needed}: record longer"
 
 
@@ -151,7 +151,7 @@ def accel_implausible(accel_m_s2: float, likely: str) -> str:
         "g": "it is in g: multiply it by 9.80665",
         "counts": "it is in mg or raw counts: convert it to m/s2",
     }[likely]
-    return f"the accelerometer's median length is {accel_m_s2:.3g} m/s2 instead of about 9.8; {hint}"
+    return f"the accelerometer's median magnitude is {accel_m_s2:.3g} m/s2 instead of about 9.8; {hint}"
 
 
 @message(example={"rate_rad_s": 45.0})
@@ -162,8 +162,8 @@ def gyro_in_degrees(rate_rad_s: float) -> str:
 @message(example={"poses_s": 60000.0, "imu_s": 60.0, "factor": 1000.0})
 def poses_not_in_seconds(poses_s: float, imu_s: float, factor: float) -> str:
     return (
-        f"the poses span {poses_s:.4g} s and the IMU {imu_s:.4g} s: the poses' times are in ms, us or ns where seconds "
-        f"are read; divide them by {factor:g}"
+        f"the poses span {poses_s:.4g} s and the IMU {imu_s:.4g} s: the poses' times are in ms, us or ns, but were "
+        f"read as seconds; divide them by {factor:g}"
     )
 
 
@@ -171,8 +171,9 @@ def poses_not_in_seconds(poses_s: float, imu_s: float, factor: float) -> str:
 
 state(
     "fit-not-converged",
-    "the fit of camera and IMU does not converge: check that stamps are those of the samples, to a "
-    f"millisecond, or {_RECORD_INSTEAD}",
+    "the fit of camera and IMU does not converge: check that the timestamps are the sampling times, to a "
+    "millisecond, or "
+    "{_RECORD_INSTEAD}",
 )
 
 
@@ -195,8 +196,8 @@ def accel_gain_impossible(gain: float) -> str:
 @message(example={"unexplained_m_s2": 1.2, "motion_m_s2": 1.5})
 def accel_contradicts_motion(unexplained_m_s2: float, motion_m_s2: float) -> str:
     return (
-        f"the accelerometer and the camera's motion disagree by {unexplained_m_s2:.2f} m/s2, where the motion itself "
-        f"is {motion_m_s2:.2f} m/s2: check the accelerometer's sign and axes and that both recordings belong "
+        f"the accelerometer and the camera's motion disagree by {unexplained_m_s2:.2f} m/s2 (the motion itself is "
+        f"{motion_m_s2:.2f} m/s2): check the accelerometer's sign and axes and that both recordings belong "
         f"together, or {_RECORD_INSTEAD}"
     )
 
@@ -218,18 +219,18 @@ def accel_gain_large(gains: Sequence[float]) -> str:
 @message(example={"gains": (0.02, 0.03, -0.02)})
 def calibrated_gain_contradicted(gains: Sequence[float]) -> str:
     return (
-        "the motion contradicts the IMU's calibration: with it, the accelerometer's gain is still off by "
+        "the motion contradicts the IMU's calibration, which leaves the accelerometer's gain off by "
         f"{', '.join(f'{100 * gain:+.1f}' for gain in gains)} % (x, y, z): "
         "calibrate it again (calibrate-imu), or leave its calibration out"
     )
 
 
 _LEVERS = {
-    "inverse": "that of the inverse fits: imu_in_cam_m, and the last column of cam_from_imu, is the IMU in the "
+    "inverse": "the inverse fits: imu_in_cam_m, and the last column of cam_from_imu, is the IMU in the "
     "camera's frame (T_cam_imu)",
-    "sign": "with the other sign it fits: imu_in_cam_m points from the camera to the IMU",
+    "sign": "it fits with the other sign: imu_in_cam_m points from the camera to the IMU",
     "millimetres": "it fits in millimetres: imu_in_cam_m, and the last column of cam_from_imu, is in metres",
-    "": "correct it, or leave it out, and it is estimated",
+    "": "correct it, or leave it out to have it estimated",
 }
 
 
@@ -244,18 +245,18 @@ _LEVERS = {
 def declared_lever_arm(declared_m: Sequence[float], found_m: Sequence[float], sigma_m: float, likely: str) -> str:
     declared, found = ("(" + ", ".join(f"{1e3 * value:.0f}" for value in arm) + ")" for arm in (declared_m, found_m))
     return (
-        f"the declared lever arm is {declared} mm, and the recording shows {found} mm (+-{2e3 * sigma_m:.0f}), by "
-        f"which the scale is estimated: {_LEVERS[likely]}"
+        f"the declared lever arm is {declared} mm, but the recording shows {found} mm (+-{2e3 * sigma_m:.0f}), which "
+        f"is used: {_LEVERS[likely]}"
     )
 
 
 _AGAINST_TARGETS = {
-    "camera": "likeliest the declared intrinsics, which the images contradict, too",
-    "readout": "likeliest the readout, which the images contradict, too",
-    "declared": "likeliest what was declared of the IMU, which the recording contradicts, too",
-    "target": "likeliest the target's stated size: measure its squares, and compare them with [target]",
-    "accelerometer": "likeliest the accelerometer's gain: calibrate it (calibrate-imu)",
-    "": "measure the target's squares, compare them with [target], and see the reasons beside this one",
+    "camera": "most likely the declared intrinsics, which the images contradict, too, are wrong",
+    "readout": "most likely the declared readout, which the images contradict, too, is wrong",
+    "declared": "most likely a declared value of the IMU, which the recording contradicts, too, is wrong",
+    "target": "most likely the target's stated size is wrong: measure its squares, and compare them with [target]",
+    "accelerometer": "most likely the accelerometer's gain is off: calibrate it (calibrate-imu)",
+    "": "measure the target's squares, compare them with [target], and see the other reasons",
 }
 
 
@@ -295,15 +296,16 @@ def accel_lags_as_filtered(lag_s: float) -> str:
 def fit_hardly_converged(moves_log: float) -> str:
     return (
         f"the fit of camera and IMU converges slowly: the scale still moves by {100 * moves_log:.1f} % (included in "
-        "the interval): check that the stamps are the sampling times, to a millisecond"
+        "the interval): check that the timestamps are the sampling times, to a millisecond"
     )
 
 
 @message(example={"delay_s": 0.06})
 def accel_delay_undone(delay_s: float) -> str:
     return (
-        f"the accelerometer's stamps are {1e3 * delay_s:+.0f} ms off the gyroscope's, by the fit, which corrects it: "
-        "stamp both sensors when they are sampled"
+        f"the accelerometer's timestamps are {1e3 * delay_s:+.0f} ms off the gyroscope's (corrected by the fit): "
+        "timestamp "
+        "both sensors when they are sampled"
     )
 
 
@@ -352,16 +354,17 @@ def path_smoothed(cutoff_hz: float) -> str:
 def accel_axes_apart(delays_s: Sequence[float]) -> str:
     delays = ", ".join(f"{axis} {1e3 * d:+.1f}" for axis, d in zip("xyz", delays_s, strict=True))
     return (
-        f"the accelerometer's axes are sampled at different times ({delays} ms from their mean), which is "
-        "corrected: give the stamps of each axis, or a recording that was not resampled axis by axis"
+        f"the accelerometer's axes are sampled at different times ({delays} ms from their mean), which was "
+        "corrected: give the timestamps of each axis, or a recording that was not resampled axis by axis"
     )
 
 
 @message(example={"rate": 2e-4})
 def accel_clock_apart(rate: float) -> str:
     return (
-        f"the accelerometer's clock runs {1e6 * rate:+.0f} ppm off the gyroscope's, which is corrected: "
-        "stamp both sensors by one clock"
+        f"the accelerometer's clock rate is {1e6 * rate:+.0f} ppm off the gyroscope's (corrected): timestamp both "
+        "sensors "
+        "by one clock"
     )
 
 
@@ -442,7 +445,8 @@ def imu_warmer(calibrated_c: float, recorded_c: float, gain_change: float) -> st
 @message(example={"sensor": "gyroscope", "scatter_s": 0.002})
 def stamps_scatter(sensor: str, scatter_s: float) -> str:
     return (
-        f"the {sensor}'s stamps jitter by {1e3 * scatter_s:.1f} ms: stamp samples when they are taken, not when they "
+        f"the {sensor}'s timestamps jitter by {1e3 * scatter_s:.1f} ms: timestamp samples when they are taken, not "
+        "when they "
         "arrive"
     )
 

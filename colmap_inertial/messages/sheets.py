@@ -33,14 +33,14 @@ state("no-body-pose", "holds no T_BS with rows, cols and data")
 @message(example={"key": "camera_model", "found": "'fisheye'", "known": ("pinhole",)})
 def value_not_known(key: str, found: str, known: Sequence[str]) -> str:
     listed = " and ".join(known) if len(known) == 2 else ", ".join(known)
-    return f"{key} {found} is not known here ({listed} {'is' if len(known) == 1 else 'are'})"
+    return f"{key} {found} is not supported (supported: {listed})"
 
 
 @message(example={"missing": ("cov",), "unknown": ()})
 def calibration_fields(missing: Sequence[str], unknown: Sequence[str]) -> str:
     stated = (("missing:", missing), ("unknown:", unknown))
     what = "; ".join(f"{label} {', '.join(names)}" for label, names in stated if names)
-    return f"not the fields of such a calibration ({what})"
+    return f"the fields are not those of such a calibration ({what})"
 
 
 @message(example={"name": "device", "expected": "text"})
@@ -57,7 +57,7 @@ def field_not_single(name: str) -> str:
 @message(example={"kind": "lens", "known": ("camera-imu", "imu"), "writers": ("align", "calibrate-imu")})
 def calibration_kind_unknown(kind: str, known: Sequence[str], writers: Sequence[str]) -> str:
     listed = ", ".join(f'"{name}" ({command})' for name, command in zip(known, writers, strict=True))
-    return f"kind: {kind!r} is no kind of calibration; known: {listed}"
+    return f"unknown kind of calibration {kind!r}; known: {listed}"
 
 
 @message(example={"name": "cam2", "cameras": ("cam0", "cam1")})
@@ -67,15 +67,15 @@ def no_camera_of_name(name: str, cameras: tuple[str, ...]) -> str:
 
 state("kalibr-pose-missing", "T_cn_cnm1 (its pose against the camera before it) is missing")
 state("sheet-without-intrinsics", "holds no intrinsics")
-state("lens-model-unknown-to-colmap", "prism or tilt coefficients are not known to COLMAP's cameras")
-state("calibration-of-another-kind", "holds no calibration of a camera and an IMU (its kind is another)")
+state("lens-model-unknown-to-colmap", "COLMAP has no camera model with prism or tilt coefficients")
+state("calibration-of-another-kind", "holds no calibration of a camera and an IMU (it is of another kind)")
 state("calibration-cov-order", "cov_parameters: the order of cov is not the one of this version")
 state("no-imu-calibration", "holds no calibration of an IMU (colmap-inertial calibrate-imu writes one)")
 
 
 @message(advice="give one of them", example={"other": "a.json", "kind": "imu"})
 def calibrations_say_the_same(other: str, kind: str) -> str:
-    what = {"camera-imu": "how camera and IMU relate", "imu": "the IMU's own gains"}[kind]
+    what = {"camera-imu": "the rotation and time offset between camera and IMU", "imu": "the IMU's own gains"}[kind]
     return f"and {other} both say {what}"
 
 
@@ -86,7 +86,7 @@ def camera_not_calibrated(name: str, cameras: tuple[str, ...]) -> str:
 
 state(
     "no-rig-calibration",
-    "is no calibration of several cameras",
+    "is not a calibration of several cameras",
     advice="give Kalibr's or OpenCV's YAML, COLMAP's rig_config.json, or the folder of a COLMAP model with rigs.bin",
     joint=": ",
 )
@@ -121,7 +121,7 @@ def camera_model_unknown(model: str) -> str:
     return f"camera model {model} is unknown"
 
 
-state("cam-from-rig-not-a-quaternion", "cam_from_rig_rotation is no unit quaternion")
+state("cam-from-rig-not-a-quaternion", "cam_from_rig_rotation is not a unit quaternion")
 state("rig-file-missing", "is missing: the calibration must be a COLMAP model in binary format with rigs")
 
 

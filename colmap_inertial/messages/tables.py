@@ -21,7 +21,7 @@ state("no-header-of-columns", "has no header that names its columns")
 
 @message(example={"first": "gyro x", "second": "wx"})
 def columns_alike(first: str, second: str) -> str:
-    return f'two columns mean the same: "{first}" and "{second}"'
+    return f'two columns hold the same quantity: "{first}" and "{second}"'
 
 
 @message(example={"columns": ("gx", "gy", "gz")})
@@ -31,7 +31,7 @@ def no_single_unit(columns: Sequence[str]) -> str:
 
 
 @message(
-    advice=lambda why, header, hint: f"describe it in a capture.toml, where ? stands for what it does not say:\n{hint}",
+    advice=lambda why, header, hint: f"describe it in a capture.toml, with ? for what the file does not state:\n{hint}",
     example={"why": {"code": "no-header-of-columns", "values": {}}, "header": None, "hint": "[imu.gyro]\n..."},
 )
 def table_unclear(why: Said, header: str | None, hint: str) -> str:
@@ -39,11 +39,11 @@ def table_unclear(why: Said, header: str | None, hint: str) -> str:
 
 
 @message(
-    advice="write an array of objects, an object on each line, or lists of one length under their names: a time, and "
+    advice="write an array of objects, an object on each line, or lists of equal length under their names: a time, and "
     "three numbers of each sensor"
 )
 def json_without_rows() -> str:
-    return "is JSON without rows of samples that are known here"
+    return "is JSON without samples in a known layout"
 
 
 _POINTS = {
@@ -60,7 +60,7 @@ _SENSORS = {"gyro": "gyroscope", "accel": "accelerometer"}
 
 
 @message(
-    advice=lambda hint, **_: f"describe it in a capture.toml, where ? stands for what it does not say:\n{hint}",
+    advice=lambda hint, **_: f"describe it in a capture.toml, with ? for what the file does not state:\n{hint}",
     example={"source": "", "open": (("gyro", "unit"), ("accel", "unit")), "header": "t,gx", "hint": "[imu.gyro]\n..."},
 )
 def table_open(source: str, open: Sequence[tuple[str, str]], header: str | None, hint: str) -> str:
@@ -71,17 +71,17 @@ def table_open(source: str, open: Sequence[tuple[str, str]], header: str | None,
     begin = f"it does not say {', '.join(said)}"
     if not said:
         begin = (
-            f"it is to be confirmed that this is from {source}"
+            f"it must be confirmed that this is from {source}"
             if source
-            else "holds one sensor, a table beside it the other"
+            else "holds one sensor; a table beside it holds the other"
         )
     return begin + (f"; the header is: {header}" if header else "")
 
 
 def _arrival_advice(jitter_ms: float, hint: str, **_: object) -> str:
     return (
-        f"have the driver stamp its messages, or take the times of their arrival (uneven by {jitter_ms:.2g} ms; delays "
-        f"stay) by a capture.toml:\n{hint}"
+        f"let the driver timestamp its messages, or use their arrival times (jitter {jitter_ms:.2g} ms; delays "
+        f"remain) by a capture.toml:\n{hint}"
     )
 
 
@@ -106,8 +106,8 @@ def bag_stamps_repeated(path: str, topic: str, count: int, total: int, jitter_ms
 @message(advice=_arrival_advice, example={**_BAG, "count": 7})
 def bag_stamps_jump_back(path: str, topic: str, count: int, total: int, jitter_ms: float, hint: str) -> str:
     return (
-        f"{path}: the header.stamp of {count} of {total} messages of {topic} lies more than half a second behind one "
-        "before it: the driver's clock was set, or drivers with two clocks publish on the topic"
+        f"{path}: the header.stamp of {count} of {total} messages of {topic} is more than half a second before that "
+        "of an earlier message: the driver's clock was set, or drivers with two clocks publish on the topic"
     )
 
 
@@ -117,8 +117,8 @@ def bag_stamps_jump_back(path: str, topic: str, count: int, total: int, jitter_m
 )
 def bag_stamps_jump_ahead(path: str, topic: str, count: int, jump_s: float, jitter_ms: float, hint: str) -> str:
     return (
-        f"{path}: the header.stamp of {count} messages of {topic} jumps ahead, by up to {jump_s:.3g} s more than they "
-        "arrived later: the driver's clock was set"
+        f"{path}: the header.stamp of {count} messages of {topic} jumps ahead by up to {jump_s:.3g} s against their "
+        "times of arrival: the driver's clock was set"
     )
 
 
@@ -133,17 +133,15 @@ def bag_stamps_jump_ahead(path: str, topic: str, count: int, jump_s: float, jitt
     },
 )
 def bag_of_two_clocks(path: str, topics: Sequence[str], apart_s: float, jitter_ms: float, hint: str) -> str:
-    return f"{path}: the header.stamp of {' and '.join(topics)} are of two clocks, {apart_s:.3g} s apart"
+    return f"{path}: the header.stamp of {' and '.join(topics)} come from two clocks, {apart_s:.3g} s apart"
 
 
 @message(
-    advice="record one of them, or keep one by its node (rosbag filter with m._connection_header['callerid'])",
+    advice="record one of them, or select one by its node (rosbag filter with m._connection_header['callerid'])",
     example={"path": "imu.bag", "topic": "/imu", "nodes": ("/driver", "/filter")},
 )
 def bag_of_two_drivers(path: str, topic: str, nodes: Sequence[str]) -> str:
-    return (
-        f"{path}: {len(nodes)} drivers publish on {topic} in turn ({', '.join(nodes)}); as one IMU they make no sense"
-    )
+    return f"{path}: {len(nodes)} drivers publish on {topic} ({', '.join(nodes)}): these are not the samples of one IMU"
 
 
 @message(example={"topic": "/imu", "topics": ("/imu0", "/imu1")})
@@ -156,7 +154,7 @@ def bag_without_topic(topic: str, topics: Sequence[str]) -> str:
     "file that align wrote"
 )
 def calibration_unknown() -> str:
-    return "is no calibration of a camera and an IMU that is known here"
+    return "is not a supported calibration of a camera and an IMU"
 
 
 @message(
@@ -167,6 +165,6 @@ def calibration_of_several(cameras: Sequence[str]) -> str:
     return f"calibrates several cameras ({', '.join(cameras)})"
 
 
-@message(advice="give Kalibr's camchain-imucam, in which T_cam_imu stands, or state cam_from_imu under [calibration]")
+@message(advice="give Kalibr's camchain-imucam (with T_cam_imu), or cam_from_imu under [calibration]")
 def calibration_without_imu() -> str:
-    return "says nothing of an IMU: it calibrates the camera alone, for sensor_yaml under [camera]"
+    return "calibrates the camera alone, without an IMU, as sensor_yaml under [camera] expects"

@@ -139,7 +139,7 @@ def marker_of_table_not_measured(marker: str, measured: Sequence[int]) -> str:
 
 # its place in the model
 
-state("target-behind-camera", "the fit placed the target behind a camera that sees it")
+state("target-behind-camera", "the fit places the target behind a camera that sees it")
 
 
 @message(example={"count": 5, "unknowns": 9})

@@ -115,12 +115,12 @@ state("no-video-frames", "holds no video frames")
 
 @message(advice="give frame_times under [video] in capture.toml", example={"path": "a.mp4"})
 def frames_without_stamps(path: str) -> str:
-    return f"{path}: frames carry no presentation stamps"
+    return f"{path}: frames carry no presentation timestamps"
 
 
 @message(advice="give frame_times under [video] in capture.toml", example={"path": "a.mp4", "stamp_s": 1.0})
 def frames_of_one_stamp(path: str, stamp_s: float) -> str:
-    return f"{path}: two frames have the presentation stamp {stamp_s:.6f} s"
+    return f"{path}: two frames have the presentation timestamp {stamp_s:.6f} s"
 
 
 @message(example={"frame_s": 1.0})

@@ -155,12 +155,12 @@ state(
 
 @message(example={"names": ("points3D.bin",)})
 def model_incomplete(names: tuple[str, ...]) -> str:
-    return f"no whole COLMAP model here: {', '.join(names)} {'is' if len(names) == 1 else 'are'} missing"
+    return f"incomplete COLMAP model: {', '.join(names)} {'is' if len(names) == 1 else 'are'} missing"
 
 
 @message(advice="open the folder there and have it downloaded", example={"names": ("points3D.bin",)})
 def kept_in_cloud(names: tuple[str, ...]) -> str:
-    return f"no whole COLMAP model here: {', '.join(names)} {'is' if len(names) == 1 else 'are'} in iCloud only"
+    return f"incomplete COLMAP model: {', '.join(names)} {'is' if len(names) == 1 else 'are'} in iCloud only"
 
 
 @message(example={"kinds": ("2 .las", "1 .splat")})
@@ -214,7 +214,7 @@ def training_of_another_model(path: str) -> str:
 
 @message(example={"path": "exports/splat.ply", "by": "outputs/dataparser_transforms.json"})
 def frame_of_training(path: str, by: str) -> str:
-    return f"{path}: copied unchanged, as its points are in a training's own frame; {by} transforms metres to it"
+    return f"{path}: copied unchanged, as its points are in the frame of a training run; {by} transforms metres to it"
 
 
 @message(example={"path": "transforms.json"})
@@ -331,7 +331,7 @@ def _contradiction_advice(
             f"check the gap, which is {gap:g} in its description: the distance between two tags divided by a tag's "
             f"side{likely}"
         )
-    return "check its columns, rows and sizes, that it is flat, and that it was not printed stretched"
+    return "check its columns, rows and sizes, that it is flat, and that it was printed without distortion"
 
 
 @message(

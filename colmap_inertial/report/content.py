@@ -175,9 +175,7 @@ def _validation(out: Path, model: Content, *, project: bool) -> Content:
         if model["metres_per_unit"] is None:
             return _mark_missing("Without a scale there is nothing to measure a target with.")
         if project:
-            return _mark_missing(
-                "No target was named, or the project's images are not at hand (then the notes say so)."
-            )
+            return _mark_missing("No target was named, or the project's images are missing (the notes then say so).")
         return _mark_missing("The capture names no target of known size ([target] in capture.toml).")
     if "error" in validation:
         return _mark_missing(f"The target could not be measured: {validation['error']}.")
@@ -275,7 +273,7 @@ def _rolling_shutter(done: Content, recording: Content | None) -> Content:
     movement = None if recording is None else recording["rolling_shutter"]
     if movement is None:
         note = done.get("imaging", {}).get("rolling_shutter")
-        return _mark_missing(f"Nothing was done about a rolling shutter{f': {note}' if note else ''}.")
+        return _mark_missing(f"No rolling shutter was corrected{f': {note}' if note else ''}.")
     assert recording is not None
     note = done.get("imaging", {}).get("rolling_shutter", "")
     return {"note": note, "readout_s": recording["frames"]["readout_s"], **movement}

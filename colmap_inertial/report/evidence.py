@@ -50,8 +50,8 @@ def evidence_rows(sensors: Mapping[str, Any]) -> tuple[EvidenceRow, ...]:
 def _row(one: Mapping[str, Any]) -> EvidenceRow:
     scale, ci95 = float(one["metres_per_unit"]), (float(one["ci95"][0]), float(one["ci95"][1]))
     own = sum(float(sigma) ** 2 for sigma in one["systematic_sigma_log"].values()) ** 0.5
-    made_of = f"random {196 * one['random_sigma_log']:.2g} %, its own {196 * own:.2g} %"
-    text = f"{_in_words(scale, ci95)}; {made_of}; counts {100 * one['share']:.0f} %"
+    made_of = f"random {196 * one['random_sigma_log']:.2g} %, systematic {196 * own:.2g} %"
+    text = f"{_in_words(scale, ci95)}; {made_of}; weight {100 * one['share']:.0f} %"
     return EvidenceRow(sensor=name_of(one["sensor"]), metres_per_unit=scale, ci95=ci95, text=text)
 
 

@@ -181,7 +181,7 @@ def spectra(spectrum: dict[str, Any], *, unit: str, factor: float = 1.0) -> Figu
     other = spectrum.get("camera_unit") == "units/s2"
     names = {
         "imu": ("IMU, all samples", QUIET, 1.4),
-        "imu_at_frames": ("IMU as the frames see it", IMU, 5.0),
+        "imu_at_frames": ("IMU, averaged from frame to frame", IMU, 5.0),
         "camera": ("camera (model units, right)" if other else "camera", CAMERA, 1.6),
     }
     data = []
@@ -269,7 +269,7 @@ def drift(model: dict[str, Any]) -> Figure:
     band |= {"fillcolor": GOOD, "opacity": 0.13, "layer": "below"}
     most = 1.15 * max([1.3 * width, *(abs(o) + r for o, r in zip(off, reach, strict=True))])
     x = axis(_TIME, range=[min(0.0, every[0]["begin_s"] - start_s), every[-1]["end_s"] - start_s], zeroline=False)
-    y = axis("off the whole (%)", zeroline=True, range=[-most, most])
+    y = axis("against the whole (%)", zeroline=True, range=[-most, most])
     return {"data": [dots, key], "layout": layout(300, x, y, shapes=[band])}
 
 
@@ -281,7 +281,9 @@ def refined(model: dict[str, Any], parts: Sequence[dict[str, Any]]) -> Figure:
     sides = (("before", CAMERA, before), ("after", GOOD, [0.0] * len(parts)))
     return {
         "data": [_intervals(parts, start_s, off, reach, f"{name} the refinement, 95 %", c) for name, c, off in sides],
-        "layout": layout(300, axis(_TIME, zeroline=False), axis("off the whole (%)", zeroline=True), showlegend=True),
+        "layout": layout(
+            300, axis(_TIME, zeroline=False), axis("against the whole (%)", zeroline=True), showlegend=True
+        ),
     }
 
 

@@ -39,8 +39,8 @@ def calibration_page(found: RestCalibration, *, source: str) -> str:
         verdict=found.verdict,
         reasons=[*sentences(found.reasons), gain_effect(found)],
         values=calibration_facts(found),
-        lengths=_dots([("as read", QUIET, middle_s, before, names), corrected], "error of gravity's length (%)"),
-        corrected=_dots([corrected], "error of gravity's length (%)"),
+        lengths=_dots([("as read", QUIET, middle_s, before, names), corrected], "error of gravity's magnitude (%)"),
+        corrected=_dots([corrected], "error of gravity's magnitude (%)"),
         turns=_dots([turns], "gravity error after a turn (°)"),
         parameters=_parameters(found),
     )

@@ -21,7 +21,11 @@ if TYPE_CHECKING:
 
 
 def photogrammetry_record(
-    reconstruction: pycolmap.Reconstruction, display_from_model_xyzw: Array, *, unit: str
+    reconstruction: pycolmap.Reconstruction,
+    display_from_model_xyzw: Array,
+    *,
+    unit: str,
+    keeps_intrinsics: bool = False,
 ) -> dict[str, Any]:
     """Figures of a model, its images and cameras; lengths are in ``unit``.
 
@@ -33,6 +37,8 @@ def photogrammetry_record(
         (4,) rotation that puts it upright, for what is seen from above.
     unit
         ``"m"`` or ``"model"``.
+    keeps_intrinsics
+        Whether the cameras are as they were declared: their parameters have no standard deviation then.
 
     Returns
     -------
@@ -50,7 +56,8 @@ def photogrammetry_record(
         _observe(reconstruction.camera(images[i].camera_id), images[i], place)
         for i in stride_indices(len(images), SIZES.residual_images)
     ]
-    sigma, longest = intrinsics_sigma(reconstruction), SIZES.longest_track
+    sigma = {} if keeps_intrinsics else intrinsics_sigma(reconstruction)
+    longest = SIZES.longest_track
     return {
         "unit": unit,
         "cameras": [

@@ -134,9 +134,9 @@ def survey_facts(survey: Content, scene: Content, place: Content | None) -> Iter
     if gsd:
         middle = gsd[len(gsd) // 2]
         length = f"{digits(1000 * middle, 3)} mm" if unit == "m" else f"{digits(middle, 3)} {unit}"
-        yield "ground sampling distance", f"{length} a pixel"
+        yield "ground sampling distance", f"{length} per pixel"
     if images:
-        yield "points an image", f"{sum(i['observations'] for i in images) / len(images):.0f}"
+        yield "points per image", f"{sum(i['observations'] for i in images) / len(images):.0f}"
     yield "mean track length", digits(survey["tracks"]["mean"], 3)
     if scene.get("path_length") is not None:
         yield "camera path", f"{digits(scene['path_length'], 3)} {unit}"
@@ -176,7 +176,7 @@ def readout_rows(models: Sequence[Content]) -> Rows:
         if change:
             lengths = f"{change['shift_px']:.2f}", f"{change['before_px']:.3f}", f"{change['after_px']:.3f}"
             rows.append(
-                (str(model["index"]), *lengths, "kept" if change["accepted"] else "not worth it, left as it was")
+                (str(model["index"]), *lengths, "kept" if change["accepted"] else "no improvement, left as it was")
             )
     return rows
 

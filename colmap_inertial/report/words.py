@@ -31,10 +31,10 @@ _TARGET = (
     "([target]), or measure a length: reconstruct OUT/colmap NEW_FOLDER --scale-from distance, or --scale-from target."
 )
 _MODEL = (
-    "Resolve the reasons listed: check the model first (wrong poses show as jumps of the camera's path), then "
-    "the axes, units and time stamps of the IMU."
+    "Resolve the reasons below: check the model first (wrong poses show as jumps of the camera's path), then "
+    "the axes, units and timestamps of the IMU."
 )
-_CHECK = "Resolve the reasons listed; until then, check a known length before you measure in the model."
+_CHECK = "Resolve the reasons below; until then, check a known length before you measure in the model."
 
 
 def digits(value: float, count: int = 4) -> str:

@@ -325,7 +325,7 @@ def units() -> Iterator[Mistake]:
         name="frame times in ms, called s",
         codes=("time-unit",),
         make=frame_times(lambda t_s: 1e3 * t_s),
-        says="frames span .* in milliseconds where seconds were read",
+        says="frames span .* in milliseconds",
         mend=frame_times(lambda t_ms: t_ms, "name,t_ms"),
     )
     yield unit(
@@ -382,7 +382,7 @@ def clocks() -> Iterator[Mistake]:
         name="times by another frame rate",
         codes=("frame-rate",),
         make=frame_times(lambda t_s: 1.25 * t_s),
-        says="timed by another frame rate",
+        says="timed at another frame rate",
         mend=follow_frame_rate,
     )
     yield clock(

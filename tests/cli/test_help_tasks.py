@@ -42,7 +42,7 @@ def test_each_page_begins_with_what_it_does_and_an_example(capsys):
         paragraphs = out.split("\n\n")
         assert paragraphs[0].startswith(f"usage: colmap-inertial {command}")
         assert paragraphs[1].endswith(".") and "Example: colmap-inertial" in out
-        assert out.index("Arguments:") < out.index("Of every command:")
+        assert out.index("Arguments:") < out.index("Options of every command:")
 
 
 def test_the_common_options_come_first(subtests, capsys):

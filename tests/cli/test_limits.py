@@ -59,9 +59,9 @@ def test_a_limit_that_numpy_cannot_be_loaded_within_is_said_too(tmp_path):
 
 def test_what_runs_out_on_the_way_is_a_sentence(subtests, capsys):
     for error, said in (
-        (MemoryError(), "the memory is used up"),
-        (OSError(errno.ENOMEM, "Cannot allocate memory"), "the memory is used up"),
-        (ImportError("cv2.abi3.so: failed to map segment from shared object"), "the memory is used up"),
+        (MemoryError(), "out of memory"),
+        (OSError(errno.ENOMEM, "Cannot allocate memory"), "out of memory"),
+        (ImportError("cv2.abi3.so: failed to map segment from shared object"), "out of memory"),
         (OSError(errno.EMFILE, "Too many open files"), "too many files are open"),
     ):
         with subtests.test(error=error), pytest.MonkeyPatch.context() as patch:
@@ -89,7 +89,7 @@ def test_what_it_has_led_to_is_the_same_sentence(monkeypatch, capsys):
     with pytest.raises(SystemExit) as stopped:
         main(["scale", "a", "--json", "b"])
     assert stopped.value.code == 2
-    assert capsys.readouterr().err.startswith("error: the memory is used up")
+    assert capsys.readouterr().err.startswith("error: out of memory")
 
 
 def test_anything_else_keeps_its_traceback(subtests):

@@ -179,7 +179,7 @@ def test_a_viewer_that_others_can_reach_says_so(subtests, told):
         with subtests.test(host=host):
             words = told(terminal.show_view, Path("out"), "http://address", host)
             assert words.startswith("out is shown at http://address (Ctrl-C ends this)")
-            assert ("everybody on the network" in words) == warned
+            assert ("anyone on the network" in words) == warned
 
 
 HERE = Path("here")

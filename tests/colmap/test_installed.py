@@ -278,7 +278,7 @@ def test_another_program_is_refused_before_any_work(capture, tmp_path, text, mes
 def test_one_that_may_not_be_run_or_hangs_is_refused(capture, tmp_path, monkeypatch):
     path = program(tmp_path / "colmap", OLDER)
     path.chmod(0o644)
-    with pytest.raises(FormatError, match=r"may not be run: make it executable \(chmod \+x\)"):
+    with pytest.raises(FormatError, match=r"is not executable: make it executable \(chmod \+x\)"):
         run(capture, tmp_path / "out", path)
     limits = dataclasses.replace(executable._LIMITS, help_s=0.2)
     monkeypatch.setattr(executable, "_LIMITS", limits)

@@ -50,7 +50,7 @@ def test_packets_are_found_in_samples_of_one_or_several():
 
 def test_packets_that_are_cut_off_are_named(subtests):
     for samples, said in (
-        ([turn(1.0), bytes(3)], "shorter than its head"),
+        ([turn(1.0), bytes(3)], "shorter than its header"),
         ([turn(1.0), turn(2.0), pull(3.0)[:-1]], "packet 3 of type 3 of its camm track is cut off"),
         ([turn(1.0), turn(2.0) + pull(3.0)[:-4], turn(4.0)], "of type 3 of its camm track is cut off"),
     ):

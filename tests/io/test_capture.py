@@ -166,7 +166,7 @@ def test_a_video_capture(tmp_path: Path) -> None:
         (IMU + '[imu.gyro]\naxes = "y,x,z"\n', "line 4: .*left-handed.*mirrored = true"),
         (IMU + '[imu.gyro]\naxes = "y,y,z"\n', "line 4: .*x, y and z once each"),
         (IMU + '[imu.gyro]\naxes = "y,-x"\n', "line 4: .*x, y and z once each"),
-        (IMU + '[imu.gyro]\naxes = "x,y,z"\nmirrored = true\n', "line 5: .*keep the handedness"),
+        (IMU + '[imu.gyro]\naxes = "x,y,z"\nmirrored = true\n', "line 5: .*handedness"),
         (IMU + "[imu.noise]\ngyro_density_rad_s_rthz = 1e-4\n", r"line 3: .*accel_density_m_s2_rthz is missing"),
         (IMU + "[calibration]\ncam_from_imu = [[1, 0], [0, 1]]\n", "line 4: .*3x3 or 4x4"),
         (IMU + "[calibration]\ncam_from_imu = [[1,0,0],[0,1,0],[0,0,-1]]\n", "line 4: .*right-handed"),
@@ -229,7 +229,7 @@ def test_intrinsics_count_from_the_corner_or_the_centre_of_the_first_pixel(tmp_p
         ('columns = ["gx", "gy"]', "three names"),
         ("columns = [1, 2, 3]", "none of them the time"),
         ("columns = [0, 2, 3]", "counted from 1"),
-        ("columns = [2, 3, 40]", "there is no column 40"),
+        ("columns = [2, 3, 40]", "column 40 does not exist"),
         ('columns = ["gx", "gy", "gz"]', 'has no column "gx"; the header is'),
     ],
 )

@@ -135,8 +135,9 @@ def test_ros_recordings_that_unpack_to_much_more_are_refused(
     assert size < 3e6
     tracemalloc.start()
     try:
-        with pytest.raises(FormatError, match=r"unpacks to more than \d+ MB, out of proportion to its \d+ bytes"):
+        with pytest.raises(FormatError) as refused:
             read_imu(path)
+        assert refused.value.code == "bag-out-of-proportion"
         assert tracemalloc.get_traced_memory()[1] < 30e6
     finally:
         tracemalloc.stop()
@@ -151,8 +152,9 @@ def test_a_bag_whose_index_names_a_chunk_twice_is_refused(tmp_path: Path, imu: I
         at += 4 + struct.unpack_from("<I", data, at)[0]
     many = data.replace(b"chunk_count=\1", b"chunk_count=\5") + 4 * data[at:]
     write_anew(path, many)
-    with pytest.raises(FormatError, match="its index names parts of it more than once"):
+    with pytest.raises(FormatError) as refused:
         read_imu(path)
+    assert refused.value.code == "bag-index-repeats"
 
 
 @pytest.mark.parametrize("name", RECORDERS)

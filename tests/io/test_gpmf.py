@@ -126,6 +126,6 @@ def test_samples_lie_evenly_but_where_some_were_lost_or_came_from_before():
 
 
 def test_stamps_without_a_pace_are_refused(subtests):
-    for stamps_ns, said in (([5], "one payload alone"), ([5, 5, 5], "do not increase"), ([9, 5, 1], "do not increase")):
+    for stamps_ns, said in (([5], "single payload"), ([5, 5, 5], "do not increase"), ([9, 5, 1], "do not increase")):
         with subtests.test(stamps_ns=stamps_ns, said=said), pytest.raises(ValueError, match=said):
             spread(np.array(stamps_ns), np.full(len(stamps_ns), 4), 2, 0.02)

@@ -102,9 +102,9 @@ def test_a_video_s_stamps_packet_by_packet(monkeypatch: pytest.MonkeyPatch, tmp_
     refused: tuple[tuple[list[int | None], dict[str, Any], type[InertialError], str], ...] = (
         ([], {}, FormatError, "holds no video frames"),
         ([0, 20], {"cut": (0, 1)}, FormatError, "holds no video frames"),
-        ([0, None, 40], {}, TimingError, "no presentation stamps; give frame_times"),
-        ([0, 20, 40], {"base": None}, TimingError, "no presentation stamps; give frame_times"),
-        ([0, 20, 40, 20], {}, TimingError, "two frames have the presentation stamp 0.020000 s"),
+        ([0, None, 40], {}, TimingError, "no presentation timestamps; give frame_times"),
+        ([0, 20, 40], {"base": None}, TimingError, "no presentation timestamps; give frame_times"),
+        ([0, 20, 40, 20], {}, TimingError, "two frames have the presentation timestamp 0.020000 s"),
         ([0, 20], {"listed": 5}, FormatError, "is cut off: it holds 2 of the 5 frames .*, the last at 0.020 s"),
         ([0, 20], {"duration_s": 0.17}, FormatError, "is cut off: it states 0.170 s, but holds 2 frames"),
     )

@@ -127,7 +127,7 @@ def test_what_cannot_be_frames_is_named(subtests, tmp_path_factory):
     for content, said in (
         ([sample(0)], "holds no frames"),
         ([frame(0), frame(1, t=b"")], "a frame has no time"),
-        ([frame(0), frame(1, iso=message(6, b"1"))], "a frame's number that is none"),
+        ([frame(0), frame(1, iso=message(6, b"1"))], "a frame's number"),
     ):
         with subtests.test(said=said):
             tmp_path = tmp_path_factory.mktemp("given")

@@ -11,6 +11,7 @@ from jsonschema import Draft202012Validator
 from colmap_inertial.model.readout import intrinsics_sigma
 from colmap_inertial.report import write_report
 from colmap_inertial.report.photogrammetry import photogrammetry_record
+from colmap_inertial.report.run_page import intrinsics_rows
 from tests.helpers.report_runs import write_run
 
 ROOT = Path(__file__).parents[2]
@@ -90,6 +91,13 @@ def test_the_uncertainty_of_intrinsics_is_their_scatter_over_models(synthetic):
     # half of the variance, the noise that the model had before, is the same in all
     ratio = 2**0.5 * scatter / told
     assert ((ratio > 0.6) & (ratio < 1.6)).all(), ratio
+
+
+def test_intrinsics_that_were_kept_have_no_standard_deviation(synthetic, record):
+    assert set(record["cameras"][0]["sigma"]) == {"f", "k"}
+    kept = photogrammetry_record(synthetic, UPRIGHT, unit="m", keeps_intrinsics=True)
+    assert kept["cameras"][0]["sigma"] == {}
+    assert intrinsics_rows(kept["cameras"][0])[0][2:] == ("1280", "")
 
 
 def test_the_ground_sampling_distance_is_depth_over_focal_length(synthetic, record):

@@ -563,7 +563,7 @@ def test_a_refused_report_does_not_say_that_nothing_was_wrong(refused, tmp_path)
     [
         ("diagnosis.json", "findings", "was not checked before the reconstruction"),
         ("report_data/model_0.json", "scene", "were not kept"),
-        ("report_data/recording.json", "shutter", "Nothing was done about a rolling shutter"),
+        ("report_data/recording.json", "shutter", "No rolling shutter was corrected"),
     ],
 )
 def test_a_section_without_data_is_left_out_with_the_reason(full, tmp_path, gone, anchor, said):
@@ -688,7 +688,7 @@ def test_why_there_is_no_target_and_there_are_no_crops(full, tmp_path):
         frame |= {"action": "passed", "sharpened": False}
     del result["imaging"]
     content, _ = report_of_changed(out, {**result, "project": {"imu": "x"}})
-    assert "not at hand" in content["models"][0]["validation"]["missing"]
+    assert "are missing" in content["models"][0]["validation"]["missing"]
     assert "No frame was deblurred" in content["crops"]["missing"]
 
 

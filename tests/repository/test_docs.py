@@ -229,8 +229,8 @@ def test_the_public_names_are_those_of_the_api_reference():
     assert sorted(listed) == sorted(colmap_inertial.__all__)
 
 
-def test_every_field_of_a_result_is_in_its_docstring():
-    for result in (ReconstructResult, ModelResult, Fragment):
+def test_every_field_of_a_result_and_of_the_options_is_in_its_docstring():
+    for result in (ReconstructResult, ModelResult, Fragment, ReconstructOptions):
         text = "".join(kind.__doc__.partition("Attributes")[2] for kind in result.__mro__[:-1])
         listed = {name for line in re.findall(r"^    (\w.*)$", text, re.MULTILINE) for name in line.split(", ")}
         assert {f.name for f in dataclasses.fields(result)} - listed == set(), result

@@ -27,7 +27,7 @@ from colmap_inertial.model.similarities import undoing
 from colmap_inertial.run.commands.reporting import write_model_record
 from colmap_inertial.run.commands.result import ScaledModel
 from colmap_inertial.run.commands.torn_parts import TornParts
-from colmap_inertial.run.stages.metric import gravity_in_model, metric_trajectory, write_trajectory
+from colmap_inertial.run.stages.metric import MetricStage, gravity_in_model, metric_trajectory, write_trajectory
 from colmap_inertial.run.steps.session import Session
 
 log = logging.getLogger(__name__)
@@ -179,7 +179,8 @@ class ModelStageRun:
                 trajectory = workspace.trajectory(result.index, first=not any(workspace.root.glob("trajectory*.tum")))
                 write_trajectory(trajectory, model, poses, imu, place)
                 result = replace(result, trajectory=count_from(workspace.root, trajectory))
-        write_model_record(workspace, result.index, model, poses, imu)
+        keeps = any(isinstance(stage, MetricStage) and stage.keeps_intrinsics for stage in self.stages)
+        write_model_record(workspace, result.index, model, poses, imu, keeps_intrinsics=keeps)
         log.info("model %d: %s %s", result.index, model.scale.verdict, "; ".join(sentences(model.scale.reasons)))
         return result
 

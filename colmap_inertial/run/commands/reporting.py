@@ -143,6 +143,8 @@ def write_model_record(
     model: Model,
     trajectory: CameraTrajectory,
     imu: ImuRecording,
+    *,
+    keeps_intrinsics: bool,
 ) -> None:
     """Keep what the report draws of one model: its scene, and camera against IMU."""
     if model.scale is None:
@@ -153,7 +155,10 @@ def write_model_record(
         record = {
             "scene": scene,
             "photogrammetry": photogrammetry_record(
-                model.reconstruction, np.array(scene["display_from_model_xyzw"]), unit=scene["unit"]
+                model.reconstruction,
+                np.array(scene["display_from_model_xyzw"]),
+                unit=scene["unit"],
+                keeps_intrinsics=keeps_intrinsics,
             ),
             "signals": signal_record(trajectory, imu, model.scale, gravity, first_frame_s=first_frame_s),
         }

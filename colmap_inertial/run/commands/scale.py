@@ -6,13 +6,14 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from colmap_inertial.core.camera_clock import CameraTimedImu
-from colmap_inertial.core.errors import FormatError, NotObservableError
+from colmap_inertial.core.errors import FormatError, NotObservableError, TimingError
 from colmap_inertial.core.facts import Fact, as_fact
 from colmap_inertial.core.options import ScaleOptions
 from colmap_inertial.core.progress import silent
-from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate
+from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, FrameTiming, ImuRecording, ScaleEstimate
 from colmap_inertial.diagnose import diagnose
 from colmap_inertial.inertial.scale import estimate_scale, first_seconds, learn_lever_arm
 from colmap_inertial.io.calibration import (
@@ -27,7 +28,7 @@ from colmap_inertial.io.calibration import (
 from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.device_folders import is_device_folder, read_device_folder
 from colmap_inertial.io.files import write_json
-from colmap_inertial.io.frame_times import NO_RIGS
+from colmap_inertial.io.frame_times import NO_RIGS, stamps_of_pattern
 from colmap_inertial.io.frames import read_frame_times
 from colmap_inertial.io.imu import is_capture, read_unchecked_imu
 from colmap_inertial.io.imu_text import is_inertial_scale
@@ -53,6 +54,9 @@ from colmap_inertial.run.preparation.preflight import CheckInputs, TolerantReade
 from colmap_inertial.run.stages.metric import MetricStage
 from colmap_inertial.run.steps.workspace import refuse_links_around
 
+if TYPE_CHECKING:
+    import pycolmap
+
 
 @dataclass(frozen=True, kw_only=True)
 class ScaleSource:
@@ -66,6 +70,9 @@ class ScaleSource:
         What ``read_imu`` accepts; an InertialScale folder has its own.
     frame_times
         For a COLMAP model: CSV or capture.toml; where ``imu`` is a capture.toml, its frame times serve.
+    name_times
+        For a COLMAP model, in place of ``frame_times``: how its images' names hold their times
+        (:func:`stamps_of_pattern`).
     calibration
         Calibration files; where ``imu`` is a capture.toml, its calibration serves.
     """
@@ -73,6 +80,7 @@ class ScaleSource:
     source: Path
     imu: Path | None = None
     frame_times: Path | None = None
+    name_times: str | None = None
     calibration: CalibrationFiles = None
 
 
@@ -159,13 +167,12 @@ def read_source(source: ScaleSource) -> tuple[CheckInputs, Sequence[Fact]]:
         trajectory = reader.attempt(lambda: read_inertial_scale_poses(path))
     elif path.is_dir():
         read_as = COLMAP
-        folder, times = only_model(path), _find_times(source)
-        if times is None:
+        folder = only_model(path)
+        if not _has_times(source):
             raise FormatError(path, Fact("model-without-times"))
         capture = next(iter(_captures(source)), None)
         model = reader.attempt(lambda: read_model(folder))
-        rigs = NO_RIGS if model is None else frames_of_rigs([model])
-        timing = reader.attempt(lambda: read_frame_times(times, rigs))
+        timing = reader.attempt(lambda: _read_times(source, model))
         if model is not None and timing is not None:
             placed, known = model, timing
             trajectory, left_out = reader.attempt(lambda: trajectory_from_model(placed, known)) or (None, ())
@@ -216,6 +223,23 @@ def _find_times(source: ScaleSource) -> Path | None:
     return imu if is_capture(imu) and load_capture(imu).frames is not None else None
 
 
+def _has_times(source: ScaleSource) -> bool:
+    return source.name_times is not None or _find_times(source) is not None
+
+
+def _read_times(source: ScaleSource, model: pycolmap.Reconstruction | None) -> FrameTiming:
+    """Times of a model's images; of a model that cannot be read, those that do not come from its names."""
+    rigs = NO_RIGS if model is None else frames_of_rigs([model])
+    if source.name_times is None:
+        times = _find_times(source)
+        assert times is not None
+        return read_frame_times(times, rigs)
+    if model is None:
+        raise TimingError(Fact("model-without-times"))
+    names = sorted(model.image(i).name for i in model.reg_image_ids())
+    return stamps_of_pattern(source.source, names, source.name_times).one_per_frame(rigs).timing()
+
+
 def _require_all(source: ScaleSource) -> None:
     """Refuse a model or trajectory without its recording or times, naming all that is missing at once."""
     path, missing = source.source, list[Fact]()
@@ -223,7 +247,7 @@ def _require_all(source: ScaleSource) -> None:
         only_model(path)
     if source.imu is None:
         missing.append(Fact("imu-missing"))
-    if path.is_dir() and _find_times(source) is None:
+    if path.is_dir() and not _has_times(source):
         missing.append(Fact("times-missing"))
     if missing:
         raise FormatError(path, Fact("inputs-missing", missing=missing))

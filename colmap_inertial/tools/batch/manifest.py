@@ -87,7 +87,7 @@ def read_manifest(
     options
         Those of all captures; what the manifest states of one goes before them, ``options`` before ``config``.
     allow_stages
-        Take a manifest that names stages: they are code that its author chose, and that the batch runs.
+        Take a manifest that names stages: they are code of the manifest's author, and that the batch runs.
 
     Raises
     ------

@@ -373,7 +373,7 @@ TRAINERS = ExportTarget(write=_write_for_trainers, says="", recentres=True)
 TARGETS: Mapping[ExportProgram, ExportTarget] = {
     "metashape": ExportTarget(
         write=_write_metashape,
-        says="add the pictures of images/ to a chunk, then File > Import > Import Cameras, cameras.xml: its local "
+        says="add the images in images/ to a chunk, then File > Import > Import Cameras, cameras.xml: its local "
         "coordinates are those of the model",
     ),
     "bundler": ExportTarget(
@@ -412,43 +412,43 @@ TARGETS: Mapping[ExportProgram, ExportTarget] = {
         recentres=True,
         write=_write_for_trainers,
         command="python train.py -s {folder}",
-        says="nothing is needed for metres and up to stay",
+        says="metres and up are kept without any option",
     ),
     "gsplat": ExportTarget(
         recentres=True,
         write=_write_for_gsplat,
         command="python examples/simple_trainer.py default --data-dir {folder} --data-factor 1 "
         "--no-normalize-world-space --result-dir {folder}_gsplat",
-        says="metres and up stay by --no-normalize-world-space",
+        says="--no-normalize-world-space keeps metres and up",
     ),
     "nerfstudio": ExportTarget(
         recentres=True,
         write=_write_for_trainers,
         command=_NERFSTUDIO.replace("{method}", "splatfacto"),
-        says="metres and up stay by these options; without them, dataparser_transforms.json leads back",
+        says="these options keep metres and up; without them, dataparser_transforms.json converts back",
     ),
     "brush": ExportTarget(
         recentres=True,
         write=_write_for_trainers,
         command="brush {folder}",
-        says="nothing is needed for metres and up to stay",
+        says="metres and up are kept without any option",
     ),
     "opensplat": ExportTarget(
         recentres=True,
         write=_write_for_trainers,
         command="opensplat {folder} --keep-crs",
-        says="metres and up stay by --keep-crs",
+        says="--keep-crs keeps metres and up",
     ),
     "instant-ngp": ExportTarget(
         recentres=True,
         write=partial(_write_for_trainers, add_motion=_add_row_poses),
         command="instant-ngp {folder}/transforms.json",
-        says="p = (p' - offset) / scale leads back to metres, with scale and offset of transforms.json",
+        says="p = (p' - offset) / scale converts back to metres, with scale and offset of transforms.json",
     ),
     "3dgs-deblur": ExportTarget(
         recentres=True,
         write=partial(_write_for_trainers, add_motion=_add_velocities),
         command=_NERFSTUDIO.replace("{method}", "splatfacto --pipeline.model.blur-samples 5"),
-        says="metres and up stay by these options; velocities are in m/s and rad/s",
+        says="these options keep metres and up; velocities are in m/s and rad/s",
     ),
 }

@@ -90,7 +90,7 @@ def describe_distance(result: Measured) -> str:
         low, high = result.ci95
         lines.append(
             f"95 % interval of the scale: {length_text(low, digits=4)} to {length_text(high, digits=4)}. "
-            "Errors of the two points come on top."
+            "Errors of the two picked points are not included."
         )
     elif result.unit == "m":
         lines.append("The uncertainty of the scale is not known.")

@@ -331,7 +331,7 @@ WRONG = {
             [helper.make_node("Add", ["picture", "aid"], ["restored"])],
             sizes={k: v for k, v in small.SIZES.items() if k != "blur"},
         ),
-        r"takes picture tensor\(float\), aid tensor\(float\) and gives restored; .* picture, aid, blur",
+        r"inputs picture tensor\(float\), aid tensor\(float\) and the outputs restored; .* picture, aid, blur",
     ),
     "another output": (
         small.network([helper.make_node("Add", ["picture", "aid"], ["out"])], output="out"),
@@ -353,7 +353,7 @@ WRONG = {
         small.network(
             [helper.make_node("AveragePool", ["picture"], ["restored"], kernel_shape=[2, 2], strides=[2, 2])]
         ),
-        r"makes \(1, 3, 16, 24\) of \(1, 3, 32, 48\); an image must keep its size",
+        r"returns \(1, 3, 16, 24\) for an input of \(1, 3, 32, 48\); an image must keep its size",
     ),
 }
 

@@ -212,6 +212,6 @@ def test_a_calibration_by_rests_is_not_replaced_by_targets_and_a_place_is_for_re
         remember("My phone", tmp_path / "targets.json")
     assert read_imu_calibration(kept).attitudes == 12
     out = ["--out", str(tmp_path / "out.json")]
-    for words, said in ((["a", "b", "--latitude-deg", "47"], "leave it out with results"), ([], "name the recording")):
+    for words, said in ((["a", "b", "--latitude-deg", "47"], "with results"), ([], "name the recording")):
         assert run(["calibrate-imu", *words, *out]) == 2
         assert said in capsys.readouterr().err

@@ -398,7 +398,7 @@ def test_names_that_the_run_needs_are_said_before_any_work(placing):
 
 def test_what_is_not_of_the_project_is_not_written_over(placing):
     (placing.workspace.root / "notes.txt").write_text("mine")
-    with pytest.raises(OutputExistsError, match=r"notes\.txt is in the place of the project's"):
+    with pytest.raises(OutputExistsError, match=r"notes\.txt has the name of the project's"):
         placing()
     assert (placing.workspace.root / "notes.txt").read_text() == "mine"
     assert "images" not in placing.names()

@@ -349,7 +349,7 @@ def test_a_target_without_images_to_measure_it_in_is_said(box, tmp_path):
     result = reconstruct_project(project, tmp_path / "out", ProjectOptions(imu=described), NOT_REFINED)
     assert any("the target was not measured" in str(note) for note in result.models[0].scale.notes)
     report = json.loads((tmp_path / "out" / "report.json").read_text())
-    assert "not at hand" in report["models"][0]["validation"]["missing"]
+    assert "are missing" in report["models"][0]["validation"]["missing"]
 
 
 def test_a_capture_toml_gives_imu_times_and_what_is_known_of_the_camera(box, tmp_path):

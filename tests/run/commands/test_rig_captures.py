@@ -134,7 +134,7 @@ def test_what_is_not_done_with_a_rig_is_refused_before_anything(filmed, tmp_path
         (ReconstructOptions(refine="inertial"), "--refine inertial"),
         (ReconstructOptions(mapping=MappingOptions(mapper="global")), "--mapping.mapper global"),
     ):
-        with pytest.raises(InertialError, match=f"{words}: not done for cameras of a rig"):
+        with pytest.raises(InertialError, match=f"{words}: not supported for cameras of a rig"):
             reconstruct(capture, tmp_path / "out", options)
     for words in (
         ["deblur", str(capture), str(tmp_path / "out")],

@@ -226,7 +226,7 @@ def test_what_pictures_alone_cannot_give_is_refused_before_the_mapping(pictures,
     folder, mapped = pictures
     points = ["--scale-from", "distance", "--between", "1,2,3", "4,5,6", "--distance", "2+-0.1"]
     code, _, err = run(capsys, "reconstruct", folder, tmp_path / "out", *points)
-    assert code == 2 and "needs the model that they are of" in err
+    assert code == 2 and "--between with points needs" in err
     code, _, err = run(capsys, "reconstruct", folder, tmp_path / "out", "--scale-from", "target")
     assert code == 2 and "needs the target" in err
     assert mapped == [] and not (tmp_path / "out").exists()

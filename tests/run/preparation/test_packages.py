@@ -43,8 +43,8 @@ def test_two_packages_that_bring_one_module_are_named_with_what_to_do(there, cap
     packages.warn_of_conflicts()
     first, second = (record.getMessage() for record in caplog.records)
     assert first == (
-        "pycolmap 4.0.0 and pycolmap-cuda12 4.1.0 are installed, and each brings the module pycolmap: the files of the "
-        "last one overwrote the others'; keep one of them: pip uninstall pycolmap pycolmap-cuda12; pip install "
+        "pycolmap 4.0.0 and pycolmap-cuda12 4.1.0 are installed, and each provides the module pycolmap: the files of "
+        "the last one overwrote the others'; keep one of them: pip uninstall pycolmap pycolmap-cuda12; pip install "
         "pycolmap-cuda12"
     )
     assert second.endswith(

@@ -276,7 +276,7 @@ def test_a_clock_of_another_rate_ranks_all_of_a_long_recording(turning, monkeypa
     known = np.isfinite(predicted)
     assert np.median(np.abs(predicted - true)[known]) < 0.05 * np.median(true)
     # the camera's clock against the IMU's
-    said = re.search(r"rates ([+-]\d+) ppm apart \(to (\d+) ppm", str(clocks.note))
+    said = re.search(r"rates differ by ([+-]\d+) ppm \(to (\d+) ppm", str(clocks.note))
     assert abs(int(said[1]) + 1e6 * clock_rate) < 4 * int(said[2]) + 1
 
 

@@ -199,7 +199,7 @@ SECOND = FIRST | {
 @loop_over(
     ("rigs", "reason"),
     [
-        ([{"cameras": [FIRST, SECOND | {"cam_from_rig_rotation": [1, 0, 0, 0.1]}]}], "b: .*no unit quaternion"),
+        ([{"cameras": [FIRST, SECOND | {"cam_from_rig_rotation": [1, 0, 0, 0.1]}]}], "b: .*unit quaternion"),
         ([{"cameras": [FIRST, SECOND | {"cam_from_rig_rotation": [1, 0, 0]}]}], "must hold 4 numbers"),
         ([{"cameras": [FIRST, SECOND | {"camera_model_name": "LENS"}]}], "camera model 'LENS' is unknown"),
         ([{"cameras": [FIRST, SECOND | {"camera_params": [5, 3, 2]}]}], "must hold 4 numbers"),

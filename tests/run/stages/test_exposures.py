@@ -161,7 +161,7 @@ def test_what_is_wrong_with_the_exposures_is_said(subtests, two_pairs, tmp_path)
         ('folder = "long"', "", "the same images as .images."),
         ('folder = "long"', 'folder = "short"', "the same images as .images."),
         ('folder = "long"', 'folder = "long"\nrename = "x"', "must be two strings"),
-        ('folder = "long"', 'folder = "long"\nlong_delay_s = 0.1', "stands in place of times"),
+        ('folder = "long"', 'folder = "long"\nlong_delay_s = 0.1', "excludes times"),
         ("short_iso = 1600", "short_iso = 0", "must be above 0"),
         ("short_iso = 1600", "long_exposure_s = 11", "must be from 0 to 10"),
         ("short_iso = 1600", "long_delay_s = 11", "must be from -10 to 10"),
@@ -487,7 +487,7 @@ def test_a_fused_frame_is_not_deblurred_again(written, tmp_path):
 
 def test_a_missing_partner_or_network_is_said_before_the_work(capture, tmp_path, monkeypatch, capsys):
     def missing(*args, **options):
-        raise MissingExtraError("restore", Fact.stated("networks run in onnxruntime"))
+        raise MissingExtraError("restore", Fact.stated("networks need onnxruntime"))
 
     monkeypatch.setattr("colmap_inertial.run.stages.inputs.load_network", missing)
     for command in ("reconstruct", "fuse-exposures"):

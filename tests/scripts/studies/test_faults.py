@@ -86,7 +86,7 @@ main(sys.argv[3:])
     [
         ("apply", "files", (4, 2), "[Tt]oo many|unable to open"),
         ("fuse-apertures", "files", (2, 1), "[Tt]oo many"),
-        ("fuse-apertures", "memory", (600, 500), "the memory is used up"),
+        ("fuse-apertures", "memory", (600, 500), "out of memory"),
     ],
 )
 def test_what_runs_out_on_the_way_is_a_sentence_and_no_half_result(whole, tmp_path, name, kind, lefts, said):

@@ -235,7 +235,7 @@ def test_a_script_s_own_stages_and_dots_twice_are_refused():
     [
         ('stages.frame = ["mask"]', "stages: frame: 'mask' names no stage"),
         ('stages.frame = ["...", "..."]', "once"),
-        ('stages.frame = "a:b"', "is not a list of texts"),
+        ('stages.frame = "a:b"', "is not a list of strings"),
         ('stages.frames = ["a:b"]', "did you mean frame"),
         ('stages = ["a:b"]', "is a table"),
         ('stages.model = ["a:b"]', "--allow-stages"),

@@ -384,7 +384,7 @@ def test_what_is_no_mesh_of_triangles_is_refused(subtests, tmp_path_factory):
         ({"faces": [[0, 1, 2, 4]]}, "faces other than triangles"),
         ({"faces": [[0, 1, 5]]}, "faces other than triangles"),
         ({"cut": 1}, "truncated"),
-        ({"lists": "list uchar int vertex_indices; list uchar int more"}, "more than lists of vertices"),
+        ({"lists": "list uchar int vertex_indices; list uchar int more"}, "besides their lists of vertices"),
         ({"order": None}, "only binary PLY"),
         ({"axes": "xyw"}, "holds no points"),
         ({"vertices": VERTICES[:0]}, "holds no points"),
@@ -764,7 +764,7 @@ def test_a_real_browser_shows_it_measures_and_looks_through_a_camera(out, tmp_pa
             page.wait("document.body.innerText.includes('Click the first point')")
             # two points that nothing is in front of
             a, b = lonely_points(scene, *size)
-            for place, answer in ((a, "Click the second point"), (b, "Errors of the two points")):
+            for place, answer in ((a, "Click the second point"), (b, "Errors of the two picked points")):
                 page.click(*on_screen(scene, place, *size))
                 page.wait(f"document.body.innerText.includes({json.dumps(answer)})")
             text = measure_distance(a, b, "m", scene.scale.relative_ci95).text
