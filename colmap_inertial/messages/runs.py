@@ -84,12 +84,12 @@ state("capture-has-no-pictures", "has no images", advice="add [images] or [video
 
 state(
     "scale-from-plain-pictures",
-    "--scale-from target or distance takes plain images",
+    "metres without an IMU take plain images",
     advice="fuse them first",
     joint=": ",
 )
 
-state("scale-from-one-camera", "--scale-from target or distance takes one camera", advice="take [rig] out", joint=": ")
+state("scale-from-one-camera", "metres without an IMU take one camera", advice="take [rig] out", joint=": ")
 
 # what a device's store takes
 
