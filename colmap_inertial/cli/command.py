@@ -142,7 +142,7 @@ class ConfiguredCommand(Command):
         "An existing COLMAP project in place of a capture": (
             "imu", "frame_times", "name_times", "exif_times", "video", "images", "keep", "link", "follow_links",
         ),
-        "Metres without an IMU": ("scale_from", "target", "between", "distance"),
+        "Where metres come from": ("scale_from", "target", "between", "distance"),
         "Frame selection": ("frames",),
         "How COLMAP builds the model": (
             "mapping", "colmap", "colmap_project", "colmap_executable", "database", "database_images", "workers",

@@ -12,6 +12,7 @@ from tyro.conf import Positional, arg
 from colmap_inertial.cli.command import ConfiguredCommand, DeviceCommand
 from colmap_inertial.cli.terminal import show_reference, show_result
 from colmap_inertial.core.errors import InertialError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ProjectOptions, ReferenceOptions
 from colmap_inertial.core.printing import say
 
@@ -26,8 +27,9 @@ class Reconstruct(DeviceCommand, ConfiguredCommand):
     dense reconstruction with --dense. Options that change a finished result need another OUT, or --overwrite.
 
     CAPTURE may be an existing COLMAP project: give --imu, and when its images were taken. Nothing is mapped again, and
-    OUT is all of the project in metres. Without an IMU --scale-from takes the metres from a target or a known distance:
-    of a folder of pictures, a video, a capture, or a project (OUT/colmap of a run whose scale was refused).
+    OUT is all of the project in metres. Without an IMU, depth maps, positions (GPS), a target or a known distance give
+    metres (--scale-from): of a folder of images, a video, a capture, an app's export, or a project (OUT/colmap of a run
+    whose scale was refused).
 
     Example: colmap-inertial reconstruct my_capture/capture.toml out
     """
@@ -37,8 +39,8 @@ class Reconstruct(DeviceCommand, ConfiguredCommand):
 
     capture: Positional[Path]
     """A capture.toml or a folder that holds one; a video or a recorder's folder with the IMU in it (GoPro, phones); an
-    EuRoC/ASL dataset; or a COLMAP project. With --scale-from target or distance also images or a video without
-    IMU."""
+    EuRoC/ASL dataset; an app's export with depth maps; or a COLMAP project. With --scale-from also images or a video
+    without IMU."""
     out: Positional[Path]
     """A new folder for the results, or that of an earlier run on the same capture, which is continued."""
     project: Annotated[ProjectOptions, arg(name="")] = dataclasses.field(default_factory=ProjectOptions)
@@ -64,7 +66,21 @@ class Reconstruct(DeviceCommand, ConfiguredCommand):
         from colmap_inertial.colmap.workers import using_workers
 
         with using_workers(self.workers, scheduler=self.scheduler):
-            return self._scale_by_imu() if self.reference.scale_from == "imu" else self._scale_by_reference()
+            return self._scale_by_imu() if self._uses_imu() else self._scale_without_imu()
+
+    def _uses_imu(self) -> bool:
+        """Whether the IMU's metres count, or its clock and gravity; lengths alone need none."""
+        from colmap_inertial.run.commands.scale_by_reference import has_imu, knows_metres
+
+        chosen, lengths = set(self.options.scale_from), {"target", "distance"}
+        given = any(getattr(self.reference, f.name) is not None for f in dataclasses.fields(self.reference))
+        if chosen and chosen <= lengths:
+            return False
+        if "imu" in chosen or has_imu(self.capture, self.project):
+            if given or chosen & lengths:
+                raise InertialError(Fact("lengths-beside-imu"))
+            return True
+        return not (chosen or given or knows_metres(self.capture, self.project))
 
     def _scale_by_imu(self) -> int:
         from colmap_inertial.diagnose import Diagnosis
@@ -110,14 +126,22 @@ class Reconstruct(DeviceCommand, ConfiguredCommand):
             say(f"error: {'no scale was accepted, for the reasons above' if shown_above else stopped}", error=True)
         return code
 
-    def _scale_by_reference(self) -> int:
+    def _scale_without_imu(self) -> int:
         self.check_json(self.capture, self.project.imu, self.project.frame_times)
         from colmap_inertial.run.commands.reconstruct_project import is_project
         from colmap_inertial.run.commands.scale_by_reference import reconstruct_by, scale_project_by
 
         with self.progress() as screen:
             if is_project(self.capture):
-                reference = scale_project_by(self.capture, self.out, self.reference, self.project, progress=screen)
+                reference = scale_project_by(
+                    self.capture,
+                    self.out,
+                    self.reference,
+                    self.project,
+                    scale_from=self.options.scale_from,
+                    world=self.options.world,
+                    progress=screen,
+                )
             else:
                 reference = reconstruct_by(self.capture, self.out, self.reference, self.options, progress=screen)
         self.tell(lambda: show_reference(reference), reference.as_json(), {"out": reference.out, "exit_code": 0})

@@ -287,11 +287,15 @@ def show_reference(reference: Reference) -> None:
 
     # a small target says how long things are where it lies, and no more
     lengths = None if reference.validation is None else reference.validation.lengths
-    small = reference.scale_from == "target" and lengths is not None and lengths.is_short
-    metres = length_in_words("trusted", half_width_pct(reference.metres_per_unit, reference.ci95))
-    values = {"metres_per_unit": reference.metres_per_unit, "ci95": reference.ci95}
+    small = reference.scale_from == ("target",) and lengths is not None and lengths.is_short
+    combined = reference.sensors
+    metres = length_in_words(combined.verdict, half_width_pct(combined.metres_per_unit, combined.ci95))
+    values = {"metres_per_unit": combined.metres_per_unit, "ci95": combined.ci95}
     lines: list[Line] = [("metres", f"{metres}{', as far as the target reaches' if small else ''}")]
-    lines += [("from", reference.made_of), *scale_facts(values), *_label_first("note", reference.notes)]
+    lines += [("from", reference.made_of), *scale_facts(values)]
+    if len(combined.evidence) + len(combined.absent) > 1:
+        lines += evidence_lines(combined)
+    lines += _label_first("note", reference.notes)
     _print_panel("Project", [*lines, ("written", str(reference.out))])
     say(f"next: {_next_to_see(reference.out, None)}")
 

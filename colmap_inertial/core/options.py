@@ -17,6 +17,8 @@ RollingShutterMethod = Literal["off", "rectify"]
 RefineMethod = Literal["off", "auto", "inertial"]
 JoinMethod = Literal["off", "inertial"]
 WorldAxes = Literal["z-up", "y-down"]
+#: What knows of metres: sensors, and known lengths.
+ScaleFrom = Literal["imu", "depth", "device", "positions", "target", "distance"]
 #: What an export is for: a program, or a format.
 ExportProgram = Literal[
     "3dgs",
@@ -257,24 +259,14 @@ class ProjectOptions(CheckedOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class ReferenceOptions(CheckedOptions):
-    """Source of a project's metres, and known lengths."""
+    """Known lengths, where no IMU gives metres."""
 
-    scale_from: Literal["imu", "target", "distance"] = "imu"
-    """Where metres come from: the IMU; or, without any IMU, a target of known size in the images, or one known
-    distance."""
     target: str | None = None
-    """With --scale-from: the target, as of `validate --target`; of a distance between markers, what they are."""
+    """A target of known size in the images, as of `validate --target`; of a distance between markers, what they are."""
     between: tuple[str, str] | None = None
-    """With --scale-from distance: the numbers of two markers, or two points as x,y,z in the units of the model."""
+    """With --distance: the numbers of two markers, or two points as x,y,z in the units of the model."""
     distance: str | None = None
-    """With --scale-from distance: metres between them and how well they are known (standard deviation), as in
-    4.20+-0.01."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        given = [name for name in ("target", "between", "distance") if getattr(self, name) is not None]
-        if self.scale_from == "imu" and given:
-            raise ValueError(f"--{given[0]} goes with --scale-from target or --scale-from distance")
+    """Metres between them and how well they are known (standard deviation), as in 4.20+-0.01."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -374,6 +366,11 @@ class ReconstructOptions(CheckedOptions):
     database_images: Literal["filmed", "rectified"] | None = None
     """With --database, where the rolling shutter is corrected: whether its keypoints are those of images as filmed
     (deblurred or not), or of images that `deblur --rectify` wrote."""
+    scale_from: tuple[ScaleFrom, ...] = ()
+    """Where metres come from, each by its name. Not given: from all that the capture has of IMU, depth maps, the
+    device's own path (ARKit, ARCore) and positions (GPS); without an IMU, also from a target and a known distance,
+    which check the others' metres otherwise. All are taken together by how sure they are; those that contradict each
+    other are named."""
     scale: ScaleOptions = field(default_factory=ScaleOptions)
     """How metres come from the IMU."""
     join: JoinMethod = "inertial"

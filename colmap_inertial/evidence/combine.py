@@ -182,37 +182,34 @@ def _contradiction(evidence: Sequence[ScaleEvidence], cov: Array, cases: _Cases,
     )
 
 
-def judge_device(
-    combined: CombinedScale, trajectory: CameraTrajectory, device_log_scale: float = 0.0
-) -> DeviceDrift | None:
-    """How wrong the device's own metres are, by all other sensors; ``None`` where there is no other.
+def judge_device(combined: CombinedScale, trajectory: CameraTrajectory) -> DeviceDrift | None:
+    """How wrong the device's own metres are, by all other sensors; ``None`` where there is no other, or no device.
 
     Parameters
     ----------
     combined
-        With the device's own evidence among the others, or without.
+        With the device's own evidence among the others.
     trajectory
         The device's path.
-    device_log_scale
-        Logarithm of the device's metres per unit of the path in question.
     """
+    device = combined.of("device")
     others = [one for one in combined.evidence if one.sensor != "device"]
-    if not others:
+    if device is None or not others:
         return None
     by_others = combine(others)
-    log_error = device_log_scale - by_others.log_scale
-    length = length_of(trajectory) * math.exp(-device_log_scale)
+    log_error = device.log_scale - by_others.log_scale
+    length = length_of(trajectory) * math.exp(-device.log_scale)
     length_m = length * by_others.metres_per_unit
     return DeviceDrift(
         log_error=log_error,
-        sigma=by_others.sigma,
+        sigma=math.hypot(by_others.sigma, device.random_sigma),
         length_m=length_m,
         error_m=length_m * math.expm1(log_error),
-        parts=_combine_parts(others, device_log_scale),
+        parts=_combine_parts(others, device),
     )
 
 
-def _combine_parts(evidence: Sequence[ScaleEvidence], device_log_scale: float) -> tuple[ScalePart, ...]:
+def _combine_parts(evidence: Sequence[ScaleEvidence], device: ScaleEvidence) -> tuple[ScalePart, ...]:
     """The device's error by the shortest parts that any sensor tells of, each by all that tell of it."""
     finest = min((one.parts for one in evidence if one.parts), key=_length, default=())
     out = []
@@ -227,8 +224,10 @@ def _combine_parts(evidence: Sequence[ScaleEvidence], device_log_scale: float) -
         values, sigmas = np.array(rows).T
         weight = 1 / sigmas**2
         mean, sigma = float(weight @ values / weight.sum()), float(1 / np.sqrt(weight.sum()))
+        by_device = next((part for part in device.parts if part.begin_s <= middle_s < part.end_s), None)
+        error = (device.log_scale if by_device is None else by_device.log_scale) - mean
+        sigma = sigma if by_device is None else math.hypot(sigma, by_device.sigma)
         if sigma < _SHOWN:
-            error = device_log_scale - mean
             out.append(ScalePart(begin_s=span.begin_s, end_s=span.end_s, log_scale=error, sigma=sigma))
     return tuple(out)
 

@@ -58,14 +58,14 @@ _HALF_NORMAL = 0.6745
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DepthScale:
-    """Scale of a path by depth maps, pair by pair.
+    """Scale of a path by depth maps, pair by pair, or of a model, image by image.
 
     Attributes
     ----------
     t_s
-        (P,) middle of each pair, of the trajectory's clock.
+        (P,) middle of each pair, or of each image, of the trajectory's clock.
     log_scale, sigma
-        (P,) logarithm of metres per unit, and its standard deviation by the registration.
+        (P,) logarithm of metres per unit, and its standard deviation by the registration, or by the image's points.
     is_fused
         As of :class:`DepthMaps`.
     """
@@ -218,22 +218,22 @@ def combine_blocks(t_s: Array, log_scale: Array, sigma: Array, limits: DepthLimi
     Parameters
     ----------
     t_s, log_scale, sigma
-        (P,) of each pair.
+        (P,) of each pair, or of each image.
     """
     order = np.argsort(t_s, kind="stable")
     values, sigmas = log_scale[order], np.hypot(sigma[order], limits.pair_sigma)
-    whole = _robust_mean(values, sigmas)
+    whole = robust_mean(values, sigmas)
     count = min(limits.blocks, len(values) // 2)
     if count < 2:
         return whole, float(np.max(sigmas))
     number = np.arange(len(values)) * count // len(values)
-    without = np.array([_robust_mean(values[number != k], sigmas[number != k]) for k in range(count)])
+    without = np.array([robust_mean(values[number != k], sigmas[number != k]) for k in range(count)])
     by_blocks = math.sqrt((count - 1) / count * float(np.sum((without - without.mean()) ** 2)))
     least = float(1 / np.sqrt(np.sum(1 / sigmas**2)))
     return whole, max(by_blocks, least) * student_factor(count - 1)
 
 
-def _robust_mean(values: Array, sigmas: Array) -> float:
+def robust_mean(values: Array, sigmas: Array) -> float:
     """Mean with Tukey's weights; all have a scatter beyond their own standard deviations, found along the way."""
     mean, beyond = float(np.median(values)), 0.0
     for _ in range(50):

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import CameraTrajectory, ScaleEstimate
 from colmap_inertial.core.types.evidence import ScaleEvidence, ScalePart
 from colmap_inertial.evidence.priors import ACCEL_GAIN, DEVICE_FUSION, DEVICE_WANDER, LENS, PRIORS
@@ -70,7 +71,14 @@ def evidence_of_imu(estimate: ScaleEstimate, span_s: tuple[float, float] | None 
 _SURE = 0.1
 
 
-def evidence_of_device(log_scale: float = 0.0, random_sigma: float = 0.0) -> ScaleEvidence:
+def evidence_of_device(
+    log_scale: float = 0.0,
+    random_sigma: float = 0.0,
+    *,
+    span_s: tuple[float, float] | None = None,
+    parts: tuple[ScalePart, ...] = (),
+    reasons: tuple[Fact, ...] = (),
+) -> ScaleEvidence:
     """The device's own metres as evidence.
 
     They come from the same accelerometer as the IMU's, and its depth from the same filter.
@@ -79,6 +87,8 @@ def evidence_of_device(log_scale: float = 0.0, random_sigma: float = 0.0) -> Sca
     ----------
     log_scale, random_sigma
         Of the device's path against the path in question, where it is another one; a path is as long as itself.
+    span_s, parts, reasons
+        When it holds, by parts, and why it is in doubt.
     """
     return ScaleEvidence(
         sensor="device",
@@ -89,6 +99,10 @@ def evidence_of_device(log_scale: float = 0.0, random_sigma: float = 0.0) -> Sca
             DEVICE_FUSION: PRIORS.device_fusion,
             ACCEL_GAIN: INERTIAL_PRIORS.accel_model,
         },
+        begin_s=None if span_s is None else span_s[0],
+        end_s=None if span_s is None else span_s[1],
+        parts=parts,
+        reasons=reasons,
     )
 
 

@@ -12,8 +12,7 @@ LENS = "lens"
 DEPTH_SCALE = "depth_scale"
 DEVICE_FUSION = "device_fusion"
 DEVICE_WANDER = "device_wander"
-RECEIVER = "receiver"
-REFERENCE = "reference"
+DECLARED = "declared"
 
 
 @dataclass(frozen=True, kw_only=True)

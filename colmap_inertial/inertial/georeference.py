@@ -263,8 +263,8 @@ def georeference(
     chosen = np.argsort(t_s, kind="stable")
     chosen = chosen[np.unique(np.linspace(0, len(chosen) - 1, _LIMITS.most).round().astype(np.intp))]
     fixes, path_m, t_s = fixes.select(chosen), np.asarray(cam_in_world_m)[chosen], np.asarray(t_s)[chosen]
-    origin, enu, heights = _convert_to_enu(fixes)
-    level_from_world = _turn_upright(up_in_world)
+    origin, enu, heights = convert_to_enu(fixes)
+    level_from_world = turn_upright(up_in_world)
     target = enu[:, 0] + 1j * enu[:, 1]
 
     def level_at(delay_s: float) -> Array:
@@ -317,7 +317,7 @@ def _add_height(cov: Array, *, known: bool) -> Array:
     return whole
 
 
-def _convert_to_enu(fixes: PositionFixes) -> tuple[Array, Array, BoolArray]:
+def convert_to_enu(fixes: PositionFixes) -> tuple[Array, Array, BoolArray]:
     """Origin (latitude, longitude, height), east, north and up of the positions (N, 3), and which have a height."""
     heights = np.isfinite(fixes.height_m)
     place = np.stack([fixes.latitude_deg, fixes.longitude_deg, np.where(heights, fixes.height_m, 0.0)], axis=1)
@@ -354,7 +354,7 @@ def _describe_fit(fit: _Fit, stated: bool, height_above: HeightDatum | None) -> 
         yield Fact("heights-not-of-ellipsoid", height_above=height_above)
 
 
-def _turn_upright(up_in_world: Array) -> Array:
+def turn_upright(up_in_world: Array) -> Array:
     """(3, 3) the shortest turn that brings up to z."""
     return np.asarray(matrix_from_quat(rotation_between(up_in_world, np.array([0.0, 0.0, 1.0]))))
 

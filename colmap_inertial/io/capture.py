@@ -22,6 +22,13 @@ from colmap_inertial.core.types import CameraImuCalibration, CameraModel, FrameL
 from colmap_inertial.io import sensor_yaml
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.camera_table import CAMERA_KEYS, read_camera_table
+from colmap_inertial.io.capture_depth import (
+    DEPTH_KEYS,
+    POSES_KEYS,
+    DescribedDepth,
+    read_depth_table,
+    read_poses_table,
+)
 from colmap_inertial.io.capture_images import (
     EXPOSURES_KEYS,
     ApertureImages,
@@ -39,6 +46,7 @@ from colmap_inertial.io.capture_tables import (
     read_calibration_table,
     read_imu_table,
 )
+from colmap_inertial.io.device_folders import export_frames, is_device_folder
 from colmap_inertial.io.files import StrPath, reader, require_utf8
 from colmap_inertial.io.frame_sources import IMAGES_KEYS, ImageFolder, Video, read_image_folder, read_video
 from colmap_inertial.io.gcsv import is_gcsv, read_gcsv_frames
@@ -91,6 +99,11 @@ class Capture:
         The long exposures beside ``frames``, which are the short ones.
     rig
         Cameras that are fixed to the one of ``frames``.
+    poses
+        The path that the device computed by itself: an app's export, which may hold depth maps, too, or a file in TUM
+        format; ``None`` where there is none.
+    depth
+        Depth maps beside the frames; ``None`` where there are none but those of the export.
     """
 
     path: Path
@@ -112,6 +125,8 @@ class Capture:
     apertures: ApertureImages | None = None
     exposures: LongExposures | None = None
     rig: tuple[RigCamera, ...] = ()
+    poses: Path | None = None
+    depth: DescribedDepth | None = None
 
     @property
     def image_folder(self) -> Path | None:
@@ -129,7 +144,7 @@ def load_capture(path: StrPath) -> Capture:
         A ``.toml`` file, a folder with a ``capture.toml``, the root of an ASL/EuRoC dataset with one camera and one
         IMU that carry on (``cam0``, ``imu0``), an InertialScale folder, a video with an IMU inside (GoPro, CAMM), or
         the folder of a recorder that wrote down everything (VideoIMUCapture, MARS logger, OpenCamera-Sensors, Stray
-        Scanner).
+        Scanner), or an export without an IMU (Record3D, Polycam raw, a nerfstudio dataset with depth).
 
     Raises
     ------
@@ -170,6 +185,9 @@ def _read_capture_toml(path: Path) -> Capture:
             capture = section.read(table, capture)
     if capture.frames is None and capture.imu is None:
         raise FormatError(path, Fact("capture-of-nothing"))
+    if capture.poses is None and isinstance(capture.imu, ImuPath) and is_device_folder(capture.imu.path):
+        # the recorder of the IMU kept the device's path, too
+        capture = replace(capture, poses=capture.imu.path)
     return capture
 
 
@@ -273,6 +291,14 @@ def _read_calibration(table: Section, capture: Capture) -> Capture:
     return replace(capture, calibration=prior, imu_calibration=calibrations.imu)
 
 
+def _read_poses(table: Section, capture: Capture) -> Capture:
+    return replace(capture, poses=read_poses_table(table))
+
+
+def _read_depth(table: Section, capture: Capture) -> Capture:
+    return replace(capture, depth=read_depth_table(table))
+
+
 def _read_target(table: Section, capture: Capture) -> Capture:
     return replace(capture, target=table.require("spec", table.text("spec")))
 
@@ -318,6 +344,8 @@ SECTIONS = (
     CaptureSection(name="exposures", keys=EXPOSURES_KEYS, read=_read_exposures),
     CaptureSection(name="rig", keys=None, read=_read_rig),
     CaptureSection(name="calibration", keys=CALIBRATION_KEYS, read=_read_calibration, is_always_read=True),
+    CaptureSection(name="poses", keys=POSES_KEYS, read=_read_poses, short="path"),
+    CaptureSection(name="depth", keys=DEPTH_KEYS, read=_read_depth),
     CaptureSection(name="target", keys=("spec",), read=_read_target),
 )
 
@@ -335,6 +363,8 @@ def _recognise_folder(path: Path) -> Capture:
     recording = find_recorder_output(path)
     if recording is not None:
         return _describe_recording(path, recording)
+    if is_device_folder(path):
+        return _describe_export(path)
     if (path / "recipe.toml").is_file():
         raise FormatError(path, Fact("recipe-without-capture"))
     raise FormatError(path, Fact("no-capture-folder"))
@@ -355,7 +385,13 @@ def _describe_recording(path: Path, recording: RecorderOutput) -> Capture:
         imu=ImuPath(path=recording.imu, format=recording.format),
         calibration=calibration_prior(Declared(readout_s=readout_s), shared_clock=shared_clock),
         frame_log=log,
+        poses=path if is_device_folder(path) else None,
     )
+
+
+def _describe_export(path: Path) -> Capture:
+    """An app's export with the device's own path, and without an IMU."""
+    return Capture(path=path, frames=export_frames(path), calibration=calibration_prior(), poses=path)
 
 
 def _describe_asl(path: Path, camera: Path, imu: Path) -> Capture:

@@ -52,7 +52,16 @@ class DepthFiles:
 
     def maps(self) -> DepthMaps:
         """The maps of all frames, read as they are needed."""
-        return DepthMaps(names=tuple(sorted(self.depth)), read=self._read, source=self.source, is_fused=self.is_fused)
+        return DepthMaps(
+            names=tuple(sorted(self.depth)),
+            read=self._read,
+            source=self.source,
+            is_fused=self.is_fused,
+            files={
+                name: (str(path), str(self.confidence[name])) if name in self.confidence else (str(path),)
+                for name, path in self.depth.items()
+            },
+        )
 
     def _read(self, name: str) -> DepthMap:
         view = self.view if isinstance(self.view, PinholeGrid) else self.view[name]

@@ -31,12 +31,15 @@ from colmap_inertial.core.types import CameraTrajectory
 from colmap_inertial.core.types.depth import DepthMaps, PinholeGrid
 from colmap_inertial.io.depth_maps import MILLIMETRES, DepthFiles, grid_of_matrix
 from colmap_inertial.io.files import path_in, read_json, reader
+from colmap_inertial.io.frame_sources import ImageFolder
 from colmap_inertial.io.ios import is_stray_scanner
 from colmap_inertial.io.tables import read_table
 from colmap_inertial.io.units import seconds
 
 #: Half a turn about x: between a camera whose y is up and z back (ARKit, OpenGL) and one of COLMAP.
 _HALF_TURN_XYZW = np.array([1.0, 0.0, 0.0, 0.0])
+#: ARKit's worlds: y against gravity.
+_ARKIT_UP = (0.0, 1.0, 0.0)
 #: ARKit's pictures of which Stray Scanner writes the intrinsics, where its video is not there to tell.
 _ARKIT_PX = (1920, 1440)
 
@@ -55,15 +58,21 @@ class DeviceFolder:
         Whether the path counts in the device's metres; else in any unit.
     imu
         Where its IMU recording lies, on the clock of the path; ``None`` where there is none.
+    on_clock_of_images
+        Whether times of the path are on the clock that frames of this recording have; else names tell which is which.
     depth
         Its depth maps; ``None`` where there are none.
+    up_in_world
+        (3,) against gravity in the path's world; ``None`` where nobody says.
     """
 
     app: str
     trajectory: CameraTrajectory
     is_metric: bool = True
     imu: Path | None = None
+    on_clock_of_images: bool = False
     depth: DepthMaps | None = None
+    up_in_world: tuple[float, float, float] | None = None
 
 
 def is_device_folder(path: Path) -> bool:
@@ -115,6 +124,11 @@ def _trajectory(path: Path, names: tuple[str, ...], t_ns: Int64Array, xyzw: Arra
     )
 
 
+def export_frames(path: Path) -> ImageFolder | None:
+    """The images of an export, named as its poses but for endings and folders; ``None`` where it has none."""
+    return next((layout.frames(path) for layout in LAYOUTS if layout.frames is not None and layout.accepts(path)), None)
+
+
 # --- Stray Scanner ---------------------------------------------------------------------------------------------------
 
 
@@ -129,7 +143,14 @@ def _read_stray(path: Path) -> DeviceFolder:
     names = tuple(table.text(table.column("frame")))
     t_ns = table.stamps_ns(table.column("timestamp"), "s")
     trajectory = _trajectory(file, names, t_ns, numbers[:, 3:], numbers[:, :3])
-    return DeviceFolder(app="Stray Scanner", trajectory=trajectory, imu=path, depth=_stray_depth(path))
+    return DeviceFolder(
+        app="Stray Scanner",
+        trajectory=trajectory,
+        imu=path,
+        on_clock_of_images=True,
+        depth=_stray_depth(path),
+        up_in_world=_ARKIT_UP,
+    )
 
 
 def _stray_depth(path: Path) -> DepthMaps | None:
@@ -195,7 +216,18 @@ def _read_record3d(path: Path) -> DeviceFolder:
         source="Record3D",
         is_fused=True,
     ).maps()
-    return DeviceFolder(app="Record3D", trajectory=trajectory, depth=maps if depth else None)
+    return DeviceFolder(app="Record3D", trajectory=trajectory, depth=maps if depth else None, up_in_world=_ARKIT_UP)
+
+
+def _record3d_frames(path: Path) -> ImageFolder | None:
+    return _images_in(path / "rgbd")
+
+
+def _images_in(folder: Path, *, time_unit: str | None = None) -> ImageFolder | None:
+    """The images of a folder, where there are some; ``time_unit`` of their names, where these are times."""
+    if not _files(folder, (".jpg", ".jpeg", ".png")):
+        return None
+    return ImageFolder(folder=folder, times=None if time_unit is None else "name", time_unit=time_unit)
 
 
 # --- Polycam ---------------------------------------------------------------------------------------------------------
@@ -225,7 +257,11 @@ def _read_polycam(path: Path) -> DeviceFolder:
         is_fused=True,
     ).maps()
     trajectory = _trajectory(base / "cameras", names, t_ns, xyzw, rows[:, :, 3])
-    return DeviceFolder(app="Polycam", trajectory=trajectory, depth=maps if depth else None)
+    return DeviceFolder(app="Polycam", trajectory=trajectory, depth=maps if depth else None, up_in_world=_ARKIT_UP)
+
+
+def _polycam_frames(path: Path) -> ImageFolder | None:
+    return _images_in(path / "keyframes" / "images", time_unit="us")
 
 
 def _stamp(file: Path) -> int:
@@ -289,16 +325,22 @@ def _read_nerfstudio(path: Path) -> DeviceFolder:
     return DeviceFolder(app="nerfstudio", trajectory=trajectory, is_metric=False, depth=maps)
 
 
+def _nerfstudio_frames(path: Path) -> ImageFolder | None:
+    folders = {str(Path(str(one["file_path"])).parent) for one in read_json(path / "transforms.json")["frames"]}
+    return _images_in(path_in(path, folders.pop())) if len(folders) == 1 else None
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Layout:
     name: str
     accepts: Callable[[Path], bool]
     read: Callable[[Path], DeviceFolder]
+    frames: Callable[[Path], ImageFolder | None] | None = None
 
 
 LAYOUTS = (
     _Layout(name="Stray Scanner", accepts=_is_stray, read=_read_stray),
-    _Layout(name="Record3D", accepts=_is_record3d, read=_read_record3d),
-    _Layout(name="Polycam raw", accepts=_is_polycam, read=_read_polycam),
-    _Layout(name="nerfstudio with depth", accepts=_is_nerfstudio, read=_read_nerfstudio),
+    _Layout(name="Record3D", accepts=_is_record3d, read=_read_record3d, frames=_record3d_frames),
+    _Layout(name="Polycam raw", accepts=_is_polycam, read=_read_polycam, frames=_polycam_frames),
+    _Layout(name="nerfstudio with depth", accepts=_is_nerfstudio, read=_read_nerfstudio, frames=_nerfstudio_frames),
 )

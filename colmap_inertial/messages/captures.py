@@ -155,7 +155,7 @@ state(
         "is not a capture: it holds no capture.toml, and is neither an ASL/EuRoC dataset "
         "(cam0/data.csv, cam0/data/, imu0/data.csv) nor an InertialScale folder"
     ),
-    advice="describe it in a capture.toml (images without an IMU: reconstruct --scale-from target or distance)",
+    advice="describe it in a capture.toml (images without an IMU: reconstruct --scale-from target or another)",
 )
 
 
@@ -321,5 +321,5 @@ state("capture-without-frames", "describes no frames", advice="add [images] or [
 state(
     "capture-without-imu",
     "describes no inertial recording",
-    advice="add [imu] with path = ..., or take the metres from a target or a known distance (reconstruct --scale-from)",
+    advice="add [imu] with path = ..., or take the metres from something else (reconstruct --scale-from)",
 )

@@ -85,14 +85,14 @@ state("capture-has-no-pictures", "has no images", advice="add [images] or [video
 
 state(
     "scale-from-plain-pictures",
-    "--scale-from target or distance is for plain images",
+    "scale without an IMU is for plain images",
     advice="fuse them first",
     joint=": ",
 )
 
 state(
     "scale-from-one-camera",
-    "--scale-from target or distance is for a single camera",
+    "scale without an IMU is for a single camera",
     advice="take [rig] out",
     joint=": ",
 )

@@ -124,3 +124,113 @@ state(
     "states no image size, there is no video, and its principal point does not fit 1920 x 1440",
 )
 state("keyframe-name-no-number", "a keyframe is named by microseconds, such as 104563217.json")
+
+
+@message(example={"maps": 230, "images": 90})
+def depth_without_images(maps: int, images: int) -> str:
+    return f"none of the {maps} depth maps belongs to one of the model's {images} images"
+
+
+@message(
+    advice="give maps that show what the images show, neither turned nor cut",
+    example={"name": "000012.jpg", "width": 256, "height": 192, "of_width": 1080, "of_height": 1920},
+)
+def depth_of_other_images(name: str, width: int, height: int, of_width: int, of_height: int) -> str:
+    return f"the depth map of {name} is {width} x {height}, and the image {of_width} x {of_height}: another shape"
+
+
+@message(
+    advice="film surfaces nearer than five metres that neither shine nor let light through",
+    example={"count": 2, "needed": 4},
+)
+def depth_images_too_few(count: int, needed: int) -> str:
+    return f"only {count} images have depth at enough of their points, and {needed} are needed"
+
+
+@message(
+    advice="give poses on the clock of the frames, or of the frames' names",
+    example={"count": 2, "needed": 8},
+)
+def device_poses_too_few(count: int, needed: int) -> str:
+    return f"only {count} images of the model have a pose of the device, and {needed} are needed"
+
+
+state("device-stands-still", "the device's path does not leave its place")
+state(
+    "device-path-of-other-shape",
+    "the device's path has nothing of the shape of the model's",
+    advice="check that its times are those of the frames",
+)
+
+
+@message(
+    advice="look at the model there: either COLMAP's images are joined wrongly, or the device lost its path",
+    example={"at_s": 12.3, "jump_m": 0.42, "turn_deg": 6.0},
+)
+def device_path_breaks(at_s: float, jump_m: float, turn_deg: float) -> str:
+    return (
+        f"about {at_s:.1f} s, one of the model's and the device's path jumps against the other by {jump_m:.2g} m "
+        f"and {turn_deg:.2g} degrees within a second"
+    )
+
+
+@message(
+    advice="close loops, or use --refine inertial; the device's heading drifts by itself, its vertical hardly",
+    example={"turn_deg": 7.0, "tilt_deg": 4.0},
+)
+def device_path_bends(turn_deg: float, tilt_deg: float | None) -> str:
+    tilt = "" if tilt_deg is None else f", the vertical by {tilt_deg:.2g}"
+    return f"the model's path is bent against the device's by {turn_deg:.2g} degrees from begin to end{tilt}"
+
+
+@message(example={"ratio": 1.2, "sigma": 2.0})
+def positions_say_no_length(ratio: float, sigma: float) -> str:
+    return f"the positions leave the length of the path open ({ratio:.2g} +- {sigma:.2g} times)"
+
+
+state("positions-stand-still", "the path or its positions do not leave their place")
+state("positions-without-heights", "the positions have no heights, so that nothing says which way is up")
+
+
+@message(
+    advice="move over an area, not along a line, that is wide against the errors of the positions",
+    example={"across_m": 2.0, "error_m": 3.0},
+)
+def positions_leave_up_open(across_m: float, error_m: float) -> str:
+    wide = f"the path is {across_m:.2g} m wide, and they are off by {error_m:.2g} m"
+    return f"the positions do not say which way is up: {wide}"
+
+
+@message(example={"half_width": 0.6})
+def sensor_tells_little(half_width: float) -> str:
+    return f"leaves the scale open by +-{100 * half_width:.2g} %"
+
+
+state("sensor-not-asked", "was not asked (--scale-from)")
+
+
+@message(example={"sensor": "depth", "capture": "capture.toml"})
+def sensor_not_there(sensor: str, capture: str) -> str:
+    return f"{capture} has no {name_of(sensor)}, which --scale-from names"
+
+
+@message(example={"sensor": "device", "half_width_deg": 2.0})
+def up_by_sensor(sensor: str, half_width_deg: float) -> str:
+    return f"which way is up is known by the {name_of(sensor)}, to {half_width_deg:.2g} degrees"
+
+
+state(
+    "lengths-beside-imu",
+    "a target or a known distance does not give metres together with the IMU: it checks them",
+    advice="name the target in capture.toml ([target]), or give --scale-from target or distance alone",
+)
+
+
+@message(example={"found": "'depth.png'"})
+def depth_pattern_without_stem(found: str) -> str:
+    return f"must name a file by {{stem}}, the image's name without ending, not {found}"
+
+
+@message(example={"units": ("m", "cm", "mm")})
+def depth_without_unit(units: Sequence[str]) -> str:
+    return f"the unit of the maps' numbers must be stated once: unit = {', '.join(units)}, or metres_per_step"

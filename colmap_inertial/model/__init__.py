@@ -127,6 +127,51 @@ class Model:
             similarity=similarity,
         )
 
+    def rescaled(self, estimate: ScaleEstimate, factor: float) -> Model:
+        """A metric model whose metres were found to be another length.
+
+        Parameters
+        ----------
+        estimate
+            Of COLMAP's model, with the new length.
+        factor
+            New lengths over those before.
+        """
+        similarity = self.similarity
+        if similarity is None or estimate.sigma_log is None:
+            raise ValueError("only a metric model is scaled again, by a scale that was not refused")
+        longer = Similarity(
+            scale=factor, rotation_xyzw=np.array([0, 0, 0, 1.0]), translation_m=np.zeros(3), cov=np.zeros((7, 7))
+        )
+        moved = np.diag([*(factor,) * 3, 1.0, 1.0, 1.0])
+        return replace(
+            self,
+            reconstruction=transformed(self.reconstruction, longer),
+            scale=estimate,
+            similarity=_scaled_again(similarity, factor, estimate.sigma_log),
+            parts=tuple(
+                replace(
+                    part,
+                    similarity=_scaled_again(part.similarity, factor, float(np.sqrt(part.similarity.cov[0, 0]))),
+                    sigma_m=factor * part.sigma_m,
+                )
+                for part in self.parts
+            ),
+            joined_covs={name: moved @ cov @ moved for name, cov in self.joined_covs.items()},
+            motion=None if self.motion is None else self.motion.scaled(factor),
+        )
+
+
+def _scaled_again(similarity: Similarity, factor: float, sigma_log: float) -> Similarity:
+    """A similarity to lengths that are larger by a factor, with another standard deviation of the scale."""
+    before = float(np.sqrt(similarity.cov[0, 0]))
+    by = np.array([sigma_log / before if before > 0 else 1.0, 1.0, 1.0, 1.0, factor, factor, factor])
+    cov = similarity.cov * np.outer(by, by)
+    cov[0, 0] = sigma_log**2
+    return replace(
+        similarity, scale=factor * similarity.scale, translation_m=factor * similarity.translation_m, cov=cov
+    )
+
 
 def add_doubts(estimate: ScaleEstimate, doubts: Sequence[Fact]) -> ScaleEstimate:
     """An estimate that is weak at most where there are doubts, which are its first reasons."""

@@ -331,7 +331,7 @@ import pycolmap
 def test_it_goes_with_captures_and_the_imu_alone(capture, project, tmp_path):
     path = program(tmp_path / "colmap", OLDER)
     options = ReconstructOptions(colmap_executable=path)
-    target = ReferenceOptions(scale_from="target", target="checkerboard:8x6:0.04")
+    target = ReferenceOptions(target="checkerboard:8x6:0.04")
     with pytest.raises(InertialError, match="--colmap-executable goes with a capture"):
         reconstruct_by(capture, tmp_path / "out", target, options)
     with pytest.raises(InertialError, match="--colmap-executable: an existing model is not mapped again"):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -89,12 +89,28 @@ class DepthMaps:
         What wrote them, in a word.
     is_fused
         Whether the device made them from more than its depth sensor: from pictures and its own motion, too.
+    files
+        Paths of the files behind, by name; empty where there are none.
     """
 
     names: tuple[str, ...]
-    read: Callable[[str], DepthMap]
+    read: Callable[[str], DepthMap] = field(compare=False)
     source: str
     is_fused: bool = False
+    files: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def renamed(self, own: Mapping[str, str]) -> DepthMaps:
+        """The maps under other names.
+
+        Parameters
+        ----------
+        own
+            This one's name of a map by the other.
+        """
+        having = set(self.names)
+        named = {other: name for other, name in own.items() if name in having}
+        files = {other: self.files[name] for other, name in named.items() if name in self.files}
+        return replace(self, names=tuple(named), read=lambda other: self.read(named[other]), files=files)

@@ -502,3 +502,13 @@ class SolvedMotion:
                 unmoved.add(name)
         velocity, cov = ({n: v for n, v in of.items() if n in unmoved} for of in (self.velocity_in_world, self.cov))
         return replace(self, velocity_in_world=velocity, cov=cov)
+
+    def scaled(self, factor: float) -> SolvedMotion:
+        """The motion in units of which a length has ``factor`` times as many."""
+        by = np.array([*(factor,) * 6, 1.0, 1.0, 1.0])
+        return replace(
+            self,
+            cam_in_world={name: factor * centre for name, centre in self.cam_in_world.items()},
+            velocity_in_world={name: factor * velocity for name, velocity in self.velocity_in_world.items()},
+            cov={name: cov * np.outer(by, by) for name, cov in self.cov.items()},
+        )

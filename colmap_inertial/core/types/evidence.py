@@ -6,16 +6,16 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Literal, get_args
+from typing import Literal
 
 from colmap_inertial.core.arrays import set_fields
 from colmap_inertial.core.facts import Fact, with_sentences
+from colmap_inertial.core.options import ScaleFrom
 from colmap_inertial.core.quantiles import Z95
 
 Verdict = Literal["trusted", "weak", "refused"]
 #: ``device``: poses that the device itself computed (ARKit, ARCore); ``positions``: of a satellite receiver.
-Sensor = Literal["imu", "depth", "device", "positions", "target", "distance"]
-SENSORS: tuple[Sensor, ...] = get_args(Sensor)
+Sensor = ScaleFrom
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,11 +12,12 @@ from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import WorldAxes
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import DOWN_IN_WORLD, FrameTiming, PositionFixes
+from colmap_inertial.evidence.positions import georeference_path
 from colmap_inertial.inertial.georeference import Georeference
 from colmap_inertial.io.files import read_record, write_json, write_record
 from colmap_inertial.model import read_model, trajectory_from_model
 from colmap_inertial.run.commands.result import ModelResult, error_as_json
-from colmap_inertial.run.preparation.geolocation import cameras_as_json, georeference_path
+from colmap_inertial.run.preparation.geolocation import cameras_as_json
 from colmap_inertial.run.steps.session import Session
 
 log = logging.getLogger(__name__)

@@ -57,7 +57,10 @@ from colmap_inertial.run.preparation.geolocation import positions_of
 from colmap_inertial.run.preparation.packages import warn_of_conflicts
 from colmap_inertial.run.preparation.plan import add_stated_exposures, ask_for_plan, run_plan
 from colmap_inertial.run.preparation.preflight import check_imu, run_preflight
+from colmap_inertial.run.preparation.sampling import guess_camera
 from colmap_inertial.run.preparation.selection import part_of, run_selection
+from colmap_inertial.run.preparation.sensors import find_sensors
+from colmap_inertial.run.stages.capture_sensors import CaptureSensors
 from colmap_inertial.run.stages.deblur import require_method
 from colmap_inertial.run.stages.defaults import (
     default_frame_stages,
@@ -304,6 +307,7 @@ def _run_steps(
         fuser=given.fuser,
         apertures=workspace.apertures,
         database=workspace.colmap_database,
+        sensors=_find_sensors(recording, options),
     )
     of_frames = insert_defaults(stages.frame, default_frame_stages(inputs))
     of_keypoints = insert_defaults(stages.keypoint, default_keypoint_stages(inputs))
@@ -347,6 +351,17 @@ def _run_steps(
         selection=selection,
         seconds=session.runner.seconds,
     )
+
+
+def _find_sensors(recording: Recording, options: ReconstructOptions) -> CaptureSensors:
+    """What the capture holds beside the IMU that knows of metres."""
+    capture, timing = recording.capture, recording.timing
+
+    def size_px() -> tuple[int, int]:
+        camera = guess_camera(capture, timing)
+        return camera.width, camera.height
+
+    return find_sensors(capture, timing.names, size_px, timing=timing, chosen=options.scale_from)
 
 
 def _require_known_images(options: ReconstructOptions, stages: Sequence[KeypointStage]) -> None:

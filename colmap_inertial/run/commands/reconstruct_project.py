@@ -62,6 +62,8 @@ from colmap_inertial.run.commands.result import Fragment, ModelResult, Reconstru
 from colmap_inertial.run.preparation.geolocation import positions_of
 from colmap_inertial.run.preparation.packages import warn_of_conflicts
 from colmap_inertial.run.preparation.preflight import run_preflight
+from colmap_inertial.run.preparation.sensors import find_sensors
+from colmap_inertial.run.stages.capture_sensors import CaptureSensors
 from colmap_inertial.run.stages.defaults import default_model_stages
 from colmap_inertial.run.stages.inputs import StageInputs
 from colmap_inertial.run.steps.session import Session, open_session
@@ -238,7 +240,7 @@ def _run_steps(
     poses = _read_poses(largest, timing)
     doubts = run_preflight(session, recording, beside.raw, findings, force=options.force, model=poses)
     recording = dataclasses.replace(recording, doubts=doubts)
-    inputs = _make_stage_inputs(given, recording, source, options)
+    inputs = _make_stage_inputs(given, recording, source, options, _find_sensors(given, recording, options))
     stages = insert_defaults(model_stages, default_model_stages(inputs))
     submodels = Submodels(folders=models, numbered=True, after=(), read=read)
     results, fragments, gaps = run_models(session, recording, stages, submodels, fragments=options.fragments)
@@ -271,8 +273,30 @@ def _read_poses(model: pycolmap.Reconstruction, timing: FrameTiming) -> CameraTr
         return "untimed"
 
 
+def _find_sensors(given: _CheckedProject, recording: Recording, options: ReconstructOptions) -> CaptureSensors:
+    """What the recording holds beside the IMU that knows of metres, by the names of the images."""
+    names = list_registered(given.models, given.read)
+
+    def size_px() -> tuple[int, int]:
+        camera = next(iter(given.read(next(iter(given.models.values()))).cameras.values()))
+        return camera.width, camera.height
+
+    return find_sensors(
+        given.beside.capture,
+        names,
+        size_px,
+        timing=recording.timing,
+        chosen=options.scale_from,
+        images=given.images,
+    )
+
+
 def _make_stage_inputs(
-    given: _CheckedProject, recording: Recording, source: ProjectOptions, options: ReconstructOptions
+    given: _CheckedProject,
+    recording: Recording,
+    source: ProjectOptions,
+    options: ReconstructOptions,
+    sensors: CaptureSensors,
 ) -> StageInputs:
     """Inputs of the model stages."""
     project, layout = given.folder, given.layout
@@ -282,6 +306,7 @@ def _make_stage_inputs(
         options=_hold_cameras(options),
         database=find_database(project, files),
         made_from=name_made_from(project, layout, files, source.keep) if options.refine == "auto" else "",
+        sensors=sensors,
     )
 
 

@@ -1,4 +1,4 @@
-"""Scale by a reference, such as a target or a distance: of an existing model, or of pictures without an IMU."""
+"""Scale without an IMU: by a target, a distance, depth maps, positions; of an existing model, or of images alone."""
 
 from __future__ import annotations
 
@@ -23,25 +23,46 @@ from colmap_inertial.colmap.features.extraction import (
 from colmap_inertial.colmap.mapping.mapper import map_images
 from colmap_inertial.colmap.settings import read_settings
 from colmap_inertial.core.arrays import Array
-from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError, OutputExistsError, fact_of
+from colmap_inertial.core.errors import (
+    FormatError,
+    InertialError,
+    NotObservableError,
+    OutputExistsError,
+    TimingError,
+    fact_of,
+)
 from colmap_inertial.core.facts import Fact, with_sentences
-from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, ReferenceOptions, ValidateOptions
+from colmap_inertial.core.options import (
+    ProjectOptions,
+    ReconstructOptions,
+    ReferenceOptions,
+    ScaleFrom,
+    ValidateOptions,
+    WorldAxes,
+)
 from colmap_inertial.core.progress import Progress, report_each, silent
 from colmap_inertial.core.quantiles import Z95
+from colmap_inertial.core.types import CameraTrajectory, FrameTiming
+from colmap_inertial.core.types.evidence import AbsentSensor, CombinedScale, ScaleEvidence, Sensor
+from colmap_inertial.evidence.combine import combine, judge_device
+from colmap_inertial.evidence.references import evidence_of_distance, evidence_of_target
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.io.capture import Capture, load_capture
+from colmap_inertial.io.device_folders import is_device_folder
 from colmap_inertial.io.files import StrPath, a_record_of_ours, path_in, read_json, write_json
 from colmap_inertial.io.fingerprints import fingerprint
 from colmap_inertial.io.frame_sources import ImageFolder, Video, image_names
-from colmap_inertial.io.frames import read_frames
+from colmap_inertial.io.frames import read_frame_timing, read_frames
 from colmap_inertial.io.imu import is_capture
 from colmap_inertial.io.mp4 import is_mp4
-from colmap_inertial.model import find_models, read_model
+from colmap_inertial.messages.sensors import name_of
+from colmap_inertial.model import Model, find_models, read_model, trajectory_from_model
 from colmap_inertial.model.copying import copy_file, new_folder
 from colmap_inertial.model.project import apply_to_project
 from colmap_inertial.run.commands.paths import only_model
-from colmap_inertial.run.commands.validate import scaling
+from colmap_inertial.run.preparation.sensors import find_sensors
 from colmap_inertial.run.stages.frame_folder import encode_image, require_frames
+from colmap_inertial.run.stages.sensors import SensorsOfModel, ask_sensors, turn_up
 from colmap_inertial.run.steps.session import keep_colmap_quiet
 from colmap_inertial.run.steps.workspace import refuse_links, require_apart
 from colmap_inertial.validate import Validation, parse_target, validate_model
@@ -59,10 +80,8 @@ class Reference:
     ----------
     out
         The project in metres.
-    scale_from
-        ``"target"`` or ``"distance"``.
-    metres_per_unit, ci95
-        The scale and its 95 % interval.
+    sensors
+        What each says, and all together.
     made_of
         What it was measured by, in words.
     notes
@@ -72,17 +91,27 @@ class Reference:
     """
 
     out: Path
-    scale_from: str
-    metres_per_unit: float
-    ci95: tuple[float, float]
+    sensors: CombinedScale
     made_of: str
     notes: tuple[Fact, ...]
     validation: Validation | None = None
 
+    @property
+    def scale_from(self) -> tuple[Sensor, ...]:
+        """What gave metres."""
+        return tuple(one.sensor for one in self.sensors.evidence)
+
     def as_json(self) -> dict[str, object]:
         """The content of ``scale.json``."""
-        kept = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in ("validation", "out")}
-        return {**with_sentences(kept), "validation": self.validation and self.validation.as_json()}
+        return {
+            "scale_from": list(self.scale_from),
+            "metres_per_unit": self.sensors.metres_per_unit,
+            "ci95": list(self.sensors.ci95),
+            "verdict": self.sensors.verdict,
+            **with_sentences({"made_of": self.made_of, "notes": list(self.notes)}),
+            "sensors": self.sensors.as_json(),
+            "validation": self.validation and self.validation.as_json(),
+        }
 
 
 def scale_project_by(
@@ -91,6 +120,9 @@ def scale_project_by(
     reference: ReferenceOptions,
     source: ProjectOptions | None = None,
     *,
+    scale_from: Sequence[ScaleFrom] = (),
+    capture: Capture | None = None,
+    world: WorldAxes = "z-up",
     progress: Progress = silent,
 ) -> Reference:
     """Write a whole COLMAP project in metres, by what is known of its size.
@@ -102,11 +134,17 @@ def scale_project_by(
     out
         A folder that does not exist; it appears whole or not at all.
     reference
-        What is known.
+        What lengths are known.
     source
         Where the project's pictures are, and how files are taken over.
+    scale_from
+        What counts; all that there is where empty.
+    capture
+        What describes depth maps, the device's own path and positions; without it, the project and its pictures.
+    world
+        Where gravity points, where some sensor tells.
     progress
-        Called with ``"validation"`` and ``"apply"``.
+        Called with ``"validation"``, ``"depth"`` and ``"apply"``.
 
     Raises
     ------
@@ -115,45 +153,43 @@ def scale_project_by(
         :func:`apply_to_project`.
     """
     project, out, source = Path(project), Path(out), source or ProjectOptions()
-    model = only_model(project / "sparse" if (project / "sparse").is_dir() else project)
+    check_reference(reference, scale_from)
+    folder = only_model(project / "sparse" if (project / "sparse").is_dir() else project)
+    images = project / "images" if source.images is None else source.images
     validation = None
     if reference.target is not None:
-        images = project / "images" if source.images is None else source.images
         if not images.is_dir():
             raise FormatError(images, Fact("no-folder-of-pictures"))
         validation = validate_model(
-            model,
+            folder,
             images,
             parse_target(reference.target),
             ValidateOptions(unscaled=True),
             progress=lambda done, total: progress("validation", done, total),
         )
-        if validation.doubts and reference.scale_from == "target":
-            raise NotObservableError("scale", Fact("found-together", found=validation.doubts))
-    if reference.scale_from == "distance":
-        scale, sigma_log, made_of = _scale_by_distance(reference, validation)
-    else:
-        scale, sigma_log, made_of = _scale_by_target(validation)
-    half = Z95 * sigma_log
-    notes = [Fact("up-unknown-without-imu")]
+    lengths = _ask_lengths(reference, validation, scale_from)
+    said = _ask_sensors(capture or _describe(project, source), folder, images, scale_from, progress)
+    combined = combine([*lengths.evidence, *said.evidence], [*lengths.absent, *said.absent])
+    if said.path_of_device is not None:
+        combined = dataclasses.replace(combined, device=judge_device(combined, said.path_of_device))
+    if combined.verdict == "refused":
+        raise NotObservableError("scale", Fact("found-together", found=combined.reasons))
+    notes = []
+    similarity, up = turn_up(combined.metres_per_unit, combined.sigma, said.model, world)
+    made_of = "; ".join([*lengths.made_of, *(name_of(one.sensor) for one in said.evidence)])
+    similarity = dataclasses.replace(similarity, provenance=made_of)
+    notes.append(up)
     if validation is not None:
         notes += [] if validation.lengths is None else [Fact("target-proves", proof=validation.lengths.proves)]
         if validation.check_error_pct is not None:
             notes.append(Fact("check-corners-off", error=validation.check_error_pct / 100))
         notes += (*validation.doubts, *validation.reasons)
-    by_reference = Reference(
-        out=out,
-        scale_from=reference.scale_from,
-        metres_per_unit=scale,
-        ci95=(scale * float(np.exp(-half)), scale * float(np.exp(half))),
-        made_of=made_of,
-        notes=tuple(notes),
-        validation=validation,
-    )
+    notes += combined.reasons
+    by_reference = Reference(out=out, sensors=combined, made_of=made_of, notes=tuple(notes), validation=validation)
     apply_to_project(
         project,
         out,
-        scaling(scale, sigma_log, made_of),
+        similarity,
         link=source.link,
         keep=source.keep,
         follow_links=source.follow_links,
@@ -163,7 +199,119 @@ def scale_project_by(
     return by_reference
 
 
-def check_reference(reference: ReferenceOptions) -> None:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Lengths:
+    """What known lengths say, in the model's units, and what they were measured by, in words."""
+
+    evidence: tuple[ScaleEvidence, ...] = ()
+    absent: tuple[AbsentSensor, ...] = ()
+    made_of: tuple[str, ...] = ()
+
+
+def _ask_lengths(
+    reference: ReferenceOptions, validation: Validation | None, scale_from: Sequence[ScaleFrom]
+) -> _Lengths:
+    """The target and the known distance; a target that only says what the markers of a distance are does not count."""
+    found = _Lengths()
+    counts = reference.distance is None if not scale_from else "target" in scale_from
+    if validation is not None and counts:
+        if validation.doubts:
+            found = _Lengths(absent=(AbsentSensor(sensor="target", reasons=tuple(validation.doubts)),))
+        else:
+            target, made_of = scale_by_target(validation)
+            found = _Lengths(evidence=(target,), made_of=(made_of,))
+    if reference.distance is not None and (not scale_from or "distance" in scale_from):
+        distance, made_of = scale_by_distance(reference, validation)
+        found = _Lengths(evidence=(*found.evidence, distance), absent=found.absent, made_of=(*found.made_of, made_of))
+    return found
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Said:
+    """What sensors say of a model in its units."""
+
+    model: SensorsOfModel = dataclasses.field(default_factory=SensorsOfModel)
+    path_of_device: CameraTrajectory | None = None
+
+    @property
+    def evidence(self) -> tuple[ScaleEvidence, ...]:
+        return self.model.evidence
+
+    @property
+    def absent(self) -> tuple[AbsentSensor, ...]:
+        return self.model.absent
+
+
+def _describe(project: Path, source: ProjectOptions) -> Capture:
+    """What is known of a project's images: what was given beside it, else what lies in it."""
+    beside = (path for path in (source.imu, source.frame_times) if path is not None and is_capture(path))
+    if (path := next(beside, None)) is not None:
+        return load_capture(path)
+    poses = project if is_device_folder(project) else None
+    return Capture(path=project, calibration=calibration_prior(), poses=poses)
+
+
+def _ask_sensors(
+    capture: Capture, folder: Path, images: Path, scale_from: Sequence[ScaleFrom], progress: Progress
+) -> _Said:
+    """What depth, the device's path and positions say of a model that no IMU scaled."""
+    if scale_from and not set(scale_from) & {"depth", "device", "positions"}:
+        return _Said()
+    reconstruction = read_model(folder)
+    names = sorted(reconstruction.image(i).name for i in reconstruction.reg_image_ids())
+    timing = _time_images(capture, names)
+
+    def size_px() -> tuple[int, int]:
+        camera = next(iter(reconstruction.cameras.values()))
+        return camera.width, camera.height
+
+    sensors = find_sensors(
+        capture, names, size_px, timing=timing, chosen=scale_from, images=images if images.is_dir() else None
+    )
+    if not sensors:
+        return _Said()
+    in_order = timing or FrameTiming(names=tuple(names), t_s=np.arange(float(len(names))))
+    model = Model(reconstruction=reconstruction, colmap_index=0, timing=in_order)
+    path, _ = trajectory_from_model(reconstruction, in_order, covariances=False)
+    said = ask_sensors(
+        sensors, model, path, up_in_world=None, log_scale=None, timed=timing is not None, progress=progress
+    )
+    return _Said(model=said, path_of_device=None if said.device is None else sensors.device)
+
+
+def _time_images(capture: Capture, names: Sequence[str]) -> FrameTiming | None:
+    """When a capture's images were exposed; ``None`` where nobody says."""
+    if capture.frames is None:
+        return None
+    try:
+        timing = read_frame_timing(capture)
+    except TimingError:
+        return None
+    return timing if len(set(names) & set(timing.names)) > 1 else None
+
+
+def has_imu(path: Path, source: ProjectOptions) -> bool:
+    """Whether an IMU was recorded with a capture, or is given beside a project."""
+    if source.imu is not None and not is_capture(source.imu):
+        return True
+    capture = _try_capture(path if source.imu is None else source.imu)
+    return capture is not None and capture.imu is not None
+
+
+def knows_metres(path: Path, source: ProjectOptions) -> bool:
+    """Whether a capture without an IMU says by itself where metres come from."""
+    capture = _try_capture(path if source.imu is None else source.imu)
+    return capture is not None and any((capture.poses, capture.depth, capture.target))
+
+
+def _try_capture(path: Path) -> Capture | None:
+    try:
+        return load_capture(path)
+    except FormatError:
+        return None
+
+
+def check_reference(reference: ReferenceOptions, scale_from: Sequence[ScaleFrom]) -> None:
     """Refuse, before any work, what is not given or cannot be.
 
     Raises
@@ -171,9 +319,9 @@ def check_reference(reference: ReferenceOptions) -> None:
     InertialError
         With all that is missing.
     """
-    if reference.scale_from == "target" and reference.target is None:
+    if "target" in scale_from and reference.target is None:
         raise InertialError(Fact("target-not-given"))
-    if reference.scale_from == "distance":
+    if "distance" in scale_from or reference.distance is not None or reference.between is not None:
         if reference.between is None or reference.distance is None:
             raise InertialError(Fact("distance-not-given"))
         _parse_length(reference.distance)
@@ -183,18 +331,26 @@ def check_reference(reference: ReferenceOptions) -> None:
         parse_target(reference.target)
 
 
-def _scale_by_target(validation: Validation | None) -> tuple[float, float, str]:
-    if validation is None:
-        raise InertialError(Fact("target-not-given"))
+def scale_by_target(validation: Validation) -> tuple[ScaleEvidence, str]:
+    """A target as evidence, and what was measured, in words."""
     # by half of its corners, so that the others can tell how right that is
     control = validation.control
     scale = validation.metres_per_unit if control is None else control.metres_per_unit
     low, high = validation.metres_per_unit_ci95 if control is None else control.ci95
-    made_of = f"target {validation.target.spec} in {validation.views_used} images"
-    return scale, float(np.log(high / low)) / (2 * Z95), made_of
+    target = validation.target
+    declared_log = 0.0 if target.sigma_m is None else target.sigma_m / target.length_m
+    evidence = evidence_of_target(scale, float(np.log(high / low)) / (2 * Z95), declared_log)
+    return evidence, f"target {target.spec} in {validation.views_used} images"
 
 
-def _scale_by_distance(reference: ReferenceOptions, validation: Validation | None) -> tuple[float, float, str]:
+def scale_by_distance(reference: ReferenceOptions, validation: Validation | None) -> tuple[ScaleEvidence, str]:
+    """A known distance as evidence, and what was measured, in words.
+
+    Raises
+    ------
+    NotObservableError
+        Where an end was not measured, or both are one place.
+    """
     between, distance = reference.between, reference.distance
     if between is None or distance is None:
         raise InertialError(Fact("distance-not-given"))
@@ -203,8 +359,8 @@ def _scale_by_distance(reference: ReferenceOptions, validation: Validation | Non
     measured = float(np.linalg.norm(places[0] - places[1]))
     if not measured > 0:
         raise NotObservableError("scale", Fact("one-place", first=between[0], second=between[1]))
-    sigma_log = float(np.hypot(sigma_m / metres, np.hypot(*noise) / measured))
-    return metres / measured, sigma_log, f"distance of {distance} m between {between[0]} and {between[1]}"
+    evidence = evidence_of_distance(metres, sigma_m, measured, float(np.hypot(*noise)))
+    return evidence, f"distance of {distance} m between {between[0]} and {between[1]}"
 
 
 def _parse_length(text: str) -> tuple[float, float]:
@@ -274,11 +430,11 @@ def reconstruct_by(
         A folder that does not exist, or one with nothing but ``colmap/`` of an earlier run on the same pictures, whose
         scale was not found: that model is then taken.
     reference
-        What is known: a target, or the distance of two markers.
+        What lengths are known: a target, or the distance of two markers.
     options
-        ``mapping``, ``deterministic`` and ``seed`` count.
+        ``scale_from``, ``mapping``, ``world``, ``deterministic`` and ``seed`` count.
     progress
-        Called with ``"frames"``, what COLMAP does, ``"validation"`` and ``"apply"``.
+        Called with ``"frames"``, what COLMAP does, ``"validation"``, ``"depth"`` and ``"apply"``.
 
     Raises
     ------
@@ -287,7 +443,10 @@ def reconstruct_by(
         kept then.
     """
     capture, out = Path(capture), Path(out)
-    check_reference(reference)
+    pictures = _load_pictures(capture)
+    if reference.target is None and pictures.target is not None:
+        reference = dataclasses.replace(reference, target=pictures.target)
+    check_reference(reference, options.scale_from)
     if out.is_dir() and any(out.iterdir()) and not (out / "colmap" / _MADE_FROM).exists():
         raise OutputExistsError(Fact("output-not-empty", path=str(out)))
     refuse_links(out)
@@ -297,7 +456,6 @@ def reconstruct_by(
         raise InertialError(Fact("for-metres-of-the-imu", option="--database"))
     if any("," in end for end in reference.between or ()):
         raise InertialError(Fact("points-need-a-model"))
-    pictures = _load_pictures(capture)
     names = _list_names(pictures)
     made_from = {"capture": str(capture.resolve()), "pictures": len(names), **dataclasses.asdict(options.mapping)}
     if settings := read_settings(options.colmap, options.colmap_project).settings:
@@ -310,7 +468,14 @@ def reconstruct_by(
     left_out = read_json(out / "colmap" / _MADE_FROM)["left_out"]
     metric = out / "metric"
     scaled = scale_project_by(
-        out / "colmap", metric, reference, ProjectOptions(link=True, keep=(_MADE_FROM,)), progress=progress
+        out / "colmap",
+        metric,
+        reference,
+        ProjectOptions(link=True, keep=(_MADE_FROM,)),
+        scale_from=options.scale_from,
+        capture=pictures,
+        world=options.world,
+        progress=progress,
     )
     notes = (*scaled.notes, Fact("treatment-without-imu"))
     if left_out:

@@ -14,6 +14,7 @@ from colmap_inertial.run.stages.metric import MetricStage
 from colmap_inertial.run.stages.readout import ReadoutStage
 from colmap_inertial.run.stages.refine import RefineStage
 from colmap_inertial.run.stages.rolling_shutter import RollingShutterStage
+from colmap_inertial.run.stages.sensors import SensorStage
 
 _FRAME: tuple[Callable[[StageInputs], FrameStage | None], ...] = (
     ApertureStage.for_run,
@@ -26,6 +27,7 @@ _MODEL: tuple[Callable[[StageInputs], ModelStage | None], ...] = (
     MetricStage.for_run,
     JoinStage.for_run,
     RefineStage.for_run,
+    SensorStage.for_run,
 )
 
 

@@ -14,6 +14,7 @@ from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.exposure_pairs import replace_departures
 from colmap_inertial.imaging.restoration import load_network, lsd2, shipped
 from colmap_inertial.io.recording import Recording
+from colmap_inertial.run.stages.capture_sensors import CaptureSensors
 from colmap_inertial.run.stages.imaging_plan import ImagingPlan
 
 #: Makes one picture of a short exposure as bright as the long one, the long one in its geometry, and the long one's
@@ -81,6 +82,8 @@ class StageInputs:
     made_from
         For model stages: a file of an existing project that was made from its models; empty without one, ``None`` of a
         capture.
+    sensors
+        For model stages: what the capture holds beside the IMU that knows of metres.
     """
 
     recording: Recording
@@ -93,3 +96,4 @@ class StageInputs:
     keypoint_stages: Sequence[KeypointStage] = ()
     database: Path | None = None
     made_from: str | None = None
+    sensors: CaptureSensors | None = None

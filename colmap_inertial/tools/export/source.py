@@ -15,6 +15,7 @@ from colmap_inertial.core.errors import FormatError, NotObservableError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ExportImages
 from colmap_inertial.core.types import DOWN_IN_WORLD, Action, CameraMotion, CameraTrajectory
+from colmap_inertial.evidence.positions import georeference_path
 from colmap_inertial.inertial.georeference import Georeference
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import a_record_of_ours, read_json, read_record
@@ -24,7 +25,7 @@ from colmap_inertial.io.positions import positions_in_pictures
 from colmap_inertial.model import read_model, transformed
 from colmap_inertial.model.nerf import NEVER_SCALED, NO_SCALE, NO_UP
 from colmap_inertial.model.places import Place, translation
-from colmap_inertial.run.preparation.geolocation import georeference_path, positions_of, read_georeference
+from colmap_inertial.run.preparation.geolocation import positions_of, read_georeference
 from colmap_inertial.run.stages.metric import motion_file
 from colmap_inertial.run.steps.runner import explaining_losses, find_change
 from colmap_inertial.run.steps.workspace import Workspace, places_of

@@ -326,6 +326,6 @@ def test_a_database_of_an_installed_colmap_goes_on(tmp_path):
 
 
 def test_a_target_in_place_of_an_imu_takes_none(capture, akaze, tmp_path):
-    target = ReferenceOptions(scale_from="target", target="checkerboard:8x6:0.04")
+    target = ReferenceOptions(target="checkerboard:8x6:0.04")
     with pytest.raises(InertialError, match="--database goes with a capture"):
         reconstruct_by(capture, tmp_path / "out", target, ReconstructOptions(database=akaze))

@@ -13,12 +13,13 @@ from colmap_inertial.core.earth import ecef_from_enu, ecef_of_geodetic, geodetic
 from colmap_inertial.core.errors import FormatError, NotObservableError
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.core.types import CameraTrajectory, PositionFixes
+from colmap_inertial.evidence.positions import located, path_at
 from colmap_inertial.inertial.georeference import Georeference, georeference, georeference_of_json
 from colmap_inertial.io.positions import positions_in_pictures, positions_in_video
 from colmap_inertial.model import read_model
 from colmap_inertial.report.words import place_facts
 from colmap_inertial.run.commands.reconstruct_project import reconstruct_project
-from colmap_inertial.run.preparation.geolocation import located, path_at, read_georeference
+from colmap_inertial.run.preparation.geolocation import read_georeference
 from colmap_inertial.tools.export.whole import export_model
 from scripts.studies.georeference import measure
 from tests.helpers import imu_files

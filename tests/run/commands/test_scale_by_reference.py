@@ -15,6 +15,8 @@ from colmap_inertial.colmap.chunks import Processes
 from colmap_inertial.core.errors import InertialError, NotObservableError, TargetNotFoundError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ReferenceOptions
+from colmap_inertial.evidence.combine import combine
+from colmap_inertial.evidence.references import evidence_of_target
 from colmap_inertial.run.commands import scale_by_reference as rooms
 from colmap_inertial.run.commands.scale_by_reference import Reference, scale_project_by
 from colmap_inertial.validate.result import LengthCheck
@@ -47,7 +49,7 @@ def test_a_known_distance_of_two_points_makes_a_project_metric(bare, tmp_path, c
     a, b = (after.image(i).projection_center() for i in (images[0], images[-1]))
     assert np.linalg.norm(a - b) == pytest.approx(2.5)
     found = json.loads((out / "scale.json").read_text())
-    assert found["scale_from"] == "distance" and "2.5+-0.01 m" in found["made_of"]
+    assert found["scale_from"] == ["distance"] and "2.5+-0.01 m" in found["made_of"]
     low, high = found["ci95"]
     assert np.log(high / low) == pytest.approx(2 * 1.96 * 0.004, rel=1e-3)
     assert "which way is up is not known" in found["notes"][0]
@@ -59,19 +61,17 @@ def test_a_known_distance_of_two_points_makes_a_project_metric(bare, tmp_path, c
 
 def test_markers_and_targets_give_their_scale(bare, tmp_path, monkeypatch):
     monkeypatch.setattr(rooms, "validate_model", lambda *_, **__: validated(0.5, unscaled=True))
-    markers = {"target": "aruco:DICT_4X4_50:0.1", "scale_from": "distance"}
+    markers = {"target": "aruco:DICT_4X4_50:0.1"}
     known = ReferenceOptions(**markers, between=("0", "1"), distance="2.1+-0.001")
     found = scale_project_by(bare, tmp_path / "markers", known)
-    assert found.metres_per_unit == pytest.approx(2.1 / 4)
+    assert found.sensors.metres_per_unit == pytest.approx(2.1 / 4)
     assert found.validation is not None
-    target = scale_project_by(
-        bare, tmp_path / "target", ReferenceOptions(scale_from="target", target="aruco:DICT_4X4_50:0.1")
-    )
-    assert target.metres_per_unit == pytest.approx(0.5) and target.made_of.startswith("target aruco")
+    target = scale_project_by(bare, tmp_path / "target", ReferenceOptions(target="aruco:DICT_4X4_50:0.1"))
+    assert target.sensors.metres_per_unit == pytest.approx(0.5) and target.made_of.startswith("target aruco")
     doubted = dataclasses.replace(validated(0.5, unscaled=True), views_used=2)
     monkeypatch.setattr(rooms, "validate_model", lambda *_, **__: doubted)
     with pytest.raises(NotObservableError, match="only 2 of 5 images agree on the target, too few to prove its size"):
-        scale_project_by(bare, tmp_path / "no", ReferenceOptions(scale_from="target", target="aruco:DICT_4X4_50:0.1"))
+        scale_project_by(bare, tmp_path / "no", ReferenceOptions(target="aruco:DICT_4X4_50:0.1"))
     found = scale_project_by(bare, tmp_path / "doubted", known)
     assert any("only 2 of 5 images agree" in str(note) for note in found.notes)
     with pytest.raises(NotObservableError, match="marker 9 was not measured in the model; measured: 0, 1, 2, 3, 7"):
@@ -82,20 +82,21 @@ def test_markers_and_targets_give_their_scale(bare, tmp_path, monkeypatch):
 @loop_over(
     ("options", "words"),
     [
-        ({"scale_from": "target"}, "--scale-from target needs the target"),
-        ({"scale_from": "distance"}, "needs --between A B"),
-        ({"scale_from": "distance", "between": ("1,2,3", "4,5,6"), "distance": "2.5"}, "how well they are known"),
-        ({"scale_from": "distance", "between": ("1,2,3", "4,5,6"), "distance": "0+-1"}, "how well they are known"),
-        ({"scale_from": "distance", "between": ("1,2,3", "3"), "distance": "2+-0.1"}, "needs what they are: --target"),
-        ({"scale_from": "distance", "between": ("a,b,c", "3"), "distance": "2+-0.1"}, "a point is x,y,z"),
-        ({"scale_from": "distance", "between": ("1,2,nan", "3,4,5"), "distance": "2+-0.1"}, "a point is x,y,z"),
-        ({"scale_from": "distance", "between": ("1,2,3", "1e999,0,0"), "distance": "2+-0.1"}, "a point is x,y,z"),
-        ({"scale_from": "distance", "between": ("1,2,3", "1,2,3"), "distance": "2+-0.1"}, "are the same place"),
+        ({"scale_from": ("target",)}, "--scale-from target needs the target"),
+        ({"scale_from": ("distance",)}, "needs --between A B"),
+        ({"between": ("1,2,3", "4,5,6"), "distance": "2.5"}, "how well they are known"),
+        ({"between": ("1,2,3", "4,5,6"), "distance": "0+-1"}, "how well they are known"),
+        ({"between": ("1,2,3", "3"), "distance": "2+-0.1"}, "needs what they are: --target"),
+        ({"between": ("a,b,c", "1,2,3"), "distance": "2+-0.1"}, "a point is x,y,z"),
+        ({"between": ("1,2,nan", "3,4,5"), "distance": "2+-0.1"}, "a point is x,y,z"),
+        ({"between": ("1,2,3", "1e999,0,0"), "distance": "2+-0.1"}, "a point is x,y,z"),
+        ({"between": ("1,2,3", "1,2,3"), "distance": "2+-0.1"}, "are the same place"),
     ],
 )
 def test_what_is_missing_is_named(bare, tmp_path, options, words):
     with pytest.raises(InertialError, match=words):
-        scale_project_by(bare, tmp_path / "out", ReferenceOptions(**options))
+        scale_from = options.pop("scale_from", ())
+        scale_project_by(bare, tmp_path / "out", ReferenceOptions(**options), scale_from=scale_from)
     assert not (tmp_path / "out").exists()
 
 
@@ -154,7 +155,7 @@ def test_pictures_alone_are_mapped_and_scaled(pictures, tmp_path, monkeypatch, c
         *("colmap", "database.db", "images", "scale.json", "sparse", "transform.json")
     ]
     found = json.loads((out / "scale.json").read_text())
-    assert found["scale_from"] == "target" and found["metres_per_unit"] == pytest.approx(0.5)
+    assert found["scale_from"] == ["target"] and found["metres_per_unit"] == pytest.approx(0.5)
     told = " ".join(found["notes"])
     assert "which way is up is not known" in told and "no IMU was used" in told and "1 more models" in told
     assert [path.name for path in (out / "sparse").iterdir()] == ["0"]
@@ -236,7 +237,7 @@ def test_options_without_their_way_are_refused(tmp_path, capsys):
     code, _, err = run(capsys, "reconstruct", tmp_path, tmp_path / "out", "--scale-from", "target", "--target", "x")
     assert code == 2 and "target" in err
     code, _, err = run(capsys, "reconstruct", tmp_path, tmp_path / "out", "--distance", "2+-0.1")
-    assert code == 2 and "--distance goes with --scale-from" in err
+    assert code == 2 and "needs --between A B" in " ".join(err.split())
 
 
 def test_a_small_target_vouches_for_no_more_than_its_own_place(capsys):
@@ -255,9 +256,7 @@ def test_a_small_target_vouches_for_no_more_than_its_own_place(capsys):
         show_reference(
             Reference(
                 out=Path("out"),
-                scale_from="target",
-                metres_per_unit=0.5,
-                ci95=(0.499, 0.501),
+                sensors=combine([evidence_of_target(0.5, 0.001, 0.0)]),
                 made_of="a target",
                 notes=(),
                 validation=validation,

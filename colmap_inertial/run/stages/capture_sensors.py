@@ -1,0 +1,41 @@
+"""What a capture holds beside the IMU that knows of metres."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.types import CameraTrajectory, PositionFixes
+from colmap_inertial.core.types.depth import DepthMaps
+from colmap_inertial.core.types.evidence import AbsentSensor
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CaptureSensors:
+    """What a capture holds beside the IMU that knows of metres, joined with its images by name.
+
+    Attributes
+    ----------
+    depth
+        Depth maps.
+    device
+        The path that the device computed by itself, in its metres.
+    up_in_device
+        (3,) against gravity in its world, where that is known.
+    fixes
+        Positions of a satellite receiver.
+    absent
+        What is there and cannot be used.
+    files
+        Identity of the files behind.
+    """
+
+    depth: DepthMaps | None = None
+    device: CameraTrajectory | None = None
+    up_in_device: Array | None = None
+    fixes: PositionFixes | None = None
+    absent: tuple[AbsentSensor, ...] = ()
+    files: tuple[object, ...] = ()
+
+    def __bool__(self) -> bool:
+        return any(one is not None for one in (self.depth, self.device, self.fixes)) or bool(self.absent)
