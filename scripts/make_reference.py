@@ -1,11 +1,11 @@
 """Write the generated pages: fields of JSON files, messages, scripts, and the tables of the API reference.
 
-    python scripts/make_reference.py            # writes docs/reference/*.md, docs/api.md and docs/dev/scripts.md
+    python scripts/make_reference.py            # writes docs/reference/*.md, docs/api.md and pages in docs/dev
     python scripts/make_reference.py --check    # exit code 1 where one of them is stale
 
 Fields come from ``docs/schemas/*.schema.json``, messages from ``colmap_inertial/messages``, scripts
 from the first sentences of their docstrings. ``docs/api.md`` lists its names by hand, section by section; the table
-above each list is made of the names' docstrings.
+above each list is made of the names' docstrings. Keys of a simulation's recipe come from the fields of its classes.
 """
 
 import ast
@@ -13,13 +13,17 @@ import inspect
 import json
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import colmap_inertial
+from colmap_inertial.cli.help import read_texts
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.messages import all_messages
+from colmap_inertial.tools.simulate.recipe import SceneRecipe
+from colmap_inertial.tools.simulate.sensors import IMU_PRESETS
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -189,9 +193,59 @@ def first_sentence(name: str) -> str:
     return re.split(r"\.(?= [A-Z])|\.$", text)[0]
 
 
+# --- recipes of simulations ------------------------------------------------------------------------------------------
+
+
+def recipe_page() -> str:
+    """The keys of a recipe, table by table, from the fields of its classes and the texts below them."""
+    lines = [
+        "# Simulation",
+        "",
+        NOTE,
+        "`colmap-inertial simulate RECIPE OUT` renders a capture with known truth from a recipe, a TOML file. Every key",
+        "has a default; examples are in `example_scenes/`. `OUT/recipe.toml` is the recipe with every value, and",
+        "`OUT/truth.json` has poses, calibration, IMU errors and the board's corners. A path that leaves the room is",
+        "refused.",
+        "",
+        "World: metres, z up, the origin on the desk or at eye height in the middle of the room. Camera: x right, y down,",
+        "z forwards.",
+    ]
+    recipe = SceneRecipe()
+    parts = {"board": recipe.board, "motion": recipe.motion, "imu": recipe.imu, "camera": recipe.camera}
+    lines += ["", "## Top of the file", "", *recipe_rows(recipe, leave_out={*parts, "rig"})]
+    for name, part in parts.items():
+        lines += ["", f"## [{name}]", ""]
+        if name == "imu":
+            presets = ", ".join(f"`{one}`" for one in IMU_PRESETS)
+            lines += [f"`preset` ({presets}) sets all values, of which keys replace some.", ""]
+        if name == "camera":
+            lines += [
+                "`model`, `width`, `height`, `params`: a COLMAP camera model and its parameters. `[rig.NAME]` adds a",
+                "camera on the same body; what it leaves out is as in `[camera]`.",
+                "",
+            ]
+        lines += recipe_rows(part, leave_out={"model"} if name == "camera" else set())
+    return "\n".join(lines) + "\n"
+
+
+def recipe_rows(part: Any, leave_out: Collection[str]) -> list[str]:
+    """A table of a dataclass's fields: key, default, and the text below the field."""
+    rows, texts, kinds = ["| key | default | |", "|---|---|---|"], read_texts(type(part)), get_type_hints(type(part))
+    for field in fields(part):
+        if field.name not in leave_out:
+            default = getattr(part, field.name)
+            shown = "" if default is None else f"`{json.dumps(default)}`"
+            choices = ", ".join(
+                f"`{one}`" for one in get_args(kinds[field.name]) if get_origin(kinds[field.name]) is Literal
+            )
+            rows.append(f"| `{field.name}` | {shown} | {texts[field.name]}{f' One of {choices}.' if choices else ''} |")
+    return rows
+
+
 def pages() -> dict[Path, str]:
     """Every generated page and its text."""
     made = {DOCS / "dev" / "scripts.md": scripts_page(), DOCS / "reference" / "messages.md": messages_page()}
+    made[DOCS / "dev" / "simulation.md"] = recipe_page()
     made[DOCS / "api.md"] = api_page((DOCS / "api.md").read_text())
     for path in sorted(DOCS.glob("schemas/*.schema.json")):
         made[DOCS / "reference" / f"{path.name.removesuffix('.schema.json')}.md"] = reference_page(path)

@@ -56,11 +56,13 @@ GROUPS: dict[str, dict[str, type[Command]]] = {
         "diagnose": Diagnose,
         "reconstruct": Reconstruct,
         "batch": Batch,
-        "simulate": Simulate,
     },
-    "With a model that exists": {"scale": Scale, "apply": Apply, "validate": Validate, "view": View, "export": Export},
+    "With a result": {"view": View, "export": Export, "validate": Validate},
+    "With a model that exists": {"scale": Scale, "apply": Apply},
+    "Images alone": {"deblur": Deblur},
     "Calibrate a device": {"align": Align, "calibrate-imu": CalibrateImu},
-    "Images only": {"deblur": Deblur, "fuse-apertures": FuseApertures, "fuse-exposures": FuseExposures},
+    "Special cameras": {"fuse-apertures": FuseApertures, "fuse-exposures": FuseExposures},
+    "For developers": {"simulate": Simulate},
 }
 COMMANDS = {name: command for group in GROUPS.values() for name, command in group.items()}
 

@@ -69,7 +69,7 @@ class Option:
 
 def list_options(cls: type[Any], group: str = "") -> Iterator[Option]:
     """All options of a command in the order of its fields, those of nested values in their places."""
-    hints, texts = get_type_hints(cls, include_extras=True), _read_texts(cls)
+    hints, texts = get_type_hints(cls, include_extras=True), read_texts(cls)
     for f in dataclasses.fields(cls):
         kind, *settings = get_args(hints[f.name]) if get_origin(hints[f.name]) is Annotated else (hints[f.name],)
         names = [setting.name for setting in settings if getattr(setting, "name", None) is not None]
@@ -125,7 +125,7 @@ def _describe(default: object) -> str:
     return f"[{default:g}]" if isinstance(default, float) else f"[{default}]"
 
 
-def _read_texts(cls: type[Any]) -> dict[str, str]:
+def read_texts(cls: type[Any]) -> dict[str, str]:
     """The text below each field of a class and of those that it is made of."""
     texts: dict[str, str] = {}
     for base in filter(dataclasses.is_dataclass, reversed(cls.__mro__)):

@@ -22,7 +22,8 @@ class Simulate(ReadingCommand):
     """
 
     recipe: Positional[Path]
-    """A recipe (TOML): world, motion, IMU, camera, checkerboard; see example_scenes/."""
+    """A recipe (TOML): world, motion, IMU, camera, checkerboard; keys in docs/dev/simulation.md,
+    examples in example_scenes/."""
     out: Positional[Path]
     """A new folder for images or video, IMU files, capture.toml and truth.json."""
     workers: int = os.cpu_count() or 1

@@ -233,6 +233,28 @@ state(
 state("not-a-result", "is not the result of a reconstruction")
 
 
+def _advise_on_path(low_m: Sequence[float], high_m: Sequence[float], **_: float) -> str:
+    low, high = ("(" + ", ".join(f"{value:g}" for value in corner) + ")" for corner in (low_m, high_m))
+    return (
+        "set start_m and heading_deg, a shorter duration_s or a lower speed_m_s under [motion]; the room reaches from "
+        f"{low} to {high} m"
+    )
+
+
+@message(
+    advice=_advise_on_path,
+    example={
+        "first_s": 4.2,
+        "outside": 83,
+        "frames": 100,
+        "low_m": (-3.2, -2.8, -1.4),
+        "high_m": (3.2, 2.8, 1.3),
+    },
+)
+def path_leaves_room(first_s: float, outside: int, frames: int, low_m: Sequence[float], high_m: Sequence[float]) -> str:
+    return f"the camera leaves the room: it is outside in {outside} of {frames} frames, first at {first_s:.1f} s"
+
+
 @message(advice="name a new folder", example={"folder": "scene"})
 def folder_exists(folder: str) -> str:
     return say_existing(folder)

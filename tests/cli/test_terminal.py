@@ -275,7 +275,7 @@ def test_a_scale_says_apart_what_its_recording_has(project, tmp_path, capsys):
     assert "Note" in line
 
 
-def test_a_batch_says_what_was_found_in_each_capture_once(capsys):
+def test_a_batch_says_what_begins_and_what_was_found_in_each_capture_once(capsys):
     from colmap_inertial.tools.batch.task import CaptureStatus
     from colmap_inertial.tools.batch.terminal import live_batch
 
@@ -292,8 +292,8 @@ def test_a_batch_says_what_was_found_in_each_capture_once(capsys):
         )
         watch(replace(ended, findings=(found, "warning: 2 % are cut; use a wider range (saturated)")))
     lines = capsys.readouterr().err.splitlines()
-    assert lines[0] == f"hall {found}" and "".join(lines).count("no-motion") == 1
-    assert lines[1] == "yard warning: 2 % are cut; use a wider range (saturated)"
+    assert lines[:2] == ["started hall", f"hall {found}"] and "".join(lines).count("no-motion") == 1
+    assert lines[2] == "yard warning: 2 % are cut; use a wider range (saturated)"
     with live_batch(quiet=True) as watch:
         watch(ended)
     assert capsys.readouterr().err == ""

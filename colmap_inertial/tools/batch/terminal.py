@@ -25,7 +25,7 @@ def _outcome(status: CaptureStatus) -> str:
 
 @contextlib.contextmanager
 def live_batch(*, quiet: bool = False) -> Iterator[Watch]:
-    """A bar for each capture in work on standard error; a line for each that ends."""
+    """On standard error: a bar for each running capture, or a line where that is no terminal; a line for each end."""
     from rich.markup import escape
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
@@ -37,6 +37,10 @@ def live_batch(*, quiet: bool = False) -> Iterator[Watch]:
     reported: set[str] = set()
 
     def watch(status: CaptureStatus, /) -> None:
+        if status.state == "running" and status.name not in running:
+            running[status.name] = bars.add_task(status.name, total=None)
+            if not console.is_terminal:
+                console.print(f"started {escape(status.name)}", soft_wrap=True, highlight=False)
         if status.findings and status.name not in reported:
             reported.add(status.name)
             for finding in status.findings:
@@ -44,8 +48,6 @@ def live_batch(*, quiet: bool = False) -> Iterator[Watch]:
                 if status.error is None or finding.partition(": ")[2].partition("; ")[0] not in status.error:
                     console.print(f"{escape(status.name)} {escape(finding)}", soft_wrap=True, highlight=False)
         if status.state == "running":
-            if status.name not in running:
-                running[status.name] = bars.add_task(status.name, total=None)
             text = f"{escape(status.name)} [dim]{status.stage or 'starts'}[/]"
             bars.update(running[status.name], description=text, completed=status.steps_done, total=status.steps or None)
             return

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from colmap_inertial.core.arrays import Array, UInt8Array
-from colmap_inertial.core.errors import OutputExistsError
+from colmap_inertial.core.errors import InertialError, OutputExistsError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_multiply, quat_normalize
 from colmap_inertial.core.types import CameraModel
@@ -28,7 +28,7 @@ from colmap_inertial.tools.simulate.motion import Motion
 from colmap_inertial.tools.simulate.recipe import SceneRecipe, recipe_text
 from colmap_inertial.tools.simulate.render import Renderer, ShutterCamera, develop
 from colmap_inertial.tools.simulate.sensors import STANDARD_GRAVITY_M_S2, SampledImu, simulate_imu
-from colmap_inertial.tools.simulate.world import Board, World, WorldKind, make_world
+from colmap_inertial.tools.simulate.world import WALLS_M, Board, World, WorldKind, make_world
 
 #: Camera (end of its files' names), frame, folder for the depth map.
 _Job = tuple[str, int, Path | None]
@@ -114,18 +114,44 @@ def write_capture(
     ------
     OutputExistsError
         Where the folder holds something already.
+    InertialError
+        Where the path leaves the room, which is black outside.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise OutputExistsError(Fact("folder-exists", folder=str(folder)))
+    scene = make_scene(recipe)
+    _require_inside(scene)
     with new_folder(folder, into_empty=True) as partial_folder:
-        _write_capture(recipe, partial_folder, workers, progress)
+        _write_capture(scene, partial_folder, workers, progress)
     return folder / "capture.toml"
 
 
-def _write_capture(
-    recipe: SceneRecipe, folder: Path, workers: int, progress: Callable[[int, int], None] | None
-) -> None:
-    scene = make_scene(recipe)
+def _require_inside(scene: Scene) -> None:
+    """Refuse a path on which a camera of the rig is outside the walls when a frame is exposed.
+
+    Raises
+    ------
+    InertialError
+    """
+    low_m, high_m = map(np.array, WALLS_M[scene.recipe.world])
+    centre_m = np.stack([scene.camera_pose(camera, scene.trigger_s)[1] for camera in _cameras(scene.recipe).values()])
+    outside = ((centre_m < low_m) | (centre_m > high_m)).any(axis=(0, 2))
+    if outside.any():
+        first_s = float(scene.trigger_s[np.argmax(outside)])
+        raise InertialError(
+            Fact(
+                "path-leaves-room",
+                first_s=first_s,
+                outside=int(outside.sum()),
+                frames=len(outside),
+                low_m=low_m.tolist(),
+                high_m=high_m.tolist(),
+            )
+        )
+
+
+def _write_capture(scene: Scene, folder: Path, workers: int, progress: Callable[[int, int], None] | None) -> None:
+    recipe = scene.recipe
     cameras = _cameras(recipe)
     total, done = len(cameras) * len(scene.names), 0
     write = _write_video if recipe.format == "h264" else _write_images

@@ -84,21 +84,21 @@ class MotionOptions:
     vigour: float = 1.0
     """Factor on the hand's positions and rotations; 1 is as measured (lively: 0.5 m/s and 1 rad/s rms)."""
     speed_m_s: float = 0.8
-    """Of walk and constant_velocity."""
+    """Speed of walk and constant_velocity."""
     radius_m: float = 1.2
     """Horizontal distance from the subject, for orbit."""
     height_m: float = 0.5
-    """Above the subject, for orbit."""
+    """Height above the subject, for orbit."""
     arc_deg: float = 150.0
     """Azimuth swept by orbit."""
     sweep_s: float = 20.0
-    """Time for one sweep of the arc; then back again."""
+    """Time for one sweep of the arc, forth or back."""
     heading_deg: float | None = None
-    """Azimuth of the way forwards; for orbit, of the middle of the arc. None draws it."""
+    """Azimuth of the direction of motion; for orbit, of the middle of the arc. Drawn by default."""
     look_deg: float = 0.0
-    """Where the camera looks, to the left of the way forwards; orbit looks at its subject."""
+    """Direction of view, to the left of the direction of motion; orbit looks at its subject."""
     start_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Where the camera is at time 0, but for the hand; for orbit, the subject."""
+    """Position of the camera at time 0, without the hand's motion; for orbit, of the subject."""
 
     def __post_init__(self) -> None:
         for name in ("duration_s", "radius_m", "sweep_s"):

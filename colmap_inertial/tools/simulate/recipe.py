@@ -40,15 +40,15 @@ class SceneRecipe:
     seed: int = 1
     """Same recipe, same capture, to the last bit on one machine."""
     world: WorldKind = "desk"
-    """Where it is filmed."""
+    """The scene that is filmed."""
     frame_rate_hz: float = 3.0
     """Frames per second."""
     format: FrameFormat = "jpeg"
-    """jpeg, png: a folder of pictures; h264: a video."""
+    """jpeg, png: a folder of images; h264: a video."""
     quality: int = 90
-    """Of JPEG, 0 to 100."""
+    """Quality of JPEG, 0 to 100."""
     crf: int = 18
-    """Of H.264: constant rate factor, 0 (lossless) to 51."""
+    """Constant rate factor of H.264, 0 (lossless) to 51."""
     depth_maps: bool = False
     """Also write the true depth map of every frame, at its middle instant, as NumPy files."""
     camera_known: bool = True

@@ -50,11 +50,11 @@ class ShutterCamera:
     model: CameraModel
     """Any COLMAP camera model."""
     exposure_s: float = 0.004
-    """Of every line."""
+    """Exposure time of every line."""
     readout_s: float = 0.0
     """From the start of the first line's exposure to one past the last; 0 is a global shutter."""
     readout_direction: ReadoutDirection = "down"
-    """Where the exposed line moves in the stored picture."""
+    """Direction in which the exposed line moves in the stored image."""
     body_from_cam_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
     """Orientation on the body."""
     cam_in_body_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -62,7 +62,7 @@ class ShutterCamera:
     delay_s: float = 0.0
     """Starts exposing this long after the body's first camera."""
     gain: float = 1.0
-    """Brightness of the picture against the world's linear light."""
+    """Brightness of the image relative to the world's linear light."""
     white_electrons: float = 8000.0
     """Electrons at full white: shot noise."""
     read_noise_electrons: float = 8.0

@@ -13,6 +13,12 @@ from colmap_inertial.core.arrays import Array, Float32Array
 from colmap_inertial.tools.simulate import textures
 
 WorldKind = Literal["desk", "room"]
+
+#: Lowest and highest corner of the room around each world.
+WALLS_M: dict[WorldKind, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
+    "desk": ((-2.5, -2.5, -0.8), (2.5, 2.5, 1.7)),
+    "room": ((-3.2, -2.8, -1.4), (3.2, 2.8, 1.3)),
+}
 _Material = Callable[[np.random.Generator, int, int], Float32Array]
 
 #: Direction to the lamp, and how much light comes from everywhere.
@@ -181,7 +187,7 @@ def _shadow(texture: Float32Array, footprints: list[Array], texel_m: float) -> F
 
 def _desk(builder: _Builder, board: Board) -> Array:
     rng = builder.rng
-    low, high = np.array([-2.5, -2.5, -0.8]), np.array([2.5, 2.5, 1.7])
+    low, high = map(np.array, WALLS_M["desk"])
     builder.room(low, high, 0.004)
     builder.posters(low, high, 12, 0.003)
     for i in range(10):  # furniture along the walls
@@ -235,7 +241,7 @@ def _desk(builder: _Builder, board: Board) -> Array:
 
 def _room(builder: _Builder, board: Board) -> Array:
     rng = builder.rng
-    low, high = np.array([-3.2, -2.8, -1.4]), np.array([3.2, 2.8, 1.3])
+    low, high = map(np.array, WALLS_M["room"])
     builder.room(low, high, 0.004)
     builder.posters(low, high, 20, 0.003)
     for i in range(14):

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from colmap_inertial.core.errors import FormatError, OutputExistsError
+from colmap_inertial.core.errors import FormatError, InertialError, OutputExistsError
 from colmap_inertial.core.geometry import (
     matrix_from_quat,
     quat_conjugate,
@@ -129,6 +129,19 @@ def test_same_recipe_same_bytes_with_one_process_or_two(written, tmp_path):
     assert contents(tmp_path / "again") == contents(tmp_path / "once")
     with pytest.raises(OutputExistsError, match="exists already"):
         write_capture(recipe, tmp_path / "again")
+
+
+def test_a_path_out_of_the_room_is_refused_before_any_frame_is_rendered(tmp_path):
+    straight = MotionOptions(
+        kind="constant_velocity", duration_s=6.0, vigour=0.0, speed_m_s=1.0, heading_deg=0.0, look_deg=90.0
+    )
+    recipe = replace(RECIPE, world="room", frame_rate_hz=2.0, motion=straight)
+    with pytest.raises(InertialError) as refused:
+        write_capture(recipe, tmp_path / "out")
+    # the wall is 3.2 m away: frames at 0 to 3 s of 0 to 5.5 s are inside
+    assert refused.value.code == "path-leaves-room"
+    assert [refused.value.fact.values[key] for key in ("first_s", "outside", "frames")] == [3.5, 5, 12]
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_recipes_survive_writing_and_reading(tmp_path, written):
