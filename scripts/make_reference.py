@@ -202,13 +202,13 @@ def recipe_page() -> str:
         "# Simulation",
         "",
         NOTE,
-        "`colmap-inertial simulate RECIPE OUT` renders a capture with known truth from a recipe, a TOML file. Every key",
-        "has a default; examples are in `example_scenes/`. `OUT/recipe.toml` is the recipe with every value, and",
+        "`colmap-inertial simulate RECIPE OUT` renders a capture with known truth from a recipe, a TOML file. Every",
+        "key has a default; examples are in `example_scenes/`. `OUT/recipe.toml` is the recipe with every value, and",
         "`OUT/truth.json` has poses, calibration, IMU errors and the board's corners. A path that leaves the room is",
         "refused.",
         "",
-        "World: metres, z up, the origin on the desk or at eye height in the middle of the room. Camera: x right, y down,",
-        "z forwards.",
+        "World: metres, z up, the origin on the desk or at eye height in the middle of the room. Camera: x right,",
+        "y down, z forwards.",
     ]
     recipe = SceneRecipe()
     parts = {"board": recipe.board, "motion": recipe.motion, "imu": recipe.imu, "camera": recipe.camera}

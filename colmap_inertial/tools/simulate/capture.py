@@ -135,7 +135,7 @@ def _require_inside(scene: Scene) -> None:
     """
     low_m, high_m = map(np.array, WALLS_M[scene.recipe.world])
     centre_m = np.stack([scene.camera_pose(camera, scene.trigger_s)[1] for camera in _cameras(scene.recipe).values()])
-    outside = ((centre_m < low_m) | (centre_m > high_m)).any(axis=(0, 2))
+    outside = np.any((centre_m < low_m) | (centre_m > high_m), axis=(0, 2))
     if outside.any():
         first_s = float(scene.trigger_s[np.argmax(outside)])
         raise InertialError(
@@ -143,7 +143,7 @@ def _require_inside(scene: Scene) -> None:
                 "path-leaves-room",
                 first_s=first_s,
                 outside=int(outside.sum()),
-                frames=len(outside),
+                frames=len(scene.trigger_s),
                 low_m=low_m.tolist(),
                 high_m=high_m.tolist(),
             )
