@@ -8,7 +8,7 @@
     root.dataset.plots = "none";
   };
   if (typeof DecompressionStream === "undefined") {
-    notice("To turn and zoom the plots takes a newer browser (Chrome or Edge 80, Firefox 113, Safari 16.4).");
+    notice("Turning and zooming the plots needs a newer browser (Chrome or Edge 80, Firefox 113, Safari 16.4).");
     return;
   }
   const inflate = async (id) => {
