@@ -98,7 +98,7 @@ class FormatError(InertialError):
 
 
 class TimingError(InertialError):
-    """Time stamps are missing, out of order, or do not fit together."""
+    """Timestamps are missing, out of order, or do not fit together."""
 
 
 class OutputError(InertialError):
