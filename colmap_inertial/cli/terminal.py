@@ -193,7 +193,7 @@ def show_calibration(calibration: CameraImuCalibration, source: Path, kept: Path
     offset, offset_ms = calibration.clock_offset_s, 1e3 * calibration.clock_sigma_s
     lines: list[Line] = [
         ("rotation", f"camera from IMU, xyzw: {rotation}, +-{spread_deg:.2g} deg"),
-        ("time offset", f"{offset:+.4f} s, +-{offset_ms:.2g} ms (camera time = stamp + offset)"),
+        ("time offset", f"{offset:+.4f} s, +-{offset_ms:.2g} ms (camera time = timestamp + offset)"),
         ("gyro bias", f"{bias} rad/s, +-{bias_spread:.2g}"),
     ]
     _print_panel(str(source), [*lines, *_describe_remembered(kept)])

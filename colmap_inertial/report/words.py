@@ -93,7 +93,7 @@ def sensor_facts(estimate: Mapping[str, Any]) -> Iterator[Fact]:
     """Time offsets and biases that a fit of the scale found."""
     if estimate["gyro_time_offset_s"] is not None:
         gyro_s, accel_s = estimate["gyro_time_offset_s"], estimate["accel_time_offset_s"]
-        yield "time offset", f"gyro {gyro_s:+.4f} s, accelerometer {accel_s:+.4f} s (camera time = stamp + offset)"
+        yield "time offset", f"gyro {gyro_s:+.4f} s, accelerometer {accel_s:+.4f} s (camera time = timestamp + offset)"
         yield "gyro bias", f"{', '.join(f'{value:+.4f}' for value in estimate['gyro_bias_rad_s'])} rad/s"
     if estimate["accel_bias_m_s2"] is not None:
         yield "accel. bias", f"{', '.join(f'{value:+.3f}' for value in estimate['accel_bias_m_s2'])} m/s2"

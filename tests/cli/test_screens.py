@@ -42,7 +42,7 @@ def test_a_calibration_says_degrees_seconds_and_milliseconds(told):
     known = replace(known, gyro_bias_rad_s=np.array([0.01, -0.02, 0.0]), cov=cov)
     words = told(terminal.show_calibration, known, Path("desk"))
     assert "xyzw: +0.00000, +0.00000, +0.60000, +0.80000, +-1.1 deg" in words
-    assert "-1.2500 s, +-2.5 ms (camera time = stamp + offset)" in words
+    assert "-1.2500 s, +-2.5 ms (camera time = timestamp + offset)" in words
     assert "+0.0100, -0.0200, +0.0000 rad/s, +-0.0003" in words and "remembered" not in words.lower()
     assert "kept.json; reconstruct and scale take it" in told(
         terminal.show_calibration, known, Path("desk"), Path("kept.json")
