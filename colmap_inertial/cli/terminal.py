@@ -204,9 +204,9 @@ def show_diagnosis(diagnosis: Diagnosis, source: Path) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from colmap_inertial.report.words import not_checked
+    from colmap_inertial.report.words import checked_in_words, not_checked
 
-    title = f"{source} (checked: {', '.join(diagnosis.checked) or 'nothing'})"
+    title = f"{source} (checked: {checked_in_words(diagnosis.checked) or 'nothing'})"
     table = Table(title=Text(title), title_justify="left", show_lines=True)
     for column in ("Severity", "Code", "Found", "What to do"):
         table.add_column(column, overflow="fold", no_wrap=column in ("Severity", "Code"))

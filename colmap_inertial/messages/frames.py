@@ -209,7 +209,7 @@ def exposures_aligned(no_gyro: Said | None) -> str:
 
 state("left-to-frame-stages", "left to the given frame stages")
 state("left-to-keypoint-stages", "left to the given keypoint stages")
-state("not-asked-for", "off, as requested")
+state("not-asked-for", "switched off")
 state("rig-not-deblurred", "frames are not deblurred: not supported for a rig's cameras")
 state(
     "no-exposures-to-deblur",

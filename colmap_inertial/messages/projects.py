@@ -208,9 +208,10 @@ def lengths_agree(
     checked += f", in {'one direction' if directions == 1 else f'{directions} directions'}"
     if shows_elsewhere is None:
         return f"{checked} and over {100 * longest_share:.0f} % of the model's diagonal of {diagonal_m:.3g} m"
+    would = "hardly" if shows_elsewhere == "little" else "not"
     return (
-        f"{checked}; they span {100 * longest_share:.2g} % of the model's diagonal of {diagonal_m:.3g} m and show "
-        f"{shows_elsewhere} of a bend or drift elsewhere"
+        f"{checked}; they span {100 * longest_share:.2g} % of the model's diagonal of {diagonal_m:.3g} m and would "
+        f"{would} show bend or drift elsewhere"
     )
 
 

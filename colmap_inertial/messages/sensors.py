@@ -132,15 +132,18 @@ def depth_without_images(maps: int, images: int) -> str:
 
 
 @message(
-    advice="give maps that show what the images show, neither turned nor cut",
+    advice="give depth maps with the rotation and crop of the images",
     example={"name": "000012.jpg", "width": 256, "height": 192, "of_width": 1080, "of_height": 1920},
 )
 def depth_of_other_images(name: str, width: int, height: int, of_width: int, of_height: int) -> str:
-    return f"the depth map of {name} is {width} x {height}, and the image {of_width} x {of_height}: another shape"
+    return (
+        f"the depth map of {name} is {width} x {height}, but the image {of_width} x {of_height}, of another aspect "
+        "ratio"
+    )
 
 
 @message(
-    advice="film surfaces nearer than five metres that neither shine nor let light through",
+    advice="film matt, opaque surfaces within five metres",
     example={"count": 2, "needed": 4},
 )
 def depth_images_too_few(count: int, needed: int) -> str:
@@ -155,21 +158,21 @@ def device_poses_too_few(count: int, needed: int) -> str:
     return f"only {count} images of the model have a pose of the device, and {needed} are needed"
 
 
-state("device-stands-still", "the device's path does not leave its place")
+state("device-stands-still", "the device did not move")
 state(
     "device-path-of-other-shape",
-    "the device's path has nothing of the shape of the model's",
+    "the device's path and the model's differ in shape",
     advice="check that its times are those of the frames",
 )
 
 
 @message(
-    advice="look at the model there: either COLMAP's images are joined wrongly, or the device lost its path",
+    advice="check the model there: either COLMAP placed images wrongly, or the device lost track",
     example={"at_s": 12.3, "jump_m": 0.42, "turn_deg": 6.0},
 )
 def device_path_breaks(at_s: float, jump_m: float, turn_deg: float) -> str:
     return (
-        f"about {at_s:.1f} s, one of the model's and the device's path jumps against the other by {jump_m:.2g} m "
+        f"at about {at_s:.1f} s, the model's path and the device's jump apart by {jump_m:.2g} m "
         f"and {turn_deg:.2g} degrees within a second"
     )
 
@@ -179,34 +182,34 @@ def device_path_breaks(at_s: float, jump_m: float, turn_deg: float) -> str:
     example={"turn_deg": 7.0, "tilt_deg": 4.0},
 )
 def device_path_bends(turn_deg: float, tilt_deg: float | None) -> str:
-    tilt = "" if tilt_deg is None else f", the vertical by {tilt_deg:.2g}"
-    return f"the model's path is bent against the device's by {turn_deg:.2g} degrees from begin to end{tilt}"
+    tilt = "" if tilt_deg is None else f", its vertical by {tilt_deg:.2g}"
+    return f"the model's path bends against the device's by {turn_deg:.2g} degrees from start to end{tilt}"
 
 
 @message(example={"ratio": 1.2, "sigma": 2.0})
 def positions_say_no_length(ratio: float, sigma: float) -> str:
-    return f"the positions leave the length of the path open ({ratio:.2g} +- {sigma:.2g} times)"
+    return f"the positions do not determine the length of the path ({ratio:.2g} +- {sigma:.2g} times)"
 
 
-state("positions-stand-still", "the path or its positions do not leave their place")
-state("positions-without-heights", "the positions have no heights, so that nothing says which way is up")
+state("positions-stand-still", "the camera or its positions did not move")
+state("positions-without-heights", "the positions have no heights, by which up would be known")
 
 
 @message(
-    advice="move over an area, not along a line, that is wide against the errors of the positions",
+    advice="move over an area, not along a line, larger than the errors of the positions",
     example={"across_m": 2.0, "error_m": 3.0},
 )
 def positions_leave_up_open(across_m: float, error_m: float) -> str:
     wide = f"the path is {across_m:.2g} m wide, and they are off by {error_m:.2g} m"
-    return f"the positions do not say which way is up: {wide}"
+    return f"the positions do not determine which way is up: {wide}"
 
 
 @message(example={"half_width": 0.6})
 def sensor_tells_little(half_width: float) -> str:
-    return f"leaves the scale open by +-{100 * half_width:.2g} %"
+    return f"determines the scale only to +-{100 * half_width:.2g} %"
 
 
-state("sensor-not-asked", "was not asked (--scale-from)")
+state("sensor-not-asked", "is not used (--scale-from)")
 
 
 @message(example={"sensor": "depth", "capture": "capture.toml"})
@@ -216,12 +219,12 @@ def sensor_not_there(sensor: str, capture: str) -> str:
 
 @message(example={"sensor": "device", "half_width_deg": 2.0})
 def up_by_sensor(sensor: str, half_width_deg: float) -> str:
-    return f"which way is up is known by the {name_of(sensor)}, to {half_width_deg:.2g} degrees"
+    return f"up is known by the {name_of(sensor)} to {half_width_deg:.2g} degrees"
 
 
 state(
     "lengths-beside-imu",
-    "a target or a known distance does not give metres together with the IMU: it checks them",
+    "a target or a known distance is not combined with the IMU, whose scale it checks",
     advice="name the target in capture.toml ([target]), or give --scale-from target or distance alone",
 )
 
@@ -233,4 +236,4 @@ def depth_pattern_without_stem(found: str) -> str:
 
 @message(example={"units": ("m", "cm", "mm")})
 def depth_without_unit(units: Sequence[str]) -> str:
-    return f"the unit of the maps' numbers must be stated once: unit = {', '.join(units)}, or metres_per_step"
+    return f"state the unit of the depth maps once: unit = {', '.join(units)}, or metres_per_step"

@@ -16,6 +16,7 @@ from colmap_inertial.report.page import render_page
 from colmap_inertial.report.series import SIZES
 from colmap_inertial.report.words import (
     Fact,
+    checked_in_words,
     digits,
     model_facts,
     not_checked,
@@ -71,7 +72,15 @@ def run_page(content: Content, out: Path) -> str:
 
     helpers: Sequence[Callable[..., Any]] = (
         *(run_facts, survey_facts, target_facts, intrinsics_rows, readout_rows, list_outputs, model_rows, gap_rows),
-        *(count_drifted_parts, find_refined_parts, not_checked, scale_drifts, scale_facts, scene_figure),
+        *(
+            count_drifted_parts,
+            find_refined_parts,
+            checked_in_words,
+            not_checked,
+            scale_drifts,
+            scale_facts,
+            scene_figure,
+        ),
     )
     return render_page(
         "report.html",

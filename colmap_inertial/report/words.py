@@ -6,7 +6,7 @@ Values come as ``result.json`` has them. Texts of facts are ASCII ("+-", "m/s2",
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from colmap_inertial.inertial.scale.verdict import TRUSTED_HALF_WIDTH, describe_parts
@@ -180,6 +180,11 @@ def describe_joined(models: Collection[int], gaps: Sequence[Mapping[str, Any]]) 
     ]
     known = f"; 1 sigma across: {'; '.join(across)}" if across else ""  # a user's own stage need not say it
     return f"COLMAP's models {', '.join(map(str, models))}{known}"
+
+
+def checked_in_words(checked: Iterable[str]) -> str:
+    """What of a recording was checked, as ``diagnosis.json`` lists it."""
+    return ", ".join(checked).replace("pictures", "images")
 
 
 def not_checked(checked: Collection[str]) -> str:

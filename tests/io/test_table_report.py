@@ -6,6 +6,8 @@ import pytest
 from colmap_inertial.cli import main
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.io.table_report import report_table
+from colmap_inertial.run.commands.diagnose import describe_table
+from colmap_inertial.run.commands.scale import ScaleSource
 from tests.io.test_columns import ACCEL, COUNT, GYRO, T_S, check, floats, ints, write
 
 
@@ -70,3 +72,13 @@ def test_a_folder_of_open_tables_is_described(tmp_path, capsys):
     text = text.replace('"?"  # rad/s', '"rad/s"  #').replace('"?"  # m/s2', '"m/s2"  #')
     (tmp_path / "capture.toml").write_text(text)
     check(read_imu(tmp_path / "capture.toml"))
+
+
+def test_tables_that_a_capture_describes_are_not_asked_about(tmp_path):
+    t = floats(T_S[:, None])[0]
+    write(tmp_path / "gyro.csv", "t,x,y,z", [t, *floats(GYRO)])
+    write(tmp_path / "accel.csv", "t,x,y,z", [t, *floats(ACCEL)])
+    alone = describe_table(ScaleSource(source=tmp_path))
+    assert alone is not None and alone.is_open
+    (tmp_path / "capture.toml").write_text('[imu.gyro]\nfile = "gyro.csv"\n')
+    assert describe_table(ScaleSource(source=tmp_path)) is None

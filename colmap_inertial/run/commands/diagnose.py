@@ -51,7 +51,7 @@ def diagnose_source(
 
 
 def describe_table(source: ScaleSource, capture: Path | None = None) -> TableReport | None:
-    """What a table of samples was taken for; ``None`` for any other source.
+    """What a table of samples was taken for; ``None`` for any other source, and for what a capture.toml describes.
 
     Parameters
     ----------
@@ -65,6 +65,8 @@ def describe_table(source: ScaleSource, capture: Path | None = None) -> TableRep
     FormatError
         Where one is to be written, and the source is no table.
     """
+    if capture is None and is_capture(source.source):
+        return None
     report = report_table(source.source, None if capture is None else capture.parent)
     if capture is not None:
         if report is None:
