@@ -39,7 +39,7 @@ _STAGES = {
     "apply": "Files",
     "dense": "Dense",
     "mesh": "Mesh",
-    "export": "Pictures",
+    "export": "Images",
 }
 SEVERITY_COLOUR = {"info": "blue", "warning": "yellow", "error": "red"}
 

@@ -187,6 +187,11 @@ def folders_within_each_other(folder: str, out: str) -> str:
 # batches and simulations
 
 state("no-folder-with-capture", "holds no folder with a capture")
+state(
+    "batch-of-one-capture",
+    "is a capture itself (capture.toml)",
+    advice="give the folder that holds the captures, or use reconstruct",
+)
 state("manifest-without-capture", "names no capture", advice="write [[capture]] tables", joint=": ")
 state("capture-not-in-tables", "write [[capture]], with two brackets, before each capture")
 

@@ -129,7 +129,7 @@ def target_facts(validation: Mapping[str, Any]) -> Iterator[Fact]:
     if lengths is not None:
         rms_mm, largest_mm = 1000 * lengths["rms_m"], 1000 * lengths["largest_m"]
         share = lengths["longest_share"]
-        of_model = "" if share is None else f", {100 * share:.2g} % of the model's diagonal"
+        of_model = "" if share is None else f", {digits(100 * share, 2)} % of the model's diagonal"
         yield "length errors", f"rms {rms_mm:.3g} mm, largest {largest_mm:+.3g} mm of {lengths['count']}"
         yield "longest length", f"{lengths['longest_m']:.3g} m{of_model}; {lengths['directions']} directions"
     yield "images", f"{validation['views_used']} used of {validation['views_searched']} searched"

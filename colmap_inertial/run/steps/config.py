@@ -58,9 +58,13 @@ def list_changed_options(earlier: Path, config: str) -> tuple[Fact, ...]:
 
 
 def _flatten(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Values by their dotted names; empty lists are left out, as what is not given."""
     flat: dict[str, Any] = {}
     for key, value in table.items():
-        flat |= _flatten(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {prefix + key: value}
+        if isinstance(value, Mapping):
+            flat |= _flatten(value, f"{prefix}{key}.")
+        elif value != []:
+            flat[prefix + key] = value
     return flat
 
 

@@ -13,6 +13,7 @@ from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, StageNames
 from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.io.files import StrPath, check_names, reader
+from colmap_inertial.io.imu import is_capture
 from colmap_inertial.io.toml_section import Section, read_toml
 from colmap_inertial.run.steps.config import override_options, read_values
 
@@ -96,6 +97,8 @@ def read_manifest(
         ``allow_stages``.
     """
     path = Path(path)
+    if path.is_dir() and is_capture(path):
+        raise FormatError(path, Fact("batch-of-one-capture"))
     captures = _list_captures(path, options) if path.is_dir() else _read_captures(path, options)
     if not allow_stages:
         _refuse_stages(captures, path)

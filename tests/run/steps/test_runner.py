@@ -32,7 +32,7 @@ from colmap_inertial.run.commands.reporting import report_result
 from colmap_inertial.run.commands.result import ReconstructResult
 from colmap_inertial.run.stages.frame_folder import FramePaths, read_frame_records, write_frames
 from colmap_inertial.run.stages.metric import MetricStage
-from colmap_inertial.run.steps.config import config_as_toml, read_config
+from colmap_inertial.run.steps.config import config_as_toml, list_changed_options, read_config
 from colmap_inertial.run.steps.hashing import as_json_types
 from colmap_inertial.run.steps.runner import StepRunner
 from colmap_inertial.run.steps.session import Session
@@ -420,3 +420,12 @@ def test_square_brackets_of_notes_and_paths_reach_the_terminal(capsys):
     show_applied(applied)
     shown = capsys.readouterr().out
     assert "[timing]" in shown and "out [new]" in shown
+
+
+def test_what_an_earlier_configuration_does_not_name_is_no_change_where_it_is_empty(tmp_path):
+    earlier = tmp_path / "config.toml"
+    text = config_as_toml(ReconstructOptions(world="y-down"))
+    earlier.write_text("\n".join(line for line in text.splitlines() if not line.endswith("= []")))
+    assert list_changed_options(earlier, text) == ()
+    changed = list_changed_options(earlier, config_as_toml(ReconstructOptions()))
+    assert changed == (Fact("option-changed", option="world", now="z-up", before="y-down"),)

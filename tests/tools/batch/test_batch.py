@@ -152,6 +152,10 @@ def test_a_folder_of_captures_is_a_manifest(tmp_path):
         (tmp_path / name).mkdir()
     (tmp_path / "notes.txt").write_text("")
     assert [capture.name for capture in read_manifest(tmp_path)] == ["a", "b"]
+    (tmp_path / "capture.toml").write_text("")
+    with pytest.raises(FormatError) as refused:
+        read_manifest(tmp_path)
+    assert refused.value.code == "batch-of-one-capture"
 
 
 @loop_over(
