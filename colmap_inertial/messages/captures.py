@@ -211,7 +211,7 @@ def long_exposure_far(times: str, short: str, late_s: float) -> str:
     )
 
 
-state("delay-beside-times", "excludes times", advice="leave one of them out")
+state("delay-beside-times", "cannot be given together with times", advice="leave one of them out")
 state("rig-without-cameras", "needs a table [rig.NAME] for each camera but the main one")
 state("pose-of-some-cameras", "give cam_from_reference of each camera, or of none")
 state("calibration-without-unit", "holds lengths without a unit", advice='give unit = "m" or "mm"')

@@ -124,12 +124,12 @@ state("not-a-depth-map", "not a depth or normal map of COLMAP: it does not begin
 
 @message(example={"found": 3, "expected": 1})
 def map_of_other_channels(found: int, expected: int) -> str:
-    return f"its header says {found} channels instead of {expected}"
+    return f"its header states {found} channels instead of {expected}"
 
 
 @message(example={"width": 0, "height": 480})
 def map_of_no_size(width: int, height: int) -> str:
-    return f"its header says {width} x {height} pixels"
+    return f"its header states {width} x {height} pixels"
 
 
 @message(example={"size_bytes": 1000, "expected_bytes": 2000, "width": 20, "height": 25, "channels": 1})
@@ -334,7 +334,7 @@ state(
 
 state("rotations-not-names", "rotations: left_out, registered_again and joined must be lists of image names")
 
-state("of-model-unreadable", "of_model does not say which model the scale is of")
+state("of-model-unreadable", "of_model does not state the model of the scale")
 
 
 @message(advice="give one for each, --scale NUMBER=FILE", joint=": ", example={"project": "project", "numbers": (0, 1)})

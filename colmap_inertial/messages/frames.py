@@ -118,7 +118,7 @@ def frame_blur_confirmed(support_sigmas: float) -> str:
 # stages
 
 
-@message(example={"doubt": "40 pairs of frames do not tell whether the gyroscope has the right sign"})
+@message(example={"doubt": "40 pairs of frames do not show whether the gyroscope has the right sign"})
 def curved_blur_in_doubt(doubt: Said) -> str:
     return f"{doubt}, and the opposite sign would curve the blur the other way"
 

@@ -240,7 +240,7 @@ state("sensor-logger-rows-missing", "holds no rows of Sensor Logger with sensor,
 state("sensor-logger-without-gyroscope", "holds no gyroscope of Sensor Logger")
 state(
     "sensor-logger-platform-of-rows-unknown",
-    "the row of metadata that tells iOS from Android is missing; the accelerometer's sign differs between the two",
+    "the row of metadata that states iOS or Android is missing; the accelerometer's sign differs between the two",
     advice=(
         'describe its rows under [imu.gyro] and [imu.accel] in a capture.toml, with where = ["sensor", '
         '"Gyroscope"] (["name", "gyroscope"] in messages), time = "time", time_unit = "ns", columns = ["x", '
@@ -249,7 +249,7 @@ state(
 )
 state(
     "sensor-logger-platform-unknown",
-    "Metadata.csv, which tells iOS from Android, is missing; the accelerometer's sign differs between the two",
+    "Metadata.csv, which states iOS or Android, is missing; the accelerometer's sign differs between the two",
     advice="add it, or describe the tables under [imu.gyro] and [imu.accel] in a capture.toml",
 )
 state("bag-without-imu", "holds no sensor_msgs/Imu messages")

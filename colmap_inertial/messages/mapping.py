@@ -474,12 +474,12 @@ def worker_of_another_version(worker: str, versions: str, wanted: str) -> str:
 
 
 @message(
-    advice="the output must lie on a path that all machines share",
+    advice="put the output on a path that all machines share",
     joint=": ",
     example={"worker": "tcp://host:1", "folder": "out"},
 )
 def worker_sees_no_output(worker: str, folder: str) -> str:
-    return f"worker {worker} does not see {folder}"
+    return f"worker {worker} cannot access {folder}"
 
 
 @message(example={"work": "features 3"})

@@ -48,7 +48,7 @@ def refine_shape_in_use(made_from: str) -> str:
 
 @message(example={"size_bytes": 5_000_000_000})
 def refine_too_large(size_bytes: int) -> str:
-    return f"distant frames see the same points, and solving for all of them needs {1e-9 * size_bytes:.1f} GB"
+    return f"frames far apart in time see the same points, and solving for all of them needs {1e-9 * size_bytes:.1f} GB"
 
 
 @message(example={"share": 0.4})
@@ -305,7 +305,7 @@ def positions_of_another_path(ratio: float) -> str:
 def positions_of_another_scale(ratio: float, half_width: float) -> str:
     return (
         f"the positions are {ratio:.3f} times as far apart as in the model (+-{half_width:.3f}): "
-        "one of them is wrong; the model's scale is unchanged"
+        "either is wrong; the model's scale is unchanged"
     )
 
 

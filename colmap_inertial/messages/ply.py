@@ -61,7 +61,7 @@ def integer_beyond_bits(text: str, bits: int) -> str:
 
 state("not-a-ply", "not a PLY file", advice="apply copies it as it is with --keep")
 state("ply-header-endless", "the PLY header does not end")
-state("ply-format-missing", "the PLY header does not say its format")
+state("ply-format-missing", "the PLY header does not state the format")
 
 
 @message(example={"element": "vertex"})

@@ -274,7 +274,7 @@ def folder_exists(folder: str) -> str:
     example={"worker": "host", "path": "out/walk.toml"},
 )
 def worker_sees_no_files(worker: str, path: str) -> str:
-    return f"{worker} does not see {path}"
+    return f"{worker} cannot access {path}"
 
 
 @message(advice=lambda log, **_: f"see {log}", example={"times": 3, "log": "out/walk.log"})

@@ -218,8 +218,8 @@ def lengths_agree(
 @message(example={"spec": "checkerboard:9x6:0.025", "found": 30, "agreeing": 6})
 def target_seldom_agrees(spec: str, found: int, agreeing: int) -> str:
     return (
-        f"{spec} was detected in {found} images, but only {agreeing} of them agree "
-        "on its place in the model: check the number of columns and rows (inner corners of a checkerboard), and "
+        f"{spec} was detected in {found} images, but only {agreeing} of them agree on its position in the model: "
+        "check the number of columns and rows (inner corners of a checkerboard), and "
         "that the target did not move"
     )
 
@@ -282,7 +282,7 @@ _PLACED_NOWHERE = {
 @message(example={"spec": "checkerboard:9x6:0.025", "kind": "checkerboard", "images": 30, "residual_px": 20.0})
 def target_nowhere_alike(spec: str, kind: str, images: int, residual_px: float) -> str:
     return (
-        f"{spec} was detected in {images} images, but no two of them agree on its place in the model "
+        f"{spec} was detected in {images} images, but no two of them agree on its position in the model "
         f"(to {residual_px:g} px): {_PLACED_NOWHERE.get(kind, 'false detections, wrong poses')}, a target that moved "
         "between the images, or images that do not belong to this model"
     )

@@ -326,7 +326,7 @@ state(
     advice="distances between single markers go into --bars",
 )
 
-state("other-target-the-same", "--other-target must be another board than --target, to tell them apart")
+state("other-target-the-same", "--other-target must differ from --target")
 
 state(
     "corners-too-few-to-keep-apart",

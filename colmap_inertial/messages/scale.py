@@ -10,9 +10,9 @@ from colmap_inertial.messages import message, state
 
 _RECORD_INSTEAD = (
     "move the camera itself back and forth by 20 cm or more, in several directions and briskly, for 10 s or longer, "
-    "while it sees texture; panning, walking straight at constant speed, or a tripod cannot give a scale"
+    "with texture in view; panning, walking straight at constant speed, or a tripod cannot give a scale"
 )
-_SWING = "swing the camera back and forth by 20 cm or more, for 10 s or longer, while it sees texture"
+_SWING = "swing the camera back and forth by 20 cm or more, for 10 s or longer, with texture in view"
 _TURN = "turn the camera about all of its axes while it moves"
 _LONGER = "record longer, with brisker movements of the camera itself in several directions"
 _CLOSE_LOOPS = "close loops while recording, or scale its parts separately"
@@ -76,7 +76,7 @@ def scale_unknown(half_width: float | None) -> str:
     known = f"known to no better than +-{100 * (half_width or 0):.0f} %" if is_known else "not known at all"
     return (
         f"the scale is {known}: record a clip in which the camera itself speeds up and slows down "
-        "(swing it back and forth by 20 cm or more, for 10 s or longer) while it sees texture"
+        "(swing it back and forth by 20 cm or more, for 10 s or longer) with texture in view"
     )
 
 
@@ -363,8 +363,7 @@ def accel_axes_apart(delays_s: Sequence[float]) -> str:
 def accel_clock_apart(rate: float) -> str:
     return (
         f"the accelerometer's clock rate is {1e6 * rate:+.0f} ppm off the gyroscope's (corrected): timestamp both "
-        "sensors "
-        "by one clock"
+        "sensors with one clock"
     )
 
 

@@ -76,7 +76,7 @@ state("no-imu-calibration", "holds no calibration of an IMU (colmap-inertial cal
 @message(advice="give one of them", example={"other": "a.json", "kind": "imu"})
 def calibrations_say_the_same(other: str, kind: str) -> str:
     what = {"camera-imu": "the rotation and time offset between camera and IMU", "imu": "the IMU's own gains"}[kind]
-    return f"and {other} both say {what}"
+    return f"and {other} both give {what}"
 
 
 @message(example={"name": "cam2", "cameras": ("cam0", "cam1")})
@@ -104,7 +104,7 @@ state(
     advice="put intrinsics and extrinsics in one file",
     joint=": ",
 )
-state("rotation-without-translation", "R and T belong together; one of them is missing")
+state("rotation-without-translation", "R and T must be given together; one is missing")
 state("not-a-rig-config", "not a rig_config.json: expected a list of rigs")
 
 

@@ -68,7 +68,7 @@ def table_open(source: str, open: Sequence[tuple[str, str]], header: str | None,
     for sensor, point in open:
         points.setdefault(point, []).append(_SENSORS[sensor])
     said = [_POINTS[point].format(" and ".join(sensors)) for point, sensors in points.items()]
-    begin = f"it does not say {', '.join(said)}"
+    begin = f"it does not state {', '.join(said)}"
     if not said:
         begin = (
             f"it must be confirmed that this is from {source}"
@@ -81,7 +81,7 @@ def table_open(source: str, open: Sequence[tuple[str, str]], header: str | None,
 def _arrival_advice(jitter_ms: float, hint: str, **_: object) -> str:
     return (
         f"let the driver timestamp its messages, or use their arrival times (jitter {jitter_ms:.2g} ms; delays "
-        f"remain) by a capture.toml:\n{hint}"
+        f"remain) with a capture.toml:\n{hint}"
     )
 
 

@@ -109,7 +109,7 @@ def bar_not_positive(length_m: float) -> str:
 
 @message(example={"path": "points.csv", "count": 2, "needed": 3})
 def check_points_too_few(path: str, count: int, needed: int) -> str:
-    return f"{path} has {count} check points; {needed} are needed, apart in space"
+    return f"{path} has {count} check points; {needed} at different places are needed"
 
 
 @message(example={"target": "aruco:4X4_50:0.1"})

@@ -99,7 +99,7 @@ def decimal_commas(count: int) -> str:
 
 
 @message(
-    advice="names must be unique: rename them where the model was made (some readers of text models cut "
+    advice="names must be unique: rename them in the program that made the model (some readers of text models cut "
     "names at blanks)",
     example={"count": 10, "name": "A-DJI_2024"},
 )
@@ -112,7 +112,7 @@ def repeated_number(what: str, number: int) -> str:
     return f"{what} {number} appears twice"
 
 
-@message(advice="write the model again where it was made", example={"image": "a.jpg", "camera": 3})
+@message(advice="write the model again with the program that made it", example={"image": "a.jpg", "camera": 3})
 def unknown_camera(image: str, camera: int) -> str:
     return f"its image {image!r} is of camera {camera}, which the model lacks"
 

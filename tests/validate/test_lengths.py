@@ -113,7 +113,7 @@ def test_the_distance_between_two_boards_is_a_length_to_check_by():
 @loop_over(
     ("target", "other", "words"),
     [
-        ("checkerboard:8x6:0.03", ("checkerboard:8x6:0.03", "4"), "must be another board"),
+        ("checkerboard:8x6:0.03", ("checkerboard:8x6:0.03", "4"), "must differ from --target"),
         ("aruco:DICT_4X4_50:0.1", ("checkerboard:8x6:0.03", "4"), "go into --bars"),
         ("checkerboard:8x6:0.03", ("checkerboard:9x6:0.03", "four"), "write metres between"),
         ("checkerboard:8x6:0.03", ("checkerboard:9x6:0.03", "4+-5"), "write metres between"),

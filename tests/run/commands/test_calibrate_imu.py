@@ -132,7 +132,7 @@ def test_each_file_says_what_it_holds_and_two_of_a_kind_are_an_error(both, tmp_p
     assert read_calibrations(None).camera_imu is None
     again = tmp_path / "again.json"
     again.write_bytes(both[1].read_bytes())
-    with pytest.raises(FormatError, match=r"again\.json: and .*phone_imu\.json both say the IMU's own gains"):
+    with pytest.raises(FormatError, match=r"again\.json: and .*phone_imu\.json both give the IMU's own gains"):
         read_calibrations((*both, again))
     again.write_text('{"kind": "lens"}')
     with pytest.raises(FormatError) as refused:
@@ -328,7 +328,7 @@ def test_scale_takes_what_is_remembered_of_its_device_and_says_so(capsys, projec
         capsys, "scale", project.model, *files, "--json", tmp_path / "s.json", "--calibration", tmp_path / "imu.json",
         "--calibration", tmp_path / "imu.json",
     )  # fmt: skip
-    assert code == 2 and "both say" in err
+    assert code == 2 and "both give" in err
 
 
 def test_what_a_capture_says_goes_before_what_is_remembered(both, tmp_path, home) -> None:

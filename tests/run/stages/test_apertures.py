@@ -175,7 +175,10 @@ def test_colmap_s_rig_config_is_read_as_colmap_reads_it(tmp_path):
         (kalibr_text(intrinsics=["a", 2, 3, 4]), "not a list of numbers"),
         (kalibr_text().replace("T_cn_cnm1", "T_x"), "T_cn_cnm1 .* is missing"),
         ("a: 1", "holds no calibration of several cameras"),
-        ("a: {camera_matrix: [1, 0, 0, 0, 1, 0, 0, 0, 1], R: [1, 0, 0, 0, 1, 0, 0, 0, 1]}", "R and T belong together"),
+        (
+            "a: {camera_matrix: [1, 0, 0, 0, 1, 0, 0, 0, 1], R: [1, 0, 0, 0, 1, 0, 0, 0, 1]}",
+            "R and T must be given together",
+        ),
         ("[1, 2]", "expected keys and values"),
         ("a: [", "not valid YAML"),
     ],

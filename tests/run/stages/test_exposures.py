@@ -161,7 +161,7 @@ def test_what_is_wrong_with_the_exposures_is_said(subtests, two_pairs, tmp_path)
         ('folder = "long"', "", "the same images as .images."),
         ('folder = "long"', 'folder = "short"', "the same images as .images."),
         ('folder = "long"', 'folder = "long"\nrename = "x"', "must be two strings"),
-        ('folder = "long"', 'folder = "long"\nlong_delay_s = 0.1', "excludes times"),
+        ('folder = "long"', 'folder = "long"\nlong_delay_s = 0.1', "together with times"),
         ("short_iso = 1600", "short_iso = 0", "must be above 0"),
         ("short_iso = 1600", "long_exposure_s = 11", "must be from 0 to 10"),
         ("short_iso = 1600", "long_delay_s = 11", "must be from -10 to 10"),
