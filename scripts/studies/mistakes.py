@@ -379,7 +379,7 @@ def axes() -> Iterator[Mistake]:
     yield axis(
         name="both sensors left-handed",
         make=values("gyro.csv", "accel.csv", change=lambda w, _: w * [-1, 1, 1]),
-        mend=follow_axes,
+        mend=lambda scene, _: set_axes(scene, ["gyro", "accel"], "-x,y,z", mirrored=True),
     )
     yield axis(
         name="gyroscope turned against the accelerometer",
