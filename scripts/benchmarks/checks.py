@@ -2,13 +2,16 @@
 
     python -m scripts.benchmarks.checks [--shared ../shared] [--sets tablet rooms ...] [--rows rows.csv] [--table]
     python -m scripts.benchmarks.checks --command 5     # a sample of the same through the command line
+    python -m scripts.benchmarks.checks --sets random --command 32
 
 Recordings with known scale, cut as a user cuts them: camera and IMU, the latter to a second before and after the
 frames. All windows of 10, 15, 20, 30, 40 and 60 s of tablets' recordings (``inertial_scale``), of handheld and flown
 IMUs with motion capture (``real_imu``, ``euroc_v101``: poses with the errors of a reconstruction), of a phone with
 LiDAR (``iphone_lidar``) and of a flight that stands still in the end (``euroc_mh01``, frames at 5 and 20 Hz); and 200
 simulated recordings of every kind of motion, device, length and frame rate, among them short orbits and ones that
-stand still for a part of their time. And faults of every kind, at sizes from harmless to gross, in three of them.
+stand still for a part of their time. ``random`` are windows of 12 to 50 s from anywhere in the real ones, of every,
+every second or third frame, with 0 to 1 s of the IMU before and after them. And faults of every kind, at sizes from
+harmless to gross, in three of them.
 
 Each goes the way of ``scale``: the checks beforehand, then the estimate, also where a check stops it, as ``--force``
 would. Rows are kept in a CSV, and those that are there are not run again. ``--table`` prints the tables of a CSV.
@@ -35,6 +38,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.facts import Fact, sentences
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_multiply
+from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import CameraTrajectory, ImuRecording
 from colmap_inertial.diagnose import Recorded, diagnose
 from colmap_inertial.inertial.scale import estimate_scale
@@ -86,12 +90,19 @@ def parts(t_s: Array, lengths_s: Sequence[float] = LENGTHS_S) -> Iterator[tuple[
 
 
 def cut(
-    trajectory: CameraTrajectory, imu: ImuRecording, offset_s: float, begin_s: float, length_s: float, truth: float
+    trajectory: CameraTrajectory,
+    imu: ImuRecording,
+    offset_s: float,
+    begin_s: float,
+    length_s: float,
+    truth: float,
+    *,
+    margin_s: float = MARGIN_S,
 ) -> Made:
-    """Frames of a window, and the IMU to a second around them; ``offset_s`` is camera time less the IMU's."""
+    """Frames of a window, and the IMU to a margin around them; ``offset_s`` is camera time less the IMU's."""
     seen = (trajectory.t_s >= begin_s) & (trajectory.t_s <= begin_s + length_s)
     frames = trajectory.select(seen)
-    first_s, last_s = frames.t_s[0] - MARGIN_S - offset_s, frames.t_s[-1] + MARGIN_S - offset_s
+    first_s, last_s = frames.t_s[0] - margin_s - offset_s, frames.t_s[-1] + margin_s - offset_s
     gyro, accel = ((t_s >= first_s) & (t_s <= last_s) for t_s in (imu.gyro_t_s, imu.accel_t_s))
     return (
         frames,
@@ -106,18 +117,23 @@ def cut(
     )
 
 
-def tablets(shared: Path) -> Iterator[Case]:
+def recorded_by_tablet(shared: Path) -> Iterator[tuple[str, CameraTrajectory, ImuRecording, float, float]]:
+    """Name, poses, IMU, camera time less the IMU's, and metres per unit."""
     for folder in sorted((shared / "data/inertial_scale").glob("D*"), key=lambda path: (len(path.name), path.name)):
         trajectory, imu = read_inertial_scale(folder)
-        truth = float((folder / "groundtruth.txt").read_text())
         shift_s = (imu.epoch_ns - trajectory.epoch_ns) * 1e-9
         offset_s = shift_s + align_camera_imu(trajectory, imu).clock_offset_s
+        yield folder.name, trajectory, imu, offset_s, float((folder / "groundtruth.txt").read_text())
+
+
+def tablets(shared: Path) -> Iterator[Case]:
+    for name, trajectory, imu, offset_s, truth in recorded_by_tablet(shared):
         for length_s, begin_s in parts(trajectory.t_s):
             make = partial(cut, trajectory, imu, offset_s, begin_s, length_s, truth)
 
             yield Case(
                 group="tablet",
-                name=folder.name,
+                name=name,
                 length_s=length_s,
                 begin_s=begin_s - float(trajectory.t_s[0]),
                 by_hand=True,
@@ -166,7 +182,7 @@ def euroc_imu(folder: Path, origin_ns: int) -> tuple[Array, Array, Array]:
     return (stamps - origin_ns) * 1e-9, rows[:, 1:4], rows[:, 4:7]
 
 
-def vicon_room(shared: Path) -> Iterator[Case]:
+def vicon_room(shared: Path) -> Motion:
     """EuRoC V1_01: 20 poses a second of its ground truth, moved to the camera."""
     folder = shared / "data/euroc_v101"
     lines = [line for line in (folder / "gt/V1_01_easy.csv").read_text().splitlines() if line[0] != "#"]
@@ -175,7 +191,7 @@ def vicon_room(shared: Path) -> Iterator[Case]:
     imu_t_s, gyro, accel = euroc_imu(folder, int(stamps[0]))
     body_from_cam, cam_in_body_m = FLOWN
     world_from_imu = matrix_from_quat(rows[:, [5, 6, 7, 4]] / np.linalg.norm(rows[:, 4:8], axis=1)[:, None])
-    motion = Motion(
+    return Motion(
         t_s=(stamps - stamps[0]) * 1e-9,
         world_from_cam=world_from_imu @ body_from_cam,
         cam_in_world_m=rows[:, 1:4] + world_from_imu @ cam_in_body_m,
@@ -183,7 +199,10 @@ def vicon_room(shared: Path) -> Iterator[Case]:
         gyro_rad_s=gyro,
         accel_m_s2=accel,
     )
-    yield from windows_of("flights", "V101", motion, by_hand=False)
+
+
+def vicon_flight(shared: Path) -> Iterator[Case]:
+    yield from windows_of("flights", "V101", vicon_room(shared), by_hand=False)
 
 
 def machine_hall(shared: Path, every: int) -> Motion:
@@ -257,6 +276,69 @@ def phone(shared: Path) -> Iterator[Case]:
             make=partial(cut, trajectory, imu, 0.0, begin_s, length_s, LIDAR),
             truth_sigma=LIDAR_SIGMA,
         )
+
+
+#: Of windows from anywhere: shortest and longest, the IMU before and after the frames, and which of these are left.
+ANYWHERE_S, LEFT_AROUND_S, EVERY = (12.0, 50.0), (0.0, 0.3, 1.0), (1, 2, 3)
+
+
+def anywhere(shared: Path, each: int = 2, seed: int = 0) -> Iterator[Case]:
+    """Windows at random of every real recording whose scale is known to a per mille."""
+
+    def draw(name: str, t_s: Array, by_hand: bool, make: Callable[[float, float, float, int], Made]) -> Iterator[Case]:
+        for k in range(each):
+            rng = np.random.default_rng([seed, 61, k, *name.encode()])
+            length_s = float(min(rng.uniform(*ANYWHERE_S), t_s[-1] - t_s[0]))
+            begin_s = float(rng.uniform(t_s[0], t_s[-1] - length_s))
+            margin_s, every = float(rng.choice(LEFT_AROUND_S)), int(rng.choice(EVERY))
+            yield Case(
+                group="random",
+                name=f"{name} every {every}, {margin_s:g} s around",
+                length_s=length_s,
+                begin_s=begin_s - float(t_s[0]),
+                by_hand=by_hand,
+                make=partial(_thinned, partial(make, begin_s, length_s, margin_s, k), every),
+            )
+
+    for name, trajectory, imu, offset_s, truth in recorded_by_tablet(shared):
+
+        def from_tablet(
+            begin_s: float,
+            length_s: float,
+            margin_s: float,
+            k: int,
+            poses: CameraTrajectory = trajectory,
+            imu: ImuRecording = imu,
+            offset_s: float = offset_s,
+            truth: float = truth,
+        ) -> Made:
+            return cut(poses, imu, offset_s, begin_s, length_s, truth, margin_s=margin_s)
+
+        yield from draw(name, trajectory.t_s, True, from_tablet)
+    motions = {name: read(shared / "data/real_imu", name) for name in RECORDINGS}
+    motions |= {"V101": vicon_room(shared), "MH01": machine_hall(shared, 1)}
+    for name, motion in motions.items():
+
+        def from_motion(begin_s: float, length_s: float, margin_s: float, k: int, motion: Motion = motion) -> Made:
+            window = Window(
+                recording="random",
+                length_s=length_s,
+                begin_s=begin_s,
+                end_s=begin_s + length_s,
+                noise_m=NOISE_M,
+                correlation_s=(0.1, 0.35, 1.0)[k % 3],
+                seed=4000 + k,
+            )
+            return reconstructed(motion, window, margin_s=margin_s)
+
+        by_hand = name in RECORDINGS and RECORDINGS[name][0] is HANDHELD
+        yield from draw(name, motion.t_s, by_hand, from_motion)
+
+
+def _thinned(make: Callable[[], Made], every: int) -> Made:
+    """The same with every so many of the frames."""
+    trajectory, imu, truth = make()
+    return trajectory.select(np.arange(len(trajectory.t_s)) % every == 0), imu, truth
 
 
 # --- simulated recordings --------------------------------------------------------------------------------------------
@@ -392,9 +474,10 @@ SETS: dict[str, Callable[[Path], Iterator[Case]]] = {
     "tablet": tablets,
     "rooms": lambda shared: with_mocap(shared, by_hand=True),
     "flights": lambda shared: with_mocap(shared, by_hand=False),
-    "vicon": vicon_room,
+    "vicon": vicon_flight,
     "standing": standing_flight,
     "phone": phone,
+    "random": anywhere,
     "simulated": lambda shared: simulated(),
     "resting": lambda shared: resting(),
 }
@@ -673,7 +756,7 @@ def judge(case: Case) -> dict[str, object]:
     if estimate.metres_per_unit is not None and estimate.sigma_log is not None:
         error = float(np.log(estimate.metres_per_unit / truth))
         sigma = float(np.hypot(estimate.sigma_log, case.truth_sigma))
-        width, inside = 100 * half_width(estimate.sigma_log), abs(error) <= 1.96 * sigma
+        width, inside = 100 * half_width(estimate.sigma_log), abs(error) <= Z95 * sigma
     return {
         "key": case.key,
         "group": case.group,
@@ -698,9 +781,9 @@ def judge(case: Case) -> dict[str, object]:
     }
 
 
-def run_command(case: Case, folder: Path) -> str:
-    """What the command says of a case: its verdict, or ``stopped``."""
-    trajectory, imu, _ = case.make()
+def run_command(case: Case, folder: Path) -> tuple[str, float | None, float | None]:
+    """What the command says of a case: its verdict, or ``stopped``; error and standard deviation of a scale, in %."""
+    trajectory, imu, truth = case.make()
     poses, out = folder / "poses.txt", folder / "scale.json"
     write_tum(poses, trajectory)
     for name, t_s, values in (
@@ -713,7 +796,27 @@ def run_command(case: Case, folder: Path) -> str:
     words = [sys.executable, "-m", "colmap_inertial", "scale", str(poses), "--imu", str(folder), "--json", str(out)]
     subprocess.run(words, capture_output=True, text=True, check=False, cwd=folder)
     found = json.loads(out.read_text())
-    return "stopped" if found["method"] == "none" else str(found["verdict"])
+    if found["metres_per_unit"] is None:
+        return "stopped" if found["method"] == "none" else str(found["verdict"]), None, None
+    error = 100 * float(np.log(found["metres_per_unit"] / truth))
+    return str(found["verdict"]), error, 100 * float(np.hypot(found["sigma_log"], case.truth_sigma))
+
+
+def run_commands(cases: Sequence[Case], known: dict[str, dict[str, str]]) -> None:
+    """Print what the command says of cases, and whether it says the same as a row does."""
+    outcomes: Counter[str] = Counter()
+    for case in cases:
+        with tempfile.TemporaryDirectory() as folder:
+            said, error, sigma = run_command(case, Path(folder))
+        row = known.get(case.key)
+        same = "" if row is None else "same" if said == row["outcome"] else f"OTHER: {row['outcome']}"
+        outcomes[said] += 1
+        if error is not None and sigma is not None:
+            holds = abs(error) <= Z95 * sigma
+            outcomes[f"{said} and inside"] += holds
+            said += f" {error:6.2f} % +-{Z95 * sigma:.2f} %{'' if holds else ' OUTSIDE'}"
+        print(f"{case.key:<60} {said} {same}", flush=True)
+    print(", ".join(f"{name}: {count}" for name, count in outcomes.items()))
 
 
 # --- tables ----------------------------------------------------------------------------------------------------------
@@ -775,25 +878,19 @@ def print_tables(rows: Sequence[dict[str, str]]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--shared", type=Path, default=HERE.parent / "shared")
-    parser.add_argument("--sets", nargs="+", choices=SETS, default=list(SETS), help="of recordings, and faults")
+    usual = [name for name in SETS if name != "random"]
+    parser.add_argument("--sets", nargs="+", choices=SETS, default=usual, help="of recordings, and faults")
     parser.add_argument("--rows", type=Path, default=Path("bench_checks.csv"), help="CSV of outcomes, continued")
     parser.add_argument("--keys", default="", help="only cases whose key matches this pattern")
     parser.add_argument("--table", action="store_true", help="print the tables of the CSV, and run nothing")
-    parser.add_argument("--command", type=int, default=0, help="run so many of the CSV's rows by the command")
+    parser.add_argument("--command", type=int, default=0, help="run so many of the cases by the command")
     args = parser.parse_args()
     before = read_rows(args.rows)
     if not args.table:
         known = {row["key"]: row for row in before}
         cases = [case for name in args.sets for case in SETS[name](args.shared) if re.search(args.keys, case.key)]
         if args.command:
-            chosen = [case for case in cases if case.key in known]
-            for case in chosen[:: max(1, len(chosen) // args.command)][: args.command]:
-                with tempfile.TemporaryDirectory() as folder:
-                    said = run_command(case, Path(folder))
-                same = said == known[case.key]["outcome"]
-                print(
-                    f"{'same ' if same else 'OTHER'} {case.key:<60} {said} / {known[case.key]['outcome']}", flush=True
-                )
+            run_commands(cases[:: max(1, len(cases) // args.command)][: args.command], known)
             return
         with args.rows.open("a", newline="") as file:
             writer = csv.DictWriter(file, FIELDS)
