@@ -226,7 +226,7 @@ def _list_deblurred(records: Sequence[FrameRecord]) -> list[str]:
     return [record.name for record in sorted(deblurred, key=lambda record: -(record.value("blur_px") or 0.0))]
 
 
-def fuse_captured(
+def fuse_aperture_capture(
     capture: StrPath,
     out: StrPath,
     options: FuseAperturesOptions | None = None,
@@ -302,7 +302,7 @@ def fuse_captured(
         return tuple(session.workspace.images / name for name in names)
 
 
-def fuse_exposures_captured(
+def fuse_exposure_capture(
     capture: StrPath,
     out: StrPath,
     options: ExposureOptions | None = None,
