@@ -15,6 +15,8 @@ from .core.errors import (
 from .core.facts import Fact as Fact
 from .core.options import (
     BatchOptions as BatchOptions,
+    ExposureOptions as ExposureOptions,
+    FuseAperturesOptions as FuseAperturesOptions,
     MappingOptions as MappingOptions,
     ProjectOptions as ProjectOptions,
     ReadLimits as ReadLimits,
@@ -44,6 +46,7 @@ from .core.types import (
     SmoothedTrajectory as SmoothedTrajectory,
     Treatment as Treatment,
 )
+from .diagnose import Diagnosis as Diagnosis, Finding as Finding
 from .hooks import (
     FrameStage as FrameStage,
     KeypointStage as KeypointStage,
@@ -81,7 +84,12 @@ from .motion.align import AlignOptions as AlignOptions, align_camera_imu as alig
 from .motion.align.conventions import LikelyConvention as LikelyConvention, likely_convention as likely_convention
 from .motion.smooth import smooth_trajectory as smooth_trajectory
 from .report import write_report as write_report
-from .run.commands.images_alone import deblur_capture as deblur_capture
+from .run.commands.diagnose import diagnose_source as diagnose_source
+from .run.commands.images_alone import (
+    deblur_capture as deblur_capture,
+    fuse_aperture_capture as fuse_aperture_capture,
+    fuse_exposure_capture as fuse_exposure_capture,
+)
 from .run.commands.reconstruct import reconstruct as reconstruct
 from .run.commands.reconstruct_project import reconstruct_project as reconstruct_project
 from .run.commands.result import (
@@ -90,9 +98,10 @@ from .run.commands.result import (
     ModelResult as ModelResult,
     ReconstructResult as ReconstructResult,
 )
+from .run.commands.scale import ScaleSource as ScaleSource
 from .run.stages.apertures import ApertureStage as ApertureStage
 from .run.stages.deblur import DeblurStage as DeblurStage
-from .run.stages.exposures import ExposureStage as ExposureStage
+from .run.stages.exposures import ExposureStage as ExposureStage, FusedPair as FusedPair
 from .run.stages.frame_folder import FrameRecord as FrameRecord
 from .run.stages.join import JoinStage as JoinStage
 from .run.stages.metric import MetricStage as MetricStage
@@ -108,6 +117,8 @@ from .tools.batch import (
     run_batch as run_batch,
 )
 from .tools.export.whole import Exported as Exported, export_model as export_model
+from .tools.simulate.capture import write_capture as write_capture
+from .tools.simulate.recipe import SceneRecipe as SceneRecipe, load_recipe as load_recipe
 from .validate import (
     Target as Target,
     Validation as Validation,

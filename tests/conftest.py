@@ -90,7 +90,7 @@ def _once(measure: Callable) -> Callable:
         known = (camera.model, camera.params.tolist(), told, timing.epoch_ns, options)
         seen = hashlib.sha256(repr(known).encode())
         for frame in frames:
-            seen.update(f"{frame.name} {frame.image.shape}".encode() + frame.image.tobytes())
+            seen.update(f"{frame.name} {frame.width} {frame.grey.shape}".encode() + frame.grey.tobytes())
         if seen.digest() not in measured:
             measured[seen.digest()] = measure(frames, camera, timing, *options)
         return measured[seen.digest()]

@@ -41,13 +41,13 @@ class FuseApertures(ReadingCommand):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.run.commands.images_alone import fuse_captured
+        from colmap_inertial.run.commands.images_alone import fuse_aperture_capture
         from colmap_inertial.run.steps.workspace import Workspace
 
         options = FuseAperturesOptions(fusion=self.fusion, refocus=self.refocus, lens_width=self.lens_width)
         self.check_json(self.capture)
         with self.progress() as screen:
-            written = fuse_captured(self.capture, self.out, options, overwrite=self.overwrite, progress=screen)
+            written = fuse_aperture_capture(self.capture, self.out, options, overwrite=self.overwrite, progress=screen)
         lines = [f"{len(written)} images in {self.out / 'images'}"]
         self.tell(
             lambda: show_fused(lines, screen),

@@ -41,13 +41,13 @@ class FuseExposures(ReadingCommand):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.run.commands.images_alone import fuse_exposures_captured
+        from colmap_inertial.run.commands.images_alone import fuse_exposure_capture
         from colmap_inertial.run.steps.workspace import Workspace
 
         options = ExposureOptions(fusion=self.fusion, device=self.device)
         self.check_json(self.capture)
         with self.progress() as screen:
-            pairs = fuse_exposures_captured(
+            pairs = fuse_exposure_capture(
                 self.capture,
                 self.out,
                 options,

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,14 @@ from colmap_inertial.io.files import StrPath, path_in, reading
 from colmap_inertial.io.frame_sources import ImageFolder, Video, image_names
 from colmap_inertial.io.frame_times import NO_RIGS, FrameStamps, stamps_of_csv, stamps_of_log, stamps_of_names
 from colmap_inertial.io.images import SUFFIXES, grey_8bit, read_image
-from colmap_inertial.io.video import decode_reduced, decode_video, frame_name, reduced, video_stamps_ns
+from colmap_inertial.io.video import (
+    DecodedPicture,
+    decode_pictures,
+    decode_video,
+    frame_name,
+    reduced,
+    video_stamps_ns,
+)
 
 
 def read_frames(
@@ -58,23 +66,54 @@ def read_frames(
     return timing, decode_images(capture, timing, _places(timing, only))
 
 
-def read_reduced(capture: Capture, names: Collection[str], long_side_px: int) -> Iterator[tuple[str, UInt8Array]]:
-    """Some frames of a capture to look at: grey, 8 bit, not larger than ``long_side_px``, in order of time.
+class LazyFrame:
+    """A decoded frame that is converted as far as somebody asks.
+
+    Attributes
+    ----------
+    name
+        Its name.
+    width, height
+        Its size, px.
+    frame
+        Its pixels, as of :func:`read_frames`.
+    luma
+        8 bit brightness, not larger than so many pixels; of a video as it is coded.
+    """
+
+    def __init__(
+        self, name: str, size: tuple[int, int], frame: Callable[[], Frame], luma: Callable[[int], UInt8Array]
+    ) -> None:
+        self.name, (self.width, self.height) = name, size
+        self.frame, self.luma = cache(frame), luma
+
+
+def decode_lazily(capture: Capture) -> Iterator[LazyFrame]:
+    """All frames of a capture's video in order of time; each is to be converted before the next is asked for.
 
     Raises
     ------
     FormatError, TimingError
         As :func:`read_frames`.
     """
-    if not isinstance(capture.frames, Video):
-        for frame in read_frames(capture, only=names)[1]:
-            yield frame.name, reduced(grey_8bit(frame.image), long_side_px)
-        return
+    assert isinstance(capture.frames, Video)
     stamps, source_ns = _video_frames(capture.frames, capture.frame_log)
-    wanted = set(names)
-    name_of = {int(t): name for t, name in zip(source_ns, stamps.names, strict=True) if name in wanted}
-    for t_ns, grey in decode_reduced(capture.frames.file, np.array(list(name_of), dtype=np.int64), long_side_px):
-        yield name_of[t_ns], grey
+    timing, place = _timing(capture, stamps), {int(t_ns): i for i, t_ns in enumerate(source_ns)}
+
+    def convert(i: int, picture: DecodedPicture) -> Frame:
+        assert isinstance(capture.frames, Video)
+        return _frame(capture, timing, i, capture.frames.file, picture.pixels())
+
+    for picture in decode_pictures(capture.frames.file, source_ns):
+        i = place[picture.t_ns]
+        yield LazyFrame(timing.names[i], picture.size, partial(convert, i, picture), picture.luma)
+
+
+def read_lazily(path: Path, name: str) -> LazyFrame:
+    """An image of a folder; its time is not told."""
+    image = read_image(path)
+    frame, size = Frame(name=name, image=image, t_s=0.0), (image.shape[1], image.shape[0])
+    return LazyFrame(name, size, lambda: frame, lambda long_side_px: reduced(grey_8bit(image), long_side_px))
 
 
 def _places(timing: FrameTiming, only: Collection[str] | None) -> IndexArray:

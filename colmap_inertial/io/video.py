@@ -91,11 +91,39 @@ def frame_name(t_ns: int, first_ns: int) -> str:
     return f"frame_{(t_ns - min(0, first_ns) + 500) // 1000:012d}.png"
 
 
-def decode_video(path: Path, wanted_ns: Int64Array) -> Iterator[tuple[int, UInt8Array | UInt16Array]]:
-    """Decode the frames with the wanted presentation stamps, in order.
+@dataclass(frozen=True, eq=False)
+class DecodedPicture:
+    """A decoded frame of a video, converted as far as somebody asks.
+
+    Attributes
+    ----------
+    t_ns
+        Its presentation stamp.
+    """
+
+    t_ns: int
+    _frame: av.VideoFrame
+    _reformatter: VideoReformatter
+
+    def pixels(self) -> UInt8Array | UInt16Array:
+        """(H, W, 3) RGB or (H, W) grey; of more than 8 bit uint16, spread over its whole range."""
+        return _pixels(self._frame, self._reformatter)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height, px."""
+        return self._frame.width, self._frame.height
+
+    def luma(self, long_side_px: int) -> UInt8Array:
+        """8 bit luma alone, not larger than ``long_side_px``: for analysis."""
+        return reduced(_brightness(self._frame), long_side_px)
+
+
+def decode_pictures(path: Path, wanted_ns: Int64Array) -> Iterator[DecodedPicture]:
+    """Decode the frames with the wanted presentation stamps, in order; each is to be converted before the next.
 
     Rotation that the container states is not applied: rows stay the sensor's rows, which the rolling shutter, the
-    calibration and the IMU's axes refer to. Videos of more than 8 bit give uint16, spread over its whole range.
+    calibration and the IMU's axes refer to.
 
     Raises
     ------
@@ -106,13 +134,13 @@ def decode_video(path: Path, wanted_ns: Int64Array) -> Iterator[tuple[int, UInt8
 
     reformatter = VideoReformatter()  # one for all frames: to set one up takes longer than a frame
     for t_ns, frame in _decode_wanted(path, wanted_ns):
-        yield t_ns, _pixels(frame, reformatter)
+        yield DecodedPicture(t_ns, frame, reformatter)
 
 
-def decode_reduced(path: Path, wanted_ns: Int64Array, long_side_px: int) -> Iterator[tuple[int, UInt8Array]]:
-    """:func:`decode_video`, with 8 bit luma only, not larger than ``long_side_px``: for analysis."""
-    for t_ns, frame in _decode_wanted(path, wanted_ns):
-        yield t_ns, reduced(_brightness(frame), long_side_px)
+def decode_video(path: Path, wanted_ns: Int64Array) -> Iterator[tuple[int, UInt8Array | UInt16Array]]:
+    """Stamps and pixels of :func:`decode_pictures`."""
+    for picture in decode_pictures(path, wanted_ns):
+        yield picture.t_ns, picture.pixels()
 
 
 def reduced(grey: UInt8Array, long_side_px: int) -> UInt8Array:

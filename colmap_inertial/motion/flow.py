@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array, Float32Array, IndexArray, UInt8Array, UInt16Array
+from colmap_inertial.core.arrays import Array, Float32Array, IndexArray, UInt8Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import (
@@ -31,13 +31,13 @@ from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.rolling_shutter import append_unit_depth
 from colmap_inertial.imaging.tracking import convert_to_grey, reduce_image, track_points
 
+#: Longer side of frames in which corners are followed.
+FOLLOWED_PX = 640
+
 
 @dataclass(frozen=True, kw_only=True)
 class FlowOptions:
     """Options of the measurement of rotations between frames."""
-
-    long_side_px: int = 640
-    """Pictures are reduced to this size before corners are tracked."""
 
     corners: int = 400
     """Corners tracked from each frame to the next."""
@@ -46,8 +46,8 @@ class FlowOptions:
     """Fewest tracks that must agree on a rotation; below, the pair is left out."""
 
     def __post_init__(self) -> None:
-        if self.long_side_px < 64 or self.min_support < 8 or self.corners < self.min_support:
-            raise ValueError("long_side_px must be 64 or more, min_support 8 or more, corners at least min_support")
+        if self.min_support < 8 or self.corners < self.min_support:
+            raise ValueError("min_support must be 8 or more, corners at least min_support")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,6 +79,44 @@ class FlowLimits:
 
 
 _LIMITS = FlowLimits()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class GreyFrame:
+    """A frame reduced for looking at it.
+
+    Attributes
+    ----------
+    name
+        Of the frame.
+    grey
+        (H, W) its brightness in 8 bit.
+    width, height
+        Of the frame itself, px.
+    """
+
+    name: str
+    grey: UInt8Array
+    width: int
+    height: int
+
+    @classmethod
+    def of(cls, frame: Frame, long_side_px: int) -> GreyFrame:
+        """A frame, shrunk by area where its longer side is longer than this."""
+        grey = reduce_image(convert_to_grey(frame.image), long_side_px)
+        height, width = frame.image.shape[:2]
+        return cls(
+            name=frame.name,
+            grey=np.asarray(grey if grey.dtype == np.uint8 else grey >> 8, dtype=np.uint8),
+            width=width,
+            height=height,
+        )
+
+
+def reduce_frames(frames: Iterable[Frame], long_side_px: int = FOLLOWED_PX) -> Iterator[GreyFrame]:
+    """Reduce frames one by one; by default to the size in which corners are followed."""
+    for frame in frames:
+        yield GreyFrame.of(frame, long_side_px)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -169,21 +207,21 @@ class VisualRotation:
 
 
 def measure_rotation(
-    frames: Iterable[Frame], camera: Projector, timing: FrameTiming, options: FlowOptions | None = None
+    frames: Iterable[GreyFrame], camera: Projector, timing: FrameTiming, options: FlowOptions | None = None
 ) -> VisualRotation:
     """Rotations of the camera between consecutive frames.
 
     Parameters
     ----------
     frames
-        In order of time, all of one size; two are held at a time.
+        As of :func:`reduce_frames`, in order of time, all of one size; two are held at a time.
     camera
         Intrinsics with distortion, COLMAP's pixel coordinates. Without a calibration, a guess serves to find the clock
         offset and the axes: a wrong focal length scales all rotations equally.
     timing
         Holds every frame; its readout, where known, gives each line a time of its own.
     options
-        Size, number of corners.
+        Number of corners.
     """
     options = options or FlowOptions()
     index = {name: i for i, name in enumerate(timing.names)}
@@ -192,9 +230,7 @@ def measure_rotation(
     pairs: list[_PairRotation] = []
     before: tuple[UInt8Array, FrameShutter] | None = None
     for frame in frames:
-        height, width = frame.image.shape[:2]
-        shutter = FrameShutter.of(timing, index[frame.name], width=width, height=height)
-        now = (reduced(frame.image, options.long_side_px), shutter)
+        now = frame.grey, FrameShutter.of(timing, index[frame.name], width=frame.width, height=frame.height)
         if before is not None:
             pairs.append(_estimate_pair_rotation(before, now, camera, options))
         names.append(frame.name)
@@ -335,12 +371,6 @@ def _measure_quick_rotation(rate: Array, width: int) -> float:
     """Robust size of what changes faster than the running mean over ``width`` samples."""
     quick = np.linalg.norm(subtract_running_mean(rate, width), axis=1)
     return float(np.sqrt(np.mean(np.sort(quick**2)[: max(1, int(0.98 * len(quick)))])))
-
-
-def reduced(image: UInt8Array | UInt16Array, long_side_px: int) -> UInt8Array:
-    """The picture in which corners are tracked: (H, W), 8 bit."""
-    grey = reduce_image(convert_to_grey(image), long_side_px)
-    return np.asarray(grey if grey.dtype == np.uint8 else grey >> 8, dtype=np.uint8)
 
 
 def _estimate_pair_rotation(

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from colmap_inertial.core.arrays import Array, UInt8Array
-from colmap_inertial.core.types import Frame, FrameTiming, Projector
+from colmap_inertial.core.types import FrameTiming, Projector
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.rolling_shutter import rays
-from colmap_inertial.motion.flow import FlowOptions, follow_points, reduced
+from colmap_inertial.motion.flow import FlowOptions, GreyFrame, follow_points
 
 #: Share of the points that are slower: as of a frame's blur, which is the 90th percentile over the picture.
 _PERCENTILE = 90
@@ -55,30 +55,29 @@ class FollowedPair:
 
 
 def follow_pairs(
-    frames: Iterable[Frame], timing: FrameTiming, firsts: Collection[str], options: FlowOptions | None = None
+    frames: Iterable[GreyFrame], timing: FrameTiming, firsts: Collection[str], options: FlowOptions | None = None
 ) -> Iterator[FollowedPair]:
     """Follow points from some frames to the ones after them; pairs that share too little are left out.
 
     Parameters
     ----------
     frames
-        In order of time, all of one size, with those that ``firsts`` names and the ones after them; two are held.
+        As of :func:`reduce_frames`, in order of time, all of one size, with those that ``firsts`` names and the ones
+        after them; two are held.
     timing
         Holds every frame; its readout, where known, gives each line a time of its own.
     firsts
         The first frame of each pair.
     options
-        Size, number of corners.
+        Number of corners.
     """
     options = options or FlowOptions()
     index = {name: i for i, name in enumerate(timing.names)}
     before: tuple[str, UInt8Array, FrameShutter] | None = None
     for frame in frames:
-        height, width = frame.image.shape[:2]
-        shutter = FrameShutter.of(timing, index[frame.name], width=width, height=height)
-        now = reduced(frame.image, options.long_side_px)
+        shutter = FrameShutter.of(timing, index[frame.name], width=frame.width, height=frame.height)
         if before is not None and before[0] in firsts and index[frame.name] == index[before[0]] + 1:
-            followed = next(follow_points(before[1], now, shutter, options), None)
+            followed = next(follow_points(before[1], frame.grey, shutter, options), None)
             if followed is not None:
                 yield FollowedPair(name=before[0], shutters=(before[2], shutter), points=np.stack(followed))
-        before = frame.name, now, shutter
+        before = frame.name, frame.grey, shutter

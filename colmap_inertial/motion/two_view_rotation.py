@@ -14,18 +14,19 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, Float32Array, IndexArray
 from colmap_inertial.core.geometry import so3_log
-from colmap_inertial.core.types import Frame, FrameTiming, Projector
+from colmap_inertial.core.types import FrameTiming, Projector
 from colmap_inertial.imaging.rolling_shutter import append_unit_depth
-from colmap_inertial.motion.flow import VisualRotation, reduced
+from colmap_inertial.motion.flow import GreyFrame, VisualRotation
+
+#: Longer side of pictures that are compared (the 45 of the desk: 6.2 CPU-s, 10.8 at 640 px; rotations differ by .07
+#: degrees).
+COMPARED_PX = 400
 
 
 @dataclass(frozen=True, kw_only=True)
 class TwoViewLimits:
     """Limits for the rotation between two views."""
 
-    #: Pictures are reduced to this long side (the 45 of the desk: 6.2 CPU-s, 10.8 at 640 px; rotations differ by .07
-    #: degrees).
-    long_side_px: int = 400
     #: Features of a picture.
     features: int = 1000
     #: Matches of two pictures that must agree.
@@ -54,25 +55,18 @@ class _Features:
     pixel_rad: float
 
 
-def measure_two_view_rotations(
-    frames: Iterable[Frame],
-    camera: Projector,
-    timing: FrameTiming,
-    *,
-    long_side_px: int = _LIMITS.long_side_px,
-) -> VisualRotation:
+def measure_two_view_rotations(frames: Iterable[GreyFrame], camera: Projector, timing: FrameTiming) -> VisualRotation:
     """Rotations of the camera between pictures that follow each other.
 
     Parameters
     ----------
     frames
-        In order of time, all of one size; the features of three are held at a time.
+        Reduced to about :data:`COMPARED_PX`, in order of time, all of one size; the features of three are held at a
+        time.
     camera
         Intrinsics with distortion; a guess of the focal length serves to tell whether a gyroscope belongs to them.
     timing
         Holds every frame.
-    long_side_px
-        Size to which pictures are reduced.
 
     Returns
     -------
@@ -84,7 +78,7 @@ def measure_two_view_rotations(
     next_one: list[tuple[Array, int] | None] = []
     after_next: list[tuple[Array, int] | None] = []
     for frame in frames:
-        seen.append(_detect_features(frame, camera, long_side_px))
+        seen.append(_detect_features(frame, camera))
         names.append(frame.name)
         if len(seen) > 1:
             next_one.append(_estimate_rotation(seen[-2], seen[-1]))
@@ -112,13 +106,13 @@ def measure_two_view_rotations(
     )
 
 
-def _detect_features(frame: Frame, camera: Projector, long_side_px: int) -> _Features:
+def _detect_features(frame: GreyFrame, camera: Projector) -> _Features:
     import cv2
 
-    grey = reduced(frame.image, long_side_px)
+    grey = frame.grey
     points, descriptors = cv2.SIFT.create(_LIMITS.features).detectAndCompute(grey, None)
-    to_full = np.array([frame.image.shape[1] / grey.shape[1], frame.image.shape[0] / grey.shape[0]])
-    centre = np.array([[frame.image.shape[1] / 2, frame.image.shape[0] / 2]])
+    to_full = np.array([frame.width / grey.shape[1], frame.height / grey.shape[0]])
+    centre = np.array([[frame.width / 2, frame.height / 2]])
     xy_px = (np.array([point.pt for point in points], dtype=np.float64).reshape(-1, 2) + 0.5) * to_full
     rays = np.asarray(camera.cam_from_img(np.concatenate([xy_px, centre, centre + to_full])))[:, :2]
     ok = np.isfinite(rays[:-2]).all(axis=1)

@@ -55,7 +55,7 @@ from colmap_inertial.imaging.multi_aperture import (
     plane_of,
 )
 from colmap_inertial.imaging.multi_aperture.disparity import Disparity
-from colmap_inertial.run.commands.images_alone import fuse_captured
+from colmap_inertial.run.commands.images_alone import fuse_aperture_capture
 from colmap_inertial.tools.simulate import MotionOptions, SceneRecipe, ShutterCamera, make_scene
 from colmap_inertial.tools.simulate.aperture_array import write_aperture_capture
 from scripts.common.aperture_baselines import (
@@ -309,7 +309,7 @@ def bench_simulated(work: Path) -> dict[str, Any]:
     fused = work / "fused"
     shutil.rmtree(fused, ignore_errors=True)
     start = time.perf_counter()
-    pictures = fuse_captured(
+    pictures = fuse_aperture_capture(
         capture, fused, FuseAperturesOptions(fusion=ApertureOptions(depth=True)), progress=lambda *_: None
     )
     seconds = (time.perf_counter() - start) / len(pictures)

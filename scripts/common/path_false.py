@@ -24,7 +24,7 @@ from colmap_inertial.imaging.evidence import blur_evidence, measure_blur_shares
 from colmap_inertial.imaging.gate import GateOptions, RecordingVerdict, judge_frame, keep_sharp
 from colmap_inertial.imaging.path_filters import smoothed
 from colmap_inertial.imaging.psf import blur_field, blur_path
-from colmap_inertial.motion.flow import measure_rotation
+from colmap_inertial.motion.flow import measure_rotation, reduce_frames
 from colmap_inertial.motion.sign import SignCheck, compare_signs
 from colmap_inertial.run.preparation.judge import Looked, judged
 from colmap_inertial.run.stages import deblur
@@ -146,7 +146,7 @@ def _sign(frames: Sequence[UInt8Array], known: Sequence[Known]) -> SignCheck:
     ):
         timing = FrameTiming(names=("0", "1"), t_s=np.array([one.t_s, other.t_s]), readout_s=one.readout_s)
         pair = (Frame(name=str(i), image=image, t_s=0.0) for i, image in enumerate((first, second)))
-        rotation = measure_rotation(pair, camera, timing)
+        rotation = measure_rotation(reduce_frames(pair), camera, timing)
         times_s = np.array([shutter.reference_s() for shutter in (one, other)])
         found.append((rotation.turn_rad[0], motion.turn_rad(times_s)[0], rotation.sigma_rad[0]))
     visual, inertial, sigma = (np.array(values) for values in zip(*found, strict=True))

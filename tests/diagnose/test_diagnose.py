@@ -24,7 +24,7 @@ from colmap_inertial.io.frames import read_frame_times
 from colmap_inertial.io.imu import read_capture_imu, read_imu
 from colmap_inertial.io.trajectories import read_inertial_scale
 from colmap_inertial.model import Model, read_model
-from colmap_inertial.motion.flow import measure_rotation
+from colmap_inertial.motion.flow import measure_rotation, reduce_frames
 from colmap_inertial.run.preparation.preflight import stop_or_doubt
 from colmap_inertial.run.stages.metric import MetricStage
 from colmap_inertial.tools.simulate.motion import MotionKind, MotionOptions
@@ -366,7 +366,7 @@ class Film:
     imu: ImuRecording
 
     def recorded(self, camera: CameraModel = LENS) -> Recorded:
-        rotation = measure_rotation(self.frames, colmap_camera(camera), self.timing)
+        rotation = measure_rotation(reduce_frames(self.frames), colmap_camera(camera), self.timing)
         return Recorded(rotation=rotation, imu=self.imu, timing=self.timing, camera=camera, is_capture=True)
 
 

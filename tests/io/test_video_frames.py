@@ -19,8 +19,8 @@ from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.core.types import FrameLog
 from colmap_inertial.io import video
 from colmap_inertial.io.capture import load_capture
-from colmap_inertial.io.frames import read_frame_timing, read_frames, read_reduced, thin
-from colmap_inertial.io.video import decode_grey, decode_reduced, decode_video, video_stamps_ns
+from colmap_inertial.io.frames import decode_lazily, read_frame_timing, read_frames, thin
+from colmap_inertial.io.video import decode_grey, decode_pictures, decode_video, video_stamps_ns
 from tests.helpers.files import write_anew
 
 VARIABLE_MS = (100, 133, 167, 250, 283, 400, 417, 450, 600, 633, 667, 700)
@@ -155,8 +155,8 @@ def test_some_frames_are_decoded_alone(tmp_path: Path) -> None:
         assert frame.name == expected.name and frame.t_s == expected.t_s
         np.testing.assert_array_equal(frame.image, expected.image)
     assert list(read_frames(capture, only=())[1]) == []
-    small = list(read_reduced(capture, timing.names[2:9:3], 32))
-    assert [name for name, _ in small] == list(timing.names[2:9:3])
+    small = [(frame.name, frame.luma(32)) for frame in decode_lazily(capture)]
+    assert [name for name, _ in small] == list(timing.names)
     assert all(grey.shape == (24, 32) and grey.dtype == np.uint8 for _, grey in small)
 
 
@@ -338,10 +338,10 @@ def test_a_change_of_size_is_refused_at_its_time(tmp_path: Path) -> None:
     stamps = video_stamps_ns(video)
     assert len(stamps) == 30
     at = rf"from 320x240 to 160x120 at {stamps[15] * 1e-9:.3f} s"
-    for decoded in (decode_video(video, stamps), decode_reduced(video, stamps, 64)):
+    for decoded in (decode_video(video, stamps), decode_pictures(video, stamps)):
         with pytest.raises(FormatError, match=at):
             list(decoded)
-    assert len(list(decode_reduced(video, stamps[:14], 64))) == 14
+    assert len(list(decode_pictures(video, stamps[:14]))) == 14
 
 
 def test_a_rotation_mark_leaves_the_sensor_s_rows_alone(
@@ -417,8 +417,8 @@ def test_colours_are_those_that_the_video_states(
                     # FFmpeg takes white of 10 bit in limited range to 65280 of 65535
                     tolerance = 0.8 / 255 if bits == 8 else 1.0 / 255
                     assert image.dtype == kind and np.abs(image / np.iinfo(kind).max - expected).max() < tolerance
-                    [(_, grey)] = decode_reduced(tmp_path / "a.mkv", np.array([0]), 4000)
-                    assert np.array_equal(grey, yuv[..., 0] // one)
+                    [picture] = decode_pictures(tmp_path / "a.mkv", np.array([0]))
+                    assert np.array_equal(picture.luma(4000), yuv[..., 0] // one)
 
 
 def test_codecs_depths_and_odd_sizes(subtests: pytest.Subtests, tmp_path_factory: pytest.TempPathFactory) -> None:

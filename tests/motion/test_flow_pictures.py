@@ -14,7 +14,14 @@ from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.types import CameraModel, Frame, FrameTiming, ImuRecording
 from colmap_inertial.imaging.gyro_camera import FrameShutter
 from colmap_inertial.motion.align import AlignOptions, align_camera_imu
-from colmap_inertial.motion.flow import FlowOptions, _fit_rate, check_motion, find_stabilisation, measure_rotation
+from colmap_inertial.motion.flow import (
+    FlowOptions,
+    _fit_rate,
+    check_motion,
+    find_stabilisation,
+    measure_rotation,
+    reduce_frames,
+)
 from colmap_inertial.motion.shutter import estimate_readout
 from colmap_inertial.tools.simulate.render import colmap_camera
 from tests.helpers.far_scene import FarScene
@@ -60,26 +67,26 @@ def film(scene):
 def rotation(film):
     """What its pictures tell."""
     frames, timing = film
-    return measure_rotation(frames, colmap_camera(LENS), timing)
+    return measure_rotation(reduce_frames(frames), colmap_camera(LENS), timing)
 
 
 @pytest.mark.parametrize("model", [LENS, FISHEYE], ids=lambda m: m.model)
 def test_rotations_are_right_with_any_lens_and_a_rolling_shutter(scene, film, rotation, model):
     frames, timing = film if model is LENS else filmed(scene, model)
     if model is not LENS:
-        rotation = measure_rotation(frames, colmap_camera(model), timing)
+        rotation = measure_rotation(reduce_frames(frames), colmap_camera(model), timing)
     error = rotation.turn_rad - true_turns(scene, timing)
     assert np.isfinite(error).all()
     # a pixel is 4 mrad; the rate changes while a frame is read
     assert np.median(np.linalg.norm(error, axis=1)) < 3e-3
-    ignoring = measure_rotation(frames, colmap_camera(model), replace(timing, readout_s=0.0))
+    ignoring = measure_rotation(reduce_frames(frames), colmap_camera(model), replace(timing, readout_s=0.0))
     blind = ignoring.turn_rad - true_turns(scene, timing)
     assert np.sqrt(np.mean(error**2)) < 0.85 * np.sqrt(np.mean(blind**2))
 
 
 def test_frames_far_apart_are_matched_by_features(scene):
     frames, timing = filmed(scene, rate_hz=3.0)
-    rotation = measure_rotation(frames, colmap_camera(LENS), timing, FlowOptions(corners=300))
+    rotation = measure_rotation(reduce_frames(frames), colmap_camera(LENS), timing, FlowOptions(corners=300))
     error = np.linalg.norm(rotation.turn_rad - true_turns(scene, timing), axis=1)
     assert np.linalg.norm(rotation.turn_rad, axis=1).max() > 0.2
     assert np.isfinite(error).mean() > 0.8 and np.nanmedian(error) < 1e-2
@@ -103,14 +110,14 @@ def test_a_pair_that_tells_nothing_breaks_the_chain_and_the_longest_run_is_kept(
     frames, timing = film
     frames = list(frames)
     frames[10] = replace(frames[10], image=np.full((240, 320, 3), 90, np.uint8))
-    rotation = measure_rotation(frames, colmap_camera(LENS), timing)
+    rotation = measure_rotation(reduce_frames(frames), colmap_camera(LENS), timing)
     assert np.isnan(rotation.turn_rad[9:11]).all() and np.isfinite(rotation.turn_rad[11:]).all()
     track = rotation.trajectory()
     assert track.names == timing.names[11:]
     np.testing.assert_array_equal(track.t_s, timing.pose_t_s()[11:])
     blank = [replace(frame, image=np.full((240, 320), 90, np.uint8)) for frame in frames[:8]]
     with pytest.raises(NotObservableError, match="too few corners"):
-        measure_rotation(blank, colmap_camera(LENS), timing).trajectory()
+        measure_rotation(reduce_frames(blank), colmap_camera(LENS), timing).trajectory()
 
 
 def test_pictures_without_the_gyroscope_s_rotation_were_stabilised(scene, rotation):
@@ -158,7 +165,7 @@ def test_memory_does_not_grow_with_the_number_of_frames(film):
     def peak(count):
         stream = (replace(frames[i], image=frames[i].image.copy()) for i in range(count))
         tracemalloc.start()
-        measure_rotation(stream, colmap_camera(LENS), timing)
+        measure_rotation(reduce_frames(stream), colmap_camera(LENS), timing)
         out = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         return out
@@ -189,7 +196,7 @@ def test_gyrostab_s_axes_and_offset_are_found(shared_data):
         Frame(name=name, image=cv2.imread(str(folder / "reshape" / name))[..., ::-1], t_s=t)
         for name, t in zip(names, timing.t_s, strict=True)
     )
-    rotation = measure_rotation(frames, colmap_camera(camera), timing)
+    rotation = measure_rotation(reduce_frames(frames), colmap_camera(camera), timing)
     found = align_camera_imu(rotation.trajectory(), imu, options=AlignOptions(max_offset_s=1.0))
     axes = matrix_from_quat(found.cam_from_imu_xyzw)
     np.testing.assert_allclose(axes, [[0, -1, 0], [-1, 0, 0], [0, 0, -1]], atol=0.08)

@@ -13,6 +13,7 @@ from colmap_inertial.core.geometry import so3_exp, so3_log
 from colmap_inertial.core.types import CameraModel, Frame, FrameTiming
 from colmap_inertial.diagnose import Recorded, diagnose
 from colmap_inertial.imaging.gyro_camera import FrameShutter
+from colmap_inertial.motion.flow import reduce_frames
 from colmap_inertial.motion.two_view_rotation import (
     _estimate_rotation,
     _Features,
@@ -49,7 +50,7 @@ def test_rotations_between_pictures_are_those_of_the_camera(
     scene: FarScene, taken: tuple[list[Frame], FrameTiming]
 ) -> None:
     frames, timing = taken
-    found = measure_two_view_rotations(frames, colmap_camera(LENS), timing, long_side_px=320)
+    found = measure_two_view_rotations(reduce_frames(frames, 320), colmap_camera(LENS), timing)
     poses = scene.wall_from_cam(timing.pose_t_s())
     true = np.stack([so3_log(a.T @ b) for a, b in itertools.pairwise(poses)])
     known = np.isfinite(found.turn_rad).all(axis=1)
@@ -103,7 +104,7 @@ def test_a_folder_of_pictures_is_compared_with_the_gyroscope(
     assert "pictures far apart" in told["checked"]
     assert [f["code"] for f in told["findings"] if f["severity"] == "error"] == ["gyro-not-in-deg"]
     # the same pictures with the right numbers, and with those of another motion
-    rotation = measure_two_view_rotations(frames, colmap_camera(LENS), timing, long_side_px=320)
+    rotation = measure_two_view_rotations(reduce_frames(frames, 320), colmap_camera(LENS), timing)
     recorded = Recorded(imu=imu, rotation=rotation, timing=timing, camera=LENS, is_capture=True)
     assert diagnose(recorded).findings == ()
     other = replace(imu, gyro_rad_s=imu.gyro_rad_s[::-1])

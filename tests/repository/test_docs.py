@@ -19,7 +19,7 @@ import pytest
 from jsonschema import Draft202012Validator
 
 import colmap_inertial
-from colmap_inertial.cli import main, parse
+from colmap_inertial.cli import GROUPS, main, parse
 from colmap_inertial.colmap.dense.depth_maps import DenseResult
 from colmap_inertial.core.errors import InertialError, NotObservableError
 from colmap_inertial.core.facts import Fact
@@ -227,6 +227,17 @@ def test_figures_name_options_that_their_scripts_have():
 def test_the_public_names_are_those_of_the_api_reference():
     listed = re.findall(r"^::: colmap_inertial\.(\w+)$", (DOCS / "api.md").read_text(), re.MULTILINE)
     assert sorted(listed) == sorted(colmap_inertial.__all__)
+
+
+def test_every_command_but_the_viewer_is_a_public_function():
+    table = (DOCS / "api.md").read_text().split("\n## ", 1)[0]
+    rows = re.findall(r"^\| (`[a-z`, -]+`) \| (.*) \|$", table, re.MULTILINE)
+    commands = {command for cell, _ in rows for command in re.findall(r"`([\w-]+)`", cell)}
+    assert sorted(commands) == sorted(name for group in GROUPS.values() for name in group)
+    for cell, functions in rows:
+        named = re.findall(r"`(\w+)`", functions)
+        assert cell == "`view`" or named, cell
+        assert set(named) <= set(colmap_inertial.__all__), cell
 
 
 def test_every_field_of_a_result_and_of_the_options_is_in_its_docstring():

@@ -21,7 +21,7 @@ from colmap_inertial.io.picture_names import picture_in
 from colmap_inertial.model import read_model
 from colmap_inertial.report.page import embed_images
 from colmap_inertial.run.commands.dense_steps import _check_images
-from colmap_inertial.run.preparation.sampling import some_frames
+from colmap_inertial.run.preparation.frame_reading import GLANCED_AT, GreyFrames
 from colmap_inertial.run.stages.frame_folder import FramePaths, write_frames, write_images
 from colmap_inertial.tools.batch import read_manifest
 from colmap_inertial.tools.view.sources import find_source
@@ -112,9 +112,10 @@ def test_the_first_look_at_a_capture_does_not_follow_links_out(tmp_path):
     (folder / "1.png").symlink_to(tmp_path / "secret.png")
     capture = SimpleNamespace(frames=ImageFolder(folder=folder), camera=None)
     timing = FrameTiming(names=("0.png", "1.png"), t_s=np.arange(2.0))
-    assert next(some_frames(capture, timing, [0])).name == "0.png"
+    frames = GreyFrames(capture, timing)
+    assert next(frames.look(GLANCED_AT, ["0.png"])).name == "0.png"
     with pytest.raises(FormatError) as refused:
-        list(some_frames(capture, timing, [1]))
+        list(frames.look(GLANCED_AT, ["1.png"]))
     assert refused.value.code == "link-leads-out"
 
 

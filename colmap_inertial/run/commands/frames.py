@@ -17,14 +17,13 @@ from colmap_inertial.hooks import FrameStage, KeypointStage, apply_refined_calib
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.gate import Decision
 from colmap_inertial.imaging.psf import blur_field
-from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import path_in, write_json
 from colmap_inertial.io.images import read_image
 from colmap_inertial.io.recording import Recording
 from colmap_inertial.io.rig_frames import RigFrames
 from colmap_inertial.model import colmap_camera, read_model
 from colmap_inertial.run.commands.result import ModelResult
-from colmap_inertial.run.preparation.sampling import some_frames
+from colmap_inertial.run.preparation.frame_reading import FullFrames
 from colmap_inertial.run.stages.frame_folder import (
     FramePaths,
     FrameRecord,
@@ -63,7 +62,7 @@ _LEGEND = "red lines: the path of a point while the frame is exposed, by the gyr
 Part = tuple[int, int, int, int]
 
 
-def write_contact_sheet(path: Path, capture: Capture, plan: ImagingPlan, images: Path, names: Sequence[str]) -> None:
+def write_contact_sheet(path: Path, frames: FullFrames, plan: ImagingPlan, images: Path, names: Sequence[str]) -> None:
     """Write a PNG: one row for each of the first frames named; before on the left, after on the right with the
     method that undid the blur.
 
@@ -71,8 +70,8 @@ def write_contact_sheet(path: Path, capture: Capture, plan: ImagingPlan, images:
     ----------
     path
         Of the PNG.
-    capture
-        The recording.
+    frames
+        The images as they were filmed.
     plan
         By which it was deblurred.
     images
@@ -88,7 +87,7 @@ def write_contact_sheet(path: Path, capture: Capture, plan: ImagingPlan, images:
     index = view.index()
     motion, camera = view.motion(), colmap_camera(view.camera)
     rows: dict[str, UInt8Array] = {}
-    for frame in some_frames(capture, view.timing, [index[name] for name in names[: _LIMITS.frames]]):
+    for frame in frames.decode(names[: _LIMITS.frames]):
         parallax = plan.parallaxes.get(frame.name)
         field = blur_field(motion, camera, view.shutter(index[frame.name]), parallax=parallax)
         before, after = _eight_bit(frame.image), _eight_bit(read_image(path_in(images, frame.name)))
@@ -215,7 +214,7 @@ def _draw(crop: UInt8Array, field: BlurField, top: int, left: int) -> None:
 def run_frames(
     session: Session,
     recording: Recording,
-    frames: Iterator[Frame],
+    frames: FullFrames,
     stages: Sequence[FrameStage],
     images: Path,
     plan: ImagingPlan | None = None,
@@ -225,7 +224,7 @@ def run_frames(
 
     ``rig``: images of other cameras, which go with the frames.
     """
-    source, workspace, timing = recording.capture.image_folder, session.workspace, recording.timing
+    workspace, timing = session.workspace, recording.timing
     names, elsewhere = list(timing.names), {}
     if rig is not None:
         names, elsewhere = names + rig.names(timing.names), rig.originals(timing.names)
@@ -233,9 +232,12 @@ def run_frames(
 
     def work(partial: Sequence[Path]) -> None:
         images, records, unsmoothed = partial[:3]
-        paths = FramePaths(source=source, images=images, records=records, unsmoothed=unsmoothed, elsewhere=elsewhere)
+        paths = FramePaths(
+            source=frames.files, images=images, records=records, unsmoothed=unsmoothed, elsewhere=elsewhere
+        )
         through = stages if kept is None else (kept.before, *stages, kept.after)
-        every = frames if rig is None else rig.add_images(frames, timing)
+        decoded = frames.decode()
+        every = decoded if rig is None else rig.add_images(decoded, timing)
         write_frames(every, names, through, paths, session.progress)
         if kept is not None:
             kept.write(partial[3])

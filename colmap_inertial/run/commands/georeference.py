@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from colmap_inertial.core.errors import NotObservableError
-from colmap_inertial.core.facts import Fact
+from colmap_inertial.core.errors import NotObservableError, TargetNotFoundError
 from colmap_inertial.core.options import WorldAxes
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import DOWN_IN_WORLD, FrameTiming, PositionFixes
@@ -16,6 +15,7 @@ from colmap_inertial.evidence.positions import georeference_path
 from colmap_inertial.inertial.georeference import Georeference
 from colmap_inertial.io.files import read_record, write_json, write_record
 from colmap_inertial.model import read_model, trajectory_from_model
+from colmap_inertial.run.commands.outcome import Outcome
 from colmap_inertial.run.commands.result import ModelResult, error_as_json
 from colmap_inertial.run.preparation.geolocation import cameras_as_json
 from colmap_inertial.run.steps.session import Session
@@ -24,26 +24,10 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _Outcome:
-    """Outcome for one model; the reason where its heading stays open."""
-
-    index: int
-    found: Georeference | None = None
-    unobservable: str = "heading"
-    why: Fact | None = None
-
-    def outcome(self) -> Georeference | NotObservableError:
-        if self.why is not None:
-            return NotObservableError(self.unobservable, self.why)
-        assert self.found is not None
-        return self.found
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
 class _Outcomes:
-    """Outcomes of all metric models."""
+    """Outcomes of all metric models by their number; the reason where a heading stays open."""
 
-    models: tuple[_Outcome, ...]
+    models: dict[int, Outcome[Georeference]]
 
 
 def run_georeference(
@@ -62,16 +46,17 @@ def run_georeference(
     record = workspace.stamps / "georeferenced.json"
 
     def work(partial: Sequence[Path]) -> None:
-        outcomes, written = [], []
+        outcomes: dict[int, Outcome[Georeference]] = {}
+        written: list[dict[str, object]] = []
         for index, folder in metric.items():
             path, _ = trajectory_from_model(read_model(folder), timing, covariances=False)
             try:
                 georeference = georeference_path(fixes, path, -DOWN_IN_WORLD[world])
             except NotObservableError as error:
-                outcomes.append(_Outcome(index=index, unobservable=error.quantity, why=error.fact))
+                outcomes[index] = Outcome.of_error(error)
                 written.append({"model": index, **error_as_json(error)})
             else:
-                outcomes.append(_Outcome(index=index, found=georeference))
+                outcomes[index] = Outcome(found=georeference)
                 written.append(
                     {
                         "model": index,
@@ -79,13 +64,16 @@ def run_georeference(
                         "cameras": cameras_as_json(georeference, path.names, path.cam_in_world),
                     }
                 )
-        write_record(partial[0], _Outcomes(models=tuple(outcomes)))
+        write_record(partial[0], _Outcomes(models=outcomes))
         write_json(partial[1], {"models": written})
 
     depends = {"fixes": fixes, "timing": timing, "world": world}
     session.runner.run("georeference", depends, [record, workspace.georeference], work, after=("metric",))
-    known = {entry.index: entry.outcome() for entry in read_record(record, _Outcomes).models}
-    for index, outcome in known.items():
+    known: dict[int, Georeference | NotObservableError] = {}
+    for index, entry in read_record(record, _Outcomes).models.items():
+        outcome = entry.result()
+        assert not isinstance(outcome, TargetNotFoundError)
+        known[index] = outcome
         if isinstance(outcome, Georeference):
             width_deg = Z95 * outcome.heading_sigma_deg
             log.info("model %d: heading +-%.1f degrees by %d positions", index, width_deg, outcome.used)

@@ -29,13 +29,14 @@ from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.files import StrPath, path_in, read_json, structured, write_json
 from colmap_inertial.io.fingerprints import fingerprint
 from colmap_inertial.io.frame_sources import ImageFolder, image_names
-from colmap_inertial.io.frames import picture_folders, read_frame_timing, read_frames
+from colmap_inertial.io.frames import picture_folders, read_frame_timing
 from colmap_inertial.io.images import read_image
 from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.io.recording import Recording, correct_imu, prior_calibration
 from colmap_inertial.run.commands.frames import run_frames, run_images, write_contact_sheet
 from colmap_inertial.run.commands.result import DeblurResult, frame_as_json, imaging_as_json
-from colmap_inertial.run.preparation.plan import Treatments, add_stated_exposures, run_plan
+from colmap_inertial.run.preparation.frame_reading import FullFrames, GreyFrames
+from colmap_inertial.run.preparation.plan import Treatments, add_stated_exposures, expect_plan, run_plan
 from colmap_inertial.run.stages.apertures import ApertureStage, write_maps
 from colmap_inertial.run.stages.deblur import require_method
 from colmap_inertial.run.stages.defaults import default_frame_stages, default_keypoint_stages
@@ -164,8 +165,7 @@ def deblur_capture(
     if sheet is not None:
         _require_free_sheet(sheet, Path(out))
     imu = read_capture_imu(loaded)
-    timing, frames = read_frames(loaded)
-    timing = add_stated_exposures(loaded, timing)
+    timing = add_stated_exposures(loaded, read_frame_timing(loaded))
     check_pair_names(timing.names)
     options = ReconstructOptions(
         deblur=method, rolling_shutter="rectify" if rectify else "off", calibration=list_paths(calibration)
@@ -173,8 +173,8 @@ def deblur_capture(
     imu = correct_imu(loaded, imu, calibration)
     recording = Recording.of(loaded, imu, timing, prior_calibration(loaded, calibration))
     with _open_session(out, loaded, options, "deblur", overwrite=overwrite, progress=progress) as session:
-        workspace = session.workspace
-        plan = run_plan(session, recording, Treatments(deblur=method, rolling_shutter=options.rolling_shutter))
+        workspace, asked = session.workspace, Treatments(deblur=method, rolling_shutter=options.rolling_shutter)
+        frames, plan = _plan(session, recording, asked)
         for_matching = purpose == "matching"
         inputs = StageInputs(recording=recording, options=options, plan=plan, maps=False, matching=for_matching)
         deblurred = workspace.colmap_images if rectify else workspace.images
@@ -189,7 +189,8 @@ def deblur_capture(
         shown = _list_deblurred(records)
         if sheet is not None and shown and plan.view is not None:
             write_json(workspace.stamps / _SHEET, {"sheet": str(sheet.resolve())})
-            write_contact_sheet(sheet, loaded, plan, deblurred, shown)
+            write_contact_sheet(sheet, frames, plan, deblurred, shown)
+        frames.close()
         content = {
             "imaging": imaging_as_json(plan, rectified),
             "frames": [frame_as_json(record, plan, rectified) for record in records],
@@ -225,7 +226,7 @@ def _list_deblurred(records: Sequence[FrameRecord]) -> list[str]:
     return [record.name for record in sorted(deblurred, key=lambda record: -(record.value("blur_px") or 0.0))]
 
 
-def fuse_captured(
+def fuse_aperture_capture(
     capture: StrPath,
     out: StrPath,
     options: FuseAperturesOptions | None = None,
@@ -301,7 +302,7 @@ def fuse_captured(
         return tuple(session.workspace.images / name for name in names)
 
 
-def fuse_exposures_captured(
+def fuse_exposure_capture(
     capture: StrPath,
     out: StrPath,
     options: ExposureOptions | None = None,
@@ -362,7 +363,7 @@ def fuse_exposures_captured(
     with _open_session(out, loaded, options, "fuse-exposures", overwrite=overwrite, progress=progress) as session:
         plan = ImagingPlan(deblur_note=Fact("exposures-aligned", no_gyro=no_gyro))
         if recording is not None:
-            plan = run_plan(session, recording, Treatments(deblur="off", rolling_shutter="off", pairs=True))
+            _, plan = _plan(session, recording, Treatments(deblur="off", rolling_shutter="off", pairs=True))
         stage = ExposureStage.of_capture(
             loaded,
             options,
@@ -387,6 +388,15 @@ def fuse_exposures_captured(
         }
         _write_result(session, loaded, content)
         return pairs
+
+
+def _plan(session: Session, recording: Recording, asked: Treatments) -> tuple[FullFrames, ImagingPlan]:
+    """Plan the treatment of all frames; returns these, too."""
+    capture, timing, scratch = recording.capture, recording.timing, session.context.scratch
+    full = FullFrames(capture, timing, scratch)
+    with contextlib.closing(GreyFrames(capture, timing, scratch)) as grey:
+        expect_plan(grey, recording, asked)
+        return full, run_plan(session, recording, grey, full, asked)
 
 
 def _read_short_exposures(capture: Capture, timing: FrameTiming | None, names: Sequence[str]) -> Iterator[Frame]:

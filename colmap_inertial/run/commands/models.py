@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from colmap_inertial.core.errors import NotObservableError, TargetNotFoundError
-from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import DenseOptions
 from colmap_inertial.core.types import Gap
 from colmap_inertial.hooks import ModelStage
@@ -25,6 +24,7 @@ from colmap_inertial.model import (
 )
 from colmap_inertial.run.commands.dense_steps import run_dense
 from colmap_inertial.run.commands.model_stages import ModelStageRun, count_from
+from colmap_inertial.run.commands.outcome import Outcome
 from colmap_inertial.run.commands.project_output import remove_stale_dense
 from colmap_inertial.run.commands.result import Fragment, ModelResult, ScaledModel
 from colmap_inertial.run.steps.session import Session
@@ -166,23 +166,6 @@ def _select_models(folders: Mapping[int, Path], *, keep: bool) -> tuple[list[int
     return kept, left_out
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Validated:
-    """Measurement of the target in a model, or the error, in its parts."""
-
-    found: Validation | None = None
-    unobservable: str | None = None
-    why_not: Fact | None = None
-
-    def outcome(self) -> Validation | TargetNotFoundError | NotObservableError:
-        if self.found is not None:
-            return self.found
-        assert self.why_not is not None
-        if self.unobservable is not None:
-            return NotObservableError(self.unobservable, self.why_not)
-        return TargetNotFoundError(self.why_not)
-
-
 def run_validation(
     session: Session, models: Sequence[ModelResult], target: Target | None, images: Path | None
 ) -> tuple[ModelResult, ...]:
@@ -207,20 +190,18 @@ def _validate(session: Session, model: ModelResult, target: Target, images: Path
             validation = validate_model(
                 metric, images, target, progress=lambda done, total: session.progress("validation", done, total)
             )
-        except TargetNotFoundError as error:
-            write_record(partial[0], _Validated(why_not=error.fact))
-        except NotObservableError as error:
-            write_record(partial[0], _Validated(unobservable=error.quantity, why_not=error.fact))
+        except (TargetNotFoundError, NotObservableError) as error:
+            write_record(partial[0], Outcome[Validation].of_error(error))
         else:
             write_overlays(validation, images, pictures)
-            write_record(partial[0], _Validated(found=validation))
+            write_record(partial[0], Outcome(found=validation))
 
     record = session.workspace.stamps / f"validated_{model.index}.json"
     after = ["metric", *session.runner.list_own("frames", "images")]
     depends = {"target": target.spec, "images": [] if len(after) > 1 else fingerprint(images)}
     step = f"validation_{model.index}"
     session.runner.run(step, depends, [record], work, after=after, beside=lambda: [pictures])
-    outcome = read_record(record, _Validated).outcome()
+    outcome = read_record(record, Outcome[Validation]).result()
     words = f"scale error {outcome.scale_error_pct:+.3f} %" if isinstance(outcome, Validation) else str(outcome)
     log.info("model %d: %s against %s", model.index, words, target.spec)
     scale = doubt_by_target(model.scale, outcome) if isinstance(outcome, Validation) else model.scale

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import EllipsisType
@@ -22,7 +23,7 @@ from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.gyro import gravity_in_cam
 from colmap_inertial.core.options import BlurRemover, ReconstructOptions
 from colmap_inertial.core.progress import Progress, silent
-from colmap_inertial.core.types import Frame, FrameTiming, ImuRecording, PositionFixes
+from colmap_inertial.core.types import FrameTiming, ImuRecording, PositionFixes
 from colmap_inertial.diagnose import Diagnosis
 from colmap_inertial.hooks import (
     FrameStage,
@@ -36,7 +37,7 @@ from colmap_inertial.io.calibration import describe_files
 from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.disk import remove
 from colmap_inertial.io.files import StrPath, reading_within
-from colmap_inertial.io.frames import picture_folders, read_frames
+from colmap_inertial.io.frames import picture_folders, read_frame_timing, read_frames
 from colmap_inertial.io.imu import read_unchecked_capture_imu
 from colmap_inertial.io.recording import Recording, correct_imu, prior_calibration
 from colmap_inertial.io.rig_frames import RigFrames, pair_rig_frames
@@ -53,12 +54,12 @@ from colmap_inertial.run.commands.models import Submodels, run_dense_models, run
 from colmap_inertial.run.commands.reporting import report_result, reporting_stops, write_recording
 from colmap_inertial.run.commands.result import ReconstructResult
 from colmap_inertial.run.commands.unplaced import note_unplaced
+from colmap_inertial.run.preparation.frame_reading import FullFrames, GreyFrames
 from colmap_inertial.run.preparation.geolocation import positions_of
 from colmap_inertial.run.preparation.packages import warn_of_conflicts
-from colmap_inertial.run.preparation.plan import add_stated_exposures, ask_for_plan, run_plan
+from colmap_inertial.run.preparation.plan import add_stated_exposures, ask_for_plan, expect_plan, run_plan
 from colmap_inertial.run.preparation.preflight import check_imu, run_preflight
-from colmap_inertial.run.preparation.sampling import guess_camera
-from colmap_inertial.run.preparation.selection import part_of, run_selection
+from colmap_inertial.run.preparation.selection import expect_selection, part_of, run_selection
 from colmap_inertial.run.preparation.sensors import find_sensors
 from colmap_inertial.run.stages.capture_sensors import CaptureSensors
 from colmap_inertial.run.stages.deblur import require_method
@@ -150,8 +151,6 @@ class _CheckedCapture:
         The IMU, before any calibration of its own.
     recording
         With all frames.
-    frames
-        Of the capture, in order of time.
     fuser
         What fuses pairs of exposures; ``None`` where none are fused.
     target
@@ -167,7 +166,6 @@ class _CheckedCapture:
     capture: Capture
     raw: ImuRecording
     recording: Recording
-    frames: Iterator[Frame]
     fuser: Fuser | None
     target: Target | None
     gravity: Mapping[str, Array]
@@ -194,7 +192,7 @@ def _read_capture(path: Path, options: ReconstructOptions, stages: Stages) -> _C
     raw = check_imu(read_unchecked_capture_imu(capture), force=options.force)
     target = None if capture.target is None else parse_target(capture.target)
     _refuse_with_rig(capture, options)
-    timing, frames, rig = _read_used_frames(capture, options)
+    timing, rig = _read_used_frames(capture, options)
     timing = add_stated_exposures(capture, timing)
     require_frames(len(timing.names), of=len(timing.names))
     prior = prior_calibration(capture, options.calibration)
@@ -207,7 +205,6 @@ def _read_capture(path: Path, options: ReconstructOptions, stages: Stages) -> _C
         capture=capture,
         raw=raw,
         recording=recording,
-        frames=frames,
         fuser=fuser,
         target=target,
         gravity=gravity,
@@ -216,25 +213,21 @@ def _read_capture(path: Path, options: ReconstructOptions, stages: Stages) -> _C
     )
 
 
-def _read_used_frames(
-    capture: Capture, options: ReconstructOptions
-) -> tuple[FrameTiming, Iterator[Frame], RigFrames | None]:
-    """The frames of a capture: of a rig, those that all cameras took; with a given database, those that it has."""
-    timing, frames = read_frames(capture)
+def _read_used_frames(capture: Capture, options: ReconstructOptions) -> tuple[FrameTiming, RigFrames | None]:
+    """Times of a capture's frames: of a rig, those that all cameras took; with a given database, those that it has."""
+    timing = read_frame_timing(capture)
     rig = None
     if capture.rig:
         rig = pair_rig_frames(capture, timing)
         if rig.alone:
             log.warning("%d frames are left out: a camera of the rig has no image of them", len(rig.alone))
         timing = part_of(timing, rig.own_names[0].keys() - set(rig.alone))
-        _, frames = read_frames(capture, only=timing.names)
     if options.database is not None:
         given = read_given(options.database)
         timing = part_of(timing, given.names_in_time(timing.names))
         first = next(read_frames(capture, only=timing.names[:1])[1])
         given.require_size(first.name, first.image.shape[1], first.image.shape[0])
-        _, frames = read_frames(capture, only=timing.names)
-    return timing, frames, rig
+    return timing, rig
 
 
 def _refuse_with_rig(capture: Capture, options: ReconstructOptions) -> None:
@@ -276,9 +269,7 @@ def _reconstruct(
         reporting_stops(session, capture, given.recording),
     ):
         session.context.executor.require(session.context.scratch)
-        doubts = run_preflight(session, given.recording, given.raw, findings, force=options.force)
-        given = replace(given, recording=replace(given.recording, doubts=doubts))
-        result = _run_steps(session, given, options, stages)
+        result = _run_steps(session, given, options, stages, findings)
         result = report_result(session, result, capture, used_calibration)
         remove(session.workspace.colmap_features)
         session.runner.forget("features")
@@ -286,24 +277,33 @@ def _reconstruct(
 
 
 def _run_steps(
-    session: Session, given: _CheckedCapture, options: ReconstructOptions, stages: Stages
+    session: Session,
+    given: _CheckedCapture,
+    options: ReconstructOptions,
+    stages: Stages,
+    findings: Callable[[Diagnosis], None],
 ) -> ReconstructResult:
-    """The steps of a run, from the choice of frames to the dense reconstruction."""
-    workspace, capture = session.workspace, given.capture
-    recording, frames, timing = given.recording, given.frames, given.recording.timing
+    """The steps of a run, from the check beforehand to the dense reconstruction."""
+    workspace, capture, recording = session.workspace, given.capture, given.recording
     # whoever made a database chose its frames
     choice = options.frames if options.database is None else replace(options.frames, use="all")
-    selection = run_selection(session, recording, choice)
-    if len(selection.names) < len(timing.names):
-        recording = recording.using(part_of(timing, selection.names))
-        _, frames = read_frames(capture, only=selection.names)
-    if not options.apertures.depth:
-        session.runner.discard(workspace.apertures)
     asked = ask_for_plan(options, stages.frame, stages.keypoint, pairs=given.fuser is not None)
+    with closing(GreyFrames(capture, recording.timing, session.context.scratch)) as grey:
+        # what the check passes on its way is kept for those who look after it
+        expect_selection(grey, choice, capture)
+        expect_plan(grey, recording, asked)
+        doubts = run_preflight(session, recording, given.raw, findings, force=options.force, frames=grey)
+        recording = replace(recording, doubts=doubts)
+        selection = run_selection(session, recording, choice, grey)
+        recording = recording.using(part_of(recording.timing, selection.names))
+        if not options.apertures.depth:
+            session.runner.discard(workspace.apertures)
+        full = FullFrames(capture, recording.timing, session.context.scratch)
+        plan = run_plan(session, recording, grey, full, asked)
     inputs = StageInputs(
         recording=recording,
         options=options,
-        plan=run_plan(session, recording, asked),
+        plan=plan,
         fuser=given.fuser,
         apertures=workspace.apertures,
         database=workspace.colmap_database,
@@ -312,7 +312,8 @@ def _run_steps(
     of_frames = insert_defaults(stages.frame, default_frame_stages(inputs))
     of_keypoints = insert_defaults(stages.keypoint, default_keypoint_stages(inputs))
     _require_known_images(options, of_keypoints)
-    records = run_frames(session, recording, frames, of_frames, workspace.colmap_images, inputs.plan, given.rig)
+    with closing(full):
+        records = run_frames(session, recording, full, of_frames, workspace.colmap_images, plan, given.rig)
     used_timing = part_of(recording.timing, [record.name for record in records if record.used])
     # pairs are chosen by what the capture itself holds: a calibration that is given later maps nothing again
     plain_imu = correct_imu(capture, given.raw, None)
@@ -347,7 +348,7 @@ def _run_steps(
         keypoints=keypoints,
         matching=matching,
         mapping=mapping,
-        imaging=inputs.plan,
+        imaging=plan,
         selection=selection,
         seconds=session.runner.seconds,
     )
@@ -358,7 +359,8 @@ def _find_sensors(recording: Recording, options: ReconstructOptions) -> CaptureS
     capture, timing = recording.capture, recording.timing
 
     def size_px() -> tuple[int, int]:
-        camera = guess_camera(capture, timing)
+        with closing(GreyFrames(capture, timing)) as grey:
+            camera = grey.guess_camera()
         return camera.width, camera.height
 
     return find_sensors(capture, timing.names, size_px, timing=timing, chosen=options.scale_from)

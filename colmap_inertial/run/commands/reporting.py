@@ -36,7 +36,7 @@ from colmap_inertial.report.series import round_values, stride_indices
 from colmap_inertial.report.signals import signal_record
 from colmap_inertial.run.commands.project_output import withdraw
 from colmap_inertial.run.commands.result import ReconstructResult, result_as_json
-from colmap_inertial.run.preparation.sampling import guess_camera
+from colmap_inertial.run.preparation.frame_reading import GreyFrames
 from colmap_inertial.run.stages.metric import gravity_in_model
 from colmap_inertial.run.steps.session import Session
 from colmap_inertial.run.steps.workspace import Workspace
@@ -102,7 +102,7 @@ def _shutter_record(
     """Shift of keypoints: the largest of some frames, and that of the worst one over the image."""
     if not rectified:
         return None
-    timing, camera = recording.timing, guess_camera(recording.capture, recording.timing)
+    timing, camera = recording.timing, GreyFrames(recording.capture, recording.timing).guess_camera()
     x = (np.arange(_LIMITS.grid) + 0.5) * camera.width / _LIMITS.grid
     y = (np.arange(_LIMITS.grid) + 0.5) * camera.height / _LIMITS.grid
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

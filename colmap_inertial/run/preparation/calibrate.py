@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import logging
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -29,10 +29,10 @@ from colmap_inertial.core.types import (
     CameraImuCalibration,
     CameraModel,
     CameraTrajectory,
+    Frame,
     FrameTiming,
 )
 from colmap_inertial.hooks import FrameStage
-from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import path_in
 from colmap_inertial.io.recording import Recording
 from colmap_inertial.model import find_models, read_model, trajectory_from_model
@@ -40,12 +40,12 @@ from colmap_inertial.motion.align import AlignOptions, align_clocks
 from colmap_inertial.motion.align.consensus import align_by_consensus
 from colmap_inertial.motion.flow import VisualRotation, check_motion, find_stabilisation
 from colmap_inertial.motion.sign import check_sign
+from colmap_inertial.run.preparation.frame_reading import FOLLOWED, FullFrames, GreyFrames
 from colmap_inertial.run.preparation.sampling import (
-    guess_camera,
     measure_sampled_rotation,
+    names_at,
     sample_middle,
     sample_spaced,
-    some_frames,
 )
 from colmap_inertial.run.stages.frame_folder import encode_image, smooth_for_colmap
 from colmap_inertial.run.stages.imaging_plan import GyroView
@@ -106,7 +106,38 @@ class PreliminaryCalibration:
     models: tuple[pycolmap.Reconstruction, ...] = ()
 
 
-def estimate_preliminary_calibration(recording: Recording, context: RunContext) -> PreliminaryCalibration:
+def expect_calibration(frames: GreyFrames, recording: Recording) -> None:
+    """Have frames kept that pass before they are followed to calibrate camera and IMU."""
+    every = frames.timing
+    if _is_video(every):
+        frames.expect(FOLLOWED, names_at(every, _list_followed(every)))
+    elif _is_declared(recording.prior):
+        frames.expect(FOLLOWED, names_at(every, _list_for_sign(every)))
+
+
+def _is_video(every: FrameTiming) -> bool:
+    return len(every.t_s) > 1 and float(np.median(np.diff(every.t_s))) <= _LIMITS.video_step_s
+
+
+def _is_declared(calibration: CameraImuCalibration) -> bool:
+    """Whether a declared calibration needs no search."""
+    rotation_rad, offset_s = _sigmas(calibration)
+    return rotation_rad <= _LIMITS.good_rotation_rad and offset_s <= _LIMITS.good_offset_s
+
+
+def _list_followed(every: FrameTiming) -> list[int]:
+    """Indices of the frames that are followed by their pixels."""
+    return sample_middle(every, _LIMITS.flow_spacing_s, _LIMITS.flow_frames)
+
+
+def _list_for_sign(every: FrameTiming) -> list[int]:
+    """Indices of the frames that tell a wrong sign."""
+    return sample_middle(every, _LIMITS.flow_spacing_s, _LIMITS.sign_frames)
+
+
+def estimate_preliminary_calibration(
+    recording: Recording, grey: GreyFrames, full: FullFrames, context: RunContext
+) -> PreliminaryCalibration:
     """Find the calibration that the treatment of frames needs.
 
     Parameters
@@ -114,6 +145,8 @@ def estimate_preliminary_calibration(recording: Recording, context: RunContext) 
     recording
         What is known beforehand is used as it stands where that is enough. Pixels are followed through all frames of a
         video.
+    grey, full
+        All images of the capture, and those to use.
     context
         ``progress`` is called with ``"motion"`` and ``"calibration"``.
 
@@ -122,24 +155,20 @@ def estimate_preliminary_calibration(recording: Recording, context: RunContext) 
     NotObservableError
         Where the frames do not turn as the gyroscope does, or were stabilised.
     """
-    capture, timing, every, progress = recording.capture, recording.timing, recording.every, context.progress
-    camera = guess_camera(capture, timing)
-    is_video = len(every.t_s) > 1 and float(np.median(np.diff(every.t_s))) <= _LIMITS.video_step_s
-    rotation_rad, offset_s = _sigmas(recording.prior)
-    declared = rotation_rad <= _LIMITS.good_rotation_rad and offset_s <= _LIMITS.good_offset_s
-    along = sample_middle(every, _LIMITS.flow_spacing_s, _LIMITS.flow_frames)
-    rotation = measure_sampled_rotation(capture, every, camera, along, progress) if is_video else None
+    capture, timing, progress = recording.capture, recording.timing, context.progress
+    camera, along = grey.guess_camera(), _list_followed(grey.timing)
+    rotation = measure_sampled_rotation(grey, camera, along, progress) if _is_video(grey.timing) else None
     view: GyroView | NotObservableError
     models: tuple[pycolmap.Reconstruction, ...] = ()
-    if declared:
+    if _is_declared(recording.prior):
         notes = () if capture.camera is not None else (Fact("focal-length-guessed", focal_px=camera.params[0]),)
         view = GyroView(
             imu=recording.imu, timing=timing, calibration=recording.prior, camera=camera, source="capture", notes=notes
         )
     else:
-        view, models = _calibrate_by_model(recording, context)
+        view, models = _calibrate_by_model(recording, full, context)
         if isinstance(view, NotObservableError):
-            rotation = rotation or measure_sampled_rotation(capture, every, camera, along, progress)
+            rotation = rotation or measure_sampled_rotation(grey, camera, along, progress)
             view = _calibrate_by_pixels(rotation, recording, camera, view)
     if rotation is not None:
         known_s = None if isinstance(view, NotObservableError) else view.motion().offset_s
@@ -152,11 +181,11 @@ def estimate_preliminary_calibration(recording: Recording, context: RunContext) 
                 raise NotObservableError("the pixels' motion", agreement.reason)
     if isinstance(view, NotObservableError):
         raise view
-    return PreliminaryCalibration(view=_check_declared_sign(view, recording, rotation, progress), models=models)
+    return PreliminaryCalibration(view=_check_declared_sign(view, grey, rotation, progress), models=models)
 
 
 def _check_declared_sign(
-    view: GyroView, recording: Recording, rotation: VisualRotation | None, progress: Progress
+    view: GyroView, grey: GreyFrames, rotation: VisualRotation | None, progress: Progress
 ) -> GyroView:
     """The view, with what there is to say about its sign; what was estimated has the right one.
 
@@ -168,8 +197,7 @@ def _check_declared_sign(
     if view.source != "capture":
         return view
     if rotation is None:
-        some = sample_middle(recording.every, _LIMITS.flow_spacing_s, _LIMITS.sign_frames)
-        rotation = measure_sampled_rotation(recording.capture, recording.every, view.camera, some, progress)
+        rotation = measure_sampled_rotation(grey, view.camera, _list_for_sign(grey.timing), progress)
     sign = check_sign(rotation, view.motion())
     if sign.right is False:
         raise NotObservableError("the pixels' motion", sign.reason)
@@ -184,14 +212,14 @@ def survey_parts(timing: FrameTiming) -> list[list[str]]:
 
 
 def survey(
-    capture: Capture, view: GyroView, names: Sequence[str], stages: Sequence[FrameStage], context: RunContext
+    frames: FullFrames, view: GyroView, names: Sequence[str], stages: Sequence[FrameStage], context: RunContext
 ) -> tuple[pycolmap.Reconstruction, ...]:
     """COLMAP's small models of some frames; empty where it makes none.
 
     Parameters
     ----------
-    capture
-        The recording.
+    frames
+        The images.
     view
         By which keypoints are rectified.
     names
@@ -208,9 +236,9 @@ def survey(
 
     with tempfile.TemporaryDirectory(dir=context.scratch) as folder:
         work = Path(folder)
-        images = _image_folder(capture, view.timing, names, work, stages)
+        images = frames.require_files() if not stages else _write_staged(frames.decode(names), work / "images", stages)
         try:
-            models = _small_models(capture, images, names, work / "0", view, context.reporting(step))
+            models = _small_models(frames.camera, images, names, work / "0", view, context.reporting(step))
         except (MappingError, FormatError) as error:
             log.info("no survey: %s", error)
             models = ()
@@ -260,13 +288,13 @@ def _aligned(trajectory: CameraTrajectory, recording: Recording, camera: CameraM
 
 
 def _calibrate_by_model(
-    recording: Recording, context: RunContext
+    recording: Recording, frames: FullFrames, context: RunContext
 ) -> tuple[GyroView | NotObservableError, tuple[pycolmap.Reconstruction, ...]]:
     """The calibration by a small model; with a rolling shutter, by a second one of rectified keypoints.
 
     Also the models, where they are of all the recording.
     """
-    capture, timing = recording.capture, recording.timing
+    timing = recording.timing
     indices = sample_middle(timing, _LIMITS.model_spacing_s, _LIMITS.model_frames)
     whole = len(indices) == len(sample_spaced(timing, _LIMITS.model_spacing_s))
     names = [timing.names[i] for i in indices]
@@ -279,12 +307,13 @@ def _calibrate_by_model(
     models: tuple[pycolmap.Reconstruction, ...] = ()
     with tempfile.TemporaryDirectory(dir=context.scratch) as folder:
         work = Path(folder)
-        images = _image_folder(capture, timing, names, work)
+        images = frames.require_files()
         view: GyroView | None = None
         try:
             for i in range(rounds):
                 matched = work / "0" if i else None
-                models = _small_models(capture, images, names, work / str(i), view, context.reporting(step), matched)
+                hears = context.reporting(step)
+                models = _small_models(frames.camera, images, names, work / str(i), view, hears, matched)
                 trajectory, _ = trajectory_from_model(models[0], timing, covariances=False)
                 view = _aligned(trajectory, recording, _camera_of(models[0]), "model")
         except (MappingError, FormatError) as error:
@@ -296,16 +325,8 @@ def _calibrate_by_model(
     return view, models if whole else ()
 
 
-def _image_folder(
-    capture: Capture, timing: FrameTiming, names: Sequence[str], work: Path, stages: Sequence[FrameStage] = ()
-) -> Path:
-    """Folder with some frames as pictures: the capture's own, or one to which they are written."""
-    images = capture.image_folder
-    if images is not None and not stages:
-        return images
-    images = work / "images"
-    place = {name: i for i, name in enumerate(timing.names)}
-    frames = some_frames(capture, timing, [place[name] for name in names])
+def _write_staged(frames: Iterator[Frame], images: Path, stages: Sequence[FrameStage]) -> Path:
+    """Write frames to a folder as stages have them; returns it."""
     for stage in stages:
         frames = stage(frames)
     for frame in frames:
@@ -316,7 +337,7 @@ def _image_folder(
 
 
 def _small_models(
-    capture: Capture,
+    camera: CameraModel | None,
     images: Path,
     names: Sequence[str],
     work: Path,
@@ -331,7 +352,7 @@ def _small_models(
     """
     work.mkdir()
     database, sparse = work / "database.db", work / "sparse"
-    cameras = {name: capture.camera for name in names}
+    cameras = {name: camera for name in names}
     stages = [] if view is None else [RollingShutterStage(view=view)]
     pairs = image_pairs(names, _SMALL)
     # what is small, and of images that others may not see, is done here
@@ -343,7 +364,7 @@ def _small_models(
         match_pairs(database, pairs, alone)
     else:
         verify_again(matched / "database.db", database, pairs, stages, alone)
-    map_images(database, images, sparse, replace(_SMALL, refine_intrinsics=capture.camera is None), alone)
+    map_images(database, images, sparse, replace(_SMALL, refine_intrinsics=camera is None), alone)
     models = [read_model(folder) for folder in find_models(sparse).values()]
     return tuple(sorted(models, key=lambda model: -int(model.num_reg_images())))
 

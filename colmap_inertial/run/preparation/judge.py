@@ -21,9 +21,8 @@ from colmap_inertial.imaging.gate import (
 from colmap_inertial.imaging.parallax import Parallax
 from colmap_inertial.imaging.psf import blur_path
 from colmap_inertial.imaging.tracking import convert_to_grey
-from colmap_inertial.io.capture import Capture
 from colmap_inertial.model import colmap_camera
-from colmap_inertial.run.preparation.sampling import some_frames
+from colmap_inertial.run.preparation.frame_reading import FullFrames
 from colmap_inertial.run.stages.imaging_plan import GyroView
 
 
@@ -58,7 +57,7 @@ _LIMITS = JudgeLimits()
 
 def judge_frames(
     view: GyroView,
-    capture: Capture,
+    frames: FullFrames,
     chosen: Sequence[FrameDecision],
     parallaxes: Mapping[str, Parallax],
     progress: Progress,
@@ -69,8 +68,8 @@ def judge_frames(
     ----------
     view
         Gyroscope, camera and times.
-    capture
-        Where the frames are.
+    frames
+        The images.
     chosen
         The frames to look at, blurred ones.
     parallaxes
@@ -84,8 +83,7 @@ def judge_frames(
     for exposure times that are wrong by one factor, that is corrected, and said.
     """
 
-    index = view.index()
-    decoded = some_frames(capture, view.timing, [index[decision.name] for decision in chosen])
+    decoded = frames.decode([decision.name for decision in chosen])
     # decoded once for every factor that is tried, and held in grey, which is all that is looked at
     pictures = {frame.name: convert_to_grey(frame.image) for frame in decoded}
 

@@ -29,9 +29,14 @@ from colmap_inertial.io.exif import read_exposures_s
 from colmap_inertial.io.files import path_in
 from colmap_inertial.io.recording import Recording
 from colmap_inertial.model import colmap_camera
-from colmap_inertial.run.preparation.calibrate import estimate_preliminary_calibration, survey, survey_parts
+from colmap_inertial.run.preparation.calibrate import (
+    estimate_preliminary_calibration,
+    expect_calibration,
+    survey,
+    survey_parts,
+)
+from colmap_inertial.run.preparation.frame_reading import FullFrames, GreyFrames
 from colmap_inertial.run.preparation.judge import judge_frames
-from colmap_inertial.run.preparation.sampling import guess_camera
 from colmap_inertial.run.preparation.translation import (
     find_parallaxes,
     most_by_sliding_px,
@@ -115,14 +120,23 @@ def ask_for_plan(
     )
 
 
-def run_plan(session: Session, recording: Recording, asked: Treatments) -> ImagingPlan:
+def expect_plan(frames: GreyFrames, recording: Recording, asked: Treatments) -> None:
+    """Have frames kept that pass before they are looked at for a plan, where it may look at some."""
+    deblurs = asked.deblur != "off" and recording.timing.exposure_s is not None and not asked.frames_by_others
+    if deblurs or asked.pairs or _no_rectifying(recording, asked) is None:
+        expect_calibration(frames, recording)
+
+
+def run_plan(
+    session: Session, recording: Recording, grey: GreyFrames, full: FullFrames, asked: Treatments
+) -> ImagingPlan:
     """Plan the treatment of frames and keypoints; nothing is looked at where nothing is asked for."""
 
     # the user's settings are for the whole capture, not for small models of parts of it
     plain = replace(session.context, features="sift", colmap=NO_SETTINGS)
 
     def work(partial: Sequence[Path]) -> None:
-        write_plan(partial[0], plan_imaging(recording, plain, asked))
+        write_plan(partial[0], plan_imaging(recording, grey, full, plain, asked))
 
     depends = {
         **recording.identity(),
@@ -138,13 +152,17 @@ def run_plan(session: Session, recording: Recording, asked: Treatments) -> Imagi
     return plan
 
 
-def plan_imaging(recording: Recording, context: RunContext, asked: Treatments) -> ImagingPlan:
+def plan_imaging(
+    recording: Recording, grey: GreyFrames, full: FullFrames, context: RunContext, asked: Treatments
+) -> ImagingPlan:
     """Decide what is done to frames and keypoints.
 
     Parameters
     ----------
     recording
         See :func:`add_stated_exposures`.
+    grey, full
+        All images of the capture, and those to use.
     context
         ``progress`` is called with ``"motion"``, ``"calibration"``, ``"survey"`` and ``"blur"``.
     asked
@@ -160,7 +178,7 @@ def plan_imaging(recording: Recording, context: RunContext, asked: Treatments) -
     capture, timing = recording.capture, recording.timing
     if asked.rolling_shutter == "rectify" and timing.readout_s is None:
         raise InertialError(Fact("readout-needed", path=str(capture.path)))
-    why_not = _no_deblurring(recording, asked, context.progress)
+    why_not = _no_deblurring(recording, grey, asked, context.progress)
     no_rectifying = _no_rectifying(recording, asked)
     plan = ImagingPlan(
         method="wiener" if asked.deblur is None or asked.deblur == "off" else asked.deblur,
@@ -174,7 +192,7 @@ def plan_imaging(recording: Recording, context: RunContext, asked: Treatments) -
     if not plan.rectify and no_gyro is not None:
         return replace(plan, deblur_note=Fact("exposures-aligned", no_gyro=no_gyro))
     try:
-        calibration = estimate_preliminary_calibration(recording, context)
+        calibration = estimate_preliminary_calibration(recording, grey, full, context)
     except NotObservableError as error:
         if asked.by_name(deblur=why_not is None, rectify=plan.rectify):
             raise
@@ -194,15 +212,15 @@ def plan_imaging(recording: Recording, context: RunContext, asked: Treatments) -
         if plan is None and calibration.models:
             return calibration.models
         stage = None if plan is None else DeblurStage.of_plan(plan, drop=False)
-        return survey(capture, calibration.view, names, [] if stage is None else [stage], context)
+        return survey(full, calibration.view, names, [] if stage is None else [stage], context)
 
     def sliding(parts: Sequence[Sequence[str]]) -> list[bool]:
         camera = calibration.view.camera
         return translating_segments(
-            recording, camera, parts, _limit_px(camera), context.progress, motion=calibration.view.motion()
+            recording, grey, camera, parts, _limit_px(camera), context.progress, motion=calibration.view.motion()
         )
 
-    return _deblurring(plan, calibration.view, capture, models, sliding, context.progress)
+    return _deblurring(plan, calibration.view, full, models, sliding, context.progress)
 
 
 def _no_rectifying(recording: Recording, asked: Treatments) -> Fact | None:
@@ -228,7 +246,7 @@ def _limit_px(camera: CameraModel) -> float:
     return max(_LIMITS.telling_px, GateOptions().skip_below_px * max(camera.width, camera.height) / 1920)
 
 
-def _no_deblurring(recording: Recording, asked: Treatments, progress: Progress) -> Fact | None:
+def _no_deblurring(recording: Recording, grey: GreyFrames, asked: Treatments, progress: Progress) -> Fact | None:
     """Why no frame of a recording can be deblurred; ``None`` where some may be."""
     timing = recording.timing
     if asked.frames_by_others:
@@ -239,14 +257,14 @@ def _no_deblurring(recording: Recording, asked: Treatments, progress: Progress) 
         return Fact("rig-not-deblurred")
     if timing.exposure_s is None:
         return Fact("no-exposures-to-deblur")
-    camera = guess_camera(recording.capture, timing)
+    camera = grey.guess_camera()
     most_px = _most_turned_rad(recording, timing.exposure_s) * 1.2 * colmap_camera(camera).mean_focal_length()
     limit_px = _limit_px(camera)
     if most_px >= limit_px:
         return None
     if most_by_sliding_px(timing, camera) < limit_px:
         return Fact("blur-nowhere", most_px=most_px, by_sliding=False)
-    if any(translating_segments(recording, camera, survey_parts(timing), limit_px, progress)):
+    if any(translating_segments(recording, grey, camera, survey_parts(timing), limit_px, progress)):
         return None
     return Fact("blur-nowhere", most_px=most_px, by_sliding=True)
 
@@ -281,7 +299,7 @@ def _no_gyro_for_pairs(recording: Recording) -> Fact | None:
 def _deblurring(
     plan: ImagingPlan,
     view: GyroView,
-    capture: Capture,
+    frames: FullFrames,
     models: Callable[[Sequence[str], ImagingPlan | None], tuple[pycolmap.Reconstruction, ...]],
     sliding: Callable[[Sequence[Sequence[str]]], Sequence[bool]],
     progress: Progress,
@@ -298,7 +316,7 @@ def _deblurring(
     others = [i for i in range(len(segments)) if i not in turning]
     pending = turning.union(itertools.compress(others, sliding([segments[i] for i in others])))
     if not pending:
-        return _decided(plan, view, capture, {}, progress)
+        return _decided(plan, view, frames, {}, progress)
     surveys: dict[int, _Surveyed] = {}
     treated = None
     for _ in range(_LIMITS.surveys):
@@ -310,7 +328,7 @@ def _deblurring(
         if not better:
             break
         parallaxes = _merge_parallaxes(surveys, segments, view)
-        treated = _decided(plan, view, capture, parallaxes, progress)
+        treated = _decided(plan, view, frames, parallaxes, progress)
         blurred = _group_by_segment(_select_blurred(_decisions(view, parallaxes)), segments, view)
         registered = {name for surveyed in surveys.values() for name in surveyed.registered}
         pending = {i for i, names in blurred.items() if names & set(segments[i]) - registered}
@@ -373,14 +391,14 @@ def _blurred(decisions: Sequence[FrameDecision]) -> list[FrameDecision]:
 
 
 def _decided(
-    plan: ImagingPlan, view: GyroView, capture: Capture, parallaxes: Mapping[str, Parallax], progress: Progress
+    plan: ImagingPlan, view: GyroView, frames: FullFrames, parallaxes: Mapping[str, Parallax], progress: Progress
 ) -> ImagingPlan:
     decisions = _decisions(view, parallaxes)
     chosen = _blurred(decisions)
     if not chosen:
         known = [d.blur_px for d in decisions if d.blur_px is not None]
         return replace(plan, deblur_note=Fact("blur-predicted-nowhere", most_px=max(known) if known else None))
-    verdict = judge_frames(view, capture, chosen, parallaxes, progress)
+    verdict = judge_frames(view, frames, chosen, parallaxes, progress)
     used = {name: parallaxes[name] for name in sorted(_select_blurred(decisions)) if name in parallaxes}
     note = Fact(
         "frames-blurred",

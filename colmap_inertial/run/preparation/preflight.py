@@ -14,7 +14,7 @@ from colmap_inertial.core.errors import FormatError, InertialError, NotObservabl
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.progress import Progress, report_each
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, Frame, FrameTiming, ImuRecording
+from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, FrameTiming, ImuRecording
 from colmap_inertial.diagnose import Diagnosis, FramesInVideo, Recorded, diagnose
 from colmap_inertial.imaging.detail import is_blank
 from colmap_inertial.io.capture import Capture
@@ -26,14 +26,14 @@ from colmap_inertial.io.recording import Recording
 from colmap_inertial.io.video import decode_grey, video_stamps_ns
 from colmap_inertial.io.video_match import match_to_video
 from colmap_inertial.model import colmap_camera
-from colmap_inertial.motion.flow import VisualRotation
+from colmap_inertial.motion.flow import GreyFrame, VisualRotation
 from colmap_inertial.motion.two_view_rotation import measure_two_view_rotations
+from colmap_inertial.run.preparation.frame_reading import COMPARED, FOLLOWED, GLANCED_AT, GreyFrames
 from colmap_inertial.run.preparation.sampling import (
-    guess_camera,
     measure_sampled_rotation,
+    names_at,
     sample_beginning,
     show_frames,
-    some_frames,
 )
 from colmap_inertial.run.steps.session import Session
 
@@ -131,10 +131,11 @@ class TolerantReader:
             return None
 
 
-def measure_recording(inputs: CheckInputs, progress: Progress) -> Recorded:
+def measure_recording(inputs: CheckInputs, progress: Progress, frames: GreyFrames | None = None) -> Recorded:
     """Measure what the checks look at: ``diagnose``, ``scale``, and each reconstruction before its work.
 
-    Images that cannot be read are among what was refused; the rest is measured all the same.
+    Images that cannot be read are among what was refused; the rest is measured all the same. ``frames``: the images,
+    where others are going to look at them, too.
     """
     reader = TolerantReader(inputs.refused)
     capture, timing, poses = inputs.capture, inputs.timing, inputs.trajectory
@@ -142,13 +143,11 @@ def measure_recording(inputs: CheckInputs, progress: Progress) -> Recorded:
     rotation = in_video = None
     looked: dict[str, bool] = {}
 
-    def look(frame: Frame) -> None:
-        looked[frame.name] = is_blank(frame.image)
-
     if poses is None and capture is not None and timing is not None:
         # turns in pictures that the camera stabilised are not the camera's
         if log_ is None or not log_.stabilised:
-            rotation = reader.attempt(lambda: measure_images(capture, timing, progress, look))
+            seen = frames or GreyFrames(capture, timing)
+            rotation = reader.attempt(lambda: measure_images(seen, progress, looked))
         in_video = reader.attempt(lambda: find_in_video(capture, timing, progress))
     return Recorded(
         refused=tuple(reader.refused),
@@ -175,11 +174,13 @@ def run_preflight(
     findings: Callable[[Diagnosis], None],
     *,
     force: bool,
+    frames: GreyFrames | None = None,
     model: CameraTrajectory | Literal["untimed"] | None = None,
 ) -> tuple[Fact, ...]:
     """The checks, written down and told to ``findings``; the doubts of a run that goes on, also of a forced one.
 
-    Of a ``model``, its poses are checked in place of the images.
+    ``frames``: the images, where others are going to look at them, too. Of a ``model``, its poses are checked in place
+    of the images.
 
     Raises
     ------
@@ -199,7 +200,7 @@ def run_preflight(
     record = session.workspace.stamps / "checked.json"
 
     def work(partial: Sequence[Path]) -> None:
-        recorded = measure_recording(inputs, session.progress)
+        recorded = measure_recording(inputs, session.progress, frames)
         diagnosis = diagnose(recorded)
         if recorded.refused:
             write_json(session.workspace.diagnosis, diagnosis.as_json())
@@ -238,28 +239,34 @@ def stop_or_doubt(diagnosis: Diagnosis, *, force: bool) -> tuple[Fact, ...]:
     return (*(Fact("forced-to-go-on", finding=finding.fact) for finding in stopping), *doubts)
 
 
-def measure_images(
-    capture: Capture, timing: FrameTiming, progress: Progress, look: Callable[[Frame], None] | None = None
-) -> VisualRotation | None:
+def measure_images(frames: GreyFrames, progress: Progress, looked: dict[str, bool]) -> VisualRotation | None:
     """The rotation between images: those of a video are followed, those further apart compared; ``None`` for few.
 
-    Each is shown to ``look``.
+    ``looked`` takes the names of those that were looked at, and whether they are blank.
     """
-    if len(timing.t_s) > 1 and float(np.median(np.diff(timing.t_s))) <= _EFFORT.video_step_s:
+    timing = frames.timing
+    is_video = len(timing.t_s) > 1 and float(np.median(np.diff(timing.t_s))) <= _EFFORT.video_step_s
+
+    def look(frame: GreyFrame) -> None:
+        [small] = frames.look(GLANCED_AT, [frame.name])
+        looked[frame.name] = is_blank(small.grey)
+
+    if is_video:
         indices = sample_beginning(timing, _EFFORT.frame_spacing_s, _EFFORT.frames)
-        return measure_sampled_rotation(
-            capture, timing, guess_camera(capture, timing), indices, progress, stage="check", look=look
-        )
-    if len(timing.t_s) < 5:
+    elif len(timing.t_s) < 5:
         return None
-    first = max(0, (len(timing.t_s) - _EFFORT.compared) // 2)
-    few = range(first, min(first + _EFFORT.compared, len(timing.t_s)))
-    frames = report_each(some_frames(capture, timing, few), len(few), "check", progress)
-    if look is not None:
-        frames = show_frames(frames, look)
-    camera = colmap_camera(guess_camera(capture, timing))
+    else:
+        first = max(0, (len(timing.t_s) - _EFFORT.compared) // 2)
+        indices = list(range(first, min(first + _EFFORT.compared, len(timing.t_s))))
+    names = names_at(timing, indices)
+    frames.expect(GLANCED_AT, names)
+    frames.expect(FOLLOWED if is_video else COMPARED, names)
+    camera = frames.guess_camera()
+    if is_video:
+        return measure_sampled_rotation(frames, camera, indices, progress, stage="check", look=look)
+    compared = report_each(frames.look(COMPARED, names), len(names), "check", progress)
     with one_blas_thread():
-        return measure_two_view_rotations(frames, camera, timing)
+        return measure_two_view_rotations(show_frames(compared, look), colmap_camera(camera), timing)
 
 
 def find_in_video(capture: Capture, timing: FrameTiming, progress: Progress) -> FramesInVideo | None:

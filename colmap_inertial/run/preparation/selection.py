@@ -30,16 +30,12 @@ from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.disk import remove
 from colmap_inertial.io.files import a_record_of_ours, read_json, structured, without_sentences, write_json
 from colmap_inertial.io.frame_sources import Video
-from colmap_inertial.io.frames import read_reduced
 from colmap_inertial.io.recording import Recording
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.motion.align import AlignOptions, align_clocks
 from colmap_inertial.motion.flow import check_motion
-from colmap_inertial.run.preparation.sampling import (
-    guess_camera,
-    measure_sampled_rotation,
-    sample_beginning,
-)
+from colmap_inertial.run.preparation.frame_reading import FOLLOWED, RANKED, GreyFrames
+from colmap_inertial.run.preparation.sampling import measure_sampled_rotation, names_at, sample_beginning
 from colmap_inertial.run.steps.session import Session
 
 log = logging.getLogger(__name__)
@@ -51,8 +47,6 @@ class SelectionLimits:
 
     #: Of several frames within so much time, the least blurred one is looked at.
     slot_s: float = 1 / 30
-    #: Longer side in which pictures are looked at.
-    looked_px: int = 960
     #: Frames that are followed to find the offset between the clocks: how many, how far apart.
     followed_frames: int = 300
     followed_spacing_s: float = 0.06
@@ -180,7 +174,19 @@ def read_selection(path: Path) -> Selection:
         return Selection(**values, names=names, note=note, windows=windows)
 
 
-def run_selection(session: Session, recording: Recording, options: FrameOptions) -> Selection:
+def expect_selection(frames: GreyFrames, options: FrameOptions, capture: Capture) -> None:
+    """Have frames kept that pass before they are ranked."""
+    if use_all(capture, options) is None:
+        frames.expect(FOLLOWED, names_at(frames.timing, _list_followed(frames.timing)))
+        frames.expect(RANKED, frames.timing.names)
+
+
+def _list_followed(timing: FrameTiming) -> list[int]:
+    """Indices of the frames that are followed to find the offset between the clocks."""
+    return sample_beginning(timing, _LIMITS.followed_spacing_s, _LIMITS.followed_frames)
+
+
+def run_selection(session: Session, recording: Recording, options: FrameOptions, frames: GreyFrames) -> Selection:
     """The frames to use, by :func:`select_frames` or all of them."""
     selection_file = session.workspace.selection
     why_all = use_all(recording.capture, options)
@@ -189,7 +195,7 @@ def run_selection(session: Session, recording: Recording, options: FrameOptions)
         return everything(recording.timing, why_all)
 
     def work(partial: Sequence[Path]) -> None:
-        write_selection(partial[0], select_frames(recording, options, session.progress))
+        write_selection(partial[0], select_frames(recording, options, frames, session.progress))
 
     session.runner.run("selection", {**recording.identity(), "frames": options}, [selection_file], work)
     selection = read_selection(selection_file)
@@ -221,7 +227,7 @@ class _Clocks:
         return np.asarray(np.hypot(sigma_s, self.rate_sigma * (t_s - self.middle_s)) <= _LIMITS.offset_s)
 
 
-def select_frames(recording: Recording, options: FrameOptions, progress: Progress) -> Selection:
+def select_frames(recording: Recording, options: FrameOptions, frames: GreyFrames, progress: Progress) -> Selection:
     """Choose the frames to use: about ``min_fps`` to ``max_fps`` a second, each the least blurred of its window.
 
     Parameters
@@ -230,6 +236,8 @@ def select_frames(recording: Recording, options: FrameOptions, progress: Progres
         With the timing of all its frames.
     options
         How many.
+    frames
+        The images.
     progress
         Called with ``"clocks"`` and ``"selection"``.
 
@@ -238,9 +246,9 @@ def select_frames(recording: Recording, options: FrameOptions, progress: Progres
     FormatError
         For a frame that cannot be decoded.
     """
-    capture, timing = recording.capture, recording.timing
+    timing = recording.timing
     with one_blas_thread():
-        clocks = _clocks(recording, progress)
+        clocks = _clocks(recording, frames, progress)
         blur, ranking = _predicted(clocks, timing)
         looked = _slots(timing.t_s, blur)
         pose_t_s = timing.pose_t_s()[looked]
@@ -257,9 +265,9 @@ def select_frames(recording: Recording, options: FrameOptions, progress: Progres
             start_from_cam=turning,
         )
         names = [timing.names[i] for i in looked]
-        pictures = report_each(read_reduced(capture, names, _LIMITS.looked_px), len(names), "selection", progress)
+        images = report_each(frames.look(RANKED, names), len(names), "selection", progress)
         chosen = choose_frames(
-            (picture for _, picture in pictures),
+            (image.grey for image in images),
             ranked,
             WindowLimits(shortest_s=1 / options.max_fps, longest_s=1 / options.min_fps),
             colmap_camera(clocks.camera),
@@ -318,9 +326,9 @@ def _predicted(clocks: _Clocks, timing: FrameTiming) -> tuple[Array, Ranking]:
     return np.where(known, loss, np.nan), "speed"
 
 
-def _clocks(recording: Recording, progress: Progress) -> _Clocks:
+def _clocks(recording: Recording, frames: GreyFrames, progress: Progress) -> _Clocks:
     capture, imu, timing, prior = recording.capture, recording.imu, recording.timing, recording.prior
-    camera = guess_camera(capture, timing)
+    camera = frames.guess_camera()
     rotation_rad = prior.rotation_sigma_rad
     offset_sigma_s = prior.clock_sigma_s
     known = _Clocks(
@@ -340,8 +348,7 @@ def _clocks(recording: Recording, progress: Progress) -> _Clocks:
         offset_sigma_s = _LIMITS.offset_s
         known = replace(known, oriented=False, note=Fact("one-clock"), offset_sigma_s=offset_sigma_s)
     try:
-        indices = sample_beginning(timing, _LIMITS.followed_spacing_s, _LIMITS.followed_frames)
-        rotation = measure_sampled_rotation(capture, timing, camera, indices, progress, stage="clocks")
+        rotation = measure_sampled_rotation(frames, camera, _list_followed(timing), progress, stage="clocks")
         options = AlignOptions(max_offset_s=recording.max_offset_s)
         aligned = align_clocks(rotation.trajectory(), imu, prior=prior, options=options)
         calibration, on_rate, rate_sigma = aligned.calibration, imu, 0.0

@@ -28,7 +28,8 @@ from colmap_inertial.inertial.scale import estimate_scale
 from colmap_inertial.io.recording import Recording
 from colmap_inertial.model import colmap_camera, trajectory_from_model
 from colmap_inertial.motion.lateral_flow import follow_pairs
-from colmap_inertial.run.preparation.sampling import some_frames
+from colmap_inertial.run.preparation.frame_reading import FOLLOWED, GreyFrames
+from colmap_inertial.run.preparation.sampling import names_at
 from colmap_inertial.run.stages.imaging_plan import GyroView
 from colmap_inertial.run.stages.metric import calibration_of_rectified, smooth_path
 
@@ -71,6 +72,7 @@ def most_by_sliding_px(timing: FrameTiming, camera: CameraModel) -> float:
 
 def translating_segments(
     recording: Recording,
+    frames: GreyFrames,
     camera: CameraModel,
     parts: Sequence[Sequence[str]],
     limit_px: float,
@@ -82,7 +84,9 @@ def translating_segments(
     Parameters
     ----------
     recording
-        Pixels are followed to the next frame of the video, where frames were chosen from one.
+        With the frames to use.
+    frames
+        All images: pixels are followed to the next frame of the video, where frames were chosen from one.
     camera
         Intrinsics; a guess serves without a gyroscope.
     parts
@@ -94,7 +98,7 @@ def translating_segments(
     motion
         Takes the camera's turning out; without it, all that moves counts.
     """
-    timing, every = recording.timing, recording.every
+    timing, every = recording.timing, frames.timing
     if timing.exposure_s is None or most_by_sliding_px(timing, camera) < limit_px:
         return [False] * len(parts)
     exposure_s = dict(zip(timing.names, timing.exposure_s.tolist(), strict=True))
@@ -115,12 +119,12 @@ def translating_segments(
     if not firsts:
         return [False] * len(parts)
     indices = sorted({place[name] + k for name in firsts for k in (0, 1)})
-    frames = report_each(some_frames(recording.capture, every, indices), len(indices), "motion", progress)
+    seen = report_each(frames.look(FOLLOWED, names_at(every, indices)), len(indices), "motion", progress)
     projector = colmap_camera(camera)
     with one_blas_thread():
         blur_px = {
             pair.name: exposure_s[pair.name] * pair.speed_px_s(projector, motion)
-            for pair in follow_pairs(frames, every, firsts)
+            for pair in follow_pairs(seen, every, firsts)
         }
     return [sum(blur_px.get(name, 0.0) >= limit_px for name in names) >= _LIMITS.blurred_pairs for names in chosen]
 

@@ -8,6 +8,7 @@ import sqlite3
 from dataclasses import replace
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -20,10 +21,12 @@ from colmap_inertial.core.types import FrameTiming
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.gate import GATE_LIMITS, RecordingVerdict
 from colmap_inertial.io.fingerprints import fingerprint
+from colmap_inertial.io.frame_sources import ImageFolder
 from colmap_inertial.run.commands import frames as framing, reporting, validate as validation
 from colmap_inertial.run.commands.scale_by_reference import _find_place
 from colmap_inertial.run.commands.validate import ValidationOutputs, validate_source
 from colmap_inertial.run.preparation import judge as judging, sampling
+from colmap_inertial.run.preparation.frame_reading import GreyFrames
 from colmap_inertial.run.preparation.plan import Treatments, plan_imaging
 from colmap_inertial.run.stages.join import _beside, _spans
 from colmap_inertial.run.stages.readout import ReadoutStage
@@ -109,7 +112,7 @@ def test_rectifying_by_name_needs_a_readout():
         capture=SimpleNamespace(path="capture"), timing=FrameTiming(names=("a",), t_s=np.zeros(1))
     )
     with pytest.raises(InertialError, match="needs readout_s"):
-        plan_imaging(recording, None, Treatments(rolling_shutter="rectify"))
+        plan_imaging(recording, None, None, None, Treatments(rolling_shutter="rectify"))
 
 
 def test_a_model_is_scaled_by_its_control_distances_with_their_standard_deviation(tmp_path, monkeypatch):
@@ -210,7 +213,7 @@ def test_a_worker_s_database_is_looked_through(tmp_path):
 
 
 def test_a_report_knows_rates_times_and_how_far_keypoints_moved(tmp_path, monkeypatch):
-    monkeypatch.setattr(reporting, "guess_camera", lambda *_: SimpleNamespace(width=640, height=480))
+    monkeypatch.setattr(GreyFrames, "guess_camera", lambda _: SimpleNamespace(width=640, height=480))
     names = ("a", "b", "c", "d")
     timing = FrameTiming(names=names, t_s=np.array([5.0, 5.5, 6.25, 7.0]), exposure_s=np.full(4, 0.004), readout_s=0.02)
     gyro_s, accel_s = 4 + np.arange(1000) / 200, 4 + np.arange(500) / 100
@@ -290,15 +293,16 @@ def test_a_cluster_without_a_gpu_is_warned_of(subtests, caplog):
                 assert ("depth maps wait for one" in caplog.text) == warned
 
 
-def test_a_camera_that_nobody_states_is_guessed_as_colmap_does(monkeypatch):
+def test_a_camera_that_nobody_states_is_guessed_as_colmap_does(tmp_path):
     """A focal length of 1.2 times the longer side, and the middle of the picture."""
-    picture = SimpleNamespace(image=np.zeros((480, 640, 3), np.uint8))
-    monkeypatch.setattr(sampling, "some_frames", lambda *_: iter([picture]))
-    guessed = sampling.guess_camera(SimpleNamespace(camera=None), None)
+    assert cv2.imwrite(str(tmp_path / "0.png"), np.zeros((480, 640, 3), np.uint8))
+    capture = SimpleNamespace(camera=None, frames=ImageFolder(folder=tmp_path))
+    timing = FrameTiming(names=("0.png",), t_s=np.zeros(1))
+    guessed = GreyFrames(capture, timing).guess_camera()
     assert (guessed.model, guessed.width, guessed.height) == ("SIMPLE_PINHOLE", 640, 480)
     assert guessed.params == pytest.approx((768, 320, 240))
     known = object()
-    assert sampling.guess_camera(SimpleNamespace(camera=known), None) is known
+    assert GreyFrames(SimpleNamespace(camera=known), timing).guess_camera() is known
 
 
 def test_samples_of_a_recording_are_as_far_apart_as_asked_from_where_they_are_to_begin():

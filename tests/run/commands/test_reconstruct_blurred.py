@@ -36,6 +36,7 @@ from colmap_inertial.run.stages.imaging_plan import read_plan, write_plan
 from colmap_inertial.tools.simulate import MotionOptions, make_motion
 from tests.helpers.corner_scene import CALIBRATED, LENS, CornerScene
 from tests.helpers.desk_scene import contents
+from tests.helpers.frame_readers import readers
 
 QUICK = ReconstructOptions(mapping=MappingOptions(max_num_features=700, first_octave=0), deterministic=True)
 OFF = replace(QUICK, deblur="off", rolling_shutter="off")
@@ -281,7 +282,7 @@ def parts(capture):
 
 
 def planned(recording, scratch, **asked):
-    return plan_imaging(recording, RunContext(scratch=scratch), Treatments(**asked))
+    return plan_imaging(recording, *readers(recording, scratch), RunContext(scratch=scratch), Treatments(**asked))
 
 
 @pytest.fixture(scope="module")

@@ -47,6 +47,7 @@ from colmap_inertial.tools.simulate.capture import make_scene
 from colmap_inertial.tools.simulate.recipe import SceneRecipe
 from colmap_inertial.tools.simulate.sensors import IMU_PRESETS
 from tests.helpers.box_video import BoxVideo, film
+from tests.helpers.frame_readers import readers
 
 
 def silent(*_: object) -> None:
@@ -62,7 +63,7 @@ def selected(video: BoxVideo, **options: float) -> Selection:
 
 def chosen(capture, imu, timing, **options: float) -> Selection:
     recording = Recording.of(capture, imu, timing, capture.calibration)
-    return select_frames(recording, FrameOptions(use="auto", **options), silent)
+    return select_frames(recording, FrameOptions(use="auto", **options), readers(recording)[0], silent)
 
 
 def places(selection: Selection) -> np.ndarray:
@@ -84,10 +85,10 @@ def _followed_once():
     """Pixels of a video that are asked for again are not followed again: the answer is the same, and takes seconds."""
     follow = choosing.measure_sampled_rotation
 
-    def known(capture, timing, camera, indices, progress, *, stage="motion"):
-        key = (capture.path, camera.params, timing.pose_t_s().tobytes(), tuple(indices))
+    def known(frames, camera, indices, progress, *, stage="motion"):
+        key = (frames, camera.params, frames.timing.pose_t_s().tobytes(), tuple(indices))
         if key not in _followed:
-            _followed[key] = follow(capture, timing, camera, indices, progress, stage=stage)
+            _followed[key] = follow(frames, camera, indices, progress, stage=stage)
         return _followed[key]
 
     with pytest.MonkeyPatch.context() as patch:
@@ -249,7 +250,7 @@ def of_a_long_recording(
     )
     monkeypatch.setattr(choosing, "measure_sampled_rotation", lambda *_, **__: rotation)
     stretching = Recording.of(replace(capture, camera=_PINHOLE), imu, timing, calibration_prior())
-    clocks = choosing._clocks(replace(stretching, max_offset_s=None), silent)
+    clocks = choosing._clocks(replace(stretching, max_offset_s=None), readers(stretching)[0], silent)
     predicted, kind = choosing._predicted(clocks, timing)
     assert kind == "blur"
     exact = GyroCamera(
@@ -350,7 +351,7 @@ def test_a_finished_selection_is_kept_and_another_option_makes_a_new_one(turning
         context = RunContext(scratch=workspace.stamps, progress=progress)
         session = Session(workspace=workspace, runner=StepRunner(workspace), context=context)
         recording = Recording.of(capture, imu, timing, capture.calibration)
-        return run_selection(session, recording, options.frames)
+        return run_selection(session, recording, options.frames, readers(recording)[0])
 
     first = run(ReconstructOptions())
     assert run(ReconstructOptions()).names == first.names and len(runs) == 1

@@ -17,12 +17,14 @@ from colmap_inertial.io.frames import read_frames
 from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.io.recording import Recording, prior_calibration
 from colmap_inertial.model import colmap_camera
+from colmap_inertial.motion.flow import reduce_frames
 from colmap_inertial.motion.lateral_flow import FollowedPair, follow_pairs
 from colmap_inertial.run.commands.images_alone import deblur_capture
 from colmap_inertial.run.preparation import plan as imaging, translation as looked_at
 from colmap_inertial.run.preparation.plan import Treatments, plan_imaging
 from colmap_inertial.tools.simulate.motion import MARGIN_S, Motion
 from tests.helpers.corner_scene import CALIBRATED, LENS, PLANES, CornerScene
+from tests.helpers.frame_readers import readers
 from tests.imaging.test_psf_pictures import PINHOLE, turning
 
 FRAMES, EXPOSURE_S = 18, 0.025
@@ -52,7 +54,7 @@ def planned(folder, scratch):
     recording = Recording.of(
         capture, read_capture_imu(capture), read_frames(capture)[0], prior_calibration(capture, None)
     )
-    return plan_imaging(recording, RunContext(scratch=scratch), Treatments())
+    return plan_imaging(recording, *readers(recording, scratch), RunContext(scratch=scratch), Treatments())
 
 
 def psnr_db(folder, sharp):
@@ -131,10 +133,10 @@ def test_points_are_followed_from_the_frames_that_are_named_to_the_ones_after_th
         names=tuple(frame.name for frame in capture), t_s=np.array([frame.t_s for frame in capture]),
         exposure_s=np.full(4, 0.004), readout_s=0.0,
     )  # fmt: skip
-    found = list(follow_pairs(capture, timing, {"0000.jpg", "0002.jpg"}))
+    found = list(follow_pairs(reduce_frames(capture), timing, {"0000.jpg", "0002.jpg"}))
     assert [pair.name for pair in found] == ["0000.jpg", "0002.jpg"]
     for i, pair in zip((0, 2), found, strict=True):
         true = np.linalg.norm(scene.centres()[i + 1] - scene.centres()[i]) * LENS.params[0] / AWAY_M * 3.2
         assert pair.speed_px_s(colmap_camera(LENS)) == pytest.approx(true, rel=0.15)
     # what lies between them was not decoded: nothing to follow
-    assert not list(follow_pairs([capture[0], capture[2]], timing, {"0000.jpg"}))
+    assert not list(follow_pairs(reduce_frames([capture[0], capture[2]]), timing, {"0000.jpg"}))

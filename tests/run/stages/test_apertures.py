@@ -18,7 +18,7 @@ from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.capture_images import SubImages
 from colmap_inertial.io.frames import read_frames
 from colmap_inertial.io.rig_calibration import read_rig_calibration
-from colmap_inertial.run.commands.images_alone import fuse_captured
+from colmap_inertial.run.commands.images_alone import fuse_aperture_capture
 from colmap_inertial.run.commands.reconstruct import reconstruct
 from colmap_inertial.run.stages.apertures import ApertureStage
 from colmap_inertial.tools.simulate import MotionOptions, SceneRecipe, ShutterCamera
@@ -377,7 +377,7 @@ def test_exposures_are_fused_to_pictures_of_the_reference_s_names(tmp_path):
     out = tmp_path / "out"
     options = FuseAperturesOptions(fusion=replace(SMALL, depth=True), refocus=1.0)
     steps = []
-    written = fuse_captured(tmp_path / "capture", out, options, progress=lambda *step: steps.append(step))
+    written = fuse_aperture_capture(tmp_path / "capture", out, options, progress=lambda *step: steps.append(step))
     assert [p.name for p in written] == ["shot0_0.png", "shot1_0.png"]
     assert steps[-1] == ("fusing", 2, 2)
     picture = cv2.imread(str(written[0]))
@@ -389,17 +389,17 @@ def test_exposures_are_fused_to_pictures_of_the_reference_s_names(tmp_path):
     assert (out / "refocused" / "shot1_0.png").is_file()
     # started again there is nothing to do; without depths, those are taken away where that is asked for
     before = written[0].stat().st_mtime_ns
-    assert fuse_captured(tmp_path / "capture", out, options) == written
+    assert fuse_aperture_capture(tmp_path / "capture", out, options) == written
     assert written[0].stat().st_mtime_ns == before
     with pytest.raises(OutputExistsError, match=r"fusion.depth = False \(was True\)"):
-        fuse_captured(tmp_path / "capture", out, replace(options, fusion=SMALL))
+        fuse_aperture_capture(tmp_path / "capture", out, replace(options, fusion=SMALL))
     assert (out / "depth").is_dir()
-    fuse_captured(tmp_path / "capture", out, replace(options, fusion=SMALL), overwrite=True)
+    fuse_aperture_capture(tmp_path / "capture", out, replace(options, fusion=SMALL), overwrite=True)
     assert not (out / "depth").exists() and (out / "refocused").is_dir()
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.tex").write_text("years of work")
     with pytest.raises(OutputExistsError):
-        fuse_captured(tmp_path / "capture", tmp_path / "other", options)
+        fuse_aperture_capture(tmp_path / "capture", tmp_path / "other", options)
 
 
 def test_a_stopped_fusion_is_gone_on_with(tmp_path):
@@ -410,10 +410,10 @@ def test_a_stopped_fusion_is_gone_on_with(tmp_path):
 
     options = FuseAperturesOptions(fusion=replace(SMALL, depth=True))
     with pytest.raises(KeyboardInterrupt):
-        fuse_captured(tmp_path / "capture", tmp_path / "out", options, progress=stop)
+        fuse_aperture_capture(tmp_path / "capture", tmp_path / "out", options, progress=stop)
     assert not (tmp_path / "out" / "images").exists()
-    fuse_captured(tmp_path / "capture", tmp_path / "out", options)
-    fuse_captured(tmp_path / "capture", tmp_path / "whole", options)
+    fuse_aperture_capture(tmp_path / "capture", tmp_path / "out", options)
+    fuse_aperture_capture(tmp_path / "capture", tmp_path / "whole", options)
     for kind in ("images", "depth", "disparity"):
         one, two = ({p.name: p.read_bytes() for p in (tmp_path / o / kind).iterdir()} for o in ("out", "whole"))
         assert one == two and len(one) == 2
@@ -426,20 +426,20 @@ def test_sub_images_of_another_size_or_depth_are_named(tmp_path):
     whole = cv2.imread(str(small), cv2.IMREAD_UNCHANGED)
     cv2.imwrite(str(small), whole[:100])
     with pytest.raises(FormatError, match=r"shot0_2.png: is 160x100, but blue is calibrated for 160x120"):
-        fuse_captured(tmp_path, tmp_path / "a", progress=lambda *_: None)
+        fuse_aperture_capture(tmp_path, tmp_path / "a", progress=lambda *_: None)
     cv2.imwrite(str(small), whole.astype(np.uint16))
     with pytest.raises(FormatError, match="write all with the same depth"):
-        fuse_captured(tmp_path, tmp_path / "b", progress=lambda *_: None)
+        fuse_aperture_capture(tmp_path, tmp_path / "b", progress=lambda *_: None)
     small.unlink()
     with pytest.raises(FormatError, match=r"shot0_2.png: no such file"):
-        fuse_captured(tmp_path, tmp_path / "c", progress=lambda *_: None)
+        fuse_aperture_capture(tmp_path, tmp_path / "c", progress=lambda *_: None)
 
 
 def test_a_rig_without_a_colour_is_said_before_the_work(tmp_path):
     write_plane_capture(tmp_path, exposures=1)
     changed(tmp_path, 'role = "blue"', 'role = "other"')
     with pytest.raises(InertialError, match=r"blue is missing among green \(green\), red \(red\), blue \(other\)"):
-        fuse_captured(tmp_path, tmp_path / "out", progress=lambda *_: None)
+        fuse_aperture_capture(tmp_path, tmp_path / "out", progress=lambda *_: None)
 
 
 def test_a_simulated_capture_goes_through_the_stage(tmp_path):
@@ -487,7 +487,7 @@ def test_reconstruct_fuses_before_it_looks_for_features_and_again_where_a_sub_im
     out, alone = tmp_path / "out", tmp_path / "alone"
     with pytest.raises(KeyboardInterrupt):
         reconstruct(toml, out, options, progress=stop)
-    fuse_captured(toml, alone, FuseAperturesOptions(fusion=options.apertures), progress=lambda *_: None)
+    fuse_aperture_capture(toml, alone, FuseAperturesOptions(fusion=options.apertures), progress=lambda *_: None)
     names = sorted(path.name for path in (alone / "images").iterdir())
     assert len(names) == 6 and {f"{name}.npy" for name in names} == {
         p.name for p in (out / "apertures/depth").iterdir()

@@ -29,7 +29,7 @@ from colmap_inertial.imaging.restoration import shipped
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frames import read_frame_timing, read_frames
 from colmap_inertial.run.commands import images_alone, reconstruct as driver
-from colmap_inertial.run.commands.images_alone import deblur_capture, fuse_exposures_captured
+from colmap_inertial.run.commands.images_alone import deblur_capture, fuse_exposure_capture
 from colmap_inertial.run.commands.reconstruct import reconstruct
 from colmap_inertial.run.preparation import plan
 from colmap_inertial.run.stages import frame_folder
@@ -153,7 +153,7 @@ def test_partners_have_the_same_stem_or_are_renamed(tmp_path):
     assert loaded.exposures.timing(read_frame_timing(loaded)) is not None
     changed(tmp_path / "b", ("*_s.png", "*.png"))
     with pytest.raises(FormatError, match=r"let pattern under .images. match the short ones only"):
-        fuse_exposures_captured(tmp_path / "b", tmp_path / "out", fuser=AVERAGE, progress=silent)
+        fuse_exposure_capture(tmp_path / "b", tmp_path / "out", fuser=AVERAGE, progress=silent)
 
 
 def test_what_is_wrong_with_the_exposures_is_said(subtests, two_pairs, tmp_path):
@@ -226,7 +226,7 @@ def test_exif_states_exposure_and_sensitivity(capture, tmp_path):
 def test_pairs_become_pictures_of_the_short_ones_names(written, tmp_path):
     folder, scenes = written
     steps = []
-    pairs = fuse_exposures_captured(folder, tmp_path / "out", fuser=AVERAGE, progress=lambda *step: steps.append(step))
+    pairs = fuse_exposure_capture(folder, tmp_path / "out", fuser=AVERAGE, progress=lambda *step: steps.append(step))
     assert steps[-1] == ("fusing", 3, 3)
     assert [pair.name for pair in pairs] == ["000.png", "001.png", "002.png"] and all(pair.fused for pair in pairs)
     for pair, scene in zip(pairs, scenes, strict=True):
@@ -244,21 +244,21 @@ def test_pairs_become_pictures_of_the_short_ones_names(written, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("years of work")
     with pytest.raises(OutputExistsError):
-        fuse_exposures_captured(folder, tmp_path / "mine", fuser=AVERAGE, progress=silent)
+        fuse_exposure_capture(folder, tmp_path / "mine", fuser=AVERAGE, progress=silent)
 
 
 def test_pictures_alone_are_enough(capture, tmp_path):
     text = (capture / "capture.toml").read_text()
     alone = '[images]\nfolder = "short"\n[exposures]\nfolder = "long"\n'
     (capture / "capture.toml").write_text(alone)
-    pairs = fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
+    pairs = fuse_exposure_capture(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
     assert all(pair.fused and pair.by_pixels and not pair.by_gyro and pair.blur_px is None for pair in pairs)
     assert pairs[0].gain == pytest.approx(GAIN, rel=0.05) and pairs[0].gain_stated is None
     note = json.loads((tmp_path / "out" / "result.json").read_text())["note"]
     assert "by the pixels alone: the frames have no times" in note
     # times without those of the long ones
     (capture / "capture.toml").write_text(text.replace('times = "long.csv"\n', ""))
-    fuse_exposures_captured(capture, tmp_path / "timed", fuser=AVERAGE, progress=silent)
+    fuse_exposure_capture(capture, tmp_path / "timed", fuser=AVERAGE, progress=silent)
     note = json.loads((tmp_path / "timed" / "result.json").read_text())["note"]
     assert "start or length of the long exposures is unknown" in note
 
@@ -266,7 +266,7 @@ def test_pictures_alone_are_enough(capture, tmp_path):
 def test_exposure_times_tell_the_gain_without_a_gyroscope_too(capture, tmp_path):
     text = (capture / "capture.toml").read_text()
     (capture / "capture.toml").write_text(text.replace('[imu]\npath = "imu.csv"\n', ""))
-    pairs = fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
+    pairs = fuse_exposure_capture(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
     assert not pairs[0].by_gyro and pairs[0].gain_stated == pytest.approx(GAIN)
 
 
@@ -275,7 +275,7 @@ def test_pictures_of_another_size_than_the_camera_s_are_named(capture, tmp_path)
         path = capture / folder / "001.png"
         cv2.imwrite(str(path), cv2.imread(str(path))[:100])
     with pytest.raises(FormatError, match=r"short/001.png: is 240x100, but the camera is 240x160"):
-        fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
+        fuse_exposure_capture(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
 
 
 def test_colmap_is_quiet_while_it_looks_for_the_calibration(capture, tmp_path, monkeypatch):
@@ -290,7 +290,7 @@ def test_colmap_is_quiet_while_it_looks_for_the_calibration(capture, tmp_path, m
     monkeypatch.setattr(plan, "estimate_preliminary_calibration", look)
     pycolmap.logging.minloglevel = 0
     try:
-        fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
+        fuse_exposure_capture(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
     finally:
         pycolmap.logging.minloglevel = before
     assert levels == [pycolmap.logging.Level.FATAL.value]
@@ -298,7 +298,7 @@ def test_colmap_is_quiet_while_it_looks_for_the_calibration(capture, tmp_path, m
 
 def test_a_stated_gain_that_the_pixels_deny_is_said(capture, tmp_path):
     changed(capture, ("short_iso = 1600", "short_iso = 100"))
-    pairs = fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
+    pairs = fuse_exposure_capture(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
     assert "give 192 times, which the pixels contradict" in str(pairs[0].reason)
     assert pairs[0].gain == pytest.approx(GAIN, rel=0.05)
 
@@ -308,7 +308,7 @@ def test_fusion_brings_back_what_clips(written, tmp_path):
     clipping = Fuser(fuse=lambda short, long, blur: long, identity="long")
     for fusion in ("none", "mertens"):
         options = ExposureOptions(fusion=fusion)
-        fuse_exposures_captured(folder, tmp_path / fusion, options, fuser=clipping, progress=silent)
+        fuse_exposure_capture(folder, tmp_path / fusion, options, fuser=clipping, progress=silent)
     clipped = [(read(tmp_path / fusion / "images" / "000.png") >= 250).mean() for fusion in ("none", "mertens")]
     assert clipped[1] < clipped[0]
 
@@ -317,7 +317,7 @@ def test_of_a_pair_that_shows_different_things_the_better_one_is_taken(capture, 
     rng = np.random.default_rng(0)
     other = cv2.resize(rng.uniform(20, 220, (20, 30, 3)), (240, 160), interpolation=cv2.INTER_CUBIC)
     cv2.imwrite(str(capture / "long" / "001.png"), np.clip(other, 0, 255).astype(np.uint8))
-    first, second = fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
+    first, second = fuse_exposure_capture(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
     assert first.fused and not second.fused and second.reason.values["why"].code == "pair-not-alike"
     # the short one, as bright as the long one
     assert second.used == "short" and str(second.reason).startswith("is the short exposure, ")
@@ -329,7 +329,7 @@ def test_in_place_of_a_black_short_exposure_the_long_one_is_taken(capture, tmp_p
     text = (capture / "capture.toml").read_text()
     (capture / "capture.toml").write_text("\n".join(line for line in text.splitlines() if "_iso" not in line))
     cv2.imwrite(str(capture / "short" / "000.png"), np.zeros((160, 240, 3), np.uint8))
-    first, second = fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
+    first, second = fuse_exposure_capture(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
     assert not first.fused and first.used == "long" and second.fused and second.used == "both"
     assert str(first.reason).startswith("is the long exposure as it is, not fused: too few pixels")
     images = [read(folder / "000.png") for folder in (tmp_path / "out" / "images", capture / "long")]
@@ -338,7 +338,7 @@ def test_in_place_of_a_black_short_exposure_the_long_one_is_taken(capture, tmp_p
 
 def test_damaged_and_unlike_partners_are_named(capture, tmp_path):
     def fuse(name):
-        fuse_exposures_captured(capture, tmp_path / name, fuser=AVERAGE, progress=silent)
+        fuse_exposure_capture(capture, tmp_path / name, fuser=AVERAGE, progress=silent)
 
     path = capture / "long" / "001.png"
     whole = cv2.imread(str(path))
@@ -370,34 +370,34 @@ def test_a_full_disk_is_told(capture, tmp_path, monkeypatch):
 
     monkeypatch.setattr(frame_folder, "encode_image", full)
     with pytest.raises(OutputError, match=r"is full .* free some space and start again; the run continues"):
-        fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
+        fuse_exposure_capture(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
 
 
 def test_a_stopped_run_is_gone_on_with_and_ends_as_if_undisturbed(capture, tmp_path):
-    fuse_exposures_captured(capture, tmp_path / "whole", fuser=AVERAGE, progress=silent)
+    fuse_exposure_capture(capture, tmp_path / "whole", fuser=AVERAGE, progress=silent)
 
     def stop(stage, done, total, /):
         if stage == "fusing" and done == 1:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=stop)
+        fuse_exposure_capture(capture, tmp_path / "out", fuser=AVERAGE, progress=stop)
     assert not (tmp_path / "out" / "images").exists() and not (tmp_path / "out" / "result.json").exists()
-    pairs = fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
+    pairs = fuse_exposure_capture(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
     assert contents(tmp_path / "out" / "images") == contents(tmp_path / "whole" / "images")
     before = (tmp_path / "out" / "result.json").read_bytes()
     # nothing is left to do; another fusion makes the pictures again where that is asked for
     stages = []
-    again = fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=lambda s, *_: stages.append(s))
+    again = fuse_exposure_capture(capture, tmp_path / "out", fuser=AVERAGE, progress=lambda s, *_: stages.append(s))
     assert again == pairs and stages == [] and (tmp_path / "out" / "result.json").read_bytes() == before
     options = ExposureOptions(fusion="mertens")
     with pytest.raises(OutputExistsError, match=r"fusion = mertens \(was none\)"):
-        fuse_exposures_captured(capture, tmp_path / "out", options, fuser=AVERAGE, progress=silent)
+        fuse_exposure_capture(capture, tmp_path / "out", options, fuser=AVERAGE, progress=silent)
     assert contents(tmp_path / "out" / "images") == contents(tmp_path / "whole" / "images")
-    fuse_exposures_captured(capture, tmp_path / "out", options, fuser=AVERAGE, overwrite=True, progress=silent)
+    fuse_exposure_capture(capture, tmp_path / "out", options, fuser=AVERAGE, overwrite=True, progress=silent)
     assert contents(tmp_path / "out" / "images") != contents(tmp_path / "whole" / "images")
     with Workspace(tmp_path / "out").locked(), pytest.raises(OutputExistsError, match="another run is at work"):
-        fuse_exposures_captured(capture, tmp_path / "out", options, fuser=AVERAGE, progress=silent)
+        fuse_exposure_capture(capture, tmp_path / "out", options, fuser=AVERAGE, progress=silent)
 
 
 def test_the_stage_keeps_order_and_a_bounded_number_of_frames(written):
@@ -440,7 +440,7 @@ def test_reconstruct_fuses_before_it_looks_for_features(written, tmp_path, by_av
     out, alone = tmp_path / "out", tmp_path / "alone"
     with pytest.raises(KeyboardInterrupt):
         reconstruct(folder, out, OPTIONS, progress=stop)
-    fuse_exposures_captured(folder, alone, progress=silent)
+    fuse_exposure_capture(folder, alone, progress=silent)
     assert contents(out / "colmap" / "images") == contents(alone / "images")
     decided = json.loads((out / "imaging.json").read_text())
     assert decided["deblur"] == "short and long exposures are fused, aligned by the gyroscope and the pixels"
@@ -504,9 +504,9 @@ def test_a_missing_partner_or_network_is_said_before_the_work(capture, tmp_path,
 def test_the_package_s_network_is_used_and_named(capture, tmp_path, monkeypatch):
     small.write_weights(tmp_path / "weights", lsd2=small.mixing(0.5))
     monkeypatch.setattr(shipped, "folder", lambda: tmp_path / "weights")
-    fuse_exposures_captured(capture, tmp_path / "net", ExposureOptions(device="cpu"), progress=silent)
+    fuse_exposure_capture(capture, tmp_path / "net", ExposureOptions(device="cpu"), progress=silent)
     guarded = Fuser(fuse=lambda short, *other: replace_departures(average(short, *other), short), identity="guarded")
-    fuse_exposures_captured(capture, tmp_path / "mean", fuser=guarded, progress=silent)
+    fuse_exposure_capture(capture, tmp_path / "mean", fuser=guarded, progress=silent)
     for name in ("000.png", "001.png"):
         two = [read(tmp_path / out / "images" / name).astype(int) for out in ("net", "mean")]
         assert np.abs(two[0] - two[1]).max() <= 1

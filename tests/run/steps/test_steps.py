@@ -1,7 +1,6 @@
 """What is made again and what is kept, step by step; what steps are given, and what they leave behind."""
 
 import contextlib
-import itertools
 import json
 import os
 import shutil
@@ -68,6 +67,7 @@ from colmap_inertial.run.steps.session import Session, open_session
 from colmap_inertial.run.steps.workspace import Workspace, refuse_links
 from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, simulate_recording
 from tests.helpers.desk_scene import contents
+from tests.helpers.frame_readers import readers
 from tests.run.steps.test_runner import frames_of, recording_of, session_in
 
 NAMES = tuple(f"{i}.jpg" for i in range(6))
@@ -105,7 +105,8 @@ def test_all_that_decides_a_plan_makes_it_again(subtests, tmp_path_factory):
     def made(workspace, *, asked=OFF, seed=0, **changes):
         context = RunContext(scratch=workspace.stamps, seed=seed)
         session = Session(workspace=workspace, runner=StepRunner(workspace), context=context)
-        run_plan(session, recording(**changes), asked)
+        filmed = recording(**changes)
+        run_plan(session, filmed, *readers(filmed, workspace.stamps), asked)
         return session.runner.worked
 
     for label, change in (
@@ -127,7 +128,8 @@ def test_another_network_makes_the_plan_again(workspace, monkeypatch):
     def made(checksum):
         monkeypatch.setattr(imaging, "checksum", lambda name: f"{name} {checksum}")
         session = session_in(workspace)
-        run_plan(session, recording(timing=replace(TIMING, exposure_s=None)), replace(OFF, deblur="deepgyro"))
+        filmed = recording(timing=replace(TIMING, exposure_s=None))
+        run_plan(session, filmed, *readers(filmed, workspace.stamps), replace(OFF, deblur="deepgyro"))
         return session.runner.worked
 
     assert [made("a"), made("a"), made("b")] == [["imaging"], [], ["imaging"]]
@@ -138,11 +140,9 @@ def test_a_picture_that_was_edited_makes_the_frames_again(workspace, tmp_path):
     capture = Capture(path=tmp_path, calibration=calibration_prior(), frames=ImageFolder(folder=tmp_path / "in"))
     filmed = Recording.of(capture, IMU, timing, capture.calibration)
 
-    count = itertools.count()
-
     def made():
         session = session_in(workspace)
-        run_frames(session, filmed, frames_of(tmp_path / f"filmed {next(count)}")[1], [], workspace.images)
+        run_frames(session, filmed, readers(filmed, tmp_path)[1], [], workspace.images)
         return session.runner.worked
 
     assert [made(), made()] == [["frames"], []]
@@ -448,10 +448,9 @@ def test_however_a_capture_is_spelt_its_steps_are_kept(workspace, tmp_path, monk
         capture = Capture(path=folder, calibration=calibration_prior(), frames=ImageFolder(folder=folder / "in"))
         filmed = Recording.of(capture, IMU, timing, capture.calibration)
         session = session_in(workspace)
-        run_frames(session, filmed, frames_of(tmp_path / f"filmed {next(count)}")[1], [], workspace.images)
+        run_frames(session, filmed, readers(filmed, tmp_path)[1], [], workspace.images)
         return session.runner.worked
 
-    count = itertools.count()
     assert made(tmp_path) == ["frames"]
     for folder in ("in", ".stages"):
         monkeypatch.chdir(tmp_path / folder if folder == "in" else workspace.stamps)
@@ -739,7 +738,7 @@ def test_intrinsics_are_refined_where_that_is_asked_for(features, tmp_path, monk
 
 
 def test_the_longest_exposure_tells_whether_anything_may_be_blurred(tmp_path, monkeypatch):
-    def none(recording, context):
+    def none(*_):
         raise NotObservableError("the pixels' motion", Fact.stated("looked at"))
 
     monkeypatch.setattr(imaging, "estimate_preliminary_calibration", none)
@@ -748,7 +747,11 @@ def test_the_longest_exposure_tells_whether_anything_may_be_blurred(tmp_path, mo
     def note(exposure_s):
         timing = replace(TIMING, exposure_s=exposure_s)
         filmed = Recording.of(capture, IMU, timing, capture.calibration)
-        return str(plan_imaging(filmed, RunContext(scratch=tmp_path), replace(OFF, deblur=None)).deblur_note)
+        return str(
+            plan_imaging(
+                filmed, *readers(filmed, tmp_path), RunContext(scratch=tmp_path), replace(OFF, deblur=None)
+            ).deblur_note
+        )
 
     # 3 rad/s and 60 px of focal length: 0.2 px in 1 ms, and 9 px in 50 ms
     assert "no frame has more than" in note([0.001] * 6)
@@ -756,7 +759,7 @@ def test_the_longest_exposure_tells_whether_anything_may_be_blurred(tmp_path, mo
 
 
 def test_a_quick_turn_counts_where_a_frame_may_have_been_taken(subtests, tmp_path_factory, monkeypatch):
-    def none(recording, context):
+    def none(*_):
         raise NotObservableError("the pixels' motion", Fact.stated("looked at"))
 
     monkeypatch.setattr(imaging, "estimate_preliminary_calibration", none)
@@ -783,9 +786,9 @@ def test_a_quick_turn_counts_where_a_frame_may_have_been_taken(subtests, tmp_pat
                 cov[at, at] = offset_sigma_s**2
             timing = replace(TIMING, t_s=np.arange(6.0), exposure_s=np.full(6, 0.01), readout_s=None)
             filmed = Recording.of(replace(recording().capture, camera=CAMERA), imu, timing, replace(known, cov=cov))
-            note = plan_imaging(
-                filmed, RunContext(scratch=tmp_path_factory.mktemp("given")), replace(OFF, deblur=None)
-            ).deblur_note
+            scratch = tmp_path_factory.mktemp("given")
+            context = RunContext(scratch=scratch)
+            note = plan_imaging(filmed, *readers(filmed, scratch), context, replace(OFF, deblur=None)).deblur_note
             assert (note.code == "frames-untreated") == looked_at and (note.code == "blur-nowhere") != looked_at
 
 
