@@ -543,6 +543,23 @@ def declared_focal_length(declared_px: float, found_px: float, sigma_px: float) 
     )
 
 
+@message(
+    example={
+        "declared": "PINHOLE",
+        "found": "OPENCV",
+        "distortion": [0.06, -0.11, 0.0, 0.001],
+        "shift_px": 3.2,
+    }
+)
+def declared_distortion(declared: str, found: str, distortion: Sequence[float], shift_px: float) -> str:
+    numbers = ", ".join(f"{value:.3f}" for value in distortion)
+    return (
+        f"the declared camera ({declared}) has no distortion, but the images show {shift_px:.1f} px of it: {found} "
+        f"with about {numbers}; ignored, it bends the model and changes its size: declare it, or leave out [camera] "
+        "to let COLMAP calibrate"
+    )
+
+
 @message(example={"readout_s": 0.02, "sigma_s": 0.001, "direction": "down"})
 def rolling_shutter_ignored(readout_s: float, sigma_s: float, direction: str, declared_global: bool = False) -> str:
     found = f"read out line by line in {1e3 * readout_s:.1f} +- {1e3 * sigma_s:.1f} ms ({direction})"

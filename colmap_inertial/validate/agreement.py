@@ -23,6 +23,7 @@ Likely = Literal["camera", "readout", "declared", "target", "accelerometer", ""]
 #: What is named in a scale's reasons already, and bends or scales a model, the likeliest first.
 _NAMED: tuple[tuple[str, Likely], ...] = (
     ("declared-focal-length", "camera"),
+    ("declared-distortion", "camera"),
     ("declared-readout", "readout"),
     ("rolling-shutter-ignored", "readout"),
     ("calibrated-gain-contradicted", "declared"),

@@ -52,7 +52,7 @@ from colmap_inertial.inertial.refine.setup import (
     read_seen,
 )
 from colmap_inertial.inertial.refine.solve import factor_information, solve
-from colmap_inertial.inertial.refine.values import Estimate, Problem
+from colmap_inertial.inertial.refine.values import ACCEL_DENSITY, GYRO_DENSITY, Estimate, Problem
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.model import Model
 from colmap_inertial.run.stages.imaging_plan import GyroView
@@ -170,9 +170,10 @@ def by_chance(stage: RefineStage, before: Model, after: Model, truth: np.ndarray
     """What is to be expected of a refined walk, and whether it came so."""
     seen = read_seen(before.reconstruction, before.timing)
     values = after.treatments[-1].values
-    known = stage._known(before)
-    known = replace(known, noise=replace(known.noise, accel_density_m_s2_rthz=values["accel_noise_m_s2_rthz"]))
-    problem, start = make_problem(seen, before.timing, stage.imu, known, stage._exposed_px(before, seen))
+    known = stage.known_of(before, refine_intrinsics=stage.refine_intrinsics)
+    levels = {ACCEL_DENSITY: values["accel_noise_m_s2_rthz"], GYRO_DENSITY: values["gyro_noise_rad_s_rthz"]}
+    known = replace(known, noise=replace(known.noise, **levels))
+    problem, start = make_problem(seen, before.timing, stage.imu, known, stage._expose_keypoints(before, seen))
     alone = pictures_alone(problem, seen.observations.xy_px)
     noise = measure_picture_noise(alone, start)
     problem, alone = (apply_noise(one, noise) for one in (problem, alone))

@@ -5,7 +5,8 @@ Also the camera's position and velocity at a solution, and how they depend on wh
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -19,8 +20,10 @@ from colmap_inertial.inertial.core.factors import imu_group
 from colmap_inertial.inertial.core.preintegration import SensorErrors, SensorStreams, preintegrate
 from colmap_inertial.inertial.refine.values import (
     ACCEL_BIAS,
+    ACCEL_DENSITY,
     CLOCK_RATE,
     GYRO_BIAS,
+    GYRO_DENSITY,
     LEVER,
     N_SEEN,
     N_STATE,
@@ -302,16 +305,16 @@ class Rows:
         (N, r, 15) derivatives by the states ``0 .. N`` and by the ones after them.
     by_shared
         (N, r, Q), or ``None`` where it is zero.
-    share
-        (N, r, r) part of the residuals' covariance that is the accelerometer's white noise; ``None`` where there is
-        none.
+    shares
+        (N, r, r) parts of the residuals' covariance that are white noise of a sensor, by the density's name in
+        :class:`~colmap_inertial.core.types.ImuNoise`.
     """
 
     residual: Array
     here: Array
     after: Array | None = None
     by_shared: Array | None = None
-    share: Array | None = None
+    shares: Mapping[str, Array] = field(default_factory=dict)
 
 
 def imu_rows(problem: Problem, x: Estimate) -> Rows:
@@ -343,13 +346,15 @@ def imu_rows(problem: Problem, x: Estimate) -> Rows:
     for mine, theirs in ((at.gyro_gain, par.GYRO_GAIN), (at.accel_gain, par.ACCEL_GAIN)):
         by_shared[:, :, mine] = by[:, :, theirs.start - start : theirs.stop - start]
     counts = inertial.linked.astype(np.float64)[:, None]
-    assert group.share is not None
+    assert group.share is not None and group.root is not None
+    turned = inertial.noise.gyro_density_rad_s_rthz * group.root
+    shares = {ACCEL_DENSITY: group.share, GYRO_DENSITY: turned @ pre.cov_gyro @ turned.transpose(0, 2, 1)}
     return Rows(
         residual=group.residual * counts,
         here=group.here[:, :, :N_STATE] * counts[:, :, None],
         after=group.after[:, :, :N_STATE] * counts[:, :, None],
         by_shared=by_shared * counts[:, :, None],
-        share=group.share * counts[:, :, None],
+        shares={name: share * counts[:, :, None] for name, share in shares.items()},
     )
 
 

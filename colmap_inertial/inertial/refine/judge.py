@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array, BoolArray
+from colmap_inertial.core.arrays import Array, BoolArray, Int64Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.inertial.refine._panels import Layout
@@ -15,7 +15,12 @@ from colmap_inertial.inertial.refine._residuals import Moving, moving
 from colmap_inertial.inertial.refine._system import Factored
 from colmap_inertial.inertial.refine.judging_points import carry_points, draw_points, restore_points, select_points
 from colmap_inertial.inertial.refine.motion import find_motion_covs
-from colmap_inertial.inertial.refine.pictures import apply_noise, measure_picture_noise, pictures_alone
+from colmap_inertial.inertial.refine.pictures import (
+    apply_noise,
+    measure_picture_noise,
+    measure_shared_errors,
+    pictures_alone,
+)
 from colmap_inertial.inertial.refine.setup import NO_READOUT_S, move_to_middle_lines
 from colmap_inertial.inertial.refine.shutter import SHUTTER_LIMITS
 from colmap_inertial.inertial.refine.solve import (
@@ -100,8 +105,10 @@ class Judged:
         What the IMU adds to the sum of squares (its own squares at least), over its degrees of freedom.
     sigma_px
         Standard deviation of an observation.
-    accel_noise_m_s2_rthz
-        White noise of the accelerometer, as the refinement found it; as it was known where it did not come so far.
+    shared_errors
+        Variance of a frame's pose by its observations, over what independent errors would make of it.
+    accel_noise_m_s2_rthz, gyro_noise_rad_s_rthz
+        White noise of the sensors, as the refinement found it; as it was known where it did not come so far.
     shared_cov
         (Q, Q) covariance of what is shared; ``None`` where it is not believed.
     world
@@ -129,7 +136,9 @@ class Judged:
     change_sigma: float
     chi2: float
     sigma_px: float
+    shared_errors: float
     accel_noise_m_s2_rthz: float
+    gyro_noise_rad_s_rthz: float
     shared_cov: Array | None = None
     world: FoundWorld | None = None
     drift: tuple[Stretched, ...] = ()
@@ -184,12 +193,13 @@ def refine(
         steps += seen.steps
     if seen.converged and chi2 <= LIMITS.largest_chi2:
         # a false IMU would find itself noisy: it is judged by what was known before
-        problem = _measure_accel_noise(problem, kept, seen.estimate)
+        problem = _measure_noise(problem, kept, seen.estimate)
         seen = solve(_select_observations(problem, kept), seen.estimate)
         steps += seen.steps
+    alone = replace(alone, shared_errors=problem.shared_errors)
     before = evaluate_held_out(alone, seen_alone.estimate, alone.observations.select(~kept))
     after = evaluate_held_out(problem, seen.estimate, problem.observations.select(~kept))
-    change, change_sigma = _average_change(before, after)
+    change, change_sigma = _average_change(before, after, problem.observations.frame[~kept])
     reason = _find_doubt(seen_alone, seen, chi2, change, change_sigma) or _find_late_clock(problem, seen.estimate)
     assert problem.inertial is not None
     judged = Judged(
@@ -197,13 +207,15 @@ def refine(
         accepted=False,
         reason=reason,
         held_out=len(before),
-        before_px=_convert_cost_to_px(before, problem.sigma_px),
-        after_px=_convert_cost_to_px(after, problem.sigma_px),
+        before_px=_convert_cost_to_px(before, problem.weighed_px),
+        after_px=_convert_cost_to_px(after, problem.weighed_px),
         change=change,
         change_sigma=change_sigma,
         chi2=chi2,
         sigma_px=noise.sigma_px,
+        shared_errors=problem.shared_errors,
         accel_noise_m_s2_rthz=problem.inertial.noise.accel_density_m_s2_rthz,
+        gyro_noise_rad_s_rthz=problem.inertial.noise.gyro_density_rad_s_rthz,
         velocity_m_s=np.full_like(start.velocity_m_s, np.nan),
         readout=readout,
         steps=steps,
@@ -213,14 +225,19 @@ def refine(
     x = seen.estimate
     if points is not None:
         problem, x = restore_points(whole, problem), carry_points(whole.observations, whole_start, x)
+        problem = replace(problem, shared_errors=measure_shared_errors(problem, x))
     return _solve_all(judged, problem, x, t_s)
 
 
-def _average_change(before: Array, after: Array) -> tuple[float, float]:
-    """Mean change of the costs (M,) of what was held out, and its standard deviation."""
+def _average_change(before: Array, after: Array, frame: Int64Array) -> tuple[float, float]:
+    """Mean change of the costs (M,) of what was held out, and its standard deviation; frames (M,) are independent."""
     change, count = after - before, len(before)
     mean = float(change.mean()) if count else 0.0
-    return mean, float(change.std(ddof=1) / count**0.5) if count > 1 else np.inf
+    frames = len(np.unique(frame))
+    if frames < 2:
+        return mean, np.inf
+    squares = float(np.sum(np.bincount(frame, change - mean) ** 2))
+    return mean, (squares * frames / (frames - 1)) ** 0.5 / count
 
 
 def _solve_all(judged: Judged, problem: Problem, x: Estimate, t_s: Array) -> Judged:
@@ -267,10 +284,13 @@ def _select_observations(problem: Problem, keep: BoolArray) -> Problem:
     return replace(problem, observations=problem.observations.select(keep))
 
 
-def _measure_accel_noise(problem: Problem, kept: BoolArray, x: Estimate) -> Problem:
-    """The problem with the accelerometer's noise re-estimated, from the solution on nine tenths of the observations."""
+def _measure_noise(problem: Problem, kept: BoolArray, x: Estimate) -> Problem:
+    """The problem with noise of pictures and IMU measured at the solution on nine tenths of the observations."""
+    seen = _select_observations(problem, kept)
+    shared_errors = measure_shared_errors(seen, x)
+    problem, seen = (replace(one, shared_errors=shared_errors) for one in (problem, seen))
     try:
-        return replace(problem, inertial=apply_measured_noise(_select_observations(problem, kept), x).inertial)
+        return replace(problem, inertial=apply_measured_noise(seen, x).inertial)
     except np.linalg.LinAlgError:  # the solution says why not
         return problem
 
@@ -307,10 +327,10 @@ def _test_readout(
     readout = _estimate_readout(_select_observations(problem, kept), seen.estimate)
     if readout is None or abs(readout[0]) < max(SHUTTER_LIMITS.least_s, SHUTTER_LIMITS.sure_sigma * readout[1]):
         return None, still, without
-    better = evaluate_held_out(still, without.estimate, still.observations.select(~kept)) - evaluate_held_out(
-        problem, seen.estimate, observations.select(~kept)
-    )
-    if len(better) < 2 or better.mean() < LIMITS.better_sigma * better.std(ddof=1) / len(better) ** 0.5:
+    held_out = observations.select(~kept)
+    before = evaluate_held_out(still, without.estimate, still.observations.select(~kept))
+    change, change_sigma = _average_change(before, evaluate_held_out(problem, seen.estimate, held_out), held_out.frame)
+    if change > -LIMITS.better_sigma * change_sigma:
         return None, still, without
     return (readout[0], float(np.hypot(readout[1], SHUTTER_LIMITS.cut_share * readout[0]))), problem, seen
 

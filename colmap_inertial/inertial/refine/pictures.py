@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array, BoolArray
-from colmap_inertial.inertial.refine._residuals import project
+from colmap_inertial.core.arrays import Array, BoolArray, Int64Array
+from colmap_inertial.inertial.refine._residuals import derivatives, project
 from colmap_inertial.inertial.refine.setup import Seen, free_cameras, intrinsics_of
-from colmap_inertial.inertial.refine.values import FIRST_INTRINSIC, Estimate, Prior, Problem
+from colmap_inertial.inertial.refine.values import FIRST_INTRINSIC, N_POSE, Estimate, Prior, Problem
 
 #: Points this much nearer or farther than a path is long are left out.
 _EXTREME = 1e4
@@ -18,6 +18,11 @@ _LEAST_PX = 0.05
 #: Noise is measured by this quantile of the squares of both coordinates, which for normal errors is that of chi-square
 #: with two degrees: a robust fit follows the quieter observations, and the median is a tenth too small.
 _QUANTILE = 0.75
+#: Cells of a picture, across and down, in which errors are looked at together: residuals of real keypoints are alike up
+#: to a sixth of its width.
+_CELLS = 4
+#: Frames with fewer observations do not tell.
+_FEWEST = 20
 
 
 def make_pictures(seen: Seen) -> tuple[Problem, Estimate]:
@@ -111,12 +116,15 @@ class PictureNoise:
         its scale, observations would weigh 0.6 of what they should beside the IMU.
     informs
         What they tell over what their weights say: the weights are those of steps, steeper than the loss is curved.
+    shared_errors
+        Of :func:`measure_shared_errors`.
     """
 
     sigma_px: float
     robust_px: float
     weighed_px: float
     informs: float
+    shared_errors: float
 
 
 def measure_picture_noise(problem: Problem, x: Estimate) -> PictureNoise:
@@ -138,9 +146,63 @@ def measure_picture_noise(problem: Problem, x: Estimate) -> PictureNoise:
         robust_px=robust_px,
         weighed_px=max(_LEAST_PX, sigma_px * float(np.sqrt(variance / slope))),
         informs=slope / float(np.mean(weight)),
+        shared_errors=measure_shared_errors(replace(problem, robust_px=robust_px), x),
     )
+
+
+def measure_shared_errors(problem: Problem, x: Estimate) -> float:
+    """Variance of a frame's pose by its observations, over what independent errors would make of it; 1 or more.
+
+    Neighbouring keypoints err alike: by what the camera model leaves of the lens, by blur, by what is left of a rolling
+    shutter. What residuals pull at their frame's pose with is summed in each of 4 x 4 cells of the picture. Independent
+    errors give these sums the variance of the cell's information, less what the pose took of them (a variance by
+    clusters: Liang and Zeger, Biometrika 1986). What all of a picture shares is the pose's, and not seen.
+
+    Parameters
+    ----------
+    problem, x
+        Observations, with their robust loss, and a solution.
+    """
+    observations, at = problem.observations, project(problem, x, problem.observations)
+    frame, frames = observations.frame, len(x.velocity_m_s)
+    weight = 1 / (1 + np.sum(at.residual**2, axis=1) / problem.robust_px**2)
+    pull = weight[:, None] * at.residual
+    by_pose = derivatives(problem, x, observations, at, np.ones(len(frame))).by_frame[:, :, :N_POSE]
+    size = np.array([(camera.model.width, camera.model.height) for camera in problem.cameras])
+    place = observations.xy_px / size[problem.camera_of[frame]] * _CELLS
+    column, row = np.clip(place.astype(np.int64), 0, _CELLS - 1).T
+    cell = (frame * _CELLS + column) * _CELLS + row
+    by_cell = _sum_by(cell, frames * _CELLS**2, by_pose.transpose(0, 2, 1) @ by_pose).reshape(
+        frames, -1, N_POSE, N_POSE
+    )
+    whole = by_cell.sum(axis=1)
+    # of so few that they do not determine the pose
+    told = np.flatnonzero(np.bincount(frame[at.seen], minlength=frames) >= _FEWEST)
+    told = told[np.linalg.cond(whole[told]) < 1 / np.finfo(np.float64).eps]
+    cov = np.zeros_like(whole)
+    cov[told] = np.linalg.inv(whole[told])
+    moved = (cov @ _sum_by(frame, frames, by_pose.transpose(0, 2, 1) @ pull[:, :, None]))[:, :, 0]
+    left = pull - np.einsum("nri,ni->nr", by_pose, moved[frame])
+    sums = _sum_by(cell, frames * _CELLS**2, np.einsum("nri,nr->ni", by_pose, left)).reshape(frames, -1, N_POSE)
+    squares = float(np.einsum("fci,fij,fcj->", sums, cov, sums))
+    share = cov[:, None] @ by_cell
+    expected = float(np.mean(pull**2)) * float(np.einsum("fcii->", share) - np.einsum("fcij,fcji->", share, share))
+    return max(1.0, squares / expected) if expected > 0 else 1.0
+
+
+def _sum_by(group: Int64Array, groups: int, values: Array) -> Array:
+    """(G, ...) sums of values (N, ...) by group."""
+    out = np.zeros((groups, *values.shape[1:]))
+    np.add.at(out, group, values)
+    return out
 
 
 def apply_noise(problem: Problem, noise: PictureNoise) -> Problem:
     """The problem with its observations weighed so."""
-    return replace(problem, sigma_px=noise.weighed_px, robust_px=noise.robust_px, informs=noise.informs)
+    return replace(
+        problem,
+        sigma_px=noise.weighed_px,
+        robust_px=noise.robust_px,
+        informs=noise.informs,
+        shared_errors=noise.shared_errors,
+    )

@@ -13,8 +13,8 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.facts import Fact
-from colmap_inertial.core.types import FrameTiming, ImuRecording, ReadoutDirection, ScaleEstimate
-from colmap_inertial.inertial.refine._residuals import derivatives, project
+from colmap_inertial.core.types import CameraModel, FrameTiming, ImuRecording, ReadoutDirection, ScaleEstimate
+from colmap_inertial.inertial.refine._residuals import camera_of, derivatives, project
 from colmap_inertial.inertial.refine.pictures import (
     apply_noise,
     measure_picture_noise,
@@ -24,7 +24,7 @@ from colmap_inertial.inertial.refine.pictures import (
 )
 from colmap_inertial.inertial.refine.setup import Known, Seen, make_problem
 from colmap_inertial.inertial.refine.solve import factor_information, solve
-from colmap_inertial.inertial.refine.values import FIRST_INTRINSIC, READOUT, Estimate, Problem
+from colmap_inertial.inertial.refine.values import FIRST_INTRINSIC, READOUT, Estimate, FreeCamera, Problem
 from colmap_inertial.inertial.scale.verdict import finite, half_width, verdict_of, without_width
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.motion.shutter import compare_readout
@@ -54,6 +54,9 @@ class ShutterLimits:
     contradicts_sigmas: float = 5.0
     contradicts_s: float = 3e-3
     contradicts_focal: float = 0.03
+    #: A declared camera without distortion is contradicted by one that as surely has some, and moves observations so
+    #: far (root mean square).
+    contradicts_lens_px: float = 1.0
     #: One that is found is followed on, so many times as far, until it moves by less than this share of its deviation.
     rounds: int = 5
     settled_sigma: float = 0.2
@@ -92,6 +95,51 @@ class SeenFocal:
         return Fact("declared-focal-length", declared_px=self.model_px, found_px=self.found_px, sigma_px=self.sigma_px)
 
 
+#: Camera models without distortion, and those that add some to their numbers.
+_DISTORTED = {"SIMPLE_PINHOLE": ("RADIAL", (0.0, 0.0)), "PINHOLE": ("OPENCV", (0.0, 0.0, 0.0, 0.0))}
+#: Places across and down a picture, at which distortion is looked at.
+_PLACES = (32, 18)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeenLens:
+    """Distortion of a camera whose model has none, by the observations.
+
+    Attributes
+    ----------
+    declared
+        Its model.
+    found
+        The camera with distortion, by a few steps with the intrinsics free.
+    sigmas
+        How many standard deviations its distortion is from none.
+    shift_px
+        How far it moves observations, root mean square over the picture.
+    """
+
+    declared: str
+    found: CameraModel
+    sigmas: float
+    shift_px: float
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether the camera has distortion, and by how much matters."""
+        limits = SHUTTER_LIMITS
+        return self.sigmas > limits.contradicts_sigmas and self.shift_px > limits.contradicts_lens_px
+
+    def as_fact(self) -> Fact:
+        """What is wrong with a model whose camera was declared without distortion."""
+        extra = colmap_camera(self.found).extra_params_idxs()
+        return Fact(
+            "declared-distortion",
+            declared=self.declared,
+            found=self.found.model,
+            distortion=[self.found.params[i] for i in extra],
+            shift_px=self.shift_px,
+        )
+
+
 @dataclass(frozen=True, kw_only=True)
 class SeenReadout:
     """Readout by the observations of a model.
@@ -107,6 +155,8 @@ class SeenReadout:
         stretched by.
     focal
         What was found of the camera on the way; ``None`` where its intrinsics were not free.
+    lens
+        Distortion, where it was looked for in a camera without.
     """
 
     readout_s: float
@@ -114,6 +164,7 @@ class SeenReadout:
     direction: ReadoutDirection
     rate_hz: float
     focal: SeenFocal | None = None
+    lens: SeenLens | None = None
 
     @property
     def is_found(self) -> bool:
@@ -178,6 +229,7 @@ def find_readout(
     known: Known,
     *,
     exposed_px: Callable[[Seen], Array] | None = None,
+    find_lens: bool = False,
 ) -> SeenReadout | None:
     """The readout of a metric model's images, down or across, whatever is declared; ``None`` where too little is seen.
 
@@ -191,6 +243,8 @@ def find_readout(
         As the refinement has them.
     exposed_px
         Where the shutter had the observations of a model whose keypoints were rectified.
+    find_lens
+        Whether cameras without distortion may have some.
 
     Raises
     ------
@@ -204,6 +258,8 @@ def find_readout(
     if count < SHUTTER_LIMITS.fewest:
         return None
     seen = select_points(seen, np.arange(len(seen.points)) % -(-count // SHUTTER_LIMITS.most) == 0)
+    if find_lens:
+        seen = replace(seen, cameras=tuple(map(_add_distortion, seen.cameras)))
     if exposed_px is not None:
         return _measure(seen, timing, imu, known, exposed_px(seen), rounds=SHUTTER_LIMITS.rounds)
     at_once_px = seen.observations.xy_px
@@ -251,15 +307,51 @@ def _measure(
         direction=timing.readout_direction if x.readout_s >= 0 else _OPPOSITE[timing.readout_direction],
         rate_hz=float(np.sqrt(np.mean(np.square(of_images)))) / focal_px,
         focal=_focal_of(problem, start, x, cov),
+        lens=_lens_of(problem, x, cov),
+    )
+
+
+def _add_distortion(camera: CameraModel) -> CameraModel:
+    """A camera as it is, of a model that has distortion."""
+    if camera.model not in _DISTORTED:
+        return camera
+    model, none = _DISTORTED[camera.model]
+    return replace(camera, model=model, params=(*camera.params, *none))
+
+
+def _find_most_seen(problem: Problem) -> tuple[FreeCamera, int]:
+    """The camera with the most observations, and the place of its first free number among those of all cameras."""
+    of_camera = np.bincount(problem.camera_of[problem.observations.frame], minlength=len(problem.cameras))
+    number = int(np.argmax(of_camera))
+    return problem.cameras[number], sum(len(camera.free) for camera in problem.cameras[:number])
+
+
+def _lens_of(problem: Problem, x: Estimate, cov: Array) -> SeenLens | None:
+    """Distortion of the camera with the most observations; ``None`` where it began with some, or cannot have any."""
+    camera, before = _find_most_seen(problem)
+    extra = list(colmap_camera(camera.model).extra_params_idxs())
+    declared = next((plain for plain, (distorted, _) in _DISTORTED.items() if distorted == camera.model.model), None)
+    if declared is None or not camera.free or np.any(np.array(camera.model.params)[extra]):
+        return None
+    at = FIRST_INTRINSIC + before + np.array([camera.free.index(place) for place in extra])
+    found = camera_of(camera, x.intrinsics[before : before + len(camera.free)])
+    none = replace(found, params=tuple(0.0 if i in extra else value for i, value in enumerate(found.params)))
+    across, down = np.meshgrid(*((np.arange(n) + 0.5) / n for n in _PLACES))
+    places = np.stack([across.ravel() * found.width, down.ravel() * found.height], axis=1)
+    rays = np.column_stack([np.asarray(colmap_camera(none).cam_from_img(places)), np.ones(len(places))])
+    shift = np.asarray(colmap_camera(found).img_from_cam(rays)) - places
+    distortion = x.intrinsics[at - FIRST_INTRINSIC]
+    return SeenLens(
+        declared=declared,
+        found=found,
+        sigmas=float(distortion @ np.linalg.solve(cov[np.ix_(at, at)], distortion)) ** 0.5,
+        shift_px=float(np.sqrt(np.mean(np.sum(shift**2, axis=1)))),
     )
 
 
 def _focal_of(problem: Problem, start: Estimate, x: Estimate, cov: Array) -> SeenFocal | None:
     """Mean focal length of the camera with the most observations."""
-    of_camera = np.bincount(problem.camera_of[problem.observations.frame], minlength=len(problem.cameras))
-    number = int(np.argmax(of_camera))
-    before = sum(len(camera.free) for camera in problem.cameras[:number])
-    camera = problem.cameras[number]
+    camera, before = _find_most_seen(problem)
     focal = [i for i, place in enumerate(camera.free) if place in colmap_camera(camera.model).focal_length_idxs()]
     if not focal:
         return None

@@ -19,7 +19,14 @@ from colmap_inertial.inertial.refine._residuals import (
     project,
 )
 from colmap_inertial.inertial.refine._system import Factored, Step, System
-from colmap_inertial.inertial.refine.values import N_STATE, Estimate, Observations, Problem
+from colmap_inertial.inertial.refine.values import (
+    ACCEL_DENSITY,
+    GYRO_DENSITY,
+    N_STATE,
+    Estimate,
+    Observations,
+    Problem,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,10 +101,10 @@ def robust_cost(residual_px: Array, sigma_px: float, robust_px: float) -> Array:
 def _evaluate(problem: Problem, x: Estimate, observations: Observations) -> _Point:
     projected = project(problem, x, observations)
     rows, offset = all_rows(problem, x), prior_offset(problem, x)
-    cost = float(np.sum(robust_cost(projected.residual, problem.sigma_px, problem.robust_px)))
+    cost = float(np.sum(robust_cost(projected.residual, problem.weighed_px, problem.robust_px)))
     cost += 0.5 * sum(float(np.sum(block.residual**2)) for block in rows.values())
     # a point that a step brings behind the camera must not look like a gain
-    cost += float(np.sum(~projected.seen)) * (problem.robust_px / problem.sigma_px) ** 2 * 5
+    cost += float(np.sum(~projected.seen)) * (problem.robust_px / problem.weighed_px) ** 2 * 5
     cost += 0.5 * float(offset @ problem.prior.info @ offset)
     if problem.distances is not None:
         cost += 0.5 * float(np.sum(problem.distances.residuals(x.points_m)[0] ** 2))
@@ -111,7 +118,7 @@ def _weight_rows(problem: Problem, at: _Point, informs: float = 1.0) -> tuple[De
     With ``informs``, derivatives of observations tell as much more; what residuals pull with stays.
     """
     squares = np.sum(at.projected.residual**2, axis=1)
-    root = 1 / (problem.sigma_px * np.sqrt(1 + squares / problem.robust_px**2))
+    root = 1 / (problem.weighed_px * np.sqrt(1 + squares / problem.robust_px**2))
     by = derivatives(problem, at.estimate, problem.observations, at.projected, root * informs**0.5)
     residual = at.projected.residual * (root / informs**0.5)[:, None]
     if problem.distances is None:
@@ -289,29 +296,33 @@ def linearise_observations(problem: Problem, x: Estimate) -> Linearised:
 def evaluate_held_out(problem: Problem, x: Estimate, observations: Observations) -> Array:
     """(M,) robust costs of observations that were not used."""
     at = project(replace(problem, observations=observations), x, observations)
-    cost = robust_cost(at.residual, problem.sigma_px, problem.robust_px)
-    return np.where(at.seen, cost, 5 * (problem.robust_px / problem.sigma_px) ** 2)
+    cost = robust_cost(at.residual, problem.weighed_px, problem.robust_px)
+    return np.where(at.seen, cost, 5 * (problem.robust_px / problem.weighed_px) ** 2)
 
 
 #: Standard deviation of the logarithm of what was known before: on walks of 40 m, where little tells noise of pictures
 #: from the accelerometer's, the scale's own level was right to a third or thirteen times too large.
 _LEVEL_SPREAD = 0.7
-#: The level stays within this factor of what was known before; no sensor is quieter than the other number.
-_MOST_LEVEL, _LEAST_LEVEL_M_S2_RTHZ = 20.0, 3e-4
+#: A level stays within this factor of what was known before; no sensor is quieter than the other numbers.
+_MOST_LEVEL = 20.0
+_LEAST_LEVELS = {ACCEL_DENSITY: 3e-4, GYRO_DENSITY: 1e-5}
 #: Columns of random signs: with four hundred frames the trace is known to a hundredth.
 _PROBES, _SEED = 8, 0
 #: Steps; the largest of a logarithm; and where they are at rest: a fiftieth of a level is nothing.
-_LEVEL_STEPS, _LARGEST_LEVEL_STEP, _LEVEL_AT_REST = 8, 1.0, 0.02
+_LEVEL_STEPS, _LARGEST_LEVEL_STEP, _LEVEL_AT_REST = 12, 1.0, 0.02
 
 
 def apply_measured_noise(problem: Problem, x: Estimate) -> Problem:
-    """The problem with its accelerometer as noisy as what is left of its readings says.
+    """The problem with its accelerometer and gyroscope as noisy as what is left of their readings says.
 
     The scale estimate knows the noise from the readings' roughness more than from the path: what shakes faster than
     frames follow counts as white noise there. Between frames most of it cancels; and beside pictures that know poses to
-    a millimetre, the path tells what is left. It is the level of the greatest restricted likelihood (REML), by Newton's
-    steps with the average information (Gilmour, Thompson and Cullis, Biometrics 1995), as the scale's own levels are
-    found. The trace in it, of how many residuals the fit explains, is that of random signs (Hutchinson 1990).
+    a millimetre, the path tells what is left. What all observations of a frame err by together is a turn of its camera
+    and counts with the gyroscope's: believed as it reads, the path and the lever arm would follow it.
+
+    The levels are those of the greatest restricted likelihood (REML), by Newton's steps with the average information
+    (Gilmour, Thompson and Cullis, Biometrics 1995), as the scale's own levels are found. The trace in it, of how many
+    residuals the fit explains, is that of random signs (Hutchinson 1990).
 
     Parameters
     ----------
@@ -325,41 +336,44 @@ def apply_measured_noise(problem: Problem, x: Estimate) -> Problem:
     """
     inertial = problem.inertial
     assert inertial is not None
-    known, change = inertial.noise, 0.0
-    assumed = known.accel_density_m_s2_rthz
-    least = min(0.0, max(-float(np.log(_MOST_LEVEL)), float(np.log(_LEAST_LEVEL_M_S2_RTHZ / assumed))))
-    at = linearise_observations(problem, x)
+    known = {name: getattr(inertial.noise, name) for name in _LEAST_LEVELS}
+    most = float(np.log(_MOST_LEVEL))
+    least = np.array([min(0.0, max(-most, np.log(_LEAST_LEVELS[name] / level))) for name, level in known.items()])
+
+    def at_levels(change: Array) -> Problem:
+        levels = {name: level * float(np.exp(c)) for (name, level), c in zip(known.items(), change, strict=True)}
+        return replace(problem, inertial=replace(inertial, noise=replace(inertial.noise, **levels)))
+
+    change, at = np.zeros(len(known)), linearise_observations(problem, x)
     for _ in range(_LEVEL_STEPS):
-        noise = replace(known, accel_density_m_s2_rthz=assumed * float(np.exp(change)))
-        problem = replace(problem, inertial=replace(inertial, noise=noise))
-        step = _level_step(problem, x, at, change)
-        moved = float(np.clip(change + step, least, np.log(_MOST_LEVEL)))
+        moved = np.clip(change + _level_step(at_levels(change), x, at, change), least, most)
         step, change = moved - change, moved
-        if abs(step) < _LEVEL_AT_REST:
+        if np.all(np.abs(step) < _LEVEL_AT_REST):
             break
-    noise = replace(known, accel_density_m_s2_rthz=assumed * float(np.exp(change)))
-    return replace(problem, inertial=replace(inertial, noise=noise))
+    return at_levels(change)
 
 
-def _level_step(problem: Problem, x: Estimate, at: Linearised, change: float) -> float:
-    """Newton's step of the logarithm of the level, which has changed by so much from what was known."""
+def _level_step(problem: Problem, x: Estimate, at: Linearised, change: Array) -> Array:
+    """Newton's steps of the logarithms of the levels, which have changed by so much from what was known."""
     solved, states, shared = at.solve(problem)
-    rows = imu_rows(problem, x)
-    assert rows.share is not None
+    rows, count = imu_rows(problem, x), len(change)
+    shares = [rows.shares[name] for name in _LEAST_LEVELS]
     left = rows.residual[:, :, None] + _apply_rows(rows, states[:, :, None], shared[:, None])
-    own = rows.share @ left
-    squares = float(np.sum(left * own))
+    own = np.concatenate([share @ left for share in shares], axis=2)
+    squares = np.sum(left * own, axis=(0, 1))
     signs = np.random.default_rng(_SEED).choice([-1.0, 1.0], (*rows.residual.shape, _PROBES))
     along = _project_on_fit(rows, np.concatenate([signs, own], axis=2), solved)
-    explained = float(np.sum(signs * (rows.share @ along[:, :, :-1]))) / _PROBES
-    count = float(np.trace(rows.share, axis1=1, axis2=2).sum())
-    right = max(count - explained, 0.01 * count)
+    explained = np.array([np.sum(signs * (share @ along[:, :, :-count])) for share in shares]) / _PROBES
+    whole = np.array([np.trace(share, axis1=1, axis2=2).sum() for share in shares])
+    right = np.maximum(whole - explained, 0.01 * whole)
     # of the logarithm of a variance, which is twice that of the density
-    average = 0.5 * (float(np.sum(own**2)) - float(np.sum(own * along[:, :, -1:])))
-    prior = 1 / (2 * _LEVEL_SPREAD) ** 2
+    average = 0.5 * np.einsum("nrk,nrl->kl", own, own - along[:, :, -count:])
+    average[np.diag_indices(count)] = np.maximum(np.diagonal(average), 0.1 * right) + (
+        prior := (2 * _LEVEL_SPREAD) ** -2
+    )
     gradient = 0.5 * (squares - right) - prior * 2 * change
-    step = 0.5 * gradient / (max(average, 0.1 * right) + prior)
-    return float(np.clip(step, -_LARGEST_LEVEL_STEP, _LARGEST_LEVEL_STEP))
+    step = 0.5 * np.linalg.solve(average, gradient)
+    return np.clip(step, -_LARGEST_LEVEL_STEP, _LARGEST_LEVEL_STEP)
 
 
 def _apply_rows(rows: Rows, states: Array, shared: Array) -> Array:

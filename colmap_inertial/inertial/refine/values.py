@@ -12,13 +12,16 @@ from colmap_inertial.core.geometry import so3_exp
 from colmap_inertial.core.types import CameraModel, ImuNoise
 from colmap_inertial.inertial.core.preintegration import SensorStreams
 
-# Columns of a frame's state. The first nine are what its observations depend on.
+# Columns of a frame's state. The first six are its pose, the first nine what its observations depend on.
 THETA, POSITION, VELOCITY, GYRO_BIAS, ACCEL_BIAS = (slice(3 * i, 3 * i + 3) for i in range(5))
-N_SEEN, N_STATE = 9, 15
+N_POSE, N_SEEN, N_STATE = 6, 9, 15
 
 # Columns of what all frames share; the free numbers of the cameras stand between what observations see and the rest.
 ROTATION, LEVER, OFFSET, CLOCK_RATE, READOUT = slice(0, 3), slice(3, 6), 6, 7, 8
 FIRST_INTRINSIC = 9
+
+# Fields of ImuNoise that a refinement estimates: the sensors' white noise.
+ACCEL_DENSITY, GYRO_DENSITY = "accel_density_m_s2_rthz", "gyro_density_rad_s_rthz"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -344,11 +347,13 @@ class Problem:
     prior
         What is known beforehand.
     sigma_px
-        What an observation's errors are divided by, each coordinate.
+        What an observation's errors would be divided by, each coordinate, if they were independent.
     robust_px
         Scale of Cauchy's loss: of an error this long half the weight is left.
     informs
         What observations tell, over what their weights in the loss say that they do: for covariances.
+    shared_errors
+        Variance of a frame's pose by its observations, over what independent errors would make of it.
     distances
         Of the points; ``None`` where nothing is known of them.
     """
@@ -361,7 +366,13 @@ class Problem:
     sigma_px: float
     robust_px: float = 1.0
     informs: float = 1.0
+    shared_errors: float = 1.0
     distances: Distances | None = None
+
+    @property
+    def weighed_px(self) -> float:
+        """What errors of observations are divided by, where those of one frame are partly the same."""
+        return self.sigma_px * float(np.sqrt(self.shared_errors))
 
     @property
     def rows(self) -> Observations:

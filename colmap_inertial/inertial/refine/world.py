@@ -17,6 +17,7 @@ from colmap_inertial.inertial.refine._residuals import TURN as MOVING_TURN, Movi
 from colmap_inertial.inertial.refine._system import Factored
 from colmap_inertial.inertial.refine.values import (
     ACCEL_BIAS,
+    ACCEL_DENSITY,
     CLOCK_RATE,
     GYRO_BIAS,
     N_STATE,
@@ -151,8 +152,7 @@ def _split(problem: Problem, x: Estimate, variance: float, states: Array, shared
     rows, info, at = all_rows(problem, x), problem.prior.info, x.columns
     imu, walk, first = rows["imu"], _along(rows["walk"], states, shared), _along(rows["states"], states, shared)
     along = _along(imu, states, shared)
-    assert imu.share is not None
-    accel = float(np.einsum("ni,nij,nj->", along, imu.share, along))
+    accel = float(np.einsum("ni,nij,nj->", along, imu.shares[ACCEL_DENSITY], along))
 
     def of_prior(columns: slice | int) -> float:
         index = np.atleast_1d(np.arange(at.count)[columns])

@@ -273,6 +273,9 @@ class MetricStage(InertialStage):
         if self.keeps_intrinsics and readout.focal is not None and readout.focal.contradicts:
             found.append(readout.focal.as_fact())
             estimate = add_doubts(estimate, found[-1:])
+        if self.keeps_intrinsics and readout.lens is not None and readout.lens.contradicts:
+            found.append(readout.lens.as_fact())
+            estimate = add_doubts(estimate, found[-1:])
         metric = self._apply(model, estimate)
         for fact in found:
             done = Treatment(stage="shutter", reason=fact, values=dict(fact.values))
@@ -309,7 +312,7 @@ class MetricStage(InertialStage):
         shutter = self.shutter
         exposed_px = None if shutter is None or not model.rectified else partial(exposed_keypoints, model, shutter)
         with one_blas_thread():
-            return find_readout(seen, timing, self.imu, known, exposed_px=exposed_px)
+            return find_readout(seen, timing, self.imu, known, exposed_px=exposed_px, find_lens=self.keeps_intrinsics)
 
 
 def exposed_keypoints(model: Model, shutter: InvertibleStage, seen: Seen) -> Array:

@@ -54,8 +54,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 #: What is written of a refined model, as a number: raised with its layout, so that a run goes on from no older one.
-#: 3: the refinement's own scale; covariances of rotations.
-_WRITES = 3
+#: 3: the refinement's own scale; covariances of rotations. 4: noise of the gyroscope, errors that observations share.
+_WRITES = 4
 _FEWEST_IMAGES, _FEWEST_POINTS = 10, 50
 #: Squares of what the IMU and the pictures disagree by, over those that its noise explains, from which on one of them
 #: is wrong: five standard deviations between all images.
@@ -338,7 +338,8 @@ def _move_part(part: JoinedPart, move: Similarity) -> JoinedPart:
 def _state_figures(judged: Judged) -> dict[str, Any]:
     """What a refinement is judged by."""
     names = ("accepted", "held_out", "before_px", "after_px", "change", "change_sigma", "chi2", "sigma_px")
-    out = {name: getattr(judged, name) for name in (*names, "accel_noise_m_s2_rthz")}
+    noise = ("shared_errors", "accel_noise_m_s2_rthz", "gyro_noise_rad_s_rthz")
+    out = {name: getattr(judged, name) for name in (*names, *noise)}
     if judged.readout is not None:
         out |= dict(zip(("readout_s", "readout_sigma_s"), judged.readout, strict=True))
     return out

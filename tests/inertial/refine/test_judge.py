@@ -1,5 +1,6 @@
 """What decides whether a refinement is believed, and what is told of it: against counts and closed forms."""
 
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import numpy as np
@@ -161,6 +162,27 @@ def test_noise_that_cannot_be_measured_stays_as_it_was(monkeypatch):
         raise np.linalg.LinAlgError
 
     monkeypatch.setattr(judge, "apply_measured_noise", singular)
+    monkeypatch.setattr(judge, "measure_shared_errors", lambda problem, x: 4.0)
     monkeypatch.setattr(judge, "_select_observations", lambda problem, keep: problem)
-    problem = SimpleNamespace(inertial=1)
-    assert judge._measure_accel_noise(problem, np.ones(3, dtype=bool), None) is problem
+    problem = Pixels(inertial=1, shared_errors=1.0)
+    assert judge._measure_noise(problem, np.ones(3, dtype=bool), None) == Pixels(inertial=1, shared_errors=4.0)
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """Of a problem, what noise changes."""
+
+    inertial: int
+    shared_errors: float
+
+
+def test_frames_whose_observations_change_together_are_one_each():
+    rng = np.random.default_rng(0)
+    frame = rng.permutation(np.repeat(np.arange(0, 400, 2), 30))
+    by_frame, own = rng.normal(-0.1, 0.3, 400), rng.normal(0.0, 0.5, len(frame))
+    for together, sigma in ((0.0, 0.5 / 6000**0.5), (1.0, (0.3**2 / 200 + 0.5**2 / 6000) ** 0.5)):
+        change, found = judge._average_change(np.ones(6000), 1 + together * by_frame[frame] + own, frame)
+        assert found == pytest.approx(sigma, rel=0.15)
+        assert abs(change + 0.1 * together) < 4 * sigma
+    assert judge._average_change(np.ones(9), np.zeros(9), np.full(9, 3)) == (-1.0, np.inf)
+    assert judge._average_change(np.ones(0), np.ones(0), frame[:0]) == (0.0, np.inf)

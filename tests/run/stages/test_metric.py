@@ -165,7 +165,9 @@ def test_a_readout_is_sought_in_the_middle_images_whatever_was_declared(monkeypa
     root = 1e-3 * np.random.default_rng(3).standard_normal((CAL.COUNT, CAL.COUNT))
     declared = calibration_prior(Declared(readout_s=0.03))
     declared = replace(declared, cov=root @ root.T)
-    stage = SimpleNamespace(imu="imu", shutter=None, known_of=lambda model, refine_intrinsics: Known(prior=declared))
+    stage = SimpleNamespace(
+        imu="imu", shutter=None, keeps_intrinsics=False, known_of=lambda model, refine_intrinsics: Known(prior=declared)
+    )
 
     def found(seen, timing, imu, known, exposed_px):
         sought.update(seen=seen, cov=known.prior.cov)

@@ -14,7 +14,7 @@ from colmap_inertial import read_model, reconstruct_project
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, so3_log
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, ScaleOptions
-from colmap_inertial.core.types import CameraMotion, Similarity
+from colmap_inertial.core.types import CameraModel, CameraMotion, Similarity
 from colmap_inertial.inertial.core.priors import PRIORS, model_scale_sigma
 from colmap_inertial.inertial.refine import judge, motion
 from colmap_inertial.inertial.refine.shutter import SeenReadout
@@ -429,6 +429,36 @@ def test_a_declared_focal_length_is_compared_with_what_the_images_show(factor):
     # where the intrinsics were refined, they are COLMAP's
     refined = MetricStage(imu=tracks.imu, calibration=UNKNOWN)(start)
     assert "declared-focal-length" not in {reason.code for reason in refined.scale.reasons}
+
+
+@pytest.mark.parametrize(("distorted", "declares"), [(True, False), (True, True), (False, False)])
+def test_a_declared_camera_without_distortion_is_compared_with_what_the_images_show(distorted, declares):
+    lens = (-0.05, 0.02, 0.0, 0.0) if distorted else (0.0, 0.0, 0.0, 0.0)
+    true = CameraModel(model="OPENCV", width=1280, height=960, params=(1000.0, 990.0, 640.0, 480.0, *lens))
+    tracks = tracks_of(replace(walk(16.0, points_per_m=50.0), camera=true))
+    reconstruction = tracks.reconstruction()
+    if not declares:
+        for camera in reconstruction.cameras.values():
+            camera.model, camera.params = pycolmap.CameraModelId.PINHOLE, true.params[:4]
+    start = Model(
+        reconstruction=adjusted(reconstruction, keeps_intrinsics=True),
+        colmap_index=0,
+        timing=replace(tracks.timing, readout_s=0.0),
+    )
+    model = MetricStage(imu=tracks.imu, calibration=UNKNOWN, keeps_intrinsics=True)(start)
+    found = [reason for reason in model.scale.reasons if reason.code == "declared-distortion"]
+    assert bool(found) == (distorted and not declares)
+    if found:
+        assert model.scale.verdict != "trusted"
+        values = found[0].values
+        assert (values["declared"], values["found"]) == ("PINHOLE", "OPENCV")
+        assert values["distortion"][:2] == pytest.approx(lens[:2], abs=0.01)
+        # where the distortion moves the picture by 16 px at a corner
+        assert 3 < values["shift_px"] < 16
+        assert found[0] in [treatment.reason for treatment in model.treatments]
+    # where the intrinsics were refined, they are COLMAP's
+    refined = MetricStage(imu=tracks.imu, calibration=UNKNOWN)(start)
+    assert "declared-distortion" not in {reason.code for reason in refined.scale.reasons}
 
 
 def test_an_imu_that_contradicts_the_pictures_beyond_any_noise_makes_a_scale_weak(walked):
