@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from colmap_inertial.core.arrays import BoolArray
+from colmap_inertial.core.arrays import Array, BoolArray
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.facts import Fact
@@ -99,10 +99,19 @@ def _are_frozen(recorded: Recorded) -> BoolArray:
         return none
     motion = GyroCamera.of(imu, aligned.calibration, camera_epoch_ns=rotation.epoch_ns)
     covered = motion.covers(rotation.t_s[:-1], rotation.t_s[1:])
-    shown, turned = (np.linalg.norm(turn, axis=1) for turn in (rotation.turn_rad, motion.turn_rad(rotation.t_s)))
+    turn_rad, step_s = motion.turn_rad(rotation.t_s), np.diff(rotation.t_s)[:, None]
+    shown = np.linalg.norm(rotation.turn_rad, axis=1)
     least_rad = np.maximum(_LIMITS.frozen_rad, _LIMITS.frozen_sigmas * rotation.sigma_rad)
-    with np.errstate(invalid="ignore"):
-        still = covered & (turned > least_rad) & (shown < _LIMITS.frozen_share * turned)
+
+    def stand_still(turn_rad: Array) -> BoolArray:
+        turned = np.linalg.norm(turn_rad, axis=1)
+        with np.errstate(invalid="ignore"):
+            return covered & (turned > least_rad) & (shown < _LIMITS.frozen_share * turned)
+
+    still = stand_still(turn_rad)
+    if still.any():
+        # what the gyroscope reads in all of them alike is its bias, which pixels tell poorly where the camera slides
+        still = stand_still(turn_rad - np.median(turn_rad[still] / step_s[still], axis=0) * step_s)
     # by chance where both turn back, once; not in a row
     runs = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]])))
     for begin, end in zip(runs[::2].tolist(), runs[1::2].tolist(), strict=True):
