@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial as bind
 from pathlib import Path
 from typing import Literal, TypeVar
 
@@ -141,6 +142,7 @@ def measure_recording(inputs: CheckInputs, progress: Progress) -> Recorded:
     log_ = None if capture is None else capture.frame_log
     rotation = in_video = None
     looked: dict[str, bool] = {}
+    pictures: Callable[[Sequence[int]], Iterable[Frame]] | None = None
 
     def look(frame: Frame) -> None:
         looked[frame.name] = is_blank(frame.image)
@@ -150,6 +152,7 @@ def measure_recording(inputs: CheckInputs, progress: Progress) -> Recorded:
         if log_ is None or not log_.stabilised:
             rotation = reader.attempt(lambda: measure_images(capture, timing, progress, look))
         in_video = reader.attempt(lambda: find_in_video(capture, timing, progress))
+        pictures = bind(some_frames, capture, timing)
     return Recorded(
         refused=tuple(reader.refused),
         imu=inputs.imu,
@@ -165,6 +168,7 @@ def measure_recording(inputs: CheckInputs, progress: Progress) -> Recorded:
         read_as=inputs.read_as,
         max_offset_s=inputs.max_offset_s,
         in_video=in_video,
+        pictures=pictures,
     )
 
 
