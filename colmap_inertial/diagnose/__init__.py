@@ -1,7 +1,8 @@
 """Check a capture before any reconstruction: findings, each with a code, evidence and advice.
 
-A check is a function of what was recorded (:class:`Recorded`) that yields :class:`Finding` values; it opens no file.
-``CHECKS`` lists all of them. ``run.preparation.preflight`` reads captures for them.
+A check is a function of what was recorded (:class:`Recorded`) that yields :class:`Finding` values; it opens no file by
+itself (``Recorded.images`` decodes frames anew). ``CHECKS`` lists all of them. ``run.preparation.preflight`` reads
+captures for them.
 """
 
 from __future__ import annotations
@@ -47,6 +48,7 @@ CHECKS: tuple[Check, ...] = (
     frames.check_repeated,
     frames.check_blank,
     frames.check_exposure,
+    frames.check_unstated_exposure,
     frames.check_readout,
 )
 

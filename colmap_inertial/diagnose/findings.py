@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Literal
@@ -19,6 +19,7 @@ from colmap_inertial.core.types import (
     CameraImuCalibration,
     CameraModel,
     CameraTrajectory,
+    Frame,
     FrameLog,
     FrameTiming,
     ImuRecording,
@@ -222,6 +223,8 @@ class Recorded:
         What is known of camera and IMU, and the largest offset between their clocks.
     in_video
         Where pictures were found in the video they were taken from.
+    images
+        Decodes some of the timing's frames, by their places; ``None`` where there are none.
     """
 
     refused: Sequence[InertialError] = ()
@@ -238,6 +241,7 @@ class Recorded:
     calibration: CameraImuCalibration | None = None
     max_offset_s: float | None = None
     in_video: FramesInVideo | None = None
+    images: Callable[[Sequence[int]], Iterable[Frame]] | None = None
 
     @cached_property
     def implausible(self) -> tuple[FormatError, ...]:

@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from colmap_inertial.core.arrays import BoolArray
+from colmap_inertial.core.arrays import Array, BoolArray
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.facts import Fact
-from colmap_inertial.core.types import FrameTiming
+from colmap_inertial.core.types import CameraModel, FrameTiming
 from colmap_inertial.diagnose.findings import Finding, Recorded, Severity
-from colmap_inertial.imaging.gyro_camera import GyroCamera
+from colmap_inertial.imaging.exposure import (
+    ExposureEstimate,
+    compare_exposures,
+    estimate_exposure,
+    exposures_to_compare,
+)
+from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
+from colmap_inertial.imaging.psf import predict_blur_px
+from colmap_inertial.model import colmap_camera
 from colmap_inertial.motion.align import Alignment
 from colmap_inertial.motion.shutter import ReadoutEstimate, compare_readout, estimate_readout
 
@@ -48,6 +56,13 @@ class FrameCheckLimits:
     blurred_frames: float = 0.5
     #: COLMAP's guess of a focal length in long sides, where none is declared.
     guessed_focal: float = 1.2
+    #: Frames by which an exposure is estimated: so many of the slowest share, and of the fastest; and the exposure for
+    #: which their speed is predicted.
+    slow_frames: int = 10
+    slow_share: float = 0.35
+    fast_frames: int = 20
+    fast_share: float = 0.4
+    brief_s: float = 0.01
     #: Times of cut frames against the video's own: below the first is rounding; and how near a video's start is meant.
     wander_s: float = 0.003
     start_s: float = 0.002
@@ -99,10 +114,19 @@ def _are_frozen(recorded: Recorded) -> BoolArray:
         return none
     motion = GyroCamera.of(imu, aligned.calibration, camera_epoch_ns=rotation.epoch_ns)
     covered = motion.covers(rotation.t_s[:-1], rotation.t_s[1:])
-    shown, turned = (np.linalg.norm(turn, axis=1) for turn in (rotation.turn_rad, motion.turn_rad(rotation.t_s)))
+    turn_rad, step_s = motion.turn_rad(rotation.t_s), np.diff(rotation.t_s)[:, None]
+    shown = np.linalg.norm(rotation.turn_rad, axis=1)
     least_rad = np.maximum(_LIMITS.frozen_rad, _LIMITS.frozen_sigmas * rotation.sigma_rad)
-    with np.errstate(invalid="ignore"):
-        still = covered & (turned > least_rad) & (shown < _LIMITS.frozen_share * turned)
+
+    def stand_still(turn_rad: Array) -> BoolArray:
+        turned = np.linalg.norm(turn_rad, axis=1)
+        with np.errstate(invalid="ignore"):
+            return covered & (turned > least_rad) & (shown < _LIMITS.frozen_share * turned)
+
+    still = stand_still(turn_rad)
+    if still.any():
+        # what the gyroscope reads in all of them alike is its bias, which pixels tell poorly where the camera slides
+        still = stand_still(turn_rad - np.median(turn_rad[still] / step_s[still], axis=0) * step_s)
     # by chance where both turn back, once; not in a row
     runs = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]])))
     for begin, end in zip(runs[::2].tolist(), runs[1::2].tolist(), strict=True):
@@ -149,6 +173,80 @@ def check_exposure(recorded: Recorded) -> Iterator[Finding]:
             exposure_s=np.median(timing.exposure_s),
         )
         yield Finding(fact=fact, severity="warning")
+
+
+def check_unstated_exposure(recorded: Recorded) -> Iterator[Finding]:
+    """An exposure that nobody states, by the blur of frames that turn quickly and slowly."""
+    timing = recorded.timing
+    if not recorded.is_capture or timing is None or timing.exposure_s is not None or recorded.camera is None:
+        return
+    try:
+        found = estimate_unstated_exposure(recorded)
+    except NotObservableError:
+        return
+    speed_px_s = np.nanmax(_predict_speed(recorded, timing, recorded.camera))
+    fact = Fact(
+        "exposure-unstated",
+        exposure_s=found.exposure_s,
+        exposure_sigma_s=found.sigma_s,
+        most_s=found.most_s,
+        most_px=float(speed_px_s * (found.exposure_s or found.most_s)),
+        frames=found.frames,
+    )
+    yield Finding(fact=fact, severity="info")
+
+
+def estimate_unstated_exposure(recorded: Recorded) -> ExposureEstimate:
+    """The exposure of frames by their blur, with the gyroscope as it was aligned.
+
+    Raises
+    ------
+    NotObservableError
+        Where pictures or an alignment are missing, or frames do not tell.
+    """
+    timing, camera = recorded.timing, recorded.camera
+    if timing is None or camera is None or recorded.images is None:
+        raise NotObservableError("exposure", Fact("exposure-without-pictures"))
+    stabilised = recorded.stabilisation is not None and recorded.stabilisation.stabilised
+    if not isinstance(recorded.aligned, Alignment) or stabilised:
+        raise NotObservableError("exposure", Fact("exposure-without-gyroscope"))
+    speed_px_s = _predict_speed(recorded, timing, camera)
+    known = np.flatnonzero(np.isfinite(speed_px_s))
+    slowest_first = known[np.argsort(speed_px_s[known], kind="stable")]
+    shares = np.concatenate(
+        [
+            np.linspace(0, _LIMITS.slow_share, _LIMITS.slow_frames),
+            np.linspace(1 - _LIMITS.fast_share, 1, _LIMITS.fast_frames),
+        ]
+    )
+    chosen = slowest_first[np.unique(np.rint(shares * max(len(known) - 1, 0)).astype(np.intp))] if len(known) else known
+    motion, pinhole = _gyro_camera(recorded, timing), colmap_camera(camera)
+    exposures_s = exposures_to_compare(float(np.median(np.diff(timing.t_s))))
+    places = {name: i for i, name in enumerate(timing.names)}
+    compared = []
+    for frame in recorded.images(sorted(chosen.tolist())):
+        shutter = FrameShutter.of(timing, places[frame.name], width=camera.width, height=camera.height)
+        one = compare_exposures(frame.image, motion, pinhole, shutter, exposures_s)
+        if one is not None:
+            compared.append(one)
+    return estimate_exposure(compared, exposures_s)
+
+
+def _gyro_camera(recorded: Recorded, timing: FrameTiming) -> GyroCamera:
+    assert recorded.imu is not None and isinstance(recorded.aligned, Alignment)
+    return GyroCamera.from_timed(
+        CameraTimedImu.from_recording(recorded.imu, recorded.aligned.settle_clock_rate(), timing.epoch_ns)
+    )
+
+
+def _predict_speed(recorded: Recorded, timing: FrameTiming, camera: CameraModel) -> Array:
+    """(F,) px/s by which the camera's turning moves the picture (90th percentile); NaN without gyroscope."""
+    brief_s = _LIMITS.brief_s
+    brief = replace(timing, exposure_s=np.full(len(timing.t_s), brief_s), t_s=timing.t_s - 0.5 * brief_s)
+    predicted = predict_blur_px(
+        _gyro_camera(recorded, timing), colmap_camera(camera), brief, width=camera.width, height=camera.height
+    )
+    return predicted.px / brief_s
 
 
 def check_readout(recorded: Recorded) -> Iterator[Finding]:

@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from colmap_inertial.core.arrays import AnyArray, Array, Float32Array, IndexArray, UInt8Array, UInt16Array
+from colmap_inertial.core.arrays import AnyArray, Array, BoolArray, Float32Array, IndexArray, UInt8Array, UInt16Array
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath, middles
 from colmap_inertial.imaging.tracking import convert_to_grey
@@ -263,7 +263,6 @@ def _compute_spectra(
     """(N, T, T // 2 + 1) log power of tiles, the (N, 2) chords and the (N, S, 2) paths of their blur; ``None`` where
     there are too few to tell."""
     import cv2
-    from scipy.fft import rfft2
 
     light = _linearise(image)
     chords = path.field()
@@ -285,22 +284,44 @@ def _compute_spectra(
     height, width = light.shape
     if min(height, width) < tile:
         return None
-    step = max(3 * tile // 4, int(np.ceil(np.sqrt(height * width / most_tiles))))
-    top, left = (_place_tiles(size, tile, step) for size in (height, width))
-    windows = np.lib.stride_tricks.sliding_window_view(light, (tile, tile))[top[:, None], left].reshape(-1, tile, tile)
-    middles = [(start + tile / 2) * reduced for start in (top, left)]
+    windows, starts = _cut_tiles(light, tile, most_tiles)
+    middles = [(start + tile / 2) * reduced for start in starts]
     vectors = chords.at(*middles).reshape(-1, 2) / reduced
     extent = np.hypot(vectors[:, 0], vectors[:, 1])
     usable = (extent >= _LIMITS.shortest_px) & (extent * FACTORS[-1] < 0.5 * tile)
-    usable &= (windows > 0.97).mean(axis=(1, 2)) < _LIMITS.most_clipped
-    tiles = windows - windows.mean(axis=(1, 2), keepdims=True)
-    usable &= np.einsum("nij,nij->n", tiles, tiles) > (_LIMITS.least_contrast * tile) ** 2
+    usable &= _hold_texture(windows)
     if usable.sum() < _LIMITS.fewest_tiles:
         return None
-    window = np.hanning(tile).astype(np.float32)
-    power = _measure_power(rfft2(tiles[usable] * (window[:, None] * window)))
     paths = path.at(*middles).reshape(len(vectors), -1, 2)[usable] / reduced
-    return np.asarray(np.log(power + _LIMITS.floor * tile**2)), vectors[usable], paths
+    return _compute_log_power(windows[usable]), vectors[usable], paths
+
+
+def _cut_tiles(light: Float32Array, tile: int, most_tiles: int) -> tuple[Float32Array, list[IndexArray]]:
+    """(N, T, T) tiles that cover an image evenly, and where their rows and columns begin."""
+    height, width = light.shape
+    step = max(3 * tile // 4, int(np.ceil(np.sqrt(height * width / most_tiles))))
+    top, left = (_place_tiles(size, tile, step) for size in (height, width))
+    windows = np.lib.stride_tricks.sliding_window_view(light, (tile, tile))[top[:, None], left].reshape(-1, tile, tile)
+    return windows, [top, left]
+
+
+def _hold_texture(windows: Float32Array) -> BoolArray:
+    """(N,) which of the tiles are neither flat nor clipped."""
+    tiles = windows - windows.mean(axis=(1, 2), keepdims=True)
+    clipped = (windows > 0.97).mean(axis=(1, 2)) >= _LIMITS.most_clipped
+    least = (_LIMITS.least_contrast * windows.shape[1]) ** 2
+    return np.asarray((np.einsum("nij,nij->n", tiles, tiles) > least) & ~clipped)
+
+
+def _compute_log_power(windows: Float32Array) -> Float32Array:
+    """(N, T, T // 2 + 1) log power of tiles under Hann's window."""
+    from scipy.fft import rfft2
+
+    tile = windows.shape[1]
+    tiles = windows - windows.mean(axis=(1, 2), keepdims=True)
+    window = np.hanning(tile).astype(np.float32)
+    power = _measure_power(rfft2(tiles * (window[:, None] * window)))
+    return np.asarray(np.log(power + _LIMITS.floor * tile**2))
 
 
 def _weigh_tiles(logarithm: Float32Array) -> Array:
@@ -340,6 +361,21 @@ def _place_tiles(size: int, tile: int, step: int) -> IndexArray:
 def _measure_falls(logarithm: Float32Array, vectors: Array, path_px: Array) -> tuple[Array, Array, Array, Array]:
     """(N,) sums over the frequencies of each tile: its fall times the expected one, and the expected one squared; and
     both of the means over frequencies."""
+    seen, expected, counts = _compute_falls(logarithm, vectors, path_px)
+    frequencies = np.maximum(counts.sum(1), 1)
+    return (
+        (seen * expected).sum(1),
+        (expected**2).sum(1),
+        seen.sum(1) * expected.sum(1) / frequencies,
+        expected.sum(1) ** 2 / frequencies,
+    )
+
+
+def _compute_falls(logarithm: Float32Array, vectors: Array, path_px: Array) -> tuple[Array, Array, BoolArray]:
+    """(N, M) falls of N tiles at their frequencies: as seen, and as expected of a path; and (N, M) which of them count.
+
+    A fall is the log power less its mean over the directions across ``vectors`` at the same distance from the origin.
+    """
     tile = logarithm.shape[1]
     reach = int(_LIMITS.band_per_px[1] * tile) + 2
     x, y = np.arange(reach - 1) / tile, np.arange(2 - reach, reach - 1)[:, None] / tile
@@ -367,14 +403,7 @@ def _measure_falls(logarithm: Float32Array, vectors: Array, path_px: Array) -> t
     picture = np.maximum(above / (passed * across).sum(1), 0)[:, None] / rise
     counts = ~across & (count[:, ring] > 0)
     expected = np.maximum(np.log((picture * passed + noise) / (picture * after + noise)), _LIMITS.deepest_log) * counts
-    seen = (power - level) * counts
-    frequencies = np.maximum(counts.sum(1), 1)
-    return (
-        (seen * expected).sum(1),
-        (expected**2).sum(1),
-        seen.sum(1) * expected.sum(1) / frequencies,
-        expected.sum(1) ** 2 / frequencies,
-    )
+    return (power - level) * counts, expected, counts
 
 
 def _compute_transfer(path_px: Array, x: Array, y: Array) -> Float32Array:

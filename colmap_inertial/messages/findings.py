@@ -821,6 +821,30 @@ def declared_readout(
     )
 
 
+def _advise_exposure(exposure_s: float | None = None, **_: object) -> str:
+    if exposure_s is None:
+        return "give exposure_s under [timing] in capture.toml where the recorder knows it"
+    return f"write exposure_s = {exposure_s:.4f} under [timing] in capture.toml, so that frames can be deblurred"
+
+
+@message(
+    advice=_advise_exposure,
+    example={"exposure_s": 0.0312, "exposure_sigma_s": 0.0021, "most_s": 0.0364, "most_px": 21.0, "frames": 30},
+)
+def exposure_unstated(
+    exposure_s: float | None, exposure_sigma_s: float | None, most_s: float, most_px: float, frames: int
+) -> str:
+    if exposure_s is None or exposure_sigma_s is None:
+        return (
+            f"no exposure is stated; the blur of {frames} frames shows that it is at most {1e3 * most_s:.1f} ms, with "
+            f"which the fastest turning smears {most_px:.1f} px"
+        )
+    return (
+        f"no exposure is stated; the blur of {frames} frames shows {1e3 * exposure_s:.1f} +- "
+        f"{1e3 * exposure_sigma_s:.1f} ms, with which the fastest turning smears {most_px:.1f} px"
+    )
+
+
 def _advise_readout(readout_s: float | None = None, direction: str = "down", **_: object) -> str:
     if readout_s is None:
         return "give readout_s under [timing] in capture.toml (0 for a global shutter), so that it is corrected"

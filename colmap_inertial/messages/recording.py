@@ -241,6 +241,20 @@ def readout_of_even_rotation(change_rad_s: float) -> str:
 
 
 state("readout-of-sparse-pictures", "images this far apart in time do not determine it; a video does")
+state("exposure-without-pictures", "it needs the camera's intrinsics and images")
+state("exposure-without-gyroscope", "it needs images as filmed and a gyroscope that fits them")
+
+
+@message(example={"frames": 5})
+def exposure_of_few_frames(frames: int) -> str:
+    return f"{frames} frames with texture are too few"
+
+
+@message(example={"longest_s": 0.08})
+def exposure_not_bounded(longest_s: float) -> str:
+    return f"frames exclude no exposure up to {1e3 * longest_s:.0f} ms: the camera hardly turns, or texture is missing"
+
+
 state("readout-without-gyroscope", "it needs a video and a gyroscope that fit each other")
 state("readout-of-stabilised-video", "a stabilised video does not show it")
 

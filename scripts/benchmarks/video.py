@@ -1,18 +1,18 @@
 """Real video beside bare COLMAP: processor time by step, registered images, path and scale errors, verdict.
 
     python -m scripts.benchmarks.video FOLDER [--data ../shared/data] [--sets mh01_5hz room ...] [--only
-    {bare,ours,refined}]
-        [--overlap N] [--json FILE]
+    {bare,ours,refined,exhaustive}] [--overlap N] [--json FILE]
 
 FOLDER takes captures and reconstructions. Sets: ``mh01_20hz``, ``mh01_10hz``, ``mh01_5hz`` (EuRoC MH_01, 30 s, of which
-the camera stands still in the last 14), ``room`` (a room by hand, 22 s at 8.3 Hz, rolling shutter; no truth). Both find
-COLMAP's default features with the camera given, one thread each, seed 0; bare COLMAP matches sequentially (by
-``--overlap`` frames, and a quadratic overlap) and maps with its own settings.
+the camera stands still in the last 14), ``room`` (a room by hand, 22 s at 8.3 Hz, rolling shutter; no truth), and the
+first 62 frames of it, ``room_62``. Both find COLMAP's default features with the camera given, one thread each, seed 0;
+bare COLMAP matches sequentially (by ``--overlap`` frames, and a quadratic overlap) and maps with its own settings.
 
 Bare steps are the processor time of each call, ours that between the stamps of the process' steps. ``refined`` repeats
-our metric step with ``--refine inertial``. Path: rms distance of camera centres from the truth after a similarity, of
-COLMAP's model and of the metric one; scale: the metric model's length over the true one, less one. A set without its
-recordings is skipped.
+our metric step with ``--refine inertial``. ``exhaustive``, only where it is asked for, is ours with every pair matched;
+where ours is there, too, it tells how far the cameras of both lie apart, after a similarity. Path: rms distance of
+camera centres from the truth after a similarity, of COLMAP's model and of the metric one; scale: the metric model's
+length over the true one, less one. A set without its recordings is skipped.
 """
 
 from __future__ import annotations
@@ -46,13 +46,20 @@ if TYPE_CHECKING:
 Figures = dict[str, Any]
 #: EuRoC's frames a second.
 EUROC_HZ = 20
-#: Sets by name: folder of the recordings, and each which frame.
+#: Sets by name: folder of the recordings; of EuRoC each which frame, of the room how many.
 SETS = {"mh01_20hz": ("euroc_mh01", 1), "mh01_10hz": ("euroc_mh01", 2), "mh01_5hz": ("euroc_mh01", 4)}
-SETS |= {"room": ("handheld_room", 1)}
+SETS |= {"room": ("handheld_room", 185), "room_62": ("handheld_room", 62)}
 #: Our steps in the columns of the table; any other is ``rest``.
 STEPS = {"features": "features", "matches": "matching", "mapping": "mapping", "metric": "metric"}
 #: All steps of a run; other stamps are of what these are made from.
 RUN_STEPS = ("imaging", "frames", *STEPS, "images")
+#: Options of our runs, and what is run where nothing is asked for.
+OPTIONS = {
+    "ours": ("--refine", "auto"),
+    "refined": ("--refine", "inertial"),
+    "exhaustive": ("--refine", "auto", "--mapping.pairing", "exhaustive"),
+}
+RUNS = ("bare", "ours", "refined")
 COLUMNS = ("features", "matching", "mapping", "metric", "rest", "processor_s")
 
 
@@ -97,10 +104,15 @@ def euroc_video(dataset: Path, folder: Path, every: int) -> Video:
 
 def video_of(kind: str, data: Path, folder: Path) -> Video:
     """A set's capture, written to ``folder``."""
-    name, every = SETS[kind]
+    name, number = SETS[kind]
     if name == "euroc_mh01":
-        return euroc_video(data / name, folder, every)
-    shutil.copytree(data / name, folder, dirs_exist_ok=True, copy_function=copy_once)
+        return euroc_video(data / name, folder, every=number)
+    lines = (data / name / "frames.csv").read_text().splitlines()[: number + 1]
+    others = {path.name for path in (data / name / "frames").iterdir()} - {row.partition(",")[0] for row in lines}
+    shutil.copytree(
+        data / name, folder, dirs_exist_ok=True, copy_function=copy_once, ignore=lambda *_: {"frames.csv", *others}
+    )
+    (folder / "frames.csv").write_text("\n".join(lines) + "\n")
     return Video(capture=folder / "capture.toml", truth={})
 
 
@@ -197,10 +209,10 @@ def run_by_step(command: list[object], stamps: Path) -> tuple[float, dict[str, f
     return spent_s, {name: ended[name] - before[name] for name in steps}
 
 
-def measure_ours(video: Video, out: Path, refine: str) -> Figures:
+def measure_ours(video: Video, out: Path, *options: str) -> Figures:
     """Figures of ``reconstruct``; of a folder that holds a run, the steps that it repeats."""
     command: list[object] = [sys.executable, "-m", "colmap_inertial", "reconstruct", video.capture, out, "--quiet"]
-    command += ["--deterministic", "--refine", refine]
+    command += ["--deterministic", *options]
     processor_s, steps = run_by_step(command, out / ".stages")
     result = read_json(out / "result.json")
     figures: Figures = dict.fromkeys(COLUMNS, 0.0)
@@ -240,16 +252,28 @@ def path_mm(centre: Array, true: Array) -> float:
 
 def judge(models: Path, truth: dict[str, Array]) -> Figures:
     """Images of the models, and of the largest one residuals, points and path error."""
-    read = sorted((read_model(folder) for folder in find_models(models).values()), key=lambda m: -m.num_reg_images())
-    model = read[0]
+    model = largest(models)
     figures: Figures = {
-        "images": [int(one.num_reg_images()) for one in read],
+        "images": sorted((int(read_model(one).num_reg_images()) for one in find_models(models).values()), reverse=True),
         "points": int(model.num_points3D()),
         "residual_px": float(model.compute_mean_reprojection_error()),
     }
     if truth:
         figures["path_mm"] = path_mm(*aligned(model, truth))
     return figures
+
+
+def largest(models: Path) -> pycolmap.Reconstruction:
+    """The model of most images."""
+    return max((read_model(folder) for folder in find_models(models).values()), key=lambda m: m.num_reg_images())
+
+
+def measure_apart_pct(one: Path, other: Path) -> float:
+    """Rms distance of the cameras that both have, after a similarity, of the extent of their path."""
+    model = largest(other)
+    truth = {image.name: image.projection_center() for image in map(model.image, model.reg_image_ids())}
+    centre, true = aligned(largest(one), truth)
+    return 0.1 * path_mm(centre, true) / float(np.linalg.norm(np.ptp(true, axis=0)))
 
 
 def show(kind: str, who: str, figures: Figures) -> str:
@@ -268,7 +292,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--data", type=Path, default=Path(__file__).parents[3] / "shared" / "data")
     parser.add_argument("--sets", nargs="*", choices=tuple(SETS), default=["mh01_5hz", "room"])
-    parser.add_argument("--only", choices=("bare", "ours", "refined"))
+    parser.add_argument("--only", choices=("bare", *OPTIONS))
     parser.add_argument("--overlap", type=int, default=10, help="of bare COLMAP's sequential matching")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--bare", type=Path, help=argparse.SUPPRESS)
@@ -284,18 +308,20 @@ def main() -> None:
             print(f"{kind}: skipped, as {args.data / SETS[kind][0]} is not there", flush=True)
             continue
         video = video_of(kind, args.data, args.folder / kind / "capture")
-        for who in ("bare", "ours", "refined"):
-            if args.only in (None, who):
-                out = args.folder / kind / ("bare" if who == "bare" else "ours")
-                if who != "refined":
-                    shutil.rmtree(out, ignore_errors=True)
-                measured = (
-                    measure_bare(video, out, args.overlap)
-                    if who == "bare"
-                    else measure_ours(video, out, "inertial" if who == "refined" else "auto")
-                )
-                found[f"{kind} {who}"] = measured
-                print(show(kind, who, measured), flush=True)
+        for who in RUNS if args.only is None else (args.only,):
+            out = args.folder / kind / ("ours" if who == "refined" else who)
+            if who != "refined":
+                shutil.rmtree(out, ignore_errors=True)
+            if who == "bare":
+                measured = measure_bare(video, out, args.overlap)
+            else:
+                measured = measure_ours(video, out, *OPTIONS[who])
+            found[f"{kind} {who}"] = measured
+            print(show(kind, who, measured), flush=True)
+            ours = args.folder / kind / "ours" / "colmap" / "sparse"
+            if who == "exhaustive" and find_models(ours):
+                apart_pct = measure_apart_pct(ours, out / "colmap" / "sparse")
+                print(f"{kind}: cameras of both lie {apart_pct:.2f} % of the path's extent apart (rms)", flush=True)
     write_report(args.json, found)
 
 

@@ -15,8 +15,10 @@ from colmap_inertial.cli import main
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import quat_conjugate, quat_exp, quat_multiply, quat_rotate, so3_exp
+from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.types import CameraModel, CameraTrajectory, Frame, FrameLog, FrameTiming, ImuRecording
 from colmap_inertial.diagnose import Diagnosis, FramesInVideo, Recorded, diagnose
+from colmap_inertial.diagnose.frames import check_repeated
 from colmap_inertial.imaging.gyro_camera import FrameShutter
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.capture import load_capture
@@ -24,7 +26,8 @@ from colmap_inertial.io.frames import read_frame_times
 from colmap_inertial.io.imu import read_capture_imu, read_imu
 from colmap_inertial.io.trajectories import read_inertial_scale
 from colmap_inertial.model import Model, read_model
-from colmap_inertial.motion.flow import measure_rotation, reduce_frames
+from colmap_inertial.motion.align import Alignment
+from colmap_inertial.motion.flow import VisualRotation, measure_rotation, reduce_frames
 from colmap_inertial.run.preparation.preflight import stop_or_doubt
 from colmap_inertial.run.stages.metric import MetricStage
 from colmap_inertial.tools.simulate.motion import MotionKind, MotionOptions
@@ -452,6 +455,40 @@ def test_what_is_wrong_with_pictures_is_found(film: Film, filmed: Recorded) -> N
     for blank, severity in ((2, "warning"), (200, "error")):
         few = replace(clean, looked_at=300, blank=tuple(f"{i:03}.png" for i in range(blank)))
         assert found(diagnose(few), "frames-blank") == severity
+
+
+def test_a_camera_that_rests_after_sliding_past_close_things_repeats_no_frame() -> None:
+    rng = np.random.default_rng(5)
+    gyro_s, moving_s = np.arange(0.0, 24.0, 0.005), 16.0
+    # a hand's turning, then none
+    white = rng.standard_normal((len(gyro_s), 3))
+    rate = np.stack([np.convolve(column, np.hanning(120), mode="same") for column in white.T], axis=1)
+    rate *= 0.4 / rate.std() * np.clip((moving_s - gyro_s[:, None]) / 0.3, 0, 1)
+    path = GyroPath(gyro_s, rate, np.zeros(3))
+    t_s = np.concatenate([np.arange(0.5, moving_s, 0.05), np.arange(moving_s, 23.5, 0.2)])
+    turn = path.turn_rad(t_s[:-1], t_s[1:])
+    # to pixels, sliding past close things looks like turning
+    turn[t_s[1:] < moving_s] += 0.05 * np.array([-0.02, 0.03, 0.01])
+    turn += 3e-5 * rng.standard_normal(turn.shape)
+    rotation = VisualRotation(
+        names=tuple(f"{i}.png" for i in range(len(t_s))),
+        t_s=t_s,
+        turn_rad=turn,
+        sigma_rad=np.full(len(turn), 1e-4),
+        support=np.full(len(turn), 200, dtype=np.intp),
+    )
+    imu = ImuRecording(
+        gyro_t_s=gyro_s,
+        gyro_rad_s=rate + [0.005, 0.03, 0.08] + 0.001 * rng.standard_normal(rate.shape),
+        accel_t_s=gyro_s,
+        accel_m_s2=np.tile([0.0, 0.0, 9.81], (len(gyro_s), 1)),
+    )
+    recorded = Recorded(rotation=rotation, imu=imu)
+    aligned = recorded.aligned
+    assert isinstance(aligned, Alignment)
+    bias = aligned.calibration.gyro_bias_rad_s - [0.005, 0.03, 0.08]
+    assert np.linalg.norm(bias) > 0.01
+    assert not list(check_repeated(recorded))
 
 
 def test_a_calibration_that_turns_the_camera_is_found(filmed: Recorded) -> None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal, TypeVar
 
@@ -14,12 +15,13 @@ from colmap_inertial.core.errors import FormatError, InertialError, NotObservabl
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.progress import Progress, report_each
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, FrameTiming, ImuRecording
+from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, Frame, FrameTiming, ImuRecording
 from colmap_inertial.diagnose import Diagnosis, FramesInVideo, Recorded, diagnose
 from colmap_inertial.imaging.detail import is_blank
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import read_record, write_json, write_record
 from colmap_inertial.io.frame_sources import ImageFolder
+from colmap_inertial.io.frames import decode_images, read_frames
 from colmap_inertial.io.plausible import check_readings
 from colmap_inertial.io.pose_convention import COLMAP, PoseConvention
 from colmap_inertial.io.recording import Recording
@@ -131,6 +133,13 @@ class TolerantReader:
             return None
 
 
+def _decode_some(capture: Capture, timing: FrameTiming, places: Sequence[int]) -> Iterable[Frame]:
+    """Some frames in full, by their places; of a folder, no other is opened."""
+    if isinstance(capture.frames, ImageFolder):
+        return decode_images(capture, timing, np.asarray(places, dtype=np.intp))
+    return read_frames(capture, only=[timing.names[i] for i in places])[1]
+
+
 def measure_recording(inputs: CheckInputs, progress: Progress, frames: GreyFrames | None = None) -> Recorded:
     """Measure what the checks look at: ``diagnose``, ``scale``, and each reconstruction before its work.
 
@@ -142,6 +151,7 @@ def measure_recording(inputs: CheckInputs, progress: Progress, frames: GreyFrame
     log_ = None if capture is None else capture.frame_log
     rotation = in_video = None
     looked: dict[str, bool] = {}
+    images: Callable[[Sequence[int]], Iterable[Frame]] | None = None
 
     if poses is None and capture is not None and timing is not None:
         # turns in pictures that the camera stabilised are not the camera's
@@ -149,6 +159,7 @@ def measure_recording(inputs: CheckInputs, progress: Progress, frames: GreyFrame
             seen = frames or GreyFrames(capture, timing)
             rotation = reader.attempt(lambda: measure_images(seen, progress, looked))
         in_video = reader.attempt(lambda: find_in_video(capture, timing, progress))
+        images = partial(_decode_some, capture, timing)
     return Recorded(
         refused=tuple(reader.refused),
         imu=inputs.imu,
@@ -164,6 +175,7 @@ def measure_recording(inputs: CheckInputs, progress: Progress, frames: GreyFrame
         read_as=inputs.read_as,
         max_offset_s=inputs.max_offset_s,
         in_video=in_video,
+        images=images,
     )
 
 
