@@ -7,7 +7,6 @@ import math
 from colmap_inertial.core.types.evidence import ScaleEvidence
 from colmap_inertial.evidence.priors import DECLARED
 
-
 #: Nothing is measured better than this (logarithm).
 _EXACT = 1e-6
 

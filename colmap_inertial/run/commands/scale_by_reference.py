@@ -48,7 +48,6 @@ from colmap_inertial.evidence.combine import combine, judge_device
 from colmap_inertial.evidence.references import evidence_of_distance, evidence_of_target
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.io.capture import Capture, load_capture
-from colmap_inertial.io.device_folders import is_device_folder
 from colmap_inertial.io.files import StrPath, a_record_of_ours, path_in, read_json, write_json
 from colmap_inertial.io.fingerprints import fingerprint
 from colmap_inertial.io.frame_sources import ImageFolder, Video, image_names
@@ -244,11 +243,8 @@ class _Said:
 
 def _describe(project: Path, source: ProjectOptions) -> Capture:
     """What is known of a project's images: what was given beside it, else what lies in it."""
-    beside = (path for path in (source.imu, source.frame_times) if path is not None and is_capture(path))
-    if (path := next(beside, None)) is not None:
-        return load_capture(path)
-    poses = project if is_device_folder(project) else None
-    return Capture(path=project, calibration=calibration_prior(), poses=poses)
+    given = _find_capture(project, source)
+    return Capture(path=project, calibration=calibration_prior()) if given is None else given
 
 
 def _ask_sensors(
@@ -294,19 +290,21 @@ def has_imu(path: Path, source: ProjectOptions) -> bool:
     """Whether an IMU was recorded with a capture, or is given beside a project."""
     if source.imu is not None and not is_capture(source.imu):
         return True
-    capture = _try_capture(path if source.imu is None else source.imu)
+    capture = _find_capture(path, source)
     return capture is not None and capture.imu is not None
 
 
 def knows_metres(path: Path, source: ProjectOptions) -> bool:
-    """Whether a capture without an IMU says by itself where metres come from."""
-    capture = _try_capture(path if source.imu is None else source.imu)
+    """Whether a capture, or what is given beside a project, says where metres come from without an IMU."""
+    capture = _find_capture(path, source)
     return capture is not None and any((capture.poses, capture.depth, capture.target))
 
 
-def _try_capture(path: Path) -> Capture | None:
+def _find_capture(path: Path, source: ProjectOptions) -> Capture | None:
+    """What describes the images: the capture, or one that is given beside a project; ``None`` where nothing does."""
+    beside = (given for given in (source.imu, source.frame_times) if given is not None and is_capture(given))
     try:
-        return load_capture(path)
+        return load_capture(next(beside, path))
     except FormatError:
         return None
 

@@ -16,6 +16,7 @@ from colmap_inertial.core.types.depth import PinholeGrid
 from colmap_inertial.core.types.evidence import AbsentSensor, Sensor
 from colmap_inertial.evidence.device_path import join_by_time
 from colmap_inertial.io.capture import Capture
+from colmap_inertial.io.capture_depth import DevicePoses
 from colmap_inertial.io.device_folders import DeviceFolder, is_device_folder, read_device_folder
 from colmap_inertial.io.fingerprints import fingerprint
 from colmap_inertial.io.trajectories import read_tum
@@ -95,10 +96,11 @@ def _wanted(chosen: Sequence[ScaleFrom], *sensors: Sensor) -> bool:
     return not chosen or any(sensor in chosen for sensor in sensors)
 
 
-def _read_poses(path: Path) -> DeviceFolder:
-    if is_device_folder(path):
-        return read_device_folder(path)
-    return DeviceFolder(app="TUM", trajectory=replace(read_tum(path), length_unit="m"), on_clock_of_images=True)
+def _read_poses(given: DevicePoses) -> DeviceFolder:
+    if is_device_folder(given.path):
+        return read_device_folder(given.path)
+    trajectory = replace(read_tum(given.path), length_unit="m")
+    return DeviceFolder(app="TUM", trajectory=trajectory, on_clock_of_images=True, up_in_world=given.up_in_world)
 
 
 def _name_by_images(folder: DeviceFolder, names: Sequence[str], timing: FrameTiming | None) -> dict[str, str]:

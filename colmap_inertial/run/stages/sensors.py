@@ -219,7 +219,7 @@ class SensorStage:
         chosen = inputs.options.scale_from
         return cls(
             sensors=inputs.sensors,
-            imu="imu" in chosen or "auto" in chosen,
+            imu=not chosen or "imu" in chosen,
             world=inputs.options.world,
         )
 
