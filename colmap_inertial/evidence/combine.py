@@ -1,9 +1,9 @@
 """All evidence of scale together: weights by covariance, sensors that may be wrong, contradictions by name.
 
 Each sensor's logarithm of the scale is normal about the true one. Errors of one cause that several share are one error.
-Beside, each sensor may be wrong (``FAULTS``), then by any amount of ``FAULT_SIGMA``, or seldom of ``GROSS_SIGMA``; of all
-cases of who is wrong, each counts by its probability given what all say. So sensors that agree confirm each other, and where two differ the
-interval reaches to both.
+Beside, each sensor may be wrong (``FAULTS``), then by any amount of ``FAULT_SIGMA``, or seldom of ``GROSS_SIGMA``. Of
+all cases of who is wrong, each counts by its probability given what all say. So sensors that agree confirm each other,
+and where two differ the interval reaches to both.
 """
 
 from __future__ import annotations

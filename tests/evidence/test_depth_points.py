@@ -15,9 +15,10 @@ from tests.helpers.depth_scenes import VIEW, Sensor, cast, record, walk
 
 #: Images are four times as large as maps.
 LARGER = 4
+USUAL = Sensor()
 
 
-def film(count=30, seed=0, *, unit_m=1.0, sensor=Sensor(), points=60, depth_log=0.02):
+def film(count=30, seed=0, *, unit_m=1.0, sensor=USUAL, points=60, depth_log=0.02):
     """Depth maps, and points of a model that counts in units of ``unit_m`` metres, at pixels of any place."""
     maps, path = record(count=count, seed=seed, sensor=sensor)
     rng = np.random.default_rng(500 + seed)
