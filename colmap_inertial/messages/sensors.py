@@ -221,8 +221,13 @@ def up_by_sensor(sensor: str, half_width_deg: float) -> str:
 
 state(
     "lengths-beside-imu",
-    "a target or a known distance does not give metres together with the IMU: it checks them",
-    advice="name the target in capture.toml ([target]), or give --scale-from target or distance alone",
+    "a known distance gives no metres together with the IMU, and a target is named in capture.toml then ([target])",
+    advice="such a target checks them, and gives them with --scale-from imu --scale-from target",
+)
+state(
+    "target-before-images",
+    "a target gives metres together with the IMU only where the refinement leaves the rectified images as they are",
+    advice="give --refine off, or --rolling-shutter off",
 )
 
 

@@ -21,7 +21,7 @@ from colmap_inertial.io.device_folders import DeviceFolder, is_device_folder, re
 from colmap_inertial.io.fingerprints import fingerprint
 from colmap_inertial.io.trajectories import read_tum
 from colmap_inertial.run.preparation.geolocation import positions_of
-from colmap_inertial.run.stages.capture_sensors import CaptureSensors
+from colmap_inertial.run.stages.capture_sensors import CaptureSensors, SeenTarget
 
 #: A pose is of an image where it was taken within this share of the time between poses.
 _WITHIN = 0.5
@@ -35,6 +35,7 @@ def find_sensors(
     timing: FrameTiming | None,
     chosen: Sequence[ScaleFrom] = (),
     images: Path | None = None,
+    made: Path | None = None,
 ) -> CaptureSensors:
     """Depth maps, the device's own path and positions of a capture, by the names of its images.
 
@@ -52,6 +53,8 @@ def find_sensors(
         The sensors that were asked for by name; all where empty.
     images
         Where an existing project has its images.
+    made
+        Where the images that agree with the model will be, where they are not those.
 
     Raises
     ------
@@ -78,7 +81,10 @@ def find_sensors(
             if error.code not in _NO_POSITIONS:
                 absent = AbsentSensor(sensor="positions", reasons=(fact_of(error),))
                 found = replace(found, absent=(*found.absent, absent))
-    there = {"depth": found.depth, "device": found.device}
+    of_model = images if made is None else made
+    if "target" in chosen and capture.target is not None and of_model is not None:
+        found = replace(found, target=SeenTarget(spec=capture.target, images=of_model))
+    there = {"depth": found.depth, "device": found.device, "target": found.target}
     for sensor, value in there.items():
         if sensor in chosen and value is None:
             raise InertialError(Fact("sensor-not-there", sensor=sensor, capture=str(capture.path)))

@@ -12,10 +12,12 @@ from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, Ref
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.run.commands.reconstruct_project import reconstruct_project
 from colmap_inertial.run.commands.scale_by_reference import has_imu, knows_metres, scale_project_by
+from colmap_inertial.run.stages import sensors
 from tests.helpers.box_project import build
 from tests.helpers.box_sensors import DepthErrors, PathErrors, write_capture
 from tests.helpers.json_schemas import find_violations
 from tests.run.commands.test_georeference import ORIGIN, geodetic_of_enu, turn, with_position
+from tests.validate.test_lengths import validated
 
 
 @pytest.fixture(scope="module")
@@ -30,8 +32,8 @@ def by_imu(box, tmp_path_factory):
     return run(box, tmp_path_factory.mktemp("imu"))
 
 
-def run(box, root, *, scale_from=(), **sensors):
-    toml = write_capture(box, root / "capture", **sensors)
+def run(box, root, *, scale_from=(), **errors):
+    toml = write_capture(box, root / "capture", **errors)
     source = ProjectOptions(imu=toml, frame_times=toml)
     return reconstruct_project(box.root, root / "out", source, ReconstructOptions(refine="off", scale_from=scale_from))
 
@@ -119,6 +121,45 @@ def test_sensors_can_be_chosen(box, by_imu, tmp_path):
     with pytest.raises(InertialError) as error:
         run(box, tmp_path / "none", scale_from=("imu", "device"))
     assert error.value.fact.code == "sensor-not-there"
+
+
+def test_a_target_that_is_named_gives_metres_and_else_checks_them(box, tmp_path, monkeypatch):
+    """The board is found by a stand-in, which says what it would measure in a model of COLMAP's units."""
+    true = box.recording.truth.metres_per_unit
+    asked = []
+
+    def measured(model, images, target, options=None, *, progress=None):
+        asked.append((model.num_reg_images(), images, target.spec))
+        assert options is not None and options.unscaled
+        # in the metres of the IMU
+        return validated(true / by_imu_scale[0], unscaled=True)
+
+    by_imu_scale = [0.0]
+    monkeypatch.setattr(sensors, "validate_model", measured)
+    original = sensors.SensorStage.__call__
+
+    def noted(self, model):
+        by_imu_scale[0] = model.similarity.scale
+        return original(self, model)
+
+    monkeypatch.setattr(sensors.SensorStage, "__call__", noted)
+    toml = write_capture(box, tmp_path / "capture")
+    toml.write_text(toml.read_text() + '[target]\nspec = "aruco:DICT_4X4_50:0.1"\n')
+    source = ProjectOptions(imu=toml, frame_times=toml)
+    options = ReconstructOptions(refine="off", scale_from=("imu", "target"))
+    monkeypatch.setattr(
+        "colmap_inertial.run.commands.reconstruct_project.run_validation", lambda _, models, *__: models
+    )
+    result = reconstruct_project(box.root, tmp_path / "out", source, options)
+    target = of(result, "target")
+    assert target.metres_per_unit == pytest.approx(true, rel=1e-6)
+    assert asked == [(len(box.names), box.root / "images", "aruco:DICT_4X4_50:0.1")]
+    assert abs(np.log(result.models[0].scale.metres_per_unit / true)) < abs(
+        np.log(of(result, "imu").metres_per_unit / true)
+    )
+    asked.clear()
+    plain = reconstruct_project(box.root, tmp_path / "plain", source, ReconstructOptions(refine="off"))
+    assert asked == [] and plain.models[0].scale.sensors is None
 
 
 # --- without an IMU --------------------------------------------------------------------------------------------------
