@@ -77,7 +77,7 @@ class Reconstruct(DeviceCommand, ConfiguredCommand):
         if chosen and chosen <= lengths:
             return False
         if "imu" in chosen or has_imu(self.capture, self.project):
-            if given or chosen & lengths:
+            if given or "distance" in chosen:
                 raise InertialError(Fact("lengths-beside-imu"))
             return True
         return not (chosen or given or knows_metres(self.capture, self.project))

@@ -368,9 +368,9 @@ class ReconstructOptions(CheckedOptions):
     (deblurred or not), or of images that `deblur --rectify` wrote."""
     scale_from: tuple[ScaleFrom, ...] = ()
     """Where metres come from, each by its name. Not given: from all that the capture has of IMU, depth maps, the
-    device's own path (ARKit, ARCore) and positions (GPS); without an IMU, also from a target and a known distance,
-    which check the others' metres otherwise. All are taken together by how sure they are; those that contradict each
-    other are named."""
+    device's own path (ARKit, ARCore) and positions (GPS); without an IMU, also from a target and a known distance. A
+    target that is not named checks the IMU's metres. All are taken together by how sure they are; those that
+    contradict each other are named."""
     scale: ScaleOptions = field(default_factory=ScaleOptions)
     """How metres come from the IMU."""
     join: JoinMethod = "inertial"

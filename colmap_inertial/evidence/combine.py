@@ -1,9 +1,9 @@
 """All evidence of scale together: weights by covariance, sensors that may be wrong, contradictions by name.
 
 Each sensor's logarithm of the scale is normal about the true one. Errors of one cause that several share are one error.
-Beside, each sensor may be wrong (``FAULTS``), then by any amount of ``FAULT_SIGMA``; of all cases of who is wrong, each
-counts by its probability given what all say. So sensors that agree confirm each other, and where two differ the
-interval reaches to both.
+Beside, each sensor may be wrong (``FAULTS``), then by any amount of ``FAULT_SIGMA``, or seldom of ``GROSS_SIGMA``. Of
+all cases of who is wrong, each counts by its probability given what all say. So sensors that agree confirm each other,
+and where two differ the interval reaches to both.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import CameraTrajectory
 from colmap_inertial.core.types.evidence import AbsentSensor, CombinedScale, DeviceDrift, ScaleEvidence, ScalePart
 from colmap_inertial.evidence.inertial import length_of
-from colmap_inertial.evidence.priors import FAULT_SIGMA, FAULTS
+from colmap_inertial.evidence.priors import FAULT_SIGMA, FAULTS, GROSS_SHARE, GROSS_SIGMA
 from colmap_inertial.inertial.scale.verdict import verdict_of
 
 #: Sensors as far apart are said to contradict each other: by chance, one recording in a hundred shows as much.
@@ -70,14 +70,16 @@ class _Cases:
 def _weigh_cases(values: Array, cov: Array, faults: Array) -> _Cases:
     n = len(values)
     rows = []
-    for wrong in itertools.product((False, True), repeat=n if n > 1 else 0):
-        is_wrong = np.array(wrong if n > 1 else (False,))
-        widened = cov + FAULT_SIGMA**2 * np.diag(is_wrong.astype(np.float64))
+    sigmas, shares = np.array([0.0, FAULT_SIGMA, GROSS_SIGMA]), np.array([1 - GROSS_SHARE, GROSS_SHARE])
+    for kinds in itertools.product(range(3), repeat=n if n > 1 else 0):
+        kind = np.array(kinds if n > 1 else (0,))
+        is_wrong = kind > 0
+        widened = cov + np.diag(sigmas[kind] ** 2)
         inverse = np.linalg.inv(widened)
         information = float(inverse.sum())
         best = float(inverse.sum(axis=0) @ values) / information
         chi2 = float((values - best) @ inverse @ (values - best))
-        prior = float(np.sum(np.log(np.where(is_wrong, faults, 1 - faults))))
+        prior = float(np.sum(np.log(np.where(is_wrong, faults * shares[kind - 1], 1 - faults))))
         log = prior - 0.5 * (np.linalg.slogdet(widened)[1] + math.log(information) + chi2)
         weights = weigh(widened)
         rows.append((log, float(weights @ values), float(weights @ widened @ weights), weights, is_wrong, chi2))

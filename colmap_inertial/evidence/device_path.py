@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -96,6 +96,13 @@ def place_device_path(
     if not (reach > limits.least_reach * np.maximum(whole, 1e-12)).all():
         raise NotObservableError("scale", Fact("device-stands-still"))
     log_scale, turn = _fit(both)
+    breaks = _find_breaks(both, log_scale, limits)
+    if breaks:
+        # pieces between breaks tell the scale, each about its own middle
+        at_s = [moment.at_s for moment in breaks]
+        both = replace(both, piece=np.searchsorted(at_s, both.t_s))
+        log_scale, turn = _fit(both)
+        breaks = _find_breaks(both, log_scale, limits) or breaks
     number = np.arange(len(both.t_s)) * limits.blocks // len(both.t_s)
     without = np.array([_fit(both.select(number != k))[0] for k in range(limits.blocks)])
     by_blocks = math.sqrt((limits.blocks - 1) / limits.blocks * float(np.sum((without - without.mean()) ** 2)))
@@ -105,23 +112,26 @@ def place_device_path(
         sigma,
         span_s=(float(both.t_s[0]), float(both.t_s[-1])),
         parts=tuple(part for span in parts if (part := _fit_part(both, span, limits)) is not None),
-        reasons=(*_find_break(both, log_scale, limits), *_find_bend(both, up_in_device, limits)),
+        reasons=(
+            *(moment.as_fact() for moment in breaks[:_MOST_NAMED]),
+            *_find_bend(both, up_in_device, limits),
+        ),
     )
-    placed = math.exp(log_scale) * (both.model - both.model.mean(axis=0)) @ turn.T
-    apart = both.device - both.device.mean(axis=0) - placed
+    apart = both.centred(both.device) - math.exp(log_scale) * both.centred(both.model) @ turn.T
     residual_m = float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
     return DevicePath(evidence=evidence, device_from_model=turn, residual_m=residual_m)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Both:
-    """Images that both have: times, centres (N, 3) and ``cam_from_world`` (N, 3, 3)."""
+    """Images that both have: times, centres (N, 3), ``cam_from_world`` (N, 3, 3), numbers of pieces (N,)."""
 
     t_s: Array
     device: Array
     model: Array
     cam_from_device: Array
     cam_from_model: Array
+    piece: IndexArray
 
     @classmethod
     def of(cls, device: CameraTrajectory, path: CameraTrajectory) -> _Both:
@@ -134,6 +144,7 @@ class _Both:
             model=path.cam_in_world[of_path],
             cam_from_device=matrix_from_quat(device.cam_from_world_xyzw[of_device]),
             cam_from_model=matrix_from_quat(path.cam_from_world_xyzw[of_path]),
+            piece=np.zeros(len(common), dtype=np.intp),
         )
 
     def select(self, kept: BoolArray) -> _Both:
@@ -143,7 +154,15 @@ class _Both:
             model=self.model[kept],
             cam_from_device=self.cam_from_device[kept],
             cam_from_model=self.cam_from_model[kept],
+            piece=self.piece[kept],
         )
+
+    def centred(self, points: Array) -> Array:
+        """(N, 3) points about the middle of those of their piece."""
+        out = points.copy()
+        for number in np.unique(self.piece):
+            out[self.piece == number] -= points[self.piece == number].mean(axis=0)
+        return out
 
     def turns(self) -> Array:
         """(N, 3, 3) rotation ``device_from_model`` by each image's attitude."""
@@ -160,9 +179,11 @@ def _fit(both: _Both) -> tuple[float, Array]:
     The rotation is that of positions and of attitudes: a straight path has no turn about itself. Errors of both paths
     are alike, so that the scale is the ratio of their reaches along each other, either way.
     """
-    device, model = both.device - both.device.mean(axis=0), both.model - both.model.mean(axis=0)
-    size = _reach(both.device) * _reach(both.model)
-    turn = _nearest_rotation(device.T @ model / (len(model) * size) + both.turns().mean(axis=0))
+    device, model = both.centred(both.device), both.centred(both.model)
+    size = float(np.sqrt(np.sum(device**2) * np.sum(model**2)))
+    if not size > 0:
+        raise NotObservableError("scale", Fact("device-stands-still"))
+    turn = _nearest_rotation(device.T @ model / size + both.turns().mean(axis=0))
     along = float(np.sum(device * (model @ turn.T)))
     # least squares of either on the other, and their geometric mean
     forth, back = along / float(np.sum(model**2)), float(np.sum(device**2)) / along if along > 0 else math.nan
@@ -182,8 +203,6 @@ def _fit_part(both: _Both, span: tuple[float, float], limits: DevicePathLimits) 
     if inside.sum() < limits.fewest:
         return None
     part = both.select(inside)
-    if not min(_reach(part.device), _reach(part.model)) > 0:
-        return None
     half = np.arange(len(part.t_s)) < len(part.t_s) // 2
     try:
         log_scale, _ = _fit(part)
@@ -194,7 +213,23 @@ def _fit_part(both: _Both, span: tuple[float, float], limits: DevicePathLimits) 
     return ScalePart(begin_s=span[0], end_s=span[1], log_scale=log_scale, sigma=max(sigma, 1e-6))
 
 
-def _find_break(both: _Both, log_scale: float, limits: DevicePathLimits) -> list[Fact]:
+@dataclass(frozen=True, kw_only=True)
+class _Break:
+    """When one path jumps against the other, and by how much within a moment."""
+
+    at_s: float
+    jump_m: float
+    turn_deg: float
+
+    def as_fact(self) -> Fact:
+        return Fact("device-path-breaks", at_s=self.at_s, jump_m=self.jump_m, turn_deg=self.turn_deg)
+
+
+#: So many breaks are named, the rest counts all the same.
+_MOST_NAMED = 3
+
+
+def _find_breaks(both: _Both, log_scale: float, limits: DevicePathLimits) -> list[_Break]:
     """Where one path jumps against the other: the motion over a moment, seen from the camera, compared."""
     later = np.searchsorted(both.t_s, both.t_s + limits.break_s)
     first = np.flatnonzero(later < len(both.t_s))
@@ -206,14 +241,15 @@ def _find_break(both: _Both, log_scale: float, limits: DevicePathLimits) -> list
     off_m = np.linalg.norm(by_device - by_model, axis=1)
     turns = both.turns()
     off_deg = np.degrees(np.linalg.norm(so3_log(turns[later] @ np.swapaxes(turns[first], 1, 2)), axis=1))
-    worst_m, worst_deg = int(np.argmax(off_m)), int(np.argmax(off_deg))
-    jumps = off_m[worst_m] > max(limits.break_sigmas * float(np.median(off_m)), limits.break_m)
-    twists = off_deg[worst_deg] > max(limits.break_sigmas * float(np.median(off_deg)), limits.break_deg)
-    if not (jumps or twists):
-        return []
-    at = worst_m if jumps else worst_deg
-    at_s = 0.5 * float(both.t_s[first[at]] + both.t_s[later[at]])
-    return [Fact("device-path-breaks", at_s=at_s, jump_m=float(off_m[at]), turn_deg=float(off_deg[at]))]
+    jumps = off_m > max(limits.break_sigmas * float(np.median(off_m)), limits.break_m)
+    twists = off_deg > max(limits.break_sigmas * float(np.median(off_deg)), limits.break_deg)
+    found = []
+    # one break is in all moments that it lies in
+    at = np.flatnonzero(jumps | twists)
+    for run in np.split(at, np.flatnonzero(np.diff(at) > 1) + 1) if len(at) else ():
+        middle_s = 0.25 * float(both.t_s[first[run[[0, -1]]]].sum() + both.t_s[later[run[[0, -1]]]].sum())
+        found.append(_Break(at_s=middle_s, jump_m=float(off_m[run].max()), turn_deg=float(off_deg[run].max())))
+    return found
 
 
 def _moved(centres: Array, cam_from_world: Array, first: IndexArray, later: IndexArray) -> Array:

@@ -41,3 +41,5 @@ FAULTS: dict[Sensor, float] = {
 }
 #: Standard deviation of the logarithm of the scale of one that is: mostly a few per cent, and more where it shows.
 FAULT_SIGMA = 0.04
+#: Of those that are wrong, the share that is so by any factor: another unit, a board of another size, a foreign path.
+GROSS_SHARE, GROSS_SIGMA = 0.05, 0.7

@@ -26,6 +26,7 @@ from colmap_inertial.io.capture_depth import (
     DEPTH_KEYS,
     POSES_KEYS,
     DescribedDepth,
+    DevicePoses,
     read_depth_table,
     read_poses_table,
 )
@@ -100,8 +101,7 @@ class Capture:
     rig
         Cameras that are fixed to the one of ``frames``.
     poses
-        The path that the device computed by itself: an app's export, which may hold depth maps, too, or a file in TUM
-        format; ``None`` where there is none.
+        The path that the device computed by itself; ``None`` where there is none.
     depth
         Depth maps beside the frames; ``None`` where there are none but those of the export.
     """
@@ -125,7 +125,7 @@ class Capture:
     apertures: ApertureImages | None = None
     exposures: LongExposures | None = None
     rig: tuple[RigCamera, ...] = ()
-    poses: Path | None = None
+    poses: DevicePoses | None = None
     depth: DescribedDepth | None = None
 
     @property
@@ -187,7 +187,7 @@ def _read_capture_toml(path: Path) -> Capture:
         raise FormatError(path, Fact("capture-of-nothing"))
     if capture.poses is None and isinstance(capture.imu, ImuPath) and is_device_folder(capture.imu.path):
         # the recorder of the IMU kept the device's path, too
-        capture = replace(capture, poses=capture.imu.path)
+        capture = replace(capture, poses=DevicePoses(path=capture.imu.path))
     return capture
 
 
@@ -385,13 +385,13 @@ def _describe_recording(path: Path, recording: RecorderOutput) -> Capture:
         imu=ImuPath(path=recording.imu, format=recording.format),
         calibration=calibration_prior(Declared(readout_s=readout_s), shared_clock=shared_clock),
         frame_log=log,
-        poses=path if is_device_folder(path) else None,
+        poses=DevicePoses(path=path) if is_device_folder(path) else None,
     )
 
 
 def _describe_export(path: Path) -> Capture:
     """An app's export with the device's own path, and without an IMU."""
-    return Capture(path=path, frames=export_frames(path), calibration=calibration_prior(), poses=path)
+    return Capture(path=path, frames=export_frames(path), calibration=calibration_prior(), poses=DevicePoses(path=path))
 
 
 def _describe_asl(path: Path, camera: Path, imu: Path) -> Capture:

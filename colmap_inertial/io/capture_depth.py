@@ -4,6 +4,7 @@
 
     [poses]
     path = "8653a2142b"         # an export of an app, with its depth maps; or a path in TUM format, in metres
+    up = "y"                    # of TUM: the axis of its world against gravity, where it has one (ARKit, ARCore: y)
 
     [depth]
     folder = "depth"            # maps that show what the images show, in any size
@@ -25,7 +26,8 @@ from colmap_inertial.io.files import path_in
 from colmap_inertial.io.toml_section import Section
 
 DEPTH_KEYS = ("folder", "pattern", "unit", "metres_per_step", "confidence")
-POSES_KEYS = ("path",)
+POSES_KEYS = ("path", "up")
+_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 _STEM = "{stem}"
 
@@ -98,9 +100,26 @@ def read_depth_table(table: Section) -> DescribedDepth:
     return DescribedDepth(folder=folder, pattern=pattern, metres=metres, confidence=table.file("confidence"))
 
 
-def read_poses_table(table: Section) -> Path:
-    """``[poses]``: the device's own path, an export of an app or a file in TUM format."""
+@dataclass(frozen=True, kw_only=True)
+class DevicePoses:
+    """Where the path lies that the device computed by itself.
+
+    Attributes
+    ----------
+    path
+        An app's export, which may hold depth maps, too, or a file in TUM format, in metres.
+    up_in_world
+        (3,) against gravity in the world of a file; exports know it, or do not.
+    """
+
+    path: Path
+    up_in_world: tuple[float, float, float] | None = None
+
+
+def read_poses_table(table: Section) -> DevicePoses:
+    """``[poses]``: the device's own path."""
     path: Path = table.require("path", table.file("path"))
     if not path.exists():
         raise FormatError(path, Fact("no-such-file", what="file or folder"))
-    return path
+    up = table.choice("up", _AXES)
+    return DevicePoses(path=path, up_in_world=None if up is None else _AXES[up])

@@ -224,8 +224,13 @@ def up_by_sensor(sensor: str, half_width_deg: float) -> str:
 
 state(
     "lengths-beside-imu",
-    "a target or a known distance is not combined with the IMU, whose scale it checks",
-    advice="name the target in capture.toml ([target]), or give --scale-from target or distance alone",
+    "a known distance is not combined with the IMU; a target is, where capture.toml names it ([target])",
+    advice="such a target checks them, and gives them with --scale-from imu --scale-from target",
+)
+state(
+    "target-before-images",
+    "a target gives metres together with the IMU only where the refinement leaves the rectified images as they are",
+    advice="give --refine off, or --rolling-shutter off",
 )
 
 

@@ -68,3 +68,8 @@ def device_in_words(device: Mapping[str, Any]) -> str:
         f"{abs(percent):.1f} % too {way} (+-{half:.1f} % points), {abs(device['error_m']):.2g} m over a path of "
         f"{device['length_m']:.3g} m"
     )
+
+
+def evidence_facts(sensors: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The rows as labelled texts."""
+    return [(row.sensor, row.text) for row in evidence_rows(sensors)]

@@ -287,6 +287,61 @@ def refined(model: dict[str, Any], parts: Sequence[dict[str, Any]]) -> Figure:
     }
 
 
+#: Sensors in few letters.
+_SHORT = {"imu": "IMU", "depth": "depth", "device": "device", "positions": "GPS"}
+
+
+def sensors(combined: dict[str, Any]) -> Figure:
+    """What each sensor says of the scale, and all together, in per cent of that: a row for each, with 95 %."""
+    rows = [("all", combined), *((_SHORT.get(one["sensor"], one["sensor"]), one) for one in combined["evidence"][::-1])]
+    whole = float(combined["metres_per_unit"])
+    data = []
+    # the axis counts from below
+    for colour, name, some in ((GOOD, "all together, 95 %", rows[:1]), (IMU, "each by itself, 95 %", rows[1:])):
+        data.append(
+            {
+                "type": "scatter",
+                "mode": "markers",
+                "name": name,
+                "x": [100 * (one["metres_per_unit"] / whole - 1) for _, one in some],
+                "y": [label for label, _ in some],
+                "text": [f"{digits(one['metres_per_unit'])} m per unit" for _, one in some],
+                "error_x": {
+                    "type": "data",
+                    "array": [50 * (one["ci95"][1] - one["ci95"][0]) / whole for _, one in some],
+                    "thickness": 3,
+                    "width": 0,
+                    "color": colour,
+                },
+                "marker": {"color": colour, "size": 11},
+                "hovertemplate": "%{y}: %{x:+.2f} %, %{text}<extra></extra>",
+            }
+        )
+    x = axis("off all together (%)", zeroline=True)
+    return {"data": data, "layout": layout(110 + 38 * len(rows), x, {"type": "category", "zeroline": False})}
+
+
+def device_drift(device: dict[str, Any], start_s: float) -> Figure:
+    """How much too long the device's own metres are by parts of the recording, in per cent, each with 95 %."""
+    parts = informative_parts(device["parts"])
+    off = [100 * (part["length_ratio"] - 1) for part in parts]
+    reach = [100 * half_width(part["sigma_log"]) for part in parts]
+    dots = _intervals(parts, start_s, off, reach, "part of the recording, 95 %", CAMERA)
+    key = {
+        "type": "scatter",
+        "mode": "markers",
+        "name": "interval of the whole",
+        "x": [None],
+        "y": [None],
+        "marker": {"color": GOOD, "symbol": "square", "size": 12, "opacity": 0.4},
+    }
+    low, high = (100 * (ratio - 1) for ratio in device["ci95"])
+    band = {"type": "rect", "xref": "paper", "x0": 0, "x1": 1, "y0": low, "y1": high, "line": {"width": 0}}
+    band |= {"fillcolor": GOOD, "opacity": 0.13, "layer": "below"}
+    x, y = axis(_TIME, zeroline=False), axis("device's lengths, too long (%)", zeroline=True)
+    return {"data": [dots, key], "layout": layout(280, x, y, shapes=[band])}
+
+
 def blur(frames: Sequence[dict[str, Any]]) -> Figure:
     """Predicted blur of each frame, by what became of it."""
     data = []

@@ -11,6 +11,7 @@ from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.inertial.scale.verdict import scale_drifts
 from colmap_inertial.report import figures
 from colmap_inertial.report.content import find_refined_parts
+from colmap_inertial.report.evidence import device_in_words, evidence_facts
 from colmap_inertial.report.figure_3d import scene_figure
 from colmap_inertial.report.page import render_page
 from colmap_inertial.report.series import SIZES
@@ -81,6 +82,7 @@ def run_page(content: Content, out: Path) -> str:
             scale_facts,
             scene_figure,
         ),
+        *(device_in_words, evidence_facts),
     )
     return render_page(
         "report.html",

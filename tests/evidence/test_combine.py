@@ -111,6 +111,13 @@ def test_where_two_contradict_both_are_named_and_the_interval_reaches_to_both():
     assert both.log_scale - 1.96 * both.sigma < 0 < 0.1 < both.log_scale + 1.96 * both.sigma
 
 
+def test_no_interval_lies_between_two_that_are_far_apart_and_holds_neither():
+    for apart in (0.2, 0.47, 2.3):
+        both = combine([evidence("imu", 0.0, **IMU), evidence("depth", apart, **DEPTH)])
+        assert both.log_scale - 1.96 * both.sigma < 0 < apart < both.log_scale + 1.96 * both.sigma
+        assert "sensors-contradict" in [reason.code for reason in both.reasons]
+
+
 def test_a_third_sensor_tells_which_of_two_is_wrong():
     sensors = [
         evidence("imu", 0.08, **IMU),

@@ -307,7 +307,7 @@ def _run_steps(
         fuser=given.fuser,
         apertures=workspace.apertures,
         database=workspace.colmap_database,
-        sensors=_find_sensors(recording, options),
+        sensors=_find_sensors(recording, options, workspace.images),
     )
     of_frames = insert_defaults(stages.frame, default_frame_stages(inputs))
     of_keypoints = insert_defaults(stages.keypoint, default_keypoint_stages(inputs))
@@ -323,6 +323,8 @@ def _run_steps(
     of_models = insert_defaults(stages.model, default_model_stages(replace(inputs, keypoint_stages=of_keypoints)))
     # images agree with the model as it is in the end
     after_models = changes_images(of_models)
+    if after_models and "target" in options.scale_from:
+        raise InertialError(Fact("target-before-images"))
     if not after_models:
         images = run_images(session, records, rectified, of_keypoints)
     models, fragments, gaps = run_models(
@@ -354,7 +356,7 @@ def _run_steps(
     )
 
 
-def _find_sensors(recording: Recording, options: ReconstructOptions) -> CaptureSensors:
+def _find_sensors(recording: Recording, options: ReconstructOptions, images: Path) -> CaptureSensors:
     """What the capture holds beside the IMU that knows of metres."""
     capture, timing = recording.capture, recording.timing
 
@@ -363,7 +365,7 @@ def _find_sensors(recording: Recording, options: ReconstructOptions) -> CaptureS
             camera = grey.guess_camera()
         return camera.width, camera.height
 
-    return find_sensors(capture, timing.names, size_px, timing=timing, chosen=options.scale_from)
+    return find_sensors(capture, timing.names, size_px, timing=timing, chosen=options.scale_from, made=images)
 
 
 def _require_known_images(options: ReconstructOptions, stages: Sequence[KeypointStage]) -> None:

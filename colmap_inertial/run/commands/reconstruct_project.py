@@ -26,6 +26,7 @@ from colmap_inertial.diagnose import Diagnosis
 from colmap_inertial.hooks import ModelStage, insert_defaults
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.files import StrPath, read_json, reading_within
+from colmap_inertial.io.fingerprints import fingerprint
 from colmap_inertial.io.frame_sources import Video
 from colmap_inertial.io.imu import is_capture
 from colmap_inertial.io.recording import Recording
@@ -281,7 +282,7 @@ def _find_sensors(given: _CheckedProject, recording: Recording, options: Reconst
         camera = next(iter(given.read(next(iter(given.models.values()))).cameras.values()))
         return camera.width, camera.height
 
-    return find_sensors(
+    found = find_sensors(
         given.beside.capture,
         names,
         size_px,
@@ -289,6 +290,9 @@ def _find_sensors(given: _CheckedProject, recording: Recording, options: Reconst
         chosen=options.scale_from,
         images=given.images,
     )
+    if found.target is None:
+        return found
+    return dataclasses.replace(found, files=(*found.files, fingerprint(found.target.images)))
 
 
 def _make_stage_inputs(

@@ -41,11 +41,10 @@ from colmap_inertial.core.options import (
     WorldAxes,
 )
 from colmap_inertial.core.progress import Progress, report_each, silent
-from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import CameraTrajectory, FrameTiming
 from colmap_inertial.core.types.evidence import AbsentSensor, CombinedScale, ScaleEvidence, Sensor
 from colmap_inertial.evidence.combine import combine, judge_device
-from colmap_inertial.evidence.references import evidence_of_distance, evidence_of_target
+from colmap_inertial.evidence.references import evidence_of_distance
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.device_folders import is_device_folder
@@ -62,7 +61,7 @@ from colmap_inertial.model.project import apply_to_project
 from colmap_inertial.run.commands.paths import only_model
 from colmap_inertial.run.preparation.sensors import find_sensors
 from colmap_inertial.run.stages.frame_folder import encode_image, require_frames
-from colmap_inertial.run.stages.sensors import SensorsOfModel, ask_sensors, turn_up
+from colmap_inertial.run.stages.sensors import SensorsOfModel, ask_sensors, scale_by_target, turn_up
 from colmap_inertial.run.steps.session import keep_colmap_quiet
 from colmap_inertial.run.steps.workspace import refuse_links, require_apart
 from colmap_inertial.validate import Validation, parse_target, validate_model
@@ -244,18 +243,16 @@ class _Said:
 
 def _describe(project: Path, source: ProjectOptions) -> Capture:
     """What is known of a project's images: what was given beside it, else what lies in it."""
-    beside = (path for path in (source.imu, source.frame_times) if path is not None and is_capture(path))
-    if (path := next(beside, None)) is not None:
-        return load_capture(path)
-    poses = project if is_device_folder(project) else None
-    return Capture(path=project, calibration=calibration_prior(), poses=poses)
+    given = _find_capture(project, source)
+    return Capture(path=project, calibration=calibration_prior()) if given is None else given
 
 
 def _ask_sensors(
     capture: Capture, folder: Path, images: Path, scale_from: Sequence[ScaleFrom], progress: Progress
 ) -> _Said:
     """What depth, the device's path and positions say of a model that no IMU scaled."""
-    if scale_from and not set(scale_from) & {"depth", "device", "positions"}:
+    chosen = [name for name in scale_from if name not in ("target", "distance")]
+    if scale_from and not chosen:
         return _Said()
     reconstruction = read_model(folder)
     names = sorted(reconstruction.image(i).name for i in reconstruction.reg_image_ids())
@@ -266,7 +263,7 @@ def _ask_sensors(
         return camera.width, camera.height
 
     sensors = find_sensors(
-        capture, names, size_px, timing=timing, chosen=scale_from, images=images if images.is_dir() else None
+        capture, names, size_px, timing=timing, chosen=chosen, images=images if images.is_dir() else None
     )
     if not sensors:
         return _Said()
@@ -294,19 +291,21 @@ def has_imu(path: Path, source: ProjectOptions) -> bool:
     """Whether an IMU was recorded with a capture, or is given beside a project."""
     if source.imu is not None and not is_capture(source.imu):
         return True
-    capture = _try_capture(path if source.imu is None else source.imu)
+    capture = _find_capture(path, source)
     return capture is not None and capture.imu is not None
 
 
 def knows_metres(path: Path, source: ProjectOptions) -> bool:
-    """Whether a capture without an IMU says by itself where metres come from."""
-    capture = _try_capture(path if source.imu is None else source.imu)
+    """Whether a capture, or what is given beside a project, says where metres come from without an IMU."""
+    capture = _find_capture(path, source)
     return capture is not None and any((capture.poses, capture.depth, capture.target))
 
 
-def _try_capture(path: Path) -> Capture | None:
+def _find_capture(path: Path, source: ProjectOptions) -> Capture | None:
+    """What describes the images: the capture, or one that is given beside a project; ``None`` where nothing does."""
+    beside = (given for given in (source.imu, source.frame_times) if given is not None and is_capture(given))
     try:
-        return load_capture(path)
+        return load_capture(next(beside, path))
     except FormatError:
         return None
 
@@ -329,18 +328,6 @@ def check_reference(reference: ReferenceOptions, scale_from: Sequence[ScaleFrom]
             raise InertialError(Fact("markers-not-given"))
     if reference.target is not None:
         parse_target(reference.target)
-
-
-def scale_by_target(validation: Validation) -> tuple[ScaleEvidence, str]:
-    """A target as evidence, and what was measured, in words."""
-    # by half of its corners, so that the others can tell how right that is
-    control = validation.control
-    scale = validation.metres_per_unit if control is None else control.metres_per_unit
-    low, high = validation.metres_per_unit_ci95 if control is None else control.ci95
-    target = validation.target
-    declared_log = 0.0 if target.sigma_m is None else target.sigma_m / target.length_m
-    evidence = evidence_of_target(scale, float(np.log(high / low)) / (2 * Z95), declared_log)
-    return evidence, f"target {target.spec} in {validation.views_used} images"
 
 
 def scale_by_distance(reference: ReferenceOptions, validation: Validation | None) -> tuple[ScaleEvidence, str]:
@@ -529,7 +516,7 @@ def _load_pictures(path: Path) -> Capture:
     if path.is_file() and is_mp4(path):
         frames = Video(file=path, frames_per_s=_FRAMES_PER_S)
         return Capture(path=path, frames=frames, calibration=calibration_prior())
-    if path.is_dir() and not is_capture(path):
+    if path.is_dir() and not (is_capture(path) or is_device_folder(path)):
         frames = ImageFolder(folder=path)
         return Capture(path=path, frames=frames, calibration=calibration_prior())
     capture = load_capture(path)

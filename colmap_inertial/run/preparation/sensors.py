@@ -16,11 +16,12 @@ from colmap_inertial.core.types.depth import PinholeGrid
 from colmap_inertial.core.types.evidence import AbsentSensor, Sensor
 from colmap_inertial.evidence.device_path import join_by_time
 from colmap_inertial.io.capture import Capture
+from colmap_inertial.io.capture_depth import DevicePoses
 from colmap_inertial.io.device_folders import DeviceFolder, is_device_folder, read_device_folder
 from colmap_inertial.io.fingerprints import fingerprint
 from colmap_inertial.io.trajectories import read_tum
 from colmap_inertial.run.preparation.geolocation import positions_of
-from colmap_inertial.run.stages.capture_sensors import CaptureSensors
+from colmap_inertial.run.stages.capture_sensors import CaptureSensors, SeenTarget
 
 #: A pose is of an image where it was taken within this share of the time between poses.
 _WITHIN = 0.5
@@ -34,6 +35,7 @@ def find_sensors(
     timing: FrameTiming | None,
     chosen: Sequence[ScaleFrom] = (),
     images: Path | None = None,
+    made: Path | None = None,
 ) -> CaptureSensors:
     """Depth maps, the device's own path and positions of a capture, by the names of its images.
 
@@ -51,6 +53,8 @@ def find_sensors(
         The sensors that were asked for by name; all where empty.
     images
         Where an existing project has its images.
+    made
+        Where the images that agree with the model will be, where they are not those.
 
     Raises
     ------
@@ -77,7 +81,10 @@ def find_sensors(
             if error.code not in _NO_POSITIONS:
                 absent = AbsentSensor(sensor="positions", reasons=(fact_of(error),))
                 found = replace(found, absent=(*found.absent, absent))
-    there = {"depth": found.depth, "device": found.device}
+    of_model = images if made is None else made
+    if "target" in chosen and capture.target is not None and of_model is not None:
+        found = replace(found, target=SeenTarget(spec=capture.target, images=of_model))
+    there = {"depth": found.depth, "device": found.device, "target": found.target}
     for sensor, value in there.items():
         if sensor in chosen and value is None:
             raise InertialError(Fact("sensor-not-there", sensor=sensor, capture=str(capture.path)))
@@ -95,10 +102,11 @@ def _wanted(chosen: Sequence[ScaleFrom], *sensors: Sensor) -> bool:
     return not chosen or any(sensor in chosen for sensor in sensors)
 
 
-def _read_poses(path: Path) -> DeviceFolder:
-    if is_device_folder(path):
-        return read_device_folder(path)
-    return DeviceFolder(app="TUM", trajectory=replace(read_tum(path), length_unit="m"), on_clock_of_images=True)
+def _read_poses(given: DevicePoses) -> DeviceFolder:
+    if is_device_folder(given.path):
+        return read_device_folder(given.path)
+    trajectory = replace(read_tum(given.path), length_unit="m")
+    return DeviceFolder(app="TUM", trajectory=trajectory, on_clock_of_images=True, up_in_world=given.up_in_world)
 
 
 def _name_by_images(folder: DeviceFolder, names: Sequence[str], timing: FrameTiming | None) -> dict[str, str]:

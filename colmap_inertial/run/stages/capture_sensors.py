@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.types import CameraTrajectory, PositionFixes
 from colmap_inertial.core.types.depth import DepthMaps
 from colmap_inertial.core.types.evidence import AbsentSensor
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeenTarget:
+    """A target of known size: its specification, and the folder of the images that agree with the model."""
+
+    spec: str
+    images: Path
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -24,6 +33,8 @@ class CaptureSensors:
         (3,) against gravity in its world, where that is known.
     fixes
         Positions of a satellite receiver.
+    target
+        A target of known size that gives metres, too.
     absent
         What is there and cannot be used.
     files
@@ -34,8 +45,9 @@ class CaptureSensors:
     device: CameraTrajectory | None = None
     up_in_device: Array | None = None
     fixes: PositionFixes | None = None
+    target: SeenTarget | None = None
     absent: tuple[AbsentSensor, ...] = ()
     files: tuple[object, ...] = ()
 
     def __bool__(self) -> bool:
-        return any(one is not None for one in (self.depth, self.device, self.fixes)) or bool(self.absent)
+        return any(one is not None for one in (self.depth, self.device, self.fixes, self.target)) or bool(self.absent)

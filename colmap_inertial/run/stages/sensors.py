@@ -6,6 +6,7 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import InertialError, NotObservableError, fact_of
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import quat_rotate, rotation_between
-from colmap_inertial.core.options import WorldAxes
+from colmap_inertial.core.options import ValidateOptions, WorldAxes
 from colmap_inertial.core.progress import Progress, silent
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import DOWN_IN_WORLD, CameraTrajectory, ScaleEstimate, Similarity
@@ -23,12 +24,14 @@ from colmap_inertial.evidence.depth_points import scale_by_points
 from colmap_inertial.evidence.device_path import DevicePath, place_device_path, up_by_device
 from colmap_inertial.evidence.inertial import evidence_of_imu
 from colmap_inertial.evidence.positions import scale_by_positions
+from colmap_inertial.evidence.references import evidence_of_target
 from colmap_inertial.inertial.scale.verdict import half_width
 from colmap_inertial.io.units import STANDARD_GRAVITY_M_S2
 from colmap_inertial.model import Model, add_doubts, trajectory_from_model
 from colmap_inertial.model.seen_points import seen_points
 from colmap_inertial.run.stages.capture_sensors import CaptureSensors
 from colmap_inertial.run.stages.inputs import StageInputs
+from colmap_inertial.validate import Validation, parse_target, validate_model
 
 log = logging.getLogger(__name__)
 
@@ -78,7 +81,7 @@ def ask_sensors(
     timed: bool = True,
     progress: Progress = silent,
 ) -> SensorsOfModel:
-    """What depth, the device's own path and positions say of a model.
+    """What depth, the device's own path, positions and a target say of a model.
 
     Parameters
     ----------
@@ -93,7 +96,7 @@ def ask_sensors(
     timed
         Whether the path's times are true.
     progress
-        Called with ``"depth"``.
+        Called with ``"depth"`` and ``"validation"``.
     """
     evidence: list[ScaleEvidence] = []
     absent = list(sensors.absent)
@@ -143,6 +146,17 @@ def ask_sensors(
         attempt("positions", ask_positions)
         if up_in_world is None and found_up:
             (up_in_world, tilt_rad), up_from = found_up[0], "positions"
+    if (seen := sensors.target) is not None:
+
+        def ask_target() -> ScaleEvidence:
+            target, options = parse_target(seen.spec), ValidateOptions(unscaled=True)
+            report = partial(progress, "validation")
+            validation = validate_model(model.reconstruction, seen.images, target, options, progress=report)
+            if validation.doubts:
+                raise NotObservableError("scale", Fact("found-together", found=validation.doubts))
+            return scale_by_target(validation)[0]
+
+        attempt("target", ask_target)
     return SensorsOfModel(
         evidence=tuple(evidence),
         absent=tuple(absent),
@@ -151,6 +165,18 @@ def ask_sensors(
         tilt_rad=tilt_rad,
         up_from=up_from,
     )
+
+
+def scale_by_target(validation: Validation) -> tuple[ScaleEvidence, str]:
+    """A target as evidence, and what was measured, in words."""
+    # by half of its corners, so that the others can tell how right that is
+    control = validation.control
+    scale = validation.metres_per_unit if control is None else control.metres_per_unit
+    low, high = validation.metres_per_unit_ci95 if control is None else control.ci95
+    target = validation.target
+    declared_log = 0.0 if target.sigma_m is None else target.sigma_m / target.length_m
+    evidence = evidence_of_target(scale, float(np.log(high / low)) / (2 * Z95), declared_log)
+    return evidence, f"target {target.spec} in {validation.views_used} images"
 
 
 def why_absent(error: InertialError) -> Fact:
@@ -219,7 +245,7 @@ class SensorStage:
         chosen = inputs.options.scale_from
         return cls(
             sensors=inputs.sensors,
-            imu="imu" in chosen or "auto" in chosen,
+            imu=not chosen or "imu" in chosen,
             world=inputs.options.world,
         )
 
