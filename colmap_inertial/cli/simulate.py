@@ -25,7 +25,7 @@ class Simulate(ReadingCommand):
     """A recipe (TOML): world, motion, IMU, camera, checkerboard; keys in docs/dev/simulation.md,
     examples in example_scenes/."""
     out: Positional[Path]
-    """A new folder for images or video, IMU files, capture.toml and truth.json."""
+    """A new folder for images or video, IMU files, capture.toml and truth.json; or for what Stray Scanner writes."""
     workers: int = os.cpu_count() or 1
     """Processes that render; a frame of 640 x 480 takes one to three seconds of one core, more where it is blurred."""
 

@@ -2,7 +2,7 @@
 
 Stray Scanner: ``odometry.csv`` has camera centres in metres and world_from_camera with the camera's axes as COLMAP has
 them (its source turns ARKit's by half a turn about x); ``depth/`` millimetres, ``confidence/`` 0 to 2, both named by
-the frame's number (github.com/strayrobots/scanner, OdometryEncoder.swift).
+the frame's number (github.com/strayrobots/scanner, OdometryEncoder.swift); ``imu.csv`` may be missing.
 
 Record3D: ``metadata`` (JSON) has ``poses`` (qx qy qz qw x y z, world_from_camera, the camera's y up and z back), ``K``
 by columns, ``rgbd/N.depth`` (LZFSE, float32, metres) and ``N.conf``. An ``.r3d`` is a zip of that folder.
@@ -30,7 +30,7 @@ from colmap_inertial.core.geometry import quat_conjugate, quat_from_matrix, quat
 from colmap_inertial.core.types import CameraTrajectory
 from colmap_inertial.core.types.depth import DepthMaps, PinholeGrid
 from colmap_inertial.io.depth_maps import MILLIMETRES, DepthFiles, grid_of_matrix
-from colmap_inertial.io.files import path_in, read_json, reader
+from colmap_inertial.io.files import first_line, path_in, read_json, reader
 from colmap_inertial.io.frame_sources import ImageFolder
 from colmap_inertial.io.ios import is_stray_scanner
 from colmap_inertial.io.tables import read_table
@@ -133,7 +133,8 @@ def export_frames(path: Path) -> ImageFolder | None:
 
 
 def _is_stray(path: Path) -> bool:
-    return is_stray_scanner(path) and (path / "odometry.csv").is_file()
+    names = {cell.strip() for cell in first_line(path / "odometry.csv").split(",")}
+    return {"timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw"} <= names
 
 
 def _read_stray(path: Path) -> DeviceFolder:
@@ -146,7 +147,7 @@ def _read_stray(path: Path) -> DeviceFolder:
     return DeviceFolder(
         app="Stray Scanner",
         trajectory=trajectory,
-        imu=path,
+        imu=path if is_stray_scanner(path) else None,
         on_clock_of_images=True,
         depth=_stray_depth(path),
         up_in_world=_ARKIT_UP,

@@ -11,9 +11,9 @@ import numpy as np
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.types import CameraModel
 from colmap_inertial.tools.simulate import MotionOptions
-from colmap_inertial.tools.simulate.capture import Scene, make_scene
 from colmap_inertial.tools.simulate.recipe import SceneRecipe
 from colmap_inertial.tools.simulate.render import ShutterCamera
+from colmap_inertial.tools.simulate.scene import Scene, make_scene
 
 WIDTH, HEIGHT, FOCAL = 240, 180, 190.0
 #: The box; motions of the simulator stay well inside.

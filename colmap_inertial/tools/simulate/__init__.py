@@ -5,7 +5,8 @@ Monte-Carlo studies; :func:`simulate_rests` lays a device still in many attitude
 textured world as a :class:`SceneRecipe` says and writes what a user would have recorded, with the truth beside it.
 """
 
-from colmap_inertial.tools.simulate.capture import Scene, make_scene, write_capture
+from colmap_inertial.tools.simulate.capture import write_capture
+from colmap_inertial.tools.simulate.device import DeviceOptions
 from colmap_inertial.tools.simulate.motion import Kinematics, Motion, MotionOptions, make_motion
 from colmap_inertial.tools.simulate.recipe import SceneRecipe, load_recipe, recipe_text
 from colmap_inertial.tools.simulate.recording import (
@@ -17,6 +18,7 @@ from colmap_inertial.tools.simulate.recording import (
 )
 from colmap_inertial.tools.simulate.render import Renderer, ShutterCamera, develop
 from colmap_inertial.tools.simulate.rests import RestOptions, SimulatedRests, simulate_rests
+from colmap_inertial.tools.simulate.scene import Scene, make_scene
 from colmap_inertial.tools.simulate.sensors import IMU_PRESETS, ImuErrors, ImuOptions, draw_imu_errors, sample_imu
 from colmap_inertial.tools.simulate.truth import SceneTruth, read_truth, true_metres_per_unit
 from colmap_inertial.tools.simulate.world import Board, Quad, World, make_world
@@ -24,6 +26,7 @@ from colmap_inertial.tools.simulate.world import Board, Quad, World, make_world
 __all__ = [
     "IMU_PRESETS",
     "Board",
+    "DeviceOptions",
     "ImuErrors",
     "ImuOptions",
     "Kinematics",

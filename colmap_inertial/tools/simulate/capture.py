@@ -8,9 +8,9 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from fractions import Fraction
-from functools import lru_cache, partial
+from functools import partial
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 
@@ -22,70 +22,16 @@ from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_multiply, quat_normalize
 from colmap_inertial.core.types import CameraModel
 from colmap_inertial.io.files import write_json, write_text
-from colmap_inertial.io.video import frame_name
 from colmap_inertial.model.copying import new_folder
-from colmap_inertial.tools.simulate.motion import Motion
-from colmap_inertial.tools.simulate.recipe import SceneRecipe, recipe_text
-from colmap_inertial.tools.simulate.render import Renderer, ShutterCamera, develop
-from colmap_inertial.tools.simulate.sensors import STANDARD_GRAVITY_M_S2, SampledImu, simulate_imu
-from colmap_inertial.tools.simulate.world import WALLS_M, Board, World, WorldKind, make_world
+from colmap_inertial.tools.simulate.recipe import VIDEO_FORMATS, SceneRecipe, recipe_text
+from colmap_inertial.tools.simulate.render import ShutterCamera, develop
+from colmap_inertial.tools.simulate.scene import TICKS_HZ, Scene, make_scene
+from colmap_inertial.tools.simulate.sensors import STANDARD_GRAVITY_M_S2
+from colmap_inertial.tools.simulate.stray_scanner import write_stray_scanner
+from colmap_inertial.tools.simulate.world import WALLS_M
 
 #: Camera (end of its files' names), frame, folder for the depth map.
 _Job = tuple[str, int, Path | None]
-
-#: Ticks of a video's clock in a second: 30, 25, 24 frames per second are whole numbers of them.
-_TICKS_HZ = 90000
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Scene:
-    """A recipe carried out, but for the pictures.
-
-    Attributes
-    ----------
-    motion
-        The body's path: poses at any time.
-    imu
-        The device and its samples.
-    trigger_s
-        (F,) when the main camera starts exposing each frame's first line, camera clock.
-    names
-        (F,) file names of the frames.
-    """
-
-    recipe: SceneRecipe
-    motion: Motion
-    imu: SampledImu
-    trigger_s: Array
-    names: tuple[str, ...]
-
-    def world(self) -> World:
-        """The world that is filmed."""
-        return self.renderer().world
-
-    def renderer(self) -> Renderer:
-        """Renders that world; takes seconds to build, and is kept until one of another world is asked for."""
-        return _renderer(self.recipe.world, self.recipe.seed, self.recipe.board)
-
-    def camera_pose(self, camera: ShutterCamera, t_s: Array) -> tuple[Array, Array]:
-        """(N, 4) cam_from_world_xyzw and (N, 3) camera centres in metres of a camera of the rig at (N,) times."""
-        world_from_body = self.motion.world_from_cam_xyzw(t_s)
-        centre = self.motion.cam_in_world_m(t_s) + matrix_from_quat(world_from_body) @ np.array(camera.cam_in_body_m)
-        world_from_cam = quat_multiply(world_from_body, np.array(camera.body_from_cam_xyzw))
-        return quat_normalize(quat_conjugate(world_from_cam)), centre
-
-
-def make_scene(recipe: SceneRecipe) -> Scene:
-    """Draw the motion, the device and its samples; the camera's clock starts at 0 with the first frame."""
-    streams = [np.random.default_rng(s) for s in np.random.SeedSequence(recipe.seed).spawn(2)]
-    motion, imu = simulate_imu(recipe.motion, recipe.imu, streams)
-    count = int(recipe.motion.duration_s * recipe.frame_rate_hz)
-    ticks = np.rint(np.arange(count) * (_TICKS_HZ / recipe.frame_rate_hz)).astype(np.int64)
-    if recipe.format == "h264":
-        names = tuple(frame_name(int(t), 0) for t in np.rint(ticks * (1e9 / _TICKS_HZ)))
-    else:
-        names = tuple(f"{i:06d}.{'jpg' if recipe.format == 'jpeg' else 'png'}" for i in range(count))
-    return Scene(recipe=recipe, motion=motion, imu=imu, trigger_s=ticks / _TICKS_HZ, names=names)
 
 
 def write_capture(
@@ -95,7 +41,7 @@ def write_capture(
 
     Writes ``frames/`` and ``frames.csv``, or ``clip.mp4``; ``gyro.csv``, ``accel.csv``, ``capture.toml``,
     ``truth.json``, ``recipe.toml``; ``depth/`` where the recipe wants it; ``frames_NAME/`` or ``clip_NAME.mp4`` for the
-    rig's other cameras.
+    rig's other cameras. Or what Stray Scanner writes, with the truth and the recipe.
 
     Parameters
     ----------
@@ -108,7 +54,7 @@ def write_capture(
 
     Returns
     -------
-    The path of ``capture.toml``.
+    What commands take as the capture: ``capture.toml``, or Stray Scanner's folder.
 
     Raises
     ------
@@ -123,7 +69,7 @@ def write_capture(
     _require_inside(scene)
     with new_folder(folder, into_empty=True) as partial_folder:
         _write_capture(scene, partial_folder, workers, progress)
-    return folder / "capture.toml"
+    return folder if recipe.format == "stray-scanner" else folder / "capture.toml"
 
 
 def _require_inside(scene: Scene) -> None:
@@ -154,7 +100,7 @@ def _write_capture(scene: Scene, folder: Path, workers: int, progress: Callable[
     recipe = scene.recipe
     cameras = _cameras(recipe)
     total, done = len(cameras) * len(scene.names), 0
-    write = _write_video if recipe.format == "h264" else _write_images
+    write = _write_video if recipe.format in VIDEO_FORMATS else _write_images
     with _processes(recipe, workers) as pool:
         for suffix in cameras:
             depth = folder / f"depth{suffix}" if recipe.depth_maps else None
@@ -166,26 +112,30 @@ def _write_capture(scene: Scene, folder: Path, workers: int, progress: Callable[
                 done += 1
                 if progress is not None:
                     progress(done, total)
+    write_text(folder / "recipe.toml", recipe_text(recipe))
+    truth = _truth(scene)
+    if recipe.format == "stray-scanner":
+        truth["device"] = write_stray_scanner(scene, folder)
+    else:
+        _write_tables(scene, folder)
+        write_text(folder / "capture.toml", _capture_toml(recipe))
+    write_json(folder / "truth.json", truth)
+
+
+def _write_tables(scene: Scene, folder: Path) -> None:
+    """Samples of gyroscope and accelerometer, and the times of pictures."""
     for name, t_s, values in (
         ("gyro", scene.imu.recording.gyro_t_s, scene.imu.recording.gyro_rad_s),
         ("accel", scene.imu.recording.accel_t_s, scene.imu.recording.accel_m_s2),
     ):
         rows = [f"{t:.7f},{x:.6f},{y:.6f},{z:.6f}" for t, (x, y, z) in zip(t_s, values, strict=True)]
         write_text(folder / f"{name}.csv", "\n".join(["t,x,y,z", *rows]) + "\n")
-    if recipe.format != "h264":
+    if scene.recipe.format != "h264":
         rows = [f"{name},{t:.9f}" for name, t in zip(scene.names, scene.trigger_s, strict=True)]
         write_text(folder / "frames.csv", "\n".join(["name,t_s", *rows]) + "\n")
-    write_text(folder / "recipe.toml", recipe_text(recipe))
-    write_json(folder / "truth.json", _truth(scene))
-    write_text(folder / "capture.toml", _capture_toml(recipe))
 
 
 # --- rendering, in this process or in several ---------------------------------------------------------------------
-
-
-@lru_cache(maxsize=1)
-def _renderer(world: WorldKind, seed: int, board: Board) -> Renderer:
-    return Renderer(make_world(world, seed, board))
 
 
 def _cameras(recipe: SceneRecipe) -> dict[str, ShutterCamera]:
@@ -258,7 +208,8 @@ def _write_video(scene: Scene, images: Iterator[UInt8Array], folder: Path, suffi
     import av
 
     camera = scene.recipe.camera.model
-    with av.open(str(folder / f"clip{suffix}.mp4"), "w") as container:
+    name = "rgb.mp4" if scene.recipe.format == "stray-scanner" else f"clip{suffix}.mp4"
+    with av.open(str(folder / name), "w") as container:
         rate = Fraction(scene.recipe.frame_rate_hz).limit_denominator(1001)
         stream = container.add_stream("libx264", rate=rate)
         stream.width, stream.height = camera.width, camera.height
@@ -266,10 +217,10 @@ def _write_video(scene: Scene, images: Iterator[UInt8Array], folder: Path, suffi
         # one thread: more of them make the result depend on the machine's load
         stream.codec_context.thread_count = 1
         stream.options = {"crf": str(scene.recipe.crf), "threads": "1"}
-        stream.codec_context.time_base = stream.time_base = Fraction(1, _TICKS_HZ)
+        stream.codec_context.time_base = stream.time_base = Fraction(1, TICKS_HZ)
         for t_s, image in zip(scene.trigger_s, images, strict=True):
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
-            frame.pts, frame.time_base = round(t_s * _TICKS_HZ), Fraction(1, _TICKS_HZ)
+            frame.pts, frame.time_base = round(t_s * TICKS_HZ), Fraction(1, TICKS_HZ)
             container.mux(stream.encode(frame))
             yield
         container.mux(stream.encode())

@@ -11,13 +11,16 @@ from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import CameraModel, ReadoutDirection
 from colmap_inertial.io.files import reader
 from colmap_inertial.io.toml_section import Section, read_toml
+from colmap_inertial.tools.simulate.device import DeviceOptions
 from colmap_inertial.tools.simulate.motion import MotionKind, MotionOptions
 from colmap_inertial.tools.simulate.render import ShutterCamera
 from colmap_inertial.tools.simulate.sensors import IMU_PRESETS, ImuOptions
 from colmap_inertial.tools.simulate.world import Board, WorldKind
 
 T = TypeVar("T")
-FrameFormat = Literal["jpeg", "png", "h264"]
+FrameFormat = Literal["jpeg", "png", "h264", "stray-scanner"]
+#: Those that hold a video.
+VIDEO_FORMATS: tuple[FrameFormat, ...] = ("h264", "stray-scanner")
 
 #: Fields that take one of a few texts.
 _CHOICES: dict[str, tuple[str, ...]] = {
@@ -33,8 +36,8 @@ class SceneRecipe:
     """Everything that a simulated capture is made from.
 
     As TOML: the plain fields at the top, then the tables ``[board]``, ``[motion]``, ``[imu]`` (with ``preset``, one of
-    ``IMU_PRESETS``, as the start), ``[camera]`` (with ``model``, ``width``, ``height``, ``params`` of a COLMAP camera)
-    and, for more cameras on the same body, ``[rig.NAME]`` (what they leave out is as in ``[camera]``).
+    ``IMU_PRESETS``, as the start), ``[device]``, ``[camera]`` (with ``model``, ``width``, ``height``, ``params`` of a
+    COLMAP camera) and, for more cameras on the same body, ``[rig.NAME]`` (what they leave out is as in ``[camera]``).
     """
 
     seed: int = 1
@@ -44,7 +47,8 @@ class SceneRecipe:
     frame_rate_hz: float = 3.0
     """Frames per second."""
     format: FrameFormat = "jpeg"
-    """jpeg, png: a folder of images; h264: a video."""
+    """jpeg, png: a folder of images; h264: a video; stray-scanner: the folder that this app writes, with a video, the
+    path that the device computes and its depth maps, and no description."""
     quality: int = 90
     """Quality of JPEG, 0 to 100."""
     crf: int = 18
@@ -58,7 +62,9 @@ class SceneRecipe:
     motion: MotionOptions = field(default_factory=MotionOptions)
     """How the body moves."""
     imu: ImuOptions = field(default_factory=ImuOptions)
-    """The device."""
+    """Its gyroscope and accelerometer."""
+    device: DeviceOptions = field(default_factory=DeviceOptions)
+    """The path and the depth maps that a phone computes, for Stray Scanner."""
     camera: ShutterCamera = field(
         default_factory=lambda: ShutterCamera(
             model=CameraModel(
@@ -75,6 +81,11 @@ class SceneRecipe:
             raise ValueError("frame_rate_hz must be positive")
         if not (0 <= self.quality <= 100 and 0 <= self.crf <= 51):
             raise ValueError("quality goes from 0 to 100, crf from 0 to 51")
+        is_pinhole = self.camera.model.model in ("PINHOLE", "SIMPLE_PINHOLE")
+        if self.format == "stray-scanner" and (self.rig or self.depth_maps or not is_pinhole):
+            raise ValueError(
+                "stray-scanner takes one camera without distortion (PINHOLE), and no depth_maps beside its own"
+            )
 
 
 @reader("a recipe")
@@ -100,6 +111,7 @@ def load_recipe(path: Path) -> SceneRecipe:
         "board": _read(root.table("board"), default.board),
         "motion": _read(root.table("motion"), default.motion),
         "imu": imu,
+        "device": _read(root.table("device"), default.device),
         "camera": camera,
         "rig": rig,
     }
@@ -150,14 +162,17 @@ def _read_camera(table: Section, default: ShutterCamera) -> ShutterCamera:
 
 def recipe_text(recipe: SceneRecipe) -> str:
     """The recipe as TOML, every value spelled out; :func:`load_recipe` reads it back."""
-    tables: dict[str, Board | MotionOptions | ImuOptions | ShutterCamera] = {
+    tables: dict[str, Board | MotionOptions | ImuOptions | DeviceOptions | ShutterCamera] = {
         "board": recipe.board,
         "motion": recipe.motion,
         "imu": recipe.imu,
+        **({"device": recipe.device} if recipe.format == "stray-scanner" else {}),
         "camera": recipe.camera,
         **{f"rig.{name}": camera for name, camera in recipe.rig.items()},
     }
-    lines = _lines({f.name: getattr(recipe, f.name) for f in fields(recipe) if f.name not in {*tables, "rig"}})
+    lines = _lines(
+        {f.name: getattr(recipe, f.name) for f in fields(recipe) if f.name not in {*tables, "device", "rig"}}
+    )
     for name, table in tables.items():
         values = {f.name: getattr(table, f.name) for f in fields(table)}
         if isinstance(table, ShutterCamera):

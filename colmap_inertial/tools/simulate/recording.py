@@ -162,8 +162,8 @@ def _draw_correlated(n: int, dt_s: float, sigma: float, correlation_s: float, rn
     return np.asarray(lfilter([1.0], [1.0, -decay], noise, axis=0))
 
 
-def _perturb_poses(motion: Motion, t_s: Array, options: SfmOptions, rng: np.random.Generator) -> tuple[Array, Array]:
-    """World_from_cam and centres (metres, world) with the errors of structure from motion."""
+def perturb_poses(motion: Motion, t_s: Array, options: SfmOptions, rng: np.random.Generator) -> tuple[Array, Array]:
+    """(N, 4) world_from_cam_xyzw and (N, 3) centres (metres, world) at (N,) times, with the errors of ``options``."""
     n, dt = len(t_s), 1 / options.frame_rate_hz
     k = motion.at(t_s)
     position, rotation = k.cam_in_world_m, k.world_from_cam_xyzw
@@ -210,7 +210,7 @@ def simulate_recording(options: RecordingOptions | None = None, *, seed: int) ->
     model_from_world = quat_normalize(rng.standard_normal(4))
     world_in_model = rng.standard_normal(3)
     t_s = np.arange(int(options.motion.duration_s * options.sfm.frame_rate_hz)) / options.sfm.frame_rate_hz
-    world_from_cam, position = _perturb_poses(motion, t_s, options.sfm, rng)
+    world_from_cam, position = perturb_poses(motion, t_s, options.sfm, rng)
     trajectory = CameraTrajectory(
         names=tuple(f"{i:06d}" for i in range(len(t_s))),
         t_s=t_s,

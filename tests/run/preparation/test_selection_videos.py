@@ -43,8 +43,8 @@ from colmap_inertial.run.steps.runner import StepRunner
 from colmap_inertial.run.steps.session import Session
 from colmap_inertial.run.steps.workspace import Workspace
 from colmap_inertial.tools.simulate import MotionOptions
-from colmap_inertial.tools.simulate.capture import make_scene
 from colmap_inertial.tools.simulate.recipe import SceneRecipe
+from colmap_inertial.tools.simulate.scene import make_scene
 from colmap_inertial.tools.simulate.sensors import IMU_PRESETS
 from tests.helpers.box_video import BoxVideo, film
 from tests.helpers.frame_readers import readers

@@ -21,9 +21,10 @@ from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frames import read_frames
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.tools.simulate import MotionOptions
-from colmap_inertial.tools.simulate.capture import make_scene, write_capture
+from colmap_inertial.tools.simulate.capture import write_capture
 from colmap_inertial.tools.simulate.recipe import SceneRecipe, load_recipe, recipe_text
 from colmap_inertial.tools.simulate.render import ShutterCamera, colmap_camera
+from colmap_inertial.tools.simulate.scene import make_scene
 from colmap_inertial.tools.simulate.truth import read_truth, true_metres_per_unit
 from tests.helpers.cases import loop_over
 
