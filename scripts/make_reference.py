@@ -211,7 +211,7 @@ def recipe_page() -> str:
         "y down, z forwards.",
     ]
     recipe = SceneRecipe()
-    parts = {"board": recipe.board, "motion": recipe.motion, "imu": recipe.imu, "camera": recipe.camera}
+    parts = {name: getattr(recipe, name) for name in ("board", "motion", "imu", "device", "camera")}
     lines += ["", "## Top of the file", "", *recipe_rows(recipe, leave_out={*parts, "rig"})]
     for name, part in parts.items():
         lines += ["", f"## [{name}]", ""]

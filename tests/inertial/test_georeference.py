@@ -3,7 +3,7 @@
 import numpy as np
 
 from colmap_inertial.core.types import PositionFixes
-from colmap_inertial.inertial.georeference import _convert_to_enu
+from colmap_inertial.inertial.georeference import convert_to_enu
 
 
 def test_positions_without_a_height_lie_at_the_median_of_the_others():
@@ -14,7 +14,7 @@ def test_positions_without_a_height_lie_at_the_median_of_the_others():
         sigma_m=np.ones(3),
         t_ns=np.arange(3),
     )
-    origin, enu, has_height = _convert_to_enu(fixes)
+    origin, enu, has_height = convert_to_enu(fixes)
     np.testing.assert_allclose(origin, [65.0, 25.0, 25.0])
     # a thousandth of a degree of longitude at 65 degrees north
     np.testing.assert_allclose(enu, [[0, 0, -5], [0, 0, 5], [47.2, 0, 0]], atol=0.05)

@@ -62,7 +62,7 @@ class SceneRecipe:
     motion: MotionOptions = field(default_factory=MotionOptions)
     """How the body moves."""
     imu: ImuOptions = field(default_factory=ImuOptions)
-    """Its gyroscope and accelerometer."""
+    """Gyroscope and accelerometer."""
     device: DeviceOptions = field(default_factory=DeviceOptions)
     """The path and the depth maps that a phone computes, for Stray Scanner."""
     camera: ShutterCamera = field(
