@@ -380,20 +380,24 @@ def model_stretched(stretch: float, axis: Sequence[float]) -> str:
     )
 
 
+def _describe_growth(growth: float, sigma: float) -> str:
+    return f"{100 * abs(growth):.1f} +- {196 * sigma:.1f} % {'longer' if growth > 0 else 'shorter'}"
+
+
 @message(example={"growth": 0.03, "sigma": 0.004})
 def scale_grows(growth: float, sigma: float) -> str:
     return (
-        f"the reconstruction's scale drifts: lengths are {100 * growth:+.1f} +- {196 * sigma:.1f} "
-        f"% longer at the end than at the beginning: {_CLOSE_LOOPS}"
+        f"the reconstruction's scale drifts: lengths are {_describe_growth(growth, sigma)} at the end than at the "
+        f"beginning: {_CLOSE_LOOPS}"
     )
 
 
 @message(example={"growth": 0.03, "sigma": 0.004, "since_s": 12.0, "first": True})
 def scale_breaks(growth: float, sigma: float, since_s: float, first: bool) -> str:
     return (
-        f"the reconstruction's scale jumps: lengths are {100 * growth:+.1f} +- "
-        f"{196 * sigma:.1f} % longer {'before' if first else 'after'} {since_s:.0f} s than in the rest, whose "
-        f"scale is used, as it is better known: {_CLOSE_LOOPS}"
+        f"the reconstruction's scale jumps: lengths are {_describe_growth(growth, sigma)} "
+        f"{'before' if first else 'after'} {since_s:.0f} s than in the rest, whose scale is used, as it is better "
+        f"known: {_CLOSE_LOOPS}"
     )
 
 

@@ -8,12 +8,8 @@ from colmap_inertial.inertial.scale._shape import ShapeFault
 
 
 def test_a_scale_that_breaks_is_told_by_lengths_and_undone_in_the_part_that_tells_less(subtests):
-    for at_s, keeps_after, words in (
-        (110.0, True, "+5.0 +- 2.0 % longer before 10 s"),
-        (110.0, False, "-4.8 +- 2.0 % longer after 10 s"),
-        (150.0, False, "-4.8 +- 2.0 % longer after 50 s"),
-    ):
-        with subtests.test(at_s=at_s, keeps_after=keeps_after, words=words):
+    for at_s, keeps_after, growth in ((110.0, True, 0.05), (110.0, False, 1 / 1.05 - 1), (150.0, False, 1 / 1.05 - 1)):
+        with subtests.test(at_s=at_s, keeps_after=keeps_after):
             t_s = np.linspace(100.0, 160.0, 61)
             truth = np.stack([3 * np.sin(0.1 * t_s), 0.05 * t_s, np.cos(0.2 * t_s)], axis=1)
             # metres per unit are 5 % more behind the break, where lengths of the model are that much shorter
@@ -23,7 +19,11 @@ def test_a_scale_that_breaks_is_told_by_lengths_and_undone_in_the_part_that_tell
             fault = ShapeFault(
                 kind="break", value=value, cov=cov, by_scale=np.zeros(1), at_s=at_s + 0.1, keeps_after=keeps_after
             )
-            assert words in str(fault.as_fact(t_s, 1.0))
+            said = fault.as_fact(t_s, 1.0)
+            assert said.code == "scale-breaks" and said.values["first"] == keeps_after
+            assert said.values["growth"] == pytest.approx(growth)
+            assert said.values["sigma"] == pytest.approx(0.02 / 1.96)
+            assert said.values["since_s"] == pytest.approx(at_s + 0.1 - 100.0)
             # either part is as large as in the one that keeps its metres
             steps = np.diff(fault.undo(t_s, model), axis=0) / np.diff(truth, axis=0)
             assert steps == pytest.approx(np.full_like(steps, longer[-1] if keeps_after else 1.0), rel=1e-9)
@@ -39,7 +39,10 @@ def test_a_drift_of_the_scale_is_undone_and_told_from_end_to_end():
     fault = ShapeFault(kind="drift", value=np.array([0.08]), cov=cov, by_scale=np.zeros(1))
     assert fault.undo(t_s, model) == pytest.approx(truth, abs=1e-9)
     # more metres per unit at the end: the model's lengths are smaller there
-    assert "lengths are -7.7 +- 2.8 % longer at the end" in str(fault.as_fact(t_s, 2.0))
+    said = fault.as_fact(t_s, 2.0)
+    assert said.code == "scale-grows"
+    assert said.values["growth"] == pytest.approx(np.exp(-0.08) - 1)
+    assert said.values["sigma"] == pytest.approx(2e-4**0.5)
     tolerated = 0.01
     assert fault.chi2(2.0, tolerated) == pytest.approx(0.08**2 / (2e-4 + tolerated**2))
 
