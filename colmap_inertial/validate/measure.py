@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -53,7 +54,7 @@ if TYPE_CHECKING:
 
 @one_blas_thread()
 def validate_model(
-    model: Path | pycolmap.Reconstruction,
+    model: StrPath | pycolmap.Reconstruction,
     images: StrPath,
     target: Target,
     options: ValidateOptions | None = None,
@@ -93,6 +94,7 @@ def validate_model(
         When it is in one image only, or all views of it lie along one line.
     """
     images = Path(images)
+    model = Path(model) if isinstance(model, str | os.PathLike) else model
     options = ValidateOptions() if options is None else options
     views, missing = load_views(model, images)
     search = Search(views, target, options, progress)

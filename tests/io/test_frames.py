@@ -111,7 +111,7 @@ def test_a_csv_times_frames(subtests: pytest.Subtests, tmp_path_factory: pytest.
         ("who,t_s\na.png,0.5\nb.png,1\n", "no column of names"),
         ("name,t_s\na.png,0.5\na.png,1\n", "line 3: the frame a.png appears twice"),
         ("name,t_s\na.png,0.5\nb.png,0.5\n", "same time"),
-        ("name,t_s\na.png,0.5\nb.png,x\n", "line 3: time stamp 'x'"),
+        ("name,t_s\na.png,0.5\nb.png,x\n", "line 3: timestamp 'x'"),
         ("name,t_s,exposure\na.png,0.5,1\nb.png,1,1\n", "exposure_s or exposure_ns"),
         ("name,t_s,exposure_s\na.png,0.5,1\nb.png,1,100\n", "line 3"),
     ],

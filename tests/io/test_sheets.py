@@ -62,7 +62,7 @@ def test_a_sheet_about_a_sensor_entry_by_entry(tmp_path: Path) -> None:
         (read_imu_noise, NOISE, {"gyroscope_random_walk": float("nan")}, "not a list of numbers|must be finite"),
         (read_imu_noise, NOISE, {"gyroscope_random_walk": "1e999"}, "numbers must be finite"),
         (read_imu_noise, NOISE, {"gyroscope_random_walk": -1.0}, "sensor.yaml"),
-        (read_camera, CAMERA, {"camera_model": "left out"}, "camera_model None is not known"),
+        (read_camera, CAMERA, {"camera_model": "left out"}, "camera_model None is not supported"),
         (read_camera, CAMERA, {"distortion_model": "left out"}, "distortion_model None .*radial-tangential, radtan"),
         (read_camera, CAMERA, {"intrinsics": [1.0, 2, 3]}, "intrinsics must hold 4 numbers, found 3"),
         (read_camera, CAMERA, {"distortion_coefficients": [0.1] * 5}, "coefficients must hold 4 numbers, found 5"),

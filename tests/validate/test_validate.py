@@ -173,7 +173,7 @@ def test_pictures_show_corners_on_frames_and_a_chart(sharp, measured, tmp_path):
 
 def test_a_model_folder_is_read_as_well_as_a_model_in_memory(small, tmp_path):
     small.model().write_text(str(tmp_path))
-    from_folder = validate_model(tmp_path, small.images, TARGET)
+    from_folder = validate_model(str(tmp_path), small.images, TARGET)
     assert from_folder.scale_error_pct == pytest.approx(small.validate().scale_error_pct, abs=1e-6)
     parent = tmp_path / "sparse"
     (parent / "0").mkdir(parents=True)

@@ -335,7 +335,7 @@ WRONG = {
     ),
     "another output": (
         small.network([helper.make_node("Add", ["picture", "aid"], ["out"])], output="out"),
-        "and gives out; a network",
+        "and the outputs out; a network",
     ),
     "other numbers": (
         small.network(

@@ -169,7 +169,7 @@ def test_colmap_s_rig_config_is_read_as_colmap_reads_it(tmp_path):
 @loop_over(
     ("text", "reason"),
     [
-        (kalibr_text(distortion_model="fov"), "distortion_model 'fov' is not known"),
+        (kalibr_text(distortion_model="fov"), "distortion_model 'fov' is not supported"),
         (kalibr_text(intrinsics=[1, 2, 3]), "intrinsics must hold 4 numbers, found 3"),
         (kalibr_text(T_cn_cnm1=(2 * np.eye(4)).tolist()), "holds no rotation"),
         (kalibr_text(intrinsics=["a", 2, 3, 4]), "not a list of numbers"),
@@ -272,8 +272,9 @@ def test_what_is_wrong_with_a_model_s_rig_is_said(tmp_path, cameras, rigs, reaso
 
 
 def test_a_calibration_of_no_known_format_is_refused(tmp_path):
-    with pytest.raises(FormatError, match="no calibration of several cameras"):
+    with pytest.raises(FormatError) as refused:
         read_rig_calibration(tmp_path / "x.txt")
+    assert refused.value.code == "no-rig-calibration"
     with pytest.raises(FormatError, match=r"rigs.bin.*is missing"):
         read_rig_calibration(tmp_path)
     path = tmp_path / "camchain.yaml"

@@ -514,7 +514,7 @@ def test_a_chunk_that_a_run_has_begun_anew_is_given_up(tmp_path, monkeypatch):
         with pytest.raises(MappingError, match=r"signal 9\); if memory ran out, give workers more of it"):
             do_for_another(part, describe_versions(), "by the run that goes on")
     shutil.rmtree(part.folder)
-    with pytest.raises(InertialError, match=r"worker tcp://a:1 does not see .*0: .* that all machines share"):
+    with pytest.raises(InertialError, match=r"worker tcp://a:1 cannot access .*0: .* that all machines share"):
         do_for_another(part, describe_versions(), "by the run that goes on")
     assert list(tmp_path.iterdir()) == []
 
@@ -556,7 +556,7 @@ def test_what_keeps_a_cluster_from_helping_is_said_before_the_work(cluster, tmp_
         require({})
     with pytest.raises(InertialError, match=r"worker w cannot use colmap-inertial .* No module named"):
         require({"w": ModuleNotFoundError("No module named 'colmap_inertial'")})
-    with pytest.raises(InertialError, match=r"worker w does not see .* path that all machines share"):
+    with pytest.raises(InertialError, match=r"worker w cannot access .* path that all machines share"):
         require({"w": (here, "")})
     with using_workers(scheduler=cluster[0]):
         executor = RunContext().executor
