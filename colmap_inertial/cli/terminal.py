@@ -363,6 +363,8 @@ def _model_lines(model: ModelResult, result: ReconstructResult) -> Iterator[Line
     mapping = None if result.mapping is None else asdict(result.mapping)
     used = sum(record.used for record in frames)
     yield from scale_lines(model.scale)
+    if model.scale.sensors is not None:
+        yield from evidence_lines(model.scale.sensors)
     yield from model_facts(model.summary, f" of {used} registered ({len(frames)} frames)" if frames else "")
     if frames:
         yield from imaging_lines(frames, result.imaging, result.keypoints.rectified())

@@ -119,7 +119,5 @@ class DevicePoses:
 def read_poses_table(table: Section) -> DevicePoses:
     """``[poses]``: the device's own path."""
     path: Path = table.require("path", table.file("path"))
-    if not path.exists():
-        raise FormatError(path, Fact("no-such-file", what="file or folder"))
     up = table.choice("up", _AXES)
     return DevicePoses(path=path, up_in_world=None if up is None else _AXES[up])

@@ -8,7 +8,9 @@ import pycolmap
 import pytest
 
 from colmap_inertial.core.errors import InertialError, NotObservableError
+from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, ReferenceOptions
+from colmap_inertial.core.types import ScaleEstimate
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.run.commands.reconstruct_project import reconstruct_project
 from colmap_inertial.run.commands.scale_by_reference import has_imu, knows_metres, scale_project_by
@@ -121,6 +123,20 @@ def test_sensors_can_be_chosen(box, by_imu, tmp_path):
     with pytest.raises(InertialError) as error:
         run(box, tmp_path / "none", scale_from=("imu", "device"))
     assert error.value.fact.code == "sensor-not-there"
+
+
+def test_where_the_imu_s_scale_is_refused_the_others_give_it_and_which_way_is_up(box, tmp_path, monkeypatch):
+    refused = ScaleEstimate.refused("none", Fact("camera-still"))
+    monkeypatch.setattr("colmap_inertial.run.stages.metric.estimate_scale", lambda *_, **__: refused)
+    result = run(box, tmp_path, depth=DepthErrors(), path=PathErrors(factor=0.99))
+    (model,) = result.models
+    low, high = model.scale.ci95
+    assert low < box.recording.truth.metres_per_unit < high and model.sparse_metric is not None
+    assert [one.sensor for one in model.scale.sensors.evidence] == ["depth", "device"]
+    assert [one.sensor for one in model.scale.sensors.absent] == ["imu"]
+    assert "up-by-sensor" in [note.code for note in model.scale.notes]
+    assert up_in(tmp_path / "out", box)[2] > np.cos(np.radians(1.5))
+    assert result.report is not None and find_violations("result", tmp_path / "out" / "result.json") == []
 
 
 def test_a_target_that_is_named_gives_metres_and_else_checks_them(box, tmp_path, monkeypatch):

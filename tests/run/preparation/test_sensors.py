@@ -132,4 +132,4 @@ def test_a_path_in_tum_format_is_metric_and_has_the_stated_vertical(tmp_path: Pa
     np.testing.assert_array_equal(found.up_in_device, (0, 0, 1))
     (tmp_path / "path.tum").unlink()
     with pytest.raises(FormatError):
-        load_capture(tmp_path / "capture.toml")
+        find_sensors(capture, timing.names, no_size, timing=timing)
