@@ -3,7 +3,8 @@
 Each sensor's logarithm of the scale is normal about the true one. Errors of one cause that several share are one error.
 Beside, each sensor may be wrong (``FAULTS``), then by any amount of ``FAULT_SIGMA``, or seldom of ``GROSS_SIGMA``. Of
 all cases of who is wrong, each counts by its probability given what all say. So sensors that agree confirm each other,
-and where two differ the interval reaches to both.
+and where two differ the interval reaches to both. A sensor that agrees never makes the interval wider than the surest
+one's by itself.
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ from colmap_inertial.inertial.scale.verdict import verdict_of
 
 #: Sensors as far apart are said to contradict each other: by chance, one recording in a hundred shows as much.
 _CHANCE = 0.01
+#: Sensors agree where chance would set every second recording's farther apart.
+_AGREE = 0.5
 
 
 def covariance_of(evidence: Sequence[ScaleEvidence]) -> Array:
@@ -147,6 +150,9 @@ def combine(evidence: Sequence[ScaleEvidence], absent: Sequence[AbsentSensor] = 
     if p_value < _CHANCE:
         checks.append(_contradiction(evidence, cov, cases, p_value))
     sigma = cases.sigma
+    if p_value >= _AGREE:
+        # alone, the surest has no allowance for faults; one that agrees with it gives no reason for more
+        sigma = min(sigma, *(one.sigma for one in evidence))
     verdict, _, reasons = verdict_of(math.exp(cases.mean), sigma, checks)
     return CombinedScale(
         evidence=evidence,

@@ -1,6 +1,7 @@
 """Sensors together: draws from the very errors that evidence states, and sensors that are wrong on purpose."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from colmap_inertial.core.types import CameraTrajectory
 from colmap_inertial.core.types.evidence import AbsentSensor, ScaleEvidence, ScalePart
 from colmap_inertial.evidence.combine import combine, covariance_of, judge_device, weigh
 from colmap_inertial.evidence.inertial import evidence_of_device
+from colmap_inertial.evidence.priors import FAULT_SIGMA, FAULTS
 
 IMU = {"random_sigma": 0.006, "systematic": {"accel_gain": 0.005}}
 DEPTH = {"random_sigma": 0.005, "systematic": {"depth_scale": 0.01, "device_fusion": 0.005}}
@@ -79,6 +81,26 @@ def test_one_sensor_alone_is_left_as_it_is():
     both = combine([alone])
     assert (both.log_scale, both.sigma) == pytest.approx((0.3, alone.sigma))
     assert both.p_value == 1
+
+
+@pytest.mark.parametrize("others", [("device",), ("depth",), ("depth", "device"), ("depth", "positions", "device")])
+def test_sensors_that_agree_give_no_wider_interval_than_the_surest_alone(others: tuple[str, ...]):
+    known = {"depth": DEPTH, "positions": POSITIONS}
+    agreeing = [evidence(s, 0.001, **known[s]) if s in known else evidence_of_device(0.001) for s in others]
+    imu = evidence("imu", 0.0, **IMU)
+    both = combine([imu, *agreeing])
+    assert both.p_value > 0.5 and both.sigma <= imu.sigma
+
+
+def test_faults_as_frequent_as_assumed_leave_the_interval_true():
+    rng = np.random.default_rng(2)
+    inside = []
+    for _ in range(400):
+        sensors = draw(rng, 0.0)
+        wrong = [FAULT_SIGMA * rng.normal() * (rng.uniform() < FAULTS[one.sensor]) for one in sensors]
+        both = combine([replace(one, log_scale=one.log_scale + by) for one, by in zip(sensors, wrong, strict=True)])
+        inside.append(abs(both.log_scale) < 1.96 * both.sigma)
+    assert 0.95 - 3 * math.sqrt(0.05 * 0.95 / 400) < np.mean(inside)
 
 
 def test_an_error_that_all_share_is_never_averaged_out():
