@@ -411,10 +411,10 @@ def _fit_delay(
 ) -> _Fit:
     """The mean over sizes of errors and delays; ``paths`` gives the path (T, N) by each of T delays."""
     if not lags:
-        return _fit(paths(np.zeros(1)), np.zeros(1), target, t_s, stated_m)
+        return _average_fits(paths(np.zeros(1)), np.zeros(1), target, t_s, stated_m)
     delays_s = _LIMITS.usual_delay_s + _LIMITS.delay_sigma_s * np.linspace(*_LIMITS.delay_span, _LIMITS.delays)
     for _ in range(_LIMITS.rounds):
-        fit = _fit(paths(delays_s), delays_s, target, t_s, stated_m)
+        fit = _average_fits(paths(delays_s), delays_s, target, t_s, stated_m)
         step_s = float(delays_s[1] - delays_s[0])
         if fit.delay_sigma_s >= step_s:
             break
@@ -423,30 +423,11 @@ def _fit_delay(
     return fit
 
 
-def _fit(paths: ComplexArray, delays_s: Array, target: ComplexArray, t_s: Array, stated_m: Array) -> _Fit:
+def _average_fits(paths: ComplexArray, delays_s: Array, target: ComplexArray, t_s: Array, stated_m: Array) -> _Fit:
     """The mean over all sizes of errors and the delays given; plane points as complex numbers."""
-    stated = stated_m[np.isfinite(stated_m) & (stated_m > 0)]
-    usual_m, factor = (float(np.median(stated)), _LIMITS.slow_factor) if len(stated) else _LIMITS.unstated_slow
-    # a receiver that is less sure of some positions than of others is right about that
-    relative = np.where(np.isfinite(stated_m) & (stated_m > 0), stated_m / usual_m, 1.0)
-    apart_s = np.abs(t_s[:, None] - t_s[None, :])
     middle = complex(paths.mean())
     white_m, slow_m = (sizes.ravel() for sizes in np.meshgrid(_LIMITS.white_m, _LIMITS.slow_m))
-    log_prior = -0.5 * (np.log(slow_m / usual_m) / math.log(factor)) ** 2
-    by_correlation = [
-        _fit_given_errors(
-            (paths - middle) / relative,
-            target / relative,
-            1 / relative,
-            apart_s / alike_s,
-            (white_m, slow_m),
-            log_prior,
-        )
-        for alike_s in _LIMITS.alike_s
-    ]
-    fits = _Fits(
-        **{field.name: np.array([getattr(one, field.name) for one in by_correlation]) for field in fields(_Fits)}
-    )
+    fits = _fit_by_errors(paths - middle, target, t_s, stated_m, (white_m, slow_m))
     log_prior_of_delay = -0.5 * ((delays_s - _LIMITS.usual_delay_s) / _LIMITS.delay_sigma_s) ** 2
     logs = fits.log_probability + log_prior_of_delay[:, None]
     share = np.exp(logs - logs.max())
@@ -470,6 +451,29 @@ def _fit(paths: ComplexArray, delays_s: Array, target: ComplexArray, t_s: Array,
         ratio_sigma=math.sqrt(float(np.sum(share * (1 / fits.turn_info + (fits.ratio - ratio) ** 2)))),
         delay_s=delay_s,
         delay_sigma_s=math.sqrt(float(share_of_delay @ (delays_s - delay_s) ** 2)),
+    )
+
+
+def _fit_by_errors(
+    paths: ComplexArray, target: ComplexArray, t_s: Array, stated_m: Array, sizes: tuple[Array, Array]
+) -> _Fits:
+    """Placements of a path by each time over which slow errors are alike, by T delays and K sizes of errors: (A, T, K).
+
+    ``stated_m`` (N,): the receiver's own standard deviations; NaN or 0 where it states none. ``sizes`` (K,), (K,): of
+    white and of slow errors.
+    """
+    stated = stated_m[np.isfinite(stated_m) & (stated_m > 0)]
+    usual_m, factor = (float(np.median(stated)), _LIMITS.slow_factor) if len(stated) else _LIMITS.unstated_slow
+    # a receiver that is less sure of some positions than of others is right about that
+    relative = np.where(np.isfinite(stated_m) & (stated_m > 0), stated_m / usual_m, 1.0)
+    apart_s = np.abs(t_s[:, None] - t_s[None, :])
+    log_prior = -0.5 * (np.log(sizes[1] / usual_m) / math.log(factor)) ** 2
+    by_correlation = [
+        _fit_given_errors(paths / relative, target / relative, 1 / relative, apart_s / alike_s, sizes, log_prior)
+        for alike_s in _LIMITS.alike_s
+    ]
+    return _Fits(
+        **{field.name: np.array([getattr(one, field.name) for one in by_correlation]) for field in fields(_Fits)}
     )
 
 

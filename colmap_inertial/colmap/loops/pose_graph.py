@@ -380,7 +380,7 @@ def _choose_loops(graph: _Graph, loops: _Edges, off: Array, depth: Array, matche
     surest = surest[sigma[surest] <= _NOISE.alike * sigma[surest[0]]]
     rest = loops.only(agree)
     expected = off[agree], predicted[agree] + rest.covariance
-    return agree[surest[_prevail(graph, rest, expected, surest, matches[agree])]]
+    return agree[surest[_select_unrivalled(graph, rest, expected, surest, matches[agree])]]
 
 
 def _place_sigma(covariance: Array) -> Array:
@@ -388,22 +388,26 @@ def _place_sigma(covariance: Array) -> Array:
     return np.asarray(np.sqrt(np.trace(covariance[:, :3, :3], axis1=1, axis2=2)))
 
 
-def _prevail(
-    graph: _Graph, loops: _Edges, predicted: tuple[Array, Array], some: IndexArray, matches: Array
+def _select_unrivalled(
+    graph: _Graph, loops: _Edges, predicted: tuple[Array, Array], candidates: IndexArray, matches: Array
 ) -> BoolArray:
-    """(S,) which of some loops no other of them contradicts, or none with half as many matches behind it."""
+    """(S,) which of the candidates among M loops no other contradicts, or none with half as many matches behind it.
+
+    ``predicted``: how far each loop (M, 7) is off what the graph says, and the covariance (M, 7, 7) of that.
+    """
     off, covariance = predicted
-    # what is predicted of all loops, once one of these is accepted
-    joint = graph.covariances(loops.only(some), loops).swapaxes(0, 1)
-    gain = joint @ np.linalg.inv(covariance[some])[:, None]
-    expected = off - np.einsum("slij,sj->sli", gain, off[some])
-    agree = _agree(expected, covariance - gain @ np.swapaxes(joint, 2, 3))
-    agree[np.arange(len(some)), some] = True
-    behind = agree @ matches
-    of_all = matches.copy()  # of those that do not compete now, their own
-    of_all[some] = behind
-    rival = np.max(np.where(agree, 0.0, of_all), axis=1)
-    return np.asarray(behind >= _NOISE.by_far * rival)
+    # what is left of each loop's difference (S, M, 7) once a candidate is accepted: a Kalman update
+    joint = graph.covariances(loops.only(candidates), loops).swapaxes(0, 1)
+    gain = joint @ np.linalg.inv(covariance[candidates])[:, None]
+    off_after = off - np.einsum("slij,sj->sli", gain, off[candidates])
+    agree = _agree(off_after, covariance - gain @ np.swapaxes(joint, 2, 3))
+    agree[np.arange(len(candidates)), candidates] = True
+    matches_behind = agree @ matches
+    # a loop that is no candidate has its own matches alone
+    strength = matches.copy()
+    strength[candidates] = matches_behind
+    strongest_rival = np.max(np.where(agree, 0.0, strength), axis=1)
+    return np.asarray(matches_behind >= _NOISE.by_far * strongest_rival)
 
 
 def _agree(off: Array, covariance: Array) -> BoolArray:

@@ -157,29 +157,45 @@ class Layout:
         )
 
     def _positions(self, row: Int64Array, column: Int64Array) -> Int64Array:
-        """(N, s, s) positions of entries of states at places (N,) and (N,), of which either may be the later."""
-        own, before, across = self.starts
-        wide, narrow = self.wide, self.narrow
-        i, j = np.indices((self.state, self.state))
-        i, j = (values + np.zeros((len(row), 1, 1), dtype=np.int64) for values in (i, j))
-        a, b = (values[:, None, None] + np.zeros_like(i) for values in (row, column))
-        # biases of a group come first, then its wide numbers; of groups, the earlier one
-        key_a, key_b = (place // self.group * 2 + (number < wide) for place, number in ((a, i), (b, j)))
-        swap = (key_a < key_b) | ((key_a == key_b) & (a < b))
-        a, b, i, j = np.where(swap, b, a), np.where(swap, a, b), np.where(swap, j, i), np.where(swap, i, j)
-        group = b // self.group
+        """(N, s, s) positions of entries of states at places (N,) and (N,), of which either may be the later.
+
+        The later number of an entry is its row, the earlier one its column. See :class:`Panels` for which panel has it.
+        """
+        (row_place, row_number), (place, number) = self._sort_by_elimination(row, column)
+        group = place // self.group
         first = group * self.group
-        # rows of wide numbers begin with the group's own; of narrow ones in the group itself, or the next one's first
-        inside = a < first + self.group
-        at_wide, at_narrow = wide * (a - first) + i, narrow * (a - first) + i - wide
-        here, biased = wide * (b - first) + j, narrow * (b - first) + j - wide
-        wide_own = own[group] + at_wide * (self.group * wide) + here
-        wide_before = before[group] + (self.group * narrow + at_wide) * (self.group * narrow) + biased
-        narrow_before = before[group] + at_narrow * (self.group * narrow) + biased
-        line = across[group] + (i - wide) * (self.group * self.state)
-        narrow_across = line + np.where(j < wide, self.group * narrow + here, biased)
-        of_wide = np.where(j < wide, wide_own, wide_before)
-        return np.asarray(np.where(i < wide, of_wide, np.where(inside, narrow_before, narrow_across)))
+        row_is_wide, column_is_wide = row_number < self.wide, number < self.wide
+        wide_row, wide_column = self.wide * (row_place - first) + row_number, self.wide * (place - first) + number
+        narrow_row = self.narrow * (row_place - first) + row_number - self.wide
+        narrow_column = self.narrow * (place - first) + number - self.wide
+        own, before, across = (starts[group] for starts in self.starts)
+        all_wide, all_narrow = self.group * self.wide, self.group * self.narrow
+        in_own = own + wide_row * all_wide + wide_column
+        row_before = np.where(row_is_wide, all_narrow + wide_row, narrow_row)
+        in_before = before + row_before * all_narrow + narrow_column
+        column_across = np.where(column_is_wide, all_narrow + wide_column, narrow_column)
+        in_across = across + (row_number - self.wide) * (all_narrow + all_wide) + column_across
+        is_own, row_is_in_group = row_is_wide & column_is_wide, row_place < first + self.group
+        return np.asarray(np.select([is_own, row_is_wide | row_is_in_group], [in_own, in_before], in_across))
+
+    def _sort_by_elimination(
+        self, first: Int64Array, second: Int64Array
+    ) -> tuple[tuple[Int64Array, Int64Array], tuple[Int64Array, Int64Array]]:
+        """Places and numbers (N, s, s) of all pairs of numbers of two states: of the later number, of the earlier one.
+
+        Groups are eliminated one after the other, and of each its narrow numbers before its wide ones.
+        """
+        shape = (len(first), self.state, self.state)
+        number_a, number_b = (np.broadcast_to(numbers, shape) for numbers in np.indices(shape[1:]))
+        place_a, place_b = (np.broadcast_to(places[:, None, None], shape) for places in (first, second))
+        turn_a, turn_b = (
+            2 * (place // self.group) + (number < self.wide)
+            for place, number in ((place_a, number_a), (place_b, number_b))
+        )
+        b_is_later = (turn_a < turn_b) | ((turn_a == turn_b) & (place_a < place_b))
+        later = np.where(b_is_later, place_b, place_a), np.where(b_is_later, number_b, number_a)
+        earlier = np.where(b_is_later, place_a, place_b), np.where(b_is_later, number_a, number_b)
+        return later, earlier
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

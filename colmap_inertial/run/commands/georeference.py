@@ -25,9 +25,9 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Outcomes:
-    """Outcomes of all metric models by their number; the reason where a heading stays open."""
+    """Outcomes of all metric models by their numbers; the reason where a heading stays open."""
 
-    models: dict[int, Outcome[Georeference]]
+    models: dict[str, Outcome[Georeference]]
 
 
 def run_georeference(
@@ -46,17 +46,17 @@ def run_georeference(
     record = workspace.stamps / "georeferenced.json"
 
     def work(partial: Sequence[Path]) -> None:
-        outcomes: dict[int, Outcome[Georeference]] = {}
+        outcomes: dict[str, Outcome[Georeference]] = {}
         written: list[dict[str, object]] = []
         for index, folder in metric.items():
             path, _ = trajectory_from_model(read_model(folder), timing, covariances=False)
             try:
                 georeference = georeference_path(fixes, path, -DOWN_IN_WORLD[world])
             except NotObservableError as error:
-                outcomes[index] = Outcome.of_error(error)
+                outcomes[str(index)] = Outcome.of_error(error)
                 written.append({"model": index, **error_as_json(error)})
             else:
-                outcomes[index] = Outcome(found=georeference)
+                outcomes[str(index)] = Outcome(found=georeference)
                 written.append(
                     {
                         "model": index,
@@ -70,8 +70,8 @@ def run_georeference(
     depends = {"fixes": fixes, "timing": timing, "world": world}
     session.runner.run("georeference", depends, [record, workspace.georeference], work, after=("metric",))
     known: dict[int, Georeference | NotObservableError] = {}
-    for index, entry in read_record(record, _Outcomes).models.items():
-        outcome = entry.result()
+    for number, entry in read_record(record, _Outcomes).models.items():
+        index, outcome = int(number), entry.result()
         assert not isinstance(outcome, TargetNotFoundError)
         known[index] = outcome
         if isinstance(outcome, Georeference):
