@@ -11,6 +11,7 @@ import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union
 
@@ -108,7 +109,7 @@ def _require_choices(command: type[Command], args: Sequence[str]) -> None:
     ValueError
     """
     choices = {option.label.split()[0]: option.choices for option in list_options(command) if option.choices}
-    for given, following in zip(args, [*args[1:], ""], strict=True):
+    for given, following in pairwise([*args, ""]):
         name, equals, value = given.partition("=")
         name = name.replace("_", "-")
         if name in choices:

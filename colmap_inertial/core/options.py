@@ -325,8 +325,8 @@ class ReconstructOptions(CheckedOptions):
         Of special cameras.
     mapping, colmap, colmap_project, colmap_executable, database, database_images
         How COLMAP builds the model.
-    scale, world, georeference
-        The scale, the axes of the metric model, and its position on Earth.
+    scale_from, scale, world, georeference
+        Where metres come from, the scale by the IMU, the axes of the metric model, and its position on Earth.
     join, join_options, refine, fragments
         Which models are joined, refined and scaled.
     dense, dense_options

@@ -90,7 +90,7 @@ def test_a_wrong_flag_exits_2_and_names_it(capsys):
 @loop_over(
     ("args", "meant"),
     [
-        (["scal", "x"], "reconstruct, batch, simulate, scale"),
+        (["scal", "x"], "diagnose, reconstruct, batch, view"),
         (["scale", "x", "--frame-time", "y"], "--frame-times PATH"),
         (["reconstruct", "x", "y", "--rolling-shuter=off"], "--rolling-shutter {off,rectify}"),
         (["reconstruct", "x", "y", "--overlap", "3"], "--mapping.overlap INT"),

@@ -19,7 +19,7 @@ TASKS = [
     ("have the result for a script", "scale", "--json", ["standard output"]),
     ("check the size by a printed board", "validate", "--target", ["look for"]),
     ("take the model into a splatting trainer", "export", "--for", ["program"]),
-    ("make a device's next recordings better", "align", "--remember", ["automatically"]),
+    ("make a device's next recordings better", "align", "--remember", ["device name"]),
     ("repeat a run bit for bit", "reconstruct", "--deterministic", ["same model, bit for bit"]),
     ("keep the depths of a multi-aperture camera", "fuse-apertures", "--depth", ["depths (metres)"]),
 ]

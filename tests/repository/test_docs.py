@@ -164,7 +164,7 @@ def test_commands_in_the_text_exist(capsys):
     shown = capsys.readouterr().out
     named = set(re.findall(r"`colmap-inertial ([a-z][\w-]*)", TEXT))
     named |= set(re.findall(r"^\| `([a-z][\w-]*) [A-Z]{2,}", (ROOT / "README.md").read_text(), re.MULTILINE))
-    assert len(named) > 12
+    assert {"reconstruct", "scale", "validate", "export"} <= named
     assert [verb for verb in named if not re.search(rf"\b{verb}\b", shown)] == []
 
 
