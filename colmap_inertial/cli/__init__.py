@@ -183,7 +183,7 @@ def _main(args: Sequence[str] | None) -> None:
             print_json({**with_sentences({"error": fact_of(error)}), "error": str(error), "exit_code": code})
         say("\n".join([f"error: {error}", *getattr(error, "__notes__", ())]), error=True)
     except KeyboardInterrupt as stop:
-        again = "; started again with the same arguments, it continues" if command.resumes else ""
+        again = "; run the same command again to continue" if command.resumes else ""
         say(f"interrupted{again}", error=True)
         code = TERMINATED if isinstance(stop, Terminated) else INTERRUPTED
     except (MemoryError, OSError, ImportError, RuntimeError) as error:

@@ -836,12 +836,12 @@ def exposure_unstated(
 ) -> str:
     if exposure_s is None or exposure_sigma_s is None:
         return (
-            f"no exposure is stated; the blur of {frames} frames shows that it is at most {1e3 * most_s:.1f} ms, with "
-            f"which the fastest turning smears {most_px:.1f} px"
+            f"no exposure is stated; the blur of {frames} frames shows that it is at most {1e3 * most_s:.1f} ms, in "
+            f"which the fastest rotation blurs {most_px:.1f} px"
         )
     return (
         f"no exposure is stated; the blur of {frames} frames shows {1e3 * exposure_s:.1f} +- "
-        f"{1e3 * exposure_sigma_s:.1f} ms, with which the fastest turning smears {most_px:.1f} px"
+        f"{1e3 * exposure_sigma_s:.1f} ms, in which the fastest rotation blurs {most_px:.1f} px"
     )
 
 

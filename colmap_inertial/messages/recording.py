@@ -252,7 +252,7 @@ def exposure_of_few_frames(frames: int) -> str:
 
 @message(example={"longest_s": 0.08})
 def exposure_not_bounded(longest_s: float) -> str:
-    return f"frames exclude no exposure up to {1e3 * longest_s:.0f} ms: the camera hardly turns, or texture is missing"
+    return f"any exposure up to {1e3 * longest_s:.0f} ms is possible: the camera hardly rotates, or texture is missing"
 
 
 state("readout-without-gyroscope", "it needs a video and a gyroscope that fit each other")

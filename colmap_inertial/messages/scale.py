@@ -558,9 +558,9 @@ def declared_focal_length(declared_px: float, found_px: float, sigma_px: float) 
 def declared_distortion(declared: str, found: str, distortion: Sequence[float], shift_px: float) -> str:
     numbers = ", ".join(f"{value:.3f}" for value in distortion)
     return (
-        f"the declared camera ({declared}) has no distortion, but the images show {shift_px:.1f} px of it: {found} "
-        f"with about {numbers}; ignored, it bends the model and changes its size: declare it, or leave out [camera] "
-        "to let COLMAP calibrate"
+        f"the declared camera ({declared}) has no distortion, but the images show {shift_px:.1f} px of it "
+        f"({found} with about {numbers}), which bends the model and changes its size: declare it, or leave out "
+        "[camera] to let COLMAP calibrate"
     )
 
 
