@@ -100,8 +100,8 @@ def of_capture(path: Path) -> tuple[str, ExposureEstimate | NotObservableError]:
         stated = f"{low:.1f} to {high:.1f}, median {middle:.1f} ms"
         timing = replace(timing, exposure_s=None, t_s=timing.t_s + 0.5 * timing.exposure_s)
     camera = recorded.camera
-    if camera is None and recorded.pictures is not None:
-        height, width = next(iter(recorded.pictures([0]))).image.shape[:2]
+    if camera is None and recorded.images is not None:
+        height, width = next(iter(recorded.images([0]))).image.shape[:2]
         params = (0.5 * width / np.tan(np.radians(30)), width / 2, height / 2)
         camera = CameraModel(model="SIMPLE_PINHOLE", width=width, height=height, params=params)
     try:

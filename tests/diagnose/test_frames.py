@@ -30,7 +30,7 @@ def test_an_exposure_that_nobody_states_is_said_with_its_blur() -> None:
     t_s = np.linspace(0.4, 5.6, 40)
     timing = FrameTiming(names=tuple(f"{i:02}.png" for i in range(len(t_s))), t_s=t_s, readout_s=0.0)
 
-    def pictures(places: Sequence[int]) -> Iterator[Frame]:
+    def images(places: Sequence[int]) -> Iterator[Frame]:
         for i in places:
             shutter = FrameShutter(width=640, height=480, t_s=t_s[i] - 0.5 * exposure_s, exposure_s=exposure_s)
             image = scene.picture(camera, shutter, samples=20, noise=0.004, seed=i)
@@ -52,14 +52,14 @@ def test_an_exposure_that_nobody_states_is_said_with_its_blur() -> None:
         accel_t_s=path.t_s,
         accel_m_s2=np.tile([0.0, 0.0, 9.81], (len(path.t_s), 1)),
     )
-    recorded = Recorded(imu=imu, timing=timing, rotation=rotation, camera=camera, is_capture=True, pictures=pictures)
+    recorded = Recorded(imu=imu, timing=timing, rotation=rotation, camera=camera, is_capture=True, images=images)
     (finding,) = check_unstated_exposure(recorded)
     values = finding.fact.values
     assert finding.code == "exposure-unstated"
     assert abs(values["exposure_s"] - exposure_s) < 3 * values["exposure_sigma_s"]
     fastest_px_s = 520.0 * np.linalg.norm(gyro.rate_in_cam_rad_s(t_s), axis=1).max()
     assert values["most_px"] == pytest.approx(fastest_px_s * values["exposure_s"], rel=0.5)
-    # a stated one is not asked for, and without pictures nothing is said
+    # a stated one is not asked for, and without images nothing is said
     stated = replace(timing, exposure_s=np.full(len(t_s), exposure_s))
     assert not list(check_unstated_exposure(replace(recorded, timing=stated)))
-    assert not list(check_unstated_exposure(replace(recorded, pictures=None)))
+    assert not list(check_unstated_exposure(replace(recorded, images=None)))
