@@ -212,7 +212,7 @@ def run_by_step(command: list[object], stamps: Path) -> tuple[float, dict[str, f
 def measure_ours(video: Video, out: Path, *options: str) -> Figures:
     """Figures of ``reconstruct``; of a folder that holds a run, the steps that it repeats."""
     command: list[object] = [sys.executable, "-m", "colmap_inertial", "reconstruct", video.capture, out, "--quiet"]
-    command += ["--deterministic", *options]
+    command += ["--deterministic", "--overwrite", *options]
     processor_s, steps = run_by_step(command, out / ".stages")
     result = read_json(out / "result.json")
     figures: Figures = dict.fromkeys(COLUMNS, 0.0)

@@ -9,7 +9,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array, BoolArray, Int64Array
 from colmap_inertial.inertial.refine._residuals import derivatives, project
 from colmap_inertial.inertial.refine.setup import Seen, free_cameras, intrinsics_of
-from colmap_inertial.inertial.refine.values import FIRST_INTRINSIC, N_POSE, Estimate, Prior, Problem
+from colmap_inertial.inertial.refine.values import FIRST_INTRINSIC, N_POSE, POSITION, Estimate, Prior, Problem
 
 #: Points this much nearer or farther than a path is long are left out.
 _EXTREME = 1e4
@@ -151,12 +151,13 @@ def measure_picture_noise(problem: Problem, x: Estimate) -> PictureNoise:
 
 
 def measure_shared_errors(problem: Problem, x: Estimate) -> float:
-    """Variance of a frame's pose by its observations, over what independent errors would make of it; 1 or more.
+    """Variance of poses by their observations, over what independent errors would make of it; 1 or more.
 
-    Neighbouring keypoints err alike: by what the camera model leaves of the lens, by blur, by what is left of a rolling
-    shutter. What residuals pull at their frame's pose with is summed in each of 4 x 4 cells of the picture. Independent
-    errors give these sums the variance of the cell's information, less what the pose took of them (a variance by
-    clusters: Liang and Zeger, Biometrika 1986). What all of a picture shares is the pose's, and not seen.
+    Neighbouring keypoints err alike, and so from frame to frame: by what the camera model leaves of the lens, by blur,
+    by what is left of a rolling shutter. What residuals pull at their frame's pose with is summed in each of 4 x 4
+    cells of the picture, over as many frames as see a point. Independent errors give these sums the variance of the
+    cell's information, less what the pose took of them (variances by clusters: Liang and Zeger, Biometrika 1986; of
+    what lasts: Newey and West, Econometrica 1987). What all of a picture shares is the pose's, and not seen.
 
     Parameters
     ----------
@@ -164,30 +165,37 @@ def measure_shared_errors(problem: Problem, x: Estimate) -> float:
         Observations, with their robust loss, and a solution.
     """
     observations, at = problem.observations, project(problem, x, problem.observations)
-    frame, frames = observations.frame, len(x.velocity_m_s)
+    frame, frames, cells = observations.frame, len(x.velocity_m_s), _CELLS**2
     weight = 1 / (1 + np.sum(at.residual**2, axis=1) / problem.robust_px**2)
     pull = weight[:, None] * at.residual
-    by_pose = derivatives(problem, x, observations, at, np.ones(len(frame))).by_frame[:, :, :N_POSE]
+    by_pose = derivatives(problem, x, observations, at, np.ones(len(frame))).by_frame[:, :, :N_POSE].copy()
+    # along the body's axes, in which what lasts stays as it is
+    by_pose[:, :, POSITION] = by_pose[:, :, POSITION] @ x.world_from_imu[frame]
     size = np.array([(camera.model.width, camera.model.height) for camera in problem.cameras])
     place = observations.xy_px / size[problem.camera_of[frame]] * _CELLS
     column, row = np.clip(place.astype(np.int64), 0, _CELLS - 1).T
     cell = (frame * _CELLS + column) * _CELLS + row
-    by_cell = _sum_by(cell, frames * _CELLS**2, by_pose.transpose(0, 2, 1) @ by_pose).reshape(
-        frames, -1, N_POSE, N_POSE
-    )
+    by_cell = _sum_by(cell, frames * cells, by_pose.transpose(0, 2, 1) @ by_pose)
+    by_cell = by_cell.reshape(frames, cells, N_POSE, N_POSE)
     whole = by_cell.sum(axis=1)
-    # of so few that they do not determine the pose
     told = np.flatnonzero(np.bincount(frame[at.seen], minlength=frames) >= _FEWEST)
     told = told[np.linalg.cond(whole[told]) < 1 / np.finfo(np.float64).eps]
-    cov = np.zeros_like(whole)
+    if not len(told):
+        return 1.0
+    # poses that their observations do not determine say nothing
+    cov, root = np.zeros_like(whole), np.zeros_like(whole)
     cov[told] = np.linalg.inv(whole[told])
+    root[told] = np.linalg.cholesky(cov[told])
     moved = (cov @ _sum_by(frame, frames, by_pose.transpose(0, 2, 1) @ pull[:, :, None]))[:, :, 0]
     left = pull - np.einsum("nri,ni->nr", by_pose, moved[frame])
-    sums = _sum_by(cell, frames * _CELLS**2, np.einsum("nri,nr->ni", by_pose, left)).reshape(frames, -1, N_POSE)
-    squares = float(np.einsum("fci,fij,fcj->", sums, cov, sums))
+    sums = _sum_by(cell, frames * cells, np.einsum("nri,nr->ni", by_pose, left)).reshape(frames, cells, N_POSE)
+    lasts = min(frames, max(1, round(len(frame) / len(x.points_m))))
+    added = np.pad(np.cumsum(sums @ root, axis=0), ((lasts, lasts - 1), (0, 0), (0, 0)), mode="constant")
+    added[frames + lasts :] = added[frames + lasts - 1]
+    squares = float(np.sum((added[lasts:] - added[:-lasts]) ** 2)) / lasts
     share = cov[:, None] @ by_cell
     expected = float(np.mean(pull**2)) * float(np.einsum("fcii->", share) - np.einsum("fcij,fcji->", share, share))
-    return max(1.0, squares / expected) if expected > 0 else 1.0
+    return max(1.0, squares / expected)
 
 
 def _sum_by(group: Int64Array, groups: int, values: Array) -> Array:

@@ -169,7 +169,8 @@ def test_a_readout_is_sought_in_the_middle_images_whatever_was_declared(monkeypa
         imu="imu", shutter=None, keeps_intrinsics=False, known_of=lambda model, refine_intrinsics: Known(prior=declared)
     )
 
-    def found(seen, timing, imu, known, exposed_px):
+    def found(seen, timing, imu, known, exposed_px, find_lens):
+        assert not find_lens
         sought.update(seen=seen, cov=known.prior.cov)
         return "readout"
 
