@@ -18,7 +18,7 @@ from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.tools.simulate.render import colmap_camera
 from scripts.common.gated_deblur import deblur_gated
 from tests.helpers.far_scene import FarScene
-from tests.imaging.test_psf_pictures import CAM_FROM_IMU, PINHOLE, turning
+from tests.helpers.turning_cameras import CAM_FROM_IMU, PINHOLE, turning
 from tests.references.path_filters import Frequencies, doubt_of, transfer_of
 
 CAMERA = colmap_camera(PINHOLE)

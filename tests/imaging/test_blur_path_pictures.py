@@ -19,7 +19,7 @@ from colmap_inertial.imaging.transfer import srgb_from_linear
 from colmap_inertial.tools.simulate.render import ShutterCamera, colmap_camera
 from colmap_inertial.tools.simulate.textures import poster
 from tests.helpers.far_scene import FarScene
-from tests.imaging.test_psf_pictures import LENS, handheld, shutter_of
+from tests.helpers.turning_cameras import LENS, handheld, shutter_of
 
 MODEL = replace(LENS, width=320, height=240, params=(300, 302, 161, 119, 0.12, -0.2, 0.001, -0.0005))
 #: When the hand of this seed turns in a bend.

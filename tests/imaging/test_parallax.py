@@ -17,7 +17,7 @@ from colmap_inertial.imaging.psf import blur_field, predict_blur_px
 from colmap_inertial.run.preparation import translation
 from colmap_inertial.tools.simulate import MotionOptions, make_motion
 from colmap_inertial.tools.simulate.render import ShutterCamera, colmap_camera
-from tests.imaging.test_psf_pictures import LENS, PINHOLE, STEPS, room, shutter_of, turning
+from tests.helpers.turning_cameras import LENS, PINHOLE, STEPS, room, shutter_of, turning
 
 VELOCITY = np.array([0.3, -0.1, 0.4])
 

@@ -12,8 +12,8 @@ from colmap_inertial.core.types import FrameTiming
 from colmap_inertial.imaging.gyro_camera import FrameShutter
 from colmap_inertial.imaging.rolling_shutter import rectify_image, rectify_keypoints
 from colmap_inertial.tools.simulate.render import ShutterCamera, colmap_camera, develop
+from tests.helpers.turning_cameras import FISHEYE, LENS, PINHOLE, handheld, room, shutter_of, turning
 from tests.helpers.versions import version_of
-from tests.imaging.test_psf_pictures import FISHEYE, LENS, PINHOLE, handheld, room, shutter_of, turning
 
 POINTS = np.random.default_rng(1).uniform([5, 5], [635, 475], (300, 2))
 

@@ -16,7 +16,7 @@ from colmap_inertial.imaging.selection import _Compare, _fit_rotation, _Followed
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.run.preparation import selection as choosing
 from colmap_inertial.run.preparation.selection import _Clocks
-from tests.imaging.test_psf_pictures import CAM_FROM_IMU, PINHOLE
+from tests.helpers.turning_cameras import CAM_FROM_IMU, PINHOLE
 
 
 def textured(seed=0, size=(700, 560)):

@@ -6,20 +6,15 @@ import numpy as np
 import pytest
 
 from colmap_inertial.core.errors import FormatError, InertialError
-from colmap_inertial.core.geometry import matrix_from_quat, quat_exp
+from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.types import Similarity
 from colmap_inertial.io import ply
 from colmap_inertial.io.ply import transform_ply
 from tests.helpers.cases import loop_over
 from tests.helpers.files import write_anew
+from tests.helpers.similarities import SIMILARITY
 from tests.io.test_damaged_files import mutated
 
-SIMILARITY = Similarity(
-    scale=0.3721,
-    rotation_xyzw=quat_exp(np.array([0.4, -1.1, 0.3])),
-    translation_m=np.array([5.0, -2.0, 0.5]),
-    cov=np.zeros((7, 7)),
-)
 IDENTITY = Similarity(scale=1.0, rotation_xyzw=[0, 0, 0, 1], translation_m=[0, 0, 0], cov=np.zeros((7, 7)))
 HEADER = """ply
 format {format} 1.0

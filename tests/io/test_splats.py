@@ -19,7 +19,7 @@ from colmap_inertial.model import read_model, similarity_as_json
 from colmap_inertial.model.project import apply_to_project, undo_project
 from colmap_inertial.model.similarities import plain_factor, read_similarity
 from tests.helpers.model_project import NAMES, sparse_model
-from tests.io.test_ply import SIMILARITY
+from tests.helpers.similarities import SIMILARITY
 
 C1 = 0.4886025119029199
 C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)

@@ -30,8 +30,8 @@ from colmap_inertial.model.soundness import check_binary_model
 from tests.helpers.files import write_anew
 from tests.helpers.json_schemas import find_violations
 from tests.helpers.model_project import HEIGHT, NAMES, WIDTH, fuse, prior_rows, write_project
+from tests.helpers.similarities import SIMILARITY
 from tests.io.test_damaged_files import refusals
-from tests.io.test_ply import SIMILARITY
 
 ROTATION = matrix_from_quat(SIMILARITY.rotation_xyzw)
 

@@ -47,8 +47,8 @@ from colmap_inertial.run.stages.rolling_shutter import RollingShutterStage
 from colmap_inertial.run.steps.workspace import Workspace
 from colmap_inertial.tools.simulate import ImuOptions, MotionOptions, RecordingOptions, SfmOptions, simulate_recording
 from colmap_inertial.validate import Validation, parse_target
+from tests.helpers.sessions import recording_of, session_in
 from tests.helpers.simulated_project import write_project
-from tests.run.steps.test_runner import recording_of, session_in
 
 CAMERA = CameraModel(model="PINHOLE", width=640, height=480, params=(500.0, 500.0, 320.0, 240.0))
 

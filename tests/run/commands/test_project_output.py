@@ -40,8 +40,8 @@ from colmap_inertial.run.stages.imaging_plan import ImagingPlan
 from colmap_inertial.run.steps.workspace import Workspace, places_of
 from tests.helpers.desk_scene import copy_scene
 from tests.helpers.model_project import NAMES, write_project
-from tests.io.test_ply import SIMILARITY
-from tests.run.steps.test_runner import session_in
+from tests.helpers.sessions import session_in
+from tests.helpers.similarities import SIMILARITY
 
 SCALE = ModelScale(similarity=SIMILARITY, verdict="trusted")
 REFUSED = ModelScale(similarity=None, verdict="refused", reasons=("the camera stood still",))

@@ -25,7 +25,7 @@ from colmap_inertial.run.stages.join import JoinStage
 from colmap_inertial.run.stages.metric import MetricStage
 from colmap_inertial.run.steps.workspace import Workspace
 from tests.helpers.box_project import build
-from tests.run.steps.test_runner import recording_of, session_in
+from tests.helpers.sessions import recording_of, session_in
 
 
 @pytest.fixture(scope="module")

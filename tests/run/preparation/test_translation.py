@@ -25,7 +25,7 @@ from colmap_inertial.run.preparation.plan import Treatments, plan_imaging
 from colmap_inertial.tools.simulate.motion import MARGIN_S, Motion
 from tests.helpers.corner_scene import CALIBRATED, LENS, PLANES, CornerScene
 from tests.helpers.frame_readers import readers
-from tests.imaging.test_psf_pictures import PINHOLE, turning
+from tests.helpers.turning_cameras import PINHOLE, turning
 
 FRAMES, EXPOSURE_S = 18, 0.025
 #: From the wall, and to and fro along it: a metre a second at the quickest.

@@ -13,7 +13,7 @@ from colmap_inertial.inertial.refine.shutter import SHUTTER_LIMITS
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.run.stages import metric
 from colmap_inertial.run.stages.metric import MetricStage, _add_drift, _motion, calibration_of_rectified
-from tests.imaging.test_psf_pictures import CAM_FROM_IMU
+from tests.helpers.turning_cameras import CAM_FROM_IMU
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 COUNT = 4

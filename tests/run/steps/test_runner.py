@@ -13,18 +13,13 @@ import pycolmap
 import pytest
 
 from colmap_inertial.cli.terminal import show_applied
-from colmap_inertial.colmap.context import RunContext
 from colmap_inertial.colmap.features.extraction import check_pair_names, image_pairs
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError, OutputExistsError, TimingError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import MappingOptions, ReconstructOptions
 from colmap_inertial.core.progress import silent
-from colmap_inertial.core.types import CameraModel, Frame, FrameTiming
-from colmap_inertial.io.calibration import calibration_prior
-from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.frames import read_frame_times
 from colmap_inertial.io.imu import read_imu
-from colmap_inertial.io.recording import Recording
 from colmap_inertial.model import read_model
 from colmap_inertial.model.project import Applied
 from colmap_inertial.run.commands.models import Submodels, run_models
@@ -35,9 +30,9 @@ from colmap_inertial.run.stages.metric import MetricStage
 from colmap_inertial.run.steps.config import config_as_toml, list_changed_options, read_config
 from colmap_inertial.run.steps.hashing import as_json_types
 from colmap_inertial.run.steps.runner import StepRunner
-from colmap_inertial.run.steps.session import Session
 from colmap_inertial.run.steps.workspace import Workspace
 from tests.helpers.cases import loop_over
+from tests.helpers.sessions import CAMERA, frames_of, recording_of, session_in
 
 
 def test_a_stage_runs_once_and_again_when_anything_before_it_changes(tmp_path):
@@ -154,24 +149,6 @@ def test_few_images_are_matched_with_each_other_and_many_with_their_neighbours()
     assert {int(b) - int(a) for a, b in pairs} == {1, 2, 3, 4, 8, 16, 32, 64, 128, 256}
 
 
-CAMERA = CameraModel(model="PINHOLE", width=32, height=24, params=(30, 30, 16, 12))
-
-
-def frames_of(folder, count=6):
-    """Six grey pictures as JPEG files, and the frames that a reader would deliver."""
-    rng = np.random.default_rng(0)
-    names = tuple(f"{i}.jpg" for i in range(count))
-    folder.mkdir()
-    for name in names:
-        cv2.imwrite(str(folder / name), rng.integers(0, 255, (24, 32), dtype=np.uint8))
-    timing = FrameTiming(names=names, t_s=np.arange(count))
-    frames = (
-        Frame(name=name, image=cv2.imread(str(folder / name), cv2.IMREAD_UNCHANGED), t_s=float(i), camera=CAMERA)
-        for i, name in enumerate(names)
-    )
-    return timing, frames
-
-
 def test_frames_that_no_stage_changed_are_copied_byte_for_byte(tmp_path):
     timing, frames = frames_of(tmp_path / "in")
 
@@ -221,15 +198,6 @@ def test_pixels_in_a_frame_cannot_be_changed_in_place(tmp_path):
     _, frames = frames_of(tmp_path / "in")
     with pytest.raises(ValueError, match="read-only"):
         next(frames).image[0] = 1
-
-
-def session_in(workspace):
-    return Session(workspace=workspace, runner=StepRunner(workspace), context=RunContext(scratch=workspace.stamps))
-
-
-def recording_of(imu, timing):
-    capture = Capture(path=Path("capture.toml"), calibration=calibration_prior())
-    return Recording.of(capture, imu, timing, capture.calibration)
 
 
 def test_each_sub_model_gets_its_own_scale_and_verdict(project, tmp_path):

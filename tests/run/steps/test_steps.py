@@ -68,7 +68,7 @@ from colmap_inertial.run.steps.workspace import Workspace, refuse_links
 from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, simulate_recording
 from tests.helpers.desk_scene import contents
 from tests.helpers.frame_readers import readers
-from tests.run.steps.test_runner import frames_of, recording_of, session_in
+from tests.helpers.sessions import frames_of, recording_of, session_in
 
 NAMES = tuple(f"{i}.jpg" for i in range(6))
 TIMING = FrameTiming(names=NAMES, t_s=np.arange(6.0), exposure_s=[0.01, 0.02, 0.03, 0.04, 0.05, 0.06])
