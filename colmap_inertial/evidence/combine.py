@@ -72,25 +72,22 @@ class _Cases:
 
 def _weigh_cases(values: Array, cov: Array, faults: Array) -> _Cases:
     n = len(values)
-    rows = []
     sigmas, shares = np.array([0.0, FAULT_SIGMA, GROSS_SIGMA]), np.array([1 - GROSS_SHARE, GROSS_SHARE])
-    for kinds in itertools.product(range(3), repeat=n if n > 1 else 0):
-        kind = np.array(kinds if n > 1 else (0,))
-        is_wrong = kind > 0
-        widened = cov + np.diag(sigmas[kind] ** 2)
-        inverse = np.linalg.inv(widened)
-        information = float(inverse.sum())
-        best = float(inverse.sum(axis=0) @ values) / information
-        chi2 = float((values - best) @ inverse @ (values - best))
-        prior = float(np.sum(np.log(np.where(is_wrong, faults * shares[kind - 1], 1 - faults))))
-        log = prior - 0.5 * (np.linalg.slogdet(widened)[1] + math.log(information) + chi2)
-        weights = weigh(widened)
-        rows.append((log, float(weights @ values), float(weights @ widened @ weights), weights, is_wrong, chi2))
-    logs = np.array([row[0] for row in rows])
+    kinds = np.array(list(itertools.product(range(3), repeat=n)) if n > 1 else [(0,)])
+    wrong_of = kinds > 0
+    widened = cov + (sigmas[kinds] ** 2)[:, :, None] * np.eye(n)
+    inverse = np.linalg.inv(widened)
+    information = inverse.sum(axis=(1, 2))
+    weights = inverse.sum(axis=1) / information[:, None]
+    apart = values - (weights @ values)[:, None]
+    chi2 = np.einsum("ki,kij,kj->k", apart, inverse, apart)
+    prior = np.log(np.where(wrong_of, faults * shares[kinds - 1], 1 - faults)).sum(axis=1)
+    logs = prior - 0.5 * (np.linalg.slogdet(widened)[1] + np.log(information) + chi2)
+    for k in np.flatnonzero((weights < 0).any(axis=1)).tolist():
+        weights[k] = weigh(widened[k])
     share = np.exp(logs - logs.max())
     share /= share.sum()
-    means, variances = np.array([row[1] for row in rows]), np.array([row[2] for row in rows])
-    weights, wrong_of = np.array([row[3] for row in rows]), np.array([row[4] for row in rows])
+    means, variances = weights @ values, np.einsum("ki,kij,kj->k", weights, widened, weights)
     mean = float(share @ means)
     single = wrong_of.sum(axis=1) == 1
     alone = share[single] @ wrong_of[single] if single.any() else np.zeros(n)
@@ -98,7 +95,7 @@ def _weigh_cases(values: Array, cov: Array, faults: Array) -> _Cases:
         mean=mean,
         sigma=_spread(mean, share, means, variances),
         shares=share @ weights,
-        sound_chi2=rows[0][5],
+        sound_chi2=float(chi2[0]),
         faulty=share @ wrong_of,
         alone=alone,
     )
