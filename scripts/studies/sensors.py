@@ -28,7 +28,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 import numpy as np
 from rich.console import Console
@@ -40,11 +40,11 @@ from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import CameraModel, CameraTrajectory
 from colmap_inertial.core.types.depth import DepthMap, DepthMaps, PinholeGrid
-from colmap_inertial.core.types.evidence import SENSORS, CombinedScale, ScaleEvidence, Sensor
+from colmap_inertial.core.types.evidence import CombinedScale, ScaleEvidence, Sensor
 from colmap_inertial.evidence.combine import combine, covariance_of, weigh
 from colmap_inertial.evidence.depth import DepthLimits, scale_by_depth
 from colmap_inertial.evidence.inertial import evidence_of_device, evidence_of_imu, length_of
-from colmap_inertial.evidence.priors import FAULT_SIGMA, FAULTS, PRIORS, RECEIVER, REFERENCE
+from colmap_inertial.evidence.priors import DECLARED, FAULT_SIGMA, FAULTS, GROSS_SHARE, GROSS_SIGMA, PRIORS
 from colmap_inertial.inertial.core.priors import PRIORS as INERTIAL_PRIORS
 from colmap_inertial.inertial.scale import estimate_scale
 from colmap_inertial.inertial.scale.verdict import verdict_of, without_width
@@ -74,9 +74,9 @@ VIEWS = DepthLimits(views=35)
 DEVICE = replace(DeviceOptions(), depth_scale_sd=PRIORS.depth_scale, fusion_sd=PRIORS.device_fusion)
 #: Those that are only drawn: range of the random standard deviation, and what is their own.
 STATED: dict[Sensor, tuple[tuple[float, float], dict[str, float]]] = {
-    "positions": ((0.01, 0.04), {RECEIVER: 0.004}),
-    "target": ((0.003, 0.01), {REFERENCE: 0.003}),
-    "distance": ((0.005, 0.02), {REFERENCE: 0.003}),
+    "positions": ((0.01, 0.04), {"receiver": 0.004}),
+    "target": ((0.003, 0.01), {DECLARED: 0.003}),
+    "distance": ((0.005, 0.02), {DECLARED: 0.003}),
 }
 SETS: dict[str, tuple[Sensor, ...]] = {
     "IMU, depth, device": ("imu", "depth", "device"),
@@ -85,6 +85,7 @@ SETS: dict[str, tuple[Sensor, ...]] = {
     "depth, device": ("depth", "device"),
     "all six": ("imu", "depth", "device", "positions", "target", "distance"),
 }
+SENSORS: tuple[Sensor, ...] = get_args(Sensor)
 WRONG = (0.02, 0.05, 0.10)
 
 
@@ -343,7 +344,8 @@ def with_faults(captures: Sequence[Capture], times: int = 5) -> list[Capture]:
     """Captures some times over, whose sensors are wrong as often and by as much as is assumed beforehand."""
 
     def spoil(one: dict[str, Any], rng: np.random.Generator) -> dict[str, Any]:
-        is_wrong, by = rng.uniform() < FAULTS[one["sensor"]], FAULT_SIGMA * rng.standard_normal()
+        is_wrong, is_gross = rng.uniform(size=2) < (FAULTS[one["sensor"]], GROSS_SHARE)
+        by = (GROSS_SIGMA if is_gross else FAULT_SIGMA) * rng.standard_normal()
         return {**one, "log_scale": one["log_scale"] + by * is_wrong}
 
     out = []
