@@ -143,14 +143,14 @@ def combine(evidence: Sequence[ScaleEvidence], absent: Sequence[AbsentSensor] = 
     cases = _weigh_cases(values, cov, np.array([FAULTS[one.sensor] for one in evidence]))
     n = len(evidence)
     p_value = float(chi2_distribution.sf(cases.sound_chi2, n - 1)) if n > 1 else 1.0
-    checks = [Fact("sensor-in-doubt", sensor=one.sensor, why=reason) for one in evidence for reason in one.reasons]
+    doubts = [Fact("sensor-in-doubt", sensor=one.sensor, why=reason) for one in evidence for reason in one.reasons]
     if p_value < _CHANCE:
-        checks.append(_contradiction(evidence, cov, cases, p_value))
+        doubts.append(_contradiction(evidence, cov, cases, p_value))
     sigma = cases.sigma
     if p_value >= _AGREE:
         # alone, the surest has no allowance for faults; one that agrees with it gives no reason for more
         sigma = min(sigma, *(one.sigma for one in evidence))
-    verdict, _, reasons = verdict_of(math.exp(cases.mean), sigma, checks)
+    verdict, _, reasons = verdict_of(math.exp(cases.mean), sigma, doubts)
     return CombinedScale(
         evidence=evidence,
         absent=tuple(absent),

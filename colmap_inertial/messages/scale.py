@@ -171,9 +171,8 @@ def poses_not_in_seconds(poses_s: float, imu_s: float, factor: float) -> str:
 
 state(
     "fit-not-converged",
-    "the fit of camera and IMU does not converge: check that the timestamps are the sampling times, to a "
-    "millisecond, or "
-    "{_RECORD_INSTEAD}",
+    "the fit of camera and IMU does not converge: check that the timestamps are the sampling times, to a millisecond, "
+    f"or {_RECORD_INSTEAD}",
 )
 
 

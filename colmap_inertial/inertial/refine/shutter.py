@@ -200,15 +200,15 @@ class SeenReadout:
         assert estimate.parts is not None and estimate.cov is not None
         accepted = estimate.accepted
         sigma = float(np.hypot(self.readout_s, self.sigma_s)) * self.rate_hz
-        checks = without_width(estimate.reasons)
+        doubts = without_width(estimate.reasons)
         if self.is_found:
-            checks.append(self.as_fact(declared_global=declared_global))
+            doubts.append(self.as_fact(declared_global=declared_global))
         sigma_log = float(np.hypot(accepted.sigma_log, sigma))
-        verdict, ci95, reasons = verdict_of(accepted.metres_per_unit, sigma_log, checks)
+        verdict, ci95, reasons = verdict_of(accepted.metres_per_unit, sigma_log, doubts)
         if verdict == "refused":
             if not self.is_found:
                 return ScaleEstimate.refused(estimate.method, self._unknown(sigma), calibration=estimate.calibration)
-            verdict, reasons = "weak", tuple(checks)
+            verdict, reasons = "weak", tuple(doubts)
         cov = estimate.cov.copy()
         cov[0, 0] = sigma_log**2
         return replace(

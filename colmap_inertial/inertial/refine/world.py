@@ -105,8 +105,8 @@ def state_scale(
     variances = world.parts | {"lens": PRIORS.lens**2, "clocks": (before.parts or {}).get("clocks", 0.0) ** 2}
     variances["accel_gain"] = (variances["accel_gain"] + accel.model_sigma**2) * accel.factor**2
     sigma_log = sum(variances.values()) ** 0.5
-    checks = [*without_width(before.reasons), *_doubts(first, move, problem, x)]
-    verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, checks)
+    doubts = [*without_width(before.reasons), *_doubts(first, move, problem, x)]
+    verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, doubts)
     down, turn = inertial.down, matrix_from_quat(similarity.rotation_xyzw)
     by_world, by_gravity = np.zeros((7, COUNT)), np.zeros((7, COUNT))
     by_world[0, SIZE] = by_gravity[0, SIZE] = 1.0

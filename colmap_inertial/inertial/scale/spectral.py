@@ -333,8 +333,8 @@ def estimate_spectral(
         fit = fit_spectra(signals.spectra(options.highest_hz), calibration, options.gravity_m_s2)
     except NotObservableError as error:
         return ScaleEstimate.refused("spectral", error.fact, calibration=calibration)
-    checks, refusals = _check_fit(signals, calibration, options, fit)
-    verdict, ci95, reasons = verdict_of(fit.metres_per_unit, fit.sigma_log, checks, refusals=refusals)
+    doubts, refusals = _judge_fit(signals, calibration, options, fit)
+    verdict, ci95, reasons = verdict_of(fit.metres_per_unit, fit.sigma_log, doubts, refusals=refusals)
     if verdict == "refused":
         return ScaleEstimate.refused("spectral", *reasons, calibration=calibration)
     return ScaleEstimate(
@@ -354,11 +354,11 @@ def estimate_spectral(
     )
 
 
-def _check_fit(
+def _judge_fit(
     signals: Signals, calibration: CameraImuCalibration, options: SpectralOptions, fit: SpectralFit
 ) -> tuple[list[Fact], list[Fact]]:
     """Findings that lower the verdict, and findings that refuse the scale."""
-    checks, refusals = check_clocks(calibration.clock_rate), []
+    doubts, refusals = check_clocks(calibration.clock_rate), []
     bias_m_s2 = float(np.linalg.norm(fit.bias))
     if bias_m_s2 > _BIAS_LIMIT_M_S2:
         refusals.append(Fact("spectral-bias-large", bias_m_s2=bias_m_s2))
@@ -369,10 +369,10 @@ def _check_fit(
                 spectra = signals.half(which).spectra(options.highest_hz)
                 halves.append(fit_spectra(spectra, calibration, options.gravity_m_s2))
             except NotObservableError:
-                checks.append(Fact("half-without-scale"))
-                return checks, refusals
+                doubts.append(Fact("half-without-scale"))
+                return doubts, refusals
         first, second = halves
         apart = np.log(second.metres_per_unit / first.metres_per_unit)
         if abs(apart) > _HALVES_SIGMAS * np.hypot(first.sigma_log, second.sigma_log):
-            checks.append(Fact("halves-differ", difference=np.expm1(apart)))
-    return checks, refusals
+            doubts.append(Fact("halves-differ", difference=np.expm1(apart)))
+    return doubts, refusals

@@ -81,7 +81,7 @@ def check_clocks(clock_rate: float) -> list[Fact]:
 def verdict_of(
     metres_per_unit: float,
     sigma_log: float,
-    checks: Sequence[Fact] = (),
+    doubts: Sequence[Fact] = (),
     *,
     refusals: Sequence[Fact] = (),
 ) -> tuple[Verdict, tuple[float, float], tuple[Fact, ...]]:
@@ -93,8 +93,8 @@ def verdict_of(
         The estimate.
     sigma_log
         Standard deviation of its logarithm.
-    checks
-        The checks that failed. Any of them keeps the verdict from being ``"trusted"``.
+    doubts
+        The findings of which any keeps the verdict from being ``"trusted"``.
     refusals
         The findings that make the number worthless whatever its width.
 
@@ -105,7 +105,7 @@ def verdict_of(
     ci95
         (low, high), symmetric in the logarithm of the scale.
     reasons
-        ``refusals``, ``checks``, and the width where it decided.
+        ``refusals``, ``doubts``, and the width where it decided.
     """
     if not (math.isfinite(metres_per_unit) and metres_per_unit > 0):
         raise ValueError(f"metres_per_unit must be positive and finite, not {metres_per_unit}")
@@ -114,8 +114,8 @@ def verdict_of(
     width = half_width(sigma_log)
     factor = math.exp(min(Z95 * sigma_log, 700.0))
     ci95 = (metres_per_unit / factor, metres_per_unit * factor)
-    reasons = [*refusals, *checks]
-    verdict: Verdict = "weak" if checks else "trusted"
+    reasons = [*refusals, *doubts]
+    verdict: Verdict = "weak" if doubts else "trusted"
     if width > TRUSTED_HALF_WIDTH:
         verdict = "weak"
     if width > WEAK_HALF_WIDTH:
