@@ -292,12 +292,15 @@ _SHORT = {"imu": "IMU", "depth": "depth", "device": "device", "positions": "GPS"
 
 
 def sensors(combined: dict[str, Any]) -> Figure:
-    """What each sensor says of the scale, and all together, in per cent of that: a row for each, with 95 %."""
-    rows = [("all", combined), *((_SHORT.get(one["sensor"], one["sensor"]), one) for one in combined["evidence"][::-1])]
+    """What each sensor says of the scale, and the combined scale, in per cent of that: a row for each, with 95 %."""
+    rows = [
+        ("combined", combined),
+        *((_SHORT.get(one["sensor"], one["sensor"]), one) for one in combined["evidence"][::-1]),
+    ]
     whole = float(combined["metres_per_unit"])
     data = []
     # the axis counts from below
-    for colour, name, some in ((GOOD, "all together, 95 %", rows[:1]), (IMU, "each by itself, 95 %", rows[1:])):
+    for colour, name, some in ((GOOD, "combined, 95 %", rows[:1]), (IMU, "one sensor, 95 %", rows[1:])):
         data.append(
             {
                 "type": "scatter",
@@ -317,7 +320,7 @@ def sensors(combined: dict[str, Any]) -> Figure:
                 "hovertemplate": "%{y}: %{x:+.2f} %, %{text}<extra></extra>",
             }
         )
-    x = axis("off all together (%)", zeroline=True)
+    x = axis("difference from the combined scale (%)", zeroline=True)
     return {"data": data, "layout": layout(110 + 38 * len(rows), x, {"type": "category", "zeroline": False})}
 
 

@@ -295,7 +295,8 @@ def _describe_trust(model: dict[str, Any]) -> str:
         if place == "outside":
             return f"not until this is resolved: {against}"
     if model["verdict"] == "trusted":
-        return f"yes; {against}" if against else "yes: the IMU determines the scale, and all checks passed"
+        by = "the sensors determine" if model.get("sensors") else "the IMU determines"
+        return f"yes; {against}" if against else f"yes: {by} the scale, and all checks passed"
     rough = "no, for the reasons below: check a known length before you measure"
     return f"{rough}; {against}" if against else rough
 

@@ -47,7 +47,7 @@ EDITED = ("delete", "cut", "link")
 #: What is not made again, and what to do about it.
 REFUSED = re.compile(
     r"error: .*(is a link to .* remove it|is not empty; choose another|choose another folder|remove this one|"
-    r"choose a new one|rename or remove it|start (it|that|its run) again|no such folder|is missing).*",
+    r"choose a new one|rename or remove it|(start|run) (it|that|its run) again|no such folder|is missing).*",
     re.DOTALL,
 )
 

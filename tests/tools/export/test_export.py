@@ -396,8 +396,9 @@ def test_pinholes_see_nothing_that_the_lens_does_not_see(subtests):
 
 def test_a_camera_that_sees_all_around_is_refused():
     camera = pycolmap.Camera(camera_id=4, model="EQUIRECTANGULAR", width=640, height=320, params=[640, 320])
-    with pytest.raises(FormatError, match="sees all around"):
+    with pytest.raises(FormatError) as refused:
         Undistortion.of(camera, Path("model"))
+    assert refused.value.code == "sees-all-around" and refused.value.fact.values["camera"] == 4
 
 
 # --- names -----------------------------------------------------------------------------------------------------------
