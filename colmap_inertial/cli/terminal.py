@@ -118,7 +118,9 @@ def _print_panel(title: str, lines: Iterable[Line]) -> None:
 
 def show_scale(estimate: ScaleEstimate, source: Path) -> None:
     """Print one scale estimate."""
-    lines = [*scale_lines(estimate), ("method", f"{estimate.method}, {estimate.runtime_s:.2f} s")]
+    lines = [*scale_lines(estimate)]
+    if estimate.method != "none":
+        lines.append(("method", f"{estimate.method}, {estimate.runtime_s:.2f} s"))
     if estimate.sensors is not None:
         lines += evidence_lines(estimate.sensors)
     _print_panel(str(source), lines)

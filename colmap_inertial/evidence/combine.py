@@ -24,7 +24,7 @@ from colmap_inertial.core.types import CameraTrajectory
 from colmap_inertial.core.types.evidence import AbsentSensor, CombinedScale, DeviceDrift, ScaleEvidence, ScalePart
 from colmap_inertial.evidence.inertial import length_of
 from colmap_inertial.evidence.priors import FAULT_SIGMA, FAULTS, GROSS_SHARE, GROSS_SIGMA
-from colmap_inertial.inertial.scale.verdict import verdict_of
+from colmap_inertial.inertial.scale.verdict import TRUSTED_HALF_WIDTH, half_width, verdict_of, without_width
 
 #: Sensors as far apart are said to contradict each other: by chance, one recording in a hundred shows as much.
 _CHANCE = 0.01
@@ -151,6 +151,10 @@ def combine(evidence: Sequence[ScaleEvidence], absent: Sequence[AbsentSensor] = 
         # alone, the surest has no allowance for faults; one that agrees with it gives no reason for more
         sigma = min(sigma, *(one.sigma for one in evidence))
     verdict, _, reasons = verdict_of(math.exp(cases.mean), sigma, doubts)
+    width = half_width(sigma)
+    if width > TRUSTED_HALF_WIDTH and any(one.sensor != "imu" for one in evidence):
+        # the usual reason advises livelier motion, which helps the IMU alone
+        reasons = (*without_width(reasons), Fact("combined-interval-wide", half_width=width))
     return CombinedScale(
         evidence=evidence,
         absent=tuple(absent),

@@ -209,6 +209,14 @@ def sensor_tells_little(half_width: float) -> str:
     return f"determines the scale only to +-{100 * half_width:.2g} %"
 
 
+@message(
+    advice="add a sensor that knows the scale better, or a target of known size",
+    example={"half_width": 0.05},
+)
+def combined_interval_wide(half_width: float) -> str:
+    return f"the 95 % interval of all sensors is +-{100 * half_width:.2g} %"
+
+
 state("sensor-not-asked", "is not used (--scale-from)")
 
 
