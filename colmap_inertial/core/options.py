@@ -271,7 +271,7 @@ class ReferenceOptions(CheckedOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class ApertureOptions(CheckedOptions):
-    """Options of the fusion of a multi-aperture camera's pictures."""
+    """Options of the fusion of a multi-aperture camera's images."""
 
     cost: Literal["census", "mutual-information"] = "census"
     """How pixels of different colour are compared: by the order of brightness around them, or by the joint
@@ -479,7 +479,7 @@ class BatchOptions(CheckedOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class FuseAperturesOptions(CheckedOptions):
-    """Outputs of the fusion of a multi-aperture camera's pictures."""
+    """Outputs of the fusion of a multi-aperture camera's images."""
 
     fusion: ApertureOptions = field(default_factory=ApertureOptions)
     """How they are fused."""
