@@ -269,7 +269,7 @@ def drift(model: dict[str, Any]) -> Figure:
     band |= {"fillcolor": GOOD, "opacity": 0.13, "layer": "below"}
     most = 1.15 * max([1.3 * width, *(abs(o) + r for o, r in zip(off, reach, strict=True))])
     x = axis(_TIME, range=[min(0.0, every[0]["begin_s"] - start_s), every[-1]["end_s"] - start_s], zeroline=False)
-    y = axis("against the whole (%)", zeroline=True, range=[-most, most])
+    y = axis("difference from the whole (%)", zeroline=True, range=[-most, most])
     return {"data": [dots, key], "layout": layout(300, x, y, shapes=[band])}
 
 
@@ -282,7 +282,7 @@ def refined(model: dict[str, Any], parts: Sequence[dict[str, Any]]) -> Figure:
     return {
         "data": [_intervals(parts, start_s, off, reach, f"{name} the refinement, 95 %", c) for name, c, off in sides],
         "layout": layout(
-            300, axis(_TIME, zeroline=False), axis("against the whole (%)", zeroline=True), showlegend=True
+            300, axis(_TIME, zeroline=False), axis("difference from the whole (%)", zeroline=True), showlegend=True
         ),
     }
 

@@ -157,7 +157,7 @@ def test_a_training_stays_where_it_is(project, tmp_path, centre, fills, applied)
     np.testing.assert_allclose(into_training(after, moved(xyz_of(model))), splats, atol=1e-13)
     same = [(folder / "exports" / "splat.ply").read_bytes() for folder in (root, tmp_path / "out")]
     assert same[0] == same[1]
-    assert any(note.code == "frame-of-training" for note in done.notes)
+    assert any(note.values["found"].code == "frame-of-training" for note in done.notes)
     undo_project(tmp_path / "out", tmp_path / "back")
     back = json.loads((tmp_path / "back" / run.relative_to(root) / "dataparser_transforms.json").read_text())
     np.testing.assert_allclose(back["transform"], values["transform"], atol=4e-15)
