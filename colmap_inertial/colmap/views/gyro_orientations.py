@@ -19,7 +19,7 @@ from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.facts import Fact
-from colmap_inertial.core.geometry import skew, so3_exp, so3_log
+from colmap_inertial.core.geometry import so3_exp, so3_log
 from colmap_inertial.core.sampling import is_gap
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import (
@@ -35,6 +35,7 @@ from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.io.recording import Recording
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.motion.align import AlignOptions, align_clocks
+from colmap_inertial.motion.epipolar import RayMoments
 from colmap_inertial.motion.flow import VisualRotation
 
 #: Optical axes farther apart than this share next to nothing, or than the field of view, where that is wider.
@@ -66,9 +67,6 @@ class OrientationLimits:
 
 
 _LIMITS = OrientationLimits()
-
-#: The cross product: of vectors f and g, ``einsum("abc,b,c", _CROSS, f, g)``.
-_CROSS = np.stack([skew(axis) for axis in np.eye(3)], axis=1)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -291,18 +289,10 @@ def estimate_bias_correction(pairs: RayPairs, start_from_cam: Array, bias_lever_
     lever = bias_lever_s[pairs.second] - bias_lever_s[pairs.first]
     rays_second = pairs.rays_second @ np.swapaxes(after, 1, 2)
 
-    # a normal is linear in the products of its rays' coordinates: what all matches of a pair say is summed once
-    products = _squares((rays_first[..., :, None] * rays_second[..., None, :]).reshape(*rays_first.shape[:2], 9))
-    of_first, of_second = _squares(rays_first), _squares(rays_second)
+    moments = RayMoments.of(rays_first, rays_second)
 
     def spread(change: Array) -> Array:
-        turn = so3_exp(-(lever @ change))
-        normal_from_products = np.einsum("abc,mcd->mabd", _CROSS, turn).reshape(len(turn), 3, 9)
-        normals = normal_from_products @ products @ np.swapaxes(normal_from_products, 1, 2)
-        # noise of both rays, as it shows along a translation: without it, one along the view would suit everything
-        noise = 2 * np.eye(3) - (of_first + turn @ of_second @ np.swapaxes(turn, 1, 2))
-        whiten = np.linalg.inv(np.linalg.cholesky(noise))
-        return np.asarray(np.linalg.eigvalsh(whiten @ normals @ np.swapaxes(whiten, 1, 2))[:, 0])
+        return moments.measure_spread(so3_exp(-(lever @ change)))
 
     change = np.zeros(3)
     for _ in range(4):
@@ -326,11 +316,6 @@ def estimate_bias_correction(pairs: RayPairs, start_from_cam: Array, bias_lever_
     if values[0] <= 0:
         raise NotObservableError("gyroscope bias", Fact("matches-suit-any-bias"))
     return change, np.asarray(_LIMITS.looser**2 * np.linalg.inv(information))
-
-
-def _squares(vectors: Array) -> Array:
-    """(M, D, D) mean of the products of (M, K, D) vectors with themselves."""
-    return np.asarray(np.swapaxes(vectors, 1, 2) @ vectors / vectors.shape[1])
 
 
 def _curvature(squares: Callable[[Array], float], at: Array) -> Array:

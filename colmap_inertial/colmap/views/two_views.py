@@ -23,6 +23,7 @@ from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.io.files import reading
 from colmap_inertial.model.database import UNREADABLE, check_records
+from colmap_inertial.motion.epipolar import RayMoments
 from colmap_inertial.motion.rotation_averaging import average_rotations
 
 if TYPE_CHECKING:
@@ -130,8 +131,6 @@ class TwoViews:
 
 def compare(database: Path, pairs: Sequence[tuple[str, str]]) -> TwoViews:
     """Rotation and matched overlap of pairs of images, by their verified matches."""
-    import pycolmap
-
     rotations, covered = np.full((len(pairs), 3, 3), np.nan), np.zeros(len(pairs))
     with open_features(database) as features:
         points: dict[str, Array] = {}
@@ -143,15 +142,61 @@ def compare(database: Path, pairs: Sequence[tuple[str, str]]) -> TwoViews:
                 if name not in points:
                     points[name] = features.xy_px(name)
             first, second = ((features.camera(name), points[name]) for name in pair)
-            if pycolmap.estimate_two_view_geometry_pose(*first, *second, views) and views.cam2_from_cam1 is not None:
-                second_from_first = matrix_from_quat(np.array(views.cam2_from_cam1.rotation.quat))
+            matches = np.array(views.inlier_matches, dtype=np.intp)
+            second_from_first = _estimate_rotation(first, second, views, matches)
+            if second_from_first is not None:
                 rotations[place] = second_from_first.T
-                matches = np.array(views.inlier_matches, dtype=np.intp)
                 covered[place] = min(
                     _coverage(*first, matches[:, 0], second[0], second_from_first),
                     _coverage(*second, matches[:, 1], first[0], second_from_first.T),
                 )
     return TwoViews(first_from_second=rotations, covered=covered)
+
+
+def _estimate_rotation(
+    first: tuple[pycolmap.Camera, Array],
+    second: tuple[pycolmap.Camera, Array],
+    views: pycolmap.TwoViewGeometry,
+    matches: IndexArray,
+) -> Array | None:
+    """(3, 3) ``second_from_first``, of cameras and their keypoints; ``None`` where COLMAP finds none.
+
+    COLMAP takes the pose of views of a plane, or of a camera that only turned, from their homography. Views close in
+    time pass as such whatever they show, and of a homography's two solutions the wrong one often has all points before
+    both cameras, too. The essential matrix of the same matches has the rotation then, as it has where the fundamental
+    matrix suits more of them; that of a camera which only turned is poor. The matches tell which one suits them.
+    """
+    import pycolmap
+
+    kinds = pycolmap.TwoViewGeometryConfiguration
+
+    def solve() -> Array | None:
+        found = pycolmap.estimate_two_view_geometry_pose(*first, *second, views)
+        pose = views.cam2_from_cam1 if found else None
+        return None if pose is None else matrix_from_quat(np.array(pose.rotation.quat))
+
+    by_another = (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC, kinds.UNCALIBRATED)
+    has_essential = views.config in by_another and views.E is not None and bool(np.any(views.E))
+    solutions = [solve()]
+    if has_essential:
+        views.config = kinds.CALIBRATED
+        solutions.append(solve())
+    found = [rotation for rotation in solutions if rotation is not None]
+    if len(found) < 2:
+        return found[0] if found else None
+    rays = [_unit_rays(camera, xy_px[matches[:, k]]) for k, (camera, xy_px) in enumerate((first, second))]
+    visible = np.isfinite(rays).all(axis=(0, 2))
+    if not visible.any():
+        return found[0]
+    moments = RayMoments.of(rays[0][None, visible], rays[1][None, visible])
+    return min(found, key=lambda second_from_first: float(moments.measure_spread(second_from_first.T[None])[0]))
+
+
+def _unit_rays(camera: pycolmap.Camera, xy_px: Array) -> Array:
+    """(K, 3) unit rays to (K, 2) pixels, camera frame."""
+    seen = np.asarray(camera.cam_from_img(xy_px))[:, :2]
+    rays = np.column_stack([seen, np.ones(len(seen))])
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 
 def _coverage(
