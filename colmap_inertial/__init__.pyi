@@ -21,6 +21,7 @@ from .core.options import (
     ProjectOptions as ProjectOptions,
     ReadLimits as ReadLimits,
     ReconstructOptions as ReconstructOptions,
+    ReferenceOptions as ReferenceOptions,
     ScaleOptions as ScaleOptions,
     StageNames as StageNames,
     ValidateOptions as ValidateOptions,

@@ -12,7 +12,6 @@ from tyro.conf import Positional, arg
 from colmap_inertial.cli.command import ConfiguredCommand, DeviceCommand
 from colmap_inertial.cli.terminal import show_reference, show_result
 from colmap_inertial.core.errors import InertialError
-from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ProjectOptions, ReferenceOptions
 from colmap_inertial.core.printing import say
 
@@ -77,8 +76,6 @@ class Reconstruct(DeviceCommand, ConfiguredCommand):
         if chosen and chosen <= lengths:
             return False
         if "imu" in chosen or has_imu(self.capture, self.project):
-            if given or "distance" in chosen:
-                raise InertialError(Fact("lengths-beside-imu"))
             return True
         return not (chosen or given or knows_metres(self.capture, self.project))
 
@@ -103,13 +100,20 @@ class Reconstruct(DeviceCommand, ConfiguredCommand):
                     self.out,
                     self.project,
                     options,
+                    reference=self.reference,
                     overwrite=self.overwrite,
                     progress=screen,
                     findings=findings,
                 )
             else:
                 result = reconstruct(
-                    self.capture, self.out, options, overwrite=self.overwrite, progress=screen, findings=findings
+                    self.capture,
+                    self.out,
+                    options,
+                    reference=self.reference,
+                    overwrite=self.overwrite,
+                    progress=screen,
+                    findings=findings,
                 )
         code, stopped = 0, None
         try:

@@ -259,14 +259,27 @@ class ProjectOptions(CheckedOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class ReferenceOptions(CheckedOptions):
-    """Known lengths, where no IMU gives metres."""
+    """Known lengths, which give metres without an IMU, or together with it."""
 
     target: str | None = None
-    """A target of known size in the images, as of `validate --target`; of a distance between markers, what they are."""
+    """A target of known size in the images, as of `validate --target`; of a distance between markers, what they are.
+    Beside an IMU, it checks the metres unless --scale-from names it."""
     between: tuple[str, str] | None = None
-    """With --distance: the numbers of two markers, or two points as x,y,z in the units of the model."""
+    """With --distance: the numbers of two markers, or of a project also two points as x,y,z in the units of its
+    model."""
     distance: str | None = None
-    """Metres between them and how well they are known (standard deviation), as in 4.20+-0.01."""
+    """Metres between them and how well they are known (standard deviation), as in 4.20+-0.01. Beside an IMU, with
+    --scale-from imu --scale-from distance."""
+
+    @property
+    def has_points(self) -> bool:
+        """Whether an end of the distance is a point."""
+        return any("," in end for end in self.between or ())
+
+    @property
+    def has_markers(self) -> bool:
+        """Whether an end of the distance is a marker."""
+        return any("," not in end for end in self.between or ())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -368,9 +381,9 @@ class ReconstructOptions(CheckedOptions):
     (deblurred or not), or of images that `deblur --rectify` wrote."""
     scale_from: tuple[ScaleFrom, ...] = ()
     """Where metres come from, each by its name. Not given: from all that the capture has of IMU, depth maps, the
-    device's own path (ARKit, ARCore) and positions (GPS); without an IMU, also from a target and a known distance. A
-    target that is not named checks the IMU's metres. All are taken together by how sure they are; those that
-    contradict each other are named."""
+    device's own path (ARKit, ARCore) and positions (GPS); without an IMU, also from a target and a known distance. With
+    an IMU, these must be named; a target that is not checks the metres. All are taken together by how sure they are;
+    those that contradict each other are named."""
     scale: ScaleOptions = field(default_factory=ScaleOptions)
     """How metres come from the IMU."""
     join: JoinMethod = "inertial"

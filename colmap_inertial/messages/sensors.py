@@ -230,14 +230,26 @@ def up_by_sensor(sensor: str, half_width_deg: float) -> str:
     return f"up is known by the {name_of(sensor)} to {half_width_deg:.2g} degrees"
 
 
+def _name_distance(sensors: Sequence[str]) -> str:
+    together = " ".join(f"--scale-from {sensor}" for sensor in (*(sensors or ("imu",)), "distance"))
+    return f"give {together} to take all together, or --scale-from distance for the distance alone"
+
+
+@message(advice=_name_distance, example={"sensors": ()})
+def distance_not_named(sensors: Sequence[str]) -> str:
+    return "--distance is given beside an IMU, and not named by --scale-from"
+
+
+state("between-of-one-kind", "--between beside an IMU needs two markers, or two points")
 state(
-    "lengths-beside-imu",
-    "a known distance is not combined with the IMU; a target is, where capture.toml names it ([target])",
-    advice="such a target checks them, and gives them with --scale-from imu --scale-from target",
+    "points-of-another-model",
+    "--between with points, beside an IMU, needs a project of one model whose shape stays as it is",
+    advice="give --refine off and a project of one model, or two markers",
 )
 state(
     "target-before-images",
-    "a target gives metres together with the IMU only where the refinement leaves the rectified images as they are",
+    "a target or markers give metres together with the IMU only where the refinement leaves the rectified images as "
+    "they are",
     advice="give --refine off, or --rolling-shutter off",
 )
 

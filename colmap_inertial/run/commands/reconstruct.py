@@ -21,7 +21,7 @@ from colmap_inertial.core.choices import check_kind
 from colmap_inertial.core.errors import FormatError, InertialError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.gyro import gravity_in_cam
-from colmap_inertial.core.options import BlurRemover, ReconstructOptions
+from colmap_inertial.core.options import BlurRemover, ReconstructOptions, ReferenceOptions
 from colmap_inertial.core.progress import Progress, silent
 from colmap_inertial.core.types import FrameTiming, ImuRecording, PositionFixes
 from colmap_inertial.diagnose import Diagnosis
@@ -56,6 +56,7 @@ from colmap_inertial.run.commands.result import ReconstructResult
 from colmap_inertial.run.commands.unplaced import note_unplaced
 from colmap_inertial.run.preparation.frame_reading import FullFrames, GreyFrames
 from colmap_inertial.run.preparation.geolocation import positions_of
+from colmap_inertial.run.preparation.known_lengths import add_target, check_reference_beside_imu
 from colmap_inertial.run.preparation.packages import warn_of_conflicts
 from colmap_inertial.run.preparation.plan import add_stated_exposures, ask_for_plan, expect_plan, run_plan
 from colmap_inertial.run.preparation.preflight import check_imu, run_preflight
@@ -85,6 +86,7 @@ def reconstruct(
     out: StrPath,
     options: ReconstructOptions = ReconstructOptions(),
     *,
+    reference: ReferenceOptions = ReferenceOptions(),
     frame_stages: Sequence[FrameStage | EllipsisType] = (...,),
     keypoint_stages: Sequence[KeypointStage | EllipsisType] = (...,),
     model_stages: Sequence[ModelStage | EllipsisType] = (...,),
@@ -102,6 +104,8 @@ def reconstruct(
         A folder that does not exist, or holds a run of the same capture, which is then continued.
     options
         See :class:`ReconstructOptions`.
+    reference
+        A target, and a known distance of two markers, which gives metres where ``options.scale_from`` names it.
     frame_stages, keypoint_stages, model_stages
         The hooks. ``...`` stands for the default stages: :class:`ApertureStage` for a multi-aperture camera's frames,
         :class:`ExposureStage` for pairs of a short and a long exposure, :class:`DeblurStage` for all others;
@@ -134,9 +138,10 @@ def reconstruct(
         rectifying was asked for by name, and the gyroscope does not belong to the pixels.
     """
     check_kind("options", options, ReconstructOptions)
+    check_kind("reference", reference, ReferenceOptions)
     stages = Stages(frame=tuple(frame_stages), keypoint=tuple(keypoint_stages), model=tuple(model_stages))
     with reading_within(options.limits):
-        return _reconstruct(Path(capture), Path(out), options, stages, overwrite, progress, findings)
+        return _reconstruct(Path(capture), Path(out), options, reference, stages, overwrite, progress, findings)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -153,6 +158,8 @@ class _CheckedCapture:
         With all frames.
     fuser
         What fuses pairs of exposures; ``None`` where none are fused.
+    reference
+        Known lengths.
     target
         To measure in the model.
     gravity
@@ -167,13 +174,16 @@ class _CheckedCapture:
     raw: ImuRecording
     recording: Recording
     fuser: Fuser | None
+    reference: ReferenceOptions
     target: Target | None
     gravity: Mapping[str, Array]
     fixes: PositionFixes | None
     rig: RigFrames | None
 
 
-def _read_capture(path: Path, options: ReconstructOptions, stages: Stages) -> _CheckedCapture:
+def _read_capture(
+    path: Path, options: ReconstructOptions, reference: ReferenceOptions, stages: Stages
+) -> _CheckedCapture:
     """Read a capture; what is wrong with it, the options or the stages is said before any work."""
     for kind in (stages.frame, stages.keypoint, stages.model):
         insert_defaults(kind, [])
@@ -186,6 +196,11 @@ def _read_capture(path: Path, options: ReconstructOptions, stages: Stages) -> _C
     capture = load_capture(path)
     if capture.frames is None:
         raise FormatError(capture.path, Fact("capture-has-no-frames"))
+    reference = add_target(reference, capture)
+    check_reference_beside_imu(reference, options.scale_from)
+    if reference.has_points:
+        raise InertialError(Fact("points-need-a-model"))
+    capture = replace(capture, target=reference.target)
     pairs = ... in stages.frame and fuses_pairs(capture, options.exposures, deblur=options.deblur)
     fuser = lsd2_fuser(options.exposures) if pairs else None
     capture = capture if pairs else replace(capture, exposures=None)
@@ -206,6 +221,7 @@ def _read_capture(path: Path, options: ReconstructOptions, stages: Stages) -> _C
         raw=raw,
         recording=recording,
         fuser=fuser,
+        reference=reference,
         target=target,
         gravity=gravity,
         fixes=positions_of(capture, timing.names) if options.georeference else None,
@@ -251,12 +267,13 @@ def _reconstruct(
     path: Path,
     out: Path,
     options: ReconstructOptions,
+    reference: ReferenceOptions,
     stages: Stages,
     overwrite: bool,
     progress: Progress,
     findings: Callable[[Diagnosis], None],
 ) -> ReconstructResult:
-    given = _read_capture(path, options, stages)
+    given = _read_capture(path, options, reference, stages)
     capture, used_calibration = given.capture, describe_files(options.calibration)
     device: Device = "cpu"  # of pycolmap, which only verifies where an installed COLMAP does the rest
     if options.colmap_executable is None:
@@ -307,7 +324,7 @@ def _run_steps(
         fuser=given.fuser,
         apertures=workspace.apertures,
         database=workspace.colmap_database,
-        sensors=_find_sensors(recording, options, workspace.images),
+        sensors=_find_sensors(recording, options, given.reference, workspace.images),
     )
     of_frames = insert_defaults(stages.frame, default_frame_stages(inputs))
     of_keypoints = insert_defaults(stages.keypoint, default_keypoint_stages(inputs))
@@ -323,7 +340,7 @@ def _run_steps(
     of_models = insert_defaults(stages.model, default_model_stages(replace(inputs, keypoint_stages=of_keypoints)))
     # images agree with the model as it is in the end
     after_models = changes_images(of_models)
-    if after_models and "target" in options.scale_from:
+    if after_models and inputs.sensors is not None and inputs.sensors.seen_in is not None:
         raise InertialError(Fact("target-before-images"))
     if not after_models:
         images = run_images(session, records, rectified, of_keypoints)
@@ -356,7 +373,9 @@ def _run_steps(
     )
 
 
-def _find_sensors(recording: Recording, options: ReconstructOptions, images: Path) -> CaptureSensors:
+def _find_sensors(
+    recording: Recording, options: ReconstructOptions, reference: ReferenceOptions, images: Path
+) -> CaptureSensors:
     """What the capture holds beside the IMU that knows of metres."""
     capture, timing = recording.capture, recording.timing
 
@@ -365,7 +384,15 @@ def _find_sensors(recording: Recording, options: ReconstructOptions, images: Pat
             camera = grey.guess_camera()
         return camera.width, camera.height
 
-    return find_sensors(capture, timing.names, size_px, timing=timing, chosen=options.scale_from, made=images)
+    return find_sensors(
+        capture,
+        timing.names,
+        size_px,
+        timing=timing,
+        chosen=options.scale_from,
+        made=images,
+        reference=reference,
+    )
 
 
 def _require_known_images(options: ReconstructOptions, stages: Sequence[KeypointStage]) -> None:

@@ -16,7 +16,7 @@ from colmap_inertial.colmap.settings import read_settings
 from colmap_inertial.core.choices import check_kind
 from colmap_inertial.core.errors import FormatError, InertialError, TimingError
 from colmap_inertial.core.facts import Fact, as_fact, read_facts
-from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
+from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, ReferenceOptions
 from colmap_inertial.core.progress import Progress, silent
 from colmap_inertial.core.types import (
     CameraTrajectory,
@@ -61,6 +61,7 @@ from colmap_inertial.run.commands.project_sources import (
 from colmap_inertial.run.commands.reporting import report_result, reporting_stops, write_recording
 from colmap_inertial.run.commands.result import Fragment, ModelResult, ReconstructResult
 from colmap_inertial.run.preparation.geolocation import positions_of
+from colmap_inertial.run.preparation.known_lengths import add_target, check_reference_beside_imu
 from colmap_inertial.run.preparation.packages import warn_of_conflicts
 from colmap_inertial.run.preparation.preflight import run_preflight
 from colmap_inertial.run.preparation.sensors import find_sensors
@@ -109,6 +110,7 @@ def reconstruct_project(
     source: ProjectOptions,
     options: ReconstructOptions = ReconstructOptions(),
     *,
+    reference: ReferenceOptions = ReferenceOptions(),
     model_stages: Sequence[ModelStage | EllipsisType] = (...,),
     overwrite: bool = False,
     progress: Progress = silent,
@@ -127,6 +129,9 @@ def reconstruct_project(
         The IMU recording, and when the images were taken.
     options
         Those of mapping and of pixels must be left alone: the model is what it is.
+    reference
+        A target, and a known distance of two markers or points, which gives metres where ``options.scale_from`` names
+        it.
     model_stages, overwrite
         As of :func:`reconstruct`.
     progress
@@ -148,8 +153,11 @@ def reconstruct_project(
     """
     check_kind("source", source, ProjectOptions, options=ReconstructOptions)
     check_kind("options", options, ReconstructOptions, source=ProjectOptions)
+    check_kind("reference", reference, ReferenceOptions)
     with reading_within(options.limits):
-        return _reconstruct(Path(project), Path(out), source, options, model_stages, overwrite, progress, findings)
+        return _reconstruct(
+            Path(project), Path(out), source, options, reference, model_stages, overwrite, progress, findings
+        )
 
 
 def _reconstruct(
@@ -157,12 +165,13 @@ def _reconstruct(
     out: Path,
     source: ProjectOptions,
     options: ReconstructOptions,
+    reference: ReferenceOptions,
     model_stages: Sequence[ModelStage | EllipsisType],
     overwrite: bool,
     progress: Progress,
     findings: Callable[[Diagnosis], None],
 ) -> ReconstructResult:
-    given = _read_project(project, out, source, options)
+    given = _read_project(project, out, source, options, reference)
     context, pictures = RunContext.of(options, progress=progress), () if given.images is None else (given.images,)
     with (
         open_session(out, project, options, context, pictures=pictures, overwrite=overwrite) as session,
@@ -186,6 +195,8 @@ class _CheckedProject:
         What is given beside it.
     images
         The folder of its images; ``None`` where there is none and none is needed.
+    reference
+        Known lengths.
     target
         To measure in the models.
     read
@@ -197,21 +208,30 @@ class _CheckedProject:
     models: dict[int, Path]
     beside: ProjectSources
     images: Path | None
+    reference: ReferenceOptions
     target: Target | None
     read: functools._lru_cache_wrapper[pycolmap.Reconstruction]
 
 
-def _read_project(project: Path, out: Path, source: ProjectOptions, options: ReconstructOptions) -> _CheckedProject:
+def _read_project(
+    project: Path, out: Path, source: ProjectOptions, options: ReconstructOptions, reference: ReferenceOptions
+) -> _CheckedProject:
     """Read a project; what is wrong with it, the options or what is given beside it is said before any work."""
     warn_of_conflicts()
     _require_model(project)
     _check_options(options)
     beside = read_sources(project, source, options)
-    target = None if beside.capture.target is None else parse_target(beside.capture.target)
+    reference = add_target(reference, beside.capture)
+    check_reference_beside_imu(reference, options.scale_from)
+    beside = dataclasses.replace(beside, capture=dataclasses.replace(beside.capture, target=reference.target))
+    target = None if reference.target is None else parse_target(reference.target)
     layout = read_submodels(project, out, source)
     models = {index: project / folder for index, folder in layout.submodels.items()}
+    if reference.has_points and (len(models) > 1 or options.refine != "off"):
+        raise InertialError(Fact("points-of-another-model"))
     require_free_names(project, Workspace(out), dense=options.dense)
-    looks_at_images = options.dense or source.exif_times or source.video is not None
+    seen_in_images = "target" in options.scale_from or reference.has_markers
+    looks_at_images = options.dense or source.exif_times or source.video is not None or seen_in_images
     filmed = isinstance(beside.capture.frames, Video)
     images = find_images(project, source, needed=looks_at_images or (options.georeference and not filmed))
     read = functools.cache(read_model)
@@ -219,7 +239,14 @@ def _read_project(project: Path, out: Path, source: ProjectOptions, options: Rec
     if options.dense:
         require_near(models, read)
     return _CheckedProject(
-        folder=project, layout=layout, models=models, beside=beside, images=images, target=target, read=read
+        folder=project,
+        layout=layout,
+        models=models,
+        beside=beside,
+        images=images,
+        reference=reference,
+        target=target,
+        read=read,
     )
 
 
@@ -289,10 +316,11 @@ def _find_sensors(given: _CheckedProject, recording: Recording, options: Reconst
         timing=recording.timing,
         chosen=options.scale_from,
         images=given.images,
+        reference=given.reference,
     )
-    if found.target is None:
+    if found.seen_in is None:
         return found
-    return dataclasses.replace(found, files=(*found.files, fingerprint(found.target.images)))
+    return dataclasses.replace(found, files=(*found.files, fingerprint(found.seen_in)))
 
 
 def _make_stage_inputs(

@@ -22,7 +22,6 @@ from colmap_inertial.colmap.features.extraction import (
 )
 from colmap_inertial.colmap.mapping.mapper import map_images
 from colmap_inertial.colmap.settings import read_settings
-from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import (
     FormatError,
     InertialError,
@@ -44,7 +43,6 @@ from colmap_inertial.core.progress import Progress, report_each, silent
 from colmap_inertial.core.types import CameraTrajectory, FrameTiming
 from colmap_inertial.core.types.evidence import AbsentSensor, CombinedScale, ScaleEvidence, Sensor
 from colmap_inertial.evidence.combine import combine, judge_device
-from colmap_inertial.evidence.references import evidence_of_distance
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.device_folders import is_device_folder
@@ -59,13 +57,14 @@ from colmap_inertial.model import Model, find_models, read_model, trajectory_fro
 from colmap_inertial.model.copying import copy_file, new_folder
 from colmap_inertial.model.project import apply_to_project
 from colmap_inertial.run.commands.paths import only_model
+from colmap_inertial.run.preparation.known_lengths import add_target, check_reference
 from colmap_inertial.run.preparation.sensors import find_sensors
 from colmap_inertial.run.stages.frame_folder import encode_image, require_frames
-from colmap_inertial.run.stages.sensors import SensorsOfModel, ask_sensors, scale_by_target, turn_up
+from colmap_inertial.run.stages.known_lengths import scale_by_distance, scale_by_target
+from colmap_inertial.run.stages.sensors import SensorsOfModel, ask_sensors, turn_up
 from colmap_inertial.run.steps.session import keep_colmap_quiet
 from colmap_inertial.run.steps.workspace import refuse_links, require_apart
 from colmap_inertial.validate import Validation, parse_target, validate_model
-from colmap_inertial.validate.markers import marker_centres
 
 #: What the folder keeps beside the project: where its metres come from.
 REFERENCE_FILE = "scale.json"
@@ -310,89 +309,6 @@ def _find_capture(path: Path, source: ProjectOptions) -> Capture | None:
         return None
 
 
-def check_reference(reference: ReferenceOptions, scale_from: Sequence[ScaleFrom]) -> None:
-    """Refuse, before any work, what is not given or cannot be.
-
-    Raises
-    ------
-    InertialError
-        With all that is missing.
-    """
-    if "target" in scale_from and reference.target is None:
-        raise InertialError(Fact("target-not-given"))
-    if "distance" in scale_from or reference.distance is not None or reference.between is not None:
-        if reference.between is None or reference.distance is None:
-            raise InertialError(Fact("distance-not-given"))
-        _parse_length(reference.distance)
-        if reference.target is None and not all("," in end for end in reference.between):
-            raise InertialError(Fact("markers-not-given"))
-    if reference.target is not None:
-        parse_target(reference.target)
-
-
-def scale_by_distance(reference: ReferenceOptions, validation: Validation | None) -> tuple[ScaleEvidence, str]:
-    """A known distance as evidence, and what was measured, in words.
-
-    Raises
-    ------
-    NotObservableError
-        Where an end was not measured, or both are one place.
-    """
-    between, distance = reference.between, reference.distance
-    if between is None or distance is None:
-        raise InertialError(Fact("distance-not-given"))
-    metres, sigma_m = _parse_length(distance)
-    places, noise = zip(*(_find_place(text, validation) for text in between), strict=True)
-    measured = float(np.linalg.norm(places[0] - places[1]))
-    if not measured > 0:
-        raise NotObservableError("scale", Fact("one-place", first=between[0], second=between[1]))
-    evidence = evidence_of_distance(metres, sigma_m, measured, float(np.hypot(*noise)))
-    return evidence, f"distance of {distance} m between {between[0]} and {between[1]}"
-
-
-def _parse_length(text: str) -> tuple[float, float]:
-    try:
-        metres, sigma_m = (float(part) for part in text.split("+-"))
-    except ValueError:
-        metres = sigma_m = float("nan")
-    if not (0 < sigma_m < metres < float("inf")):
-        raise InertialError(Fact("distance-unreadable", text=text))
-    return metres, sigma_m
-
-
-def _find_place(text: str, validation: Validation | None) -> tuple[Array, float]:
-    """(3,) a marker's centre or a point, and its standard deviation; model units."""
-    parts = text.split(",")
-    if len(parts) == 3:
-        try:
-            place = np.array([float(part) for part in parts])
-        except ValueError:
-            place = np.full(3, np.nan)
-        if not np.isfinite(place).all():
-            raise InertialError(Fact("point-unreadable", text=text))
-        return place, 0.0
-    if not text.isdecimal() or len(text) > 9:
-        raise InertialError(Fact("marker-unreadable", text=text))
-    if validation is None or validation.target.kind != "aruco":
-        raise InertialError(Fact("markers-not-given"))
-    centres = marker_centres(validation)
-    if int(text) not in centres:
-        raise NotObservableError("distance", Fact("marker-not-measured", marker=text, measured=sorted(centres)))
-    return centres[int(text)], _estimate_marker_noise(validation, int(text))
-
-
-def _estimate_marker_noise(validation: Validation, marker: int) -> float:
-    """Standard deviation of a marker's centre along a line: from how far its corners are from a square's."""
-    corners: Sequence[Array] = [c.in_model for c in validation.corners if c.name.startswith(f"marker{marker}.")]
-    measured, square = np.array(corners), validation.target.corners_m[:4] / validation.metres_per_unit
-    measured = measured - measured.mean(axis=0)
-    u, _, vt = np.linalg.svd(square.T @ measured)
-    turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    residual = measured - square @ turn
-    # 12 coordinates less 6 of place and turn; the centre is the mean of four corners
-    return float(np.sqrt(np.sum(residual**2) / 6) / 2)
-
-
 #: Of a video, so many frames a second, where its capture does not say.
 _FRAMES_PER_S = 2.0
 #: Says in ``OUT/colmap`` of what it was made.
@@ -431,8 +347,7 @@ def reconstruct_by(
     """
     capture, out = Path(capture), Path(out)
     pictures = _load_pictures(capture)
-    if reference.target is None and pictures.target is not None:
-        reference = dataclasses.replace(reference, target=pictures.target)
+    reference = add_target(reference, pictures)
     check_reference(reference, options.scale_from)
     if out.is_dir() and any(out.iterdir()) and not (out / "colmap" / _MADE_FROM).exists():
         raise OutputExistsError(Fact("output-not-empty", path=str(out)))
@@ -441,7 +356,7 @@ def reconstruct_by(
         raise InertialError(Fact("for-metres-of-the-imu", option="--colmap-executable"))
     if options.database is not None:
         raise InertialError(Fact("for-metres-of-the-imu", option="--database"))
-    if any("," in end for end in reference.between or ()):
+    if reference.has_points:
         raise InertialError(Fact("points-need-a-model"))
     names = _list_names(pictures)
     made_from = {"capture": str(capture.resolve()), "pictures": len(names), **dataclasses.asdict(options.mapping)}

@@ -10,7 +10,7 @@ import numpy as np
 
 from colmap_inertial.core.errors import FormatError, InertialError, fact_of
 from colmap_inertial.core.facts import Fact
-from colmap_inertial.core.options import ScaleFrom
+from colmap_inertial.core.options import ReferenceOptions, ScaleFrom
 from colmap_inertial.core.types import CameraTrajectory, FrameTiming
 from colmap_inertial.core.types.depth import PinholeGrid
 from colmap_inertial.core.types.evidence import AbsentSensor, Sensor
@@ -21,7 +21,7 @@ from colmap_inertial.io.device_folders import DeviceFolder, is_device_folder, re
 from colmap_inertial.io.fingerprints import fingerprint
 from colmap_inertial.io.trajectories import read_tum
 from colmap_inertial.run.preparation.geolocation import positions_of
-from colmap_inertial.run.stages.capture_sensors import CaptureSensors, SeenTarget
+from colmap_inertial.run.stages.capture_sensors import CaptureSensors, KnownDistance, SeenTarget
 
 #: A pose is of an image where it was taken within this share of the time between poses.
 _WITHIN = 0.5
@@ -36,8 +36,9 @@ def find_sensors(
     chosen: Sequence[ScaleFrom] = (),
     images: Path | None = None,
     made: Path | None = None,
+    reference: ReferenceOptions = ReferenceOptions(),
 ) -> CaptureSensors:
-    """Depth maps, the device's own path and positions of a capture, by the names of its images.
+    """Depth maps, the device's own path and positions of a capture, by the names of its images, and known lengths.
 
     Parameters
     ----------
@@ -55,6 +56,8 @@ def find_sensors(
         Where an existing project has its images.
     made
         Where the images that agree with the model will be, where they are not those.
+    reference
+        A known distance; what a target is, the capture says.
 
     Raises
     ------
@@ -82,8 +85,14 @@ def find_sensors(
                 absent = AbsentSensor(sensor="positions", reasons=(fact_of(error),))
                 found = replace(found, absent=(*found.absent, absent))
     of_model = images if made is None else made
-    if "target" in chosen and capture.target is not None and of_model is not None:
-        found = replace(found, target=SeenTarget(spec=capture.target, images=of_model))
+    seen = None
+    if capture.target is not None and of_model is not None:
+        seen = SeenTarget(spec=capture.target, images=of_model)
+    if "target" in chosen:
+        found = replace(found, target=seen)
+    if "distance" in chosen:
+        markers = seen if reference.has_markers else None
+        found = replace(found, distance=KnownDistance(lengths=reference, markers=markers))
     there = {"depth": found.depth, "device": found.device, "target": found.target}
     for sensor, value in there.items():
         if sensor in chosen and value is None:

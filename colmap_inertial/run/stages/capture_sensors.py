@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.options import ReferenceOptions
 from colmap_inertial.core.types import CameraTrajectory, PositionFixes
 from colmap_inertial.core.types.depth import DepthMaps
 from colmap_inertial.core.types.evidence import AbsentSensor
@@ -17,6 +18,22 @@ class SeenTarget:
 
     spec: str
     images: Path
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnownDistance:
+    """A distance that is known, and between what.
+
+    Attributes
+    ----------
+    lengths
+        As they were given.
+    markers
+        The markers at its ends; ``None`` where both are points.
+    """
+
+    lengths: ReferenceOptions
+    markers: SeenTarget | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -35,6 +52,8 @@ class CaptureSensors:
         Positions of a satellite receiver.
     target
         A target of known size that gives metres, too.
+    distance
+        A known distance that gives metres, too.
     absent
         What is there and cannot be used.
     files
@@ -46,8 +65,16 @@ class CaptureSensors:
     up_in_device: Array | None = None
     fixes: PositionFixes | None = None
     target: SeenTarget | None = None
+    distance: KnownDistance | None = None
     absent: tuple[AbsentSensor, ...] = ()
     files: tuple[object, ...] = ()
 
     def __bool__(self) -> bool:
-        return any(one is not None for one in (self.depth, self.device, self.fixes, self.target)) or bool(self.absent)
+        there = (self.depth, self.device, self.fixes, self.target, self.distance)
+        return any(one is not None for one in there) or bool(self.absent)
+
+    @property
+    def seen_in(self) -> Path | None:
+        """The images in which a target or markers are searched; ``None`` where none are."""
+        seen = self.target or (None if self.distance is None else self.distance.markers)
+        return None if seen is None else seen.images

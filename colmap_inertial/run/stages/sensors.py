@@ -6,7 +6,7 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 
@@ -24,13 +24,13 @@ from colmap_inertial.evidence.depth_points import scale_by_points
 from colmap_inertial.evidence.device_path import DevicePath, place_device_path, up_by_device
 from colmap_inertial.evidence.inertial import evidence_of_imu
 from colmap_inertial.evidence.positions import scale_by_positions
-from colmap_inertial.evidence.references import evidence_of_target
 from colmap_inertial.inertial.scale.verdict import half_width
 from colmap_inertial.io.units import STANDARD_GRAVITY_M_S2
 from colmap_inertial.model import Model, add_doubts, trajectory_from_model
 from colmap_inertial.model.seen_points import seen_points
-from colmap_inertial.run.stages.capture_sensors import CaptureSensors
+from colmap_inertial.run.stages.capture_sensors import CaptureSensors, SeenTarget
 from colmap_inertial.run.stages.inputs import StageInputs
+from colmap_inertial.run.stages.known_lengths import scale_by_distance, scale_by_target
 from colmap_inertial.validate import Validation, parse_target, validate_model
 
 log = logging.getLogger(__name__)
@@ -81,7 +81,7 @@ def ask_sensors(
     timed: bool = True,
     progress: Progress = silent,
 ) -> SensorsOfModel:
-    """What depth, the device's own path, positions and a target say of a model.
+    """What depth, the device's own path, positions, a target and a known distance say of a model.
 
     Parameters
     ----------
@@ -146,17 +146,35 @@ def ask_sensors(
         attempt("positions", ask_positions)
         if up_in_world is None and found_up:
             (up_in_world, tilt_rad), up_from = found_up[0], "positions"
+
+    @cache
+    def measure(seen: SeenTarget) -> Validation:
+        target, options = parse_target(seen.spec), ValidateOptions(unscaled=True)
+        report = partial(progress, "validation")
+        return validate_model(model.reconstruction, seen.images, target, options, progress=report)
+
     if (seen := sensors.target) is not None:
 
         def ask_target() -> ScaleEvidence:
-            target, options = parse_target(seen.spec), ValidateOptions(unscaled=True)
-            report = partial(progress, "validation")
-            validation = validate_model(model.reconstruction, seen.images, target, options, progress=report)
+            validation = measure(seen)
             if validation.doubts:
                 raise NotObservableError("scale", Fact("found-together", found=validation.doubts))
             return scale_by_target(validation)[0]
 
         attempt("target", ask_target)
+    if (known := sensors.distance) is not None:
+
+        def ask_distance() -> ScaleEvidence:
+            if known.lengths.has_points and model.parts:
+                raise NotObservableError("distance", Fact("points-of-another-model"))
+            if known.markers is not None:
+                markers = measure(known.markers)
+                return replace(scale_by_distance(known.lengths, markers)[0], reasons=markers.doubts)
+            # points are those of COLMAP's model
+            unit = 0.0 if model.similarity is None else math.log(model.similarity.scale)
+            return _in_units(scale_by_distance(known.lengths, None)[0], -unit)
+
+        attempt("distance", ask_distance)
     return SensorsOfModel(
         evidence=tuple(evidence),
         absent=tuple(absent),
@@ -165,18 +183,6 @@ def ask_sensors(
         tilt_rad=tilt_rad,
         up_from=up_from,
     )
-
-
-def scale_by_target(validation: Validation) -> tuple[ScaleEvidence, str]:
-    """A target as evidence, and what was measured, in words."""
-    # by half of its corners, so that the others can tell how right that is
-    control = validation.control
-    scale = validation.metres_per_unit if control is None else control.metres_per_unit
-    low, high = validation.metres_per_unit_ci95 if control is None else control.ci95
-    target = validation.target
-    declared_log = 0.0 if target.sigma_m is None else target.sigma_m / target.length_m
-    evidence = evidence_of_target(scale, float(np.log(high / low)) / (2 * Z95), declared_log)
-    return evidence, f"target {target.spec} in {validation.views_used} images"
 
 
 def why_absent(error: InertialError) -> Fact:

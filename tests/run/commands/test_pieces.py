@@ -23,12 +23,12 @@ from colmap_inertial.imaging.gate import GATE_LIMITS, RecordingVerdict
 from colmap_inertial.io.fingerprints import fingerprint
 from colmap_inertial.io.frame_sources import ImageFolder
 from colmap_inertial.run.commands import frames as framing, reporting, validate as validation
-from colmap_inertial.run.commands.scale_by_reference import _find_place
 from colmap_inertial.run.commands.validate import ValidationOutputs, validate_source
 from colmap_inertial.run.preparation import judge as judging, sampling
 from colmap_inertial.run.preparation.frame_reading import GreyFrames
 from colmap_inertial.run.preparation.plan import Treatments, plan_imaging
 from colmap_inertial.run.stages.join import _beside, _spans
+from colmap_inertial.run.stages.known_lengths import _find_place
 from colmap_inertial.run.stages.readout import ReadoutStage
 from colmap_inertial.run.stages.refine import _takes_turns
 from colmap_inertial.run.steps import runner
