@@ -15,7 +15,7 @@ from colmap_inertial.core.geometry import skew
 
 #: The cross product: of vectors f and g, ``einsum("abc,b,c", _CROSS, f, g)``.
 _CROSS = np.stack([skew(axis) for axis in np.eye(3)], axis=1)
-#: Keeps the noise of rays that are all alike invertible; small against that of a picture of a degree.
+#: Keeps the noise of rays that are all alike invertible; small against that of an image one degree wide.
 _REGULAR = 1e-12
 
 

@@ -542,7 +542,7 @@ def test_the_page_has_the_command_lines_that_are_printed():
     named = set(re.findall(r"`([\w-]+)`", "".join(re.findall(r"^\| (`.*?) \|", page, re.MULTILINE))))
     assert set(TARGETS) <= named and set(get_args(ExportProgram)) == set(TARGETS)
     lines = [program.command.format(folder="DIR") for program in TARGETS.values() if program.command]
-    assert len(lines) == 7 and [line for line in lines if f"`{line}`" not in page] == []
+    assert lines and [line for line in lines if f"`{line}`" not in page] == []
 
 
 def test_the_command_prints_the_line_that_keeps_metres_and_up(known, tmp_path, capsys):
