@@ -19,11 +19,11 @@ from colmap_inertial.colmap.views.relative_track import (
     link_observations,
 )
 from colmap_inertial.core.arrays import Array, BoolArray, IndexArray, UInt8Array
-from colmap_inertial.core.geometry import matrix_from_quat
+from colmap_inertial.core.geometry import matrix_from_quat, so3_exp
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.io.files import reading
 from colmap_inertial.model.database import UNREADABLE, check_records
-from colmap_inertial.motion.epipolar import RayMoments
+from colmap_inertial.motion.epipolar import refine_poses
 from colmap_inertial.motion.rotation_averaging import average_rotations
 
 if TYPE_CHECKING:
@@ -38,6 +38,8 @@ class TwoViewLimits:
     least_matches: int = 30
     #: Matches of a pair that the gyroscope's bias is sought by.
     rays: int = 100
+    #: Matches of a pair that its pose is refined by.
+    refined_matches: int = 200
     #: A frame is localised by so many points of the track at least.
     least_placed: int = 12
     #: How far off they may lie.
@@ -130,66 +132,104 @@ class TwoViews:
 
 
 def compare(database: Path, pairs: Sequence[tuple[str, str]]) -> TwoViews:
-    """Rotation and matched overlap of pairs of images, by their verified matches."""
+    """Rotation and matched overlap of pairs of images, by their verified matches.
+
+    Views close in time pass as those of a plane, or of a camera that only turned, whatever they show. The pose that
+    COLMAP takes from their homography is off by tenths of a degree, and of a homography's two solutions the wrong one
+    often has all points before both cameras, too. So each solution is refined by the matches, and the one that suits
+    them best is taken.
+    """
     rotations, covered = np.full((len(pairs), 3, 3), np.nan), np.zeros(len(pairs))
+    starts, place_of_start, rays_of_start = [], [], []
     with open_features(database) as features:
         points: dict[str, Array] = {}
+        matched = {}
         for place, pair in enumerate(pairs):
             views = features.geometry(*pair)
-            if len(views.inlier_matches) < _LIMITS.least_matches:
+            matches = np.array(views.inlier_matches, dtype=np.intp)
+            if len(matches) < _LIMITS.least_matches:
                 continue
             for name in pair:
                 if name not in points:
                     points[name] = features.xy_px(name)
             first, second = ((features.camera(name), points[name]) for name in pair)
-            matches = np.array(views.inlier_matches, dtype=np.intp)
-            second_from_first = _estimate_rotation(first, second, views, matches)
-            if second_from_first is not None:
-                rotations[place] = second_from_first.T
-                covered[place] = min(
-                    _coverage(*first, matches[:, 0], second[0], second_from_first),
-                    _coverage(*second, matches[:, 1], first[0], second_from_first.T),
-                )
+            some = matches[np.linspace(0, len(matches) - 1, _LIMITS.refined_matches).astype(np.intp)]
+            rays = np.stack([_unit_rays(first[0], first[1][some[:, 0]]), _unit_rays(second[0], second[1][some[:, 1]])])
+            if not np.isfinite(rays).all():
+                continue
+            matched[place] = matches
+            for start in _solve_pose(first, second, views, rays):
+                starts.append(start)
+                place_of_start.append(place)
+                rays_of_start.append(rays)
+        for place, second_from_first in _choose_rotations(starts, place_of_start, rays_of_start):
+            first, second = ((features.camera(name), points[name]) for name in pairs[place])
+            rotations[place] = second_from_first.T
+            covered[place] = min(
+                _coverage(*first, matched[place][:, 0], second[0], second_from_first),
+                _coverage(*second, matched[place][:, 1], first[0], second_from_first.T),
+            )
     return TwoViews(first_from_second=rotations, covered=covered)
 
 
-def _estimate_rotation(
+def _choose_rotations(
+    starts: Sequence[tuple[Array, Array]], place: Sequence[int], rays: Sequence[Array]
+) -> Iterator[tuple[int, Array]]:
+    """Places of pairs and their rotations ``second_from_first``, of the solutions that suit their matches best."""
+    if not starts:
+        return
+    rays_first, rays_second = np.swapaxes(np.array(rays), 0, 1)
+    turns, moves = (np.array(of) for of in zip(*starts, strict=True))
+    refined = refine_poses(turns, moves, rays_first, rays_second)
+    best: dict[int, int] = {}
+    for k, of in enumerate(place):
+        if of not in best or refined.usual_rad[k] < refined.usual_rad[best[of]]:
+            best[of] = k
+    for of, k in best.items():
+        yield of, refined.second_from_first[k]
+
+
+def _solve_pose(
     first: tuple[pycolmap.Camera, Array],
     second: tuple[pycolmap.Camera, Array],
     views: pycolmap.TwoViewGeometry,
-    matches: IndexArray,
-) -> Array | None:
-    """(3, 3) ``second_from_first``, of cameras and their keypoints; ``None`` where COLMAP finds none.
-
-    COLMAP takes the pose of views of a plane, or of a camera that only turned, from their homography. Views close in
-    time pass as such whatever they show, and of a homography's two solutions the wrong one often has all points before
-    both cameras, too. The essential matrix of the same matches has the rotation then, as it has where the fundamental
-    matrix suits more of them; that of a camera which only turned is poor. The matches tell which one suits them.
-    """
+    rays: Array,
+) -> list[tuple[Array, Array]]:
+    """Rotations ``second_from_first`` and unit translations that COLMAP's matrices of two views allow."""
+    import cv2
     import pycolmap
 
     kinds = pycolmap.TwoViewGeometryConfiguration
+    poses = []
+    of_plane = views.config in (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC)
+    if of_plane and views.H is not None:
+        intrinsic_first, intrinsic_second = first[0].calibration_matrix(), second[0].calibration_matrix()
+        homography = np.linalg.solve(intrinsic_second, views.H @ intrinsic_first)
+        homography *= np.sign(np.linalg.det(homography))  # keeps points before the camera there
+        _, turns, moves, _ = cv2.decomposeHomographyMat(homography, np.eye(3))
+        poses = [(turn, _unit(move.ravel())) for turn, move in zip(turns[::2], moves[::2], strict=True)]  # of one sign
+    if views.E is not None and np.any(views.E):
+        views.config = kinds.CALIBRATED  # it has a rotation where another matrix suits more matches, too
+    if pycolmap.estimate_two_view_geometry_pose(*first, *second, views) and views.cam2_from_cam1 is not None:
+        turn = matrix_from_quat(np.array(views.cam2_from_cam1.rotation.quat))
+        move = _unit(np.array(views.cam2_from_cam1.translation))
+        poses.append((_with_less_parallax(turn, move, rays) if of_plane else turn, move))
+    return poses
 
-    def solve() -> Array | None:
-        found = pycolmap.estimate_two_view_geometry_pose(*first, *second, views)
-        pose = views.cam2_from_cam1 if found else None
-        return None if pose is None else matrix_from_quat(np.array(pose.rotation.quat))
 
-    by_another = (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC, kinds.UNCALIBRATED)
-    has_essential = views.config in by_another and views.E is not None and bool(np.any(views.E))
-    solutions = [solve()]
-    if has_essential:
-        views.config = kinds.CALIBRATED
-        solutions.append(solve())
-    found = [rotation for rotation in solutions if rotation is not None]
-    if len(found) < 2:
-        return found[0] if found else None
-    rays = [_unit_rays(camera, xy_px[matches[:, k]]) for k, (camera, xy_px) in enumerate((first, second))]
-    visible = np.isfinite(rays).all(axis=(0, 2))
-    if not visible.any():
-        return found[0]
-    moments = RayMoments.of(rays[0][None, visible], rays[1][None, visible])
-    return min(found, key=lambda second_from_first: float(moments.measure_spread(second_from_first.T[None])[0]))
+def _unit(translation: Array) -> Array:
+    """Of a camera that only turned, it is any direction."""
+    length = np.linalg.norm(translation)
+    return np.asarray(translation / length) if length > 1e-9 else np.array([0.0, 0.0, 1.0])
+
+
+def _with_less_parallax(turn: Array, move: Array, rays: Array) -> Array:
+    """A rotation, or the other one of its essential matrix, half a turn about the translation apart.
+
+    Points tell them apart by their depth, but not those of a camera that hardly moved.
+    """
+    rotations = (turn, so3_exp(np.pi * move) @ turn)
+    return max(rotations, key=lambda rotation: float(np.sum(rays[1] * (rays[0] @ rotation.T))))
 
 
 def _unit_rays(camera: pycolmap.Camera, xy_px: Array) -> Array:
