@@ -38,8 +38,9 @@ class TwoViewLimits:
     least_matches: int = 30
     #: Matches of a pair that the gyroscope's bias is sought by.
     rays: int = 100
-    #: Matches of a pair that its pose is refined by.
+    #: Matches of a pair that its pose is refined by, and pairs that are refined together.
     refined_matches: int = 200
+    at_once: int = 100
     #: A frame is localised by so many points of the track at least.
     least_placed: int = 12
     #: How far off they may lie.
@@ -140,53 +141,80 @@ def compare(database: Path, pairs: Sequence[tuple[str, str]]) -> TwoViews:
     them best is taken.
     """
     rotations, covered = np.full((len(pairs), 3, 3), np.nan), np.zeros(len(pairs))
-    starts, place_of_start, rays_of_start = [], [], []
     with open_features(database) as features:
         points: dict[str, Array] = {}
-        matched = {}
-        for place, pair in enumerate(pairs):
-            views = features.geometry(*pair)
-            matches = np.array(views.inlier_matches, dtype=np.intp)
-            if len(matches) < _LIMITS.least_matches:
-                continue
-            for name in pair:
-                if name not in points:
-                    points[name] = features.xy_px(name)
-            first, second = ((features.camera(name), points[name]) for name in pair)
-            some = matches[np.linspace(0, len(matches) - 1, _LIMITS.refined_matches).astype(np.intp)]
-            rays = np.stack([_unit_rays(first[0], first[1][some[:, 0]]), _unit_rays(second[0], second[1][some[:, 1]])])
-            if not np.isfinite(rays).all():
-                continue
-            matched[place] = matches
-            for start in _solve_pose(first, second, views, rays):
-                starts.append(start)
-                place_of_start.append(place)
-                rays_of_start.append(rays)
-        for place, second_from_first in _choose_rotations(starts, place_of_start, rays_of_start):
-            first, second = ((features.camera(name), points[name]) for name in pairs[place])
-            rotations[place] = second_from_first.T
-            covered[place] = min(
-                _coverage(*first, matched[place][:, 0], second[0], second_from_first),
-                _coverage(*second, matched[place][:, 1], first[0], second_from_first.T),
-            )
+        for begin in range(0, len(pairs), _LIMITS.at_once):
+            some = [_MatchedViews.read(features, pair, points) for pair in pairs[begin : begin + _LIMITS.at_once]]
+            solved = [(begin + k, views) for k, views in enumerate(some) if views is not None and views.poses]
+            for (place, views), turn in zip(solved, _refine_rotations([of for _, of in solved]), strict=True):
+                rotations[place], covered[place] = turn.T, views.measure_coverage(turn)
     return TwoViews(first_from_second=rotations, covered=covered)
 
 
-def _choose_rotations(
-    starts: Sequence[tuple[Array, Array]], place: Sequence[int], rays: Sequence[Array]
-) -> Iterator[tuple[int, Array]]:
-    """Places of pairs and their rotations ``second_from_first``, of the solutions that suit their matches best."""
-    if not starts:
-        return
-    rays_first, rays_second = np.swapaxes(np.array(rays), 0, 1)
-    turns, moves = (np.array(of) for of in zip(*starts, strict=True))
-    refined = refine_poses(turns, moves, rays_first, rays_second)
-    best: dict[int, int] = {}
-    for k, of in enumerate(place):
-        if of not in best or refined.usual_rad[k] < refined.usual_rad[best[of]]:
-            best[of] = k
-    for of, k in best.items():
-        yield of, refined.second_from_first[k]
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _MatchedViews:
+    """Two images, their verified matches, and poses that these allow.
+
+    Attributes
+    ----------
+    first, second
+        The camera and the (K, 2) keypoints of each, pixels.
+    matches
+        (L, 2) places of matched keypoints.
+    rays
+        (2, R, 3) unit rays of some of the matches.
+    poses
+        Rotations ``second_from_first`` and unit translations.
+    """
+
+    first: tuple[pycolmap.Camera, Array]
+    second: tuple[pycolmap.Camera, Array]
+    matches: IndexArray
+    rays: Array
+    poses: list[tuple[Array, Array]]
+
+    @classmethod
+    def read(cls, features: Features, pair: tuple[str, str], points: dict[str, Array]) -> _MatchedViews | None:
+        """Of a pair with matches enough; ``points`` keeps the keypoints of images that were read."""
+        views = features.geometry(*pair)
+        matches = np.array(views.inlier_matches, dtype=np.intp)
+        if len(matches) < _LIMITS.least_matches:
+            return None
+        for name in pair:
+            if name not in points:
+                points[name] = features.xy_px(name)
+        first, second = ((features.camera(name), points[name]) for name in pair)
+        rays = np.stack(
+            [_unit_rays(first[0], first[1][matches[:, 0]]), _unit_rays(second[0], second[1][matches[:, 1]])]
+        )
+        visible = np.flatnonzero(np.isfinite(rays).all(axis=(0, 2)))
+        if len(visible) < _LIMITS.least_matches:
+            return None
+        rays = rays[:, visible[np.linspace(0, len(visible) - 1, _LIMITS.refined_matches).astype(np.intp)]]
+        poses = _solve_pose(first, second, views, rays)
+        return cls(first=first, second=second, matches=matches, rays=rays, poses=poses)
+
+    def measure_coverage(self, second_from_first: Array) -> float:
+        """Share of the first or the second picture that is matched, whichever is less."""
+        return min(
+            _coverage(*self.first, self.matches[:, 0], self.second[0], second_from_first),
+            _coverage(*self.second, self.matches[:, 1], self.first[0], second_from_first.T),
+        )
+
+
+def _refine_rotations(pairs: Sequence[_MatchedViews]) -> list[Array]:
+    """(3, 3) ``second_from_first`` of each pair, of those poses that suit its matches best once they are refined."""
+    if not pairs:
+        return []
+    rays = np.array([views.rays for views in pairs for _ in views.poses])
+    turns, moves = (np.array(of) for of in zip(*(pose for views in pairs for pose in views.poses), strict=True))
+    refined = refine_poses(turns, moves, rays[:, 0], rays[:, 1])
+    best, begin = [], 0
+    for views in pairs:
+        own = slice(begin, begin + len(views.poses))
+        best.append(refined.second_from_first[own][np.argmin(refined.usual_rad[own])])
+        begin = own.stop
+    return best
 
 
 def _solve_pose(
