@@ -13,7 +13,7 @@ from colmap_inertial.core.errors import InertialError, TimingError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.diagnose import camera, clocks, frames, imu
-from colmap_inertial.diagnose.findings import SEVERITIES, Diagnosis, Finding, FramesInVideo, Recorded, Severity
+from colmap_inertial.diagnose.diagnosis import SEVERITIES, Diagnosis, Finding, FramesInVideo, Recorded, Severity
 
 Check = Callable[[Recorded], Iterable[Finding]]
 

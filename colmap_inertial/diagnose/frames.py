@@ -12,7 +12,7 @@ from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import CameraModel, FrameTiming
-from colmap_inertial.diagnose.findings import Finding, Recorded, Severity
+from colmap_inertial.diagnose.diagnosis import Finding, Recorded, Severity
 from colmap_inertial.imaging.exposure import (
     ExposureEstimate,
     compare_exposures,

@@ -28,9 +28,9 @@ from colmap_inertial.core.types import (
 )
 from colmap_inertial.hooks import InvertibleStage, find_inverse
 from colmap_inertial.inertial.core.priors import AccelPart, accel_part, model_scale_sigma
-from colmap_inertial.inertial.refine.judge import Judged, refine
 from colmap_inertial.inertial.refine.motion import Worth, add_scale, expect_worth
 from colmap_inertial.inertial.refine.pictures import remove_extremes
+from colmap_inertial.inertial.refine.refinement import Judged, refine
 from colmap_inertial.inertial.refine.setup import (
     Seen,
     Written,
