@@ -209,7 +209,7 @@ def estimate_unstated_exposure(recorded: Recorded) -> tuple[ExposureEstimate, fl
     """
     timing, camera = recorded.timing, recorded.camera
     if timing is None or camera is None or recorded.images is None:
-        raise NotObservableError("exposure", Fact("exposure-without-pictures"))
+        raise NotObservableError("exposure", Fact("exposure-without-images"))
     stabilised = recorded.stabilisation is not None and recorded.stabilisation.stabilised
     if not isinstance(recorded.aligned, Alignment) or stabilised:
         raise NotObservableError("exposure", Fact("exposure-without-gyroscope"))

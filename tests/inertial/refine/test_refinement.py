@@ -95,7 +95,7 @@ def test_what_the_imu_adds_is_counted(links, nodes, expected):
     ("alone", "seen", "chi2", "change", "code"),
     [
         (True, True, 3.0, -0.1, None),
-        (True, True, 3.01, -0.1, "imu-contradicts-pictures"),
+        (True, True, 3.01, -0.1, "imu-contradicts-images"),
         (True, True, 1.0, -0.011, None),
         (True, True, 1.0, -0.01, "refinement-no-better"),
         (False, True, 1.0, -0.1, "pictures-not-converged"),

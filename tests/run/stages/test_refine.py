@@ -464,7 +464,7 @@ def test_a_declared_camera_without_distortion_is_compared_with_what_the_images_s
 def test_an_imu_that_contradicts_the_pictures_beyond_any_noise_makes_a_scale_weak(walked):
     _, model = walked
     for chi2, verdict in ((5.0, "trusted"), (548.0, "weak")):
-        reason = Fact("imu-contradicts-pictures", chi2=chi2)
+        reason = Fact("imu-contradicts-images", chi2=chi2)
         doubted = refine_stage._doubt_contradicted(model, SimpleNamespace(reason=reason, chi2=chi2))
         assert doubted.scale.verdict == verdict and (reason in doubted.scale.reasons) == (verdict == "weak")
     other = SimpleNamespace(reason=Fact("refinement-no-better"), chi2=548.0)
