@@ -1,7 +1,7 @@
 """Check a capture before any reconstruction: findings, each with a code, evidence and advice.
 
 A check is a function of what was recorded (:class:`Recorded`) that yields :class:`Finding` values; it opens no file by
-itself (``Recorded.images`` decodes frames anew). ``CHECKS`` lists all of them. ``run.preparation.preflight`` reads
+itself (``Recorded.images`` has frames). ``CHECKS`` lists all of them. ``run.preparation.preflight`` reads
 captures for them.
 """
 
@@ -13,7 +13,7 @@ from colmap_inertial.core.errors import InertialError, TimingError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.diagnose import camera, clocks, frames, imu
-from colmap_inertial.diagnose.findings import SEVERITIES, Diagnosis, Finding, FramesInVideo, Recorded, Severity
+from colmap_inertial.diagnose.diagnosis import SEVERITIES, Diagnosis, Finding, FramesInVideo, Recorded, Severity
 
 Check = Callable[[Recorded], Iterable[Finding]]
 

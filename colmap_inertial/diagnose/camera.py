@@ -18,7 +18,7 @@ from colmap_inertial.diagnose.clocks import (
     rate_finding,
     wrong_time_unit,
 )
-from colmap_inertial.diagnose.findings import UNIT_FACTORS, Finding, Recorded
+from colmap_inertial.diagnose.diagnosis import UNIT_FACTORS, Finding, Recorded
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.io.plausible import best_mirrored_reading
 from colmap_inertial.motion.align import Alignment

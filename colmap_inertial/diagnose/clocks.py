@@ -10,7 +10,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array, BoolArray
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import CameraTrajectory
-from colmap_inertial.diagnose.findings import Finding, Recorded, Severity
+from colmap_inertial.diagnose.diagnosis import Finding, Recorded, Severity
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.motion.align import Alignment
 

@@ -12,7 +12,7 @@ from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.types import CameraModel, FrameTiming
-from colmap_inertial.diagnose.findings import Finding, Recorded, Severity
+from colmap_inertial.diagnose.diagnosis import Finding, Recorded, Severity
 from colmap_inertial.imaging.exposure import (
     ExposureEstimate,
     compare_exposures,
@@ -181,23 +181,26 @@ def check_unstated_exposure(recorded: Recorded) -> Iterator[Finding]:
     if not recorded.is_capture or timing is None or timing.exposure_s is not None or recorded.camera is None:
         return
     try:
-        found = estimate_unstated_exposure(recorded)
+        found, fastest_px_s = estimate_unstated_exposure(recorded)
     except NotObservableError:
         return
-    speed_px_s = np.nanmax(_predict_speed(recorded, timing, recorded.camera))
     fact = Fact(
         "exposure-unstated",
         exposure_s=found.exposure_s,
         exposure_sigma_s=found.sigma_s,
         most_s=found.most_s,
-        most_px=float(speed_px_s * (found.exposure_s or found.most_s)),
+        most_px=fastest_px_s * (found.exposure_s or found.most_s),
         frames=found.frames,
     )
     yield Finding(fact=fact, severity="info")
 
 
-def estimate_unstated_exposure(recorded: Recorded) -> ExposureEstimate:
-    """The exposure of frames by their blur, with the gyroscope as it was aligned.
+def estimate_unstated_exposure(recorded: Recorded) -> tuple[ExposureEstimate, float]:
+    """Estimate the exposure of frames by their blur, with the gyroscope as it was aligned.
+
+    Returns
+    -------
+    The estimate, from some of the frames that there are in full; and the speed of the fastest of all frames, px/s.
 
     Raises
     ------
@@ -206,12 +209,14 @@ def estimate_unstated_exposure(recorded: Recorded) -> ExposureEstimate:
     """
     timing, camera = recorded.timing, recorded.camera
     if timing is None or camera is None or recorded.images is None:
-        raise NotObservableError("exposure", Fact("exposure-without-pictures"))
+        raise NotObservableError("exposure", Fact("exposure-without-images"))
     stabilised = recorded.stabilisation is not None and recorded.stabilisation.stabilised
     if not isinstance(recorded.aligned, Alignment) or stabilised:
         raise NotObservableError("exposure", Fact("exposure-without-gyroscope"))
     speed_px_s = _predict_speed(recorded, timing, camera)
-    known = np.flatnonzero(np.isfinite(speed_px_s))
+    places = {name: i for i, name in enumerate(timing.names)}
+    at_hand = np.array([places[name] for name in recorded.in_full], dtype=np.intp)
+    known = at_hand[np.isfinite(speed_px_s[at_hand])]
     slowest_first = known[np.argsort(speed_px_s[known], kind="stable")]
     shares = np.concatenate(
         [
@@ -222,14 +227,13 @@ def estimate_unstated_exposure(recorded: Recorded) -> ExposureEstimate:
     chosen = slowest_first[np.unique(np.rint(shares * max(len(known) - 1, 0)).astype(np.intp))] if len(known) else known
     motion, pinhole = _gyro_camera(recorded, timing), colmap_camera(camera)
     exposures_s = exposures_to_compare(float(np.median(np.diff(timing.t_s))))
-    places = {name: i for i, name in enumerate(timing.names)}
     compared = []
-    for frame in recorded.images(sorted(chosen.tolist())):
+    for frame in recorded.images([timing.names[i] for i in sorted(chosen.tolist())]):
         shutter = FrameShutter.of(timing, places[frame.name], width=camera.width, height=camera.height)
-        one = compare_exposures(frame.image, motion, pinhole, shutter, exposures_s)
+        one = compare_exposures(frame.grey, motion, pinhole, shutter, exposures_s)
         if one is not None:
             compared.append(one)
-    return estimate_exposure(compared, exposures_s)
+    return estimate_exposure(compared, exposures_s), float(np.nanmax(speed_px_s))
 
 
 def _gyro_camera(recorded: Recorded, timing: FrameTiming) -> GyroCamera:

@@ -14,7 +14,7 @@ from colmap_inertial.core.geometry import matrix_from_quat, skew
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.sampling import MUCH_CUT, PAUSE_STEPS, find_clipped, integral_at, is_gap
 from colmap_inertial.core.types import CameraTrajectory, ImuRecording
-from colmap_inertial.diagnose.findings import Finding, Recorded, Severity
+from colmap_inertial.diagnose.diagnosis import Finding, Recorded, Severity
 from colmap_inertial.io.plausible import check_consistent
 from colmap_inertial.motion.align import Alignment
 

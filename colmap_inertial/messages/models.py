@@ -80,7 +80,7 @@ state("refinement-no-better", "it did not improve the held-out observations")
 
 
 @message(example={"chi2": 5.2})
-def imu_contradicts_pictures(chi2: float) -> str:
+def imu_contradicts_images(chi2: float) -> str:
     return (
         f"the IMU contradicts the images (residuals {chi2:.1f} times the expected variance): check that both "
         "recordings belong together, and the IMU's axes and gains"

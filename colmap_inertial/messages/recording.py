@@ -241,7 +241,7 @@ def readout_of_even_rotation(change_rad_s: float) -> str:
 
 
 state("readout-of-sparse-pictures", "images this far apart in time do not determine it; a video does")
-state("exposure-without-pictures", "it needs the camera's intrinsics and images")
+state("exposure-without-images", "it needs the camera's intrinsics and images")
 state("exposure-without-gyroscope", "it needs images as filmed and a gyroscope that fits them")
 
 

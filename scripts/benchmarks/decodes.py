@@ -9,12 +9,10 @@ decoded to reach others, and files of images, also those that the run wrote itse
 
 from __future__ import annotations
 
-import argparse
 import logging
 import shutil
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import av
@@ -24,6 +22,7 @@ from colmap_inertial.cli import main as run_command
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frames import read_frame_timing
 from scripts.common.bench_report import write_report
+from scripts.common.measured_run import read_run_arguments
 
 #: What is between the steps: reading, the report.
 BETWEEN = "between"
@@ -92,12 +91,7 @@ def count_decodes(counter: Counter) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("capture", type=Path)
-    parser.add_argument("out", type=Path, help="made anew")
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("options", nargs="*", help="of reconstruct, after --")
-    args = parser.parse_args()
+    args = read_run_arguments(__doc__)
     shutil.rmtree(args.out, ignore_errors=True)
     frames = len(read_frame_timing(load_capture(args.capture)).names)
     counter = Counter()

@@ -14,7 +14,6 @@ milliseconds of processor time for each image that its pose's covariance takes.
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import os
 import shutil
@@ -35,6 +34,7 @@ from colmap_inertial.io.files import read_json
 from colmap_inertial.io.frames import read_frames
 from colmap_inertial.model import find_models, read_model, trajectory_from_model
 from scripts.common.bench_report import write_report
+from scripts.common.measured_run import read_run_arguments
 
 if TYPE_CHECKING:
     import pycolmap
@@ -175,12 +175,7 @@ def _shown(model: pycolmap.Reconstruction, seen: Mapping[int, Array], i: int, j:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("capture", type=Path)
-    parser.add_argument("out", type=Path, help="made anew")
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("options", nargs="*", help="of reconstruct, after --")
-    args = parser.parse_args()
+    args = read_run_arguments(__doc__)
     shutil.rmtree(args.out, ignore_errors=True)
     command = [sys.executable, "-m", "colmap_inertial", "reconstruct", str(args.capture), str(args.out), *args.options]
     looks, spent = [], dict[int, float]()

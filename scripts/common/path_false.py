@@ -26,7 +26,7 @@ from colmap_inertial.imaging.path_filters import smoothed
 from colmap_inertial.imaging.psf import blur_field, blur_path
 from colmap_inertial.motion.flow import measure_rotation, reduce_frames
 from colmap_inertial.motion.sign import SignCheck, compare_signs
-from colmap_inertial.run.preparation.judge import Looked, judged
+from colmap_inertial.run.preparation.blur_check import Looked, judged
 from colmap_inertial.run.stages import deblur
 from colmap_inertial.run.stages.deblur import smoothing_for
 from scripts.common import imaging_metrics as metrics

@@ -101,11 +101,11 @@ def of_capture(path: Path) -> tuple[str, ExposureEstimate | NotObservableError]:
         timing = replace(timing, exposure_s=None, t_s=timing.t_s + 0.5 * timing.exposure_s)
     camera = recorded.camera
     if camera is None and recorded.images is not None:
-        height, width = next(iter(recorded.images([0]))).image.shape[:2]
-        params = (0.5 * width / np.tan(np.radians(30)), width / 2, height / 2)
-        camera = CameraModel(model="SIMPLE_PINHOLE", width=width, height=height, params=params)
+        first = next(iter(recorded.images(recorded.in_full[:1])))
+        params = (0.5 * first.width / np.tan(np.radians(30)), first.width / 2, first.height / 2)
+        camera = CameraModel(model="SIMPLE_PINHOLE", width=first.width, height=first.height, params=params)
     try:
-        return stated, estimate_unstated_exposure(replace(recorded, timing=timing, camera=camera))
+        return stated, estimate_unstated_exposure(replace(recorded, timing=timing, camera=camera))[0]
     except NotObservableError as error:
         return stated, error
 

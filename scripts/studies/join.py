@@ -44,7 +44,7 @@ from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, so3_exp, s
 from colmap_inertial.core.options import JoinOptions, ScaleOptions
 from colmap_inertial.core.types import CameraTrajectory, ImuRecording
 from colmap_inertial.inertial.join.evidence import find_links
-from colmap_inertial.inertial.join.judge import join_submodels
+from colmap_inertial.inertial.join.grouping import join_submodels
 from colmap_inertial.inertial.join.placement import FittedSubmodel, ImuLink, Placed
 from colmap_inertial.inertial.join.relative_poses import end_images, tie_cov
 from colmap_inertial.inertial.scale.posterior import FittedPath

@@ -10,11 +10,11 @@ import pytest
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import quat_rotate
 from colmap_inertial.core.gyro import GyroPath
-from colmap_inertial.core.types import CameraModel, Frame, FrameTiming, ImuRecording
+from colmap_inertial.core.types import CameraModel, FrameTiming, ImuRecording
 from colmap_inertial.diagnose import Recorded
 from colmap_inertial.diagnose.frames import _estimate_readout, check_unstated_exposure
 from colmap_inertial.imaging.gyro_camera import FrameShutter
-from colmap_inertial.motion.flow import VisualRotation
+from colmap_inertial.motion.flow import GreyFrame, VisualRotation
 from tests.helpers.far_scene import CAM_FROM_IMU, FarScene
 
 
@@ -30,11 +30,14 @@ def test_an_exposure_that_nobody_states_is_said_with_its_blur() -> None:
     t_s = np.linspace(0.4, 5.6, 40)
     timing = FrameTiming(names=tuple(f"{i:02}.png" for i in range(len(t_s))), t_s=t_s, readout_s=0.0)
 
-    def images(places: Sequence[int]) -> Iterator[Frame]:
-        for i in places:
+    asked: list[str] = []
+
+    def images(names: Sequence[str]) -> Iterator[GreyFrame]:
+        asked.extend(names)
+        for i in map(timing.names.index, names):
             shutter = FrameShutter(width=640, height=480, t_s=t_s[i] - 0.5 * exposure_s, exposure_s=exposure_s)
             image = scene.picture(camera, shutter, samples=20, noise=0.004, seed=i)
-            yield Frame(name=timing.names[i], image=image, t_s=t_s[i])
+            yield GreyFrame(name=timing.names[i], grey=image, width=640, height=480)
 
     gyro = scene.gyro(end_s=6.0)
     path = GyroPath(gyro.path.t_s + gyro.offset_s, gyro.path.rate_rad_s, np.zeros(3))
@@ -52,8 +55,17 @@ def test_an_exposure_that_nobody_states_is_said_with_its_blur() -> None:
         accel_t_s=path.t_s,
         accel_m_s2=np.tile([0.0, 0.0, 9.81], (len(path.t_s), 1)),
     )
-    recorded = Recorded(imu=imu, timing=timing, rotation=rotation, camera=camera, is_capture=True, images=images)
+    recorded = Recorded(
+        imu=imu,
+        timing=timing,
+        rotation=rotation,
+        camera=camera,
+        is_capture=True,
+        images=images,
+        in_full=timing.names[4:],
+    )
     (finding,) = check_unstated_exposure(recorded)
+    assert set(asked) <= set(timing.names[4:]), "no frame is decoded for it"
     values = finding.fact.values
     assert finding.code == "exposure-unstated"
     assert abs(values["exposure_s"] - exposure_s) < 3 * values["exposure_sigma_s"]

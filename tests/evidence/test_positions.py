@@ -9,7 +9,7 @@ from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import so3_exp
 from colmap_inertial.core.types import CameraTrajectory
 from colmap_inertial.evidence.positions import scale_by_positions
-from tests.run.commands.test_georeference import UP, walk
+from tests.helpers.position_walks import UP, walk
 
 UNIT_M = 0.3
 

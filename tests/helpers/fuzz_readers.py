@@ -34,8 +34,9 @@ from colmap_inertial.tools.view.images import read_preview
 from colmap_inertial.tools.view.scene import load_scene
 from tests.helpers import imu_files, model_project, report_runs
 from tests.helpers.fuzz_structure import structural
+from tests.helpers.simulated_imu import FRAME_NS, at_one_clock, recorded
 from tests.io import test_damaged_files
-from tests.io.test_recorders import FRAME_NS, LAYOUTS, at_one_clock, recorded
+from tests.io.test_recorders import LAYOUTS
 from tests.run.stages.test_apertures import kalibr_text
 
 SCENE = Path(__file__).resolve().parents[2] / "example_scenes" / "desk"

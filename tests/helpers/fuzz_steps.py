@@ -31,13 +31,13 @@ from colmap_inertial.validate.markers import add_bars, add_check_points
 from tests.helpers import imu_files, model_project
 from tests.helpers.exposure_scenes import write_pair_capture
 from tests.helpers.fuzz_readers import Reader, each, small_recording
+from tests.helpers.markers_in_model import PLACES, validated
 from tests.helpers.model_project import camera_poses, cast
+from tests.helpers.position_walks import walk
 from tests.helpers.report_runs import write_run
 from tests.io.test_splats import write_splats, write_trained
 from tests.run.commands.test_calibrate_imu import known
-from tests.run.commands.test_georeference import walk
 from tests.run.stages.test_apertures import ROTATION, SHIFT, write_plane_capture
-from tests.validate.test_lengths import PLACES, validated
 
 DOUBLE = plain_factor(2.0)
 

@@ -15,8 +15,8 @@ from colmap_inertial.io.frame_sources import ImageFolder, Video
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.io.sensor_yaml import CAMERA_MODELS
 from colmap_inertial.io.toml_section import parse_toml
+from tests.helpers.asl_imu import HEADER, handheld, rows, write_csv
 from tests.helpers.cases import loop_over
-from tests.io.test_imu import HEADER, handheld, rows, write_csv
 
 IMU = '[imu]\npath = "imu.csv"\n'
 

@@ -20,9 +20,9 @@ from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.imu import read_frame_log, read_imu
 from colmap_inertial.io.tables import text_of
 from tests.helpers import imu_files
+from tests.helpers.damage import mutated
 from tests.helpers.files import write_anew
-from tests.io.test_damaged_files import mutated
-from tests.io.test_recorders import FRAME_NS, recorded
+from tests.helpers.simulated_imu import FRAME_NS, recorded
 
 MUTATIONS = 100
 #: Sizes that a damaged box or entry may state.

@@ -15,7 +15,7 @@ from colmap_inertial.io.imu import read_frame_log, read_imu
 from colmap_inertial.io.mp4 import read_movie
 from colmap_inertial.io.video import video_stamps_ns
 from tests.helpers import imu_files
-from tests.io.test_recorders import recorded
+from tests.helpers.simulated_imu import recorded
 from tests.io.test_video_frames import write_video
 
 

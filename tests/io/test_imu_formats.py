@@ -12,7 +12,7 @@ from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.io import imu_formats as formats
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.imu import read_imu
-from tests.io.test_imu import handheld
+from tests.helpers.asl_imu import handheld
 
 MODULE = """
 from pathlib import Path

@@ -11,9 +11,9 @@ from colmap_inertial.core.types import Similarity
 from colmap_inertial.io import ply
 from colmap_inertial.io.ply import transform_ply
 from tests.helpers.cases import loop_over
+from tests.helpers.damage import mutated
 from tests.helpers.files import write_anew
 from tests.helpers.similarities import SIMILARITY
-from tests.io.test_damaged_files import mutated
 
 IDENTITY = Similarity(scale=1.0, rotation_xyzw=[0, 0, 0, 1], translation_m=[0, 0, 0], cov=np.zeros((7, 7)))
 HEADER = """ply

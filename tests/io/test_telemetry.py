@@ -11,8 +11,8 @@ from colmap_inertial.core.types import ImuRecording
 from colmap_inertial.io import telemetry
 from colmap_inertial.io.imu import read_frame_log, read_imu
 from colmap_inertial.io.imu_formats import find_imu_format
+from tests.helpers.asl_imu import handheld
 from tests.helpers.imu_files import INSTA360S, RUNCAMS, write_insta360, write_runcam
-from tests.io.test_imu import handheld
 
 
 def assert_read(path, imu, *, gyro_rad_s, accel_m_s2):

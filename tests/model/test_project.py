@@ -27,11 +27,11 @@ from colmap_inertial.model.notes import collecting_notes
 from colmap_inertial.model.project import apply_to_project, undo_project
 from colmap_inertial.model.similarities import ModelScale, plain_factor, read_scales, read_similarity
 from colmap_inertial.model.soundness import check_binary_model
+from tests.helpers.damage import refusals
 from tests.helpers.files import write_anew
 from tests.helpers.json_schemas import find_violations
 from tests.helpers.model_project import HEIGHT, NAMES, WIDTH, fuse, prior_rows, write_project
 from tests.helpers.similarities import SIMILARITY
-from tests.io.test_damaged_files import refusals
 
 ROTATION = matrix_from_quat(SIMILARITY.rotation_xyzw)
 

@@ -60,6 +60,8 @@ class Reduction:
 
 #: To follow corners, to compare images two by two, and to see whether there is anything in an image.
 FOLLOWED, COMPARED, GLANCED_AT = Reduction(FOLLOWED_PX), Reduction(COMPARED_PX), Reduction(320)
+#: In grey, but not reduced.
+WHOLE = Reduction(1 << 16)
 #: To rank frames by their sharpness.
 RANKED = Reduction(960, of_luma=True)
 

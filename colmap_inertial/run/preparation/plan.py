@@ -29,6 +29,7 @@ from colmap_inertial.io.exif import read_exposures_s
 from colmap_inertial.io.files import path_in
 from colmap_inertial.io.recording import Recording
 from colmap_inertial.model import colmap_camera
+from colmap_inertial.run.preparation.blur_check import judge_frames
 from colmap_inertial.run.preparation.calibrate import (
     estimate_preliminary_calibration,
     expect_calibration,
@@ -36,7 +37,6 @@ from colmap_inertial.run.preparation.calibrate import (
     survey_parts,
 )
 from colmap_inertial.run.preparation.frame_reading import FullFrames, GreyFrames
-from colmap_inertial.run.preparation.judge import judge_frames
 from colmap_inertial.run.preparation.translation import (
     find_parallaxes,
     most_by_sliding_px,

@@ -15,13 +15,12 @@ from colmap_inertial.core.errors import FormatError, InertialError, NotObservabl
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.progress import Progress, report_each
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, Frame, FrameTiming, ImuRecording
+from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, FrameTiming, ImuRecording
 from colmap_inertial.diagnose import Diagnosis, FramesInVideo, Recorded, diagnose
 from colmap_inertial.imaging.detail import is_blank
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import read_record, write_json, write_record
 from colmap_inertial.io.frame_sources import ImageFolder
-from colmap_inertial.io.frames import decode_images, read_frames
 from colmap_inertial.io.plausible import check_readings
 from colmap_inertial.io.pose_convention import COLMAP, PoseConvention
 from colmap_inertial.io.recording import Recording
@@ -30,7 +29,7 @@ from colmap_inertial.io.video_match import match_to_video
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.motion.flow import GreyFrame, VisualRotation
 from colmap_inertial.motion.two_view_rotation import measure_two_view_rotations
-from colmap_inertial.run.preparation.frame_reading import COMPARED, FOLLOWED, GLANCED_AT, GreyFrames
+from colmap_inertial.run.preparation.frame_reading import COMPARED, FOLLOWED, GLANCED_AT, WHOLE, GreyFrames
 from colmap_inertial.run.preparation.sampling import (
     measure_sampled_rotation,
     names_at,
@@ -53,6 +52,8 @@ class PreflightEffort:
     video_step_s: float = 0.13
     #: Images further apart that are compared two by two.
     compared: int = 60
+    #: Of those, so many are kept in full, where an exposure that nobody states is estimated by them: 0.2 GB of HD.
+    in_full: int = 100
     #: Images that are looked for in the video they were cut from.
     images_in_video: int = 60
 
@@ -133,13 +134,6 @@ class TolerantReader:
             return None
 
 
-def _decode_some(capture: Capture, timing: FrameTiming, places: Sequence[int]) -> Iterable[Frame]:
-    """Some frames in full, by their places; of a folder, no other is opened."""
-    if isinstance(capture.frames, ImageFolder):
-        return decode_images(capture, timing, np.asarray(places, dtype=np.intp))
-    return read_frames(capture, only=[timing.names[i] for i in places])[1]
-
-
 def measure_recording(inputs: CheckInputs, progress: Progress, frames: GreyFrames | None = None) -> Recorded:
     """Measure what the checks look at: ``diagnose``, ``scale``, and each reconstruction before its work.
 
@@ -151,15 +145,18 @@ def measure_recording(inputs: CheckInputs, progress: Progress, frames: GreyFrame
     log_ = None if capture is None else capture.frame_log
     rotation = in_video = None
     looked: dict[str, bool] = {}
-    images: Callable[[Sequence[int]], Iterable[Frame]] | None = None
+    images: Callable[[Sequence[str]], Iterable[GreyFrame]] | None = None
+    in_full: Sequence[str] = ()
 
     if poses is None and capture is not None and timing is not None:
         # turns in pictures that the camera stabilised are not the camera's
         if log_ is None or not log_.stabilised:
             seen = frames or GreyFrames(capture, timing)
+            images, in_full = partial(seen.look, WHOLE), _choose_in_full(timing)
+            if inputs.imu is not None and capture.camera is not None and timing.exposure_s is None:
+                seen.expect(WHOLE, in_full)
             rotation = reader.attempt(lambda: measure_images(seen, progress, looked))
         in_video = reader.attempt(lambda: find_in_video(capture, timing, progress))
-        images = partial(_decode_some, capture, timing)
     return Recorded(
         refused=tuple(reader.refused),
         imu=inputs.imu,
@@ -176,6 +173,7 @@ def measure_recording(inputs: CheckInputs, progress: Progress, frames: GreyFrame
         max_offset_s=inputs.max_offset_s,
         in_video=in_video,
         images=images,
+        in_full=in_full,
     )
 
 
@@ -257,19 +255,15 @@ def measure_images(frames: GreyFrames, progress: Progress, looked: dict[str, boo
     ``looked`` takes the names of those that were looked at, and whether they are blank.
     """
     timing = frames.timing
-    is_video = len(timing.t_s) > 1 and float(np.median(np.diff(timing.t_s))) <= _EFFORT.video_step_s
+    is_video = _is_video(timing)
 
     def look(frame: GreyFrame) -> None:
         [small] = frames.look(GLANCED_AT, [frame.name])
         looked[frame.name] = is_blank(small.grey)
 
-    if is_video:
-        indices = sample_beginning(timing, _EFFORT.frame_spacing_s, _EFFORT.frames)
-    elif len(timing.t_s) < 5:
+    if not is_video and len(timing.t_s) < 5:
         return None
-    else:
-        first = max(0, (len(timing.t_s) - _EFFORT.compared) // 2)
-        indices = list(range(first, min(first + _EFFORT.compared, len(timing.t_s))))
+    indices = _choose_images(timing)
     names = names_at(timing, indices)
     frames.expect(GLANCED_AT, names)
     frames.expect(FOLLOWED if is_video else COMPARED, names)
@@ -279,6 +273,24 @@ def measure_images(frames: GreyFrames, progress: Progress, looked: dict[str, boo
     compared = report_each(frames.look(COMPARED, names), len(names), "check", progress)
     with one_blas_thread():
         return measure_two_view_rotations(show_frames(compared, look), colmap_camera(camera), timing)
+
+
+def _is_video(timing: FrameTiming) -> bool:
+    return len(timing.t_s) > 1 and float(np.median(np.diff(timing.t_s))) <= _EFFORT.video_step_s
+
+
+def _choose_images(timing: FrameTiming) -> list[int]:
+    """Indices of the images to look at: of a video from its beginning, of others those in the middle."""
+    if _is_video(timing):
+        return sample_beginning(timing, _EFFORT.frame_spacing_s, _EFFORT.frames)
+    first = max(0, (len(timing.t_s) - _EFFORT.compared) // 2)
+    return list(range(first, min(first + _EFFORT.compared, len(timing.t_s))))
+
+
+def _choose_in_full(timing: FrameTiming) -> list[str]:
+    """Names of the images to keep in full, evenly among those that are looked at."""
+    names = names_at(timing, _choose_images(timing))
+    return [names[i] for i in np.unique(np.linspace(0, len(names) - 1, _EFFORT.in_full).astype(np.intp))]
 
 
 def find_in_video(capture: Capture, timing: FrameTiming, progress: Progress) -> FramesInVideo | None:

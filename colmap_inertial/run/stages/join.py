@@ -13,8 +13,8 @@ from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import JoinOptions
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import Gap
+from colmap_inertial.inertial.join.grouping import join_submodels
 from colmap_inertial.inertial.join.joined_model import join_models
-from colmap_inertial.inertial.join.judge import join_submodels
 from colmap_inertial.inertial.join.placement import FittedSubmodel
 from colmap_inertial.inertial.scale.posterior import FittedPath
 from colmap_inertial.model import Model, trajectory_from_model

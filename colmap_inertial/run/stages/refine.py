@@ -28,9 +28,9 @@ from colmap_inertial.core.types import (
 )
 from colmap_inertial.hooks import InvertibleStage, find_inverse
 from colmap_inertial.inertial.core.priors import AccelPart, accel_part, model_scale_sigma
-from colmap_inertial.inertial.refine.judge import Judged, refine
 from colmap_inertial.inertial.refine.motion import Worth, add_scale, expect_worth
 from colmap_inertial.inertial.refine.pictures import remove_extremes
+from colmap_inertial.inertial.refine.refinement import Judged, refine
 from colmap_inertial.inertial.refine.setup import (
     Seen,
     Written,
@@ -212,7 +212,7 @@ class RefineStage(InertialStage):
 def _doubt_contradicted(model: Model, judged: Judged) -> Model:
     """The model with a doubt about its scale where the IMU contradicts its pictures beyond any noise."""
     reason, scale = judged.reason, model.scale
-    if reason is None or reason.code != "imu-contradicts-pictures" or judged.chi2 <= _GROSS_CHI2 or scale is None:
+    if reason is None or reason.code != "imu-contradicts-images" or judged.chi2 <= _GROSS_CHI2 or scale is None:
         return model
     # what is contradicted by itself, as declared intrinsics are, is likelier its cause, and comes before
     doubted = add_doubts(scale, (reason,))

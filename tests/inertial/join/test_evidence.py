@@ -8,7 +8,7 @@ from scipy import stats
 
 from colmap_inertial.core.geometry import so3_exp, so3_log
 from colmap_inertial.inertial.core.priors import PRIORS
-from colmap_inertial.inertial.join import evidence, judge
+from colmap_inertial.inertial.join import evidence, grouping
 from colmap_inertial.inertial.join.evidence import chi2_limit, clocks_differ, mounting_differs, overlaps, times_counted
 from colmap_inertial.inertial.join.placement import ImuLink
 from colmap_inertial.inertial.scale import posterior as post
@@ -138,5 +138,5 @@ def test_pairs_that_cannot_be_one_model(shared, cameras, agree, why):
 )
 def test_a_gap_is_closed_up_to_the_limits(sigma_m, sigma_deg, code):
     gap = SimpleNamespace(sigma_m=sigma_m, sigma_deg=sigma_deg)
-    found = judge._unsure(gap, SimpleNamespace(sigma_m=0.1, sigma_deg=1.0))
+    found = grouping._unsure(gap, SimpleNamespace(sigma_m=0.1, sigma_deg=1.0))
     assert (None if found is None else found.code) == code

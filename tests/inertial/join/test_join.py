@@ -13,7 +13,7 @@ from colmap_inertial.cli.terminal import show_result
 from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, quat_rotate, so3_exp, so3_log
 from colmap_inertial.core.options import JoinOptions, ProjectOptions, ReconstructOptions, ScaleOptions
 from colmap_inertial.inertial.join.evidence import Evidence, find_links, find_shared
-from colmap_inertial.inertial.join.judge import join_submodels
+from colmap_inertial.inertial.join.grouping import join_submodels
 from colmap_inertial.inertial.join.placement import FittedSubmodel, ImuLink, Problem, place_submodels
 from colmap_inertial.inertial.join.relative_poses import end_images, tie_cov, worst_sigmas
 from colmap_inertial.inertial.scale.posterior import CLOCK_RATE, DELAY, FittedPath

@@ -9,9 +9,9 @@ from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.options import JoinOptions
-from colmap_inertial.inertial.join import judge
+from colmap_inertial.inertial.join import grouping
 from colmap_inertial.inertial.join.evidence import find_links, find_matched
-from colmap_inertial.inertial.join.judge import join_submodels
+from colmap_inertial.inertial.join.grouping import join_submodels
 from colmap_inertial.model import Model
 from colmap_inertial.model.submodels.matches import PlacedImages, place_images
 from colmap_inertial.run.stages.join import JoinStage
@@ -19,8 +19,8 @@ from colmap_inertial.run.stages.metric import MetricStage
 from colmap_inertial.tools.simulate.motion import MotionOptions
 from colmap_inertial.tools.simulate.tracks import TrackOptions, simulate_tracks
 from tests.helpers.refine_walk import walk
+from tests.inertial.join.test_grouping import T_S, part_of
 from tests.inertial.join.test_join import UNKNOWN, across, cut
-from tests.inertial.join.test_judge import T_S, part_of
 
 LIMITS = JoinOptions()
 
@@ -172,13 +172,13 @@ def test_what_is_said_of_matches_is_what_became_of_them_in_the_group(three, monk
     parts, imu, found = three
 
     def tried(evidence, members, matched=()):
-        trial = judge_tried(evidence, members, matched)
+        trial = grouping_tried(evidence, members, matched)
         of_pair = any({one.first, one.second} == {1, 2} for one in matched)
         return replace(trial, contradiction="it is so") if of_pair and len(members) == 3 else trial
 
-    judge_tried = judge._try
+    grouping_tried = grouping._try
     every = [found(0, 1), found(2, 1)]
-    monkeypatch.setattr(judge, "_try", tried)
+    monkeypatch.setattr(grouping, "_try", tried)
     joined = join_submodels(parts, imu, LIMITS, every)
     assert joined.groups[0].matched == {(0, 1)}
     assert said_of(joined) == {(0, 1): (True, False), (1, 2): (False, True)}

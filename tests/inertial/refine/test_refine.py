@@ -10,7 +10,15 @@ import pytest
 from colmap_inertial._kernels import _inertial
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import so3_exp, so3_log
-from colmap_inertial.inertial.refine import _residuals, _system, judge, judging_points, pictures, setup, solve as solver
+from colmap_inertial.inertial.refine import (
+    _residuals,
+    _system,
+    judging_points,
+    pictures,
+    refinement,
+    setup,
+    solve as solver,
+)
 from colmap_inertial.inertial.refine._panels import Layout
 from colmap_inertial.inertial.refine._residuals import moving
 from colmap_inertial.inertial.refine._system import System
@@ -370,8 +378,8 @@ def test_a_gap_of_the_gyroscope_links_nothing():
     assert gap.inertial.linked[~across].sum() >= (~across).sum() - 2
     # each chain's residuals less its velocities; nothing of what hangs between
     chains = 2
-    assert judge._count_freedom(gap) == 6 * gap.inertial.linked.sum() - 3 * chains
-    assert judge._count_freedom(whole) == 6 * whole.inertial.linked.sum() - 3
+    assert refinement._count_freedom(gap) == 6 * gap.inertial.linked.sum() - 3 * chains
+    assert refinement._count_freedom(whole) == 6 * whole.inertial.linked.sum() - 3
 
 
 def test_frames_more_than_ten_seconds_apart_are_not_linked():
@@ -402,13 +410,13 @@ def test_an_offset_beyond_the_readings_that_were_looked_up_is_refused(small):
     _, problem, start, _ = small
     reach_s = problem.inertial.turning.half_span_s - 0.5 * abs(start.readout_s)
     near_s, far_s = reach_s - 0.001, reach_s + 0.001
-    assert judge._find_late_clock(problem, replace(start, offset_s=near_s)) is None
-    late = judge._find_late_clock(problem, replace(start, offset_s=-far_s))
+    assert refinement._find_late_clock(problem, replace(start, offset_s=near_s)) is None
+    late = refinement._find_late_clock(problem, replace(start, offset_s=-far_s))
     assert late.code == "refined-times-far" and abs(late.values["shift_s"]) == pytest.approx(far_s, abs=1e-6)
     drifting = replace(start, offset_s=near_s, clock_rate=0.002 / np.ptp(problem.inertial.nodes_s) * 2)
-    assert abs(judge._find_late_clock(problem, drifting).values["shift_s"]) == pytest.approx(far_s, abs=1e-4)
+    assert abs(refinement._find_late_clock(problem, drifting).values["shift_s"]) == pytest.approx(far_s, abs=1e-4)
     longer = replace(start, offset_s=near_s, readout_s=start.readout_s + 0.004)
-    assert judge._find_late_clock(problem, longer).values["readout_s"] == pytest.approx(longer.readout_s)
+    assert refinement._find_late_clock(problem, longer).values["readout_s"] == pytest.approx(longer.readout_s)
 
 
 def test_a_step_that_leaves_no_camera_is_not_tried(small):
@@ -422,14 +430,14 @@ def test_a_step_that_leaves_no_camera_is_not_tried(small):
 def test_what_is_held_out_must_be_predicted_better_than_chance_does(small):
     _, problem, start, _ = small
     rests = solver._make_solution(_evaluate(problem, start, problem.observations), 1, converged=True)
-    assert judge._find_doubt(rests, rests, 1.0, -0.02, 0.01) is None
+    assert refinement._find_doubt(rests, rests, 1.0, -0.02, 0.01) is None
     for change, spread in ((-0.009, 0.01), (0.0, 0.0), (-1.0, np.inf)):
-        assert "did not improve" in str(judge._find_doubt(rests, rests, 1.0, change, spread))
+        assert "did not improve" in str(refinement._find_doubt(rests, rests, 1.0, change, spread))
 
 
 def test_what_is_held_out_leaves_each_point_enough(small):
     _, problem, _, _ = small
-    chosen = judge._choose_held_out(problem.observations)
+    chosen = refinement._choose_held_out(problem.observations)
     assert 0.05 < chosen.mean() < 0.12
     left = problem.observations.select(~chosen)
     assert np.diff(left.first).min() >= 2
@@ -440,7 +448,7 @@ def test_of_many_observations_a_share_judges_and_all_refine(monkeypatch):
     problem, start, seen = problem_of(tracks_of(options), options)
     nearly = nudged(start, np.random.default_rng(1))
     at_once_px = problem.observations.xy_px
-    whole = judge.refine(problem, nearly, at_once_px, seen.t_s)
+    whole = refinement.refine(problem, nearly, at_once_px, seen.t_s)
     assert judging_points.draw_points(problem.observations, len(seen.t_s)) is None
     monkeypatch.setattr(judging_points, "JUDGING", judging_points.JudgingLimits(observations=200, each=30))
     points = judging_points.draw_points(problem.observations, len(seen.t_s))
@@ -449,7 +457,7 @@ def test_of_many_observations_a_share_judges_and_all_refine(monkeypatch):
         for observations in (problem.observations, problem.observations.select_points(points))
     )
     assert np.all(left >= np.minimum(counts, 30)) and left.sum() < 0.8 * counts.sum()
-    shared = judge.refine(problem, nearly, at_once_px, seen.t_s)
+    shared = refinement.refine(problem, nearly, at_once_px, seen.t_s)
     assert shared.accepted and whole.accepted, (shared.reason, whole.reason)
     assert shared.held_out < 0.8 * whole.held_out
     sigma_m = np.sqrt([np.trace(cov[:3, :3]) for cov in whole.motion_covs.values()]).max()
@@ -632,14 +640,14 @@ def test_points_stand_in_order_of_time(small):
 
 def test_the_drift_map_names_what_was_stretched_and_how_sure_it_is(small, monkeypatch):
     _, problem, start, seen = small
-    monkeypatch.setattr(judge, "LIMITS", judge.RefineLimits(part_s=1.0))
+    monkeypatch.setattr(refinement, "LIMITS", refinement.RefineLimits(part_s=1.0))
     half = len(seen.t_s) // 2
     middle = start.imu_in_world_m[half]
     longer = start.imu_in_world_m.copy()
     longer[half:] = middle + 1.1 * (longer[half:] - middle)
     solved = factor_information(problem, start)
     by = moving(problem, start)
-    parts = judge.drift_map(problem, start, replace(start, imu_in_world_m=longer), seen.t_s, solved, by)
+    parts = refinement.drift_map(problem, start, replace(start, imu_in_world_m=longer), seen.t_s, solved, by)
     assert len(parts) == 4
     assert parts[-1].percent - parts[0].percent == pytest.approx(10.0, abs=1.5)
     # by the whole covariance
@@ -656,5 +664,5 @@ def test_the_drift_map_names_what_was_stretched_and_how_sure_it_is(small, monkey
     assert 0 < parts[0].sigma_percent < 50
     # of a frame by itself nothing is said
     alone_s = np.append(seen.t_s[:-1], seen.t_s[-1] + 3.0)
-    again = judge.drift_map(problem, start, replace(start, imu_in_world_m=longer), alone_s, solved, by)
+    again = refinement.drift_map(problem, start, replace(start, imu_in_world_m=longer), alone_s, solved, by)
     assert len(again) == 4 and again[-1].end_s < alone_s[-1]

@@ -24,7 +24,7 @@ from colmap_inertial.io.fingerprints import fingerprint
 from colmap_inertial.io.frame_sources import ImageFolder
 from colmap_inertial.run.commands import frames as framing, reporting, validate as validation
 from colmap_inertial.run.commands.validate import ValidationOutputs, validate_source
-from colmap_inertial.run.preparation import judge as judging, sampling
+from colmap_inertial.run.preparation import blur_check, sampling
 from colmap_inertial.run.preparation.frame_reading import GreyFrames
 from colmap_inertial.run.preparation.plan import Treatments, plan_imaging
 from colmap_inertial.run.stages.join import _beside, _spans
@@ -435,7 +435,7 @@ def test_frames_speak_for_themselves_where_too_few_confirm_the_gyroscope(subtest
             verdict = RecordingVerdict(
                 trusted=True, support=5.0, extent_factor=1.0, frames=9, reason=Fact.stated("as it was")
             )
-            found = judging.judge_each_frame(verdict, looked)
+            found = blur_check.judge_each_frame(verdict, looked)
             assert found.trusted is trusted
             assert (
                 str(found.reason) == "as it was"
@@ -443,4 +443,4 @@ def test_frames_speak_for_themselves_where_too_few_confirm_the_gyroscope(subtest
                 else f"{shown} of {telling} examined frames" in str(found.reason)
             )
             doubted = replace(verdict, trusted=False)
-            assert judging.judge_each_frame(doubted, looked) is doubted
+            assert blur_check.judge_each_frame(doubted, looked) is doubted

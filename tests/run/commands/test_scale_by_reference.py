@@ -22,7 +22,7 @@ from colmap_inertial.run.commands.scale_by_reference import Reference, scale_pro
 from colmap_inertial.validate.result import LengthCheck
 from tests.cli.test_commands import run
 from tests.helpers.cases import loop_over
-from tests.validate.test_lengths import validated
+from tests.helpers.markers_in_model import validated
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import ReferenceOptions
 from colmap_inertial.run.commands import scale_by_reference as reference
 from colmap_inertial.run.commands.scale_by_reference import scale_by_distance, scale_by_target
-from tests.validate.test_lengths import validated
+from tests.helpers.markers_in_model import validated
 
 BETWEEN = ReferenceOptions(target="aruco:DICT_4X4_50:0.1", between=("0", "1"), distance="2.0+-0.01")
 

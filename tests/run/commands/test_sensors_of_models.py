@@ -18,8 +18,9 @@ from colmap_inertial.run.stages import sensors
 from tests.helpers.box_project import build
 from tests.helpers.box_sensors import DepthErrors, PathErrors, write_capture
 from tests.helpers.json_schemas import find_violations
-from tests.run.commands.test_georeference import ORIGIN, geodetic_of_enu, turn, with_position
-from tests.validate.test_lengths import validated
+from tests.helpers.markers_in_model import validated
+from tests.helpers.position_walks import geodetic_of_enu, turn
+from tests.run.commands.test_georeference import ORIGIN, with_position
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,7 @@
 """Images are decoded once to be looked at in small, and once in full."""
 
+from dataclasses import replace
+
 import av
 import cv2
 import numpy as np
@@ -11,9 +13,11 @@ from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.frame_sources import ImageFolder
 from colmap_inertial.io.frames import read_frame_timing, read_frames
+from colmap_inertial.io.imu import read_unchecked_capture_imu
 from colmap_inertial.motion.flow import GreyFrame
 from colmap_inertial.run.preparation import frame_reading
 from colmap_inertial.run.preparation.frame_reading import COMPARED, FOLLOWED, RANKED, FullFrames, GreyFrames
+from colmap_inertial.run.preparation.preflight import CheckInputs, measure_recording
 from colmap_inertial.tools.simulate import MotionOptions
 from tests.helpers.box_video import film
 
@@ -65,6 +69,17 @@ def test_frames_that_are_expected_are_kept_while_others_are_looked_at(clip, deco
     assert grey_of(ranked) == grey_of(GreyFrames(clip, timing).look(RANKED, names))
     assert frames.guess_camera() is clip.camera
     frames.close()
+
+
+def test_frames_for_an_unstated_exposure_are_kept_while_they_are_followed(clip, decoded):
+    timing = replace(read_frame_timing(clip), exposure_s=None)
+    inputs = CheckInputs(imu=read_unchecked_capture_imu(clip), capture=clip, timing=timing)
+    recorded = measure_recording(inputs, lambda *_: None)
+    assert recorded.images is not None
+    in_full = grey_of(recorded.images(recorded.in_full))
+    assert len(decoded) == len(timing.names), "each frame once"
+    plain = {frame.name: GreyFrame.of(frame, clip.camera.width).grey.tobytes() for frame in read_frames(clip)[1]}
+    assert in_full == {name: plain[name] for name in recorded.in_full}
 
 
 def test_what_was_not_kept_is_decoded_again(clip, decoded, tmp_path, monkeypatch):

@@ -16,7 +16,7 @@ from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, so3_log
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, ScaleOptions
 from colmap_inertial.core.types import CameraModel, CameraMotion, Similarity
 from colmap_inertial.inertial.core.priors import PRIORS, model_scale_sigma
-from colmap_inertial.inertial.refine import judge, motion
+from colmap_inertial.inertial.refine import motion, refinement
 from colmap_inertial.inertial.refine.shutter import SeenReadout
 from colmap_inertial.inertial.refine.solve import evaluate_held_out, solve
 from colmap_inertial.inertial.refine.values import ROTATION
@@ -464,7 +464,7 @@ def test_a_declared_camera_without_distortion_is_compared_with_what_the_images_s
 def test_an_imu_that_contradicts_the_pictures_beyond_any_noise_makes_a_scale_weak(walked):
     _, model = walked
     for chi2, verdict in ((5.0, "trusted"), (548.0, "weak")):
-        reason = Fact("imu-contradicts-pictures", chi2=chi2)
+        reason = Fact("imu-contradicts-images", chi2=chi2)
         doubted = refine_stage._doubt_contradicted(model, SimpleNamespace(reason=reason, chi2=chi2))
         assert doubted.scale.verdict == verdict and (reason in doubted.scale.reasons) == (verdict == "weak")
     other = SimpleNamespace(reason=Fact("refinement-no-better"), chi2=548.0)
@@ -559,7 +559,7 @@ def test_auto_leaves_a_project_from_which_more_was_made(walked, tmp_path):
 @pytest.mark.parametrize("found", [(1.5e-3, 0.49e-3), (0.9e-3, 1e-5), (-5e-3, 2e-3)])
 def test_a_readout_that_predicts_nothing_better_is_none(walked, monkeypatch, found):
     tracks, model = walked
-    monkeypatch.setattr(judge, "_estimate_readout", lambda *_: found)
+    monkeypatch.setattr(refinement, "_estimate_readout", lambda *_: found)
     _, said = refined_by(tracks.imu, model)
     assert said.action == "refined" and said.values["readout_s"] == 0 and "rolling" not in str(said.reason)
 
@@ -666,7 +666,7 @@ def test_what_predicts_worse_is_not_believed(walked, monkeypatch):
     tracks, model = walked
     # as if the refined model predicted what the other one does, and the other way round
     monkeypatch.setattr(
-        judge, "evaluate_held_out", lambda problem, x, seen: evaluate_held_out(problem, x, seen) * _sign(problem)
+        refinement, "evaluate_held_out", lambda problem, x, seen: evaluate_held_out(problem, x, seen) * _sign(problem)
     )
     made, said = refined_by(tracks.imu, model)
     assert "did not improve the held-out observations" in str(said.reason)
@@ -676,7 +676,7 @@ def test_what_predicts_worse_is_not_believed(walked, monkeypatch):
 
 def test_what_takes_too_much_memory_is_left_as_it_is(walked, monkeypatch):
     tracks, model = walked
-    monkeypatch.setattr(judge, "LIMITS", judge.RefineLimits(most_bytes=100_000))
+    monkeypatch.setattr(refinement, "LIMITS", refinement.RefineLimits(most_bytes=100_000))
     made, said = refined_by(tracks.imu, model)
     assert "GB" in str(said.reason)
     assert made.reconstruction is model.reconstruction
@@ -693,7 +693,7 @@ def test_what_does_not_converge_is_not_believed(walked, monkeypatch):
             one = solve(problem, start)
             return replace(one, converged=next(count) != restless)
 
-        monkeypatch.setattr(judge, "solve", solved)
+        monkeypatch.setattr(refinement, "solve", solved)
         made, said = refined_by(tracks.imu, model)
         assert why in str(said.reason)
         assert "converge" in str(said.reason)
@@ -706,7 +706,7 @@ def test_what_nothing_is_known_about_is_not_believed(walked, monkeypatch):
     def failed(problem, x):
         raise np.linalg.LinAlgError
 
-    monkeypatch.setattr(judge, "factor_information", failed)
+    monkeypatch.setattr(refinement, "factor_information", failed)
     made, said = refined_by(tracks.imu, model)
     assert "uncertainty cannot be determined" in str(said.reason)
     assert said.values["chi2"] < 1.5

@@ -14,8 +14,8 @@ from colmap_inertial.run.steps.config import config_as_toml, read_config
 from colmap_inertial.tools.batch import read_manifest
 from colmap_inertial.tools.batch.task import CaptureStatus, read_end, read_status, write_status
 from tests.helpers.cases import loop_over
+from tests.helpers.damage import mutated, refusals
 from tests.helpers.files import write_anew
-from tests.io.test_damaged_files import mutated, refusals
 
 MUTATIONS = 60
 MODEL = {

@@ -52,7 +52,7 @@ from colmap_inertial.run.commands import (
 from colmap_inertial.run.commands.frames import run_frames, run_images
 from colmap_inertial.run.commands.paths import check_output
 from colmap_inertial.run.preparation import calibrate, plan as imaging, sampling
-from colmap_inertial.run.preparation.judge import Looked, judge_each_frame, judge_sky
+from colmap_inertial.run.preparation.blur_check import Looked, judge_each_frame, judge_sky
 from colmap_inertial.run.preparation.plan import Treatments, plan_imaging, run_plan
 from colmap_inertial.run.preparation.preflight import stop_or_doubt
 from colmap_inertial.run.preparation.selection import part_of

@@ -10,8 +10,8 @@ from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat
 from colmap_inertial.core.options import JoinOptions, ScaleOptions
 from colmap_inertial.core.types import CameraTrajectory
 from colmap_inertial.inertial.join.evidence import find_links
+from colmap_inertial.inertial.join.grouping import join_submodels
 from colmap_inertial.inertial.join.joined_model import _sigma_log
-from colmap_inertial.inertial.join.judge import join_submodels
 from colmap_inertial.inertial.join.placement import FittedSubmodel
 from colmap_inertial.inertial.join.relative_poses import tie_cov, worst_sigmas
 from colmap_inertial.inertial.scale.posterior import FittedPath

@@ -19,7 +19,6 @@ from colmap_inertial.core.types import (
     CameraImuCalibration,
     CameraModel,
     CameraTrajectory,
-    Frame,
     FrameLog,
     FrameTiming,
     ImuRecording,
@@ -32,7 +31,7 @@ from colmap_inertial.io.pose_convention import ARRAYS, PoseConvention
 from colmap_inertial.motion.align import Alignment, AlignOptions, align_clocks, searched_around_s
 from colmap_inertial.motion.align.consensus import NO_MAJORITY, align_by_consensus
 from colmap_inertial.motion.align.conventions import LikelyConvention, likely_convention
-from colmap_inertial.motion.flow import Stabilisation, VisualRotation, find_stabilisation
+from colmap_inertial.motion.flow import GreyFrame, Stabilisation, VisualRotation, find_stabilisation
 
 Severity = Literal["info", "warning", "error"]
 SEVERITIES: tuple[Severity, ...] = ("info", "warning", "error")
@@ -224,7 +223,9 @@ class Recorded:
     in_video
         Where pictures were found in the video they were taken from.
     images
-        Decodes some of the timing's frames, by their places; ``None`` where there are none.
+        Frames in grey and in full by their names, in order of time; ``None`` where there are none.
+    in_full
+        Names of those that it has without another decode of a video, in order of time.
     """
 
     refused: Sequence[InertialError] = ()
@@ -241,7 +242,8 @@ class Recorded:
     calibration: CameraImuCalibration | None = None
     max_offset_s: float | None = None
     in_video: FramesInVideo | None = None
-    images: Callable[[Sequence[int]], Iterable[Frame]] | None = None
+    images: Callable[[Sequence[str]], Iterable[GreyFrame]] | None = None
+    in_full: Sequence[str] = ()
 
     @cached_property
     def implausible(self) -> tuple[FormatError, ...]:

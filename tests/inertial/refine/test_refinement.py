@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from colmap_inertial.core.geometry import so3_exp, so3_log
-from colmap_inertial.inertial.refine import _residuals, judge, world
+from colmap_inertial.inertial.refine import _residuals, refinement, world
 from colmap_inertial.inertial.refine.motion import PictureDrift
 from tests.helpers.cases import loop_over
 
@@ -76,8 +76,8 @@ def test_a_motion_errs_by_its_drift_and_by_what_a_wrong_scale_and_up_do_to_all_o
 
 
 def test_errors_in_pixels_are_roots_of_mean_costs():
-    assert judge._convert_cost_to_px(np.array([1.0, 4.0, 7.0]), 0.5) == pytest.approx(1.0)
-    assert judge._convert_cost_to_px(np.zeros(0), 0.5) == 0.0
+    assert refinement._convert_cost_to_px(np.array([1.0, 4.0, 7.0]), 0.5) == pytest.approx(1.0)
+    assert refinement._convert_cost_to_px(np.zeros(0), 0.5) == 0.0
 
 
 @loop_over(
@@ -88,14 +88,14 @@ def test_errors_in_pixels_are_roots_of_mean_costs():
 def test_what_the_imu_adds_is_counted(links, nodes, expected):
     flags = [np.arange(20) < count for count in (links, nodes)]
     inertial = SimpleNamespace(linked=flags[0], touched=flags[1])
-    assert judge._count_freedom(SimpleNamespace(inertial=inertial)) == expected
+    assert refinement._count_freedom(SimpleNamespace(inertial=inertial)) == expected
 
 
 @loop_over(
     ("alone", "seen", "chi2", "change", "code"),
     [
         (True, True, 3.0, -0.1, None),
-        (True, True, 3.01, -0.1, "imu-contradicts-pictures"),
+        (True, True, 3.01, -0.1, "imu-contradicts-images"),
         (True, True, 1.0, -0.011, None),
         (True, True, 1.0, -0.01, "refinement-no-better"),
         (False, True, 1.0, -0.1, "pictures-not-converged"),
@@ -104,7 +104,7 @@ def test_what_the_imu_adds_is_counted(links, nodes, expected):
 )
 def test_a_refinement_is_doubted(alone, seen, chi2, change, code):
     solutions = [SimpleNamespace(converged=rests) for rests in (alone, seen)]
-    doubt = judge._find_doubt(*solutions, chi2, change, 0.01)
+    doubt = refinement._find_doubt(*solutions, chi2, change, 0.01)
     assert (None if doubt is None else doubt.code) == code
 
 
@@ -132,7 +132,7 @@ def test_clocks_are_too_far_apart_where_readings_do_not_reach(offset_s, clock_ra
         turning=SimpleNamespace(half_span_s=0.05),
     )
     x = SimpleNamespace(offset_s=offset_s, clock_rate=clock_rate, readout_s=readout_s)
-    assert bool(judge._find_late_clock(SimpleNamespace(inertial=inertial), x)) == refused
+    assert bool(refinement._find_late_clock(SimpleNamespace(inertial=inertial), x)) == refused
 
 
 def test_every_tenth_of_points_that_are_seen_often_is_held_out():
@@ -141,31 +141,31 @@ def test_every_tenth_of_points_that_are_seen_often_is_held_out():
     point = np.repeat(np.arange(8), lengths)
     observations = SimpleNamespace(first=first, point=point, frame=np.zeros(len(point)))
     often = [m for m in range(len(point)) if lengths[point[m]] >= 4]
-    assert np.flatnonzero(judge._choose_held_out(observations)).tolist() == often[5::10]
+    assert np.flatnonzero(refinement._choose_held_out(observations)).tolist() == often[5::10]
 
 
 def test_a_sigma_of_the_readout_is_that_of_its_column(monkeypatch):
     cov = np.diag(np.arange(1.0, 41.0)) * 1e-6
-    monkeypatch.setattr(judge, "factor_information", lambda problem, x: SimpleNamespace(shared_cov=lambda: cov))
-    found = judge._estimate_readout(SimpleNamespace(), SimpleNamespace(readout_s=0.02))
-    assert found == (0.02, pytest.approx(np.sqrt(1e-6 * (judge.READOUT + 1))))
+    monkeypatch.setattr(refinement, "factor_information", lambda problem, x: SimpleNamespace(shared_cov=lambda: cov))
+    found = refinement._estimate_readout(SimpleNamespace(), SimpleNamespace(readout_s=0.02))
+    assert found == (0.02, pytest.approx(np.sqrt(1e-6 * (refinement.READOUT + 1))))
 
     def singular(problem, x):
         raise np.linalg.LinAlgError
 
-    monkeypatch.setattr(judge, "factor_information", singular)
-    assert judge._estimate_readout(SimpleNamespace(), SimpleNamespace(readout_s=0.02)) is None
+    monkeypatch.setattr(refinement, "factor_information", singular)
+    assert refinement._estimate_readout(SimpleNamespace(), SimpleNamespace(readout_s=0.02)) is None
 
 
 def test_noise_that_cannot_be_measured_stays_as_it_was(monkeypatch):
     def singular(problem, x):
         raise np.linalg.LinAlgError
 
-    monkeypatch.setattr(judge, "apply_measured_noise", singular)
-    monkeypatch.setattr(judge, "measure_shared_errors", lambda problem, x: 4.0)
-    monkeypatch.setattr(judge, "_select_observations", lambda problem, keep: problem)
+    monkeypatch.setattr(refinement, "apply_measured_noise", singular)
+    monkeypatch.setattr(refinement, "measure_shared_errors", lambda problem, x: 4.0)
+    monkeypatch.setattr(refinement, "_select_observations", lambda problem, keep: problem)
     problem = Pixels(inertial=1, shared_errors=1.0)
-    assert judge._measure_noise(problem, np.ones(3, dtype=bool), None) == Pixels(inertial=1, shared_errors=4.0)
+    assert refinement._measure_noise(problem, np.ones(3, dtype=bool), None) == Pixels(inertial=1, shared_errors=4.0)
 
 
 @dataclass(frozen=True)
@@ -181,8 +181,8 @@ def test_frames_whose_observations_change_together_are_one_each():
     frame = rng.permutation(np.repeat(np.arange(0, 400, 2), 30))
     by_frame, own = rng.normal(-0.1, 0.3, 400), rng.normal(0.0, 0.5, len(frame))
     for together, sigma in ((0.0, 0.5 / 6000**0.5), (1.0, (0.3**2 / 200 + 0.5**2 / 6000) ** 0.5)):
-        change, found = judge._average_change(np.ones(6000), 1 + together * by_frame[frame] + own, frame)
+        change, found = refinement._average_change(np.ones(6000), 1 + together * by_frame[frame] + own, frame)
         assert found == pytest.approx(sigma, rel=0.15)
         assert abs(change + 0.1 * together) < 4 * sigma
-    assert judge._average_change(np.ones(9), np.zeros(9), np.full(9, 3)) == (-1.0, np.inf)
-    assert judge._average_change(np.ones(0), np.ones(0), frame[:0]) == (0.0, np.inf)
+    assert refinement._average_change(np.ones(9), np.zeros(9), np.full(9, 3)) == (-1.0, np.inf)
+    assert refinement._average_change(np.ones(0), np.ones(0), frame[:0]) == (0.0, np.inf)

@@ -342,7 +342,7 @@ def _find_doubt(alone: Solution, seen: Solution, chi2: float, change: float, spr
     if not seen.converged:
         return Fact("refinement-not-converged")
     if chi2 > LIMITS.largest_chi2:
-        return Fact("imu-contradicts-pictures", chi2=chi2)
+        return Fact("imu-contradicts-images", chi2=chi2)
     if change >= -spread:
         return Fact("refinement-no-better")
     return None
