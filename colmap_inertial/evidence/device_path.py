@@ -53,13 +53,10 @@ class DevicePath:
         The model's scale by the device's metres, in doubt where the shapes differ.
     device_from_model
         (3, 3) rotation of the worlds.
-    residual_m
-        Root mean square of what the placed positions differ by.
     """
 
     evidence: ScaleEvidence
     device_from_model: Array
-    residual_m: float
 
 
 def place_device_path(
@@ -117,9 +114,7 @@ def place_device_path(
             *_find_bend(both, up_in_device, limits),
         ),
     )
-    apart = both.centred(both.device) - math.exp(log_scale) * both.centred(both.model) @ turn.T
-    residual_m = float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
-    return DevicePath(evidence=evidence, device_from_model=turn, residual_m=residual_m)
+    return DevicePath(evidence=evidence, device_from_model=turn)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -26,6 +26,7 @@ from colmap_inertial.io.files import first_line
 from colmap_inertial.io.frame_times import frame_log, stamps_of_log
 from colmap_inertial.io.imu_text import SensorTable, read_csv, read_tables
 from colmap_inertial.io.samples import nearest
+from colmap_inertial.io.stamps import TimeColumns
 from colmap_inertial.io.tables import Table, read_table, split_unit
 from colmap_inertial.io.units import TIME_UNITS_NS, DeclaredUnits, unit_of
 
@@ -50,8 +51,9 @@ def read_opencamera(path: Path, units: DeclaredUnits) -> ImuRecording:
     """
     gyro_file = _one_gyro_file(path)
     accel_file = _sibling(gyro_file, "accel.csv")
+    time = TimeColumns(columns=(4,), units=("ns",))
     gyro, accel = (
-        SensorTable(file=file, time=4, time_unit="ns", columns=(1, 2, 3), unit=unit)
+        SensorTable(file=file, time=time, columns=(1, 2, 3), unit=unit)
         for file, unit in ((gyro_file, units.gyro or "rad/s"), (accel_file, units.accel or "m/s2"))
     )
     return read_tables(gyro, accel if accel_file.is_file() else None, layout="x y z t_ns")

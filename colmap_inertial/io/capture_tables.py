@@ -193,21 +193,17 @@ def _read_correction(table: Section | None, quantity: Quantity) -> tuple[str | N
 def _read_sensor_table(table: Section, quantity: Quantity) -> tuple[SensorTable, Axes | None]:
     table.require_known(_SENSOR_KEYS)
     file = table.require("file", table.file("file"))
-    stamps = _read_time(table)
+    time = _read_time(table)
     columns = table.require("columns", table.raw("columns"))
     unit = table.require("unit", table.choice("unit", SENSOR_UNITS[quantity]))
     if not isinstance(columns, list) or len(columns) != 3 or not all(map(_is_column, columns)):
         table.fail("columns", Fact("not-three-columns", found=repr(columns)))
-    if len({*stamps.columns, *columns}) != len(stamps.columns) + 3:
+    if len({*time.columns, *columns}) != len(time.columns) + 3:
         table.fail("columns", Fact("columns-repeated"))
     x, y, z = columns
     described = SensorTable(
         file=file,
-        time=stamps.columns,
-        time_unit=stamps.units,
-        time_counts_per_s=stamps.counts_per_second,
-        rate_hz=stamps.rate_hz,
-        date_order=stamps.date_order,
+        time=time,
         columns=(x, y, z),
         unit=unit,
         where=_read_where(table),

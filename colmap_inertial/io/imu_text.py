@@ -30,7 +30,7 @@ from colmap_inertial.io.interleaved import (
 from colmap_inertial.io.samples import Samples, order_samples
 from colmap_inertial.io.sensor_columns import Columns, SensorColumns
 from colmap_inertial.io.sensor_yaml import read_imu_noise
-from colmap_inertial.io.stamps import DateOrder, TimeColumns, read_stamps
+from colmap_inertial.io.stamps import TimeColumns, read_stamps
 from colmap_inertial.io.tables import Table, parse_bytes, read_table, recognise
 from colmap_inertial.io.units import SENSOR_NAMES, SENSOR_UNITS, TIME_UNITS_NS, DeclaredUnits, Quantity, seconds
 
@@ -51,43 +51,25 @@ class SensorTable:
     ----------
     file
         The table.
-    time, columns
-        Columns of the stamps and of x, y, z: names in the header, or numbers counted from 1. Several columns of stamps
-        are added up.
-    time_unit, unit
-        Of the stamps (of each column), and of the samples. Stamps may be ``"date"``.
+    time
+        Where the time stands.
+    columns
+        Of x, y, z: names in the header, or numbers counted from 1.
+    unit
+        Of the samples.
     zero, counts_per_unit
         Of raw counts: what the table says for nothing, and how many make one ``unit``.
-    time_counts_per_s, rate_hz
-        Of a counter, in place of ``time_unit``; of samples, in place of stamps.
-    date_order
-        Of dates that do not begin with the year.
     where
         Column and value of the rows that are this sensor's; ``None`` for all.
     """
 
     file: Path
-    time: str | int | tuple[str | int, ...]
-    time_unit: str | tuple[str, ...]
+    time: TimeColumns
     columns: tuple[str | int, str | int, str | int]
     unit: str
     zero: float = 0.0
     counts_per_unit: float = 1.0
-    time_counts_per_s: float | None = None
-    rate_hz: float | None = None
-    date_order: DateOrder | None = None
     where: tuple[str | int, str] | None = None
-
-    @property
-    def stamps(self) -> TimeColumns:
-        """Where the time stands."""
-        if self.rate_hz is not None:
-            return TimeColumns(rate_hz=self.rate_hz)
-        columns = self.time if isinstance(self.time, tuple) else (self.time,)
-        units = self.time_unit if isinstance(self.time_unit, tuple) else (self.time_unit,)
-        if self.time_counts_per_s is not None:
-            return TimeColumns(columns=columns, counts_per_second=self.time_counts_per_s)
-        return TimeColumns(columns=columns, units=units, date_order=self.date_order)
 
 
 def read_tables(gyro: SensorTable, accel: SensorTable | None, *, layout: str | None = None) -> ImuRecording:
@@ -128,8 +110,9 @@ def read_inertial_scale_imu(path: Path, units: DeclaredUnits) -> ImuRecording:
     """Read ``gyroscope.txt`` and ``accelerometer.txt``: rows ``t_ns x y z``, rad/s and m/s2."""
     if not is_inertial_scale(path):
         raise FormatError(path, Fact("inertial-scale-files-missing"))
+    time = TimeColumns(columns=(1,), units=("ns",))
     gyro, accel = (
-        SensorTable(file=path / f"{name}.txt", time=1, time_unit="ns", columns=(2, 3, 4), unit=unit)
+        SensorTable(file=path / f"{name}.txt", time=time, columns=(2, 3, 4), unit=unit)
         for name, unit in (("gyroscope", units.gyro or "rad/s"), ("accelerometer", units.accel or "m/s2"))
     )
     return read_tables(gyro, accel, layout="t_ns x y z")
@@ -394,18 +377,13 @@ def find_separate_tables(folder: Path) -> Columns | None:
 def make_sensor_table(path: Path, part: SensorColumns) -> SensorTable:
     """The description of a sensor whose columns are known."""
     assert part.columns is not None and part.time is not None and part.unit is not None
-    time = part.time
     x, y, z = (column + 1 for column in part.columns)
     return SensorTable(
         file=path,
-        time=time.columns,
-        time_unit=time.units,
+        time=part.time,
         columns=(x, y, z),
         unit=part.unit,
         counts_per_unit=part.counts_per_unit or 1.0,
-        time_counts_per_s=time.counts_per_second,
-        rate_hz=time.rate_hz,
-        date_order=time.date_order,
         where=part.where,
     )
 
@@ -419,7 +397,7 @@ def _read_described(source: SensorTable, quantity: Quantity, layout: str | None)
     values = table.numbers([table.column(column) for column in source.columns])
     if source.zero != 0 or source.counts_per_unit != 1:
         values = (values - source.zero) / source.counts_per_unit
-    t_ns, mended = read_stamps(table, source.stamps)
+    t_ns, mended = read_stamps(table, source.time)
     table = replace(table, repairs=(*table.repairs, *mended))
     return order_rows(table, quantity, source.unit, t_ns, values)
 

@@ -20,7 +20,7 @@ from colmap_inertial.io.table_report import TableReport, report_table
 from colmap_inertial.run.commands.paths import check_output
 from colmap_inertial.run.commands.scale import ScaleSource, brings_imu, read_source
 from colmap_inertial.run.preparation.plan import add_stated_exposures
-from colmap_inertial.run.preparation.preflight import CheckInputs, TolerantReader, measure_recording
+from colmap_inertial.run.preparation.preflight import TolerantReader, add_images
 
 
 def diagnose_source(
@@ -85,19 +85,22 @@ def collect(source: ScaleSource, progress: Progress) -> Recorded:
     FormatError, TimingError
         Where that leaves nothing.
     """
-    path = source.source
+    path, capture = source.source, None
     if source.imu is not None or brings_imu(source):
-        checked = read_source(source)[0]
+        recorded, capture, _ = read_source(source)
     elif _describes_frames(path):
-        checked = _read_capture(load_capture(path), source.calibration)
+        capture = load_capture(path)
+        recorded = _read_capture(capture, source.calibration)
     else:
-        checked = _read_imu(path)
-    if checked.imu is None and checked.trajectory is None and checked.timing is None and checked.capture is None:
-        error = checked.refused[0]
+        recorded = _read_imu(path)
+    if capture is not None:
+        return add_images(recorded, capture, progress)
+    if recorded.imu is None and recorded.trajectory is None and recorded.timing is None:
+        error = recorded.refused[0]
         # a file of no known kind is bad input; one that is known and damaged is a finding
         if unreadable(error).code in ("unreadable", "untimed"):
             raise error
-    return measure_recording(checked, progress)
+    return recorded
 
 
 def _describes_frames(path: Path) -> bool:
@@ -107,13 +110,13 @@ def _describes_frames(path: Path) -> bool:
     return any((base / "cam0" / "data.csv").is_file() for base in (path, path / "mav0"))
 
 
-def _read_imu(path: Path) -> CheckInputs:
+def _read_imu(path: Path) -> Recorded:
     reader = TolerantReader()
     # arguments are read in order: the reason for a refusal is there by the second
-    return CheckInputs(imu=reader.attempt(lambda: read_unchecked_imu(path)), refused=tuple(reader.refused))
+    return Recorded(imu=reader.attempt(lambda: read_unchecked_imu(path)), refused=tuple(reader.refused))
 
 
-def _read_capture(capture: Capture, calibration: CalibrationFiles) -> CheckInputs:
+def _read_capture(capture: Capture, calibration: CalibrationFiles) -> Recorded:
     reader = TolerantReader()
     timing = None
     if capture.frames is not None:
@@ -122,11 +125,13 @@ def _read_capture(capture: Capture, calibration: CalibrationFiles) -> CheckInput
         known = timing
         reader.attempt(lambda: pair_rig_frames(capture, known))
     imu = None if capture.imu is None else reader.attempt(lambda: read_unchecked_capture_imu(capture))
-    return CheckInputs(
-        imu=imu,
-        capture=capture,
-        timing=timing,
-        prior=prior_calibration(capture, calibration),
-        max_offset_s=largest_offset_s(capture.shared_clock),
+    return Recorded(
         refused=tuple(reader.refused),
+        imu=imu,
+        timing=timing,
+        log=capture.frame_log,
+        is_capture=True,
+        camera=capture.camera,
+        calibration=prior_calibration(capture, calibration),
+        max_offset_s=largest_offset_s(capture.shared_clock),
     )

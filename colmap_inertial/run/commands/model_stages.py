@@ -33,12 +33,8 @@ from colmap_inertial.run.steps.session import Session
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Staged:
-    """A model between two stages: what the result says of it, and it itself; ``None`` where it was refused."""
-
-    result: ScaledModel
-    model: Model | None
+#: A model between two stages: what the result says of it, and it itself; ``None`` where it was refused.
+_Staged = tuple[ScaledModel, Model | None]
 
 
 @dataclass(eq=False, kw_only=True)
@@ -83,17 +79,17 @@ class ModelStageRun:
         if joining is not None:
             staged = list(staged)
             if self.numbered:
-                unjoined = {one.model.colmap_index: one.model for one in staged if one.model is not None}
+                unjoined = {model.colmap_index: model for _, model in staged if model is not None}
             staged, gaps = self._join(joining, staged)
         results = []
-        for one in staged:
-            if one.model is None:
-                log.info("model %d: refused %s", one.result.index, "; ".join(sentences(one.result.scale.reasons)))
-                results.append(one.result)
+        for result, model in staged:
+            if model is None:
+                log.info("model %d: refused %s", result.index, "; ".join(sentences(result.scale.reasons)))
+                results.append(result)
                 continue
-            results.append(self._write(one.result, run_in_turn(self.stages[at + 1 :], one.model)))
+            results.append(self._write(result, run_in_turn(self.stages[at + 1 :], model)))
             if self.numbered:
-                self._write_other_parts(one.model, unjoined)
+                self._write_other_parts(model, unjoined)
         if len(self._untimed) == count:
             raise self._untimed[0]
         self.session.progress("metric", count, count)
@@ -117,36 +113,36 @@ class ModelStageRun:
             )
             if (error := _find_untimed(model)) is not None:
                 self._untimed.append(error)
-                yield _Staged(result=replace(result, scale=_refuse_scale(error.fact)), model=None)
+                yield replace(result, scale=_refuse_scale(error.fact)), None
                 continue
             model = replace(model, reconstruction=place.enter(model.reconstruction))
             made = run_in_turn(stages, model)
-            yield _Staged(result=result, model=made)
+            yield result, made
             for part in self._torn.split(model, made) if torn_apart and not self.numbered else ():
                 if _find_untimed(part) is None:
                     self._places[part.colmap_index] = place
                     of_part = replace(result, colmap_index=part.colmap_index, identity=None)
-                    yield _Staged(result=of_part, model=run_in_turn(stages, part))
+                    yield of_part, run_in_turn(stages, part)
 
     def _join(self, stage: JoiningStage, staged: Sequence[_Staged]) -> tuple[list[_Staged], tuple[Gap, ...]]:
         """Run a stage on all models at once, the largest first; numbers of models that were joined become free."""
         if len(staged) == 1:
-            (one,) = staged
-            return [replace(one, model=None if one.model is None else stage(one.model))], ()
-        models = [one.model for one in staged if one.model is not None]
+            ((result, alone),) = staged
+            return [(result, None if alone is None else stage(alone))], ()
+        models = [model for _, model in staged if model is not None]
         if self._torn:
             models.sort(key=lambda model: -int(model.reconstruction.num_reg_images()))
         joined, gaps = stage.join_models(models)
-        result_of = {one.result.colmap_index: one.result for one in staged}
-        left = [one for one in staged if one.model is None]
+        result_of = {result.colmap_index: result for result, _ in staged}
+        left: list[_Staged] = [(result, None) for result, model in staged if model is None]
         for model in self._torn.describe_joined(joined):
             result = result_of[model.colmap_index]
             if model.parts:
                 result = replace(result, summary=summarize(model.reconstruction))
-            left.append(_Staged(result=result, model=model))
-        left.sort(key=lambda one: (-one.result.summary["registered_images"], one.result.colmap_index))
+            left.append((result, model))
+        left.sort(key=lambda one: (-one[0].summary["registered_images"], one[0].colmap_index))
         if not self.numbered:
-            left = [replace(one, result=replace(one.result, index=i)) for i, one in enumerate(left)]
+            left = [(replace(result, index=i), model) for i, (result, model) in enumerate(left)]
         return left, gaps
 
     def _write(self, result: ScaledModel, model: Model) -> ScaledModel:

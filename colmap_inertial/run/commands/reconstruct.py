@@ -150,12 +150,10 @@ class _CheckedCapture:
 
     Attributes
     ----------
-    capture
-        Without its long exposures where they are not fused.
     raw
         The IMU, before any calibration of its own.
     recording
-        With all frames.
+        With all frames; its capture has no long exposures where they are not fused.
     fuser
         What fuses pairs of exposures; ``None`` where none are fused.
     reference
@@ -170,7 +168,6 @@ class _CheckedCapture:
         Images of the other cameras of a rig; ``None`` without one.
     """
 
-    capture: Capture
     raw: ImuRecording
     recording: Recording
     fuser: Fuser | None
@@ -217,7 +214,6 @@ def _read_capture(
     gravity = _gravity_priors(recording, options)
     check_pair_names(timing.names)
     return _CheckedCapture(
-        capture=capture,
         raw=raw,
         recording=recording,
         fuser=fuser,
@@ -274,7 +270,7 @@ def _reconstruct(
     findings: Callable[[Diagnosis], None],
 ) -> ReconstructResult:
     given = _read_capture(path, options, reference, stages)
-    capture, used_calibration = given.capture, describe_files(options.calibration)
+    capture, used_calibration = given.recording.capture, describe_files(options.calibration)
     device: Device = "cpu"  # of pycolmap, which only verifies where an installed COLMAP does the rest
     if options.colmap_executable is None:
         device = mapping_device(options.mapping, deterministic=options.deterministic)
@@ -301,7 +297,7 @@ def _run_steps(
     findings: Callable[[Diagnosis], None],
 ) -> ReconstructResult:
     """The steps of a run, from the check beforehand to the dense reconstruction."""
-    workspace, capture, recording = session.workspace, given.capture, given.recording
+    workspace, capture, recording = session.workspace, given.recording.capture, given.recording
     # whoever made a database chose its frames
     choice = options.frames if options.database is None else replace(options.frames, use="all")
     asked = ask_for_plan(options, stages.frame, stages.keypoint, pairs=given.fuser is not None)

@@ -12,9 +12,8 @@ from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import FormatError, NotObservableError, TimingError
 from colmap_inertial.core.facts import Fact, as_fact
 from colmap_inertial.core.options import ScaleOptions
-from colmap_inertial.core.progress import silent
 from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, FrameTiming, ImuRecording, ScaleEstimate
-from colmap_inertial.diagnose import diagnose
+from colmap_inertial.diagnose import Recorded, diagnose
 from colmap_inertial.inertial.scale import estimate_scale, first_seconds, learn_lever_arm
 from colmap_inertial.io.calibration import (
     CalibrationFiles,
@@ -50,7 +49,7 @@ from colmap_inertial.motion.align.consensus import align_by_consensus
 from colmap_inertial.motion.align.conventions import likely_convention
 from colmap_inertial.run.commands.paths import check_output, only_model
 from colmap_inertial.run.commands.sensors import scale_by_sensors
-from colmap_inertial.run.preparation.preflight import CheckInputs, TolerantReader, measure_recording
+from colmap_inertial.run.preparation.preflight import TolerantReader
 from colmap_inertial.run.stages.metric import MetricStage
 from colmap_inertial.run.steps.workspace import refuse_links_around
 
@@ -88,20 +87,23 @@ class ScaleSource:
 class TimedPoses:
     """A trajectory with its IMU recording.
 
-    ``checked`` is what the check beforehand looks at; ``imu`` is corrected by its own calibration, where there is one.
-    ``start_s`` is when the camera began, where frame times tell.
+    ``recorded`` is what the check beforehand looks at; ``imu`` is corrected by its own calibration, where there is one.
     """
 
-    trajectory: CameraTrajectory
+    recorded: Recorded
     imu: ImuRecording
-    checked: CheckInputs
+    capture: Capture | None
     shared_clock: bool
-    start_s: float | None = None
     notes: Sequence[Fact] = ()
 
     @property
+    def trajectory(self) -> CameraTrajectory:
+        assert self.recorded.trajectory is not None
+        return self.recorded.trajectory
+
+    @property
     def calibration(self) -> CameraImuCalibration | None:
-        return self.checked.prior
+        return self.recorded.calibration
 
 
 def brings_imu(source: ScaleSource) -> bool:
@@ -131,25 +133,26 @@ def load_source(source: ScaleSource) -> TimedPoses:
     """
     if not brings_imu(source):
         _require_all(source)
-    checked, notes = read_source(source)
-    for error in checked.refused:
+    recorded, capture, notes = read_source(source)
+    for error in recorded.refused:
         raise error
-    imu, trajectory, timing = checked.imu, checked.trajectory, checked.timing
-    assert imu is not None and isinstance(trajectory, CameraTrajectory)
+    imu = recorded.imu
+    assert imu is not None
     check_readings(imu)
     files, shared_clock = _read_calibrations(source)
     return TimedPoses(
-        trajectory=trajectory,
+        recorded=recorded,
         imu=imu if files.imu is None else files.imu.corrected(imu),
-        checked=checked,
+        capture=capture,
         shared_clock=shared_clock,
-        start_s=None if timing is None else float(timing.pose_t_s()[0]),
         notes=notes,
     )
 
 
-def read_source(source: ScaleSource) -> tuple[CheckInputs, Sequence[Fact]]:
-    """Read what there is of poses and the IMU recorded along, with notes; what cannot be read is among the refused.
+def read_source(source: ScaleSource) -> tuple[Recorded, Capture | None, Sequence[Fact]]:
+    """Read what there is of poses and the IMU recorded along; what cannot be read is among the refused.
+
+    Beside it come the capture that describes a model's images, where there is one, and notes.
 
     Raises
     ------
@@ -185,17 +188,19 @@ def read_source(source: ScaleSource) -> tuple[CheckInputs, Sequence[Fact]]:
     imu = reader.attempt(lambda: read_unchecked_imu(path if source.imu is None else source.imu))
     files, shared_clock = _read_calibrations(source)
     prior = files.camera_imu
-    checked = CheckInputs(
+    recorded = Recorded(
+        refused=tuple(reader.refused),
         imu=imu,
-        capture=capture,
         timing=timing,
+        log=None if capture is None else capture.frame_log,
+        is_capture=capture is not None and trajectory is None,
         trajectory=trajectory,
         read_as=read_as,
-        prior=prior if prior is None or files.imu is None else files.imu.loosened(prior),
+        camera=None if capture is None else capture.camera,
+        calibration=prior if prior is None or files.imu is None else files.imu.loosened(prior),
         max_offset_s=largest_offset_s(shared_clock),
-        refused=tuple(reader.refused),
     )
-    return checked, notes
+    return recorded, capture, notes
 
 
 def _captures(source: ScaleSource) -> list[Capture]:
@@ -288,7 +293,7 @@ def _refuse_another_convention(recording: TimedPoses, options: AlignOptions, qua
     likely = likely_convention(
         recording.trajectory,
         recording.imu,
-        read_as=recording.checked.read_as,
+        read_as=recording.recorded.read_as,
         prior=recording.calibration,
         options=options,
     )
@@ -359,9 +364,7 @@ def _scale_by_imu(source: ScaleSource, options: ScaleOptions, *, first_s: float 
     options = dataclasses.replace(options, max_offset_s=limit_s)
     if first_s is not None:
         recording = _begin_of(recording, first_s, limit_s)
-    trajectory = recording.trajectory
-    checked = dataclasses.replace(recording.checked, trajectory=trajectory, max_offset_s=limit_s)
-    recorded = measure_recording(checked, silent)
+    recorded = dataclasses.replace(recording.recorded, max_offset_s=limit_s)
     diagnosis = diagnose(recorded)
     stops = tuple(finding.reason for finding in diagnosis.stopping)
     left_out: tuple[Fact, ...] = ()
@@ -369,7 +372,8 @@ def _scale_by_imu(source: ScaleSource, options: ScaleOptions, *, first_s: float 
         estimate = ScaleEstimate.refused("none", *stops, Fact("force-goes-on"))
     else:
         # what is declared says less than what was recorded
-        recording = dataclasses.replace(recording, checked=dataclasses.replace(checked, prior=recorded.believed))
+        believed = dataclasses.replace(recorded, calibration=recorded.believed)
+        recording = dataclasses.replace(recording, recorded=believed)
         left_out = tuple(
             Fact("declared-left-out", finding=fact)
             for fact in recorded.contradicted.facts
@@ -377,11 +381,11 @@ def _scale_by_imu(source: ScaleSource, options: ScaleOptions, *, first_s: float 
         )
         doubts = (*stops, *(finding.reason for finding in diagnosis.doubting))
         estimate = estimate_scale(
-            trajectory,
+            recording.trajectory,
             recording.imu,
             calibration=recording.calibration,
             options=options,
-            read_as=recording.checked.read_as,
+            read_as=recorded.read_as,
         )
         estimate = add_doubts(_judge_shutter(source.source, recording, options, estimate), doubts)
     notes = (*left_out, *estimate.notes, *recording.imu.repairs, *recording.notes)
@@ -394,30 +398,29 @@ _AROUND_S = 1.0
 
 def _begin_of(recording: TimedPoses, first_s: float, max_offset_s: float | None) -> TimedPoses:
     """The first seconds of a recording; where the clocks cannot be aligned, with the whole of its IMU."""
-    trajectory = first_seconds(recording.trajectory, first_s, start_s=recording.start_s)
-    cut = dataclasses.replace(recording, trajectory=trajectory)
+    recorded, timing = recording.recorded, recording.recorded.timing
+    start_s = None if timing is None else float(timing.pose_t_s()[0])
+    trajectory = first_seconds(recording.trajectory, first_s, start_s=start_s)
+    recorded = dataclasses.replace(recorded, trajectory=trajectory)
     try:
         options = AlignOptions(max_offset_s=max_offset_s)
         aligned, _ = align_by_consensus(trajectory, recording.imu, prior=recording.calibration, options=options)
     except NotObservableError:
-        return cut
+        return dataclasses.replace(recording, recorded=recorded)
     timed = CameraTimedImu(imu=recording.imu, calibration=aligned.calibration, camera_epoch_ns=trajectory.epoch_ns)
     around_s = trajectory.t_s[0] - _AROUND_S, trajectory.t_s[-1] + _AROUND_S
-    checked_imu = recording.checked.imu
-    if checked_imu is not None:
-        whole = CameraTimedImu(imu=checked_imu, calibration=aligned.calibration, camera_epoch_ns=trajectory.epoch_ns)
-        checked_imu = whole.between(*around_s)
-    return dataclasses.replace(
-        cut, imu=timed.between(*around_s), checked=dataclasses.replace(recording.checked, imu=checked_imu)
-    )
+    if recorded.imu is not None:
+        whole = dataclasses.replace(timed, imu=recorded.imu)
+        recorded = dataclasses.replace(recorded, imu=whole.between(*around_s))
+    return dataclasses.replace(recording, imu=timed.between(*around_s), recorded=recorded)
 
 
 def _judge_shutter(
     folder: Path, recording: TimedPoses, options: ScaleOptions, estimate: ScaleEstimate
 ) -> ScaleEstimate:
     """The scale of a model; where its images show a rolling shutter that it ignores, it says so."""
-    timing, capture = recording.checked.timing, recording.checked.capture
-    if recording.checked.read_as != COLMAP or timing is None or estimate.verdict == "refused":
+    timing, capture = recording.recorded.timing, recording.capture
+    if recording.recorded.read_as != COLMAP or timing is None or estimate.verdict == "refused":
         return estimate
     if timing.readout_s is None and capture is not None:
         timing = dataclasses.replace(timing, readout_s=capture.readout_s, readout_direction=capture.readout_direction)

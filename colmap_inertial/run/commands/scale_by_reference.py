@@ -40,7 +40,7 @@ from colmap_inertial.core.options import (
     WorldAxes,
 )
 from colmap_inertial.core.progress import Progress, report_each, silent
-from colmap_inertial.core.types import CameraTrajectory, FrameTiming
+from colmap_inertial.core.types import FrameTiming
 from colmap_inertial.core.types.evidence import AbsentSensor, CombinedScale, ScaleEvidence, Sensor
 from colmap_inertial.evidence.combine import combine, judge_device
 from colmap_inertial.io.calibration import calibration_prior
@@ -165,16 +165,16 @@ def scale_project_by(
             ValidateOptions(unscaled=True),
             progress=lambda done, total: progress("validation", done, total),
         )
-    lengths = _ask_lengths(reference, validation, scale_from)
+    evidence, absent, made_by = _ask_lengths(reference, validation, scale_from)
     said = _ask_sensors(capture or _describe(project, source), folder, images, scale_from, progress)
-    combined = combine([*lengths.evidence, *said.evidence], [*lengths.absent, *said.absent])
-    if said.path_of_device is not None:
-        combined = dataclasses.replace(combined, device=judge_device(combined, said.path_of_device))
+    combined = combine([*evidence, *said.evidence], [*absent, *said.absent])
+    if said.device is not None:
+        combined = dataclasses.replace(combined, device=judge_device(combined, said.device))
     if combined.verdict == "refused":
         raise NotObservableError("scale", Fact("found-together", found=combined.reasons))
     notes = []
-    similarity, up = turn_up(combined.metres_per_unit, combined.sigma, said.model, world)
-    made_of = "; ".join([*lengths.made_of, *(name_of(one.sensor) for one in said.evidence)])
+    similarity, up = turn_up(combined.metres_per_unit, combined.sigma, said, world)
+    made_of = "; ".join([*made_by, *(name_of(one.sensor) for one in said.evidence)])
     similarity = dataclasses.replace(similarity, provenance=made_of)
     notes.append(up)
     if validation is not None:
@@ -197,47 +197,27 @@ def scale_project_by(
     return by_reference
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Lengths:
-    """What known lengths say, in the model's units, and what they were measured by, in words."""
-
-    evidence: tuple[ScaleEvidence, ...] = ()
-    absent: tuple[AbsentSensor, ...] = ()
-    made_of: tuple[str, ...] = ()
-
-
 def _ask_lengths(
     reference: ReferenceOptions, validation: Validation | None, scale_from: Sequence[ScaleFrom]
-) -> _Lengths:
-    """The target and the known distance; a target that only says what the markers of a distance are does not count."""
-    found = _Lengths()
+) -> tuple[list[ScaleEvidence], list[AbsentSensor], list[str]]:
+    """What the target and the known distance say, which says nothing, and what they were measured by, in words.
+
+    A target that only says what the markers of a distance are does not count.
+    """
+    evidence, absent, made_of = list[ScaleEvidence](), list[AbsentSensor](), list[str]()
     counts = reference.distance is None if not scale_from else "target" in scale_from
     if validation is not None and counts:
         if validation.doubts:
-            found = _Lengths(absent=(AbsentSensor(sensor="target", reasons=tuple(validation.doubts)),))
+            absent.append(AbsentSensor(sensor="target", reasons=tuple(validation.doubts)))
         else:
-            target, made_of = scale_by_target(validation)
-            found = _Lengths(evidence=(target,), made_of=(made_of,))
+            target, by = scale_by_target(validation)
+            evidence.append(target)
+            made_of.append(by)
     if reference.distance is not None and (not scale_from or "distance" in scale_from):
-        distance, made_of = scale_by_distance(reference, validation)
-        found = _Lengths(evidence=(*found.evidence, distance), absent=found.absent, made_of=(*found.made_of, made_of))
-    return found
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Said:
-    """What sensors say of a model in its units."""
-
-    model: SensorsOfModel = dataclasses.field(default_factory=SensorsOfModel)
-    path_of_device: CameraTrajectory | None = None
-
-    @property
-    def evidence(self) -> tuple[ScaleEvidence, ...]:
-        return self.model.evidence
-
-    @property
-    def absent(self) -> tuple[AbsentSensor, ...]:
-        return self.model.absent
+        distance, by = scale_by_distance(reference, validation)
+        evidence.append(distance)
+        made_of.append(by)
+    return evidence, absent, made_of
 
 
 def _describe(project: Path, source: ProjectOptions) -> Capture:
@@ -248,11 +228,11 @@ def _describe(project: Path, source: ProjectOptions) -> Capture:
 
 def _ask_sensors(
     capture: Capture, folder: Path, images: Path, scale_from: Sequence[ScaleFrom], progress: Progress
-) -> _Said:
+) -> SensorsOfModel:
     """What depth, the device's path and positions say of a model that no IMU scaled."""
     chosen = [name for name in scale_from if name not in ("target", "distance")]
     if scale_from and not chosen:
-        return _Said()
+        return SensorsOfModel()
     reconstruction = read_model(folder)
     names = sorted(reconstruction.image(i).name for i in reconstruction.reg_image_ids())
     timing = _time_images(capture, names)
@@ -265,14 +245,13 @@ def _ask_sensors(
         capture, names, size_px, timing=timing, chosen=chosen, images=images if images.is_dir() else None
     )
     if not sensors:
-        return _Said()
+        return SensorsOfModel()
     in_order = timing or FrameTiming(names=tuple(names), t_s=np.arange(float(len(names))))
     model = Model(reconstruction=reconstruction, colmap_index=0, timing=in_order)
     path, _ = trajectory_from_model(reconstruction, in_order, covariances=False)
-    said = ask_sensors(
+    return ask_sensors(
         sensors, model, path, up_in_world=None, log_scale=None, timed=timing is not None, progress=progress
     )
-    return _Said(model=said, path_of_device=None if said.device is None else sensors.device)
 
 
 def _time_images(capture: Capture, names: Sequence[str]) -> FrameTiming | None:

@@ -15,14 +15,14 @@ from colmap_inertial.core.errors import FormatError, InertialError, NotObservabl
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.progress import Progress, report_each
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, FrameTiming, ImuRecording
+from colmap_inertial.core.types import CameraTrajectory, FrameTiming, ImuRecording
 from colmap_inertial.diagnose import Diagnosis, FramesInVideo, Recorded, diagnose
 from colmap_inertial.imaging.detail import is_blank
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import read_record, write_json, write_record
 from colmap_inertial.io.frame_sources import ImageFolder
 from colmap_inertial.io.plausible import check_readings
-from colmap_inertial.io.pose_convention import COLMAP, PoseConvention
+from colmap_inertial.io.pose_convention import COLMAP
 from colmap_inertial.io.recording import Recording
 from colmap_inertial.io.video import decode_grey, video_stamps_ns
 from colmap_inertial.io.video_match import match_to_video
@@ -88,37 +88,6 @@ def check_imu(imu: ImuRecording, *, force: bool) -> ImuRecording:
         return imu
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class CheckInputs:
-    """The data of a recording that are checked before any work: the same for every command.
-
-    Attributes
-    ----------
-    imu
-        The IMU before any calibration of its own: the checks are about the sensor.
-    capture
-        What describes the images; ``None`` for poses that were not made from them, as those of a table.
-    timing
-        Of the images.
-    trajectory, read_as
-        Poses of a reconstruction, and the convention that they were read by; ``"untimed"`` where its images have no
-        times. Without one, the images themselves are measured.
-    prior, max_offset_s
-        What is known of camera and IMU, and the largest offset between their clocks.
-    refused
-        What could not be read, and why.
-    """
-
-    imu: ImuRecording | None
-    capture: Capture | None = None
-    timing: FrameTiming | None = None
-    trajectory: CameraTrajectory | Literal["untimed"] | None = None
-    read_as: PoseConvention = COLMAP
-    prior: CameraImuCalibration | None = None
-    max_offset_s: float | None = None
-    refused: tuple[InertialError, ...] = ()
-
-
 class TolerantReader:
     """Reads what can be read, and keeps the reasons for what cannot."""
 
@@ -134,43 +103,34 @@ class TolerantReader:
             return None
 
 
-def measure_recording(inputs: CheckInputs, progress: Progress, frames: GreyFrames | None = None) -> Recorded:
-    """Measure what the checks look at: ``diagnose``, ``scale``, and each reconstruction before its work.
+def add_images(recorded: Recorded, capture: Capture, progress: Progress, frames: GreyFrames | None = None) -> Recorded:
+    """What was recorded, with what the images of a capture show; where there are poses, these are checked in place.
 
     Images that cannot be read are among what was refused; the rest is measured all the same. ``frames``: the images,
     where others are going to look at them, too.
     """
-    reader = TolerantReader(inputs.refused)
-    capture, timing, poses = inputs.capture, inputs.timing, inputs.trajectory
-    log_ = None if capture is None else capture.frame_log
-    rotation = in_video = None
+    timing = recorded.timing
+    if not recorded.is_capture or timing is None:
+        return recorded
+    reader = TolerantReader(recorded.refused)
+    rotation = None
     looked: dict[str, bool] = {}
     images: Callable[[Sequence[str]], Iterable[GreyFrame]] | None = None
     in_full: Sequence[str] = ()
-
-    if poses is None and capture is not None and timing is not None:
-        # turns in pictures that the camera stabilised are not the camera's
-        if log_ is None or not log_.stabilised:
-            seen = frames or GreyFrames(capture, timing)
-            images, in_full = partial(seen.look, WHOLE), _choose_in_full(timing)
-            if inputs.imu is not None and capture.camera is not None and timing.exposure_s is None:
-                seen.expect(WHOLE, in_full)
-            rotation = reader.attempt(lambda: measure_images(seen, progress, looked))
-        in_video = reader.attempt(lambda: find_in_video(capture, timing, progress))
-    return Recorded(
+    # turns in pictures that the camera stabilised are not the camera's
+    if recorded.log is None or not recorded.log.stabilised:
+        seen = frames or GreyFrames(capture, timing)
+        images, in_full = partial(seen.look, WHOLE), _choose_in_full(timing)
+        if recorded.imu is not None and recorded.camera is not None and timing.exposure_s is None:
+            seen.expect(WHOLE, in_full)
+        rotation = reader.attempt(lambda: measure_images(seen, progress, looked))
+    in_video = reader.attempt(lambda: find_in_video(capture, timing, progress))
+    return replace(
+        recorded,
         refused=tuple(reader.refused),
-        imu=inputs.imu,
-        timing=timing,
-        log=log_,
-        is_capture=capture is not None and poses is None,
         rotation=rotation,
         looked_at=len(looked),
         blank=tuple(name for name, is_one in looked.items() if is_one),
-        camera=None if capture is None else capture.camera,
-        calibration=inputs.prior,
-        trajectory=None if isinstance(poses, str) else poses,
-        read_as=inputs.read_as,
-        max_offset_s=inputs.max_offset_s,
         in_video=in_video,
         images=images,
         in_full=in_full,
@@ -199,18 +159,22 @@ def run_preflight(
     NotObservableError
         As :func:`stop_or_doubt`.
     """
-    inputs = CheckInputs(
+    capture = recording.capture
+    known = Recorded(
         imu=imu,
-        capture=recording.capture,
         timing=recording.timing,
-        trajectory=model,
-        prior=recording.prior,
+        log=capture.frame_log,
+        is_capture=model is None,
+        trajectory=None if isinstance(model, str) else model,
+        read_as=COLMAP,
+        camera=capture.camera,
+        calibration=recording.prior,
         max_offset_s=recording.max_offset_s,
     )
     record = session.workspace.stamps / "checked.json"
 
     def work(partial: Sequence[Path]) -> None:
-        recorded = measure_recording(inputs, session.progress, frames)
+        recorded = add_images(known, capture, session.progress, frames)
         diagnosis = diagnose(recorded)
         if recorded.refused:
             write_json(session.workspace.diagnosis, diagnosis.as_json())
@@ -221,7 +185,7 @@ def run_preflight(
     depends = {
         "imu": imu,
         "recording": {name: getattr(recording, name) for name in ("timing", "prior", "max_offset_s")},
-        "capture": replace(recording.capture, target=None),
+        "capture": replace(capture, target=None),
         "looked at": recording.inputs() if model is None else model,
     }
     session.runner.run("check", depends, [session.workspace.diagnosis, record], work)

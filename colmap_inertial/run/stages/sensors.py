@@ -54,7 +54,7 @@ class SensorsOfModel:
     absent
         Why the others say nothing.
     device
-        The device's path on the model's.
+        The device's own path, where it fits the model's.
     up_in_world
         (3,) against gravity in the model's world, where some sensor tells, and its standard deviation (rad).
     tilt_rad
@@ -65,7 +65,7 @@ class SensorsOfModel:
 
     evidence: tuple[ScaleEvidence, ...] = ()
     absent: tuple[AbsentSensor, ...] = ()
-    device: DevicePath | None = None
+    device: CameraTrajectory | None = None
     up_in_world: Array | None = None
     tilt_rad: float = 0.0
     up_from: Sensor | None = None
@@ -178,7 +178,7 @@ def ask_sensors(
     return SensorsOfModel(
         evidence=tuple(evidence),
         absent=tuple(absent),
-        device=placed[0] if placed else None,
+        device=sensors.device if placed else None,
         up_in_world=up_in_world,
         tilt_rad=tilt_rad,
         up_from=up_from,
@@ -281,8 +281,8 @@ class SensorStage:
         if not evidence:
             return model
         combined = combine(evidence, absent)
-        if said.device is not None and self.sensors.device is not None:
-            combined = replace(combined, device=judge_device(combined, self.sensors.device))
+        if said.device is not None:
+            combined = replace(combined, device=judge_device(combined, said.device))
         log.info(
             "model %d: %.5g m per unit by %s",
             model.colmap_index,
