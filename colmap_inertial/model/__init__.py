@@ -119,7 +119,7 @@ class Model:
             raise AlreadyMetricError(
                 Fact("scaled-before", model=self.colmap_index, provenance=self.similarity.provenance)
             )
-        reconstruction = self.reconstruction if similarity is None else transformed(self.reconstruction, similarity)
+        reconstruction = self.reconstruction if similarity is None else transform_model(self.reconstruction, similarity)
         return replace(
             self,
             reconstruction=reconstruction,
@@ -146,7 +146,7 @@ class Model:
         moved = np.diag([*(factor,) * 3, 1.0, 1.0, 1.0])
         return replace(
             self,
-            reconstruction=transformed(self.reconstruction, longer),
+            reconstruction=transform_model(self.reconstruction, longer),
             scale=estimate,
             similarity=_scaled_again(similarity, factor, estimate.sigma_log),
             parts=tuple(
@@ -433,11 +433,11 @@ def apply_similarity(source: StrPath, target: StrPath, similarity: Similarity) -
         raise AlreadyMetricError(Fact("metric-already", folder=str(source), provenance=provenance))
     if target.exists():
         raise OutputExistsError(Fact("target-exists", path=str(target)))
-    write_model(transformed(read_model(source), similarity), target, similarity, suffix=model_format(source))
+    write_model(transform_model(read_model(source), similarity), target, similarity, suffix=model_format(source))
 
 
-def transformed(reconstruction: pycolmap.Reconstruction, similarity: Similarity) -> pycolmap.Reconstruction:
-    """A transformed copy of a model in memory."""
+def transform_model(reconstruction: pycolmap.Reconstruction, similarity: Similarity) -> pycolmap.Reconstruction:
+    """Make a transformed copy of a model in memory."""
     import pycolmap
 
     copy = pycolmap.Reconstruction(reconstruction)

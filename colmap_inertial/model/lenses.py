@@ -58,7 +58,7 @@ def farthest_corner_px(camera: pycolmap.Camera) -> float:
     return float(np.hypot(x, y))
 
 
-def beyond(rays: Array, fold: Fold | None) -> BoolArray:
+def is_beyond_fold(rays: Array, fold: Fold | None) -> BoolArray:
     """(N,) whether rays (N, 2) at z = 1 lie where a lens has folded."""
     if fold is None:
         return np.zeros(len(rays), bool)

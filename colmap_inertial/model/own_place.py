@@ -12,7 +12,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.types import CameraTrajectory, Similarity, SmoothedTrajectory
-from colmap_inertial.model import transformed
+from colmap_inertial.model import transform_model
 from colmap_inertial.model.places import between, find_pivot, translation
 
 if TYPE_CHECKING:
@@ -36,11 +36,11 @@ class OwnPlace:
 
     def enter(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
         """A model about its pivot."""
-        return model if self.pivot is None else transformed(model, translation(-self.pivot))
+        return model if self.pivot is None else transform_model(model, translation(-self.pivot))
 
     def leave(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
         """The model where it was."""
-        return model if self.pivot is None else transformed(model, translation(self.pivot))
+        return model if self.pivot is None else transform_model(model, translation(self.pivot))
 
     def leave_path(self, trajectory: PathT) -> PathT:
         """A path where the model was."""

@@ -27,7 +27,7 @@ from colmap_inertial.model import (
     read_model,
     require_format,
     similarity_as_json,
-    transformed,
+    transform_model,
     write_files,
 )
 from colmap_inertial.model.assigning import assign_scales, compare_models, put_about_places, require_free_records
@@ -41,7 +41,7 @@ from colmap_inertial.model.layout import CAMERA_KINDS, Layout, kind_to_move, rea
 from colmap_inertial.model.notes import collecting_notes
 from colmap_inertial.model.places import Place
 from colmap_inertial.model.pose_priors import compare_priors
-from colmap_inertial.model.similarities import ModelScale, require_not_joined, similarity_from_json, undoing
+from colmap_inertial.model.similarities import ModelScale, invert_similarity, require_not_joined, similarity_from_json
 from colmap_inertial.model.soundness import check_binary_model
 from colmap_inertial.model.worlds import Worlds
 
@@ -204,12 +204,12 @@ def undo_project(
     except (KeyError, TypeError, ValueError, AttributeError):
         raise FormatError(path, Fact("not-a-record-of-apply")) from None
     by_model = {
-        index: ModelScale(similarity=None if fields is None else undoing(similarity_from_json(path, fields)))
+        index: ModelScale(similarity=None if fields is None else invert_similarity(similarity_from_json(path, fields)))
         for index, fields in models
     }
     with collecting_notes() as read:
         work = _Work(project, out, keep, follow_links, read, beside)
-        common = undoing(similarity_from_json(path, record)) if record.get("one_for_all") is True else None
+        common = invert_similarity(similarity_from_json(path, record)) if record.get("one_for_all") is True else None
         layout = read_layout(project, work.open_folders(), one_for_all=common is not None)
         if layout.submodels.keys() != by_model.keys():
             raise FormatError(path, Fact("models-not-as-recorded"))
@@ -444,7 +444,7 @@ class _Work:
             counts = model.num_reg_images(), model.num_points3D()
             # COLMAP does not notice a disk that is full
             try:
-                write_files(transformed(model, similarity), target, suffix)
+                write_files(transform_model(model, similarity), target, suffix)
                 if suffix == ".bin":
                     check_binary_model(target)
                 else:

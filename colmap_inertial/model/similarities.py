@@ -138,7 +138,7 @@ def plain_factor(factor: float) -> Similarity:
     )
 
 
-def undoing(similarity: Similarity) -> Similarity:
+def invert_similarity(similarity: Similarity) -> Similarity:
     """The inverse, to take back what was applied; as it makes no estimate of anything, its covariance is zero."""
     rotation = matrix_from_quat(similarity.rotation_xyzw)
     return Similarity(

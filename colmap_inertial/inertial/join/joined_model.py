@@ -23,7 +23,7 @@ from colmap_inertial.core.types import DOWN_IN_WORLD, Action, JoinedPart, ScaleE
 from colmap_inertial.inertial.join.placement import FittedSubmodel, Placed
 from colmap_inertial.inertial.join.relative_poses import JoinedGroup, relative_cov, worst_sigmas
 from colmap_inertial.inertial.scale.verdict import TRUSTED_HALF_WIDTH, finite, half_width, verdict_of
-from colmap_inertial.model import Model, transformed
+from colmap_inertial.model import Model, transform_model
 from colmap_inertial.model.similarities import compose
 from colmap_inertial.model.submodels.graph import PLACEMENT
 from colmap_inertial.model.submodels.matches import PlacedImages
@@ -127,7 +127,7 @@ def _merge_members(
         }
         for constraint in group.shared
     }
-    pieces = [transformed(model.reconstruction, move) for model, move in zip(members, moves, strict=True)]
+    pieces = [transform_model(model.reconstruction, move) for model, move in zip(members, moves, strict=True)]
     whole, points = merge_models(pieces, agreeing=agreeing)
     number = {model.colmap_index: of_model for model, of_model in zip(members, points, strict=True)}
     same = [

@@ -17,13 +17,13 @@ from colmap_inertial.model import (
     model_format,
     summarize,
     trajectory_from_model,
-    transformed,
+    transform_model,
     write_model,
 )
 from colmap_inertial.model.identity import ModelIdentity
 from colmap_inertial.model.own_place import OwnPlace
 from colmap_inertial.model.rigs import rig_sensors
-from colmap_inertial.model.similarities import undoing
+from colmap_inertial.model.similarities import invert_similarity
 from colmap_inertial.run.commands.reporting import write_model_record
 from colmap_inertial.run.commands.result import ScaledModel
 from colmap_inertial.run.commands.torn_parts import TornParts
@@ -190,11 +190,11 @@ class ModelStageRun:
             before = unjoined[part.colmap_index]
             own = before.reconstruction
             if before.similarity is not None:
-                own = transformed(own, undoing(before.similarity))
+                own = transform_model(own, invert_similarity(before.similarity))
             target = self.session.workspace.sparse / str(part.colmap_index)
             similarity = place.similarity(part.similarity, self._places[part.colmap_index])
             suffix = model_format(self.folders[part.colmap_index])
-            write_model(place.leave(transformed(own, part.similarity)), target, similarity, suffix=suffix)
+            write_model(place.leave(transform_model(own, part.similarity)), target, similarity, suffix=suffix)
 
 
 def run_in_turn(stages: Sequence[ModelStage], model: Model) -> Model:

@@ -22,7 +22,7 @@ from colmap_inertial.io.files import a_record_of_ours, read_json, read_record
 from colmap_inertial.io.frames import read_frame_timing
 from colmap_inertial.io.picture_names import picture_in
 from colmap_inertial.io.positions import positions_in_pictures
-from colmap_inertial.model import read_model, transformed
+from colmap_inertial.model import read_model, transform_model
 from colmap_inertial.model.nerf import NEVER_SCALED, NO_SCALE, NO_UP
 from colmap_inertial.model.places import Place, translation
 from colmap_inertial.run.preparation.geolocation import positions_of, read_georeference
@@ -393,7 +393,7 @@ class ExportContent:
         assert self.offset is not None
         offset = self.offset
         self.notes.append(Fact("recentred", offset=offset))
-        model = transformed(self.source.model, translation(-offset))
+        model = transform_model(self.source.model, translation(-offset))
         return replace(
             self,
             source=replace(self.source, model=model),

@@ -17,7 +17,7 @@ from colmap_inertial.core.types import CameraModel
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.rolling_shutter import grid_nodes, sampling_maps
 from colmap_inertial.model import colmap_camera
-from colmap_inertial.model.lenses import Fold, beyond, find_fold, sees_all_around
+from colmap_inertial.model.lenses import Fold, find_fold, is_beyond_fold, sees_all_around
 
 if TYPE_CHECKING:
     import pycolmap
@@ -120,7 +120,7 @@ class Undistortion:
         fx, fy, cx, cy = self.pinhole.params
         rays = np.stack([(xy_px[:, 0] - cx) / fx, (xy_px[:, 1] - cy) / fy, np.ones(len(xy_px))], axis=1)
         source = np.array(self.camera.img_from_cam(rays), dtype=np.float64)
-        source[beyond(rays[:, :2], self.fold)] = np.nan
+        source[is_beyond_fold(rays[:, :2], self.fold)] = np.nan
         return source
 
     def moved_px(self, xy_px: Array) -> Array:
@@ -172,7 +172,7 @@ def _unproject(camera: pycolmap.Camera, xy_px: Array, fold: Fold | None) -> Arra
     ahead[~np.isfinite(rays).all(axis=1)] = [0.0, 0.0, 1.0]
     back = np.asarray(camera.img_from_cam(ahead), dtype=np.float64)
     lost = ~(np.abs(back - xy_px).max(axis=1) < _LIMITS.undone_px)
-    rays[lost | beyond(rays, fold)] = np.nan
+    rays[lost | is_beyond_fold(rays, fold)] = np.nan
     return rays
 
 

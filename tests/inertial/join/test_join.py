@@ -18,7 +18,7 @@ from colmap_inertial.inertial.join.placement import FittedSubmodel, ImuLink, Pro
 from colmap_inertial.inertial.join.relative_poses import end_images, tie_cov, worst_sigmas
 from colmap_inertial.inertial.scale.posterior import CLOCK_RATE, DELAY, FittedPath
 from colmap_inertial.io.calibration import calibration_prior
-from colmap_inertial.model import Model, trajectory_from_model, transformed
+from colmap_inertial.model import Model, trajectory_from_model, transform_model
 from colmap_inertial.model.submodels.graph import PLACEMENT
 from colmap_inertial.model.submodels.merging import merge_models
 from colmap_inertial.run.stages.join import JoinStage
@@ -263,7 +263,7 @@ def test_the_stage_makes_one_model_of_two(walked, halves):
         ).inverse()
         own = pycolmap.Reconstruction(model.reconstruction)
         own.transform(inverse)
-        moved = transformed(own, part.similarity)
+        moved = transform_model(own, part.similarity)
         for image_id in list(moved.reg_image_ids())[::9]:
             name = moved.image(image_id).name
             there = whole.reconstruction.find_image_with_name(name).projection_center()

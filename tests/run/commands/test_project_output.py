@@ -20,7 +20,7 @@ from colmap_inertial.core.options import ProjectOptions
 from colmap_inertial.core.types import ScaleEstimate
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.io.capture import Capture
-from colmap_inertial.model import read_model, transformed, write_model
+from colmap_inertial.model import read_model, transform_model, write_model
 from colmap_inertial.model.project import apply_to_project, undo_project
 from colmap_inertial.model.similarities import ModelScale, plain_factor
 from colmap_inertial.report.words import describe_mapping, parts_mapped_in_words
@@ -163,7 +163,7 @@ def dense_of(workspace, index, *, maps=False):
 def metric_model(workspace, colmap_project, factor, index=0):
     shutil.rmtree(workspace.sparse / str(index), ignore_errors=True)
     similarity = plain_factor(factor)
-    model = transformed(read_model(colmap_project / "sparse" / "0"), similarity)
+    model = transform_model(read_model(colmap_project / "sparse" / "0"), similarity)
     write_model(model, workspace.sparse / str(index), similarity)
     return {index: workspace.sparse / str(index)}
 
@@ -242,7 +242,7 @@ class Placing:
         for index, scale in enumerate(scales):
             place = self.workspace.sparse / str(index)
             if scale.similarity is not None and not place.exists():
-                model = transformed(read_model(folders[index], ".bin"), scale.similarity)
+                model = transform_model(read_model(folders[index], ".bin"), scale.similarity)
                 write_model(model, place, scale.similarity)
         session = session_in(self.workspace)
         source = ProjectOptions(**options)
@@ -345,7 +345,7 @@ def test_wherever_the_model_lies_it_comes_to_sparse(workspace, colmap_project, t
 
 
 def test_text_follows_what_a_model_stage_made(placing):
-    model = transformed(read_model(placing.project / "sparse" / "0"), SIMILARITY)
+    model = transform_model(read_model(placing.project / "sparse" / "0"), SIMILARITY)
     model.delete_point3D(min(model.point3D_ids()))
     write_model(model, placing.workspace.sparse / "0", SIMILARITY)
     placing()

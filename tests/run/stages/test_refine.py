@@ -25,7 +25,7 @@ from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import read_record
 from colmap_inertial.io.recording import Recording
 from colmap_inertial.io.trajectories import read_tum
-from colmap_inertial.model import Model, transformed
+from colmap_inertial.model import Model, transform_model
 from colmap_inertial.model.layout import find_made_from, read_layout
 from colmap_inertial.run.commands import frames
 from colmap_inertial.run.commands.frames import stages_of_refined
@@ -234,7 +234,7 @@ def test_a_refined_model_has_the_scale_and_up_of_the_refinement(walked, factor):
         reasons=("a doubt",) if factor == 1.01 else (),
     )
     # gravity stands where it stood, the model does not
-    start = replace(model, reconstruction=transformed(model.reconstruction, wrong), scale=scale)
+    start = replace(model, reconstruction=transform_model(model.reconstruction, wrong), scale=scale)
     start = replace(start, similarity=replace(model.similarity, scale=scale.metres_per_unit))
     made, said = refined_by(tracks.imu, start)
     estimate, truth = made.scale, tracks.motion.cam_in_world_m(tracks.timing.pose_t_s())

@@ -38,7 +38,7 @@ from colmap_inertial.io.ply import read_ply_header
 from colmap_inertial.model import read_model, write_model
 from colmap_inertial.model.nerf import EXPORT_FORMAT, NOT_METRES, transform_export
 from colmap_inertial.model.project import apply_to_project, undo_project
-from colmap_inertial.model.similarities import plain_factor, undoing
+from colmap_inertial.model.similarities import invert_similarity, plain_factor
 from colmap_inertial.tools.export.formats import write_las
 from colmap_inertial.tools.export.source import ExportSource, Picture, TreatedFrame, flat_names
 from colmap_inertial.tools.export.targets import TARGETS
@@ -336,7 +336,9 @@ def test_of_two_similarities_undone_in_turn_the_first_one_made_an_export_metres(
     first, second = plain_factor(2.0), plain_factor(2.5)
     (tmp_path / "0.json").write_text(json.dumps(said | {"notes": ["a"]}))
     units = []
-    for i, one in enumerate([first, second, undoing(second), undoing(first), undoing(first)]):
+    for i, one in enumerate(
+        [first, second, invert_similarity(second), invert_similarity(first), invert_similarity(first)]
+    ):
         transform_export(tmp_path / f"{i}.json", tmp_path / f"{i + 1}.json", one)
         units.append(json.loads((tmp_path / f"{i + 1}.json").read_text())["unit"])
     assert units == ["m", "0.4 m", "m", NOT_METRES, NOT_METRES]
