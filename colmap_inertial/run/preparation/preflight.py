@@ -154,7 +154,7 @@ def measure_recording(inputs: CheckInputs, progress: Progress, frames: GreyFrame
     images: Callable[[Sequence[int]], Iterable[Frame]] | None = None
 
     if poses is None and capture is not None and timing is not None:
-        # turns in pictures that the camera stabilised are not the camera's
+        # turns in images that the camera stabilised are not the camera's
         if log_ is None or not log_.stabilised:
             seen = frames or GreyFrames(capture, timing)
             rotation = reader.attempt(lambda: measure_images(seen, progress, looked))

@@ -1,4 +1,4 @@
-"""A recipe carried out, but for the pictures: motion, device, instants of the frames."""
+"""A recipe carried out, but for the images: motion, device, instants of the frames."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TICKS_HZ = 90000
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Scene:
-    """A recipe carried out, but for the pictures.
+    """A recipe carried out, but for the images.
 
     Attributes
     ----------
