@@ -19,7 +19,7 @@ class FuseApertures(ReadingCommand):
     """Make RGB images from the sub-images of a multi-aperture camera.
 
     One disparity map from all apertures takes their parallax out. Writes OUT/images, seen through the first aperture,
-    with the names of its pictures; with --refocus OUT/refocused; with --depth OUT/disparity and OUT/depth.
+    with the names of its images; with --refocus OUT/refocused; with --depth OUT/disparity and OUT/depth.
 
     Example: colmap-inertial fuse-apertures my_capture/capture.toml out --refocus 0.8
     """

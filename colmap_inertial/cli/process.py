@@ -80,7 +80,7 @@ def _answer(signals: socket.socket) -> None:
 
 
 #: Address space to begin with, and for each thread: its stack, and what the allocator keeps for it. A reconstruction of
-#: small pictures takes 1.3 GB on two processors.
+#: small images takes 1.3 GB on two processors.
 LEAST_BYTES, THREAD_BYTES = 2 << 30, 128 << 20
 #: Arguments are read with numpy. With less than this, and as much for each thread, it ends in OpenBLAS's words.
 LOADING_BYTES = 256 << 20

@@ -303,7 +303,7 @@ def show_reference(reference: Reference) -> None:
 
 
 def show_fused(lines: Sequence[str], screen: Screen) -> None:
-    """Print what became of the pictures of several lenses or exposures."""
+    """Print what became of the images of several lenses or exposures."""
     if screen.unchanged:
         say("nothing to do: kept from the earlier run")
     for line in lines:

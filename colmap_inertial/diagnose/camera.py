@@ -39,7 +39,7 @@ class CameraCheckLimits:
     tried_frame_rates: tuple[float, ...] = (0.8, 1.25, 5 / 6, 1.2, 0.5, 2.0, 0.6, 5 / 3)
     #: A rate that is further off is that of another frame rate.
     wrong_frame_rate: float = 0.1
-    #: Of pictures far apart so many pairs must have been compared for a gyroscope not to belong to them.
+    #: Of images far apart so many pairs must have been compared for a gyroscope not to belong to them.
     enough_pairs: int = 12
     #: A recording that is shorter may simply not have turned enough.
     enough_s: float = 8.0
@@ -50,7 +50,7 @@ class CameraCheckLimits:
     still_rad_s: float = 0.02
     turned_within_s: float = 1.0
     fewest_seconds: int = 5
-    #: Quick rotation in the picture per rotation measured; translation is slow against it, and makes it a little less
+    #: Quick rotation in the image per rotation measured; translation is slow against it, and makes it a little less
     #: (0.92 to 0.95 in rendered orbits about a desk, 1.00 before a far wall). A standard deviation above the third
     #: tells nothing.
     quick_s: float = 0.35
@@ -255,7 +255,7 @@ def _is_mirrored(turning: CameraTrajectory, imu: ImuRecording, aligned: Alignmen
 
 
 def check_stabilisation(recorded: Recorded) -> Iterator[Finding]:
-    """A picture that was turned against its lens no longer belongs to the gyroscope."""
+    """An image that was turned against its lens no longer belongs to the gyroscope."""
     if recorded.log is not None and recorded.log.stabilised:
         noted = recorded.log.stabilisation or "stabilisation was on"
         yield Finding(fact=Fact("stabilised", recorder_notes=noted), severity="error")
@@ -281,7 +281,7 @@ def check_declared(recorded: Recorded) -> Iterator[Finding]:
 
 
 def check_focal_length(recorded: Recorded) -> Iterator[Finding]:
-    """A focal length that is too long makes all rotation in the picture too small, about both of its axes."""
+    """A focal length that is too long makes all rotation in the image too small, about both of its axes."""
     aligned, rotation, imu, camera = recorded.aligned, recorded.rotation, recorded.imu, recorded.camera
     if not isinstance(aligned, Alignment) or rotation is None or imu is None or camera is None:
         return

@@ -21,7 +21,7 @@ class DeclaredLimits:
 
     #: A rotation known worse is none that was declared, and none that contradicts.
     known_rotation_rad: float = 0.2
-    #: What matters, in standard deviations, too; and what makes a scale wrong. By pictures alone, the latter alone.
+    #: What matters, in standard deviations, too; and what makes a scale wrong. By images alone, the latter alone.
     rotation_rad: float = 0.05
     wrong_rotation_rad: float = 0.35
     sigmas: float = 4.0
@@ -83,7 +83,7 @@ def compare_declared(declared: CameraImuCalibration, found: CameraImuCalibration
     declared, found
         The latter by an alignment without the former (:func:`leave_out`).
     by_poses
-        Whether cameras of a reconstruction were aligned, not pictures that were followed.
+        Whether cameras of a reconstruction were aligned, not images that were followed.
     """
     rotation, is_wrong_rotation = _compare_rotation(declared, found, by_poses=by_poses)
     offset, is_wrong_offset = _compare_offset(declared, found, by_poses=by_poses)

@@ -149,20 +149,20 @@ class Diagnosis:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FramesInVideo:
-    """Places of pictures in the video that they were taken from.
+    """Places of images in the video that they were taken from.
 
     Attributes
     ----------
     stated_ns, found_ns
-        (K,) times that the pictures have, and presentation stamps of the video's frames that they are.
+        (K,) times that the images have, and presentation stamps of the video's frames that they are.
     video_start_ns
         Presentation stamp of the video's first frame.
     quarter_turns
-        How often the pictures are turned by 90 degrees against the frames as stored.
+        How often the images are turned by 90 degrees against the frames as stored.
     container_turn_deg
         The turn that the video's container asks players for.
     doubtful
-        Pictures that could not be found, or are of several frames.
+        Images that could not be found, or are of several frames.
     """
 
     stated_ns: Int64Array
@@ -213,7 +213,7 @@ class Recorded:
     rotation
         Between consecutive frames, by their pixels.
     looked_at, blank
-        How many pictures were looked at, and the names of those without any feature.
+        How many images were looked at, and the names of those without any feature.
     trajectory, read_as
         Poses of a reconstruction; the convention that they were read by.
     camera
@@ -221,7 +221,7 @@ class Recorded:
     calibration, max_offset_s
         What is known of camera and IMU, and the largest offset between their clocks.
     in_video
-        Where pictures were found in the video they were taken from.
+        Where images were found in the video they were taken from.
     images
         Frames in grey and in full by their names, in order of time; ``None`` where there are none.
     in_full
@@ -252,14 +252,14 @@ class Recorded:
 
     @property
     def is_dense(self) -> bool:
-        """Whether pictures were followed closely enough that what is quick shows in them."""
+        """Whether images were followed closely enough that what is quick shows in them."""
         return self.rotation is not None and len(self.rotation.t_s) > 1 and self.rotation.step_s <= FOLLOWED_S
 
     @cached_property
     def contradicted(self) -> Contradicted:
         """The declared rotation and time offset against an alignment without them; nothing where that is not possible.
 
-        Pictures alone tell them worse.
+        Images alone tell them worse.
         """
         prior, imu = self.calibration, self.imu
         if prior is None or imu is None or (self.trajectory is None and self.rotation is None):
@@ -352,7 +352,7 @@ class Recorded:
 
     @cached_property
     def stabilisation(self) -> Stabilisation | None:
-        """Signs of stabilisation in the pictures; ``None`` without pictures."""
+        """Signs of stabilisation in the images; ``None`` without images."""
         if self.rotation is None or self.imu is None:
             return None
         return find_stabilisation(self.rotation, self.imu, offset_s=self.offset_s(self.rotation.epoch_ns))
@@ -434,5 +434,5 @@ class Recorded:
 PIXELS_EXPLAINED = 0.5
 #: Numbers of a gyroscope times this are rad/s, where they were in the other unit than they were declared in.
 UNIT_FACTORS = {"gyro-in-deg": np.pi / 180, "gyro-not-in-deg": 180 / np.pi}
-#: Pictures closer together than this (median) are followed; those further apart are compared two by two.
+#: Images closer together than this (median) are followed; those further apart are compared two by two.
 FOLLOWED_S = 0.15

@@ -40,18 +40,18 @@ class FrameCheckLimits:
     same_rad: float = 1e-7
     repeated: int = 2
     repeated_share: float = 0.05
-    #: Pictures that show less than this share of what the gyroscope turned, so many pairs in a row, where it turned by
-    #: more than this and than so many standard deviations of what pictures show.
+    #: Images that show less than this share of what the gyroscope turned, so many pairs in a row, where it turned by
+    #: more than this and than so many standard deviations of what images show.
     frozen_share: float = 0.1
     frozen_pairs: int = 3
     frozen_rad: float = 2e-3
     frozen_sigmas: float = 5.0
-    #: A declared readout that is off by more than this, and so many standard deviations of what pictures show.
+    #: A declared readout that is off by more than this, and so many standard deviations of what images show.
     readout_s: float = 4e-3
     readout_sigmas: float = 5.0
-    #: More pictures without any feature leave too few.
+    #: More images without any feature leave too few.
     blank_share: float = 0.5
-    #: Blur, as a share of the picture's long side, beyond which features suffer; and the frames that may have it.
+    #: Blur, as a share of the image's long side, beyond which features suffer; and the frames that may have it.
     blur_share: float = 0.004
     blurred_frames: float = 0.5
     #: COLMAP's guess of a focal length in long sides, where none is declared.
@@ -105,7 +105,7 @@ def check_repeated(recorded: Recorded) -> Iterator[Finding]:
 
 
 def _are_frozen(recorded: Recorded) -> BoolArray:
-    """Between which pictures nothing turned while the gyroscope did: one picture again, coded anew."""
+    """Between which images nothing turned while the gyroscope did: one image again, coded anew."""
     rotation, aligned, imu = recorded.rotation, recorded.aligned, recorded.imu
     assert rotation is not None
     none = np.zeros(len(rotation.turn_rad), dtype=np.bool_)
@@ -145,7 +145,7 @@ def check_blank(recorded: Recorded) -> Iterator[Finding]:
 
 
 def check_exposure(recorded: Recorded) -> Iterator[Finding]:
-    """Exposures in which the gyroscope says that the picture smeared."""
+    """Exposures in which the gyroscope says that the image smeared."""
     timing, imu = recorded.timing, recorded.imu
     if timing is None or timing.exposure_s is None or imu is None:
         return
@@ -161,7 +161,7 @@ def check_exposure(recorded: Recorded) -> Iterator[Finding]:
     focal = _LIMITS.guessed_focal
     if recorded.camera is not None:
         focal = recorded.camera.params[0] / max(recorded.camera.width, recorded.camera.height)
-    # two of three axes smear the middle of the picture
+    # two of three axes smear the middle of the image
     blur = focal * turning * timing.exposure_s * (2 / 3) ** 0.5
     share = float(np.mean(blur > _LIMITS.blur_share))
     if share > _LIMITS.blurred_frames:
@@ -205,7 +205,7 @@ def estimate_unstated_exposure(recorded: Recorded) -> tuple[ExposureEstimate, fl
     Raises
     ------
     NotObservableError
-        Where pictures or an alignment are missing, or frames do not tell.
+        Where images or an alignment are missing, or frames do not tell.
     """
     timing, camera = recorded.timing, recorded.camera
     if timing is None or camera is None or recorded.images is None:
@@ -244,7 +244,7 @@ def _gyro_camera(recorded: Recorded, timing: FrameTiming) -> GyroCamera:
 
 
 def _predict_speed(recorded: Recorded, timing: FrameTiming, camera: CameraModel) -> Array:
-    """(F,) px/s by which the camera's turning moves the picture (90th percentile); NaN without gyroscope."""
+    """(F,) px/s by which the camera's turning moves the image (90th percentile); NaN without gyroscope."""
     brief_s = _LIMITS.brief_s
     brief = replace(timing, exposure_s=np.full(len(timing.t_s), brief_s), t_s=timing.t_s - 0.5 * brief_s)
     predicted = predict_blur_px(
@@ -254,7 +254,7 @@ def _predict_speed(recorded: Recorded, timing: FrameTiming, camera: CameraModel)
 
 
 def check_readout(recorded: Recorded) -> Iterator[Finding]:
-    """A capture that does not say how its shutter runs, or otherwise than its pictures show."""
+    """A capture that does not say how its shutter runs, or otherwise than its images show."""
     if not recorded.is_capture or recorded.timing is None:
         return
     timing = recorded.timing
@@ -308,7 +308,7 @@ def _estimate_readout(recorded: Recorded) -> ReadoutEstimate:
 
 
 def check_cut_from_video(recorded: Recorded) -> Iterator[Finding]:
-    """Times and orientation of pictures against the video that they were cut from."""
+    """Times and orientation of images against the video that they were cut from."""
     cut = recorded.in_video
     if cut is None:
         return
@@ -335,7 +335,7 @@ def check_cut_from_video(recorded: Recorded) -> Iterator[Finding]:
 
 
 def _refers_to_rows(recorded: Recorded) -> bool:
-    """Whether anything is declared that pictures in another orientation would belie."""
+    """Whether anything is declared that images in another orientation would belie."""
     readout_s = None if recorded.timing is None else recorded.timing.readout_s
     prior = recorded.calibration
     calibrated = prior is not None and prior.rotation_sigma_rad < 1

@@ -1,4 +1,4 @@
-"""Colour pictures as luma in full and chroma at half the size, for filters: in linear light.
+"""Colour images as luma in full and chroma at half the size, for filters: in linear light.
 
 Chroma is R - G and B - G, zero of greys. It has less detail than luma, and what it has of its own follows luma's edges:
 at full size it is a line over luma in each small window, as in K. He, J. Sun, X. Tang, "Guided image filtering" (2013).

@@ -16,9 +16,9 @@ SAMPLES, SAMPLE_PX = 17, 2.0
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BlurPath:
-    """Path of each pixel's light across the sharp picture during the exposure.
+    """Path of each pixel's light across the sharp image during the exposure.
 
-    The blurred picture is ``g(x) = mean over k of L(x + q_k(x))``, ``L`` the sharp picture of the same shutter. The
+    The blurred image is ``g(x) = mean over k of L(x + q_k(x))``, ``L`` the sharp image of the same shutter. The
     path q has a sign and a middle of its own: reversed in time it is another one where it is curved.
 
     Attributes

@@ -1,4 +1,4 @@
-"""Whether a picture shows anything at all."""
+"""Whether an image shows anything at all."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from colmap_inertial.core.arrays import UInt8Array, UInt16Array
 from colmap_inertial.imaging.tracking import convert_to_grey
 
-#: Pictures are looked at in this size, which averages noise, in blocks of so many pixels; of these, so many in a
+#: Images are looked at in this size, which averages noise, in blocks of so many pixels; of these, so many in a
 #: hundred have less detail than what counts.
 _LONG_SIDE_PX, _BLOCK_PX, _PERCENT = 320, 20, 98.0
 #: Brightness range of a block, of full scale, below which there is nothing to match and nothing to deblur: a wall out
@@ -16,7 +16,7 @@ LEAST_DETAIL = 0.03
 
 
 def measure_detail(image: UInt8Array | UInt16Array) -> float:
-    """Brightness range of the most detailed blocks of a picture, of full scale; 0 of a black one.
+    """Brightness range of the most detailed blocks of an image, of full scale; 0 of a black one.
 
     Parameters
     ----------
@@ -40,5 +40,5 @@ def measure_detail(image: UInt8Array | UInt16Array) -> float:
 
 
 def is_blank(image: UInt8Array | UInt16Array) -> bool:
-    """Whether a picture is black or without any feature."""
+    """Whether an image is black or without any feature."""
     return measure_detail(image) < LEAST_DETAIL

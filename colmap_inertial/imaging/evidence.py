@@ -50,12 +50,12 @@ class EvidenceLimits:
     most_tiles: int = 900
     #: As many serve for the share of the blur that shows.
     few_tiles: int = 200
-    #: The share of a picture's tiles that are its quiet ones.
+    #: The share of an image's tiles that are its quiet ones.
     quiet_share: float = 0.05
     #: Times the power of quiet tiles at which a tile has half of its weight: noise varies by so much with light and
     #: JPEG.
     above_quiet: float = 3.0
-    #: How steeply weights rise there: weak textures of common pictures, of tenfold power, weigh nearly all.
+    #: How steeply weights rise there: weak textures of common images, of tenfold power, weigh nearly all.
     steepness: int = 3
     #: Cycles per pixel between which blur takes power from a direction before noise covers it.
     band_per_px: tuple[float, float] = (0.05, 0.25)
@@ -67,7 +67,7 @@ class EvidenceLimits:
     #: Zeros of the transfer are no deeper than this (natural logarithm): JPEG, and blur that changes in a tile, fill
     #: them.
     deepest_log: float = -3.0
-    #: Of a picture counts what stands out of the noise by twice its scatter; neighbours that are alike under the window
+    #: Of an image counts what stands out of the noise by twice its scatter; neighbours that are alike under the window
     #: make that half as large again.
     scatter: float = 3.0
     #: Paths that leave their chord by more are curves.
@@ -214,7 +214,7 @@ def measure_blur_share(image: UInt8Array | UInt16Array, blur: BlurField | BlurPa
     """Share of the loss of detail that a blur predicts: 1 where the image is blurred so, 0 where it is sharp.
 
     At one distance from the origin of a tile's spectrum, blur leaves the directions across it as they were and takes
-    power from those along it: ``log((S |K|^2 + n) / (S + n))``, with the path's own transfer K, a 1/f^2 picture S as
+    power from those along it: ``log((S |K|^2 + n) / (S + n))``, with the path's own transfer K, a 1/f^2 image S as
     strong as the tile's directions across say, and the tile's noise n. What the tiles have is compared with that by
     least squares. So a sky, or what is out of focus, of which noise is all that is left there, predicts no fall and
     does not count.
@@ -325,7 +325,7 @@ def _compute_log_power(windows: Float32Array) -> Float32Array:
 
 
 def _weigh_tiles(logarithm: Float32Array) -> Array:
-    """(N,) weights of tiles by how far they stand out of the quiet ones of their picture.
+    """(N,) weights of tiles by how far they stand out of the quiet ones of their image.
 
     A sky holds noise alone, and would hide in the mean what the ground below it shows. Noise cannot be told from weak
     texture by itself (JPEG takes its high frequencies), but where all tiles are alike, all weigh alike. The weights add

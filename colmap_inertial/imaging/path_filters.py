@@ -52,7 +52,7 @@ class DeblurOptions(CheckedOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class PathFilterModel:
-    """Model of pictures and their noise in the filters along paths."""
+    """Model of images and their noise in the filters along paths."""
 
     #: Noise counts so many times: for JPEG's errors, and for paths that change within a tile.
     noise_factor: float = 8.0
@@ -72,7 +72,7 @@ class PathFilterModel:
     noise_count: int = 200
     #: Of many tiles, about so many of the shortest side are looked at; of longer ones, which show more, fewer.
     noise_tiles: int = 20
-    #: of chroma, fewer: its noise is taken as the same in all of the picture.
+    #: of chroma, fewer: its noise is taken as the same in all of the image.
     chroma_noise_tiles: int = 8
     #: Weight of the data against gradients to the power 2/3 where noise is 1 % of full scale.
     data_weight: float = 1000.0
@@ -144,7 +144,7 @@ def half_quadratic(image: NDArray[Code], path: BlurPath, options: DeblurOptions 
     """Undo motion blur along a path, expecting few and strong gradients; all else as :func:`path_wiener`.
 
     Wiener's result is the first guess. In turn, what its gradients w should be is found by minimising
-    ``|w|^(2/3) + b / 2 (w - gradient)^2``, and the picture that has these gradients and, blurred, is the one seen;
+    ``|w|^(2/3) + b / 2 (w - gradient)^2``, and the image that has these gradients and, blurred, is the one seen;
     b grows (`FILTER_MODEL.splitting`). Chroma keeps Wiener's result.
     """
     return _filter_image(image, path, options or DeblurOptions(), FILTER_MODEL.splitting)

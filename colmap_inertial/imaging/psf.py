@@ -144,7 +144,7 @@ def blur_path(
     """The curve that each pixel of a frame smears along, of which :func:`blur_field` gives the chord.
 
     Light that reaches pixel x of a line exposed around t_m at time t comes from what stands, at t_m, at
-    ``x + u = project(R(t_m)' R(t) ray(x) + (t - t_m) v / z(x))``. The sharp picture of a rolling shutter has it on
+    ``x + u = project(R(t_m)' R(t) ray(x) + (t - t_m) v / z(x))``. The sharp image of a rolling shutter has it on
     another line, exposed d u later (d seconds per pixel), when it has moved on by ``-u' d (x + q - x)``, u' the path's
     own speed in the middle of the exposure: ``q = u - u' (d u) / (1 + d u')``.
 

@@ -1,4 +1,4 @@
-"""Points followed from one reduced picture to another."""
+"""Points followed from one reduced image to another."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ def reduce_image(image: AnyArray, long_side_px: int) -> AnyArray:
 def track_points(
     before: UInt8Array, now: UInt8Array, points: Float32Array, *, window_px: int, round_trip_px: float
 ) -> tuple[Float32Array, BoolArray]:
-    """Follow points by pyramidal Lucas-Kanade to another picture and back.
+    """Follow points by pyramidal Lucas-Kanade to another image and back.
 
     Parameters
     ----------
     before, now
-        (H, W) pictures of one size.
+        (H, W) images of one size.
     points
         (N, 2) in ``before``.
     window_px

@@ -67,13 +67,13 @@ class Capture:
     path
         The capture.toml, or the folder that was recognised without one.
     frames
-        Pictures or video; ``None`` where there are none.
+        Images or video; ``None`` where there are none.
     exposure_s, readout_s
         ``None`` where unknown; a readout of 0 is a global shutter.
     readout_source
         Where the readout comes from, if neither the user nor the recorder said it.
     readout_direction
-        In the stored picture.
+        In the stored image.
     shared_clock
         Whether frame times and IMU stamps come from one clock.
     camera

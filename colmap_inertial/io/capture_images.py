@@ -1,11 +1,11 @@
-"""Tables of a capture.toml for pictures beside the frames: ``[apertures]`` and ``[exposures]``.
+"""Tables of a capture.toml for images beside the frames: ``[apertures]`` and ``[exposures]``.
 
 The sub-images of a multi-aperture camera and their calibration:
 
 .. code-block:: toml
 
     [images]
-    folder = "green"                # the reference's pictures; their names and times are the exposures'
+    folder = "green"                # the reference's images; their names and times are the exposures'
     times = "frames.csv"
 
     [apertures]
@@ -19,7 +19,7 @@ The sub-images of a multi-aperture camera and their calibration:
     [apertures.red]                 # the second one is its partner: disparities are shifts between these two
     role = "red"
     camera = "cam1"
-    folder = "red"                  # pictures of the same names here; by default the folder of [images]
+    folder = "red"                  # images of the same names here; by default the folder of [images]
     rename = ["_1.", "_2."]         # or: the reference's "IMG_0007_1.tif" is "IMG_0007_2.tif" here
 
 A long exposure beside each short one:
@@ -31,7 +31,7 @@ A long exposure beside each short one:
     times = "frames.csv"
 
     [exposures]
-    folder = "long"                 # the long ones: pictures of the same names here, whatever their endings
+    folder = "long"                 # the long ones: images of the same names here, whatever their endings
     rename = ["_short.", "_long."]  # or: "IMG_7_short.jpg" is "IMG_7_long.jpg" there
     times = "long.csv"              # columns name,t_s and, best, exposure_s, on the clock of the short ones' times
     time_unit = "ns"                # of times, where the header does not say
@@ -67,12 +67,12 @@ from colmap_inertial.io.units import TIME_UNITS_NS, seconds
 
 @dataclass(frozen=True, kw_only=True)
 class SubImages:
-    """Location of one aperture's pictures.
+    """Location of one aperture's images.
 
     Attributes
     ----------
     folder
-        Of the pictures.
+        Of the images.
     rename
         What in the reference's file name is replaced by what; ``None`` where names are the same.
     """
@@ -81,7 +81,7 @@ class SubImages:
     rename: tuple[str, str] | None = None
 
     def path(self, name: str) -> Path:
-        """The picture that belongs to a picture of the reference."""
+        """The image that belongs to an image of the reference."""
         if self.rename is None:
             return path_in(self.folder, name)
         old, new = self.rename
@@ -93,21 +93,21 @@ class SubImages:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ApertureImages:
-    """A multi-aperture camera and its pictures.
+    """A multi-aperture camera and its images.
 
     Attributes
     ----------
     rig
         The calibrated apertures, the reference first.
     sources
-        Where each one's pictures are, in the rig's order.
+        Where each one's images are, in the rig's order.
     """
 
     rig: ApertureRig
     sources: tuple[SubImages, ...]
 
     def files(self, names: Iterable[str]) -> list[Path]:
-        """The pictures of all apertures but the reference, for fingerprints."""
+        """The images of all apertures but the reference, for fingerprints."""
         return [source.path(name) for name in names for source in self.sources[1:]]
 
 
@@ -127,12 +127,12 @@ def read_apertures_table(table: Section, images: Path | None) -> ApertureImages:
     Parameters
     ----------
     images
-        Folder of the reference's pictures.
+        Folder of the reference's images.
 
     Raises
     ------
     FormatError
-        Where the calibration cannot be read, lacks a camera, or knows no size and there is no picture.
+        Where the calibration cannot be read, lacks a camera, or knows no size and there is no image.
     """
     if images is None:
         table.fail(None, Fact("reference-pictures-missing"))
@@ -187,7 +187,7 @@ def _aperture(name: str, role: SpectralRole, camera: MountedCamera, source: SubI
 
 
 def _size_of_first(source: SubImages, names: Path) -> tuple[int, int]:
-    """Width and height of an aperture's first picture, where the calibration gives none."""
+    """Width and height of an aperture's first image, where the calibration gives none."""
     image_names = sorted(p.name for p in names.iterdir() if p.suffix.lower() in SUFFIXES) if names.is_dir() else []
     for name in image_names:
         if source.rename is None or source.rename[0] in name:
@@ -313,7 +313,7 @@ class LongExposures:
     ) -> float | None:
         """Light of a long exposure over that of its short one, by exposure times and sensitivities.
 
-        What is not given is looked for in the EXIF of the pictures; ``None`` where one of the four is unknown.
+        What is not given is looked for in the EXIF of the images; ``None`` where one of the four is unknown.
         """
         values = []
         for path, exposure_s, iso in (

@@ -1,4 +1,4 @@
-"""Depth maps beside frames: 16-bit pictures of millimetres, arrays of metres, with or without confidence."""
+"""Depth maps beside frames: 16-bit images of millimetres, arrays of metres, with or without confidence."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from colmap_inertial.io.images import read_image
 
 #: Endings of files that hold depth.
 SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".depth")
-#: ARKit's levels of confidence, from the lowest, as it counts them and as pictures of them have them.
+#: ARKit's levels of confidence, from the lowest, as it counts them and as images of them have them.
 _HIGHEST_LEVEL, _HIGHEST_GREY = 2, 255
-#: Depth of pictures, in metres for each step.
+#: Depth of images, in metres for each step.
 MILLIMETRES = 1e-3
 
 
@@ -34,9 +34,9 @@ class DepthFiles:
     depth, confidence
         The files by the names of frames.
     view
-        Intrinsics, of one for all or by the names of frames, in any size of the picture: maps are smaller versions.
+        Intrinsics, of one for all or by the names of frames, in any size of the image: maps are smaller versions.
     metres
-        Metres for each step of a picture; arrays count in it, too.
+        Metres for each step of an image; arrays count in it, too.
     source
         What wrote them.
     is_fused
@@ -78,13 +78,13 @@ def read_depth_map(
     Parameters
     ----------
     path
-        A picture of one channel, an array of NumPy, or a Record3D ``.depth`` (float32, LZFSE).
+        An image of one channel, an array of NumPy, or a Record3D ``.depth`` (float32, LZFSE).
     view
         Intrinsics; resized to the map's size.
     metres
         For each step of the file's numbers.
     confidence
-        A picture or array of the same size; only what has the highest level counts.
+        An image or array of the same size; only what has the highest level counts.
 
     Raises
     ------

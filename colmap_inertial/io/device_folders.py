@@ -11,7 +11,7 @@ Polycam raw: ``keyframes/cameras/T.json`` with ``t_00`` to ``t_23`` (rows of wor
 and so on; ``depth/T.png`` millimetres, ``confidence/T.png`` grey.
 
 nerfstudio: ``transforms.json`` with ``transform_matrix`` (world_from_camera, y up and z back), ``depth_file_path`` of
-each frame: millimetres where a picture, metres where an array. Its poses may be of any unit.
+each frame: millimetres where an image, metres where an array. Its poses may be of any unit.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from colmap_inertial.io.units import seconds
 _HALF_TURN_XYZW = np.array([1.0, 0.0, 0.0, 0.0])
 #: ARKit's worlds: y against gravity.
 _ARKIT_UP = (0.0, 1.0, 0.0)
-#: ARKit's pictures of which Stray Scanner writes the intrinsics, where its video is not there to tell.
+#: ARKit's images of which Stray Scanner writes the intrinsics, where its video is not there to tell.
 _ARKIT_PX = (1920, 1440)
 
 
@@ -174,7 +174,7 @@ def _stray_depth(path: Path) -> DepthMaps | None:
 
 
 def _picture_px(path: Path, matrix: Array) -> tuple[int, int]:
-    """Size of the pictures that intrinsics are of: the video's, else ARKit's own, where the centre fits."""
+    """Size of the images that intrinsics are of: the video's, else ARKit's own, where the centre fits."""
     from colmap_inertial.io.mp4 import is_mp4, read_movie
 
     video = path / "rgb.mp4"

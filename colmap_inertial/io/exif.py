@@ -1,4 +1,4 @@
-"""EXIF of pictures: time, place and exposure, and metadata that is copied to a deblurred picture byte for byte.
+"""EXIF of images: time, place and exposure, and metadata that is copied to a deblurred image byte for byte.
 
 Times are taken only where they tell more than whole seconds.
 """
@@ -54,26 +54,26 @@ class _Type(IntEnum):
 
 @reader("pictures with times")
 def stamps_of_exif(folder: Path, names: Sequence[str]) -> tuple[FrameStamps, int]:
-    """Take each picture's time from DateTimeOriginal and SubSecTimeOriginal of its EXIF.
+    """Take each image's time from DateTimeOriginal and SubSecTimeOriginal of its EXIF.
 
     Parameters
     ----------
     folder, names
-        The pictures: JPEG, PNG or TIFF.
+        The images: JPEG, PNG or TIFF.
 
     Returns
     -------
     stamps
         Universal time where the EXIF states its offset, else the camera's local time.
     digits
-        Of the fraction of a second, in the picture with the fewest.
+        Of the fraction of a second, in the image with the fewest.
 
     Raises
     ------
     FormatError
-        For a picture that is missing, or whose EXIF is.
+        For an image that is missing, or whose EXIF is.
     TimingError
-        For a time to whole or tenths of a second, which is too coarse to join with an IMU, and where only some pictures
+        For a time to whole or tenths of a second, which is too coarse to join with an IMU, and where only some images
         state their time's offset.
     """
     t_ns, digits, offsets = [], [], []
@@ -105,7 +105,7 @@ def stamps_of_exif(folder: Path, names: Sequence[str]) -> tuple[FrameStamps, int
 
 
 def _texts(path: Path) -> dict[int, str]:
-    """The text entries of a picture's EXIF directory."""
+    """The text entries of an image's EXIF directory."""
     head = read_bytes(path, HEAD_BYTES, what="picture")
     try:
         entries = _directory(head, _Tag.EXIF)
@@ -175,7 +175,7 @@ def exposure_of(head: bytes) -> tuple[float | None, float | None]:
 
 
 def position_of(head: bytes) -> tuple[float, float, float, float, HeightDatum] | None:
-    """Position from the EXIF in the head of a picture's file; ``None`` where there is none.
+    """Position from the EXIF in the head of an image's file; ``None`` where there is none.
 
     Returns
     -------
@@ -234,7 +234,7 @@ _JPEG_CODING = (0xE0, 0xEE)
 
 
 def carry_metadata(original: bytes, encoded: bytes) -> bytes:
-    """A newly encoded picture with the metadata of the one that it was made from: EXIF, XMP, colour profile, comments.
+    """A newly encoded image with the metadata of the one that it was made from: EXIF, XMP, colour profile, comments.
 
     Of JPEG, PNG and TIFF; other formats, and TIFFs whose directories are damaged, come back as they are.
     """

@@ -18,7 +18,7 @@ def fingerprint(path: Path) -> list[object]:
     """Identity of an input: names, sizes, modification times and content.
 
     Tools that edit metadata or copy with the old times leave size and time as they were, so the content counts, too: of
-    files up to 4 MiB, as most pictures and tables are, each byte; of larger ones 64 pieces over their whole length. Not
+    files up to 4 MiB, as most images and tables are, each byte; of larger ones 64 pieces over their whole length. Not
     the time of the last change of the inode, which tells of an edit as well, but also of a hard link, which
     ``reconstruct PROJECT OUT --link`` makes itself, and of another owner.
     """

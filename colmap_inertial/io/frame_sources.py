@@ -1,4 +1,4 @@
-"""Sources of frames: a folder of pictures or a video, as tables of a ``capture.toml`` describe them."""
+"""Sources of frames: a folder of images or a video, as tables of a ``capture.toml`` describe them."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from colmap_inertial.io.units import TIME_UNITS_NS
 
 @dataclass(frozen=True, kw_only=True)
 class ImageFolder:
-    """Frames as pictures in a folder.
+    """Frames as images in a folder.
 
     Attributes
     ----------
     folder, pattern
-        Files that match; ``None`` takes every picture in the folder itself.
+        Files that match; ``None`` takes every image in the folder itself.
     times
         ``"name"`` or a CSV file; ``None`` where nothing was said.
     time_unit
         Of the names, or of the CSV where its header does not say.
     video
-        What the pictures were cut from, where known; only ``diagnose`` looks at it.
+        What the images were cut from, where known; only ``diagnose`` looks at it.
     """
 
     folder: Path
@@ -60,7 +60,7 @@ IMAGES_KEYS = ("folder", "pattern", "times", "time_unit", "video")
 
 
 def read_image_folder(table: Section) -> ImageFolder:
-    """A folder of pictures, as a table describes it."""
+    """A folder of images, as a table describes it."""
     folder = table.require("folder", table.file("folder"))
     pattern = table.text("pattern")
     times: Literal["name"] | Path | None = "name" if table.text("times") == "name" else table.file("times")

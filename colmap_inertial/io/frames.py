@@ -45,7 +45,7 @@ def read_frames(
     timing
         Names and times of all frames, known before any is decoded.
     frames
-        The frames in order of time, decoded as they are asked for. Pictures keep the file's depth and stored
+        The frames in order of time, decoded as they are asked for. Images keep the file's depth and stored
         orientation; see :func:`read_image` and :func:`decode_video`.
 
     Raises
@@ -158,7 +158,7 @@ def read_frame_times(path: StrPath, first_of: Mapping[str, str] = NO_RIGS) -> Fr
 
 
 def picture_folders(capture: Capture) -> tuple[Path, ...]:
-    """All folders that pictures of a capture are read from; empty where they come from videos."""
+    """All folders that images of a capture are read from; empty where they come from videos."""
     folders = [capture.frames.folder] if isinstance(capture.frames, ImageFolder) else []
     if capture.apertures is not None:
         folders += [source.folder for source in capture.apertures.sources]

@@ -326,7 +326,7 @@ def _readout_s(path: Path, settings: dict[str, Entry], streams: dict[str, Stream
 
 
 def _stabilisation(settings: dict[str, Entry], image: Array | None) -> tuple[bool | None, str]:
-    """Whether the picture was stabilised, and how the camera puts it."""
+    """Whether the image was stabilised, and how the camera puts it."""
     words = " ".join(f"{key}={settings[key].text()}" for key in ("EISE", "EISA") if key in settings)
     flag = settings["EISE"].text().upper() if "EISE" in settings else ""
     if flag == "Y":

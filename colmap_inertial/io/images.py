@@ -1,4 +1,4 @@
-"""Decoding single pictures exactly as COLMAP sees them."""
+"""Decoding single images exactly as COLMAP sees them."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from colmap_inertial.core.facts import Fact
 from colmap_inertial.io.files import read_bytes, read_limits, reader
 from colmap_inertial.io.stand_ins import foreign_picture, what_stands_in
 
-#: File endings of pictures that both OpenCV and the published builds of pycolmap read (the latter read no WebP).
+#: File endings of images that both OpenCV and the published builds of pycolmap read (the latter read no WebP).
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".pgm", ".ppm")
 
 PNG = b"\x89PNG\r\n\x1a\n"
 #: Order of bytes as of ``struct``, by the beginning of a TIFF.
 TIFF_ORDERS = {b"II*\0": "<", b"MM\0*": ">"}
-#: Pictures of photographs are not packed more tightly, each byte of a file for so many of pixels.
+#: Images of photographs are not packed more tightly, each byte of a file for so many of pixels.
 _PACKED = 20
 #: Bytes of memory for each of a JPEG. Photographs of this many pixels have more than .5 bits each, or .7 in scans.
 _JPEG_PACKED = 100
 #: Markers of JPEG: C4, C8 and CC are none of frames.
 START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 START_OF_SCAN = 0xDA
-#: Progressive ones, whose coefficients the decoder holds, all of the picture.
+#: Progressive ones, whose coefficients the decoder holds, all of the image.
 _PROGRESSIVE = (0xC2, 0xC6, 0xCA, 0xCE)
 
 
 @reader("a picture")
 def read_image(path: Path) -> UInt8Array | UInt16Array:
-    """Decode a picture: (H, W) or (H, W, 3) RGB, in the file's own depth, rows as stored.
+    """Decode an image: (H, W) or (H, W, 3) RGB, in the file's own depth, rows as stored.
 
     The orientation that EXIF may state is not applied, as COLMAP does not apply it either (pycolmap 4.2's
     ``Bitmap.read``). An alpha channel is dropped.
@@ -92,7 +92,7 @@ def read_alpha(data: bytes) -> UInt8Array | UInt16Array | None:
 
 
 def require_modest(path: Path, data: bytes) -> None:
-    """Refuse a picture by what its header says, before it takes the memory.
+    """Refuse an image by what its header says, before it takes the memory.
 
     Raises
     ------
@@ -218,7 +218,7 @@ def grey_8bit(image: UInt8Array | UInt16Array) -> UInt8Array:
 
 
 def _fault(data: bytes) -> Fact | None:
-    """Fault in the bytes of a picture, where its format shows it; decoders pass over some of them."""
+    """Fault in the bytes of an image, where its format shows it; decoders pass over some of them."""
     if data.startswith(b"\xff\xd8"):
         return _jpeg_fault(data)
     if data.startswith(PNG):

@@ -359,7 +359,7 @@ class RecorderOutput:
     format, imu
         What ``read_imu`` takes.
     video
-        The pictures; ``None`` where they do not lie where the recorder puts them.
+        The images; ``None`` where they do not lie where the recorder puts them.
     log
         What the recorder noted about the frames.
     """

@@ -1,4 +1,4 @@
-"""Quality and colour sampling of a JPEG, so that a picture made of it is coded alike."""
+"""Quality and colour sampling of a JPEG, so that an image made of it is coded alike."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def read_jpeg_coding(data: bytes) -> tuple[int, int | None]:
     Returns
     -------
     The quality of the IJG's library with as coarse a table for luminance, within `JPEG_LIMITS`; and the sampling, or
-    ``None`` for a grey picture and where OpenCV cannot write it.
+    ``None`` for a grey image and where OpenCV cannot write it.
     """
     tables: dict[int, int] = {}
     frame = b""

@@ -42,7 +42,7 @@ class Track:
     t_ns
         (N,) presentation time on the movie's clock, edit list included.
     width_px, height_px
-        Of a video's stored pictures; 0 for other tracks.
+        Of a video's stored images; 0 for other tracks.
     """
 
     handler: str
@@ -300,7 +300,7 @@ def _track(reader: _Boxes, begin: int, end: int, movie_scale: int) -> Track | No
 
 
 def _entry(reader: _Boxes, place: tuple[int, int] | None, kind: str) -> tuple[str, int, int]:
-    """The format of the samples, and the size of a video's pictures."""
+    """The format of the samples, and the size of a video's images."""
     if place is None:
         return "", 0, 0
     begin, end = place

@@ -1,4 +1,4 @@
-"""Names of a model's images: only names, until a picture is looked for."""
+"""Names of a model's images: only names, until an image is looked for."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def check_image_names(names: Iterable[str], source: Path | str) -> None:
 
 
 def picture_in(folder: Path, name: str, source: Path | str | None = None) -> Path:
-    """The path of a picture by its name in a model; of one that leads elsewhere, of its last parts that are there.
+    """The path of an image by its name in a model; of one that leads elsewhere, of its last parts that are there.
 
-    Some programs name pictures by absolute paths, or by such that begin with ``..``: these are only names.
+    Some programs name images by absolute paths, or by such that begin with ``..``: these are only names.
 
     Raises
     ------

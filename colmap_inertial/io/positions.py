@@ -1,4 +1,4 @@
-"""Positions of a satellite receiver that a capture carries: in its video's telemetry, or in its pictures."""
+"""Positions of a satellite receiver that a capture carries: in its video's telemetry, or in its images."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ def positions_in_video(video: Path) -> PositionFixes:
 
 
 def positions_in_pictures(folder: Path, names: Sequence[str]) -> PositionFixes:
-    """Positions in the EXIF of pictures; those without one are left out.
+    """Positions in the EXIF of images; those without one are left out.
 
     Raises
     ------
     FormatError
-        Where none has a position, or a picture is missing.
+        Where none has a position, or an image is missing.
     """
     rows, named = [], []
     for name in names:

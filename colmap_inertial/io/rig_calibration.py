@@ -31,7 +31,7 @@ class MountedCamera:
     model, params
         In COLMAP's terms.
     size
-        Width and height; ``None`` where the calibration does not say, and the pictures do.
+        Width and height; ``None`` where the calibration does not say, and the images do.
     cam_from_rig
         (4, 4).
     """

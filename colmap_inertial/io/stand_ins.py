@@ -13,7 +13,7 @@ from colmap_inertial.io.files import read_bytes
 
 _HEAD = 512
 _PACKED = {b"\x1f\x8b": "gzip", b"PK\x03\x04": "zip", b"BZh": "bzip2", b"\xfd7zXZ": "xz", b"7z\xbc\xaf": "7-Zip"}
-#: What ISO media files of pictures say of themselves.
+#: What ISO media files of images say of themselves.
 _HEIF = (b"heic", b"heix", b"mif1", b"msf1", b"heim", b"heis", b"hevc", b"avif", b"avis")
 
 
@@ -64,7 +64,7 @@ def refuse_stand_in(path: Path, head: bytes | None = None) -> None:
 
 
 def foreign_picture(head: bytes) -> Fact | None:
-    """The format of a picture that is none of those that are read."""
+    """The format of an image that is none of those that are read."""
     if head[4:8] == b"ftyp" and head[8:12] in _HEIF:
         return Fact("picture-format", kind="HEIF or AVIF")
     kinds = {

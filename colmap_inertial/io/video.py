@@ -1,9 +1,9 @@
 """Video: exact presentation stamps, and frames one by one in the sensor's own orientation.
 
 Colours follow what the video says of itself: matrix (BT.601, BT.709, BT.2020) and range, limited where it says nothing,
-BT.709 from 720 rows on where it says nothing, as players have it. Transfer curves stay: a log or HDR picture stays one.
+BT.709 from 720 rows on where it says nothing, as players have it. Transfer curves stay: a log or HDR image stays one.
 
-The readout of a video that does not state its own is looked up by camera and mode: model, picture size and frame rate
+The readout of a video that does not state its own is looked up by camera and mode: model, image size and frame rate
 must all be those of a row of the table (``readouts.csv``, with the source of each figure). Where two sources contradict
 each other, none of them is in it.
 """
@@ -144,7 +144,7 @@ def decode_video(path: Path, wanted_ns: Int64Array) -> Iterator[tuple[int, UInt8
 
 
 def reduced(grey: UInt8Array, long_side_px: int) -> UInt8Array:
-    """A grey picture, shrunk by area where its longer side is longer than this."""
+    """A grey image, shrunk by area where its longer side is longer than this."""
     import cv2
 
     scale = long_side_px / max(grey.shape)
@@ -236,7 +236,7 @@ def _brightness(frame: av.VideoFrame) -> UInt8Array:
 
 @dataclass(frozen=True, kw_only=True)
 class VideoMode:
-    """The camera that a video names, and how it filmed: size of the stored pictures, mean frame rate."""
+    """The camera that a video names, and how it filmed: size of the stored images, mean frame rate."""
 
     make: str
     model: str
@@ -292,7 +292,7 @@ def _open(path: Path) -> tuple[InputContainer, VideoStream]:
 
 
 def _find_filmed(path: Path, container: InputContainer) -> VideoStream:
-    """The video stream that the camera filmed: no cover picture, no smaller copy."""
+    """The video stream that the camera filmed: no cover image, no smaller copy."""
     from av.stream import Disposition
 
     accompanying = Disposition.attached_pic | Disposition.timed_thumbnails
@@ -316,7 +316,7 @@ def _area(stream: VideoStream) -> int:
 def _count_lost(path: Path, kind: str, listed: int, not_found: int) -> int:
     """Number of frames in an index that lie beyond the end of the file, where FFmpeg gave fewer than the index lists.
 
-    An intact file gives fewer, too: what an edit list cuts away is dropped by whole groups of pictures, and AVI counts
+    An intact file gives fewer, too: what an edit list cuts away is dropped by whole groups of images, and AVI counts
     a frame that the camera dropped as an empty one.
     """
     if kind.startswith("mov,"):

@@ -1,4 +1,4 @@
-"""Find the frame of a video that a picture shows, by its content: through another codec, size or brightness, never by
+"""Find the frame of a video that an image shows, by its content: through another codec, size or brightness, never by
 counting.
 """
 
@@ -21,7 +21,7 @@ from colmap_inertial.io.video import decode_grey
 
 @dataclass(frozen=True, kw_only=True)
 class _MatchLimits:
-    """Limits for a picture that is a frame of the video."""
+    """Limits for an image that is a frame of the video."""
 
     #: Sides of the thumbnails: the small one chooses which frames are compared closely, the large one decides.
     small_px: int = 40
@@ -29,9 +29,9 @@ class _MatchLimits:
     large_px: int = 128
     #: A frame is compared closely with the images for which it is among this many most similar ones so far.
     candidates: int = 8
-    #: Below which a small thumbnail is no candidate, and a large one not the same picture.
+    #: Below which a small thumbnail is no candidate, and a large one not the same image.
     least_correlation: float = 0.5
-    #: Below which a small thumbnail is no candidate, and a large one not the same picture.
+    #: Below which a small thumbnail is no candidate, and a large one not the same image.
     same_correlation: float = 0.95
     #: How far an image may lie from its frame towards the next best one: the change from frame to frame is the measure,
     #: so that noise of coding, which has nothing of it, does not count.
@@ -50,9 +50,9 @@ class VideoMatch:
     Attributes
     ----------
     t_ns
-        Presentation stamp of the frame that each picture is.
+        Presentation stamp of the frame that each image is.
     doubtful
-        Why there is none, for the other pictures.
+        Why there is none, for the other images.
     quarter_turns
         How often the images are rotated by 90 degrees counterclockwise against the frames as stored.
     """
@@ -63,7 +63,7 @@ class VideoMatch:
 
 
 class _Candidates:
-    """The two frames that look most like each picture so far."""
+    """The two frames that look most like each image so far."""
 
     def __init__(self, images: UInt8Array) -> None:
         self._small = np.array([_normalise(_shrink(image)) for image in images])
@@ -74,7 +74,7 @@ class _Candidates:
         self.t_ns = np.zeros((len(images), 2), dtype=np.int64)
 
     def offer(self, t_ns: int, grey: UInt8Array) -> None:
-        """Compare a frame with all pictures."""
+        """Compare a frame with all images."""
         thumbnail = _thumbnail(grey, _LIMITS.large_px)
         correlation = self._small @ _normalise(_shrink(thumbnail))
         better = np.flatnonzero(correlation > self._correlation.min(axis=1))
@@ -91,7 +91,7 @@ class _Candidates:
                 self.distance[i, place], self._frames[i, place], self.t_ns[i, place] = distance, thumbnail, t_ns
 
     def fraction_to_next(self, i: int) -> float:
-        """Position of picture ``i`` between its best frame (0) and the next best (1); at most half-way."""
+        """Position of image ``i`` between its best frame (0) and the next best (1); at most half-way."""
         first, second = self.distance[i]
         if not np.isfinite(second):
             return 0.0
@@ -104,10 +104,10 @@ class _Candidates:
 def match_to_video(
     video: Path, folder: Path, names: Sequence[str], *, progress: Callable[[int], object] = lambda frames: None
 ) -> VideoMatch:
-    """Find the frame of a video that each picture was taken from.
+    """Find the frame of a video that each image was taken from.
 
-    Thumbnails of the pictures are compared with each frame as it is decoded, once; memory does not grow with the video.
-    Correlation is blind to brightness and contrast, and thumbnails to size and coding noise. A picture of which two
+    Thumbnails of the images are compared with each frame as it is decoded, once; memory does not grow with the video.
+    Correlation is blind to brightness and contrast, and thumbnails to size and coding noise. An image of which two
     frames are about equally likely has no match: a repeated frame, or a camera that stood still.
 
     Parameters
@@ -115,21 +115,21 @@ def match_to_video(
     video
         Decoded from beginning to end.
     folder, names
-        The pictures: the video's frames, whole, in any size, upright or as stored.
+        The images: the video's frames, whole, in any size, upright or as stored.
     progress
         Called with the number of frames that were looked at.
 
     Raises
     ------
     FormatError
-        For a picture or video that cannot be decoded.
+        For an image or video that cannot be decoded.
     """
     images = (grey_8bit(read_image(picture_in(folder, name))) for name in names)
     thumbnails = np.array([_thumbnail(image, _LIMITS.large_px) for image in images])
     turns: dict[int, _Candidates] = {}
     for seen, (t_ns, angle, grey) in enumerate(decode_grey(video), start=1):
         if not turns:
-            # which way round the angle is meant depends on who extracted the frames: let the pictures tell
+            # which way round the angle is meant depends on who extracted the frames: let the images tell
             possible = {0: (0,), 180: (0, 2)}.get(abs(angle) % 360, (0, 1, 3))
             turns = {turn: _Candidates(np.rot90(thumbnails, -turn, axes=(1, 2))) for turn in possible}
         for candidates in turns.values():
@@ -176,7 +176,7 @@ def _shrink(thumbnail: UInt8Array) -> UInt8Array:
 
 
 def _normalise(thumbnail: UInt8Array) -> Float32Array:
-    """(N,) zero mean, unit length; zero for a flat picture, which looks like nothing."""
+    """(N,) zero mean, unit length; zero for a flat image, which looks like nothing."""
     values = thumbnail.astype(np.float32).ravel()
     values -= values.mean()
     length = float(np.linalg.norm(values))

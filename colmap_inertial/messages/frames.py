@@ -45,7 +45,7 @@ def blur_not_undone(blur_px: float) -> str:
     return f"{blur_px:.0f} px of blur, too long to deblur"
 
 
-# what the pictures say about the gyroscope
+# what the images say about the gyroscope
 
 
 @message(example={"count": 2})

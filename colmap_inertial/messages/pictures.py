@@ -1,4 +1,4 @@
-"""Words of pictures that are not read, and of what their EXIF lacks."""
+"""Words of images that are not read, and of what their EXIF lacks."""
 
 from __future__ import annotations
 

@@ -109,7 +109,7 @@ def transform_splat_cameras(source: Path, target: Path, similarity: Similarity) 
 
 
 def is_depth_params(path: Path) -> bool:
-    """Whether a file has scale and offset of each picture's inverse depth."""
+    """Whether a file has scale and offset of each image's inverse depth."""
     return path.name == "depth_params.json" and bool(_depth_params(path))
 
 
@@ -128,7 +128,7 @@ def _depth_params(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def transform_depth_params(source: Path, target: Path, similarity: Similarity) -> tuple[str, ...]:
-    """Write a copy whose inverse depths, ``scale * picture + offset``, are those of the moved model."""
+    """Write a copy whose inverse depths, ``scale * image + offset``, are those of the moved model."""
     values = _depth_params(source)
     for fields in values.values():
         fields["scale"] /= similarity.scale

@@ -71,7 +71,7 @@ class Unmoved:
     count, example
         How many, and the path of one of them.
     lengths
-        ``carried`` for formats that have them, ``depths`` for pictures of depths, ``possible`` where nothing is known.
+        ``carried`` for formats that have them, ``depths`` for images of depths, ``possible`` where nothing is known.
     """
 
     kind: str
@@ -88,7 +88,7 @@ def lengths_of(file: Path, path: Path, depths: frozenset[Path] = frozenset()) ->
     file, path
         The file, and its path in the project.
     depths
-        Paths of pictures that hold depths.
+        Paths of images that hold depths.
     """
     name, suffix = path.name.lower(), path.suffix.lower()
     if name in _CARRY_NAMES:
@@ -134,7 +134,7 @@ def _has_rows_of_numbers(text: bytes) -> bool:
 
 
 def _is_deep(file: Path, path: Path) -> bool:
-    """Whether a picture may hold depths: grey values of 16 bit or more, or floating-point numbers."""
+    """Whether an image may hold depths: grey values of 16 bit or more, or floating-point numbers."""
     suffix = path.suffix.lower()
     if suffix == ".png":
         head = _begin(file, 32)

@@ -52,7 +52,7 @@ def find_fold(camera: pycolmap.Camera) -> Fold | None:
 
 
 def farthest_corner_px(camera: pycolmap.Camera) -> float:
-    """Distance of the farthest corner of the picture from the principal point."""
+    """Distance of the farthest corner of the image from the principal point."""
     x = max(camera.principal_point_x, camera.width - camera.principal_point_x)
     y = max(camera.principal_point_y, camera.height - camera.principal_point_y)
     return float(np.hypot(x, y))

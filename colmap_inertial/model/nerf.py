@@ -24,14 +24,14 @@ from colmap_inertial.model.database import PlacedModel
 _MATRICES = ("transform_matrix", "transform_matrix_start", "transform_matrix_end")
 #: Depths between which a camera sees, as some programs have them.
 _RANGES = {"near", "far", "z_near", "z_far", "znear", "zfar", "near_plane", "far_plane"}
-#: Fields without lengths: lenses, sizes of pictures, times, numbers of images, and what is done to the world.
+#: Fields without lengths: lenses, sizes of images, times, numbers of images, and what is done to the world.
 _FREE_FIELD = re.compile(
     r"(?i)fl_?[xy]|f[xy]|c[xy]|[wh]|width|height|k\d*|p[12]|k[1-6]|camera_angle_[xy]|[xy]?_?fov(_?[xy])?|aabb_scale|"
     r"applied_(transform|scale)|.*(exposure|time|stamp|iso|sharpness|angular_velocity|readout|shutter|index|_id).*|id|"
     r"n_frames|distortion.*|is_fisheye|rolling_.*|colmap_im_id|camera_id|white_.*|colou?r.*|orientation_override|"
     r"integer_.*levels|fps|frame_rate|rotation|bit_depth|version|.*class.*"
 )
-#: What a step in pictures of depths means, and where frames name these: of instant-ngp and nerfstudio.
+#: What a step in images of depths means, and where frames name these: of instant-ngp and nerfstudio.
 _DEPTH_UNITS = ("integer_depth_scale", "depth_unit_scale_factor")
 _DEPTHS = ("depth_file_path", "depth_path")
 #: What ``export.json`` says of itself, and of its unit: metres, or so many of them.

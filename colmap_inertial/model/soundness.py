@@ -193,7 +193,7 @@ def check_values(reconstruction: pycolmap.Reconstruction, folder: Path, suffix: 
 
 
 def _note_odd_lens(camera: pycolmap.Camera, path: Path) -> None:
-    """Tell of a lens that folds within its pictures, and of a principal point outside of them."""
+    """Tell of a lens that folds within its images, and of a principal point outside of them."""
     if sees_all_around(camera):
         return
     named = {"camera": int(camera.camera_id)}

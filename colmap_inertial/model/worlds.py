@@ -81,7 +81,7 @@ class Worlds:
         for path in files:
             if is_dataparser(project / path):
                 self._find_training(path)
-        #: Pictures of depths that are named as such, and those whose unit is in the file that names them.
+        #: Images of depths that are named as such, and those whose unit is in the file that names them.
         self.depths, self.counted = frozenset(depths), frozenset(counted)
 
     def _find_training(self, path: Path) -> None:

@@ -1,6 +1,6 @@
 """Rotation of a camera from frame to frame, from its pixels: before any reconstruction exists.
 
-Corners are tracked from each frame to the next on a reduced picture; frames too far apart for tracking are matched by
+Corners are tracked from each frame to the next on a reduced image; frames too far apart for tracking are matched by
 features. One angular velocity is fitted to the rays of each pair, robustly, each ray at the time of its own line, so
 that a rolling shutter does not bend the result. Chained, the rotations are what ``align_camera_imu`` needs.
 """
@@ -64,13 +64,13 @@ class FlowLimits:
     quick_s: float = 0.4
     #: A stabiliser leaves a smaller share of quick rotation.
     stabilised_share: float = 0.6
-    #: Quick rotation must exceed the noise of pictures by this factor.
+    #: Quick rotation must exceed the noise of images by this factor.
     clear_sigmas: float = 3.0
-    #: Tracks must come back to where they began within this, px of the reduced picture.
+    #: Tracks must come back to where they began within this, px of the reduced image.
     round_trip_px: float = 0.7
-    #: A track agrees with a rotation within this, px of the reduced picture: so much translation may show.
+    #: A track agrees with a rotation within this, px of the reduced image: so much translation may show.
     inlier_px: float = 3.0
-    #: Least scatter of tracks, px of the reduced picture.
+    #: Least scatter of tracks, px of the reduced image.
     scatter_floor_px: float = 0.05
     #: Draws of two rays.
     draws: int = 100
@@ -126,7 +126,7 @@ class Tracks:
     Attributes
     ----------
     place
-        (N, 2, 2) where in the first and the second picture: down and across, as shares of the picture from its middle.
+        (N, 2, 2) where in the first and the second image: down and across, as shares of the image from its middle.
     rays
         (N, 2, 2) their rays, z = 1.
     """
@@ -165,7 +165,7 @@ class VisualRotation:
     support
         (F - 1,) tracks that agree.
     tracks
-        (F - 1) what was followed in each pair; empty where pictures were not followed.
+        (F - 1) what was followed in each pair; empty where images were not followed.
     """
 
     names: tuple[str, ...]
@@ -248,13 +248,13 @@ def measure_rotation(
 
 @dataclass(frozen=True, kw_only=True)
 class Stabilisation:
-    """Whether the picture turns as the gyroscope says.
+    """Whether the image turns as the gyroscope says.
 
     Attributes
     ----------
     share
-        Quick rotation in the picture as a share of the gyroscope's (root mean square above about 1 Hz): about one
-        where the picture is as filmed, far less where it was stabilised. ``None`` where the hand was too still to say.
+        Quick rotation in the image as a share of the gyroscope's (root mean square above about 1 Hz): about one
+        where the image is as filmed, far less where it was stabilised. ``None`` where the hand was too still to say.
     stabilised
         ``None`` where that cannot be told.
     reason
@@ -273,10 +273,10 @@ class MotionCheck:
     Attributes
     ----------
     explained
-        Share of the rotation in the pictures that the gyroscope explains: one is all of it, below zero is worse than
+        Share of the rotation in the images that the gyroscope explains: one is all of it, below zero is worse than
         no gyroscope. ``None`` where too few frames, or too little rotation, could be compared.
     gain
-        (3,) rotation in the pictures per rotation measured, about each camera axis; negative means a flipped axis, NaN
+        (3,) rotation in the images per rotation measured, about each camera axis; negative means a flipped axis, NaN
         one about which the camera hardly turned. A common factor above or below one points at the focal length.
     agrees
         ``None`` where that cannot be told.
@@ -325,7 +325,7 @@ def check_motion(rotation: VisualRotation, motion: GyroCamera) -> MotionCheck:
 
 
 def find_stabilisation(rotation: VisualRotation, imu: ImuRecording, *, offset_s: float | None = None) -> Stabilisation:
-    """Tell electronic (or strong optical) stabilisation: the gyroscope turned, the picture did not follow.
+    """Tell electronic (or strong optical) stabilisation: the gyroscope turned, the image did not follow.
 
     What a stabiliser removes is quick; so rotations over frame intervals are compared without their running mean over
     0.4 s, by their size alone, which needs neither axes nor, over a whole recording, the clock offset.
@@ -389,7 +389,7 @@ def _estimate_pair_rotation(
             continue
         first, second = (append_unit_depth(r[ok]) for r in rays)
         span_s = shutters[1].middle_s(points[1][ok]) - shutters[0].middle_s(points[0][ok])
-        # one pixel of the reduced picture as an angle, in the middle of the picture
+        # one pixel of the reduced image as an angle, in the middle of the image
         centre = 0.5 * size[None]
         beside = np.asarray(camera.cam_from_img(np.concatenate([centre, centre + size / now[0].shape[::-1]])))[:, :2]
         pixel_rad = float(np.linalg.norm(np.diff(beside, axis=0))) / np.sqrt(2)
@@ -406,7 +406,7 @@ def _estimate_pair_rotation(
 def follow_points(
     before: UInt8Array, now: UInt8Array, shutter: FrameShutter, options: FlowOptions
 ) -> Iterator[tuple[Array, Array]]:
-    """(N, 2) points that were followed from one reduced picture to the other, px of the picture as it is.
+    """(N, 2) points that were followed from one reduced image to the other, px of the image as it is.
 
     Corners that were tracked come first, then features that were matched; ways that tell too little are left out.
     """
@@ -420,7 +420,7 @@ def follow_points(
 
 
 def _track_corners(before: UInt8Array, now: UInt8Array, options: FlowOptions) -> tuple[Float32Array, Float32Array]:
-    """Corners followed by pyramidal Lucas-Kanade, and back again; spread over the picture."""
+    """Corners followed by pyramidal Lucas-Kanade, and back again; spread over the image."""
     import cv2
 
     distance = max(4.0, 0.5 * np.sqrt(before.size / options.corners))

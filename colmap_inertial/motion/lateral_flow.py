@@ -13,7 +13,7 @@ from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.rolling_shutter import rays
 from colmap_inertial.motion.flow import FlowOptions, GreyFrame, follow_points
 
-#: Share of the points that are slower: as of a frame's blur, which is the 90th percentile over the picture.
+#: Share of the points that are slower: as of a frame's blur, which is the 90th percentile over the image.
 _PERCENTILE = 90
 
 
@@ -28,7 +28,7 @@ class FollowedPair:
     shutters
         Of both.
     points
-        (2, N, 2) where they are in the first and the second picture, px of the pictures as they are.
+        (2, N, 2) where they are in the first and the second image, px of the images as they are.
     """
 
     name: str
@@ -36,7 +36,7 @@ class FollowedPair:
     points: Array
 
     def speed_px_s(self, camera: Projector, motion: GyroCamera | None = None) -> float:
-        """Speed of points in the picture; with a gyroscope, without the camera's rotation.
+        """Speed of points in the image; with a gyroscope, without the camera's rotation.
 
         The 90th percentile of their speeds; NaN where the gyroscope did not record all the time between the frames, or
         too few of the points have rays.

@@ -1,8 +1,8 @@
-"""Readout time of a camera from its pictures and the gyroscope, where it was not measured.
+"""Readout time of a camera from its images and the gyroscope, where it was not measured.
 
 A corner is seen in two frames, each time when its own line is exposed. How far the camera turned between these two
 instants depends on the readout where the turning changes from frame to frame. All corners of all pairs are fitted at
-once: the time that lines take down and across the picture, what is uncertain in the gyroscope's calibration, and for
+once: the time that lines take down and across the image, what is uncertain in the gyroscope's calibration, and for
 each pair a translation. Of a corner whose depth is unknown, only what lies across the translation's flow counts.
 The line delay has been calibrated so with targets (Oth et al., "Rolling Shutter Camera Calibration", CVPR 2013) and
 without (Karpenko et al., "Digital Video Stabilization and Rolling Shutter Correction using Gyroscopes", 2011).
@@ -38,7 +38,7 @@ class ReadoutLimits:
     parts: int = 12
     #: and pairs in each, at least.
     pairs_of_part: int = 3
-    #: What is known beforehand, standard deviations, each far wider than what it says, so that the pictures decide:
+    #: What is known beforehand, standard deviations, each far wider than what it says, so that the images decide:
     #: readout along and across,
     readout_sigma_s: float = 0.1
     #: clock offset,
@@ -90,7 +90,7 @@ class ReadoutEstimate:
     sigma_s
         Its standard deviation.
     direction
-        Where the exposed line moves in the stored picture.
+        Where the exposed line moves in the stored image.
     pairs
         Of frames that were compared.
     """
@@ -195,9 +195,9 @@ class _Corners:
     t_s
         (N, 2) instants of the two frames, camera clock.
     place
-        (N, 2, 2) in the two pictures, down and across, from -0.5 to 0.5.
+        (N, 2, 2) in the two images, down and across, from -0.5 to 0.5.
     rays
-        (N, 2, 2) of the two pictures, z = 1.
+        (N, 2, 2) of the two images, z = 1.
     dt_s
         (K,) between the frames.
     """
@@ -324,7 +324,7 @@ def _compute_residuals(seen: _Corners, motion: GyroCamera, params: Array, moved:
     swept = np.stack([cross(turns[:, :, k], turned) for k in range(9)], axis=2)
     by_focal = np.einsum("nij,nj->ni", now_from_before[:, :, :2], rays[:, 0])
     shown = _project_changes(turned, np.concatenate([swept, by_focal[:, :, None]], axis=2))
-    # all of it in the picture's own unit: with the focal length it would shrink
+    # all of it in the image's own unit: with the focal length it would shrink
     shown[:, :, 9] -= seen_at
     shown /= focal
     flow = np.zeros((len(rays), 2, 3))
@@ -348,7 +348,7 @@ def _differentiate_translation(seen: _Corners, moved: Array) -> Array:
 
 
 def _project_changes(point: Array, change: Array) -> Array:
-    """(N, 2, P) how changes (N, 3, P) of points show in the picture at z = 1."""
+    """(N, 2, P) how changes (N, 3, P) of points show in the image at z = 1."""
     return np.asarray((change[:, :2] - (point[:, :2] / point[:, 2:])[:, :, None] * change[:, 2:]) / point[:, 2:, None])
 
 

@@ -18,7 +18,7 @@ class SignLimits:
 
     #: Natural logarithm of the ratio of the likelihoods that one sign needs over the other: 400 to 1.
     log_ratio: float = 6.0
-    #: Share of the rotation in the pictures that the negated gyroscope must explain to be called right: when a camera
+    #: Share of the rotation in the images that the negated gyroscope must explain to be called right: when a camera
     #: circles an object, its pixels turn against it, but by less.
     least_explained: float = 0.7
     #: Least scatter of a rotation from pixels as a share of its size: intrinsics and translation.
@@ -30,7 +30,7 @@ SIGN_LIMITS = SignLimits()
 
 @dataclass(frozen=True, kw_only=True)
 class SignCheck:
-    """Result of comparing pictures with their gyroscope and with its negative.
+    """Result of comparing images with their gyroscope and with its negative.
 
     Attributes
     ----------

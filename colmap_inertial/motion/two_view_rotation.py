@@ -1,8 +1,8 @@
-"""Rotation of a camera between pictures seconds apart: photographs, keyframes, frames cut once a second.
+"""Rotation of a camera between images seconds apart: photographs, keyframes, frames cut once a second.
 
 There the camera has moved, too, and the pixels' motion is no rotation. Features are matched, the geometry of two views
 with unknown translation is fitted (the five-point method of Nister, 2004, and RANSAC), and a rotation is kept only
-where it agrees with those to the picture after: around a triangle of three pictures rotations must close.
+where it agrees with those to the image after: around a triangle of three images rotations must close.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from colmap_inertial.core.types import FrameTiming, Projector
 from colmap_inertial.imaging.rolling_shutter import append_unit_depth
 from colmap_inertial.motion.flow import GreyFrame, VisualRotation
 
-#: Longer side of pictures that are compared (the 45 of the desk: 6.2 CPU-s, 10.8 at 640 px; rotations differ by .07
+#: Longer side of images that are compared (the 45 of the desk: 6.2 CPU-s, 10.8 at 640 px; rotations differ by .07
 #: degrees).
 COMPARED_PX = 400
 
@@ -27,13 +27,13 @@ COMPARED_PX = 400
 class TwoViewLimits:
     """Limits for the rotation between two views."""
 
-    #: Features of a picture.
+    #: Features of an image.
     features: int = 1000
-    #: Matches of two pictures that must agree.
+    #: Matches of two images that must agree.
     least_matches: int = 40
-    #: How far a match may lie off, px of the reduced picture.
+    #: How far a match may lie off, px of the reduced image.
     off_px: float = 1.5
-    #: Matches that one rotation explains to within this, px of the reduced picture,
+    #: Matches that one rotation explains to within this, px of the reduced image,
     turned_px: float = 3.0
     #: are of a camera that did not move, where they are more than this share.
     turned_share: float = 0.8
@@ -48,7 +48,7 @@ _LIMITS = TwoViewLimits()
 
 @dataclass(frozen=True, eq=False)
 class _Features:
-    """The features of one picture: pixels, rays (z = 1), descriptors."""
+    """The features of one image: pixels, rays (z = 1), descriptors."""
 
     rays: Array
     descriptors: Float32Array
@@ -56,7 +56,7 @@ class _Features:
 
 
 def measure_two_view_rotations(frames: Iterable[GreyFrame], camera: Projector, timing: FrameTiming) -> VisualRotation:
-    """Rotations of the camera between pictures that follow each other.
+    """Rotations of the camera between images that follow each other.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def measure_two_view_rotations(frames: Iterable[GreyFrame], camera: Projector, t
 
     Returns
     -------
-    As of ``flow.measure_rotation``, NaN where no triangle of pictures closes.
+    As of ``flow.measure_rotation``, NaN where no triangle of images closes.
     """
     index = {name: i for i, name in enumerate(timing.names)}
     names: list[str] = []

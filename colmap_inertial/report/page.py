@@ -62,7 +62,7 @@ def render_page(template: str, *, out: Path | None = None, **values: Any) -> str
     links: list[tuple[str, str]] = []
 
     def plot(figure: Figure, label: str) -> Markup:
-        """A place for a figure, and its still picture; ``label`` is for those who cannot see it."""
+        """A place for a figure, and its still image; ``label`` is for those who cannot see it."""
         key = f"f{len(figures)}"
         figures[key] = figure
         place = '<div class="plot" data-figure="{}" role="img" aria-label="{}"></div>'

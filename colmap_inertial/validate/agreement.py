@@ -1,4 +1,4 @@
-"""Whether a scale and a target of known size in the pictures agree; where not, which of them is likelier wrong."""
+"""Whether a scale and a target of known size in the images agree; where not, which of them is likelier wrong."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _NAMED: tuple[tuple[str, Likely], ...] = (
 
 
 def doubt_by_target(estimate: ScaleEstimate, validation: Validation) -> ScaleEstimate:
-    """A scale with a doubt where a target of known size in the pictures contradicts it; the same where it does not.
+    """A scale with a doubt where a target of known size in the images contradicts it; the same where it does not.
 
     Parameters
     ----------

@@ -45,7 +45,7 @@ from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.core.types import CAL, CameraImuCalibration, ImuRecording
 from colmap_inertial.inertial.core.priors import PRIORS
 from colmap_inertial.inertial.refine._residuals import moving
-from colmap_inertial.inertial.refine.pictures import apply_noise, measure_picture_noise, pictures_alone
+from colmap_inertial.inertial.refine.pictures import apply_noise, measure_image_noise, pictures_alone
 from colmap_inertial.inertial.refine.setup import (
     make_problem,
     move_to_middle_lines,
@@ -175,7 +175,7 @@ def by_chance(stage: RefineStage, before: Model, after: Model, truth: np.ndarray
     known = replace(known, noise=replace(known.noise, **levels))
     problem, start = make_problem(seen, before.timing, stage.imu, known, stage._expose_keypoints(before, seen))
     alone = pictures_alone(problem, seen.observations.xy_px)
-    noise = measure_picture_noise(alone, start)
+    noise = measure_image_noise(alone, start)
     problem, alone = (apply_noise(one, noise) for one in (problem, alone))
     x = solve(problem, start).estimate
     some = np.linspace(0, len(truth) - 1, min(len(truth), CENTRES)).astype(int)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 Maker = Literal["patch-match", "plane sweep"]
 
-#: Longer side of pictures that the sweep works on where the user names none: its work grows with its cube.
+#: Longer side of images that the sweep works on where the user names none: its work grows with its cube.
 _SWEPT_SIZE = 1200
 _RECORD = "made_from.json"
 #: Keys of the record that decide patch-match's maps, and what counts where an earlier version did not say.
@@ -186,7 +186,7 @@ def _plan_maps(model: str, max_image_size: int | None, maker: Maker, settings: C
 
 
 def map_file(folder: Path, what: str, name: str, kind: str = "geometric") -> Path:
-    """Path of a picture's map in a workspace; ``what`` is depth or normal."""
+    """Path of an image's map in a workspace; ``what`` is depth or normal."""
     return path_in(folder / "stereo" / f"{what}_maps", f"{name}.{kind}.bin")
 
 
@@ -328,7 +328,7 @@ def fuse_maps(
     """Fuse a workspace's depth maps.
 
     COLMAP's fusion takes a pixel's ray at its corner, as its patch-match does. Maps of the sweep hold the depth of
-    pixels' centres, so that fusion is shown cameras whose principal point is half a pixel aside. It holds all pictures
+    pixels' centres, so that fusion is shown cameras whose principal point is half a pixel aside. It holds all images
     and maps at once, about 20 bytes a pixel; its cache was far slower.
 
     Parameters
@@ -336,7 +336,7 @@ def fuse_maps(
     folder
         The workspace.
     names
-        Of the pictures that have maps.
+        Of the images that have maps.
     targets
         Of the points (PLY) and of who sees them (COLMAP's ``.vis``).
     maker, kind
@@ -367,7 +367,7 @@ def fuse_maps(
 
 
 def _write_corner_workspace(folder: Path, names: Sequence[str], scratch: Path) -> None:
-    """A workspace of links to the pictures and maps, with cameras that see pixels' corners where centres are."""
+    """A workspace of links to the images and maps, with cameras that see pixels' corners where centres are."""
     remove(scratch)
     (scratch / "sparse").mkdir(parents=True)
     (scratch / "stereo").mkdir()

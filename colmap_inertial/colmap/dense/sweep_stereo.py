@@ -1,6 +1,6 @@
 """Depth and normal maps of a dense workspace by our own plane sweep, where there is no CUDA for COLMAP's patch-match.
 
-First the depths of each picture by itself, which are kept aside; then, from those that others agree with, the maps that
+First the depths of each image by itself, which are kept aside; then, from those that others agree with, the maps that
 COLMAP's fusion reads. Both file by file, so that a sweep that was cut off goes on where it was.
 """
 
@@ -41,7 +41,7 @@ from colmap_inertial.model.artefacts import read_map, write_map
 
 #: Partners to match with (fewer measure less, more cost time), and views to ask for agreement.
 PARTNERS, WITNESSES = 4, 8
-#: Maps of each picture: depths, their standard deviations, normals.
+#: Maps of each image: depths, their standard deviations, normals.
 _MAPS = ("depth", "geometric"), ("depth", "sigma"), ("normal", "geometric")
 
 
@@ -53,7 +53,7 @@ class SweptWorkspace:
     raw: Path
 
     def begin(self, identity: object) -> None:
-        """Go on with a sweep of the same pictures and model, or remove what there is of another one."""
+        """Go on with a sweep of the same images and model, or remove what there is of another one."""
         record, content = self.raw / "made_from.json", convert_to_plain({"identity": identity, "smoothed": True})
         if record.is_file() and read_json(record) == content:
             return
@@ -65,7 +65,7 @@ class SweptWorkspace:
         write_json(record, content)
 
     def sweep(self, threads: int, progress: Callable[[], object]) -> None:
-        """Write the maps of all pictures that have partners; ``progress`` is called twice for each picture.
+        """Write the maps of all images that have partners; ``progress`` is called twice for each image.
 
         Parameters
         ----------
@@ -81,7 +81,7 @@ class SweptWorkspace:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the pictures, in the order of the views."""
+        """Names of the images, in the order of the views."""
         return self._scene[0]
 
     @property
@@ -117,7 +117,7 @@ class SweptWorkspace:
         return path_in(self.raw, f"{self.names[view]}.bin")
 
     def _match(self, view: int, threads: int) -> None:
-        """The depths of one picture by its partners."""
+        """The depths of one image by its partners."""
         target, sights = self._raw_file(view), self.sights
         depths = depth_range(sights, view)
         if target.is_file() or depths is None:
@@ -128,7 +128,7 @@ class SweptWorkspace:
             write_map(target, sweep_depth(self._grey(view), sights.views[view], partners, depths, threads=threads))
 
     def _confirm(self, view: int) -> None:
-        """The maps of one picture: depths that others agree with, or planes through these have, if certain."""
+        """The maps of one image: depths that others agree with, or planes through these have, if certain."""
         files = [map_file(self.folder, what, self.names[view], kind) for what, kind in _MAPS]
         if not self._raw_file(view).is_file() or all(file.is_file() for file in files):
             return
@@ -139,12 +139,12 @@ class SweptWorkspace:
             write_map(file, values)
 
     def partners(self, view: int) -> list[Pinhole]:
-        """Cameras of the pictures that a picture is matched with."""
+        """Cameras of the images that an image is matched with."""
         scores = score_partners(self.sights, view)
         return [self.sights.views[k] for k in choose_partners(self.sights, view, scores, PARTNERS)]
 
     def compare(self, view: int) -> Agreement:
-        """Compare the depths of one picture with those of others."""
+        """Compare the depths of one image with those of others."""
         scores = score_partners(self.sights, view)
         best = np.argsort(-scores, kind="stable")[:WITNESSES]
         witnesses = [int(k) for k in best if scores[k] > 0 and self._raw_file(int(k)).is_file()]

@@ -1,6 +1,6 @@
 """A surface by a truncated signed distance function (Curless and Levoy, SIGGRAPH 1996), in Open3D.
 
-Depth maps are brought in one by one, so that memory grows with the surface and not with the pictures.
+Depth maps are brought in one by one, so that memory grows with the surface and not with the images.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class SurfaceLimits:
     truncation_voxels: float = 4.0
     #: What is so many times farther than what is near is coarser than the voxels: it would take most of the memory.
     farthest: float = 3.0
-    #: Surfaces that fewer pictures saw are left out.
+    #: Surfaces that fewer images saw are left out.
     least_seen: float = 3.0
     #: Voxels on a side of the blocks that memory comes in,
     block_voxels: int = 8
@@ -103,7 +103,7 @@ def tsdf_mesh(folder: Path, names: Sequence[str], target: Path, *, maker: Maker,
     folder
         The workspace, with ``images/``, ``sparse/`` and maps.
     names
-        Of the pictures that have maps.
+        Of the images that have maps.
     target
         File to write.
     maker, kind

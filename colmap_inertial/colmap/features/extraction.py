@@ -466,7 +466,7 @@ class MatchRecord:
     loop_candidates
         Pairs that were matched as they may close a loop.
     loops_refused
-        Of these, pairs that COLMAP verified and that were left out: their matches cover too little of both pictures,
+        Of these, pairs that COLMAP verified and that were left out: their matches cover too little of both images,
         contradict the gyroscope's rotation, the relative track, or other loops, or no pair beside them agrees.
     loops_closed
         Of these, pairs that stay.

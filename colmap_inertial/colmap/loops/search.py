@@ -38,7 +38,7 @@ class LoopSearchLimits:
     #: Candidates have at least so many quick matches, and are among the best so many of one of their frames.
     least_quick_matches: int = 6
     best: int = 3
-    #: A loop's matches cover this share of what both pictures show.
+    #: A loop's matches cover this share of what both images show.
     least_covered: float = 0.5
     #: Frames farther apart than this many times how far away things are show nothing in common.
     reach: float = 2.0

@@ -1,6 +1,6 @@
 """Choose the pairs of images to match.
 
-Of few images, or of pictures taken seconds apart: all but those that the gyroscope or a quick comparison excludes. Of a
+Of few images, or of images taken seconds apart: all but those that the gyroscope or a quick comparison excludes. Of a
 video: neighbours in time, and returns to a place. A frame that shows what the one before does, as the camera stands
 still, is matched with the first of its kind alone.
 """

@@ -47,7 +47,7 @@ class TwoViewLimits:
     placed_px: float = 8.0
     #: The share of those matched that must not be farther off.
     placed_share: float = 0.7
-    #: A picture in cells, and the features that a cell must have for it to count.
+    #: An image in cells, and the features that a cell must have for it to count.
     columns: int = 8
     rows: int = 6
     least_features: int = 3
@@ -59,7 +59,7 @@ class TwoViewLimits:
     farthest_rad: float = 0.7
     #: COLMAP stores descriptors of this length.
     length: float = 512.0
-    #: A camera stands still where so many quick matches of two pictures, this share of them, lie less than this part of
+    #: A camera stands still where so many quick matches of two images, this share of them, lie less than this part of
     #: the longer side apart: a pixel of 750.
     least_still: int = 50
     still_share: float = 0.75
@@ -124,7 +124,7 @@ class TwoViews:
     first_from_second
         (M, 3, 3) rotations; NaN where there are too few matches.
     covered
-        (M,) share of the first or the second picture that is matched, whichever is less: of its cells with features
+        (M,) share of the first or the second image that is matched, whichever is less: of its cells with features
         that the other one shows, too, had it turned and not moved.
     """
 
@@ -270,7 +270,7 @@ def _unit_rays(camera: pycolmap.Camera, xy_px: Array) -> Array:
 def _coverage(
     camera: pycolmap.Camera, xy_px: Array, matched: IndexArray, other: pycolmap.Camera, other_from_this: Array
 ) -> float:
-    """Share of the picture's cells with features, as far as the other one shows them, that have a match."""
+    """Share of the image's cells with features, as far as the other one shows them, that have a match."""
     columns, rows = _LIMITS.columns, _LIMITS.rows
     scale = np.array([columns / camera.width, rows / camera.height])
     cell = np.clip(np.floor(xy_px * scale), 0, [columns - 1, rows - 1]).astype(np.intp) @ np.array([1, columns])

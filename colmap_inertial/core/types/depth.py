@@ -88,7 +88,7 @@ class DepthMaps:
     source
         What wrote them, in a word.
     is_fused
-        Whether the device made them from more than its depth sensor: from pictures and its own motion, too.
+        Whether the device made them from more than its depth sensor: from images and its own motion, too.
     files
         Paths of the files behind, by name; empty where there are none.
     """

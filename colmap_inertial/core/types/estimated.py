@@ -435,7 +435,7 @@ class CameraMotion:
     exposure_s
         (F,) exposure times, or ``None`` where unknown.
     readout_s, readout_direction
-        Of the pictures as they were filmed, as in :class:`FrameTiming`.
+        Of the images as they were filmed, as in :class:`FrameTiming`.
     """
 
     names: tuple[str, ...]
@@ -472,7 +472,7 @@ class SolvedMotion:
         By image name, (9, 9) covariance of its position against the first one's, of its velocity and of its rotation
         (world, left; the first one's heading): of all images, or of some.
     readout_s
-        Of the pictures as they were filmed; ``None`` where it was not solved for.
+        Of the images as they were filmed; ``None`` where it was not solved for.
     """
 
     cam_in_world: Mapping[str, Array]

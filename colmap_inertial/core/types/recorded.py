@@ -252,12 +252,12 @@ class FrameLog:
     readout_s, readout_direction
         As in :class:`FrameTiming`.
     stabilised
-        Whether the picture was stabilised (electronically, or by moving the lens), so that it does not turn with the
+        Whether the image was stabilised (electronically, or by moving the lens), so that it does not turn with the
         IMU; ``None`` where the recorder did not say.
     stabilisation
         In the recorder's words.
     camera
-        Intrinsics of the video's pictures.
+        Intrinsics of the video's images.
     up_in_imu
         (F, 3) unit vectors away from the ground, IMU frame, as the recorder's own filter saw them.
     start_from_imu_xyzw
@@ -379,7 +379,7 @@ class ApertureRig:
     Attributes
     ----------
     apertures
-        Two or more, at different places. The first one is the reference, through which the fused picture is seen; the
+        Two or more, at different places. The first one is the reference, through which the fused image is seen; the
         second one is its partner, and disparities are shifts between these two.
     length_unit
         ``"m"``, or ``"model"`` where the calibration has no scale.
@@ -405,7 +405,7 @@ class ApertureRig:
 
     @property
     def reference(self) -> Aperture:
-        """The aperture through which the fused picture is seen."""
+        """The aperture through which the fused image is seen."""
         return self.apertures[0]
 
 
@@ -428,7 +428,7 @@ class PositionFixes:
     t_ns
         (N,) when, on the clock of the video that holds them; ``None`` where ``names`` says it.
     names
-        (N,) of the pictures that hold them; ``None`` where ``t_ns`` says it.
+        (N,) of the images that hold them; ``None`` where ``t_ns`` says it.
     height_above
         What heights count from.
     source

@@ -31,7 +31,7 @@ class SearchLimits:
 
 _LIMITS = SearchLimits()
 
-#: Turns about the view's axis, degrees, of steady hands, and others: between them detail of a picture's tenth still
+#: Turns about the view's axis, degrees, of steady hands, and others: between them detail of an image's tenth still
 #: agrees.
 USUAL_TURNS_DEG = (0.0, -5.0, 5.0, -10.0, 10.0)
 OTHER_TURNS_DEG = tuple(sign * degrees for degrees in range(15, 65, 5) for sign in (-1.0, 1.0))

@@ -1,4 +1,4 @@
-"""Depth of posed pictures by a plane sweep: partners, matching, agreement, smoothing, normals. Touches no file.
+"""Depth of posed images by a plane sweep: partners, matching, agreement, smoothing, normals. Touches no file.
 
 Views are pinhole cameras whose pixel centres are whole numbers. Depth is along the optical axis; 0 is unknown.
 """

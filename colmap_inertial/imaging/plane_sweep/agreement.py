@@ -28,7 +28,7 @@ _LIMITS = AgreementLimits()
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DepthView:
-    """A picture's depths, (H, W), and the camera that took it."""
+    """An image's depths, (H, W), and the camera that took it."""
 
     depth: Float32Array
     camera: Pinhole
@@ -36,7 +36,7 @@ class DepthView:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Agreement:
-    """Comparison of a picture's depths with those of other views, (H, W) each.
+    """Comparison of an image's depths with those of other views, (H, W) each.
 
     Attributes
     ----------

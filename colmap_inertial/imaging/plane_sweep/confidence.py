@@ -64,11 +64,11 @@ def estimate_sigma(agreement: Agreement, camera: Pinhole, partners: Sequence[Pin
     Parameters
     ----------
     agreement
-        Of the depths of one picture with those of others.
+        Of the depths of one image with those of others.
     camera
         What took it.
     partners
-        Cameras of the pictures that it was matched with.
+        Cameras of the images that it was matched with.
 
     Returns
     -------

@@ -1,6 +1,6 @@
-"""Depth of one picture: partners are turned to its orientation, where a plane's depth moves and shrinks them.
+"""Depth of one image: partners are turned to its orientation, where a plane's depth moves and shrinks them.
 
-Coarse to fine: depths at half the size say which candidates each part of the picture needs.
+Coarse to fine: depths at half the size say which candidates each part of the image needs.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _LIMITS = SweepLimits()
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Partner:
-    """Another picture that sees some of the same.
+    """Another image that sees some of the same.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ def sweep_depth(
     camera
         What took it.
     partners
-        Pictures to compare with, at least one.
+        Images to compare with, at least one.
     depths
         Nearest and farthest, in the model's unit.
     threads
@@ -94,10 +94,10 @@ def sweep_depth(
 
     Notes
     -----
-    Planes parallel to the picture, equally spaced in inverse depth (Collins, CVPR 1996). Once a partner is turned to
-    the reference's orientation, a plane moves and shrinks its picture, so that columns and rows are looked up apart.
+    Planes parallel to the image, equally spaced in inverse depth (Collins, CVPR 1996). Once a partner is turned to
+    the reference's orientation, a plane moves and shrinks its image, so that columns and rows are looked up apart.
     Costs (census) are summed over the partners that see all of a window, and the depths found by semi-global matching.
-    Of many candidates, each tile of the picture is matched with those that its depths at half the size leave.
+    Of many candidates, each tile of the image is matched with those that its depths at half the size leave.
     """
     sweep = _Sweep.of(codes, camera, partners, depths)
     if sweep is None:
@@ -173,7 +173,7 @@ class _Sweep:
 
 
 def _halve_codes(codes: UInt8Array) -> UInt8Array:
-    """A picture at half its size."""
+    """An image at half its size."""
     import cv2
 
     height, width = codes.shape
@@ -181,7 +181,7 @@ def _halve_codes(codes: UInt8Array) -> UInt8Array:
 
 
 def _halve_camera(camera: Pinhole) -> Pinhole:
-    """The camera of the picture at half its size."""
+    """The camera of the image at half its size."""
     by = np.array([(camera.width // 2) / camera.width, (camera.height // 2) / camera.height])
     return replace(
         camera,

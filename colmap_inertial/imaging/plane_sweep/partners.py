@@ -1,4 +1,4 @@
-"""Choose partner pictures and depth ranges from the sparse points that pictures share."""
+"""Choose partner images and depth ranges from the sparse points that images share."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class PartnerLimits:
     below_deg: float = 4.0
     #: above it by this one.
     above_deg: float = 8.0
-    #: Points that pictures must at least have in common.
+    #: Points that images must at least have in common.
     least_shared: int = 20
     #: How far apart their optical axes may be.
     most_turn_deg: float = 50.0

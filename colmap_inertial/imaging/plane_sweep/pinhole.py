@@ -8,7 +8,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 
-#: Rows of a picture that are worked on at once: what is made of them stays in the cache, and little memory is held.
+#: Rows of an image that are worked on at once: what is made of them stays in the cache, and little memory is held.
 ROWS_AT_ONCE = 64
 
 
@@ -19,7 +19,7 @@ class Pinhole:
     Attributes
     ----------
     width, height
-        Of its picture.
+        Of its image.
     focal_px, centre_px
         (2,) along x and y; pixel centres are whole numbers, as in OpenCV.
     cam_from_world

@@ -73,7 +73,7 @@ def smooth_depth(
     camera
         What took it.
     partners
-        Cameras of the pictures that it was matched with.
+        Cameras of the images that it was matched with.
 
     Returns
     -------
@@ -111,7 +111,7 @@ def measure_planes(
     Notes
     -----
     Weighted moments are filtered by the domain transform (Gastal and Oliveira, SIGGRAPH 2011), to which an edge in the
-    picture is a distance.
+    image is a distance.
     """
     import cv2
 

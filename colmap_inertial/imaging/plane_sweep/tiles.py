@@ -1,4 +1,4 @@
-"""Candidates of each part of a picture, from depths at half its size."""
+"""Candidates of each part of an image, from depths at half its size."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _LIMITS = TileLimits()
 
 @dataclass(frozen=True, kw_only=True)
 class Tile:
-    """A part of a picture: what it is of, what is worked on for that, and the candidates."""
+    """A part of an image: what it is of, what is worked on for that, and the candidates."""
 
     rows: slice
     columns: slice
@@ -52,14 +52,14 @@ class Tile:
 
 
 def cut_tiles(coarse: Array, shape: tuple[int, int], count: int) -> Iterator[Tile]:
-    """Cut a picture into tiles with the candidates that each needs.
+    """Cut an image into tiles with the candidates that each needs.
 
     Parameters
     ----------
     coarse
-        (h, w) candidates of a smaller picture of the same, of those of the whole one; nan where unknown.
+        (h, w) candidates of a smaller image of the same, of those of the whole one; nan where unknown.
     shape
-        Of the whole picture.
+        Of the whole image.
     count
         How many candidates there are.
     """

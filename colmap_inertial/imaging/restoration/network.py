@@ -26,7 +26,7 @@ Device = Literal["auto", "cpu", "cuda"]
 Sample = TypeVar("Sample", np.uint8, np.uint16, np.float32)
 
 _CUDA, _CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
-#: What networks take; pictures have three channels, "blur" these, and half the height and width.
+#: What networks take; images have three channels, "blur" these, and half the height and width.
 _INPUTS = ("picture", "aid", "blur")
 _BLUR_CHANNELS: dict[NetworkName, int] = {"deepgyro": 5, "lsd2": 3}
 _OUTPUT = "restored"

@@ -36,7 +36,7 @@ class EvidenceLimits:
     images: int = 3
     #: ... to so many times their median error ...
     agree: float = 5.0
-    #: ... or to errors that pictures hardly fall below.
+    #: ... or to errors that images hardly fall below.
     least_rad: float = 1e-3
     least_m: float = 5e-3
     #: Images that matches place far from where submodels meet have the bends of both between, which last for seconds:
@@ -186,7 +186,7 @@ def _constraint(
     count = int(agree.sum())
     if count < max(LIMITS.images, len(images) / 2 + 1e-9):
         return None
-    # errors of pictures a few hundredths of a second apart are alike
+    # errors of images a few hundredths of a second apart are alike
     weight = min(count, 1 + float(np.ptp(t_s[agree])) / alike_s) / count
     paths = [submodels[k].path for k in places]
     rotation_sigma, centre_sigma = np.sqrt(np.sum([path.seen_variances for path in paths], axis=0) / weight)

@@ -379,7 +379,7 @@ def state_rows(problem: Problem, x: Estimate) -> Rows:
     count, prior = len(x.velocity_m_s), problem.prior
     residual, here = np.zeros((count, 21)), np.zeros((count, 21, N_STATE))
     inertial = problem.inertial
-    if inertial is None:  # what pictures do not show stays as it is
+    if inertial is None:  # what images do not show stays as it is
         for columns in (VELOCITY, GYRO_BIAS, ACCEL_BIAS):
             here[:, columns, columns] = np.eye(3)
         heading = np.eye(3)

@@ -1,4 +1,4 @@
-"""Covariances of camera paths against the first image: of a refined path, and of one that pictures and a scale made."""
+"""Covariances of camera paths against the first image: of a refined path, and of one that images and a scale made."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from colmap_inertial.inertial.refine._panels import Layout
 from colmap_inertial.inertial.refine._residuals import CENTRE, N_MOVING, SPEED, TURN, Moving, moving
 from colmap_inertial.inertial.refine._system import Factored
 from colmap_inertial.inertial.refine.judging_points import JUDGING
-from colmap_inertial.inertial.refine.pictures import apply_noise, make_pictures, measure_picture_noise, pictures_alone
+from colmap_inertial.inertial.refine.pictures import apply_noise, make_pictures, measure_image_noise, pictures_alone
 from colmap_inertial.inertial.refine.setup import Seen
 from colmap_inertial.inertial.refine.solve import factor_information
 from colmap_inertial.inertial.refine.values import N_STATE, Estimate, Problem
@@ -29,7 +29,7 @@ from colmap_inertial.inertial.refine.world import (
 class DriftLimits:
     """Limits of the work for a path's covariance, and for choosing a refinement."""
 
-    #: Normal equations of pictures alone, for a covariance: more take longer than a scale is worth.
+    #: Normal equations of images alone, for a covariance: more take longer than a scale is worth.
     most_bytes: int = 300_000_000
     #: Processor seconds: of a step of the refinement for each observation, and for each product of its factor; steps of
     #: those that judge, and of all; of features, matching and mapping for each image and each observation (a desk
@@ -81,8 +81,8 @@ def add_scale(cov: Array, variance_log: float, centre_m: Array, velocity_m_s: Ar
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class PictureDrift:
-    """Drift of a path that was mapped from pictures alone.
+class ImageDrift:
+    """Drift of a path that was mapped from images alone.
 
     Attributes
     ----------
@@ -126,8 +126,8 @@ class PictureDrift:
         return np.asarray(0.5 * (cov + cov.transpose(0, 2, 1)))
 
 
-def find_drift(seen: Seen, down: Array) -> PictureDrift | None:
-    """Covariance of the shape of a metric path from pictures alone; ``None`` without points, or where it takes too much
+def find_drift(seen: Seen, down: Array) -> ImageDrift | None:
+    """Covariance of the shape of a metric path from images alone; ``None`` without points, or where it takes too much
     work.
 
     Parameters
@@ -140,16 +140,16 @@ def find_drift(seen: Seen, down: Array) -> PictureDrift | None:
     Raises
     ------
     numpy.linalg.LinAlgError
-        Where pictures do not determine it.
+        Where images do not determine it.
     """
     problem, x = make_pictures(seen)
     if not len(problem.observations.point):
         return None
     if Layout.of(problem.observations, len(seen.names)).size_bytes > _LIMITS.most_bytes:
         return None
-    problem = apply_noise(problem, measure_picture_noise(problem, x))
+    problem = apply_noise(problem, measure_image_noise(problem, x))
     solved, by = factor_information(problem, x), moving(problem, x)
-    return PictureDrift(names=seen.names, cam_in_world=seen.cam_in_world, cov=_drift_covs(seen, down, solved, by))
+    return ImageDrift(names=seen.names, cam_in_world=seen.cam_in_world, cov=_drift_covs(seen, down, solved, by))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,7 +159,7 @@ class Worth:
     Attributes
     ----------
     alone_m, refined_m
-        Standard deviation of positions for the path's shape, of pictures alone and of the refinement; 0 where that was
+        Standard deviation of positions for the path's shape, of images alone and of the refinement; 0 where that was
         not looked at.
     risk
         Probability that the refined path is more than 1.05 times as far off as the one before; 0 where it was not
@@ -183,7 +183,7 @@ def expect_worth(seen: Seen, problem: Problem, start: Estimate, *, bent: bool = 
     A model that is ``bent`` by more than its noise, as by a rolling shutter that it ignores, is worth any risk.
 
     Times are predicted from counts, so that the same model always has the same answer, also where nobody knows how long
-    its mapping took. The error of the refined path is part of that of pictures alone; what it removes is independent.
+    its mapping took. The error of the refined path is part of that of images alone; what it removes is independent.
 
     Raises
     ------
@@ -200,13 +200,13 @@ def expect_worth(seen: Seen, problem: Problem, start: Estimate, *, bent: bool = 
     if share > _LIMITS.share or layout.size_bytes > _LIMITS.most_bytes:
         return Worth(share=share, reason=Fact("refine-takes-long", share=share))
     pictures, x = make_pictures(seen)
-    pictures = apply_noise(pictures, measure_picture_noise(pictures, x))
+    pictures = apply_noise(pictures, measure_image_noise(pictures, x))
     alone, size_m = _shape_cov(seen, factor_information(pictures, x), moving(pictures, x))
     worth = Worth(alone_m=_sigma(alone), share=share)
     if worth.alone_m < _LIMITS.least_drift * size_m and not bent:
         held = Fact("refine-shape-held", alone_m=worth.alone_m, share=worth.alone_m / size_m)
         return replace(worth, reason=held)
-    noise = measure_picture_noise(pictures_alone(problem, seen.observations.xy_px), start)
+    noise = measure_image_noise(pictures_alone(problem, seen.observations.xy_px), start)
     problem = apply_noise(problem, noise)
     refined, _ = _shape_cov(seen, factor_information(problem, start), moving(problem, start))
     worth = replace(worth, refined_m=_sigma(refined), risk=_risk(alone, refined))

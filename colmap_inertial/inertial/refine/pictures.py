@@ -1,4 +1,4 @@
-"""The problem of pictures alone, without an IMU, and how its observations err."""
+"""The problem of images alone, without an IMU, and how its observations err."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _LEAST_PX = 0.05
 #: Noise is measured by this quantile of the squares of both coordinates, which for normal errors is that of chi-square
 #: with two degrees: a robust fit follows the quieter observations, and the median is a tenth too small.
 _QUANTILE = 0.75
-#: Cells of a picture, across and down, in which errors are looked at together: residuals of real keypoints are alike up
+#: Cells of an image, across and down, in which errors are looked at together: residuals of real keypoints are alike up
 #: to a sixth of its width.
 _CELLS = 4
 #: Frames with fewer observations do not tell.
@@ -26,7 +26,7 @@ _FEWEST = 20
 
 
 def make_pictures(seen: Seen) -> tuple[Problem, Estimate]:
-    """The problem of pictures alone, as a global shutter sees them, cameras free; and the model as its estimate.
+    """The problem of images alone, as a global shutter sees them, cameras free; and the model as its estimate.
 
     The IMU stands where the camera does, as nothing is known of it.
     """
@@ -52,7 +52,7 @@ def make_pictures(seen: Seen) -> tuple[Problem, Estimate]:
         accel_gain=none,
         gravity_m_s2=0.0,
     )
-    # what pictures do not tell counts as known
+    # what images do not tell counts as known
     sigma = np.full(x.columns.count, 1e-4)
     sigma[FIRST_INTRINSIC : x.columns.seen.stop] = spread
     prior = Prior(mean=x, info=np.diag(sigma**-2), gyro_bias_sigma_rad_s=1.0, accel_bias_sigma_m_s2=1.0)
@@ -101,7 +101,7 @@ def pictures_alone(problem: Problem, xy_px: Array) -> Problem:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PictureNoise:
+class ImageNoise:
     """Noise of observations, and its robust loss.
 
     Attributes
@@ -127,7 +127,7 @@ class PictureNoise:
     shared_errors: float
 
 
-def measure_picture_noise(problem: Problem, x: Estimate) -> PictureNoise:
+def measure_image_noise(problem: Problem, x: Estimate) -> ImageNoise:
     """Noise of observations, from the residuals of a fit and its number of parameters."""
     observations = problem.observations
     at = project(problem, x, observations)
@@ -141,7 +141,7 @@ def measure_picture_noise(problem: Problem, x: Estimate) -> PictureNoise:
     # of what the loss pulls with: its mean slope by the error, and its variance, in two coordinates
     slope = float(np.mean(weight**2))
     variance = float(np.mean(squares * weight**2)) / (2 * sigma_px**2)
-    return PictureNoise(
+    return ImageNoise(
         sigma_px=sigma_px,
         robust_px=robust_px,
         weighed_px=max(_LEAST_PX, sigma_px * float(np.sqrt(variance / slope))),
@@ -155,9 +155,9 @@ def measure_shared_errors(problem: Problem, x: Estimate) -> float:
 
     Neighbouring keypoints err alike, and so from frame to frame: by what the camera model leaves of the lens, by blur,
     by what is left of a rolling shutter. What residuals pull at their frame's pose with is summed in each of 4 x 4
-    cells of the picture, over as many frames as see a point. Independent errors give these sums the variance of the
+    cells of the image, over as many frames as see a point. Independent errors give these sums the variance of the
     cell's information, less what the pose took of them (variances by clusters: Liang and Zeger, Biometrika 1986; of
-    what lasts: Newey and West, Econometrica 1987). What all of a picture shares is the pose's, and not seen.
+    what lasts: Newey and West, Econometrica 1987). What all of an image shares is the pose's, and not seen.
 
     Parameters
     ----------
@@ -205,7 +205,7 @@ def _sum_by(group: Int64Array, groups: int, values: Array) -> Array:
     return out
 
 
-def apply_noise(problem: Problem, noise: PictureNoise) -> Problem:
+def apply_noise(problem: Problem, noise: ImageNoise) -> Problem:
     """The problem with its observations weighed so."""
     return replace(
         problem,

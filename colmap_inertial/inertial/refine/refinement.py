@@ -17,7 +17,7 @@ from colmap_inertial.inertial.refine.judging_points import carry_points, draw_po
 from colmap_inertial.inertial.refine.motion import find_motion_covs
 from colmap_inertial.inertial.refine.pictures import (
     apply_noise,
-    measure_picture_noise,
+    measure_image_noise,
     measure_shared_errors,
     pictures_alone,
 )
@@ -98,7 +98,7 @@ class Judged:
     held_out
         How many observations.
     before_px, after_px
-        Their robust error: root of the mean square, of a model of pictures alone and of the refined one.
+        Their robust error: root of the mean square, of a model of images alone and of the refined one.
     change, change_sigma
         Mean change of their robust costs (in half squares over variances), and its standard deviation.
     chi2
@@ -158,7 +158,7 @@ def refine(
     problem, start
         Of the model; the observations' standard deviation is measured.
     at_once_px
-        (M, 2) observations as COLMAP's model has them: what pictures alone are judged by.
+        (M, 2) observations as COLMAP's model has them: what images alone are judged by.
     t_s
         (F,) times of the frames; nan without one.
     readout_declared
@@ -173,7 +173,7 @@ def refine(
     if needed > LIMITS.most_bytes:
         raise NotObservableError("refinement", Fact("refine-too-large", size_bytes=needed))
     alone = pictures_alone(problem, at_once_px)
-    noise = measure_picture_noise(alone, start)
+    noise = measure_image_noise(alone, start)
     whole, whole_start = apply_noise(problem, noise), start
     problem, alone = whole, apply_noise(alone, noise)
     points = draw_points(problem.observations, len(t_s))
@@ -185,7 +185,7 @@ def refine(
     seen_alone = solve(_select_observations(alone, kept), start)
     seen = solve(_select_observations(problem, kept), start)
     steps = seen_alone.steps + seen.steps
-    # pictures alone may fit worse than with a rolling shutter: the IMU's own squares are the least that it costs
+    # images alone may fit worse than with a rolling shutter: the IMU's own squares are the least that it costs
     chi2 = max(2 * (seen.cost - seen_alone.cost), seen.squares["imu"]) / _count_freedom(problem)
     readout = None
     if seen.converged and not readout_declared:
@@ -285,7 +285,7 @@ def _select_observations(problem: Problem, keep: BoolArray) -> Problem:
 
 
 def _measure_noise(problem: Problem, kept: BoolArray, x: Estimate) -> Problem:
-    """The problem with noise of pictures and IMU measured at the solution on nine tenths of the observations."""
+    """The problem with noise of images and IMU measured at the solution on nine tenths of the observations."""
     seen = _select_observations(problem, kept)
     shared_errors = measure_shared_errors(seen, x)
     problem, seen = (replace(one, shared_errors=shared_errors) for one in (problem, seen))

@@ -44,7 +44,7 @@ _ROTATION_RAD, _OFFSET_S, _INTRINSIC_SHARE = 0.05, 0.02, 0.1
 NO_READOUT_S = 1e-9
 #: Readings are looked up as far beyond the readout around a node; one that is not declared is hardly longer than this.
 _MARGIN_S, _LONGEST_READOUT_S = 0.01, 0.04
-#: Cameras more than this are not estimated: each picture has its own.
+#: Cameras more than this are not estimated: each image has its own.
 _MOST_FREE_CAMERAS = 4
 #: Frames farther apart say nothing of each other through the IMU.
 _LONGEST_STEP_S = 10.0

@@ -17,7 +17,7 @@ from colmap_inertial.core.types import CameraModel, FrameTiming, ImuRecording, R
 from colmap_inertial.inertial.refine._residuals import camera_of, derivatives, project
 from colmap_inertial.inertial.refine.pictures import (
     apply_noise,
-    measure_picture_noise,
+    measure_image_noise,
     pictures_alone,
     remove_extremes,
     select_points,
@@ -97,7 +97,7 @@ class SeenFocal:
 
 #: Camera models without distortion, and those that add some to their numbers.
 _DISTORTED = {"SIMPLE_PINHOLE": ("RADIAL", (0.0, 0.0)), "PINHOLE": ("OPENCV", (0.0, 0.0, 0.0, 0.0))}
-#: Places across and down a picture, at which distortion is looked at.
+#: Places across and down an image, at which distortion is looked at.
 _PLACES = (32, 18)
 
 
@@ -114,7 +114,7 @@ class SeenLens:
     sigmas
         How many standard deviations its distortion is from none.
     shift_px
-        How far it moves observations, root mean square over the picture.
+        How far it moves observations, root mean square over the image.
     """
 
     declared: str
@@ -283,7 +283,7 @@ def _measure(
 ) -> SeenReadout:
     """The readout with lines that run as the timing says, or the other way."""
     problem, start = make_problem(seen, timing, imu, known, exposed_px)
-    problem = apply_noise(problem, measure_picture_noise(pictures_alone(problem, seen.observations.xy_px), start))
+    problem = apply_noise(problem, measure_image_noise(pictures_alone(problem, seen.observations.xy_px), start))
     x = start
     for _ in range(rounds):
         before_s = x.readout_s

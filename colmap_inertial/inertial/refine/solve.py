@@ -300,7 +300,7 @@ def evaluate_held_out(problem: Problem, x: Estimate, observations: Observations)
     return np.where(at.seen, cost, 5 * (problem.robust_px / problem.weighed_px) ** 2)
 
 
-#: Standard deviation of the logarithm of what was known before: on walks of 40 m, where little tells noise of pictures
+#: Standard deviation of the logarithm of what was known before: on walks of 40 m, where little tells noise of images
 #: from the accelerometer's, the scale's own level was right to a third or thirteen times too large.
 _LEVEL_SPREAD = 0.7
 #: A level stays within this factor of what was known before; no sensor is quieter than the other numbers.
@@ -316,7 +316,7 @@ def apply_measured_noise(problem: Problem, x: Estimate) -> Problem:
     """The problem with its accelerometer and gyroscope as noisy as what is left of their readings says.
 
     The scale estimate knows the noise from the readings' roughness more than from the path: what shakes faster than
-    frames follow counts as white noise there. Between frames most of it cancels; and beside pictures that know poses to
+    frames follow counts as white noise there. Between frames most of it cancels; and beside images that know poses to
     a millimetre, the path tells what is left. What all observations of a frame err by together is a turn of its camera
     and counts with the gyroscope's: believed as it reads, the path and the lever arm would follow it.
 

@@ -70,7 +70,7 @@ class Observations:
     frame, point
         (M,) which frame sees which point; the points' numbers rise by at most one from one to the next.
     xy_px
-        (M, 2) in the picture as it was exposed.
+        (M, 2) in the image as it was exposed.
     line
         (M,) how much later than the middle line its own was exposed, in readouts: from -.5 to .5.
     """
@@ -343,7 +343,7 @@ class Problem:
     cameras, camera_of
         The cameras, and (F,) that of each frame.
     inertial
-        What the IMU says; ``None`` where pictures alone shall tell (all lines exposed at once).
+        What the IMU says; ``None`` where images alone shall tell (all lines exposed at once).
     prior
         What is known beforehand.
     sigma_px

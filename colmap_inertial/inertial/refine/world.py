@@ -145,7 +145,7 @@ def _doubts(first: AcceptedScale, move: Similarity, problem: Problem, x: Estimat
 
 
 def _split(problem: Problem, x: Estimate, variance: float, states: Array, shared: Array) -> dict[str, float]:
-    """A variance by cause: what each residual's noise alone would leave; the rest is that of the pictures.
+    """A variance by cause: what each residual's noise alone would leave; the rest is that of the images.
 
     ``states`` (F, 15) and ``shared`` (Q,) are the covariance of the unknowns with the number.
     """

@@ -1,4 +1,4 @@
-"""All residuals of the joint fit: of the pictures, the IMU, and what is expected of states."""
+"""All residuals of the joint fit: of the images, the IMU, and what is expected of states."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ def visual_groups(
 ) -> tuple[Group, Group]:
     """Rotations, and centres given the rotations.
 
-    A picture determines a camera's rotation and its centre together: what turns the camera and moves it so that the
-    scene stays in place hardly changes the picture. The errors of the two are therefore strongly correlated (by 0.6
+    An image determines a camera's rotation and its centre together: what turns the camera and moves it so that the
+    scene stays in place hardly changes the image. The errors of the two are therefore strongly correlated (by 0.6
     to 0.9 in real recordings), and the centre is much better known once the gyroscope has told the rotation. So the
     error of the centre is modelled as coupling times error of the rotation plus a rest; the coupling is estimated.
     """
@@ -63,7 +63,7 @@ def visual_groups(
     smear = rate @ centre_by_rate.T + velocity @ centre_by_velocity.T
     centre, centre_here, centre_z = _centre_residuals(data, x, rate_rad_s, smear)
 
-    # Before the shutter's part: that one, too, is mostly along the direction in which a picture changes little
+    # Before the shutter's part: that one, too, is mostly along the direction in which an image changes little
     carried = camera @ (x.coupling_m + x.metres_per_unit * data.coupling)
     centre = centre - rotate(carried, rotation)
     centre_here -= carried @ rotation_here

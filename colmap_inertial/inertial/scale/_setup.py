@@ -1,7 +1,7 @@
 """Measurements and priors of the joint fit, from a recording and a calibration.
 
 Frames of a video are averaged to one pose an eighth of a second. Averaging keeps what every frame says without a state
-for every frame. Within a group the IMU tells the motion far better than pictures do, so frames are compared after
+for every frame. Within a group the IMU tells the motion far better than images do, so frames are compared after
 moving them to the group's mean instant: rotations by the gyroscope, centres by what the accelerometer and gravity add
 to a uniform motion.
 """
@@ -192,7 +192,7 @@ def group_frames(
     rotated = np.zeros((len(t_s), 4))
     rotated[:, 3] = 1.0
     # The midpoint rule, of order two in the step: on three recordings at 100 Hz its errors are at most 6e-5 rad and
-    # 4e-6 m against steps of 0.1 ms, a small part of what pictures err by.
+    # 4e-6 m against steps of 0.1 ms, a small part of what images err by.
     # Two integrations at once: each step's force, at its middle, acts on the position for the rest of the time
     displacement = np.zeros((len(t_s), 3))
     for i in range(steps):
@@ -219,7 +219,7 @@ def group_frames(
     )
 
 
-#: Standard deviation of rows' times about the middle row, in readouts (uniform over the picture).
+#: Standard deviation of rows' times about the middle row, in readouts (uniform over the image).
 _ROW_SPREAD = 12**-0.5
 #: Scene depths that turn row times into errors of rotation by velocity (1/m) and of position by rate (m).
 _NEAR_M, _FAR_M = 1.0, 2.0

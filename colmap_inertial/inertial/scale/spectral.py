@@ -28,7 +28,7 @@ from colmap_inertial.inertial.scale.verdict import check_clocks, verdict_of
 
 #: Standard deviation of the accelerometer's bias before anything is known (m/s2).
 _BIAS_SIGMA_M_S2 = 1.0
-#: Sensors of phones lie in the plane of the picture: the lever arm along the optical axis is short (m).
+#: Sensors of phones lie in the plane of the image: the lever arm along the optical axis is short (m).
 _LEVER_ALONG_AXIS_M = 0.01
 #: What no such recording can show: the accelerometer's gain, and the angles between its axes.
 _GAIN_SIGMA, _AXIS_SIGMA_RAD = 0.005, 0.002

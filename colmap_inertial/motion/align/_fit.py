@@ -47,7 +47,7 @@ _MOUNT, _GAIN, _SHUTTER, _RATE = slice(0, 3), slice(3, 9), slice(9, 18), 18
 #: Data sheets: gain within 1 %, axes within half a percent (of a radian). Clocks of action cameras: within 1 %.
 _GAIN_SIGMA, _AXIS_SIGMA, _RATE_SIGMA = 0.01, 0.005 / np.sqrt(2), 0.01
 #: Orientation error of a rolling-shutter frame by angular velocity, in parts of the readout time, computed for
-#: points all over the picture at random depths: a turn about the vertical looks like a roll; along the diagonal it
+#: points all over the image at random depths: a turn about the vertical looks like a roll; along the diagonal it
 #: averages out, because poses hold at the middle row.
 _SHUTTER_SIGMA_DIAGONAL, _SHUTTER_SIGMA_ELSEWHERE = 0.1, 0.4
 #: Standard deviations beyond which rotation and offset count as not observed.

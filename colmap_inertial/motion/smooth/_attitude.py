@@ -34,9 +34,9 @@ from colmap_inertial.motion.smooth._positions import Chain, most_likely, runs_of
 class AttitudeLimits:
     """Usual errors of visual rotations, and when one is an outlier."""
 
-    #: Orientations from pictures err independently and, over about this time, together (as features come and go).
+    #: Orientations from images err independently and, over about this time, together (as features come and go).
     correlation_s: float = 0.35
-    #: Usual noise of orientations from pictures, rad: a start for the estimate, which may end far away.
+    #: Usual noise of orientations from images, rad: a start for the estimate, which may end far away.
     usual_rad: float = 2e-3
     spread: float = 3.0
     #: Variance (rad2) that frees the correction where the gyroscope is silent.

@@ -73,7 +73,7 @@ def smooth_trajectory(
 
     The accelerometer, turned into the world by orientations from gyroscope and camera, drives positions and
     velocities from frame to frame; what it leaves (tilt, bias, gravity) is an acceleration that walks. Positions from
-    pictures err independently and together over a third of a second. The four noise levels are those of the greatest
+    images err independently and together over a third of a second. The four noise levels are those of the greatest
     likelihood; a pose that contradicts the rest is left out. Smoothing is that of Rauch, Tung and Striebel.
 
     Parameters

@@ -1,4 +1,4 @@
-"""The frames of a capture on their way to COLMAP, and pictures of some of them before and after."""
+"""The frames of a capture on their way to COLMAP, and images of some of them before and after."""
 
 from __future__ import annotations
 

@@ -252,7 +252,7 @@ def fuse_aperture_capture(
 
     Returns
     -------
-    The fused pictures.
+    The fused images.
 
     Raises
     ------

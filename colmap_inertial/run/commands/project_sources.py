@@ -196,7 +196,7 @@ def _read_times(
             )
     else:
         timing = read_frame_timing(capture, first_of)
-    # an exposure that the pictures state belongs to the frames; one that they do not is no reason to stop
+    # an exposure that the images state belongs to the frames; one that they do not is no reason to stop
     if timing.exposure_s is None and images is not None:
         paths = [picture_in(images, name) for name in timing.names]
         if all(path.is_file() for path in paths):
@@ -223,7 +223,7 @@ def _read_video_times(
         )
     name_of = {t_ns: name for name, t_ns in match.t_ns.items()}
     kept = [i for i, t_ns in enumerate(stamps_ns.tolist()) if t_ns in name_of]
-    # counterclockwise, as the pictures were turned against the frames
+    # counterclockwise, as the images were turned against the frames
     directions: tuple[ReadoutDirection, ...] = ("down", "right", "up", "left")
     assert set(directions) == set(get_args(ReadoutDirection))
     turned = (directions.index(every.readout_direction) + match.quarter_turns) % 4

@@ -283,7 +283,7 @@ def _reconstruct(
     ):
         session.context.executor.require(session.context.scratch)
         result = _run_steps(session, given, options, stages, findings)
-        result = report_result(session, result, capture, used_calibration)
+        result = report_result(session, result, capture, used_calibration, reference=reference)
         remove(session.workspace.colmap_features)
         session.runner.forget("features")
     return result

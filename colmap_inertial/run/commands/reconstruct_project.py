@@ -178,7 +178,10 @@ def _reconstruct(
         reporting_stops(session, given.beside.capture),
     ):
         result = _run_steps(session, given, source, options, model_stages, findings)
-        return report_result(session, result, given.beside.capture, given.beside.calibration_files, project=source)
+        beside = given.beside
+        return report_result(
+            session, result, beside.capture, beside.calibration_files, project=source, reference=reference
+        )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

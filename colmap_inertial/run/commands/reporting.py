@@ -20,7 +20,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import MappingError, NotObservableError
 from colmap_inertial.core.facts import Fact
-from colmap_inertial.core.options import ProjectOptions
+from colmap_inertial.core.options import ProjectOptions, ReferenceOptions
 from colmap_inertial.core.threads import usable_processors
 from colmap_inertial.core.types import CameraTrajectory, ImuRecording, Keypoints
 from colmap_inertial.hooks import KeypointStage
@@ -172,6 +172,7 @@ def report_result(
     capture: Capture,
     calibration_files: Sequence[dict[str, str]] = (),
     project: ProjectOptions | None = None,
+    reference: ReferenceOptions = ReferenceOptions(),
 ) -> ReconstructResult:
     """Write the report, and then ``result.json``, whose presence says that the run is finished.
 
@@ -186,6 +187,8 @@ def report_result(
             key: value.resolve() if isinstance(value, Path) else value
             for key, value in dataclasses.asdict(project).items()
         }
+    if reference != ReferenceOptions():
+        content["reference"] = dataclasses.asdict(reference)
 
     def write() -> None:
         with _failures_logged("the report"):

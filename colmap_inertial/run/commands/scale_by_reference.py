@@ -134,11 +134,11 @@ def scale_project_by(
     reference
         What lengths are known.
     source
-        Where the project's pictures are, and how files are taken over.
+        Where the project's images are, and how files are taken over.
     scale_from
         What counts; all that there is where empty.
     capture
-        What describes depth maps, the device's own path and positions; without it, the project and its pictures.
+        What describes depth maps, the device's own path and positions; without it, the project and its images.
     world
         Where gravity points, where some sensor tells.
     progress
@@ -302,14 +302,14 @@ def reconstruct_by(
     *,
     progress: Progress = silent,
 ) -> Reference:
-    """Map pictures or a video with COLMAP, and write the model in metres by what is known of its size.
+    """Map images or a video with COLMAP, and write the model in metres by what is known of its size.
 
     Parameters
     ----------
     capture
-        A capture.toml, a folder of pictures, or a video. What it says of an IMU is not used.
+        A capture.toml, a folder of images, or a video. What it says of an IMU is not used.
     out
-        A folder that does not exist, or one with nothing but ``colmap/`` of an earlier run on the same pictures, whose
+        A folder that does not exist, or one with nothing but ``colmap/`` of an earlier run on the same images, whose
         scale was not found: that model is then taken.
     reference
         What lengths are known: a target, or the distance of two markers.
@@ -321,7 +321,7 @@ def reconstruct_by(
     Raises
     ------
     FormatError, MappingError, NotObservableError, OutputExistsError
-        For links in ``out``, pictures that cannot be read or mapped, and sizes that cannot be found. COLMAP's model is
+        For links in ``out``, images that cannot be read or mapped, and sizes that cannot be found. COLMAP's model is
         kept then.
     """
     capture, out = Path(capture), Path(out)
@@ -372,7 +372,7 @@ def reconstruct_by(
 
 
 def _is_mapped(out: Path, made_from: dict[str, object]) -> bool:
-    """Whether ``out`` is an earlier run's that mapped these pictures and found no scale."""
+    """Whether ``out`` is an earlier run's that mapped these images and found no scale."""
     record = out / "colmap" / _MADE_FROM
     if not record.is_file() or (out / "scale.json").exists():
         return False
@@ -403,7 +403,7 @@ def _list_contents(project: Path) -> dict[str, list[object]]:
 
 
 def _load_pictures(path: Path) -> Capture:
-    """A capture, a folder of pictures, or a video."""
+    """A capture, a folder of images, or a video."""
     if not path.exists():
         raise FormatError(path, Fact("no-such-file", what="file or folder"))
     frames: ImageFolder | Video
@@ -438,7 +438,7 @@ def _list_names(capture: Capture) -> list[str]:
 def _map_pictures(
     capture: Capture, names: list[str], project: Path, options: ReconstructOptions, progress: Progress
 ) -> list[int]:
-    """Make a COLMAP project of pictures; how many images the models have that are left out, the largest first."""
+    """Make a COLMAP project of images; how many images the models have that are left out, the largest first."""
     keep_colmap_quiet()
     mapping = options.mapping
     if isinstance(capture.frames, ImageFolder):
@@ -467,7 +467,7 @@ def _map_pictures(
 
 
 def _copy_pictures(capture: Capture, names: list[str], images: Path) -> Iterator[None]:
-    """Put every picture into a folder: files as they are, frames of a video as PNG."""
+    """Put every image into a folder: files as they are, frames of a video as PNG."""
     if isinstance(capture.frames, ImageFolder):
         for name in names:
             target = path_in(images, name)

@@ -37,7 +37,7 @@ class JudgeLimits:
     #: A frame whose dip is faint confirms the gyroscope, too, where detail falls along the blur as predicted, and no
     #: other direction shows a dip this deep.
     other_support: float = 4.0
-    #: Pictures whose tiles tell no more than this share of them would if all were alike are mostly sky. Common ones
+    #: Images whose tiles tell no more than this share of them would if all were alike are mostly sky. Common ones
     #: with short blur are at .8; 70 % of sky leaves .6.
     standing_share: float = 0.7
     #: So many frames that are mostly sky confirm the gyroscope where so large a share of them shows the fall of
@@ -46,7 +46,7 @@ class JudgeLimits:
     sky_frames: int = 5
     sky_share: float = 0.65
     sky_sigmas: float = 3.0
-    #: Where the pictures do not confirm the gyroscope, exposure times may be wrong by a common factor; these are
+    #: Where the images do not confirm the gyroscope, exposure times may be wrong by a common factor; these are
     #: tried. Twice the blur shows a dip, too, where the right one shows a deeper one.
     exposure_factors: tuple[float, ...] = (0.5, 2.0)
     exposure_support: float = 10.0
@@ -79,7 +79,7 @@ def judge_frames(
 
     Returns
     -------
-    Whether it is trusted for all frames, or every frame must confirm it by itself. Where the pictures confirm it but
+    Whether it is trusted for all frames, or every frame must confirm it by itself. Where the images confirm it but
     for exposure times that are wrong by one factor, that is corrected, and said.
     """
 
@@ -101,7 +101,7 @@ def judge_frames(
 
 @dataclass(frozen=True, eq=False)
 class Looked:
-    """Evidence of one picture: its dips, its share of the predicted loss of detail, that blur, and its share of the
+    """Evidence of one image: its dips, its share of the predicted loss of detail, that blur, and its share of the
     loss that a flipped axis would predict.
     """
 
@@ -163,7 +163,7 @@ def _correct_exposures(
     factors: Sequence[float],
     look: Callable[[float], Sequence[Looked]],
 ) -> RecordingVerdict:
-    """The verdict, or where all exposure times are wrong by one factor, that of the pictures with it corrected."""
+    """The verdict, or where all exposure times are wrong by one factor, that of the images with it corrected."""
     best, deepest = verdict, _together([frame.evidence for frame in looked])
     for factor in factors:
         others = look(factor)

@@ -69,7 +69,7 @@ class PreliminaryLimits:
     #: Frames that are followed by their pixels: at most so many, not closer than this.
     flow_frames: int = 300
     flow_spacing_s: float = 0.06
-    #: Of pictures, as many tell a wrong sign.
+    #: Of images, as many tell a wrong sign.
     sign_frames: int = 40
     #: Frames of a video are closer than this.
     video_step_s: float = 0.13
@@ -192,7 +192,7 @@ def _check_declared_sign(
     Raises
     ------
     NotObservableError
-        Where the pictures turn the other way.
+        Where the images turn the other way.
     """
     if view.source != "capture":
         return view

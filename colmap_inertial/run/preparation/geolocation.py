@@ -26,7 +26,7 @@ def positions_of(capture: Capture, names: Sequence[str], images: Path | None = N
     names
         Of the frames.
     images
-        Where an existing project has its pictures.
+        Where an existing project has its images.
 
     Raises
     ------

@@ -242,7 +242,7 @@ def _describe_rectification(capture: Capture, timing: FrameTiming) -> Fact:
 
 
 def _limit_px(camera: CameraModel) -> float:
-    """Blur of which a frame must have more to be looked at and treated, px of the picture as it is."""
+    """Blur of which a frame must have more to be looked at and treated, px of the image as it is."""
     return max(_LIMITS.telling_px, GateOptions().skip_below_px * max(camera.width, camera.height) / 1920)
 
 

@@ -117,7 +117,7 @@ def add_images(recorded: Recorded, capture: Capture, progress: Progress, frames:
     looked: dict[str, bool] = {}
     images: Callable[[Sequence[str]], Iterable[GreyFrame]] | None = None
     in_full: Sequence[str] = ()
-    # turns in pictures that the camera stabilised are not the camera's
+    # turns in images that the camera stabilised are not the camera's
     if recorded.log is None or not recorded.log.stabilised:
         seen = frames or GreyFrames(capture, timing)
         images, in_full = partial(seen.look, WHOLE), _choose_in_full(timing)

@@ -53,7 +53,7 @@ class SelectionLimits:
     #: A rotation and an offset as good as these serve.
     rotation_rad: float = 0.1
     offset_s: float = 0.01
-    #: Blur below this, for a picture of 1920 px, cannot be seen.
+    #: Blur below this, for an image of 1920 px, cannot be seen.
     sharp_px: float = 1.0
     #: Exposure is at most this where it is unknown.
     usual_exposure_s: float = 1 / 60

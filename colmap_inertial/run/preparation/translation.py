@@ -92,7 +92,7 @@ def translating_segments(
     parts
         Names of frames, in order of time.
     limit_px
-        Blur that counts, px of the picture as it is.
+        Blur that counts, px of the image as it is.
     progress
         Called with ``"motion"``.
     motion

@@ -1,4 +1,4 @@
-"""Frames of a multi-aperture camera: each exposure's sub-images become the one picture that COLMAP sees."""
+"""Frames of a multi-aperture camera: each exposure's sub-images become the one image that COLMAP sees."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from colmap_inertial.run.stages.inputs import StageInputs
 class ApertureStage:
     """The frame stage that fuses sub-images.
 
-    Takes the reference's pictures, reads the others' beside them, and yields RGB with the reference's camera.
+    Takes the reference's images, reads the others' beside them, and yields RGB with the reference's camera.
 
     Attributes
     ----------
@@ -87,7 +87,7 @@ class ApertureStage:
         return self._canvas[0]
 
     def fused(self, name: str, reference: AnyArray) -> Fused:
-        """One exposure, by the name and the pixels of the reference's picture."""
+        """One exposure, by the name and the pixels of the reference's image."""
         rig = self.pictures.rig
         paths = [source.path(name) for source in self.pictures.sources]
         images = [reference, *(read_image(path) for path in paths[1:])]

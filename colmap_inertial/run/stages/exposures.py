@@ -1,4 +1,4 @@
-"""Frames of short and long exposures: each pair becomes the one picture that COLMAP sees."""
+"""Frames of short and long exposures: each pair becomes the one image that COLMAP sees."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class FusedPair:
     name, long
         Of the frame, and the file of its long exposure.
     fused
-        Whether one picture was made of them.
+        Whether one image was made of them.
     used
         ``both``, or the better one of the two: the short one, brightened, or the long one as it is.
     reason
@@ -83,7 +83,7 @@ class FusedPair:
     blur_px
         90th percentile of the long one's blur that the gyroscope predicts; ``None`` where unknown.
     covered_share, clipped_share
-        Of the picture: what the long one covers, and where it may have clipped.
+        Of the image: what the long one covers, and where it may have clipped.
     """
 
     name: str
@@ -109,7 +109,7 @@ class FusedPair:
 class ExposureStage:
     """The frame stage that fuses pairs of exposures.
 
-    Takes the short ones, reads the long ones beside them, and yields pictures with the short ones' names, times,
+    Takes the short ones, reads the long ones beside them, and yields images with the short ones' names, times,
     geometry and depth, as bright as the long ones. Two or more are worked on at once; the order stays, and memory does
     not grow with their number.
 
@@ -120,7 +120,7 @@ class ExposureStage:
     folder
         Of the short ones.
     fuser
-        What makes one picture of two.
+        What makes one image of two.
     fusion
         Whether the result is blended with the short exposure.
     view

@@ -45,7 +45,7 @@ class FrameRecord:
     treatments
         What the stages said.
     sharpened
-        Whether the picture that COLMAP sees had its blur undone.
+        Whether the image that COLMAP sees had its blur undone.
     rectified
         Whether the rolling shutter of its keypoints was undone; ``None`` before there are keypoints, as in
         ``frames.json``.
@@ -203,7 +203,7 @@ def write_frames(
 
 
 def _write(frame: Frame, original: AnyArray | None, paths: FramePaths) -> Action:
-    """Write the picture of a frame; returns what happened to it."""
+    """Write the image of a frame; returns what happened to it."""
     source = paths.original(frame.name)
     target = path_in(paths.images, frame.name)
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -228,7 +228,7 @@ def _is_sharpened(frame: Frame, action: Action) -> bool:
 
 
 def smooth_for_colmap(frame: Frame) -> AnyArray:
-    """The picture of a frame that features are extracted from."""
+    """The image of a frame that features are extracted from."""
     image: Any = frame.image  # either of two types of pixel
     return smoothed(image, frame.smoothing_px) if frame.smoothing_px > 0 else image
 

@@ -17,14 +17,14 @@ from colmap_inertial.io.recording import Recording
 from colmap_inertial.run.stages.capture_sensors import CaptureSensors
 from colmap_inertial.run.stages.imaging_plan import ImagingPlan
 
-#: Makes one picture of a short exposure as bright as the long one, the long one in its geometry, and the long one's
+#: Makes one image of a short exposure as bright as the long one, the long one in its geometry, and the long one's
 #: blur: all float32 sRGB 0 to 1, of one shape.
 Fuse = Callable[[Float32Array, Float32Array, BlurField | None], Float32Array]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Fuser:
-    """Function that fuses two pictures into one.
+    """Function that fuses two images into one.
 
     Attributes
     ----------

@@ -10,7 +10,7 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import matrix_from_quat, skew
 from colmap_inertial.inertial.join.placement import FittedSubmodel
 from colmap_inertial.inertial.join.relative_poses import JoinedGroup, relative_cov
-from colmap_inertial.inertial.refine.motion import PictureDrift
+from colmap_inertial.inertial.refine.motion import ImageDrift
 from colmap_inertial.inertial.refine.setup import read_seen
 from colmap_inertial.model import Model
 from colmap_inertial.run.stages.metric import find_path_drift, gravity_in_model
@@ -36,7 +36,7 @@ def find_joined_covs(
     Returns
     -------
     dict
-        By name; empty where pictures do not determine the shape of a part, or that takes too much work.
+        By name; empty where images do not determine the shape of a part, or that takes too much work.
     """
     members, fitted = [models[k] for k in group.members], [submodels[k] for k in group.members]
     turns = [
@@ -70,7 +70,7 @@ def find_joined_covs(
     return out
 
 
-def _drift_of(model: Model) -> PictureDrift | None:
+def _drift_of(model: Model) -> ImageDrift | None:
     gravity = gravity_in_model(model)
     assert gravity is not None
     return find_path_drift(read_seen(model.reconstruction, model.timing), gravity)

@@ -34,7 +34,7 @@ from colmap_inertial.core.types import (
 )
 from colmap_inertial.hooks import InvertibleStage, find_inverse
 from colmap_inertial.imaging.gyro_camera import GyroCamera
-from colmap_inertial.inertial.refine.motion import PictureDrift, find_drift
+from colmap_inertial.inertial.refine.motion import ImageDrift, find_drift
 from colmap_inertial.inertial.refine.setup import Known, Seen, keypoints_of, read_seen
 from colmap_inertial.inertial.refine.shutter import SHUTTER_LIMITS, SeenReadout, find_readout
 from colmap_inertial.inertial.scale import estimate_scale, strength_of_gravity
@@ -316,7 +316,7 @@ class MetricStage(InertialStage):
 
 
 def exposed_keypoints(model: Model, shutter: InvertibleStage, seen: Seen) -> Array:
-    """(M, 2) observations of a model with rectified keypoints, in the pictures as they were exposed."""
+    """(M, 2) observations of a model with rectified keypoints, in the images as they were exposed."""
     keypoints = {}
     for image_id, name in zip(seen.image_ids, seen.names, strict=True):
         points = model.reconstruction.image(image_id).points2D
@@ -421,7 +421,7 @@ def write_trajectory(
 def _add_drift(model: Model, smoothed: SmoothedTrajectory, gravity: Array) -> tuple[Array, Array | None]:
     """(T, 9, 9) of position against the first image, velocity, acceleration, and (T, 3, 3) of rotation.
 
-    What smoothing leaves is far less than what pictures bend a path by. Where that is too much work, or pictures do not
+    What smoothing leaves is far less than what images bend a path by. Where that is too much work, or images do not
     determine it, the smoother's own covariance, and none of rotations.
     """
     assert model.similarity is not None
@@ -450,20 +450,20 @@ def _add_drift(model: Model, smoothed: SmoothedTrajectory, gravity: Array) -> tu
     return cov, motion[:, 6:, 6:]
 
 
-def find_path_drift(seen: Seen, gravity: Array) -> PictureDrift | None:
-    """Drift of a metric path; ``None`` where pictures do not determine it, or that takes too much work."""
+def find_path_drift(seen: Seen, gravity: Array) -> ImageDrift | None:
+    """Drift of a metric path; ``None`` where images do not determine it, or that takes too much work."""
     try:
         return find_drift(seen, gravity / np.linalg.norm(gravity))
     except np.linalg.LinAlgError:
         return None
 
 
-def _join_drift(seen: Seen, covs: Mapping[str, Array]) -> PictureDrift | None:
+def _join_drift(seen: Seen, covs: Mapping[str, Array]) -> ImageDrift | None:
     """Covariance of a joined path; ``None`` where that of an image is unknown."""
     if not all(name in covs for name in seen.names):
         return None
     cov = np.array([covs[name] for name in seen.names])
-    return PictureDrift(names=seen.names, cam_in_world=seen.cam_in_world, cov=cov)
+    return ImageDrift(names=seen.names, cam_in_world=seen.cam_in_world, cov=cov)
 
 
 def _write_covariance(target: Path, t_s: Array, cov: Array, rotation: Array | None) -> None:

@@ -1,4 +1,4 @@
-"""The model stage that fits pictures, rolling shutter and IMU together: a metric model's shape, without its drift."""
+"""The model stage that fits images, rolling shutter and IMU together: a metric model's shape, without its drift."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ log = logging.getLogger(__name__)
 #: 3: the refinement's own scale; covariances of rotations. 4: noise of the gyroscope, errors that observations share.
 _WRITES = 4
 _FEWEST_IMAGES, _FEWEST_POINTS = 10, 50
-#: Squares of what the IMU and the pictures disagree by, over those that its noise explains, from which on one of them
+#: Squares of what the IMU and the images disagree by, over those that its noise explains, from which on one of them
 #: is wrong: five standard deviations between all images.
 _GROSS_CHI2 = 25.0
 #: One camera comes back to settings that it had before in fewer of its images than this.
@@ -72,7 +72,7 @@ class RefineStage(InertialStage):
 
     Comes after the scale. Paths bend less, and their scale drifts less; size and up become those of the refinement,
     with their covariance. The model stays as it is where the refined one predicts observations that were held out no
-    better, or where the IMU contradicts the pictures.
+    better, or where the IMU contradicts the images.
 
     Attributes
     ----------
@@ -203,14 +203,14 @@ class RefineStage(InertialStage):
         return _record(refined_model, done, action=Action.REFINED, **figures)
 
     def _expose_keypoints(self, model: Model, seen: Seen) -> Array:
-        """(M, 2) observations in the pictures as they were exposed."""
+        """(M, 2) observations in the images as they were exposed."""
         if not model.rectified or self.shutter is None:
             return seen.observations.xy_px
         return exposed_keypoints(model, self.shutter, seen)
 
 
 def _doubt_contradicted(model: Model, judged: Judged) -> Model:
-    """The model with a doubt about its scale where the IMU contradicts its pictures beyond any noise."""
+    """The model with a doubt about its scale where the IMU contradicts its images beyond any noise."""
     reason, scale = judged.reason, model.scale
     if reason is None or reason.code != "imu-contradicts-images" or judged.chi2 <= _GROSS_CHI2 or scale is None:
         return model

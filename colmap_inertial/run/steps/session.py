@@ -124,7 +124,7 @@ def open_session(
     context
         How the work is done; defaults serve. ``scratch`` becomes a folder in ``out``.
     pictures
-        Folders that pictures are read from; ``out`` may not lie in one.
+        Folders that images are read from; ``out`` may not lie in one.
     command
         What is done; one folder is for one command.
     overwrite
@@ -135,7 +135,7 @@ def open_session(
     OutputExistsError
         When ``out`` holds something else, or another run is at work in it.
     OutputError
-        Where it cannot be written, as on a full disk, or lies among the pictures.
+        Where it cannot be written, as on a full disk, or lies among the images.
     """
     require_utf8(out, source)
     require_apart(out, pictures)

@@ -279,9 +279,9 @@ def places_of(root: Path) -> Places:
 
 
 def require_apart(out: Path, pictures: Sequence[Path]) -> None:
-    """Raise :class:`OutputError` where an output would lie among the pictures that it is made from.
+    """Raise :class:`OutputError` where an output would lie among the images that it is made from.
 
-    They would be taken for pictures of the capture when the command is given again.
+    They would be taken for images of the capture when the command is given again.
     """
     for folder in pictures:
         if out.resolve().is_relative_to(folder.resolve()):

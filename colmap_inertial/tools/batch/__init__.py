@@ -204,7 +204,8 @@ def _task(entry: BatchCapture, of_all: StageNames, out: Path, run: str, batch: B
     status = out / "status"
     config = status / f"{entry.name}.toml"
     stages = of_all if entry.stages is None else entry.stages
-    write_text(config, config_as_toml(Job(options=entry.options, project=entry.project, stages=stages)))
+    job = Job(options=entry.options, project=entry.project, reference=entry.reference, stages=stages)
+    write_text(config, config_as_toml(job))
     return CaptureTask(
         name=entry.name,
         capture=entry.path.resolve(),

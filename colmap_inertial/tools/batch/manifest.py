@@ -10,7 +10,7 @@ from typing import Any
 from colmap_inertial.core.choices import CheckedOptions
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.facts import Fact
-from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, StageNames
+from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, ReferenceOptions, StageNames
 from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.io.files import StrPath, check_names, reader
 from colmap_inertial.io.imu import is_capture
@@ -36,6 +36,8 @@ class BatchCapture(CheckedOptions):
         How it is reconstructed.
     project
         For an existing COLMAP project: the IMU recording, and when its images were taken.
+    reference
+        Known lengths: a target, and the distance of two markers or of two points of a project.
     stages
         Its hooks; ``None`` for those of all captures.
     """
@@ -44,6 +46,7 @@ class BatchCapture(CheckedOptions):
     path: Path
     options: ReconstructOptions = field(default_factory=ReconstructOptions)
     project: ProjectOptions = field(default_factory=ProjectOptions)
+    reference: ReferenceOptions = field(default_factory=ReferenceOptions)
     stages: StageNames | None = None
 
     def __post_init__(self) -> None:
@@ -83,6 +86,9 @@ def read_manifest(
             path = "old/bridge"         # an existing COLMAP project: with the flags that reconstruct takes for one
             project.imu = "old/bridge_imu.csv"
             project.frame_times = "old/bridge_frames.csv"
+            options.scale_from = ["imu", "distance"]
+            reference.between = ["-1.2,0.4,3.1", "2.5,0.3,2.9"]  # or two markers of reference.target
+            reference.distance = "4.20+-0.01"
 
         Or a folder: every folder in it is a capture.
     options
@@ -154,6 +160,7 @@ def _capture(manifest: Path, table: Section, options: ReconstructOptions) -> Bat
     config = table.file("config")
     values = _table(table, "options")
     project = override_options(ProjectOptions(), _table(table, "project"), manifest)
+    reference = override_options(ReferenceOptions(), _table(table, "reference"), manifest)
     stages = _stages(table)
     table.finish()
     if config is not None:
@@ -163,7 +170,9 @@ def _capture(manifest: Path, table: Section, options: ReconstructOptions) -> Bat
         resolved = source.resolve()
         name = resolved.parent.name if resolved.name == "capture.toml" else resolved.stem
     try:
-        return BatchCapture(name=name, path=source, options=options, project=project, stages=stages)
+        return BatchCapture(
+            name=name, path=source, options=options, project=project, reference=reference, stages=stages
+        )
     except ValueError as error:
         table.fail("name", Fact("invalid-values", detail=str(error)))
 

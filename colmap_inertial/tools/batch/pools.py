@@ -25,7 +25,7 @@ class MemoryLimits:
     """Memory of a worker, which limits their number."""
 
     per_thread_bytes: int = 3 * 2**30
-    """What a thread needs: 2.4 GB were measured for a picture of 12 megapixels with COLMAP's defaults."""
+    """What a thread needs: 2.4 GB were measured for an image of 12 megapixels with COLMAP's defaults."""
     assumed_free_bytes: int = 8 * 2**30
     """Taken to be free where the system does not say."""
 

@@ -22,7 +22,7 @@ from typing import Any, Literal
 
 from colmap_inertial.core.errors import FormatError, InertialError, OutputError, fact_of
 from colmap_inertial.core.facts import Fact
-from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, StageNames
+from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, ReferenceOptions, StageNames
 from colmap_inertial.core.summary import prints_in_lines
 from colmap_inertial.io.files import read_json, write_json
 from colmap_inertial.run.steps.config import read_config
@@ -42,12 +42,15 @@ class Job:
         As for ``reconstruct``.
     project
         For an existing COLMAP project: the IMU recording, and when its images were taken.
+    reference
+        Known lengths.
     stages
         The hooks.
     """
 
     options: ReconstructOptions = field(default_factory=ReconstructOptions)
     project: ProjectOptions = field(default_factory=ProjectOptions)
+    reference: ReferenceOptions = field(default_factory=ReferenceOptions)
     stages: StageNames = field(default_factory=StageNames)
 
 
@@ -184,6 +187,7 @@ def find_earlier_end(task: CaptureTask) -> CaptureStatus | None:
             (made_from == task.capture or task.capture in made_from.parents)
             and read_config(workspace.config, ReconstructOptions) == job.options
             and result.get("project", _plain(ProjectOptions())) == _plain(job.project)
+            and result.get("reference", _plain(ReferenceOptions())) == _plain(job.reference)
             and read_stage_names(workspace) == job.stages
         )
         lost = find_loss(workspace, [*result.get("seconds", ()), "report"], but=may_go)
@@ -197,8 +201,8 @@ def read_stage_names(workspace: Workspace) -> StageNames:
     return read_config(workspace.stage_names, StageNames) if workspace.stage_names.is_file() else StageNames()
 
 
-def _plain(project: ProjectOptions) -> object:
-    return json.loads(json.dumps(dataclasses.asdict(project), default=str))
+def _plain(options: ProjectOptions | ReferenceOptions) -> object:
+    return json.loads(json.dumps(dataclasses.asdict(options), default=str))
 
 
 def read_end(status: CaptureStatus, result: Path) -> CaptureStatus:

@@ -170,7 +170,7 @@ def _opengl(cam_from_world_xyzw: Array) -> Array:
 
 
 def _linear(rgb: UInt8Array) -> UInt16Array:
-    """(N, 3) linear values of 16 bit of colours as pictures have them (sRGB, IEC 61966-2-1)."""
+    """(N, 3) linear values of 16 bit of colours as images have them (sRGB, IEC 61966-2-1)."""
     share = rgb / 255.0
     linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
     return np.round(65535 * linear).astype(np.uint16)

@@ -1,4 +1,4 @@
-"""Source of an export: the model, its unit and up, its pictures and cameras, and the camera's motion."""
+"""Source of an export: the model, its unit and up, its images and cameras, and the camera's motion."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Picture:
     filmed
         Whether it comes out of the capture.
     agrees
-        Whether it shows things where the model has them; a picture with its rolling shutter does not, where the model
+        Whether it shows things where the model has them; an image with its rolling shutter does not, where the model
         was made without.
     """
 
@@ -97,7 +97,7 @@ class ExportSource:
     Attributes
     ----------
     found
-        Where the model is; unit, verdict, places of pictures.
+        Where the model is; unit, verdict, places of images.
     model
         The model itself.
     up_in_world
@@ -120,7 +120,7 @@ class ExportSource:
     def pictures(
         self, out: Path, names: list[str], kind: ExportImages, capture: Capture | None = None
     ) -> dict[str, Picture]:
-        """The file of each image; of those that a run changed, the picture of the capture where one is given.
+        """The file of each image; of those that a run changed, the image of the capture where one is given.
 
         Raises
         ------
@@ -176,7 +176,7 @@ def read_source(
     model
         Its number; ``None`` takes the largest.
     image_folder
-        Where its pictures are, where they are not beside it.
+        Where its images are, where they are not beside it.
     unscaled
         Whether a model without a scale will do.
 
@@ -208,7 +208,7 @@ def read_source(
 
 
 def find_georeference(out: Path, source: ExportSource, capture: Capture | None) -> Georeference:
-    """Georeference of a model: from its run, else from positions of the capture or of its pictures.
+    """Georeference of a model: from its run, else from positions of the capture or of its images.
 
     Raises
     ------
@@ -276,7 +276,7 @@ def _read_treated_frames(workspace: Workspace) -> dict[str, TreatedFrame]:
         return {str(frame["name"]): TreatedFrame.of(frame) for frame in frames}
 
 
-#: Endings of pictures that stay JPEG; all others become PNG.
+#: Endings of images that stay JPEG; all others become PNG.
 _JPEG = (".jpg", ".jpeg")
 #: Longest stem, so that a number still fits in front of the ending.
 _LONGEST = 100
@@ -362,7 +362,7 @@ class ExportContent:
 
     @classmethod
     def of(cls, source: ExportSource, on_map: Georeference | None, *, square: bool) -> ExportContent:
-        """All but the pictures; cameras with ``square`` pixels where that is needed."""
+        """All but the images; cameras with ``square`` pixels where that is needed."""
         model, where = source.model, source.found.folder
         names = flat_names(model.image(i).name for i in model.reg_image_ids())
         cameras = {i: Undistortion.of(model.camera(i), where, square=square) for i in list_needed_cameras(model)}

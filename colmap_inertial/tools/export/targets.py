@@ -55,7 +55,7 @@ def exposures_of(
 ) -> dict[str, Exposure]:
     """Velocity, exposure and readout by image name; images without a velocity are left out.
 
-    The exported picture's rows are those of the filmed one, stretched: its readout is that of as many rows as it shows.
+    The exported image's rows are those of the filmed one, stretched: its readout is that of as many rows as it shows.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ def _require_motion(motion: CameraMotion | None, pictures: Mapping[str, Picture]
 
 
 def _rows(undistortion: Undistortion) -> tuple[float, float]:
-    """Rows of the filmed picture that the new one shows, and the shift of its middle, as shares of its height."""
+    """Rows of the filmed image that the new one shows, and the shift of its middle, as shares of its height."""
     pinhole, height = undistortion.pinhole, undistortion.camera.height
     middle = [0.5 * pinhole.width, 0.5 * pinhole.height]
     step = 0.25 * pinhole.height
@@ -184,9 +184,9 @@ def _text(numbers: Array) -> str:
 
 
 def write_bundler(path: Path, listing: Path, views: list[View], model: pycolmap.Reconstruction) -> None:
-    """Write cameras and points as Bundler's ``bundle.out`` (v0.3), and the list of its pictures.
+    """Write cameras and points as Bundler's ``bundle.out`` (v0.3), and the list of its images.
 
-    One focal length, no distortion; cameras look along -z with y up; observations count from the picture's middle,
+    One focal length, no distortion; cameras look along -z with y up; observations count from the image's middle,
     upwards.
 
     Parameters
@@ -312,7 +312,7 @@ def _write_for_trainers(content: ExportContent, folder: Path, add_motion: _AddMo
 
 
 def _write_for_gsplat(content: ExportContent, folder: Path) -> None:
-    """The same, and the poses between which gsplat draws rolling-shutter pictures."""
+    """The same, and the poses between which gsplat draws rolling-shutter images."""
     _write_for_trainers(content, folder)
     motion = content.source.motion
     if motion is None or not motion.names or not (motion.readout_s or 0.0) > 0:

@@ -32,7 +32,7 @@ _LIMITS = NormalisationLimits()
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class View:
-    """One picture of the export.
+    """One image of the export.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class View:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Exposure:
-    """Motion of a camera during the exposure of a picture of the export.
+    """Motion of a camera during the exposure of an image of the export.
 
     Attributes
     ----------
@@ -70,9 +70,9 @@ class Exposure:
     exposure_s
         0 where the blur was undone.
     readout_s
-        From the first row of the exported picture to one past its last; 0 where the rolling shutter was undone.
+        From the first row of the exported image to one past its last; 0 where the rolling shutter was undone.
     late_s
-        By how much the exported picture's middle row is later than the instant of the pose.
+        By how much the exported image's middle row is later than the instant of the pose.
     """
 
     velocity_in_cam_m_s: Array
@@ -126,7 +126,7 @@ def transforms(views: Sequence[View], xyz: Array, up_in_world: Array) -> dict[st
 def add_velocities(content: Mapping[str, Any], exposures: Mapping[str, Exposure]) -> dict[str, Any]:
     """The same for the deblurring fork of splatfacto: velocities in OpenGL camera axes, exposure and readout.
 
-    It takes a pose for that of the picture's middle row, so that each is brought to it.
+    It takes a pose for that of the image's middle row, so that each is brought to it.
 
     Frames without velocities are left out: it wants them of all or of none.
     """
@@ -177,10 +177,10 @@ def add_row_poses(content: Mapping[str, Any], exposures: Mapping[str, Exposure])
 
 
 def view_matrices(views: Sequence[View], exposures: Mapping[str, Exposure]) -> dict[str, Any]:
-    """Poses at the begin and end of each picture's readout, as gsplat's ``rasterization`` takes them.
+    """Poses at the begin and end of each image's readout, as gsplat's ``rasterization`` takes them.
 
     ``viewmats`` and ``viewmats_rs``: (4, 4) camera from world, x right, y down, z forward, of the first row and of one
-    past the last. Of a picture without a readout, or a velocity, both are the pose.
+    past the last. Of an image without a readout, or a velocity, both are the pose.
     """
     frames = []
     for view in views:

@@ -1,4 +1,4 @@
-"""Pinhole cameras with the principal point in the middle, and pictures as they would have taken them."""
+"""Pinhole cameras with the principal point in the middle, and images as they would have taken them."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ if TYPE_CHECKING:
 class UndistortionLimits:
     """Limits of the search for the undistorted image."""
 
-    #: A side of the new picture is at most this many times the old one's: beyond it a wide lens shows hardly any
+    #: A side of the new image is at most this many times the old one's: beyond it a wide lens shows hardly any
     #: detail.
     largest: float = 1.6
-    #: Points of the border that tell how far a picture reaches; how well distorting must undo undistorting there, px.
+    #: Points of the border that tell how far an image reaches; how well distorting must undo undistorting there, px.
     border: int = 200
     undone_px: float = 0.05
-    #: Where the new picture shows what the old one does not have, it shrinks by this share, so often.
+    #: Where the new image shows what the old one does not have, it shrinks by this share, so often.
     shrink: float = 0.01
     rounds: int = 90
     #: Distance of the nodes between which the resampling is interpolated, px.
@@ -65,7 +65,7 @@ class Undistortion:
     def of(cls, camera: pycolmap.Camera, where: Path, *, square: bool = False) -> Undistortion:
         """The largest pinhole camera of the same focal lengths that sees nothing the camera does not see.
 
-        The picture of a camera whose principal point is off the middle loses a strip on the far side; the optical axis,
+        The image of a camera whose principal point is off the middle loses a strip on the far side; the optical axis,
         poses and points stay what they are.
 
         Parameters
@@ -107,7 +107,7 @@ class Undistortion:
         raise FormatError(where, Fact("not-undistorted", camera=camera.camera_id, model=camera.model_name))
 
     def is_inside(self) -> bool:
-        """Whether all of the new picture comes from the old one."""
+        """Whether all of the new image comes from the old one."""
         width, height = self.pinhole.width, self.pinhole.height
         x, y = np.linspace(0, width, _LIMITS.border // 4), np.linspace(0, height, _LIMITS.border // 4)
         grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
@@ -116,7 +116,7 @@ class Undistortion:
         return bool(np.isfinite(source).all() and (source >= -0.01).all() and (source <= size + 0.01).all())
 
     def source_px(self, xy_px: Array) -> Array:
-        """(N, 2) where (N, 2) points of the new picture are in the old one; nan where nowhere."""
+        """(N, 2) where (N, 2) points of the new image are in the old one; nan where nowhere."""
         fx, fy, cx, cy = self.pinhole.params
         rays = np.stack([(xy_px[:, 0] - cx) / fx, (xy_px[:, 1] - cy) / fy, np.ones(len(xy_px))], axis=1)
         source = np.array(self.camera.img_from_cam(rays), dtype=np.float64)
@@ -124,7 +124,7 @@ class Undistortion:
         return source
 
     def moved_px(self, xy_px: Array) -> Array:
-        """(N, 2) where (N, 2) points of the old picture are in the new one; nan where they have no ray."""
+        """(N, 2) where (N, 2) points of the old image are in the new one; nan where they have no ray."""
         fx, fy, cx, cy = self.pinhole.params
         return np.asarray(_unproject(self.camera, xy_px, self.fold) * [fx, fy] + [cx, cy])
 
@@ -135,7 +135,7 @@ class Undistortion:
         return size and bool(np.abs(self.source_px(corners) - corners).max() < 1e-6)
 
     def resampled(self, image: UInt8Array) -> UInt8Array:
-        """(h, w, C) or (h, w) the picture (H, W, C) or (H, W) as the pinhole camera would have taken it.
+        """(h, w, C) or (h, w) the image (H, W, C) or (H, W) as the pinhole camera would have taken it.
 
         By bicubic interpolation.
         """
@@ -154,7 +154,7 @@ class Undistortion:
 
 
 def _extrapolate_shifts(shift: Array) -> Array:
-    """Shifts at nodes beyond the picture's edge, which a lens may not reach, as those within go on."""
+    """Shifts at nodes beyond the image's edge, which a lens may not reach, as those within go on."""
     for axis in (0, 1):
         along = np.moveaxis(shift, axis, 0)
         for i in range(2, len(along)):
@@ -177,7 +177,7 @@ def _unproject(camera: pycolmap.Camera, xy_px: Array, fold: Fold | None) -> Arra
 
 
 def _half_extent(camera: pycolmap.Camera, fold: Fold | None = None) -> Array:
-    """(2,) how far the picture reaches at z = 1, to the nearer side of each two."""
+    """(2,) how far the image reaches at z = 1, to the nearer side of each two."""
     width, height = camera.width, camera.height
     x, y = np.linspace(0, width, _LIMITS.border), np.linspace(0, height, _LIMITS.border)
     sides = {
@@ -202,9 +202,9 @@ def _half_extent(camera: pycolmap.Camera, fold: Fold | None = None) -> Array:
 def pinhole_model(
     model: pycolmap.Reconstruction, cameras: Mapping[int, Undistortion], names: Mapping[str, str]
 ) -> pycolmap.Reconstruction:
-    """The model with its pictures undistorted.
+    """The model with its images undistorted.
 
-    Observations move along with the pictures; those beyond an edge of the new picture, and keypoints that see no point,
+    Observations move along with the images; those beyond an edge of the new image, and keypoints that see no point,
     are left out. All points stay, also those that lose observations.
 
     Parameters

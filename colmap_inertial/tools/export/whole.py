@@ -34,7 +34,7 @@ from colmap_inertial.tools.export.undistort import Undistortion
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Job:
-    """One picture to write.
+    """One image to write.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class Job:
             encode_image(self.target, self.undistortion.resampled(three_channels(image)), alpha=self._alpha())
 
     def _alpha(self) -> UInt8Array | None:
-        """(h, w) alpha of the new picture, where the file has one and the new format holds it."""
+        """(h, w) alpha of the new image, where the file has one and the new format holds it."""
         if self.pixels is not None or self.target.suffix.lower() != ".png":
             return None
         alpha = read_alpha(read_bytes(self.source, what="picture"))
@@ -84,19 +84,19 @@ class Job:
 
 
 def write_pictures(jobs: Iterable[Job], count: int, progress: Progress) -> None:
-    """Write pictures as pinhole cameras would have taken them; a few at a time.
+    """Write images as pinhole cameras would have taken them; a few at a time.
 
     Parameters
     ----------
     jobs, count
-        The pictures, and how many there are.
+        The images, and how many there are.
     progress
         Called with ``"export"``.
 
     Raises
     ------
     FormatError
-        For a picture that cannot be read, or whose size is not the camera's.
+        For an image that cannot be read, or whose size is not the camera's.
     """
     progress("export", 0, count)
     for done, _ in enumerate(map_in_order(Job.write, jobs, workers=frames_at_once()), start=1):
@@ -104,7 +104,7 @@ def write_pictures(jobs: Iterable[Job], count: int, progress: Progress) -> None:
 
 
 def three_channels(image: AnyArray) -> UInt8Array:
-    """(H, W, 3) the picture in 8 bit and three channels: trainers read nothing else."""
+    """(H, W, 3) the image in 8 bit and three channels: trainers read nothing else."""
     shown = np.asarray(image // 257 if image.dtype == np.uint16 else image, dtype=np.uint8)
     return np.repeat(shown[:, :, None], 3, axis=2) if shown.ndim == 2 else shown
 
@@ -183,12 +183,12 @@ def export_model(
     program
         What it is for; ``None`` makes what all splatting and NeRF trainers read.
     images
-        ``"rectified"``: the pictures that agree with the model; ``"original"``: those that COLMAP saw, with their
+        ``"rectified"``: the images that agree with the model; ``"original"``: those that COLMAP saw, with their
         rolling shutter.
     model
         Number of the model; ``None`` takes the largest.
     image_folder
-        Folder with the model's pictures, where they are not beside it.
+        Folder with the model's images, where they are not beside it.
     capture
         The capture that the run was made of: with ``images="original"`` for frames that it deblurred or changed, with
         ``georeference`` for its positions.
@@ -207,7 +207,7 @@ def export_model(
     Raises
     ------
     FormatError
-        Where there is no model, a picture is missing or of another size, or a lens cannot be undistorted.
+        Where there is no model, an image is missing or of another size, or a lens cannot be undistorted.
     NotObservableError
         Where the scale was refused; where ``program`` needs velocities and none were kept; where positions leave the
         heading open.
@@ -271,7 +271,7 @@ def _write_georeference(path: Path, content: ExportContent, on_map: Georeference
 
 
 def _jobs(content: ExportContent, folder: Path, capture: Capture | None) -> Iterator[Job]:
-    """The pictures to write: from their files, then those that come out of a capture."""
+    """The images to write: from their files, then those that come out of a capture."""
     model = content.source.model
     camera_of = {image.name: content.cameras[image.camera_id] for image in map(model.image, model.reg_image_ids())}
     for name, picture in content.pictures.items():
@@ -316,12 +316,12 @@ def _record(made: Exported, content: ExportContent, kind: ExportImages) -> dict[
     }
 
 
-#: What names of folders with masks, or of masks among the pictures, hold.
+#: What names of folders with masks, or of masks among the images, hold.
 _MASKS = re.compile(r"(?i)mask|matte|segmentation|^seg$|^alphas?$")
 
 
 def _notes_on_masks(out: Path, pictures: Collection[Path], names: Collection[str]) -> list[Fact]:
-    """Note for the user on masks beside the folders of the pictures, or in them; ``names`` are the pictures' own."""
+    """Note for the user on masks beside the folders of the images, or in them; ``names`` are the images' own."""
     beside = {path for folder in {out, *(path.parent for path in pictures)} for path in _contents(folder)}
     masks = {path for path in beside if _MASKS.search(path.name) and _contents(path)}
     for folder in pictures:
@@ -336,7 +336,7 @@ def _contents(folder: Path) -> list[Path]:
 
 
 def _notes_on(pictures: Mapping[str, Picture], kind: ExportImages) -> list[Fact]:
-    """Notes for the user on the pictures."""
+    """Notes for the user on the images."""
     notes = []
     bent = sum(not picture.agrees for picture in pictures.values())
     if bent:

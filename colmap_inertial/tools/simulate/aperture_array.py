@@ -52,7 +52,7 @@ def write_aperture_capture(
 ) -> Path:
     """Make the capture that a recipe describes, as a multi-aperture camera records it.
 
-    As :func:`write_capture`, but ``frames/`` and ``frames_ROLE/`` hold one grey picture of each aperture;
+    As :func:`write_capture`, but ``frames/`` and ``frames_ROLE/`` hold one grey image of each aperture;
     ``rig_config.json`` is COLMAP's description of the array, and ``frames_rgb/`` what a camera with all colours in the
     reference's place would have seen.
 
@@ -95,7 +95,7 @@ def _shift_camera(camera: ShutterCamera, by_m: tuple[float, float, float]) -> tu
 
 
 def _apply_filter(image: UInt8Array | UInt16Array, role: SpectralRole) -> UInt8Array:
-    """The plane of a colour picture behind an aperture's filter."""
+    """The plane of a colour image behind an aperture's filter."""
     if role in ("red", "green", "blue"):
         return np.asarray(image[..., ("red", "green", "blue").index(role)], dtype=np.uint8)
     light = np.asarray(decode_table(image.dtype)[image] @ _LUMINANCE, dtype=np.float64)

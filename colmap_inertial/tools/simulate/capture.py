@@ -123,7 +123,7 @@ def _write_capture(scene: Scene, folder: Path, workers: int, progress: Callable[
 
 
 def _write_tables(scene: Scene, folder: Path) -> None:
-    """Samples of gyroscope and accelerometer, and the times of pictures."""
+    """Samples of gyroscope and accelerometer, and the times of images."""
     for name, t_s, values in (
         ("gyro", scene.imu.recording.gyro_t_s, scene.imu.recording.gyro_rad_s),
         ("accel", scene.imu.recording.accel_t_s, scene.imu.recording.accel_m_s2),
@@ -226,7 +226,7 @@ def _write_video(scene: Scene, images: Iterator[UInt8Array], folder: Path, suffi
         container.mux(stream.encode())
 
 
-# --- what stands beside the pictures ------------------------------------------------------------------------------
+# --- what stands beside the images ------------------------------------------------------------------------------
 
 
 def _poses(scene: Scene, camera: ShutterCamera) -> list[dict[str, object]]:

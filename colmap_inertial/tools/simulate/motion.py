@@ -9,9 +9,10 @@ motion-capture recordings of people who carried a camera through a room (the con
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_inertial.core.arrays import Array, IndexArray
 from colmap_inertial.core.geometry import quat_exp, quat_from_matrix, quat_multiply, quat_normalize
@@ -19,6 +20,8 @@ from colmap_inertial.core.geometry import quat_exp, quat_from_matrix, quat_multi
 MotionKind = Literal["orbit", "walk", "roam", "constant_velocity", "pure_rotation", "static"]
 
 Spectrum = tuple[float, ...]
+#: Lowest and highest corner of a room.
+Walls = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +56,10 @@ class HandheldSpectra:
 HANDHELD = HandheldSpectra()
 #: The motion continues this long before time 0 and after the duration, for an IMU that outlasts the video.
 MARGIN_S = 3.0
+#: How far a walk in a room keeps from the walls, without the hand; the hand then reaches less far.
+_CLEARANCE_M, _REACH_M = 0.6, 0.5
+#: Nobody walks in a smaller circle.
+_SMALLEST_CIRCLE_M = 0.4
 
 # value of the six quintic B-splines over one knot interval as polynomials: row = power of the fraction, column = spline
 _QUINTIC = (
@@ -76,9 +83,9 @@ class MotionOptions:
     """Kind, duration and intensity of a motion."""
 
     kind: MotionKind = "orbit"
-    """orbit: around a subject at the origin, looking at it; walk: forwards, with a gait; roam: about a room, spectrum
-    as measured at all frequencies; constant_velocity: straight, hand rotation only; pure_rotation: about the optical
-    centre; static: a tripod."""
+    """orbit: around a subject at the origin, looking at it; walk: forwards, with a gait, in a circle to the left where
+    the room is too small to go straight on; roam: about a room, spectrum as measured at all frequencies;
+    constant_velocity: straight, hand rotation only; pure_rotation: about the optical centre; static: a tripod."""
     duration_s: float = 60.0
     """Length of the camera's recording."""
     vigour: float = 1.0
@@ -271,10 +278,38 @@ def _orient_along(direction: Array) -> Array:
     return quat_from_matrix(np.stack([right, np.cross(forward, right), forward], axis=-1))
 
 
-def make_motion(options: MotionOptions, rng: np.random.Generator) -> Motion:
+def _along_and_side(azimuth: NDArray[np.floating[Any]] | float) -> tuple[Array, Array]:
+    """(..., 3) horizontal directions of (...) azimuths, and those to their left."""
+    cos, sin, level = np.cos(azimuth), np.sin(azimuth), np.zeros_like(azimuth)
+    return np.stack([cos, sin, level], axis=-1), np.stack([-sin, cos, level], axis=-1)
+
+
+def _circle_within(walls_m: Walls, options: MotionOptions, along: Array, side: Array) -> float | None:
+    """Radius of the largest circle to the left that a walk fits into; ``None`` where it may, or has to, go straight on.
+
+    The circle's centre is ``start + radius * side``, so that its ends along each horizontal axis are linear in radius.
+    """
+    along, side = along[:2], side[:2]
+    start = np.array(options.start_m)[:2]
+    low, high = (np.array(corner)[:2] for corner in walls_m)
+    low, high = low + _CLEARANCE_M, high - _CLEARANCE_M
+    end = start + options.speed_m_s * options.duration_s * along
+    if np.all((low <= [start, end]) & ([start, end] <= high)):
+        return None
+    with np.errstate(divide="ignore", invalid="ignore"):  # a wall to the side, which the circle only leaves
+        radius_m = float(np.nanmin([(high - start) / (1 + side), (start - low) / (1 - side)]))
+    return radius_m if radius_m >= _SMALLEST_CIRCLE_M else None
+
+
+def make_motion(options: MotionOptions, rng: np.random.Generator, walls_m: Walls | None = None) -> Motion:
     """Draw a motion. It is defined from ``-MARGIN_S`` to ``duration_s + MARGIN_S``.
 
     The world's z axis points up; ``orbit`` circles its start, the others begin near it.
+
+    Parameters
+    ----------
+    walls_m
+        Lowest and highest corner of the room, in which a walk is to stay.
     """
     step_s = 1 / HANDHELD.knot_rate_hz
     guard = 16  # samples beyond the margin, where the spline's boundary condition has an effect
@@ -284,8 +319,7 @@ def make_motion(options: MotionOptions, rng: np.random.Generator) -> Motion:
     heading = rng.uniform(0, 2 * np.pi)
     if options.heading_deg is not None:
         heading = np.deg2rad(options.heading_deg)
-    along = np.array([np.cos(heading), np.sin(heading), 0.0])
-    side = np.array([-along[1], along[0], 0.0])
+    along, side = _along_and_side(heading)
     position = np.zeros((n, 3))
     low_hz = {"orbit": 0.5, "walk": 0.35}.get(options.kind, HANDHELD.frequency_hz[0])
     shake, turn = _draw_hand(n, rng, low_hz=low_hz, vigour=options.vigour)
@@ -299,10 +333,18 @@ def make_motion(options: MotionOptions, rng: np.random.Generator) -> Motion:
         position = position + reach * np.tanh(shake / reach)
         looking = _orient_along(-position)
     else:
-        look = heading + np.deg2rad(options.look_deg)
-        looking = np.broadcast_to(_orient_along(np.array([[np.cos(look), np.sin(look), 0.0]])), (n, 4))
-        if options.kind in ("walk", "constant_velocity"):
+        radius_m, azimuth = None, np.full(1, heading)
+        if options.kind == "walk" and walls_m is not None:
+            shake = _REACH_M * np.tanh(shake / _REACH_M)
+            radius_m = _circle_within(walls_m, options, along, side)
+        if radius_m is not None:
+            azimuth = heading + options.speed_m_s / radius_m * t
+            centre, (_, side) = radius_m * side, _along_and_side(azimuth)
+            position = centre - radius_m * side
+        elif options.kind in ("walk", "constant_velocity"):
             position = position + options.speed_m_s * t[:, None] * along
+        look, _ = _along_and_side(azimuth + np.deg2rad(options.look_deg))
+        looking = np.broadcast_to(_orient_along(look), (n, 4))
         if options.kind == "walk":
             step_hz = rng.uniform(1.7, 2.1)
             bob = rng.uniform(0.01, 0.02, size=2)

@@ -1,4 +1,4 @@
-"""Recordings without pictures: the poses that structure from motion would give, and the IMU recorded with it."""
+"""Recordings without images: the poses that structure from motion would give, and the IMU recorded with it."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ class RenderLimits:
     """Sampling of pixels.
 
     Against 256 samples the error is then about one grey level rms, from no blur to 60 px of it; more only where black
-    meets white all over the picture.
+    meets white all over the image.
     """
 
     near_m: float = 0.02
@@ -338,7 +338,7 @@ def _spans(inside: BoolArray) -> list[slice]:
 
 
 def develop(linear: Float32Array, camera: ShutterCamera, rng: np.random.Generator | None) -> UInt8Array:
-    """(H, W, 3) 8-bit sRGB picture of linear light, with shot and read noise (none with ``rng`` None)."""
+    """(H, W, 3) 8-bit sRGB image of linear light, with shot and read noise (none with ``rng`` None)."""
     light: NDArray[np.floating] = np.asarray(linear, dtype=np.float32)
     if rng is not None:
         # electrons: variance = mean + read noise squared

@@ -1,4 +1,4 @@
-"""A recipe carried out, but for the pictures: motion, device, instants of the frames."""
+"""A recipe carried out, but for the images: motion, device, instants of the frames."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from colmap_inertial.tools.simulate.motion import Motion
 from colmap_inertial.tools.simulate.recipe import VIDEO_FORMATS, SceneRecipe
 from colmap_inertial.tools.simulate.render import Renderer, ShutterCamera
 from colmap_inertial.tools.simulate.sensors import SampledImu, simulate_imu
-from colmap_inertial.tools.simulate.world import Board, World, WorldKind, make_world
+from colmap_inertial.tools.simulate.world import WALLS_M, Board, World, WorldKind, make_world
 
 #: Ticks of a video's clock in a second: 30, 25, 24 frames per second are whole numbers of them.
 TICKS_HZ = 90000
@@ -22,7 +22,7 @@ TICKS_HZ = 90000
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Scene:
-    """A recipe carried out, but for the pictures.
+    """A recipe carried out, but for the images.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ def make_scene(recipe: SceneRecipe) -> Scene:
     options = recipe.imu
     if recipe.format == "stray-scanner":
         options = replace(options, clock_offset_s=(0.0, 0.0), clock_rate_sd=0.0)
-    motion, imu = simulate_imu(recipe.motion, options, streams)
+    motion, imu = simulate_imu(recipe.motion, options, streams, walls_m=WALLS_M[recipe.world])
     count = int(recipe.motion.duration_s * recipe.frame_rate_hz)
     ticks = np.rint(np.arange(count) * (TICKS_HZ / recipe.frame_rate_hz)).astype(np.int64)
     if recipe.format in VIDEO_FORMATS:

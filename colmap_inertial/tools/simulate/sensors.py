@@ -19,7 +19,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, quat_multiply, quat_normalize
 from colmap_inertial.core.types import CAL, CameraImuCalibration, ImuNoise, ImuRecording
-from colmap_inertial.tools.simulate.motion import MARGIN_S, Motion, MotionOptions, make_motion
+from colmap_inertial.tools.simulate.motion import MARGIN_S, Motion, MotionOptions, Walls, make_motion
 
 STANDARD_GRAVITY_M_S2 = 9.80665
 
@@ -365,9 +365,10 @@ def simulate_imu(
     streams: Sequence[np.random.Generator],
     *,
     gravity_m_s2: float = STANDARD_GRAVITY_M_S2,
+    walls_m: Walls | None = None,
 ) -> tuple[Motion, SampledImu]:
-    """Draw a motion from the first stream; a device and what it reads on the way from the second."""
+    """Draw a motion, in a room or anywhere, from the first stream; a device and what it reads from the second."""
     duration_s = motion_options.duration_s
-    motion = make_motion(motion_options, streams[0])
+    motion = make_motion(motion_options, streams[0], walls_m)
     errors = draw_imu_errors(options, duration_s, streams[1])
     return motion, sample_imu(motion, errors, options, duration_s=duration_s, rng=streams[1], gravity_m_s2=gravity_m_s2)

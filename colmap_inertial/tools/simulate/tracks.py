@@ -1,4 +1,4 @@
-"""Walks without pictures: points along a path, where a camera would see them, and the IMU that was carried along.
+"""Walks without images: points along a path, where a camera would see them, and the IMU that was carried along.
 
 Tracks are drawn, not found in rendered images: what a mapper makes of them drifts as real models do, and hundreds of
 frames take seconds.
@@ -245,7 +245,7 @@ def _observe(
             xy = np.full((len(near), 2), -1e3)
             xy[front] = camera.img_from_cam(in_cam[front])
         inside = front & (xy > 5).all(axis=1) & (xy < [width - 5, height - 5]).all(axis=1)
-        # the lens's polynomial folds what lies far outside back into the picture
+        # the lens's polynomial folds what lies far outside back into the image
         inside &= (np.abs(in_cam[:, :2]) < 0.8 * in_cam[:, 2:]).all(axis=1)
         frames.append(np.full(int(inside.sum()), i))
         numbers.append(near[inside])

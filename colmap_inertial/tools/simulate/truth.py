@@ -1,4 +1,4 @@
-"""``truth.json``: what a simulated capture's pictures and samples were made from, and checks against it."""
+"""``truth.json``: what a simulated capture's images and samples were made from, and checks against it."""
 
 from __future__ import annotations
 

@@ -11,11 +11,12 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, Float32Array
 from colmap_inertial.tools.simulate import textures
+from colmap_inertial.tools.simulate.motion import Walls
 
 WorldKind = Literal["desk", "room"]
 
 #: Lowest and highest corner of the room around each world.
-WALLS_M: dict[WorldKind, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
+WALLS_M: dict[WorldKind, Walls] = {
     "desk": ((-2.5, -2.5, -0.8), (2.5, 2.5, 1.7)),
     "room": ((-3.2, -2.8, -1.4), (3.2, 2.8, 1.3)),
 }

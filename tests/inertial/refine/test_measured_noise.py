@@ -83,7 +83,7 @@ def test_observations_weigh_as_much_as_they_tell(subtests, solved):
             scaled = replace(
                 alone, observations=replace(alone.observations, xy_px=_with_noise(alone, x, sigma_px)), robust_px=1.0
             )
-            noise = pictures.measure_picture_noise(scaled, x)
+            noise = pictures.measure_image_noise(scaled, x)
             k = 0.5 * (noise.robust_px / noise.sigma_px) ** 2
             weight = k * np.exp(k) * exp1(k)
             slope = k * (1 - weight)
@@ -100,7 +100,7 @@ def test_noise_is_measured_beside_what_was_fitted_to_it():
     options = walk(6.0, points_per_m=80.0)
     problem, start, _ = problem_of(tracks_of(options), options)
     alone = pictures.pictures_alone(problem, problem.observations.xy_px)
-    assert pictures.measure_picture_noise(alone, solve(alone, start).estimate).sigma_px == pytest.approx(0.5, rel=0.03)
+    assert pictures.measure_image_noise(alone, solve(alone, start).estimate).sigma_px == pytest.approx(0.5, rel=0.03)
 
 
 def _with_noise(problem, x, sigma_px):

@@ -8,7 +8,7 @@ import pytest
 
 from colmap_inertial.core.geometry import so3_exp, so3_log
 from colmap_inertial.inertial.refine import _residuals, refinement, world
-from colmap_inertial.inertial.refine.motion import PictureDrift
+from colmap_inertial.inertial.refine.motion import ImageDrift
 from tests.helpers.cases import loop_over
 
 
@@ -58,7 +58,7 @@ def test_a_motion_errs_by_its_drift_and_by_what_a_wrong_scale_and_up_do_to_all_o
     roots = 0.1 * rng.standard_normal((count, 6, 6))
     similarity, local = 0.1 * rng.standard_normal((7, 7)), 0.1 * rng.standard_normal((count, 3, 3))
     names = tuple(map(str, range(count)))
-    drift = PictureDrift(names=names, cam_in_world=centres, cov=roots @ roots.transpose(0, 2, 1))
+    drift = ImageDrift(names=names, cam_in_world=centres, cov=roots @ roots.transpose(0, 2, 1))
     found = drift.motion_covs(similarity @ similarity.T, velocities, local @ local.transpose(0, 2, 1))
 
     def motion(k, error):

@@ -1,5 +1,6 @@
 """A known distance beside an IMU: one more sensor where it is named, between markers or between points of a project."""
 
+import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -15,6 +16,8 @@ from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, Ref
 from colmap_inertial.run.commands.reconstruct import reconstruct
 from colmap_inertial.run.commands.reconstruct_project import reconstruct_project
 from colmap_inertial.run.commands.scale_by_reference import scale_project_by
+from colmap_inertial.tools.batch import run_batch
+from colmap_inertial.tools.batch.manifest import read_manifest
 from tests.cli.test_commands import run
 from tests.helpers.box_project import FOCAL, HEIGHT, LOW, WIDTH, BoxProject, build, cast, rays
 from tests.helpers.box_sensors import write_capture
@@ -110,6 +113,29 @@ def test_a_distance_of_points_joins_the_imu(box, tmp_path, capsys):
     assert code == 0, err
     (again,) = json.loads(said)["models"]
     assert again["metres_per_unit"] == pytest.approx(model.scale.metres_per_unit, rel=1e-9)
+
+
+def test_a_batch_takes_a_distance_from_its_manifest(box, tmp_path):
+    given, true_by_points = between_images(box)
+    manifest = tmp_path / "m.toml"
+    project = f'project.imu = "{box.imu}"\nproject.frame_times = "{box.frame_times}"\n'
+    lengths = f'reference.between = {json.dumps(given.between)}\nreference.distance = "{given.distance}"\n'
+    named = 'options.refine = "off"\noptions.scale_from = ["imu", "distance"]\n'
+    manifest.write_text(f'[[capture]]\nname = "box"\npath = "{box.root}"\n{project}{named}{lengths}')
+    (capture,) = read_manifest(manifest)
+    assert capture.reference == given
+    batch = run_batch(manifest, tmp_path / "out")
+    assert batch.captures[0].state == "done", batch.captures[0].error
+    file = tmp_path / "out" / "box" / "result.json"
+    (model,) = json.loads(file.read_text())["models"]
+    (distance,) = [one for one in model["sensors"]["evidence"] if one["sensor"] == "distance"]
+    assert distance["metres_per_unit"] == pytest.approx(true_by_points, rel=1e-9)
+    assert find_violations("result", file) == []
+    assert run_batch(manifest, tmp_path / "out").unchanged
+    # another length does not pass for the earlier one
+    other = dataclasses.replace(capture, reference=dataclasses.replace(given, distance="2+-0.01"))
+    (end,) = run_batch([other], tmp_path / "out").captures
+    assert end.exit_code == 2
 
 
 def test_a_distance_of_markers_joins_the_imu_and_a_target_beside(box, tmp_path):

@@ -8,7 +8,7 @@ import pytest
 
 from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, so3_exp
 from colmap_inertial.core.types import CAL, CameraTrajectory, FrameTiming, ImuRecording
-from colmap_inertial.inertial.refine.motion import PictureDrift
+from colmap_inertial.inertial.refine.motion import ImageDrift
 from colmap_inertial.inertial.refine.shutter import SHUTTER_LIMITS
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.run.stages import metric
@@ -42,7 +42,7 @@ def drifted_path(patch):
         similarity=SimpleNamespace(cov=spread(rng, 7, 4e-3)),
         joined_covs=dict(zip(names, cov, strict=True)),
     )
-    drift = PictureDrift(names=names, cam_in_world=centre, cov=cov)
+    drift = ImageDrift(names=names, cam_in_world=centre, cov=cov)
     patch.setattr(metric, "read_seen", lambda *_: seen)
     patch.setattr(metric, "has_rigs", lambda _: False)
     patch.setattr(metric, "find_path_drift", lambda *_: drift)

@@ -26,6 +26,7 @@ from colmap_inertial.tools.simulate.recipe import SceneRecipe, load_recipe, reci
 from colmap_inertial.tools.simulate.render import ShutterCamera, colmap_camera
 from colmap_inertial.tools.simulate.scene import make_scene
 from colmap_inertial.tools.simulate.truth import read_truth, true_metres_per_unit
+from colmap_inertial.tools.simulate.world import WALLS_M
 from tests.helpers.cases import loop_over
 
 SCENES = Path(__file__).resolve().parents[3] / "example_scenes"
@@ -143,6 +144,32 @@ def test_a_path_out_of_the_room_is_refused_before_any_frame_is_rendered(tmp_path
     assert refused.value.code == "path-leaves-room"
     assert [refused.value.fact.values[key] for key in ("first_s", "outside", "frames")] == [3.5, 5, 12]
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_default_walk_stays_in_every_room():
+    for world, (low_m, high_m) in WALLS_M.items():
+        for seed in range(12):
+            scene = make_scene(SceneRecipe(seed=seed, world=world, motion=MotionOptions(kind="walk")))
+            k = scene.motion.at(scene.trigger_s)
+            assert np.all((np.array(low_m) < k.cam_in_world_m) & (k.cam_in_world_m < np.array(high_m))), (world, seed)
+
+
+def test_a_walk_goes_in_a_circle_only_where_it_cannot_go_straight_on():
+    walk = MotionOptions(kind="walk", vigour=0.0, speed_m_s=0.8, heading_deg=90.0)
+    straight, round_about = (
+        make_scene(replace(RECIPE, world="room", motion=replace(walk, duration_s=s))).motion.at(np.linspace(0, s, 500))
+        for s in (2.0, 20.0)
+    )
+    np.testing.assert_allclose(straight.cam_in_world_m[-1], [0.0, 1.6, 0.0], atol=0.03)
+    # 0.6 m are kept free of the wall to the left, 3.2 m away: the circle is 2.6 m wide
+    away = round_about.cam_in_world_m - [-1.3, 0.0, 0.0]
+    np.testing.assert_allclose(np.hypot(away[:, 0], away[:, 1]), 1.3, atol=0.03)
+    turned = np.unwrap(np.arctan2(away[:, 1], away[:, 0]))[-1]
+    assert turned == pytest.approx(0.8 * 20.0 / 1.3, abs=0.03)
+    # looking where one goes
+    ahead = quat_rotate(round_about.world_from_cam_xyzw, np.array([0.0, 0.0, 1.0]))
+    np.testing.assert_allclose(np.sum(ahead * away, axis=1), 0.0, atol=0.03)
+    assert (np.cross(away, ahead)[:, 2] > 1.2).all()
 
 
 def test_recipes_survive_writing_and_reading(tmp_path, written):
