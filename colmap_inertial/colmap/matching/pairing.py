@@ -2,14 +2,16 @@
 
 Of few images, or of images taken seconds apart: all but those that the gyroscope or a quick comparison excludes. Of a
 video: neighbours in time, and returns to a place. A frame that shows what the one before does, as the camera stands
-still, is matched with the first of its kind alone.
+still, is matched with the first of its kind alone. A frame that shares too little with its neighbours to be placed by
+them is matched with others farther apart.
 """
 
 from __future__ import annotations
 
+import itertools
 import logging
 import shutil
-from collections.abc import Sequence, Set
+from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -30,11 +32,14 @@ from colmap_inertial.colmap.views.gyro_orientations import GyroOrientations, est
 from colmap_inertial.colmap.views.relative_track import FramePair, RelativeTrack, estimate_relative_track
 from colmap_inertial.colmap.views.two_views import (
     Covisibility,
+    compare,
+    count_shared,
     count_verified,
     delete_matches,
     read_observations,
     read_ray_pairs,
     read_rotations_rad,
+    read_verified_pairs,
 )
 from colmap_inertial.core.arrays import BoolArray, IndexArray
 from colmap_inertial.core.errors import NotObservableError
@@ -54,6 +59,9 @@ _NEXT = 2
 #: Where neighbours are matched, those within so many times the overlap are no loop; those up to as many times that are
 #: matched, and stay where they pass as one.
 _NEAR = 2
+#: So many of a frame's features must be joined to two others, or it is matched with more: COLMAP's mapper places an
+#: image by 30 points that others show, and has not all others in the model then.
+_LEAST_SHARED = 60
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -173,7 +181,7 @@ def match_capture(
         matched += len(more)
 
     counts: dict[str, int] = {}
-    sigma_deg = None
+    sigma_deg = orientations = None
     try:
         orientations = _estimate_orientations(database, recording, close, camera)
     except NotObservableError as error:
@@ -197,6 +205,9 @@ def match_capture(
             search = LoopSearch(database, names, orientations, track, covisibility, pairs.near + 1, lenient=pairs.short)
             doubtful = pairs.where(pairs.far & (pairs.j - pairs.i <= _NEAR * pairs.near) & ~pairs.is_given)
             counts |= search.close_loops(match, doubtful=doubtful, given=loops).counts()
+    if not pairs.every and not pairs.only_given:
+        more = _match_poor_frames(database, names, pairs, match, orientations)
+        counts["returns"] = counts.get("returns", 0) + sum(j - i > pairs.near for i, j in more)
     context.progress("matches", done, done)
     record = MatchRecord(
         device=context.device if context.executable is None else context.executable.device,
@@ -264,6 +275,57 @@ def _exclude_pairs(
         asked = pairs.rest & ~apart & ~pairs.is_given
         unlike[asked] = covisibility.are_unlike(i[asked], j[asked], _LEAST_QUICK_MATCHES)
     return pairs.where(pairs.rest & ~apart & ~unlike), {"apart": int(apart.sum()), "unlike": int(unlike.sum())}
+
+
+def _match_poor_frames(
+    database: Path,
+    names: Sequence[str],
+    pairs: _Pairs,
+    match: Callable[[Sequence[FramePair]], None],
+    orientations: GyroOrientations | None,
+) -> set[FramePair]:
+    """Match frames that share too little to be placed with all neighbours; of a short video, with others, too.
+
+    Frames up to twice as far apart come next, as long as that brings more, until enough is shared. Of a longer video it
+    ends with the neighbours: nothing could tell others from copies.
+
+    Returns
+    -------
+    Pairs that were matched and stay.
+    """
+    reaches = [pairs.near]
+    while pairs.short and reaches[-1] < len(names) - 1:
+        reaches.append(2 * reaches[-1])
+    neighbours = {*pairs.where(pairs.close), *pairs.where(pairs.rest)}
+    tried = set(neighbours)
+    poor, had = np.arange(len(names)), np.full(len(names), -1)
+    for reach in reaches:
+        shared = count_shared(database, names, poor)
+        wanting = (shared < _LEAST_SHARED) & (shared > had)
+        poor, had = poor[wanting], shared[wanting]
+        if not len(poor):
+            break
+        around = {(min(k, o), max(k, o)) for k in poor.tolist() for o in range(max(0, k - reach), k + reach + 1)}
+        possible = {(i, j) for i, j in around if i < j < len(names)} - tried - read_matched_pairs(database, names)
+        more = sorted(possible)
+        if orientations is not None:
+            more = list(itertools.compress(more, (~orientations.see_nothing_in_common(*split_pairs(more))).tolist()))
+        match(more)
+        if orientations is not None:
+            _delete_turned_otherwise(database, names, more, orientations)
+        tried.update(more)
+    return (tried - neighbours) & read_verified_pairs(database, names)
+
+
+def _delete_turned_otherwise(
+    database: Path, names: Sequence[str], matched: Sequence[FramePair], orientations: GyroOrientations
+) -> None:
+    """Delete the matches of pairs whose rotation contradicts the gyroscope's."""
+    rotations = compare(database, name_pairs(names, matched)).first_from_second
+    wrong = np.asarray(np.isfinite(rotations).all(axis=(1, 2)), dtype=np.bool_)
+    i, j = split_pairs(matched)
+    wrong[wrong] = ~orientations.agree(i[wrong], j[wrong], rotations[wrong])
+    delete_matches(database, name_pairs(names, list(itertools.compress(matched, wrong.tolist()))))
 
 
 def _largest_sigma_deg(orientations: GyroOrientations) -> float:

@@ -408,6 +408,40 @@ def count_verified(database: Path) -> int:
         return int(np.count_nonzero(features.database.read_two_view_geometry_num_inliers()[1]))
 
 
+def count_shared(database: Path, names: Sequence[str], frames: IndexArray) -> IndexArray:
+    """(K,) features of some frames that verified matches join to two others: points that others show without them.
+
+    Parameters
+    ----------
+    names
+        (N,) of images; matches with others do not count.
+    frames
+        (K,) places of those that are asked for.
+    """
+    verified, asked = sorted(read_verified_pairs(database, names)), frames.tolist()
+    with open_features(database) as features:
+        counts = {k: features.database.num_keypoints_for_image(features.images[names[k]].image_id) for k in asked}
+        others = {k: np.zeros(count, dtype=np.intp) for k, count in counts.items()}
+        for pair in verified:
+            if others.keys().isdisjoint(pair):
+                continue
+            for k, own in zip(pair, features.matches(names[pair[0]], names[pair[1]]).T, strict=True):
+                if k in others:
+                    others[k][own] += 1
+    return np.array([np.count_nonzero(others[k] >= 2) for k in asked], dtype=np.intp)
+
+
+def read_verified_pairs(database: Path, names: Sequence[str]) -> set[FramePair]:
+    """Places in time of pairs whose matches COLMAP verified."""
+    import pycolmap
+
+    with open_features(database) as features:
+        at = {features.images[name].image_id: k for k, name in enumerate(names)}
+        pairs, inliers = features.database.read_two_view_geometry_num_inliers()
+        verified = [pycolmap.pair_id_to_image_pair(pair) for pair, count in zip(pairs, inliers, strict=True) if count]
+    return {(min(at[a], at[b]), max(at[a], at[b])) for a, b in verified if a in at and b in at}
+
+
 def delete_matches(database: Path, pairs: Sequence[tuple[str, str]]) -> None:
     """Remove the matches of pairs from a database."""
     with open_features(database) as features:

@@ -35,11 +35,13 @@ from colmap_inertial.colmap.views.two_views import (
     Covisibility,
     TwoViews,
     compare,
+    count_shared,
     count_verified,
     delete_matches,
     localise_frames,
     read_observations,
     read_ray_pairs,
+    read_verified_pairs,
 )
 from colmap_inertial.core.errors import InertialError, NotObservableError
 from colmap_inertial.core.facts import Fact
@@ -504,9 +506,11 @@ def test_where_the_gyroscope_looked_elsewhere_no_loop_is_sought(monkeypatch):
 
 
 def none_stands(monkeypatch, count):
-    """Nothing is read of features, and no frame shows what the one before does."""
+    """Nothing is read of features; no frame shows what the one before does, and all share enough with others."""
     moving = SimpleNamespace(find_standing=lambda: np.arange(count))
     monkeypatch.setattr(pairing.Covisibility, "of", lambda *_: moving)
+    monkeypatch.setattr(pairing, "count_shared", lambda *_: np.full(count, pairing._LEAST_SHARED))
+    monkeypatch.setattr(pairing, "read_verified_pairs", lambda *_: set())
 
 
 def test_pairs_without_a_gyroscope_are_those_of_before(database, tmp_path, monkeypatch):
@@ -602,6 +606,66 @@ def test_rotations_and_coverage_of_two_views_are_those_of_the_scene(tmp_path):
         views = compare(tmp_path / name, [("a", "b")])
         np.testing.assert_allclose(views.first_from_second[0], turned, atol=1e-3)
         assert views.covered[0] == pytest.approx(share, abs=0.1)
+
+
+def test_features_are_shared_that_are_joined_to_two_others(tmp_path):
+    xy = {name: np.random.default_rng(6).uniform(10, 350, (50, 2)) for name in "abcd"}
+    chain = {(0, 1): np.arange(50), (1, 2): np.arange(40)[::-1], (0, 2): np.arange(5), (0, 3): np.arange(7)}
+    path = written(tmp_path / "database.db", xy, chain)
+    assert count_shared(path, list("abcd"), np.arange(4)).tolist() == [7, 40, 5, 0]
+    # matches with an image that is not named do not count
+    assert count_shared(path, list("abc"), np.array([2, 0])).tolist() == [5, 5]
+    assert read_verified_pairs(path, list("bca")) == {(0, 1), (0, 2), (1, 2)}
+
+
+def poor_frames_matched(monkeypatch, gain, *, short, axis_deg=None, count=40):
+    """Pairs that are matched of frame 5, which shares ``gain`` more features each time; others share enough."""
+    rounds, deleted, asked = [], [], []
+
+    def shared(database, names, frames):
+        asked.append(len(frames))
+        return np.where(frames == 5, sum(gain[: len(asked)]), pairing._LEAST_SHARED)
+
+    monkeypatch.setattr(pairing, "count_shared", shared)
+    monkeypatch.setattr(pairing, "read_matched_pairs", lambda *_: set())
+    monkeypatch.setattr(pairing, "read_verified_pairs", lambda *_: {pair for more in rounds for pair in more})
+    monkeypatch.setattr(pairing, "compare", lambda db, named: SimpleNamespace(first_from_second=views(named)))
+    monkeypatch.setattr(pairing, "delete_matches", lambda db, named: deleted.extend(named))
+
+    def views(named):
+        # of frames 5 and 12, a rotation that nothing bears out
+        turned = {("5", "12"): so3_exp(np.array([0, 0.7, 0]))}
+        return np.array([turned.get(pair, np.eye(3)) for pair in named]).reshape(-1, 3, 3)
+
+    i, j = np.array([(a, b) for a in range(count) for b in range(a + 1, count) if b - a in (1, 2, 3, 4, 8)]).T
+    pairs = pairing._Pairs(i=i, j=j, given=set(), only_given=False, every=False, short=short, near=8)
+    headings = None if axis_deg is None else headings_of(axis_deg, np.arange(count) * 0.1, bias_sigma=1e-4)
+    names = [str(k) for k in range(count)]
+    kept = pairing._match_poor_frames(Path("x"), names, pairs, rounds.append, headings)
+    return rounds, deleted, kept
+
+
+def test_frames_that_share_little_are_matched_with_more():
+    # COLMAP's mapper must be able to place an image by what two others show
+    assert pycolmap.IncrementalMapperOptions().abs_pose_min_num_inliers < pairing._LEAST_SHARED
+
+
+@pytest.mark.parametrize(
+    ("gain", "short", "farthest"),
+    [([60], True, 0), ([20, 10, 30], True, 16), ([20, 0], True, 7), ([20, 1, 1, 1, 1], True, 34), ([9, 9], False, 7)],
+)
+def test_others_are_farther_apart_as_long_as_that_helps(monkeypatch, gain, short, farthest):
+    rounds, _, kept = poor_frames_matched(monkeypatch, gain, short=short)
+    found = [pair for more in rounds for pair in more]
+    assert len(found) == len(set(found)) and kept == set(found) and all(5 in pair for pair in found)
+    apart = {abs(i - j) for i, j in found}
+    assert max(apart, default=0) == farthest and apart.isdisjoint((1, 2, 3, 4, 8))
+
+
+def test_the_gyroscope_tells_which_others_may_show_the_same(monkeypatch):
+    turned_deg = np.where(np.arange(40) < 20, 0.0, 150.0)
+    rounds, deleted, _ = poor_frames_matched(monkeypatch, [20, 1, 1, 1, 1], short=True, axis_deg=turned_deg)
+    assert max(j for more in rounds for _, j in more) < 20 and deleted == [("5", "12")]
 
 
 def test_a_track_is_made_of_frames_next_to_each_other(monkeypatch):
