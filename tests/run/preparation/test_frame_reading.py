@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from colmap_inertial.core.types import FrameTiming
+from colmap_inertial.diagnose import Recorded
 from colmap_inertial.io import video
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.io.capture import Capture, load_capture
@@ -17,7 +18,7 @@ from colmap_inertial.io.imu import read_unchecked_capture_imu
 from colmap_inertial.motion.flow import GreyFrame
 from colmap_inertial.run.preparation import frame_reading
 from colmap_inertial.run.preparation.frame_reading import COMPARED, FOLLOWED, RANKED, FullFrames, GreyFrames
-from colmap_inertial.run.preparation.preflight import CheckInputs, measure_recording
+from colmap_inertial.run.preparation.preflight import add_images
 from colmap_inertial.tools.simulate import MotionOptions
 from tests.helpers.box_video import film
 
@@ -73,8 +74,9 @@ def test_frames_that_are_expected_are_kept_while_others_are_looked_at(clip, deco
 
 def test_frames_for_an_unstated_exposure_are_kept_while_they_are_followed(clip, decoded):
     timing = replace(read_frame_timing(clip), exposure_s=None)
-    inputs = CheckInputs(imu=read_unchecked_capture_imu(clip), capture=clip, timing=timing)
-    recorded = measure_recording(inputs, lambda *_: None)
+    imu = read_unchecked_capture_imu(clip)
+    recorded = Recorded(imu=imu, timing=timing, is_capture=True, camera=clip.camera)
+    recorded = add_images(recorded, clip, lambda *_: None)
     assert recorded.images is not None
     in_full = grey_of(recorded.images(recorded.in_full))
     assert len(decoded) == len(timing.names), "each frame once"
