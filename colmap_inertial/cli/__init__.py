@@ -7,20 +7,19 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import io
 import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Union
+from typing import Annotated, Any, Literal, Union
 
 import tyro
 
 from colmap_inertial import __version__
 from colmap_inertial.cli.align import Align
 from colmap_inertial.cli.apply import Apply
-from colmap_inertial.cli.arguments import check_arguments
 from colmap_inertial.cli.batch import Batch
 from colmap_inertial.cli.calibrate_imu import CalibrateImu
 from colmap_inertial.cli.command import Command, log_on_terminal, print_json
@@ -36,7 +35,7 @@ from colmap_inertial.cli.scale import Scale
 from colmap_inertial.cli.simulate import Simulate
 from colmap_inertial.cli.validate import Validate
 from colmap_inertial.cli.view import View
-from colmap_inertial.core.choices import suggest_nearest
+from colmap_inertial.core.choices import check_value
 from colmap_inertial.core.errors import InertialError, describe_environment_fault, fact_of
 from colmap_inertial.core.facts import with_sentences
 from colmap_inertial.core.options import ReadLimits, ReconstructOptions
@@ -90,13 +89,7 @@ def parse(args: Sequence[str]) -> Command:
         print_overview(DESCRIPTION, GROUPS, ReadLimits)
         sys.exit(0 if args else 2)
     name = args[0].replace("_", "-")
-    if name not in COMMANDS and not name.startswith("--tyro-"):
-        wrong = "a command comes first" if name.startswith("-") else "no such command"
-        near = suggest_nearest(name, COMMANDS)
-        raise ValueError(
-            f"{args[0]}: {wrong}{near}\ncommands: {', '.join(COMMANDS)}\nexplained by: colmap-inertial --help"
-        )
-    if name not in COMMANDS:  # a script that completes what one types
+    if name not in COMMANDS:  # to be told which there are, or to complete what one types
         choices: list[Any] = [Annotated[each, tyro.conf.subcommand(name)] for name, each in COMMANDS.items()]
         commands: Any = Union[tuple(choices)]  # noqa: UP007 (built at run time)
         return tyro.cli(commands, prog="colmap-inertial", description=DESCRIPTION, args=args, config=_CONFIG)
@@ -104,34 +97,23 @@ def parse(args: Sequence[str]) -> Command:
     if not {*_HELP, _HELP_ALL}.isdisjoint(options):
         print_help(name, command, everything=_HELP_ALL in options)
         sys.exit(0)
-    try:
-        check_arguments(prog, list(list_options(command)), options)
-        return _build(command, options, prog)
-    except ValueError as error:
-        raise ValueError(f"{error}\nexplained by: {prog} --help") from error
+    _require_choices(command, options)
+    return tyro.cli(command, prog=prog, args=options, default=_read_default(command, options, prog), config=_CONFIG)
 
 
-def _build(command: type[Command], args: Sequence[str], prog: str) -> Command:
-    """The command with these options and arguments.
+def _require_choices(command: type[Command], args: Sequence[str]) -> None:
+    """Refuse a value that is not among an option's choices, in the words in which a --config file is refused.
 
     Raises
     ------
     ValueError
-        Of the options, which check their own values when they are built.
     """
-    default = _read_default(command, args, prog)
-    words = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(words):
-            return tyro.cli(command, prog=prog, args=args, default=default, config=_CONFIG)
-    except SystemExit as stop:  # tyro has told it, in a box of its own
-        error = stop.__context__
-        while error is not None and type(error) is not ValueError:
-            error = error.__cause__ or error.__context__
-        if error is None:
-            say(words.getvalue().rstrip(), error=True)
-            raise
-        raise error from None
+    choices = {option.label.split()[0]: option.choices for option in list_options(command) if option.choices}
+    for given, following in pairwise([*args, ""]):
+        name, equals, value = given.partition("=")
+        name = name.replace("_", "-")
+        if name in choices:
+            check_value(name, value if equals else following, Literal[choices[name]])
 
 
 @dataclass(frozen=True)
@@ -180,7 +162,7 @@ def _main(args: Sequence[str] | None) -> None:
     try:
         require_limits(to_load=True)
         command = parse(args)
-    except (InertialError, ValueError) as error:
+    except (InertialError, ValueError) as error:  # options check their own values when they are built
         say(f"error: {error}", error=True)
         sys.exit(2)
     from colmap_inertial.io.files import reading_within, require_utf8

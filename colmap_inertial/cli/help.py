@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 _TYPES = {Path: "PATH", int: "INT", float: "FLOAT", str: "TEXT"}
 _WIDEST, _LABEL_WIDTH, _LONG = 100, 30, 120
 _ARGUMENTS, _OPTIONS, _REST, _EVERYWHERE = "Arguments", "Options", "Less common", "Options of every command"
-PAGES = ("--help", "--help-all")
 _PAGES = (("-h, --help", "The common options."), ("--help-all", "All options, by topic."))
 #: Groups of options that special cameras have; commands of their own explain them.
 _SPECIAL = ("apertures", "exposures")
@@ -56,12 +55,6 @@ class Option:
         The class that has it.
     choices
         The values that it takes; empty where they are not listed.
-    values
-        The types of the values that follow it, one for each; a switch has none.
-    several
-        Whether it takes any number of these; an option is then given once for each.
-    names
-        As it may be typed: a switch also to switch it off; an argument has none.
     """
 
     label: str
@@ -72,9 +65,6 @@ class Option:
     required: bool
     source: type[Any]
     choices: tuple[str, ...]
-    values: tuple[Any, ...]
-    several: bool
-    names: tuple[str, ...]
 
 
 def list_options(cls: type[Any], group: str = "") -> Iterator[Option]:
@@ -107,9 +97,6 @@ def list_options(cls: type[Any], group: str = "") -> Iterator[Option]:
             required=required,
             source=next(base for base in reversed(cls.__mro__) if f.name in vars(base).get("__annotations__", ())),
             choices=get_args(_leave_out_none(kind)) if get_origin(_leave_out_none(kind)) is Literal else (),
-            values=_list_values(kind),
-            several=Ellipsis in get_args(_leave_out_none(kind)),
-            names=() if positional else (f"{prefix}{name}", *([] if value else [f"{prefix}no-{name}"])),
         )
 
 
@@ -118,14 +105,6 @@ def _leave_out_none(kind: Any) -> Any:
     if get_origin(kind) in (Union, UnionType):
         (kind,) = (part for part in get_args(kind) if part is not NoneType)
     return kind
-
-
-def _list_values(kind: Any) -> tuple[Any, ...]:
-    """The type of each value that follows an option of a type."""
-    kind = _leave_out_none(kind)
-    if get_origin(kind) is tuple:
-        return tuple(part for part in get_args(kind) if part is not Ellipsis)
-    return () if kind is bool else (kind,)
 
 
 def _describe_value(kind: Any) -> str:
