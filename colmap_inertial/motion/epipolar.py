@@ -1,4 +1,4 @@
-"""How well poses of two views suit their matches: rotations, whatever the translation between them, and both.
+"""Poses of two views by the distances of their matches from the epipolar planes.
 
 With rays ``f`` and ``g`` and a rotation ``R``, the normals ``n = f x R g`` of a pair's matches are perpendicular to its
 translation (L. Kneip, S. Lynen, *Direct optimization of frame-to-frame rotation*, ICCV 2013).
@@ -71,8 +71,9 @@ class RefinementLimits:
     #: A match weighs less (Geman-McClure) beyond so many times the usual distance, which is at least this.
     sigmas: float = 2.0
     least_rad: float = 1e-6
-    #: No step turns rotation or translation farther.
+    #: No step turns rotation or translation farther; where all are smaller than the least, they have come to rest.
     farthest_rad: float = 0.05
+    resting_rad: float = 1e-6
     #: Damping at first, and its factors after a step that makes it worse, or better.
     damping: float = 1e-3
     worse: float = 10.0
@@ -94,11 +95,14 @@ class RefinedPoses:
         (M, 3) unit vectors, frame of the second view.
     usual_rad
         (M,) one standard deviation of the matches' distances from their epipolar planes, by their median.
+    in_front
+        (M,) share of the matches whose points lie before both cameras.
     """
 
     second_from_first: Array
     translation: Array
     usual_rad: Array
+    in_front: Array
 
 
 def refine_poses(second_from_first: Array, translation: Array, rays_first: Array, rays_second: Array) -> RefinedPoses:
@@ -134,7 +138,18 @@ def refine_poses(second_from_first: Array, translation: Array, rays_first: Array
         turn, move = np.where(better[:, None, None], new_turn, turn), np.where(better[:, None], new_move, move)
         off, slope = np.where(better[:, None], new_off, off), np.where(better[:, None, None], new_slope, slope)
         damping *= np.where(better, _LIMITS.better, _LIMITS.worse)
-    return RefinedPoses(second_from_first=turn, translation=move, usual_rad=_usual_size(off))
+        if np.abs(step).max(initial=0.0) < _LIMITS.resting_rad:
+            break
+    usual_rad, in_front = _usual_size(off), _share_in_front(turn, move, rays_first, rays_second)
+    return RefinedPoses(second_from_first=turn, translation=move, usual_rad=usual_rad, in_front=in_front)
+
+
+def _share_in_front(turn: Array, move: Array, rays_first: Array, rays_second: Array) -> Array:
+    """(M,) share of matches whose points lie before both cameras, with the translation's better sign."""
+    a, g, t = rays_first @ np.swapaxes(turn, 1, 2), rays_second, move[:, None]
+    normal = np.cross(g, a)
+    first, second = np.sum(np.cross(t, g) * normal, axis=2), np.sum(np.cross(t, a) * normal, axis=2)
+    return np.maximum(((first > 0) & (second > 0)).mean(axis=1), ((first < 0) & (second < 0)).mean(axis=1))
 
 
 def _linearise_distances(turn: Array, move: Array, rays_first: Array, rays_second: Array) -> tuple[Array, Array]:

@@ -41,6 +41,9 @@ class TwoViewLimits:
     #: Matches of a pair that its pose is refined by, and pairs that are refined together.
     refined_matches: int = 200
     at_once: int = 100
+    #: Poses suit the matches alike up to this factor; shares of points in front are alike up to this difference.
+    alike: float = 1.2
+    as_many: float = 0.1
     #: A frame is localised by so many points of the track at least.
     least_placed: int = 12
     #: How far off they may lie.
@@ -138,7 +141,7 @@ def compare(database: Path, pairs: Sequence[tuple[str, str]]) -> TwoViews:
     Views close in time pass as those of a plane, or of a camera that only turned, whatever they show. The pose that
     COLMAP takes from their homography is off by tenths of a degree, and of a homography's two solutions the wrong one
     often has all points before both cameras, too. So each solution is refined by the matches, and the one that suits
-    them best is taken.
+    them best is taken. Both suit those of a plane; the points before the cameras decide there.
     """
     rotations, covered = np.full((len(pairs), 3, 3), np.nan), np.zeros(len(pairs))
     with open_features(database) as features:
@@ -195,7 +198,7 @@ class _MatchedViews:
         return cls(first=first, second=second, matches=matches, rays=rays, poses=poses)
 
     def measure_coverage(self, second_from_first: Array) -> float:
-        """Share of the first or the second picture that is matched, whichever is less."""
+        """Share of the first or the second image that is matched, whichever is less."""
         return min(
             _coverage(*self.first, self.matches[:, 0], self.second[0], second_from_first),
             _coverage(*self.second, self.matches[:, 1], self.first[0], second_from_first.T),
@@ -212,9 +215,16 @@ def _refine_rotations(pairs: Sequence[_MatchedViews]) -> list[Array]:
     best, begin = [], 0
     for views in pairs:
         own = slice(begin, begin + len(views.poses))
-        best.append(refined.second_from_first[own][np.argmin(refined.usual_rad[own])])
+        best.append(refined.second_from_first[begin + _choose_pose(refined.usual_rad[own], refined.in_front[own])])
         begin = own.stop
     return best
+
+
+def _choose_pose(usual_rad: Array, in_front: Array) -> int:
+    """The pose that suits the matches best; of those alike, as both of a plane are, one with its points in front."""
+    alike = usual_rad <= _LIMITS.alike * usual_rad.min()
+    alike &= in_front >= in_front[alike].max() - _LIMITS.as_many
+    return int(np.argmin(np.where(alike, usual_rad, np.inf)))
 
 
 def _solve_pose(
@@ -230,14 +240,17 @@ def _solve_pose(
     kinds = pycolmap.TwoViewGeometryConfiguration
     poses = []
     of_plane = views.config in (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC)
-    if of_plane and views.H is not None:
+    if of_plane and views.H is not None and np.linalg.det(views.H):
         intrinsic_first, intrinsic_second = first[0].calibration_matrix(), second[0].calibration_matrix()
         homography = np.linalg.solve(intrinsic_second, views.H @ intrinsic_first)
         homography *= np.sign(np.linalg.det(homography))  # keeps points before the camera there
         _, turns, moves, _ = cv2.decomposeHomographyMat(homography, np.eye(3))
-        poses = [(turn, _unit(move.ravel())) for turn, move in zip(turns[::2], moves[::2], strict=True)]  # of one sign
+        solutions = zip(turns[::2], moves[::2], strict=True)  # of one sign
+        poses = [(turn, _unit(move.ravel())) for turn, move in solutions if np.isfinite([*turn, move.ravel()]).all()]
     if views.E is not None and np.any(views.E):
         views.config = kinds.CALIBRATED  # it has a rotation where another matrix suits more matches, too
+    elif views.F is None or not np.any(views.F):
+        return poses
     if pycolmap.estimate_two_view_geometry_pose(*first, *second, views) and views.cam2_from_cam1 is not None:
         turn = matrix_from_quat(np.array(views.cam2_from_cam1.rotation.quat))
         move = _unit(np.array(views.cam2_from_cam1.translation))
@@ -421,13 +434,13 @@ def count_shared(database: Path, names: Sequence[str], frames: IndexArray) -> In
     verified, asked = sorted(read_verified_pairs(database, names)), frames.tolist()
     with open_features(database) as features:
         counts = {k: features.database.num_keypoints_for_image(features.images[names[k]].image_id) for k in asked}
-        others = {k: np.zeros(count, dtype=np.intp) for k, count in counts.items()}
+        others = {k: np.zeros(count, dtype=np.uint8) for k, count in counts.items()}
         for pair in verified:
             if others.keys().isdisjoint(pair):
                 continue
             for k, own in zip(pair, features.matches(names[pair[0]], names[pair[1]]).T, strict=True):
                 if k in others:
-                    others[k][own] += 1
+                    others[k][own] = np.minimum(others[k][own] + 1, 2)
     return np.array([np.count_nonzero(others[k] >= 2) for k in asked], dtype=np.intp)
 
 

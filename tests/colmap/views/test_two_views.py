@@ -42,10 +42,15 @@ def see_room(rng):
     return np.concatenate([floor, back, left])
 
 
-def match_views(path, world_from_cam, centre, pairs, noise_px=0.3):
+def see_wall(rng):
+    """Points of a wall."""
+    return np.column_stack([rng.uniform(-4, 4, 4000), rng.uniform(-3, 3, 4000), np.full(4000, 2.0)])
+
+
+def match_views(path, world_from_cam, centre, pairs, noise_px=0.3, see=see_room):
     """A database of features with noise, and of matches, a twentieth of them wrong, as COLMAP verifies them."""
     rng = np.random.default_rng(4)
-    points = see_room(rng)
+    points = see(rng)
     names = tuple(f"{k:04}.png" for k in range(len(centre)))
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = 0
@@ -127,3 +132,36 @@ def test_rotations_of_a_camera_that_turns_or_moves_a_little_are_right(tmp_path, 
     found = compare(tmp_path / "d.db", [(names[i], names[j]) for i, j in pairs]).first_from_second
     off_deg = np.degrees(np.linalg.norm(so3_log(np.swapaxes(world_from_cam[1::2], 1, 2) @ found), axis=1))
     assert np.median(off_deg) < usual_deg and np.mean(off_deg > 1) < 0.1
+
+
+@pytest.mark.parametrize("metres", [0.05, 0.3])
+def test_of_both_poses_of_a_wall_the_one_with_the_wall_in_front_is_right(tmp_path, metres):
+    """Both suit all matches alike."""
+    rng = np.random.default_rng(7)
+    axis = rng.standard_normal((2, 20, 3))
+    axis /= np.linalg.norm(axis, axis=2, keepdims=True)
+    world_from_cam = np.tile(np.eye(3), (40, 1, 1))
+    world_from_cam[1::2] = so3_exp(np.radians(4) * axis[0])
+    centre = np.zeros((40, 3))
+    centre[1::2] = metres * axis[1] * [1, 1, 0.3]
+    pairs = [(i, i + 1) for i in range(0, 40, 2)]
+    names = match_views(tmp_path / "d.db", world_from_cam, centre, pairs, see=see_wall)
+    found = compare(tmp_path / "d.db", [(names[i], names[j]) for i, j in pairs]).first_from_second
+    off_deg = np.degrees(np.linalg.norm(so3_log(np.swapaxes(world_from_cam[1::2], 1, 2) @ found), axis=1))
+    assert np.mean(off_deg > 1) < 0.2
+
+
+def test_matrices_that_another_tool_left_out_are_no_pose(tmp_path):
+    centre = np.array([[0.0, 0, 0], [0.2, 0, 0]])
+    names = match_views(tmp_path / "d.db", np.tile(np.eye(3), (2, 1, 1)), centre, [(0, 1)])
+    for kind, kept in (("PLANAR", "E"), ("PLANAR", ""), ("CALIBRATED", "")):
+        with pycolmap.Database.open(str(tmp_path / "d.db")) as database:
+            ids = [image.image_id for image in database.read_all_images()]
+            views = database.read_two_view_geometry(*ids)
+            views.config = getattr(pycolmap.TwoViewGeometryConfiguration, kind)
+            views.H = np.zeros((3, 3))
+            views.F = np.zeros((3, 3))
+            views.E = views.E if kept else np.zeros((3, 3))
+            database.update_two_view_geometry(*ids, views)
+        found = compare(tmp_path / "d.db", [names]).first_from_second[0]
+        assert np.linalg.norm(so3_log(found)) < np.radians(1) if kept else not np.isfinite(found).any()
