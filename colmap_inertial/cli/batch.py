@@ -18,9 +18,9 @@ class Batch(ConfiguredCommand):
     """Reconstruct many captures, each in a process of its own; one that fails does not stop the rest.
 
     MANIFEST is a TOML file with a [[capture]] table for each: path (from the manifest's folder), and optionally name,
-    config (a TOML file with options), options, project, reference (a known
-    distance or target) and stages (with --allow-stages); or a folder in which every folder is a
-    capture. Writes OUT/NAME for each capture as reconstruct does, OUT/status/NAME.json with how far it is,
+    config (a TOML file with options), options, project, reference (a known distance or target
+    beside the IMU) and stages (with --allow-stages); or a folder in which every folder is a capture.
+    Writes OUT/NAME for each capture as reconstruct does, OUT/status/NAME.json with how far it is,
     OUT/summary.csv and OUT/summary.json. Started again, it takes up what has no result yet. Exit code 0 when every
     capture is done, 1 when one is not.
 

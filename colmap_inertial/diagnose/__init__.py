@@ -1,7 +1,7 @@
 """Check a capture before any reconstruction: findings, each with a code, evidence and advice.
 
 A check is a function of what was recorded (:class:`Recorded`) that yields :class:`Finding` values; it opens no file by
-itself (``Recorded.images`` has frames). ``CHECKS`` lists all of them. ``run.preparation.preflight`` reads
+itself (``Recorded.images`` decodes frames). ``CHECKS`` lists all of them. ``run.preparation.preflight`` reads
 captures for them.
 """
 

@@ -472,7 +472,7 @@ class MatchRecord:
         Of these, pairs that stay.
     returns
         Pairs of frames far apart in time of a short video that stay as they look alike, or as one of them shares little
-        with its neighbours, and, where the gyroscope can be used, turned as it did; no more is known of them.
+        with its neighbours, and, where the gyroscope and matches enough can tell, turned as it did; no more is known.
     matched, verified
         Pairs that were matched, and those of them whose matches COLMAP verified.
     gyroscope

@@ -60,7 +60,7 @@ _NEXT = 2
 #: matched, and stay where they pass as one.
 _NEAR = 2
 #: So many of a frame's features must be joined to two others, or it is matched with more: COLMAP's mapper places an
-#: image by 30 points that others show, and has not all others in the model then.
+#: image by 30 points that others show, and not all of the others are in the model by then.
 _LEAST_SHARED = 60
 
 

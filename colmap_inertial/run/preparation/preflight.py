@@ -104,7 +104,7 @@ class TolerantReader:
 
 
 def add_images(recorded: Recorded, capture: Capture, progress: Progress, frames: GreyFrames | None = None) -> Recorded:
-    """What was recorded, with what the images of a capture show; where there are poses, these are checked in place.
+    """What was recorded, with what the images of a capture show; where there are poses, those are checked instead.
 
     Images that cannot be read are among what was refused; the rest is measured all the same. ``frames``: the images,
     where others are going to look at them, too.
@@ -254,6 +254,8 @@ def _choose_images(timing: FrameTiming) -> list[int]:
 def _choose_in_full(timing: FrameTiming) -> list[str]:
     """Names of the images to keep in full, evenly among those that are looked at."""
     names = names_at(timing, _choose_images(timing))
+    if not names:
+        return []
     return [names[i] for i in np.unique(np.linspace(0, len(names) - 1, _EFFORT.in_full).astype(np.intp))]
 
 

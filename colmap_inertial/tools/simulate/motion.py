@@ -285,7 +285,7 @@ def _along_and_side(azimuth: NDArray[np.floating[Any]] | float) -> tuple[Array, 
 
 
 def _circle_within(walls_m: Walls, options: MotionOptions, along: Array, side: Array) -> float | None:
-    """Radius of the largest circle to the left that a walk fits into; ``None`` where it may, or has to, go straight on.
+    """Radius of the largest circle to the left that a walk fits into; ``None`` where it can, or must, go straight.
 
     The circle's centre is ``start + radius * side``, so that its ends along each horizontal axis are linear in radius.
     """
