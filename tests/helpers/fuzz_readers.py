@@ -33,6 +33,7 @@ from colmap_inertial.tools.view.clouds import dense_cloud, read_mesh
 from colmap_inertial.tools.view.images import read_preview
 from colmap_inertial.tools.view.scene import load_scene
 from tests.helpers import imu_files, model_project, report_runs
+from tests.helpers.damage import mutated
 from tests.helpers.fuzz_structure import structural
 from tests.helpers.simulated_imu import FRAME_NS, at_one_clock, recorded
 from tests.io import test_damaged_files
@@ -77,7 +78,7 @@ def mutant(data: bytes, rng: np.random.Generator) -> bytes:
             at = int(rng.integers(*span))
             out[at : at + len(said)] = said[: len(out) - at]
         return bytes(out)
-    return test_damaged_files.mutated(data, rng)
+    return mutated(data, rng)
 
 
 def each(*calls: Callable[[], object]) -> None:
