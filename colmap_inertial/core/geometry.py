@@ -210,6 +210,14 @@ def rotation_between(a: Array, b: Array) -> Array:
     return quat_normalize(np.append(np.cross(u, v), w))
 
 
+def find_tangents(unit: Array) -> Array:
+    """(K, 3, 2) two directions perpendicular to each of (K, 3) unit vectors."""
+    helper = np.eye(3)[np.argmin(np.abs(unit), axis=1)]
+    first = np.cross(unit, helper)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(unit, first)], axis=2)
+
+
 def colmap_px_from_opencv(xy_px: Array) -> Array:
     """COLMAP's pixel coordinates from OpenCV's: the top-left pixel's centre is (0.5, 0.5) instead of (0, 0)."""
     return np.asarray(xy_px, dtype=np.float64) + 0.5

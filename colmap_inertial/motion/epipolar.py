@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
-from colmap_inertial.core.geometry import skew, so3_exp
+from colmap_inertial.core.geometry import cross, find_tangents, skew, so3_exp
 
 #: The cross product: of vectors f and g, ``einsum("abc,b,c", _CROSS, f, g)``.
 _CROSS = np.stack([skew(axis) for axis in np.eye(3)], axis=1)
@@ -131,7 +131,7 @@ def refine_poses(second_from_first: Array, translation: Array, rays_first: Array
         step = -np.linalg.solve(normal, np.einsum("mki,mk,mk->mi", slope, weight, off)[..., None])[..., 0]
         step *= np.minimum(1, _LIMITS.farthest_rad / np.maximum(np.linalg.norm(step, axis=1), 1e-300))[:, None]
         new_turn = so3_exp(step[:, :3]) @ turn
-        new_move = move + np.einsum("mij,mj->mi", _tangents(move), step[:, 3:])
+        new_move = move + np.einsum("mij,mj->mi", find_tangents(move), step[:, 3:])
         new_move /= np.linalg.norm(new_move, axis=1, keepdims=True)
         new_off, new_slope = _linearise_distances(new_turn, new_move, rays_first, rays_second)
         better = _robust_cost(new_off, scale) < _robust_cost(off, scale)
@@ -147,8 +147,8 @@ def refine_poses(second_from_first: Array, translation: Array, rays_first: Array
 def _share_in_front(turn: Array, move: Array, rays_first: Array, rays_second: Array) -> Array:
     """(M,) share of matches whose points lie before both cameras, with the translation's better sign."""
     a, g, t = rays_first @ np.swapaxes(turn, 1, 2), rays_second, move[:, None]
-    normal = np.cross(g, a)
-    first, second = np.sum(np.cross(t, g) * normal, axis=2), np.sum(np.cross(t, a) * normal, axis=2)
+    normal = cross(g, a)
+    first, second = np.sum(cross(t, g) * normal, axis=2), np.sum(cross(t, a) * normal, axis=2)
     return np.maximum(((first > 0) & (second > 0)).mean(axis=1), ((first < 0) & (second < 0)).mean(axis=1))
 
 
@@ -159,22 +159,14 @@ def _linearise_distances(turn: Array, move: Array, rays_first: Array, rays_secon
     |t x g|^2``; derivatives are those by a turn after R, and by a move of t along its tangents.
     """
     a, g, t = rays_first @ np.swapaxes(turn, 1, 2), rays_second, move[:, None]
-    tangents = _tangents(move)
+    tangents = find_tangents(move)
     along_a, along_g = np.sum(a * t, axis=2, keepdims=True), np.sum(g * t, axis=2, keepdims=True)
     size = np.sqrt(np.maximum(2 - along_a**2 - along_g**2, 1e-12))
-    normal = np.cross(a, g)
+    normal = cross(a, g)
     off = np.sum(normal * t, axis=2, keepdims=True) / size
-    by_turn = np.cross(a, np.cross(g, t)) + off / size * along_a * np.cross(a, t)
+    by_turn = cross(a, cross(g, t)) + off / size * along_a * cross(a, t)
     by_move = normal + off / size * (along_a * a + along_g * g)
     return off[..., 0], np.concatenate([by_turn, by_move @ tangents], axis=2) / size
-
-
-def _tangents(unit: Array) -> Array:
-    """(M, 3, 2) two unit vectors across each of (M, 3) unit vectors."""
-    axis = np.eye(3)[np.argmin(np.abs(unit), axis=1)]
-    first = np.cross(unit, axis)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack([first, np.cross(unit, first)], axis=2)
 
 
 def _usual_size(off: Array) -> Array:

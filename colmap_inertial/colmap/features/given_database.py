@@ -277,10 +277,5 @@ def _copy_matches(source: Features, target: Features, path: Path, *, with_geomet
 
 def read_matched_pairs(database: Path, names: Sequence[str]) -> set[FramePair]:
     """Places in time of pairs that have matches, verified or not."""
-    import pycolmap
-
-    place = {name: k for k, name in enumerate(names)}
     with open_features(database) as features:
-        at = {image.image_id: place[name] for name, image in features.images.items() if name in place}
-        numbers = [pycolmap.pair_id_to_image_pair(pair) for pair in features.database.read_num_matches()[0]]
-    return {(min(at[a], at[b]), max(at[a], at[b])) for a, b in numbers if a in at and b in at}
+        return features.find_places(features.database.read_num_matches()[0], names)

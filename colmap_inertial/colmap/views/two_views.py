@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -92,6 +93,14 @@ class Features:
         """(K, 3) directions to some of an image's keypoints, camera frame; their length is arbitrary."""
         seen = np.asarray(self.camera(name).cam_from_img(self.xy_px(name)[which]))[:, :2]
         return np.column_stack([seen, np.ones(len(seen))])
+
+    def find_places(self, pair_ids: Iterable[int], names: Sequence[str]) -> set[FramePair]:
+        """Places in time of pairs by COLMAP's numbers; pairs with images that are not among the names are left out."""
+        import pycolmap
+
+        at = {self.images[name].image_id: k for k, name in enumerate(names) if name in self.images}
+        numbers = [pycolmap.pair_id_to_image_pair(pair) for pair in pair_ids]
+        return {(min(at[a], at[b]), max(at[a], at[b])) for a, b in numbers if a in at and b in at}
 
     def geometry(self, first: str, second: str) -> pycolmap.TwoViewGeometry:
         """The verified matches of two images."""
@@ -446,13 +455,9 @@ def count_shared(database: Path, names: Sequence[str], frames: IndexArray) -> In
 
 def read_verified_pairs(database: Path, names: Sequence[str]) -> set[FramePair]:
     """Places in time of pairs whose matches COLMAP verified."""
-    import pycolmap
-
     with open_features(database) as features:
-        at = {features.images[name].image_id: k for k, name in enumerate(names)}
         pairs, inliers = features.database.read_two_view_geometry_num_inliers()
-        verified = [pycolmap.pair_id_to_image_pair(pair) for pair, count in zip(pairs, inliers, strict=True) if count]
-    return {(min(at[a], at[b]), max(at[a], at[b])) for a, b in verified if a in at and b in at}
+        return features.find_places(itertools.compress(pairs, inliers), names)
 
 
 def delete_matches(database: Path, pairs: Sequence[tuple[str, str]]) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from colmap_inertial.core.arrays import Array, IndexArray
-from colmap_inertial.core.geometry import matrix_from_quat
+from colmap_inertial.core.geometry import find_tangents, matrix_from_quat
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.sampling import Coverage
 from colmap_inertial.core.types import IMU_CAL, ImuRecording
@@ -274,7 +274,7 @@ class _State:
     def moved(self, step: Array) -> _State:
         gain = self.accel_gain.copy().ravel()
         gain[_LOWER] += step[_ACCEL]
-        tangent = np.einsum("kij,kj->ki", _tangents(self.up), step[_COUNT:].reshape(-1, 2))
+        tangent = np.einsum("kij,kj->ki", find_tangents(self.up), step[_COUNT:].reshape(-1, 2))
         up = self.up + tangent
         return _State(
             accel_gain=gain.reshape(3, 3),
@@ -308,7 +308,7 @@ def _system(
     accel_rows, turn_rows = slice(0, 3 * k), slice(3 * k, 3 * k + 2 * m)
     jacobian = np.zeros((3 * k + 2 * m + _COUNT, _COUNT + 2 * k))
     residual = np.zeros(len(jacobian))
-    tangents = _tangents(state.up)
+    tangents = find_tangents(state.up)
     mean = rests.accel_m_s2
     left = state.gravity * state.up - (mean @ (np.eye(3) + state.accel_gain).T - state.accel_bias)
     for i in range(k):
@@ -335,14 +335,6 @@ def _system(
     jacobian[3 * k + 2 * m + own, own] = 1 / prior_sigma
     residual[3 * k + 2 * m + own] = -state.errors(gravity_m_s2) / prior_sigma
     return _System(jacobian=jacobian, residual=residual, accel_rows=accel_rows, turn_rows=turn_rows)
-
-
-def _tangents(up: Array) -> Array:
-    """(K, 3, 2) two directions perpendicular to each unit vector."""
-    helper = np.eye(3)[np.argmin(np.abs(up), axis=1)]
-    first = np.cross(up, helper)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack([first, np.cross(up, first)], axis=2)
 
 
 def _result(
