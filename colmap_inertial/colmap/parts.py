@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from colmap_inertial.colmap.chunks import Chunk, Executor, do_chunks
+from colmap_inertial.colmap.incremental import map_incrementally
 from colmap_inertial.model.soundness import check_binary_model
 
 if TYPE_CHECKING:
@@ -59,9 +60,7 @@ class MapPart:
         options = pycolmap.IncrementalPipelineOptions()
         options.mergedict(self.options)
         pycolmap.set_random_seed(options.random_seed)
-        pycolmap.incremental_mapping(
-            str(folder / "part.db"), str(images), str(made), options=options, next_image_callback=told
-        )
+        map_incrementally(folder / "part.db", images, made, options, told, scratch=folder)
 
     def check(self, made: Path) -> None:
         """As of :class:`~colmap_inertial.colmap.chunks.Work`."""

@@ -92,7 +92,7 @@ class RefinedPoses:
     second_from_first
         (M, 3, 3) rotations.
     translation
-        (M, 3) unit vectors, frame of the second view.
+        (M, 3) unit vectors, frame of the second view, of the sign by which more points lie before both cameras.
     usual_rad
         (M,) one standard deviation of the matches' distances from their epipolar planes, by their median.
     in_front
@@ -140,16 +140,21 @@ def refine_poses(second_from_first: Array, translation: Array, rays_first: Array
         damping *= np.where(better, _LIMITS.better, _LIMITS.worse)
         if np.abs(step).max(initial=0.0) < _LIMITS.resting_rad:
             break
-    usual_rad, in_front = _usual_size(off), _share_in_front(turn, move, rays_first, rays_second)
-    return RefinedPoses(second_from_first=turn, translation=move, usual_rad=usual_rad, in_front=in_front)
+    forward, backward = _shares_in_front(turn, move, rays_first, rays_second)
+    return RefinedPoses(
+        second_from_first=turn,
+        translation=np.where((forward >= backward)[:, None], move, -move),
+        usual_rad=_usual_size(off),
+        in_front=np.maximum(forward, backward),
+    )
 
 
-def _share_in_front(turn: Array, move: Array, rays_first: Array, rays_second: Array) -> Array:
-    """(M,) share of matches whose points lie before both cameras, with the translation's better sign."""
+def _shares_in_front(turn: Array, move: Array, rays_first: Array, rays_second: Array) -> tuple[Array, Array]:
+    """(M,) shares of matches whose points lie before both cameras, with the translation's sign and with the other."""
     a, g, t = rays_first @ np.swapaxes(turn, 1, 2), rays_second, move[:, None]
     normal = cross(g, a)
     first, second = np.sum(cross(t, g) * normal, axis=2), np.sum(cross(t, a) * normal, axis=2)
-    return np.maximum(((first > 0) & (second > 0)).mean(axis=1), ((first < 0) & (second < 0)).mean(axis=1))
+    return ((first > 0) & (second > 0)).mean(axis=1), ((first < 0) & (second < 0)).mean(axis=1)
 
 
 def _linearise_distances(turn: Array, move: Array, rays_first: Array, rays_second: Array) -> tuple[Array, Array]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from colmap_inertial.colmap.chunks import CHUNKS_FOLDER
 from colmap_inertial.colmap.context import RunContext
+from colmap_inertial.colmap.incremental import map_incrementally
 from colmap_inertial.colmap.installed import InstalledColmap
 from colmap_inertial.colmap.loops.closure import LoopClosure, MappedCapture, close_gaps
 from colmap_inertial.colmap.mapping.submaps import join_runs, map_runs, split_capture
@@ -117,9 +118,7 @@ def map_images(
             nearest = None if judged and not every_pair else near
             counted = make_counter(context.progress, "mapping", num_images)
             if context.executable is None:
-                models = pycolmap.incremental_mapping(
-                    str(database), str(images), str(sparse), options=pipeline, next_image_callback=counted
-                )
+                models = map_incrementally(database, images, sparse, pipeline, counted, scratch=context.scratch)
             else:
                 installed = InstalledColmap(executable=context.executable, scratch=context.scratch)
                 models = installed.map(database, images, sparse, pipeline, counted)

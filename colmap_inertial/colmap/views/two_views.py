@@ -144,6 +144,25 @@ class TwoViews:
     covered: Array
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RelativePose:
+    """The pose of the second of two views in the first one's frame, by their verified matches.
+
+    Attributes
+    ----------
+    second_from_first
+        (3, 3) rotation.
+    translation
+        (3,) unit vector, frame of the second view.
+    parallax_rad
+        Median angle between the two rays to a point.
+    """
+
+    second_from_first: Array
+    translation: Array
+    parallax_rad: float
+
+
 def compare(database: Path, pairs: Sequence[tuple[str, str]]) -> TwoViews:
     """Rotation and matched overlap of pairs of images, by their verified matches.
 
@@ -158,9 +177,21 @@ def compare(database: Path, pairs: Sequence[tuple[str, str]]) -> TwoViews:
         for begin in range(0, len(pairs), _LIMITS.at_once):
             some = [_MatchedViews.read(features, pair, points) for pair in pairs[begin : begin + _LIMITS.at_once]]
             solved = [(begin + k, views) for k, views in enumerate(some) if views is not None and views.poses]
-            for (place, views), turn in zip(solved, _refine_rotations([of for _, of in solved]), strict=True):
+            for (place, views), (turn, _) in zip(solved, _refine_poses([of for _, of in solved]), strict=True):
                 rotations[place], covered[place] = turn.T, views.measure_coverage(turn)
     return TwoViews(first_from_second=rotations, covered=covered)
+
+
+def estimate_relative_pose(features: Features, first: str, second: str) -> RelativePose | None:
+    """The pose of two views, as :func:`compare` has its rotation; ``None`` where they have too few matches."""
+    views = _MatchedViews.read(features, (first, second), {})
+    if views is None or not views.poses:
+        return None
+    ((turn, move),) = _refine_poses([views])
+    across = views.rays[1] @ turn  # in the first one's frame
+    sine = np.linalg.norm(np.cross(views.rays[0], across), axis=1)
+    parallax_rad = np.arctan2(sine, np.sum(views.rays[0] * across, axis=1))
+    return RelativePose(second_from_first=turn, translation=move, parallax_rad=float(np.median(parallax_rad)))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -214,8 +245,8 @@ class _MatchedViews:
         )
 
 
-def _refine_rotations(pairs: Sequence[_MatchedViews]) -> list[Array]:
-    """(3, 3) ``second_from_first`` of each pair, of those poses that suit its matches best once they are refined."""
+def _refine_poses(pairs: Sequence[_MatchedViews]) -> list[tuple[Array, Array]]:
+    """Each pair's ``second_from_first`` and unit translation: those that suit its matches best once refined."""
     if not pairs:
         return []
     rays = np.array([views.rays for views in pairs for _ in views.poses])
@@ -224,7 +255,8 @@ def _refine_rotations(pairs: Sequence[_MatchedViews]) -> list[Array]:
     best, begin = [], 0
     for views in pairs:
         own = slice(begin, begin + len(views.poses))
-        best.append(refined.second_from_first[begin + _choose_pose(refined.usual_rad[own], refined.in_front[own])])
+        chosen = begin + _choose_pose(refined.usual_rad[own], refined.in_front[own])
+        best.append((refined.second_from_first[chosen], refined.translation[chosen]))
         begin = own.stop
     return best
 
