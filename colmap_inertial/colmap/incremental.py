@@ -141,21 +141,20 @@ def _reconstruct_first_pair(
     pose = None
     with open_features(database) as features:
         names = {image.image_id: name for name, image in features.images.items()}
-        for number, (pair, theirs) in enumerate(_propose_pairs(mapper, options)):
-            pose = estimate_relative_pose(features, *(names[image] for image in pair))
-            if pose is None:
-                continue
-            wrong = _is_wrong(theirs, pose)
-            if not number and not wrong:
-                return None
-            if not wrong or _may_begin(pose, options):
+        pose, rejected = None, 0
+        for pair, theirs in _propose_pairs(mapper, options):
+            best = estimate_relative_pose(features, *(names[image] for image in pair))
+            if best is None or not _is_wrong(theirs, best):
+                pose = theirs
+            elif _may_begin(best, options):
+                pose = pycolmap.Rigid3d(pycolmap.Rotation3d(quat_from_matrix(best.second_from_first)), best.translation)
+            if pose is not None:
                 break
-            pose = None
+            rejected += 1
     if pose is None:
         return None
-    log.info("mapping begins with %s and %s", *(names[image] for image in pair))
-    turn = pycolmap.Rotation3d(quat_from_matrix(pose.second_from_first))
-    mapper.register_initial_image_pair(options, *pair, pycolmap.Rigid3d(turn, pose.translation))
+    log.info("mapping begins with %s and %s; %d pairs rejected", *(names[image] for image in pair), rejected)
+    mapper.register_initial_image_pair(options, *pair, pose)
     for image in pair:
         mapper.triangulate_image(pipeline.get_triangulation(), image)
     mapper.adjust_global_bundle(options, pipeline.get_global_bundle_adjustment())

@@ -47,7 +47,7 @@ def see_wall(rng):
     return np.column_stack([rng.uniform(-4, 4, 4000), rng.uniform(-3, 3, 4000), np.full(4000, 2.0)])
 
 
-def match_views(path, world_from_cam, centre, pairs, noise_px=0.3, see=see_room):
+def match_views(path, world_from_cam, centre, pairs, noise_px=0.3, see=see_room, most=200):
     """A database of features with noise, and of matches, a twentieth of them wrong, as COLMAP verifies them."""
     rng = np.random.default_rng(4)
     points = see(rng)
@@ -68,7 +68,7 @@ def match_views(path, world_from_cam, centre, pairs, noise_px=0.3, see=see_room)
             seen.append((before[kept], xy_px))
         for i, j in pairs:
             _, first, second = np.intersect1d(seen[i][0], seen[j][0], return_indices=True)
-            some = rng.permutation(len(first))[:200]
+            some = rng.permutation(len(first))[:most]
             matches = np.column_stack([first, second])[some].astype(np.uint32)
             wrong = rng.random(len(matches)) < 0.05
             matches[wrong, 1] = rng.integers(0, len(seen[j][0]), int(wrong.sum()))
