@@ -44,6 +44,23 @@ _LIMITS = InitialPairLimits()
 _ANY = -1
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Beginning:
+    """Numbers of two images to begin with, the second one's pose in the first one's frame, and their parallax."""
+
+    pair: tuple[int, int]
+    pose: pycolmap.Rigid3d
+    parallax_rad: float
+
+    @classmethod
+    def of(cls, pair: tuple[int, int], pose: RelativePose) -> _Beginning:
+        import pycolmap
+
+        turn = pycolmap.Rotation3d(quat_from_matrix(pose.second_from_first))
+        second_from_first = pycolmap.Rigid3d(turn, pose.translation)
+        return cls(pair=pair, pose=second_from_first, parallax_rad=pose.parallax_rad)
+
+
 def map_incrementally(
     database: Path,
     images: Path,
@@ -141,21 +158,22 @@ def _reconstruct_first_pair(
     pose = None
     with open_features(database) as features:
         names = {image.image_id: name for name, image in features.images.items()}
-        pose, rejected = None, 0
+        best: _Beginning | None = None
         for pair, theirs in _propose_pairs(mapper, options):
-            best = estimate_relative_pose(features, *(names[image] for image in pair))
-            if best is None or not _is_wrong(theirs, best):
-                pose = theirs
-            elif _may_begin(best, options):
-                pose = pycolmap.Rigid3d(pycolmap.Rotation3d(quat_from_matrix(best.second_from_first)), best.translation)
-            if pose is not None:
+            pose = estimate_relative_pose(features, *(names[image] for image in pair))
+            if pose is None or not _is_wrong(theirs, pose):
+                best = _Beginning(pair=pair, pose=theirs, parallax_rad=math.inf)
                 break
-            rejected += 1
-    if pose is None:
+            own = _Beginning.of(pair, pose)
+            if best is None or own.parallax_rad > best.parallax_rad:
+                best = own
+            if own.parallax_rad >= math.radians(options.init_min_tri_angle):
+                break
+    if best is None:
         return None
-    log.info("mapping begins with %s and %s; %d pairs rejected", *(names[image] for image in pair), rejected)
-    mapper.register_initial_image_pair(options, *pair, pose)
-    for image in pair:
+    log.info("mapping begins with %s and %s", *(names[image] for image in best.pair))
+    mapper.register_initial_image_pair(options, *best.pair, best.pose)
+    for image in best.pair:
         mapper.triangulate_image(pipeline.get_triangulation(), image)
     mapper.adjust_global_bundle(options, pipeline.get_global_bundle_adjustment())
     model.normalize()
@@ -183,12 +201,6 @@ def _is_wrong(theirs: pycolmap.Rigid3d, pose: RelativePose) -> bool:
     """Whether COLMAP's pose is turned otherwise than the one that suits the matches best."""
     turned = pose.second_from_first.T @ matrix_from_quat(np.array(theirs.rotation.quat))
     return float(np.linalg.norm(so3_log(turned))) > _LIMITS.wrong_rad
-
-
-def _may_begin(pose: RelativePose, options: pycolmap.IncrementalMapperOptions) -> bool:
-    """Whether two images have the parallax that COLMAP asks of the first two, and one is not straight ahead."""
-    parallax = pose.parallax_rad >= math.radians(options.init_min_tri_angle)
-    return parallax and abs(float(pose.translation[2])) < options.init_max_forward_motion
 
 
 def _find_rest(
