@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from colmap_inertial.colmap.views.gyro_orientations import ImageOrientations
 from colmap_inertial.colmap.views.two_views import RelativePose, estimate_relative_pose, open_features
 from colmap_inertial.core.geometry import matrix_from_quat, quat_from_matrix, so3_log
 
@@ -68,6 +69,7 @@ def map_incrementally(
     pipeline: pycolmap.IncrementalPipelineOptions,
     registered: Callable[[], None],
     *,
+    orientations: ImageOrientations,
     scratch: Path,
 ) -> dict[int, pycolmap.Reconstruction]:
     """Run COLMAP's incremental mapper; models are written to ``sparse/0``, ``sparse/1``, ...
@@ -81,6 +83,8 @@ def map_incrementally(
         COLMAP's options.
     registered
         Is called for each image that is placed.
+    orientations
+        Of the images, by the gyroscope; of those that it does not know, both poses may suit the matches.
     scratch
         For temporary files.
     """
@@ -88,7 +92,7 @@ def map_incrementally(
 
     own = None
     if not pipeline.ba_refine_focal_length and pipeline.init_image_id1 == pipeline.init_image_id2 == _ANY:
-        own = _map_from_own_pair(database, images, pipeline, registered, scratch)
+        own = _map_from_own_pair(database, images, pipeline, registered, orientations, scratch)
     if own is None:
         return dict(
             pycolmap.incremental_mapping(
@@ -102,7 +106,9 @@ def map_incrementally(
         further.mergedict(pipeline.todict())
         further.image_names, further.max_num_models = rest, pipeline.max_num_models - 1
         with tempfile.TemporaryDirectory(dir=scratch) as folder:
-            models += map_incrementally(database, images, Path(folder), further, registered, scratch=scratch).values()
+            models += map_incrementally(
+                database, images, Path(folder), further, registered, orientations=orientations, scratch=scratch
+            ).values()
     for number, model in enumerate(models):
         (sparse / str(number)).mkdir()
         model.write_binary(str(sparse / str(number)))
@@ -114,12 +120,13 @@ def _map_from_own_pair(
     images: Path,
     pipeline: pycolmap.IncrementalPipelineOptions,
     registered: Callable[[], None],
+    orientations: ImageOrientations,
     scratch: Path,
 ) -> pycolmap.Reconstruction | None:
     """A model that begins with a pose of ours; ``None`` where COLMAP's own is right, or nothing comes of ours."""
     import pycolmap
 
-    begun = _reconstruct_first_pair(database, pipeline)
+    begun = _reconstruct_first_pair(database, pipeline, orientations)
     if begun is None:
         return None
     with tempfile.TemporaryDirectory(dir=scratch) as folder:
@@ -143,7 +150,7 @@ def _map_from_own_pair(
 
 
 def _reconstruct_first_pair(
-    database: Path, pipeline: pycolmap.IncrementalPipelineOptions
+    database: Path, pipeline: pycolmap.IncrementalPipelineOptions, orientations: ImageOrientations
 ) -> pycolmap.Reconstruction | None:
     """Two images and their points; ``None`` where COLMAP begins with the right pose, or no better one is found."""
     import pycolmap
@@ -160,7 +167,8 @@ def _reconstruct_first_pair(
         names = {image.image_id: name for name, image in features.images.items()}
         best: _Beginning | None = None
         for pair, theirs in _propose_pairs(mapper, options):
-            pose = estimate_relative_pose(features, *(names[image] for image in pair))
+            first, second = (names[image] for image in pair)
+            pose = estimate_relative_pose(features, first, second, orientations.find_rotation(first, second))
             if pose is None or not _is_wrong(theirs, pose):
                 best = _Beginning(pair=pair, pose=theirs, parallax_rad=math.inf)
                 break

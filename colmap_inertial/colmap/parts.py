@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from colmap_inertial.colmap.chunks import Chunk, Executor, do_chunks
 from colmap_inertial.colmap.incremental import map_incrementally
+from colmap_inertial.colmap.views.gyro_orientations import ImageOrientations
 from colmap_inertial.model.soundness import check_binary_model
 
 if TYPE_CHECKING:
@@ -49,9 +50,12 @@ class MapPart:
     ----------
     options
         COLMAP's, as a dictionary.
+    orientations
+        Of the images, by the gyroscope.
     """
 
     options: dict[str, Any]
+    orientations: ImageOrientations
 
     def __call__(self, folder: Path, images: Path, made: Path, told: Callable[[], None]) -> None:
         """As of :class:`~colmap_inertial.colmap.chunks.Work`."""
@@ -60,7 +64,9 @@ class MapPart:
         options = pycolmap.IncrementalPipelineOptions()
         options.mergedict(self.options)
         pycolmap.set_random_seed(options.random_seed)
-        map_incrementally(folder / "part.db", images, made, options, told, scratch=folder)
+        map_incrementally(
+            folder / "part.db", images, made, options, told, orientations=self.orientations, scratch=folder
+        )
 
     def check(self, made: Path) -> None:
         """As of :class:`~colmap_inertial.colmap.chunks.Work`."""
@@ -69,14 +75,20 @@ class MapPart:
 
 
 def prepare_part(
-    database: Path, images: Path, options: pycolmap.IncrementalPipelineOptions, folder: Path, number: int
+    database: Path,
+    images: Path,
+    options: pycolmap.IncrementalPipelineOptions,
+    folder: Path,
+    number: int,
+    orientations: ImageOrientations,
 ) -> Chunk:
     """The chunk of a part: the images that the options name, whose database is written into a new ``folder``."""
     folder.mkdir(parents=True)
     write_part_database(database, options.image_names, folder / "part.db")
     with open(folder / "part.db", "rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    work, size = MapPart(options=options.todict()), len(options.image_names)
+    work = MapPart(options=options.todict(), orientations=orientations.select(options.image_names))
+    size = len(options.image_names)
     return Chunk.of(work, name=f"mapping part {number + 1}", folder=folder, images=images, size=size, reads=digest)
 
 

@@ -204,7 +204,7 @@ def run_by_step(command: list[object], stamps: Path) -> tuple[float, dict[str, f
         time.sleep(0.2)
     if process.wait():
         raise subprocess.CalledProcessError(process.returncode, process.args)
-    steps = sorted(ended, key=lambda name: ended[name])
+    steps = sorted(ended, key=lambda name: (ended[name], RUN_STEPS.index(name)))
     before = dict(zip(steps, [0.0, *(ended[name] for name in steps)], strict=False))
     return spent_s, {name: ended[name] - before[name] for name in steps}
 

@@ -57,11 +57,12 @@ from colmap_inertial.colmap.context import RunContext
 from colmap_inertial.colmap.features.extraction import extract_features
 from colmap_inertial.colmap.mapping.mapper import map_images
 from colmap_inertial.colmap.matching.pairing import match_capture
+from colmap_inertial.colmap.views.gyro_orientations import ImageOrientations
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import matrix_from_quat, quat_rotate, slerp
 from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.io.capture import load_capture
-from colmap_inertial.io.files import read_json, write_json
+from colmap_inertial.io.files import read_json, read_record, write_json, write_record
 from colmap_inertial.io.frames import read_frames
 from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.io.recording import Recording
@@ -246,7 +247,7 @@ def false_loops(walk: Walk, folder: Path) -> Figures:
     for left in folder.glob(f"{database.name}*"):
         left.unlink()
     begun_s = time.process_time()
-    record = match_capture(features, database, recording, camera, options, context)
+    record, _ = match_capture(features, database, recording, camera, options, context)
     processor_s = time.process_time() - begun_s
     centre, turned = true_poses(folder)
     right = {pair: share >= 0.5 for pair, share in true_shares(walk, names, centre, turned, database).items()}
@@ -334,11 +335,11 @@ def loop_errors(walk: Walk, folder: Path) -> dict[str, Figures]:
         shutil.rmtree(models, ignore_errors=True)
         for left in folder.glob(f"{database.name}*"):
             left.unlink()
-        begun_s = time.process_time()
+        begun_s, orientations = time.process_time(), ImageOrientations()
         if kind == "open":
             told = matched_in_line(features, database, options.overlap)
         else:
-            record = match_capture(features, database, recording, camera, options, context)
+            record, orientations = match_capture(features, database, recording, camera, options, context)
             told = {"loops_closed": record.loops_closed, "verified": record.verified}
             shares = true_shares(walk, names, *true_poses(folder), database)
             told["false"] = sum(share < 0.5 for (i, j), share in shares.items() if j - i > 2 * LOOP_OVERLAP)
@@ -350,6 +351,7 @@ def loop_errors(walk: Walk, folder: Path) -> dict[str, Figures]:
             dataclasses.replace(options, refine_intrinsics=False),
             context=context,
             in_time=names,
+            orientations=orientations,
         )
         told |= {"matching_s": matched_s - begun_s, "mapping_s": time.process_time() - matched_s}
         told["peak_mib"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
@@ -388,7 +390,7 @@ def match_walk(folder: Path) -> Figures:
     for left in folder.glob("database.db*"):
         left.unlink()
     before_mib, begun_s = peak_mib(), time.process_time()
-    record = match_capture(
+    record, orientations = match_capture(
         folder / "features.db",
         folder / "database.db",
         recording,
@@ -396,6 +398,7 @@ def match_walk(folder: Path) -> Figures:
         MappingOptions(pairing="sequential"),
         context,
     )
+    write_record(folder / "orientations.json", orientations)
     return {
         "processor_s": time.process_time() - begun_s,
         "mib_a_frame": (peak_mib() - before_mib) / record.images,
@@ -444,6 +447,7 @@ def map_by(mapper: str, folder: Path, workers: int) -> Figures:
             MappingOptions(mapper="global" if mapper == "global" else "incremental", refine_intrinsics=False),
             context=RunContext(scratch=folder, num_threads=1, executor=Processes(number=workers)),
             in_time=[] if mapper == "one" else list(truth),
+            orientations=read_record(folder / "orientations.json", ImageOrientations),
         )
         told |= {"parts": record.parts, "ends_joined": sum(met.joined for met in record.ends)}
     own_s, children = time.process_time() - begun_s, resource.getrusage(resource.RUSAGE_CHILDREN)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import logging
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from colmap_inertial.colmap.settings import NO_SETTINGS, ColmapSettings
+from colmap_inertial.colmap.views.gyro_orientations import ImageOrientations
 from colmap_inertial.core.arrays import Int64Array
 from colmap_inertial.model.submodels.graph import Pair
 from colmap_inertial.model.submodels.matches import LIMITS, Submodel, read_matches
@@ -75,6 +76,8 @@ class MappedCapture:
         Options of the mapper.
     names
         Of images, in order of time.
+    orientations
+        Of the images, by the gyroscope.
     settings
         What the user set of adjustments of a whole model.
     """
@@ -82,6 +85,7 @@ class MappedCapture:
     database: Path
     pipeline: pycolmap.IncrementalPipelineOptions
     names: Sequence[str]
+    orientations: ImageOrientations = field(default_factory=ImageOrientations)
     settings: ColmapSettings = NO_SETTINGS
 
     @cached_property

@@ -14,6 +14,7 @@ from colmap_inertial.colmap.incremental import map_incrementally
 from colmap_inertial.colmap.installed import InstalledColmap
 from colmap_inertial.colmap.loops.closure import LoopClosure, MappedCapture, close_gaps
 from colmap_inertial.colmap.mapping.submaps import join_runs, map_runs, split_capture
+from colmap_inertial.colmap.views.gyro_orientations import ImageOrientations
 from colmap_inertial.core.errors import MappingError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import MappingOptions
@@ -33,6 +34,7 @@ log = logging.getLogger(__name__)
 _GLOBAL_RATIO = 1.4
 #: Images within so many times the overlap are neighbours in time.
 _NEIGHBOURS = 2
+_UNKNOWN = ImageOrientations()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,6 +78,7 @@ def map_images(
     *,
     in_time: Sequence[str] = (),
     judged: bool = True,
+    orientations: ImageOrientations = _UNKNOWN,
 ) -> MapRecord:
     """Run COLMAP's mapper; models are written to ``sparse/0``, ``sparse/1``, ...
 
@@ -89,6 +92,8 @@ def map_images(
     judged
         Whether somebody looked which pairs far apart in time join copies (``MatchRecord.judged``). Nobody does where
         every pair is matched.
+    orientations
+        Of the images, by the gyroscope: a model begins with two images that turned as it did.
 
     Raises
     ------
@@ -110,7 +115,9 @@ def map_images(
     near = _NEIGHBOURS * options.overlap
     if options.mapper == "incremental":
         pipeline = incremental_options(options.refine_intrinsics, context)
-        capture = MappedCapture(database=database, pipeline=pipeline, names=in_time, settings=context.colmap)
+        capture = MappedCapture(
+            database=database, pipeline=pipeline, names=in_time, orientations=orientations, settings=context.colmap
+        )
         parts = [] if every_pair else split_capture(capture)
         if len(parts) > 1:
             record = _map_in_parts(capture, images, sparse, context, parts, near=near, loops=judged)
@@ -118,7 +125,9 @@ def map_images(
             nearest = None if judged and not every_pair else near
             counted = make_counter(context.progress, "mapping", num_images)
             if context.executable is None:
-                models = map_incrementally(database, images, sparse, pipeline, counted, scratch=context.scratch)
+                models = map_incrementally(
+                    database, images, sparse, pipeline, counted, orientations=orientations, scratch=context.scratch
+                )
             else:
                 installed = InstalledColmap(executable=context.executable, scratch=context.scratch)
                 models = installed.map(database, images, sparse, pipeline, counted)

@@ -170,7 +170,7 @@ def map_runs(
             own.image_names = list(capture.names[begin:end])
             folder = scratch / f"{number}_{seed}"
             remove(folder)  # of a run that was killed
-            chunks.append(prepare_part(capture.database, images, own, folder, number))
+            chunks.append(prepare_part(capture.database, images, own, folder, number, capture.orientations))
         return dict(zip(numbers, map_parts(chunks, executor, told), strict=True))
 
     seed = capture.pipeline.random_seed

@@ -28,7 +28,11 @@ from colmap_inertial.colmap.features.extraction import (
 )
 from colmap_inertial.colmap.features.given_database import can_match, read_matched_pairs
 from colmap_inertial.colmap.loops.search import LoopSearch, find_returns, name_pairs, split_pairs
-from colmap_inertial.colmap.views.gyro_orientations import GyroOrientations, estimate_gyro_orientations
+from colmap_inertial.colmap.views.gyro_orientations import (
+    GyroOrientations,
+    ImageOrientations,
+    estimate_gyro_orientations,
+)
 from colmap_inertial.colmap.views.relative_track import FramePair, RelativeTrack, estimate_relative_track
 from colmap_inertial.colmap.views.two_views import (
     Covisibility,
@@ -140,7 +144,7 @@ def match_capture(
     camera: CameraModel | None,
     options: MappingOptions,
     context: RunContext,
-) -> MatchRecord:
+) -> tuple[MatchRecord, ImageOrientations]:
     """Match and verify pairs of a recording's images in a copy of the features' database.
 
     Images close in time come first: their rotations give the gyroscope's calibration, and with it the orientation of
@@ -157,6 +161,10 @@ def match_capture(
         Of the images, where it is known.
     options
         Which pairs there are.
+
+    Returns
+    -------
+    What was matched; orientations of the images, empty where gyroscope and images disagree.
     """
     shutil.copyfile(features, database)
     every_name = recording.timing.names
@@ -224,7 +232,7 @@ def match_capture(
         **counts,
     )
     log.info("matches: %s", record)
-    return record
+    return record, ImageOrientations() if orientations is None else ImageOrientations.of(names, orientations)
 
 
 def _leave_standing_frames(

@@ -10,8 +10,8 @@ optimization of frame-to-frame rotation*, ICCV 2013).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.facts import Fact
-from colmap_inertial.core.geometry import so3_exp, so3_log
+from colmap_inertial.core.geometry import matrix_from_quat, quat_from_matrix, so3_exp, so3_log
 from colmap_inertial.core.sampling import is_gap
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import (
@@ -177,6 +177,47 @@ class GyroOrientations:
     def sigma_rad(self, i: IndexArray, j: IndexArray) -> Array:
         """(M,) standard deviation of the rotation between frames i and j, about an axis on average."""
         return np.asarray(np.sqrt(np.trace(self.covariance(i, j), axis1=1, axis2=2) / 3))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageOrientations:
+    """Orientations of images by the gyroscope, as a record.
+
+    Attributes
+    ----------
+    part
+        By image name; images of one part have no gap of the gyroscope between them.
+    start_from_cam_xyzw
+        By image name, quaternions.
+    """
+
+    part: dict[str, int] = field(default_factory=dict)
+    start_from_cam_xyzw: dict[str, tuple[float, float, float, float]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, names: Sequence[str], orientations: GyroOrientations) -> ImageOrientations:
+        """Of the images that were taken while the gyroscope was recorded."""
+        part, xyzw = {}, {}
+        for k, name in enumerate(names):
+            if orientations.part[k] >= 0:
+                x, y, z, w = quat_from_matrix(orientations.start_from_cam[k]).tolist()
+                part[name], xyzw[name] = int(orientations.part[k]), (x, y, z, w)
+        return cls(part=part, start_from_cam_xyzw=xyzw)
+
+    def select(self, names: Iterable[str]) -> ImageOrientations:
+        """Those of some images."""
+        known = [name for name in names if name in self.part]
+        xyzw = {name: self.start_from_cam_xyzw[name] for name in known}
+        return ImageOrientations(part={name: self.part[name] for name in known}, start_from_cam_xyzw=xyzw)
+
+    def find_rotation(self, first: str, second: str) -> Array | None:
+        """(3, 3) ``second_from_first``; ``None`` where the gyroscope did not measure it."""
+        if first not in self.part or self.part[first] != self.part.get(second):
+            return None
+        start_from_first, start_from_second = (
+            matrix_from_quat(np.array(self.start_from_cam_xyzw[name])) for name in (first, second)
+        )
+        return np.asarray(start_from_second.T @ start_from_first)
 
 
 def _view_rad(camera: CameraModel) -> float:

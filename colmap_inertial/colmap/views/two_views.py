@@ -20,7 +20,7 @@ from colmap_inertial.colmap.views.relative_track import (
     link_observations,
 )
 from colmap_inertial.core.arrays import Array, BoolArray, IndexArray, UInt8Array
-from colmap_inertial.core.geometry import matrix_from_quat, so3_exp
+from colmap_inertial.core.geometry import matrix_from_quat, so3_exp, so3_log
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.io.files import reading
 from colmap_inertial.model.database import UNREADABLE, check_records
@@ -182,12 +182,21 @@ def compare(database: Path, pairs: Sequence[tuple[str, str]]) -> TwoViews:
     return TwoViews(first_from_second=rotations, covered=covered)
 
 
-def estimate_relative_pose(features: Features, first: str, second: str) -> RelativePose | None:
-    """The pose of two views, as :func:`compare` has its rotation; ``None`` where they have too few matches."""
+def estimate_relative_pose(
+    features: Features, first: str, second: str, rotation: Array | None = None
+) -> RelativePose | None:
+    """The pose of two views, as :func:`compare` has its rotation; ``None`` where they have too few matches.
+
+    Parameters
+    ----------
+    rotation
+        (3, 3) ``second_from_first`` by the gyroscope, where it is known: of poses that suit the matches alike, the one
+        that is turned so is right.
+    """
     views = _MatchedViews.read(features, (first, second), {})
     if views is None or not views.poses:
         return None
-    ((turn, move),) = _refine_poses([views])
+    ((turn, move),) = _refine_poses([views], [rotation])
     across = views.rays[1] @ turn  # in the first one's frame
     sine = np.linalg.norm(np.cross(views.rays[0], across), axis=1)
     parallax_rad = np.arctan2(sine, np.sum(views.rays[0] * across, axis=1))
@@ -245,17 +254,26 @@ class _MatchedViews:
         )
 
 
-def _refine_poses(pairs: Sequence[_MatchedViews]) -> list[tuple[Array, Array]]:
-    """Each pair's ``second_from_first`` and unit translation: those that suit its matches best once refined."""
+def _refine_poses(
+    pairs: Sequence[_MatchedViews], rotations: Sequence[Array | None] | None = None
+) -> list[tuple[Array, Array]]:
+    """Each pair's ``second_from_first`` and unit translation: those that suit its matches best once refined.
+
+    Of those that do alike, the one counts that is turned as known beforehand, where rotations are given.
+    """
     if not pairs:
         return []
     rays = np.array([views.rays for views in pairs for _ in views.poses])
     turns, moves = (np.array(of) for of in zip(*(pose for views in pairs for pose in views.poses), strict=True))
     refined = refine_poses(turns, moves, rays[:, 0], rays[:, 1])
     best, begin = [], 0
-    for views in pairs:
+    for views, known in zip(pairs, rotations or [None] * len(pairs), strict=True):
         own = slice(begin, begin + len(views.poses))
-        chosen = begin + _choose_pose(refined.usual_rad[own], refined.in_front[own])
+        if known is None:
+            chosen = begin + _choose_pose(refined.usual_rad[own], refined.in_front[own])
+        else:
+            turned_rad = np.linalg.norm(so3_log(known.T @ refined.second_from_first[own]), axis=1)
+            chosen = begin + int(np.argmin(np.where(_are_alike(refined.usual_rad[own]), turned_rad, np.inf)))
         best.append((refined.second_from_first[chosen], refined.translation[chosen]))
         begin = own.stop
     return best
@@ -263,9 +281,14 @@ def _refine_poses(pairs: Sequence[_MatchedViews]) -> list[tuple[Array, Array]]:
 
 def _choose_pose(usual_rad: Array, in_front: Array) -> int:
     """The pose that suits the matches best; of those alike, as both of a plane are, one with its points in front."""
-    alike = usual_rad <= _LIMITS.alike * usual_rad.min()
+    alike = _are_alike(usual_rad)
     alike &= in_front >= in_front[alike].max() - _LIMITS.as_many
     return int(np.argmin(np.where(alike, usual_rad, np.inf)))
+
+
+def _are_alike(usual_rad: Array) -> BoolArray:
+    """Which poses suit the matches about as well as the best one."""
+    return np.asarray(usual_rad <= _LIMITS.alike * usual_rad.min())
 
 
 def _solve_pose(

@@ -29,6 +29,7 @@ from colmap_inertial.colmap.matching.rigs import (
     poses_are_known,
     write_rig,
 )
+from colmap_inertial.colmap.views.gyro_orientations import ImageOrientations
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, MappingError
 from colmap_inertial.core.facts import Fact
@@ -97,7 +98,7 @@ def run_colmap(
     }
     if rig:
         pairing["rig"] = [rig, mapping, settings("mapping")]
-    outputs = [workspace.colmap_database, workspace.keypoints, workspace.matches]
+    outputs = [workspace.colmap_database, workspace.keypoints, workspace.matches, workspace.orientations]
 
     def matches(partial: Sequence[Path]) -> None:
         # the database holds the features, too: they are made when there are no matches, and need not stay
@@ -105,18 +106,24 @@ def run_colmap(
         runner.run("features", depends, [workspace.colmap_features, record], features, after=["frames"])
         shutil.copyfile(record, partial[1])
         first_camera = next(iter(cameras.values()), None)
-        matched = match_capture(workspace.colmap_features, partial[0], recording, first_camera, mapping, context)
+        matched, orientations = match_capture(
+            workspace.colmap_features, partial[0], recording, first_camera, mapping, context
+        )
         if rig:
             matched = match_rig_images(partial[0], matched, recording.timing.names, rig, context)
             _add_rig(partial[0], workspace.colmap_images, mapping, rig, context)
         write_record(partial[2], matched)
+        write_record(partial[3], orientations)
         remove(context.scratch / CHUNKS_FOLDER)
 
     def models(partial: Sequence[Path]) -> None:
         database, images, own = workspace.colmap_database, workspace.colmap_images, _keep_declared_poses(context, rig)
         in_time = () if rig else recording.timing.names
         judged = read_record(workspace.matches, MatchRecord).judged
-        record = map_images(database, images, partial[0], mapping, own, in_time=in_time, judged=judged)
+        orientations = read_record(workspace.orientations, ImageOrientations)
+        record = map_images(
+            database, images, partial[0], mapping, own, in_time=in_time, judged=judged, orientations=orientations
+        )
         write_record(partial[1], record)
 
     runner.run("matches", pairing, outputs, matches, after=["frames"])

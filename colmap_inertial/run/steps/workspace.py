@@ -67,6 +67,8 @@ class Workspace:
     """What the keypoint stages did."""
     matches = _Inside(".stages/matches_made.json")
     """Which pairs of images were matched, and why not the rest."""
+    orientations = _Inside(".stages/orientations.json")
+    """Orientations of the images by the gyroscope, where it agrees with them."""
     mapped = _Inside(".stages/models_made.json")
     """How models were made."""
     validation = _Inside("validation")

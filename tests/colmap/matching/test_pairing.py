@@ -523,7 +523,7 @@ def test_pairs_without_a_gyroscope_are_those_of_before(database, tmp_path, monke
     monkeypatch.setattr(pairing, "estimate_gyro_orientations", refused)
     timing = FrameTiming(names=("a", "b", "c"), t_s=np.arange(3.0))
     recording = type("Recording", (), {"timing": timing})()
-    record = match_capture(
+    record, _ = match_capture(
         database, tmp_path / "out.db", recording, CAMERA, MappingOptions(), RunContext(scratch=tmp_path)
     )
     assert sorted(matched) == [("a", "b"), ("a", "c"), ("b", "c")]
@@ -543,7 +543,7 @@ def test_without_a_gyroscope_a_long_capture_matches_neighbours_only(database, tm
     names = tuple(f"{i:03}" for i in range(40))
     recording = type("Recording", (), {"timing": FrameTiming(names=names, t_s=np.arange(40.0))})()
     options = MappingOptions(pairing="sequential", overlap=3)
-    record = match_capture(database, tmp_path / "out.db", recording, CAMERA, options, RunContext(scratch=tmp_path))
+    record, _ = match_capture(database, tmp_path / "out.db", recording, CAMERA, options, RunContext(scratch=tmp_path))
     steps = sorted({int(b) - int(a) for a, b in matched})
     assert steps == [1, 2, 3, 4] and record.far == (40 - 8) + (40 - 16) + (40 - 32)
     assert record.matched == len(matched) == record.pairs - record.far and record.loops_closed == 0
@@ -571,7 +571,7 @@ def test_loops_are_sought_farther_apart_than_twice_the_overlap(database, tmp_pat
     names = tuple(f"{i:03}" for i in range(40))
     recording = type("Recording", (), {"timing": FrameTiming(names=names, t_s=np.arange(40.0))})()
     options = MappingOptions(pairing="sequential", overlap=3)
-    record = match_capture(database, tmp_path / "out.db", recording, CAMERA, options, RunContext(scratch=tmp_path))
+    record, _ = match_capture(database, tmp_path / "out.db", recording, CAMERA, options, RunContext(scratch=tmp_path))
     nearest, doubtful = sought
     # within twice the overlap nothing is a loop; pairs up to four times the overlap apart may be one
     assert {int(b) - int(a) for a, b in matched} == {1, 2, 3, 4} and nearest == 2 * 3 + 1

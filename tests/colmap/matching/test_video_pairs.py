@@ -32,7 +32,7 @@ def matched(loop, tmp_path, recording):
     walk, folder, _ = loop
     options, database = MappingOptions(refine_intrinsics=False), tmp_path / "database.db"
     context = RunContext(scratch=tmp_path, num_threads=1)
-    record = match_capture(folder / "features.db", database, recording, walk.camera().model, options, context)
+    record, _ = match_capture(folder / "features.db", database, recording, walk.camera().model, options, context)
     names = recording.timing.names
     return record, bench.true_shares(walk, names, *bench.true_poses(folder), database, apart=FRAMES // 2)
 
