@@ -12,7 +12,7 @@ import logging
 import math
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -46,20 +46,30 @@ _ANY = -1
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _Beginning:
-    """Numbers of two images to begin with, the second one's pose in the first one's frame, and their parallax."""
+class _FirstPair:
+    """Two images that a model begins with.
 
-    pair: tuple[int, int]
-    pose: pycolmap.Rigid3d
-    parallax_rad: float
+    Attributes
+    ----------
+    numbers
+        COLMAP's.
+    pose
+        Of ours; ``None`` where COLMAP finds the right one.
+    """
 
-    @classmethod
-    def of(cls, pair: tuple[int, int], pose: RelativePose) -> _Beginning:
-        import pycolmap
+    numbers: tuple[int, int]
+    pose: RelativePose | None
 
-        turn = pycolmap.Rotation3d(quat_from_matrix(pose.second_from_first))
-        second_from_first = pycolmap.Rigid3d(turn, pose.translation)
-        return cls(pair=pair, pose=second_from_first, parallax_rad=pose.parallax_rad)
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Work:
+    """Arguments of :func:`map_incrementally`."""
+
+    database: Path
+    images: Path
+    registered: Callable[[], None]
+    orientations: ImageOrientations
+    scratch: Path
 
 
 def map_incrementally(
@@ -88,120 +98,144 @@ def map_incrementally(
     scratch
         For temporary files.
     """
-    import pycolmap
-
-    own = None
-    if not pipeline.ba_refine_focal_length and pipeline.init_image_id1 == pipeline.init_image_id2 == _ANY:
-        own = _map_from_own_pair(database, images, pipeline, registered, orientations, scratch)
+    work = _Work(database=database, images=images, registered=registered, orientations=orientations, scratch=scratch)
+    known = not pipeline.ba_refine_focal_length and pipeline.init_image_id1 == pipeline.init_image_id2 == _ANY
+    own = _map_from_first_pair(work, pipeline) if known else None
     if own is None:
-        return dict(
-            pycolmap.incremental_mapping(
-                str(database), str(images), str(sparse), options=pipeline, next_image_callback=registered
-            )
-        )
-    models = [own]
-    rest = _find_rest(database, pipeline, own)
-    if pipeline.multiple_models and pipeline.max_num_models > 1 and len(rest) >= pipeline.min_model_size:
-        further = pycolmap.IncrementalPipelineOptions()
-        further.mergedict(pipeline.todict())
-        further.image_names, further.max_num_models = rest, pipeline.max_num_models - 1
+        return _run_colmap(work, sparse, pipeline)
+    models, placed = [own], _names_of(own)
+    while pipeline.multiple_models and len(models) < pipeline.max_num_models:
+        asked = _copy(pipeline)
+        asked.image_names = _find_rest(database, pipeline, placed)
+        if len(asked.image_names) < pipeline.min_model_size:
+            break
+        further = _map_from_first_pair(work, asked)
         with tempfile.TemporaryDirectory(dir=scratch) as folder:
-            models += map_incrementally(
-                database, images, Path(folder), further, registered, orientations=orientations, scratch=scratch
-            ).values()
+            found = [further] if further is not None else list(_run_colmap(work, Path(folder), asked).values())
+        # images that models have both may make another by themselves
+        new = [model for model in found if _names_of(model) - placed]
+        models += new
+        placed = placed.union(*map(_names_of, new))
+        if further is None or not new:
+            break
     for number, model in enumerate(models):
         (sparse / str(number)).mkdir()
         model.write_binary(str(sparse / str(number)))
     return dict(enumerate(models))
 
 
-def _map_from_own_pair(
-    database: Path,
-    images: Path,
-    pipeline: pycolmap.IncrementalPipelineOptions,
-    registered: Callable[[], None],
-    orientations: ImageOrientations,
-    scratch: Path,
-) -> pycolmap.Reconstruction | None:
-    """A model that begins with a pose of ours; ``None`` where COLMAP's own is right, or nothing comes of ours."""
+def _run_colmap(
+    work: _Work, sparse: Path, pipeline: pycolmap.IncrementalPipelineOptions, begun: Path | None = None
+) -> dict[int, pycolmap.Reconstruction]:
+    """COLMAP's mapper as it is, or from a model that is begun."""
     import pycolmap
 
-    begun = _reconstruct_first_pair(database, pipeline, orientations)
-    if begun is None:
-        return None
-    with tempfile.TemporaryDirectory(dir=scratch) as folder:
-        pair, made = Path(folder) / "pair", Path(folder) / "made"
-        pair.mkdir()
-        made.mkdir()
-        for number in begun.reg_image_ids():
-            if pipeline.extract_colors:
-                begun.extract_colors_for_image(number, str(images))
-            registered()
-        begun.write_binary(str(pair))
-        model = pycolmap.incremental_mapping(
-            str(database),
-            str(images),
-            str(made),
+    return dict(
+        pycolmap.incremental_mapping(
+            str(work.database),
+            str(work.images),
+            str(sparse),
             options=pipeline,
-            input_path=str(pair),
-            next_image_callback=registered,
-        ).get(0)
-    return model if model is not None and model.num_reg_images() >= pipeline.min_model_size else None
+            input_path="" if begun is None else str(begun),
+            next_image_callback=work.registered,
+        )
+    )
 
 
-def _reconstruct_first_pair(
-    database: Path, pipeline: pycolmap.IncrementalPipelineOptions, orientations: ImageOrientations
-) -> pycolmap.Reconstruction | None:
-    """Two images and their points; ``None`` where COLMAP begins with the right pose, or no better one is found."""
+def _map_from_first_pair(work: _Work, pipeline: pycolmap.IncrementalPipelineOptions) -> pycolmap.Reconstruction | None:
+    """A model that begins with the right pose of two images; ``None`` where none is found, or nothing comes of it."""
     import pycolmap
 
     asked = pycolmap.DatabaseCacheOptions()
     asked.min_num_matches, asked.image_names = pipeline.min_num_matches, set(pipeline.image_names)
-    with pycolmap.Database.open(str(database)) as opened:
+    with pycolmap.Database.open(str(work.database)) as opened:
         mapper = pycolmap.IncrementalMapper(pycolmap.DatabaseCache.create(opened, asked))
-    model = pycolmap.Reconstruction()
-    mapper.begin_reconstruction(model)
-    options = pipeline.get_mapper()
-    pose = None
-    with open_features(database) as features:
-        names = {image.image_id: name for name, image in features.images.items()}
-        best: _Beginning | None = None
-        for pair, theirs in _propose_pairs(mapper, options):
-            first, second = (names[image] for image in pair)
-            pose = estimate_relative_pose(features, first, second, orientations.find_rotation(first, second))
-            if pose is None or not _is_wrong(theirs, pose):
-                best = _Beginning(pair=pair, pose=theirs, parallax_rad=math.inf)
-                break
-            own = _Beginning.of(pair, pose)
-            if best is None or own.parallax_rad > best.parallax_rad:
-                best = own
-            if own.parallax_rad >= math.radians(options.init_min_tri_angle):
-                break
-    if best is None:
+    begun = pycolmap.Reconstruction()
+    mapper.begin_reconstruction(begun)
+    limits = pipeline.get_mapper()
+    first = _choose_first_pair(work, mapper, limits)
+    if first is None:
         return None
-    log.info("mapping begins with %s and %s", *(names[image] for image in best.pair))
-    mapper.register_initial_image_pair(options, *best.pair, best.pose)
-    for image in best.pair:
-        mapper.triangulate_image(pipeline.get_triangulation(), image)
-    mapper.adjust_global_bundle(options, pipeline.get_global_bundle_adjustment())
+    options, begun_in = _copy(pipeline), None
+    options.multiple_models = False
+    with tempfile.TemporaryDirectory(dir=work.scratch) as folder:
+        made, pair = Path(folder) / "made", Path(folder) / "pair"
+        made.mkdir()
+        if first.pose is None:
+            options.init_image_id1, options.init_image_id2 = first.numbers
+            options.mapper.init_min_num_inliers = limits.init_min_num_inliers
+            options.mapper.init_min_tri_angle = limits.init_min_tri_angle
+        else:
+            _reconstruct_pair(mapper, begun, pipeline, limits, first.numbers, first.pose)
+            for number in begun.reg_image_ids():
+                if pipeline.extract_colors:
+                    begun.extract_colors_for_image(number, str(work.images))
+                work.registered()
+            pair.mkdir()
+            begun.write_binary(str(pair))
+            begun_in = pair
+        model = _run_colmap(work, made, options, begun_in).get(0)
+    return model if model is not None and model.num_reg_images() >= pipeline.min_model_size else None
+
+
+def _choose_first_pair(
+    work: _Work, mapper: pycolmap.IncrementalMapper, limits: pycolmap.IncrementalMapperOptions
+) -> _FirstPair | None:
+    """The first pair that COLMAP proposes whose pose it finds, or that has the parallax that it asks for.
+
+    Where there is none, the one of most parallax. The limits become as loose as COLMAP makes them.
+    """
+    best: _FirstPair | None = None
+    largest_rad = 0.0
+    with open_features(work.database) as features:
+        names = {image.image_id: name for name, image in features.images.items()}
+        for numbers, theirs in _propose_pairs(mapper, limits):
+            first, second = (names[number] for number in numbers)
+            pose = estimate_relative_pose(features, first, second, work.orientations.find_rotation(first, second))
+            if pose is None or not _is_wrong(theirs, pose):
+                best = _FirstPair(numbers=numbers, pose=None)
+                break
+            log.info("%s and %s: COLMAP begins with a wrong pose", first, second)
+            if pose.parallax_rad > largest_rad:
+                best, largest_rad = _FirstPair(numbers=numbers, pose=pose), pose.parallax_rad
+            if largest_rad >= math.radians(limits.init_min_tri_angle):
+                break
+    return best
+
+
+def _reconstruct_pair(
+    mapper: pycolmap.IncrementalMapper,
+    model: pycolmap.Reconstruction,
+    pipeline: pycolmap.IncrementalPipelineOptions,
+    limits: pycolmap.IncrementalMapperOptions,
+    numbers: tuple[int, int],
+    pose: RelativePose,
+) -> None:
+    """Two images and their points, as COLMAP begins a model."""
+    import pycolmap
+
+    turn = pycolmap.Rotation3d(quat_from_matrix(pose.second_from_first))
+    mapper.register_initial_image_pair(limits, *numbers, pycolmap.Rigid3d(turn, pose.translation))
+    for number in numbers:
+        mapper.triangulate_image(pipeline.get_triangulation(), number)
+    mapper.adjust_global_bundle(limits, pipeline.get_global_bundle_adjustment())
     model.normalize()
-    mapper.filter_points(options)
-    mapper.filter_frames(options)
+    mapper.filter_points(limits)
+    mapper.filter_frames(limits)
     mapper.end_reconstruction(False)
-    return model if model.num_reg_images() and model.num_points3D() else None
 
 
 def _propose_pairs(
-    mapper: pycolmap.IncrementalMapper, options: pycolmap.IncrementalMapperOptions
+    mapper: pycolmap.IncrementalMapper, limits: pycolmap.IncrementalMapperOptions
 ) -> Iterator[tuple[tuple[int, int], pycolmap.Rigid3d]]:
-    """Pairs that COLMAP would begin with, and its poses ``second_from_first``; limits in the options become looser."""
-    least_matches, least_deg = options.init_min_num_inliers, options.init_min_tri_angle
+    """Pairs that COLMAP would begin with, and its poses ``second_from_first``; the limits become looser."""
+    least_matches, least_deg = limits.init_min_num_inliers, limits.init_min_tri_angle
     for of_matches, of_parallax in _LIMITS.relaxations:
-        options.init_min_num_inliers = int(least_matches * of_matches)
-        options.init_min_tri_angle = least_deg * of_parallax
+        limits.init_min_num_inliers = int(least_matches * of_matches)
+        limits.init_min_tri_angle = least_deg * of_parallax
         mapper.reset_initialization_stats()
         # each call leaves out what those before have found
-        while (found := mapper.find_initial_image_pair(options, _ANY, _ANY)) is not None:
+        while (found := mapper.find_initial_image_pair(limits, _ANY, _ANY)) is not None:
             yield found
 
 
@@ -211,13 +245,22 @@ def _is_wrong(theirs: pycolmap.Rigid3d, pose: RelativePose) -> bool:
     return float(np.linalg.norm(so3_log(turned))) > _LIMITS.wrong_rad
 
 
-def _find_rest(
-    database: Path, pipeline: pycolmap.IncrementalPipelineOptions, model: pycolmap.Reconstruction
-) -> list[str]:
-    """Images that a model leaves, and those of its own, few, that have most matches with them."""
+def _copy(pipeline: pycolmap.IncrementalPipelineOptions) -> pycolmap.IncrementalPipelineOptions:
     import pycolmap
 
-    placed = {model.image(number).name for number in model.reg_image_ids()}
+    options = pycolmap.IncrementalPipelineOptions()
+    options.mergedict(pipeline.todict())
+    return options
+
+
+def _names_of(model: pycolmap.Reconstruction) -> set[str]:
+    return {model.image(number).name for number in model.reg_image_ids()}
+
+
+def _find_rest(database: Path, pipeline: pycolmap.IncrementalPipelineOptions, placed: Set[str]) -> list[str]:
+    """Images that no model has, and those of the models, few, that have most matches with them."""
+    import pycolmap
+
     with open_features(database) as features:
         names = {image.image_id: name for name, image in features.images.items()}
         asked = set(pipeline.image_names) or set(names.values())
@@ -229,5 +272,6 @@ def _find_rest(
                 for one, other in ((first, second), (second, first)):
                     if one in placed and other in rest:
                         joined[one] += count
-    shared = sorted(joined, key=lambda name: (-joined[name], name))[: pipeline.max_model_overlap]
-    return sorted([*rest, *shared]) if rest else []
+    if len(rest) < pipeline.min_model_size:
+        return []
+    return sorted([*rest, *sorted(joined, key=lambda name: (-joined[name], name))[: pipeline.max_model_overlap]])

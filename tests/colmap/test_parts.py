@@ -17,6 +17,7 @@ from colmap_inertial.cli.reconstruct import Reconstruct
 from colmap_inertial.colmap.chunks import Processes, start_process
 from colmap_inertial.colmap.context import RunContext
 from colmap_inertial.colmap.parts import map_parts, prepare_part, write_part_database
+from colmap_inertial.colmap.views.gyro_orientations import ImageOrientations
 from colmap_inertial.colmap.workers import using_workers
 from colmap_inertial.core.errors import MappingError
 from colmap_inertial.core.threads import usable_processors
@@ -42,7 +43,9 @@ def options_of(ring, begin, end):
 
 def parts_in(folder: Path, ring):
     return [
-        prepare_part(ring.database, folder, options_of(ring, begin, end), folder / str(number), number)
+        prepare_part(
+            ring.database, folder, options_of(ring, begin, end), folder / str(number), number, ImageOrientations()
+        )
         for number, (begin, end) in enumerate(PARTS)
     ]
 
@@ -123,7 +126,7 @@ def test_a_part_is_kept_unless_what_it_reads_changed_or_it_is_damaged(ring, tmp_
     def prepare(number: int, database=ring.database, seed: int = 3, names=NAMES[0:18]):
         options = options_of(ring, 0, 18)
         options.image_names, options.random_seed = names, seed
-        return prepare_part(database, tmp_path, options, tmp_path / str(number), number)
+        return prepare_part(database, tmp_path, options, tmp_path / str(number), number, ImageOrientations())
 
     (made,) = map_parts([prepare(0)], Processes(number=1), registered=lambda _: None)
     assert made[0].num_reg_images() == 18

@@ -37,6 +37,7 @@ from colmap_inertial.colmap.mapping import submaps
 from colmap_inertial.colmap.mapping.mapper import map_images
 from colmap_inertial.colmap.parts import MapPart
 from colmap_inertial.colmap.settings import ColmapSettings
+from colmap_inertial.colmap.views.gyro_orientations import ImageOrientations
 from colmap_inertial.colmap.workers import Cluster, connect, describe_versions, do_for_another, using_workers
 from colmap_inertial.core.errors import (
     FormatError,
@@ -488,7 +489,14 @@ def test_features_that_others_find_are_those_that_are_found_here(tmp_path, monke
 def a_part_without_matches(folder: Path) -> Chunk:
     folder.mkdir()
     pycolmap.Database.open(str(folder / "part.db")).close()
-    return Chunk.of(MapPart(options={"random_seed": 0}), name="a part", folder=folder, images=folder, size=1, reads=0)
+    return Chunk.of(
+        MapPart(options={"random_seed": 0}, orientations=ImageOrientations()),
+        name="a part",
+        folder=folder,
+        images=folder,
+        size=1,
+        reads=0,
+    )
 
 
 def test_a_chunk_of_which_nothing_comes_is_done(cluster, tmp_path):
