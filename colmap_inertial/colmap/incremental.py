@@ -144,38 +144,50 @@ def _run_colmap(
 
 def _map_from_first_pair(work: _Work, pipeline: pycolmap.IncrementalPipelineOptions) -> pycolmap.Reconstruction | None:
     """A model that begins with the right pose of two images; ``None`` where none is found, or nothing comes of it."""
+    with tempfile.TemporaryDirectory(dir=work.scratch) as folder:
+        made, pair = Path(folder) / "made", Path(folder) / "pair"
+        options = _begin_model(work, pipeline, pair)
+        if options is None:
+            return None
+        made.mkdir()
+        model = _run_colmap(work, made, options, pair if pair.is_dir() else None).get(0)
+    return model if model is not None and model.num_reg_images() >= pipeline.min_model_size else None
+
+
+def _begin_model(
+    work: _Work, pipeline: pycolmap.IncrementalPipelineOptions, pair: Path
+) -> pycolmap.IncrementalPipelineOptions | None:
+    """Options with the first pair, if COLMAP finds its pose, or a model of this pair, written to the folder ``pair``.
+
+    ``None`` where no two images are suitable.
+    """
     import pycolmap
 
     asked = pycolmap.DatabaseCacheOptions()
     asked.min_num_matches, asked.image_names = pipeline.min_num_matches, set(pipeline.image_names)
     with pycolmap.Database.open(str(work.database)) as opened:
         mapper = pycolmap.IncrementalMapper(pycolmap.DatabaseCache.create(opened, asked))
-    begun = pycolmap.Reconstruction()
-    mapper.begin_reconstruction(begun)
+    model = pycolmap.Reconstruction()
+    mapper.begin_reconstruction(model)
     limits = pipeline.get_mapper()
     first = _choose_first_pair(work, mapper, limits)
     if first is None:
         return None
-    options, begun_in = _copy(pipeline), None
+    options = _copy(pipeline)
     options.multiple_models = False
-    with tempfile.TemporaryDirectory(dir=work.scratch) as folder:
-        made, pair = Path(folder) / "made", Path(folder) / "pair"
-        made.mkdir()
-        if first.pose is None:
-            options.init_image_id1, options.init_image_id2 = first.numbers
-            options.mapper.init_min_num_inliers = limits.init_min_num_inliers
-            options.mapper.init_min_tri_angle = limits.init_min_tri_angle
-        else:
-            _reconstruct_pair(mapper, begun, pipeline, limits, first.numbers, first.pose)
-            for number in begun.reg_image_ids():
-                if pipeline.extract_colors:
-                    begun.extract_colors_for_image(number, str(work.images))
-                work.registered()
-            pair.mkdir()
-            begun.write_binary(str(pair))
-            begun_in = pair
-        model = _run_colmap(work, made, options, begun_in).get(0)
-    return model if model is not None and model.num_reg_images() >= pipeline.min_model_size else None
+    if first.pose is None:
+        options.init_image_id1, options.init_image_id2 = first.numbers
+        options.mapper.init_min_num_inliers = limits.init_min_num_inliers
+        options.mapper.init_min_tri_angle = limits.init_min_tri_angle
+        return options
+    _reconstruct_pair(mapper, model, pipeline, limits, first.numbers, first.pose)
+    for number in model.reg_image_ids():
+        if pipeline.extract_colors:
+            model.extract_colors_for_image(number, str(work.images))
+        work.registered()
+    pair.mkdir()
+    model.write_binary(str(pair))
+    return options
 
 
 def _choose_first_pair(
