@@ -1,12 +1,13 @@
 """Real video beside bare COLMAP: processor time by step, registered images, path and scale errors, verdict.
 
     python -m scripts.benchmarks.video FOLDER [--data ../shared/data] [--sets mh01_5hz room ...] [--only
-    {bare,ours,refined,exhaustive}] [--overlap N] [--json FILE]
+    {bare,bare_exhaustive,ours,refined,exhaustive}] [--overlap N] [--json FILE]
 
 FOLDER takes captures and reconstructions. Sets: ``mh01_20hz``, ``mh01_10hz``, ``mh01_5hz`` (EuRoC MH_01, 30 s, of which
 the camera stands still in the last 14), ``room`` (a room by hand, 22 s at 8.3 Hz, rolling shutter; no truth), and the
 first 62 frames of it, ``room_62``. Both find COLMAP's default features with the camera given, one thread each, seed 0;
-bare COLMAP matches sequentially (by ``--overlap`` frames, and a quadratic overlap) and maps with its own settings.
+bare COLMAP matches sequentially (by ``--overlap`` frames, and a quadratic overlap) and maps with its own settings;
+``bare_exhaustive``, only where it is asked for, matches every pair.
 
 Bare steps are the processor time of each call, ours that between the stamps of the process' steps. ``refined`` repeats
 our metric step with ``--refine inertial``. ``exhaustive``, only where it is asked for, is ours with every pair matched;
@@ -25,6 +26,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -60,6 +62,7 @@ OPTIONS = {
     "exhaustive": ("--refine", "auto", "--mapping.pairing", "exhaustive"),
 }
 RUNS = ("bare", "ours", "refined")
+BARE = ("bare", "bare_exhaustive")
 COLUMNS = ("features", "matching", "mapping", "metric", "rest", "processor_s")
 
 
@@ -117,7 +120,10 @@ def video_of(kind: str, data: Path, folder: Path) -> Video:
 
 
 def bare(capture: Path, out: Path, overlap: int) -> Figures:
-    """COLMAP by itself: what the other process of this script does; processor time of each step."""
+    """COLMAP by itself: what the other process of this script does; processor time of each step.
+
+    Every pair is matched where the overlap is 0.
+    """
     import pycolmap
 
     pycolmap.logging.minloglevel = 2
@@ -133,7 +139,11 @@ def bare(capture: Path, out: Path, overlap: int) -> Figures:
     pycolmap.set_random_seed(0)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = 0
-    pairing = pycolmap.SequentialPairingOptions(overlap=overlap, quadratic_overlap=True)
+    pairing: dict[str, Any] = {}
+    match: Callable[..., None] = pycolmap.match_exhaustive
+    if overlap:
+        match = pycolmap.match_sequential
+        pairing["pairing_options"] = pycolmap.SequentialPairingOptions(overlap=overlap, quadratic_overlap=True)
     cpu = pycolmap.Device.cpu
     steps = {
         "features": lambda: pycolmap.extract_features(
@@ -144,10 +154,10 @@ def bare(capture: Path, out: Path, overlap: int) -> Figures:
             extraction_options=extraction,
             device=cpu,
         ),
-        "matching": lambda: pycolmap.match_sequential(
+        "matching": lambda: match(
             database,
             matching_options=matching,
-            pairing_options=pairing,
+            **pairing,
             verification_options=verification,
             device=cpu,
         ),
@@ -292,7 +302,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--data", type=Path, default=Path(__file__).parents[3] / "shared" / "data")
     parser.add_argument("--sets", nargs="*", choices=tuple(SETS), default=["mh01_5hz", "room"])
-    parser.add_argument("--only", choices=("bare", *OPTIONS))
+    parser.add_argument("--only", choices=(*BARE, *OPTIONS))
     parser.add_argument("--overlap", type=int, default=10, help="of bare COLMAP's sequential matching")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--bare", type=Path, help=argparse.SUPPRESS)
@@ -312,8 +322,8 @@ def main() -> None:
             out = args.folder / kind / ("ours" if who == "refined" else who)
             if who != "refined":
                 shutil.rmtree(out, ignore_errors=True)
-            if who == "bare":
-                measured = measure_bare(video, out, args.overlap)
+            if who in BARE:
+                measured = measure_bare(video, out, args.overlap if who == "bare" else 0)
             else:
                 measured = measure_ours(video, out, *OPTIONS[who])
             found[f"{kind} {who}"] = measured
