@@ -12,7 +12,7 @@ import logging
 import math
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterator, Set
+from collections.abc import Callable, Iterator, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -47,29 +47,10 @@ _ANY = -1
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _FirstPair:
-    """Two images that a model begins with.
-
-    Attributes
-    ----------
-    numbers
-        COLMAP's.
-    pose
-        Of ours; ``None`` where COLMAP finds the right one.
-    """
+    """Two images that a model begins with, by COLMAP's numbers, and their pose where COLMAP's own is wrong."""
 
     numbers: tuple[int, int]
     pose: RelativePose | None
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Work:
-    """Arguments of :func:`map_incrementally`."""
-
-    database: Path
-    images: Path
-    registered: Callable[[], None]
-    orientations: ImageOrientations
-    scratch: Path
 
 
 def map_incrementally(
@@ -84,135 +65,191 @@ def map_incrementally(
 ) -> dict[int, pycolmap.Reconstruction]:
     """Run COLMAP's incremental mapper; models are written to ``sparse/0``, ``sparse/1``, ...
 
-    Where cameras are known and COLMAP would begin with a wrong pose, a model begins with the pose that suits the
-    matches best. Of the images that it leaves, further models are made.
+    With known cameras and without a rig, a model begins with the pose that suits the matches of its first two images
+    best, where COLMAP would begin with a wrong one. Of the images that it leaves, further models are made. A first pair
+    that the options name is left to COLMAP.
 
     Parameters
     ----------
+    database
+        With verified matches.
+    images
+        The images' folder, for colours.
+    sparse
+        A folder that is there and takes the models.
     pipeline
         COLMAP's options.
     registered
-        Is called for each image that is placed.
+        Is called for each image that joins a model.
     orientations
-        Of the images, by the gyroscope; of those that it does not know, both poses may suit the matches.
+        By the gyroscope, of some images. Where it is unknown, both poses of a plane may suit the matches.
     scratch
         For temporary files.
+
+    Returns
+    -------
+    The models by number; none where COLMAP finds none.
     """
-    work = _Work(database=database, images=images, registered=registered, orientations=orientations, scratch=scratch)
-    known = not pipeline.ba_refine_focal_length and pipeline.init_image_id1 == pipeline.init_image_id2 == _ANY
-    own = _map_from_first_pair(work, pipeline) if known else None
-    if own is None:
-        return _run_colmap(work, sparse, pipeline)
-    models, placed = [own], _names_of(own)
+    making = _Making(
+        database=database,
+        images=images,
+        pipeline=pipeline,
+        registered=registered,
+        orientations=orientations,
+        scratch=scratch,
+    )
+    asked = making.list_names()
+    first = making.make_model(asked, [], least=min(pipeline.min_model_size, len(asked) // 2)) if asked else None
+    if first is None:
+        return making.run_colmap(sparse, pipeline)
+    models, placed = [first], _names_of(first)
     while pipeline.multiple_models and len(models) < pipeline.max_num_models:
-        asked = _copy(pipeline)
-        asked.image_names = _find_rest(database, pipeline, placed)
-        if len(asked.image_names) < pipeline.min_model_size:
+        rest = asked - placed
+        if len(rest) < pipeline.min_model_size:
             break
-        further = _map_from_first_pair(work, asked)
-        with tempfile.TemporaryDirectory(dir=scratch) as folder:
-            found = [further] if further is not None else list(_run_colmap(work, Path(folder), asked).values())
-        # images that models have both may make another by themselves
-        new = [model for model in found if _names_of(model) - placed]
-        models += new
-        placed = placed.union(*map(_names_of, new))
-        if further is None or not new:
+        further = making.make_model(rest, making.find_neighbours(rest, placed), least=pipeline.min_model_size)
+        if further is None or not _names_of(further) - placed:
             break
+        models.append(further)
+        placed |= _names_of(further)
     for number, model in enumerate(models):
         (sparse / str(number)).mkdir()
         model.write_binary(str(sparse / str(number)))
     return dict(enumerate(models))
 
 
-def _run_colmap(
-    work: _Work, sparse: Path, pipeline: pycolmap.IncrementalPipelineOptions, begun: Path | None = None
-) -> dict[int, pycolmap.Reconstruction]:
-    """COLMAP's mapper as it is, or from a model that is begun."""
-    import pycolmap
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Making:
+    """Models of a database, as :func:`map_incrementally` makes them; its arguments."""
 
-    return dict(
-        pycolmap.incremental_mapping(
-            str(work.database),
-            str(work.images),
-            str(sparse),
-            options=pipeline,
-            input_path="" if begun is None else str(begun),
-            next_image_callback=work.registered,
+    database: Path
+    images: Path
+    pipeline: pycolmap.IncrementalPipelineOptions
+    registered: Callable[[], None]
+    orientations: ImageOrientations
+    scratch: Path
+
+    def list_names(self) -> set[str]:
+        """Images to map; empty where the first pair is COLMAP's affair."""
+        pipeline = self.pipeline
+        if pipeline.ba_refine_focal_length or not pipeline.init_image_id1 == pipeline.init_image_id2 == _ANY:
+            return set()
+        with open_features(self.database) as features:
+            if any(rig.num_sensors() > 1 for rig in features.database.read_all_rigs()):
+                return set()
+            return set(pipeline.image_names) or set(features.images)
+
+    def find_neighbours(self, rest: Set[str], placed: Set[str]) -> list[str]:
+        """Images of the models, few, that have most matches with those that no model has."""
+        import pycolmap
+
+        joined = Counter[str]()
+        with open_features(self.database) as features:
+            names = {image.image_id: name for name, image in features.images.items()}
+            numbers, counts = features.database.read_two_view_geometry_num_inliers()
+            for number, count in zip(numbers, counts, strict=True):
+                first, second = (names[image] for image in pycolmap.pair_id_to_image_pair(number))
+                for one, other in ((first, second), (second, first)):
+                    if count >= self.pipeline.min_num_matches and one in placed and other in rest:
+                        joined[one] += count
+        return sorted(joined, key=lambda name: (-joined[name], name))[: self.pipeline.max_model_overlap]
+
+    def make_model(self, names: Set[str], beside: Sequence[str], *, least: int) -> pycolmap.Reconstruction | None:
+        """A model that begins with two images of some names, and may take others in.
+
+        ``None`` where no two are suitable, or fewer images than ``least`` come of it.
+        """
+        with tempfile.TemporaryDirectory(dir=self.scratch) as folder:
+            made, pair = Path(folder) / "made", Path(folder) / "pair"
+            options = self.begin_model(names, pair)
+            if options is None:
+                return None
+            options.image_names = sorted([*names, *beside])
+            made.mkdir()
+            model = self.run_colmap(made, options, pair if pair.is_dir() else None).get(0)
+        return model if model is not None and model.num_reg_images() >= least else None
+
+    def run_colmap(
+        self, sparse: Path, options: pycolmap.IncrementalPipelineOptions, begun: Path | None = None
+    ) -> dict[int, pycolmap.Reconstruction]:
+        """COLMAP's mapper, from the beginning or from a model that is begun."""
+        import pycolmap
+
+        return dict(
+            pycolmap.incremental_mapping(
+                str(self.database),
+                str(self.images),
+                str(sparse),
+                options=options,
+                input_path="" if begun is None else str(begun),
+                next_image_callback=self.registered,
+            )
         )
-    )
 
+    def begin_model(self, names: Set[str], pair: Path) -> pycolmap.IncrementalPipelineOptions | None:
+        """Options for one model, with the first pair where COLMAP finds its pose.
 
-def _map_from_first_pair(work: _Work, pipeline: pycolmap.IncrementalPipelineOptions) -> pycolmap.Reconstruction | None:
-    """A model that begins with the right pose of two images; ``None`` where none is found, or nothing comes of it."""
-    with tempfile.TemporaryDirectory(dir=work.scratch) as folder:
-        made, pair = Path(folder) / "made", Path(folder) / "pair"
-        options = _begin_model(work, pipeline, pair)
-        if options is None:
+        Else the model of this pair is written to the folder ``pair``. ``None`` where no two images are suitable.
+        """
+        import pycolmap
+
+        asked = pycolmap.DatabaseCacheOptions()
+        asked.min_num_matches, asked.ignore_watermarks = self.pipeline.min_num_matches, self.pipeline.ignore_watermarks
+        asked.image_names = set(names)
+        with pycolmap.Database.open(str(self.database)) as opened:
+            mapper = pycolmap.IncrementalMapper(pycolmap.DatabaseCache.create(opened, asked))
+        model = pycolmap.Reconstruction()
+        mapper.begin_reconstruction(model)
+        limits = self.pipeline.get_mapper()
+        limits.num_threads = 1  # threads that look ahead would change what comes next
+        options = pycolmap.IncrementalPipelineOptions()
+        options.mergedict(self.pipeline.todict())
+        options.multiple_models = False
+        first = self.choose_first_pair(mapper, limits)
+        if first is None:
             return None
-        made.mkdir()
-        model = _run_colmap(work, made, options, pair if pair.is_dir() else None).get(0)
-    return model if model is not None and model.num_reg_images() >= pipeline.min_model_size else None
-
-
-def _begin_model(
-    work: _Work, pipeline: pycolmap.IncrementalPipelineOptions, pair: Path
-) -> pycolmap.IncrementalPipelineOptions | None:
-    """Options with the first pair, if COLMAP finds its pose, or a model of this pair, written to the folder ``pair``.
-
-    ``None`` where no two images are suitable.
-    """
-    import pycolmap
-
-    asked = pycolmap.DatabaseCacheOptions()
-    asked.min_num_matches, asked.image_names = pipeline.min_num_matches, set(pipeline.image_names)
-    with pycolmap.Database.open(str(work.database)) as opened:
-        mapper = pycolmap.IncrementalMapper(pycolmap.DatabaseCache.create(opened, asked))
-    model = pycolmap.Reconstruction()
-    mapper.begin_reconstruction(model)
-    limits = pipeline.get_mapper()
-    first = _choose_first_pair(work, mapper, limits)
-    if first is None:
-        return None
-    options = _copy(pipeline)
-    options.multiple_models = False
-    if first.pose is None:
-        options.init_image_id1, options.init_image_id2 = first.numbers
-        options.mapper.init_min_num_inliers = limits.init_min_num_inliers
-        options.mapper.init_min_tri_angle = limits.init_min_tri_angle
+        if first.pose is None:
+            options.init_image_id1, options.init_image_id2 = first.numbers
+            options.init_num_trials = 1
+            options.mapper.init_min_num_inliers = limits.init_min_num_inliers
+            options.mapper.init_min_tri_angle = limits.init_min_tri_angle
+            return options
+        _reconstruct_pair(mapper, model, self.pipeline, limits, first.numbers, first.pose)
+        # as few points as COLMAP places no image by
+        if model.num_reg_images() < len(first.numbers) or model.num_points3D() < limits.abs_pose_min_num_inliers:
+            return None
+        for number in model.reg_image_ids() if self.pipeline.extract_colors else ():
+            model.extract_colors_for_image(number, str(self.images))
+        pair.mkdir()
+        model.write_binary(str(pair))
         return options
-    _reconstruct_pair(mapper, model, pipeline, limits, first.numbers, first.pose)
-    for number in model.reg_image_ids():
-        if pipeline.extract_colors:
-            model.extract_colors_for_image(number, str(work.images))
-        work.registered()
-    pair.mkdir()
-    model.write_binary(str(pair))
-    return options
 
+    def choose_first_pair(
+        self, mapper: pycolmap.IncrementalMapper, limits: pycolmap.IncrementalMapperOptions
+    ) -> _FirstPair | None:
+        """The first pair that COLMAP proposes whose pose it finds, or that has the parallax that it asks for.
 
-def _choose_first_pair(
-    work: _Work, mapper: pycolmap.IncrementalMapper, limits: pycolmap.IncrementalMapperOptions
-) -> _FirstPair | None:
-    """The first pair that COLMAP proposes whose pose it finds, or that has the parallax that it asks for.
-
-    Where there is none, the one of most parallax. The limits become as loose as COLMAP makes them.
-    """
-    best: _FirstPair | None = None
-    largest_rad = 0.0
-    with open_features(work.database) as features:
-        names = {image.image_id: name for name, image in features.images.items()}
-        for numbers, theirs in _propose_pairs(mapper, limits):
-            first, second = (names[number] for number in numbers)
-            pose = estimate_relative_pose(features, first, second, work.orientations.find_rotation(first, second))
-            if pose is None or not _is_wrong(theirs, pose):
-                best = _FirstPair(numbers=numbers, pose=None)
-                break
-            log.info("%s and %s: COLMAP begins with a wrong pose", first, second)
-            if pose.parallax_rad > largest_rad:
-                best, largest_rad = _FirstPair(numbers=numbers, pose=pose), pose.parallax_rad
-            if largest_rad >= math.radians(limits.init_min_tri_angle):
-                break
-    return best
+        Where there is none, the one of most parallax. The limits become as loose as COLMAP makes them.
+        """
+        best: _FirstPair | None = None
+        largest_rad = 0.0
+        with open_features(self.database) as features:
+            names = {image.image_id: name for name, image in features.images.items()}
+            for numbers, theirs in _propose_pairs(mapper, limits):
+                first, second = (names[number] for number in numbers)
+                rotation = self.orientations.find_rotation(first, second)
+                pose = estimate_relative_pose(features, first, second, rotation)
+                if pose is None or not _is_wrong(theirs, pose):
+                    best = _FirstPair(numbers=numbers, pose=None)
+                    break
+                log.info("%s and %s: COLMAP would begin with a wrong pose", first, second)
+                if abs(float(pose.translation[2])) >= limits.init_max_forward_motion:
+                    continue
+                if pose.parallax_rad > largest_rad:
+                    best, largest_rad = _FirstPair(numbers=numbers, pose=pose), pose.parallax_rad
+                if largest_rad >= math.radians(limits.init_min_tri_angle):
+                    break
+        return best
 
 
 def _reconstruct_pair(
@@ -257,33 +294,5 @@ def _is_wrong(theirs: pycolmap.Rigid3d, pose: RelativePose) -> bool:
     return float(np.linalg.norm(so3_log(turned))) > _LIMITS.wrong_rad
 
 
-def _copy(pipeline: pycolmap.IncrementalPipelineOptions) -> pycolmap.IncrementalPipelineOptions:
-    import pycolmap
-
-    options = pycolmap.IncrementalPipelineOptions()
-    options.mergedict(pipeline.todict())
-    return options
-
-
 def _names_of(model: pycolmap.Reconstruction) -> set[str]:
     return {model.image(number).name for number in model.reg_image_ids()}
-
-
-def _find_rest(database: Path, pipeline: pycolmap.IncrementalPipelineOptions, placed: Set[str]) -> list[str]:
-    """Images that no model has, and those of the models, few, that have most matches with them."""
-    import pycolmap
-
-    with open_features(database) as features:
-        names = {image.image_id: name for name, image in features.images.items()}
-        asked = set(pipeline.image_names) or set(names.values())
-        rest, joined = asked - placed, Counter[str]()
-        numbers, counts = features.database.read_two_view_geometry_num_inliers()
-        for number, count in zip(numbers, counts, strict=True):
-            first, second = (names[image] for image in pycolmap.pair_id_to_image_pair(number))
-            if count >= pipeline.min_num_matches and {first, second} <= asked:
-                for one, other in ((first, second), (second, first)):
-                    if one in placed and other in rest:
-                        joined[one] += count
-    if len(rest) < pipeline.min_model_size:
-        return []
-    return sorted([*rest, *sorted(joined, key=lambda name: (-joined[name], name))[: pipeline.max_model_overlap]])

@@ -93,7 +93,7 @@ def map_images(
         Whether somebody looked which pairs far apart in time join copies (``MatchRecord.judged``). Nobody does where
         every pair is matched.
     orientations
-        Of the images, by the gyroscope: a model begins with two images that turned as it did.
+        Of the images, by the gyroscope: it knows which pose of the first two images is right.
 
     Raises
     ------

@@ -146,7 +146,7 @@ class TwoViews:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RelativePose:
-    """The pose of the second of two views in the first one's frame, by their verified matches.
+    """The relative pose of two views, by their verified matches.
 
     Attributes
     ----------
