@@ -16,7 +16,8 @@ from colmap_inertial.cli import main
 from colmap_inertial.cli.reconstruct import Reconstruct
 from colmap_inertial.colmap.chunks import Processes, start_process
 from colmap_inertial.colmap.context import RunContext
-from colmap_inertial.colmap.parts import map_parts, prepare_part, write_part_database
+from colmap_inertial.colmap.mapping.part_chunks import map_parts, prepare_part
+from colmap_inertial.colmap.parts import write_part_database
 from colmap_inertial.colmap.views.gyro_orientations import ImageOrientations
 from colmap_inertial.colmap.workers import using_workers
 from colmap_inertial.core.errors import MappingError

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 from colmap_inertial.colmap.chunks import CHUNKS_FOLDER
 from colmap_inertial.colmap.context import RunContext
-from colmap_inertial.colmap.incremental import map_incrementally
 from colmap_inertial.colmap.installed import InstalledColmap
 from colmap_inertial.colmap.loops.closure import LoopClosure, MappedCapture, close_gaps
+from colmap_inertial.colmap.mapping.incremental import map_incrementally
 from colmap_inertial.colmap.mapping.submaps import join_runs, map_runs, split_capture
 from colmap_inertial.colmap.views.gyro_orientations import ImageOrientations
 from colmap_inertial.core.errors import MappingError

@@ -22,7 +22,7 @@ import numpy as np
 
 from colmap_inertial.colmap.chunks import Executor
 from colmap_inertial.colmap.loops.closure import LONGEST, LoopClosure, MappedCapture, SubmapOverlap, merge_overlaps
-from colmap_inertial.colmap.parts import map_parts, prepare_part
+from colmap_inertial.colmap.mapping.part_chunks import map_parts, prepare_part
 from colmap_inertial.io.disk import remove
 from colmap_inertial.model.submodels.graph import (
     Convergence,

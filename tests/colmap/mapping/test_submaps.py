@@ -395,7 +395,7 @@ def test_what_is_long_is_mapped_in_parts(ring, tmp_path, monkeypatch, least, pai
         asked.append(list(options.image_names))
         return incremental(*args, options=options, **more)
 
-    monkeypatch.setattr("colmap_inertial.colmap.parts.write_part_database", write_part)
+    monkeypatch.setattr("colmap_inertial.colmap.mapping.part_chunks.write_part_database", write_part)
     monkeypatch.setattr(pycolmap, "incremental_mapping", in_one_go)
     record = mapping.map_images(
         ring.database,

@@ -25,6 +25,7 @@ from colmap_inertial.colmap.features.extraction import (
     write_gravity_priors,
 )
 from colmap_inertial.colmap.mapping.mapper import MapRecord, map_images
+from colmap_inertial.colmap.views.gyro_orientations import ImageOrientations
 from colmap_inertial.core.errors import FormatError, NotObservableError, OutputExistsError
 from colmap_inertial.core.facts import Fact
 from colmap_inertial.core.options import MappingOptions, ProjectOptions, ReconstructOptions
@@ -600,9 +601,13 @@ def colmap(workspace, monkeypatch):
     def match(features, database, recording, camera, options, context):
         given["matched"] = list(recording.timing.names)
         database.write_text("matches")
-        return MatchRecord(device="cpu", pairing="exhaustive", images=2, pairs=1, matched=1, verified=1, gyroscope="")
+        counts = {"images": 2, "pairs": 1, "matched": 1, "verified": 1}
+        return MatchRecord(device="cpu", pairing="exhaustive", gyroscope="", **counts), turned
 
-    def map_them(database, images, target, *rest, **more):
+    turned = ImageOrientations(part={"0.jpg": 0}, start_from_cam_xyzw={"0.jpg": (0.0, 0.6, 0.0, 0.8)})
+
+    def map_them(database, images, target, *rest, orientations, **more):
+        assert orientations == turned
         target.mkdir()
         return MapRecord(mapper="incremental", models=1)
 

@@ -35,7 +35,7 @@ from colmap_inertial.colmap.features.chunks import ChunkSizes, FindFeatures, fin
 from colmap_inertial.colmap.features.extraction import extract_features, image_pairs, match_pairs
 from colmap_inertial.colmap.mapping import submaps
 from colmap_inertial.colmap.mapping.mapper import map_images
-from colmap_inertial.colmap.parts import MapPart
+from colmap_inertial.colmap.mapping.part_chunks import MapPart
 from colmap_inertial.colmap.settings import ColmapSettings
 from colmap_inertial.colmap.views.gyro_orientations import ImageOrientations
 from colmap_inertial.colmap.workers import Cluster, connect, describe_versions, do_for_another, using_workers

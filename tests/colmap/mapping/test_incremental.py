@@ -4,7 +4,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from colmap_inertial.colmap.incremental import map_incrementally
+from colmap_inertial.colmap.mapping.incremental import map_incrementally
 from colmap_inertial.colmap.views.gyro_orientations import ImageOrientations
 from colmap_inertial.colmap.views.two_views import estimate_relative_pose, open_features
 from colmap_inertial.core.geometry import quat_from_matrix, so3_exp, so3_log
