@@ -12,7 +12,7 @@ import logging
 import math
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence, Set
+from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,7 +20,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from colmap_inertial.colmap.views.gyro_orientations import ImageOrientations
-from colmap_inertial.colmap.views.two_views import RelativePose, estimate_relative_pose, open_features
+from colmap_inertial.colmap.views.two_views import (
+    Features,
+    RelativePose,
+    estimate_relative_pose,
+    measure_parallax_rad,
+    open_features,
+)
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import matrix_from_quat, quat_from_matrix, so3_log
 
 if TYPE_CHECKING:
@@ -34,10 +41,16 @@ class InitialPairLimits:
     """Limits for the two images that a model begins with."""
 
     #: COLMAP's pose of two views is wrong that is turned so far from the one that suits their matches best: right ones
-    #: are off by .1 to .5 degrees.
+    #: are off by .1 to .5 degrees. So is one of ours that is turned otherwise than the gyroscope.
     wrong_rad: float = math.radians(1.5)
-    #: Factors of COLMAP's least number of matches and of its least parallax, in the order in which it relaxes them.
+    #: Factors of COLMAP's least number of matches and of its least parallax, in the order in which it relaxes them ...
     relaxations: tuple[tuple[float, float], ...] = ((1, 1), (0.5, 1), (0.5, 0.5), (0.25, 0.5), (0.25, 0.25))
+    #: ... and in which they are relaxed here: few matches begin a model worse than little parallax.
+    #: At last, the one of most parallax is taken.
+    own_relaxations: tuple[tuple[float, float], ...] = (
+        *((1, 1), (1, 0.5), (1, 0.25), (0.5, 1), (0.5, 0.5), (0.5, 0.25)),
+        (1, 0),
+    )
 
 
 _LIMITS = InitialPairLimits()
@@ -205,7 +218,7 @@ class _Making:
         options = pycolmap.IncrementalPipelineOptions()
         options.mergedict(self.pipeline.todict())
         options.multiple_models = False
-        first = self.choose_first_pair(mapper, limits)
+        first = self.choose_first_pair(mapper, limits, names)
         if first is None:
             return None
         if first.pose is None:
@@ -225,31 +238,62 @@ class _Making:
         return options
 
     def choose_first_pair(
-        self, mapper: pycolmap.IncrementalMapper, limits: pycolmap.IncrementalMapperOptions
+        self, mapper: pycolmap.IncrementalMapper, limits: pycolmap.IncrementalMapperOptions, names: Set[str]
     ) -> _FirstPair | None:
-        """The first pair that COLMAP proposes whose pose it finds, or that has the parallax that it asks for.
-
-        Where there is none, the one of most parallax. The limits become as loose as COLMAP makes them.
-        """
-        best: _FirstPair | None = None
-        largest_rad = 0.0
+        """The pair that COLMAP begins with where it finds its pose, or else one of ours; the limits are relaxed."""
+        proposed = _propose_pair(mapper, limits)
+        if proposed is None:
+            return None
+        numbers, theirs = proposed
         with open_features(self.database) as features:
-            names = {image.image_id: name for name, image in features.images.items()}
-            for numbers, theirs in _propose_pairs(mapper, limits):
-                first, second = (names[number] for number in numbers)
+            of_number = {image.image_id: name for name, image in features.images.items()}
+            first, second = (of_number[number] for number in numbers)
+            rotation = self.orientations.find_rotation(first, second)
+            pose = estimate_relative_pose(features, first, second, rotation)
+            turn = matrix_from_quat(np.array(theirs.rotation.quat))
+            if pose is None or not _is_turned(pose.second_from_first, turn):
+                return _FirstPair(numbers=numbers, pose=None)
+            log.info("%s and %s: COLMAP would begin with a wrong pose", first, second)
+            return self.choose_own_pair(features, self.pipeline.get_mapper(), names)
+
+    def choose_own_pair(
+        self, features: Features, limits: pycolmap.IncrementalMapperOptions, names: Set[str]
+    ) -> _FirstPair | None:
+        """The pair of most matches that has the parallax that COLMAP asks for, or a part of it."""
+        import pycolmap
+
+        of_number = {image.image_id: name for name, image in features.images.items()}
+        least = min(of_matches for of_matches, _ in _LIMITS.own_relaxations) * limits.init_min_num_inliers
+        pairs: list[tuple[int, float, tuple[int, int]]] = []
+        numbers, counts = features.database.read_two_view_geometry_num_inliers()
+        for number, count in zip(numbers, counts, strict=True):
+            pair = pycolmap.pair_id_to_image_pair(number)
+            if count >= least and names >= {of_number[image] for image in pair}:
+                pairs.append((count, self.find_parallax_rad(features, *(of_number[image] for image in pair)), pair))
+        pairs.sort(key=lambda item: (-item[0], item[2]))
+        by_parallax = sorted(pairs, key=lambda item: -item[1])
+        for of_matches, of_parallax in _LIMITS.own_relaxations:
+            least_rad = of_parallax * math.radians(limits.init_min_tri_angle)
+            for count, parallax_rad, pair in pairs if of_parallax else by_parallax:
+                if count < of_matches * limits.init_min_num_inliers or parallax_rad < least_rad:
+                    continue
+                first, second = (of_number[image] for image in pair)
                 rotation = self.orientations.find_rotation(first, second)
                 pose = estimate_relative_pose(features, first, second, rotation)
-                if pose is None or not _is_wrong(theirs, pose):
-                    best = _FirstPair(numbers=numbers, pose=None)
-                    break
-                log.info("%s and %s: COLMAP would begin with a wrong pose", first, second)
-                if abs(float(pose.translation[2])) >= limits.init_max_forward_motion:
+                if pose is None or (rotation is not None and _is_turned(rotation, pose.second_from_first)):
                     continue
-                if pose.parallax_rad > largest_rad:
-                    best, largest_rad = _FirstPair(numbers=numbers, pose=pose), pose.parallax_rad
-                if largest_rad >= math.radians(limits.init_min_tri_angle):
-                    break
-        return best
+                if abs(float(pose.translation[2])) < limits.init_max_forward_motion:
+                    log.info("mapping begins with %s and %s", first, second)
+                    return _FirstPair(numbers=pair, pose=pose)
+        return None
+
+    def find_parallax_rad(self, features: Features, first: str, second: str) -> float:
+        """Median angle between the rays to a point, by the gyroscope's rotation where it is known."""
+        rotation = self.orientations.find_rotation(first, second)
+        if rotation is not None:
+            return measure_parallax_rad(features, first, second, rotation)
+        pose = estimate_relative_pose(features, first, second)
+        return 0.0 if pose is None else pose.parallax_rad
 
 
 def _reconstruct_pair(
@@ -274,24 +318,24 @@ def _reconstruct_pair(
     mapper.end_reconstruction(False)
 
 
-def _propose_pairs(
+def _propose_pair(
     mapper: pycolmap.IncrementalMapper, limits: pycolmap.IncrementalMapperOptions
-) -> Iterator[tuple[tuple[int, int], pycolmap.Rigid3d]]:
-    """Pairs that COLMAP would begin with, and its poses ``second_from_first``; the limits become looser."""
+) -> tuple[tuple[int, int], pycolmap.Rigid3d] | None:
+    """The pair that COLMAP would begin with, and its pose ``second_from_first``; the limits are relaxed as it does."""
     least_matches, least_deg = limits.init_min_num_inliers, limits.init_min_tri_angle
     for of_matches, of_parallax in _LIMITS.relaxations:
         limits.init_min_num_inliers = int(least_matches * of_matches)
         limits.init_min_tri_angle = least_deg * of_parallax
         mapper.reset_initialization_stats()
-        # each call leaves out what those before have found
-        while (found := mapper.find_initial_image_pair(limits, _ANY, _ANY)) is not None:
-            yield found
+        found = mapper.find_initial_image_pair(limits, _ANY, _ANY)
+        if found is not None:
+            return found
+    return None
 
 
-def _is_wrong(theirs: pycolmap.Rigid3d, pose: RelativePose) -> bool:
-    """Whether COLMAP's pose is turned otherwise than the one that suits the matches best."""
-    turned = pose.second_from_first.T @ matrix_from_quat(np.array(theirs.rotation.quat))
-    return float(np.linalg.norm(so3_log(turned))) > _LIMITS.wrong_rad
+def _is_turned(known: Array, found: Array) -> bool:
+    """Whether a rotation is surely another one than is known."""
+    return float(np.linalg.norm(so3_log(known.T @ found))) > _LIMITS.wrong_rad
 
 
 def _names_of(model: pycolmap.Reconstruction) -> set[str]:

@@ -20,7 +20,7 @@ from colmap_inertial.colmap.views.relative_track import (
     link_observations,
 )
 from colmap_inertial.core.arrays import Array, BoolArray, IndexArray, UInt8Array
-from colmap_inertial.core.geometry import matrix_from_quat, so3_exp, so3_log
+from colmap_inertial.core.geometry import cross, matrix_from_quat, so3_exp, so3_log
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.io.files import reading
 from colmap_inertial.model.database import UNREADABLE, check_records
@@ -197,10 +197,23 @@ def estimate_relative_pose(
     if views is None or not views.poses:
         return None
     ((turn, move),) = _refine_poses([views], [rotation])
-    across = views.rays[1] @ turn  # in the first one's frame
-    sine = np.linalg.norm(np.cross(views.rays[0], across), axis=1)
-    parallax_rad = np.arctan2(sine, np.sum(views.rays[0] * across, axis=1))
-    return RelativePose(second_from_first=turn, translation=move, parallax_rad=float(np.median(parallax_rad)))
+    parallax_rad = _measure_parallax_rad(views.rays[0], views.rays[1], turn)
+    return RelativePose(second_from_first=turn, translation=move, parallax_rad=parallax_rad)
+
+
+def measure_parallax_rad(features: Features, first: str, second: str, second_from_first: Array) -> float:
+    """Median angle between the two rays to a point, of all verified matches of two views whose rotation is known."""
+    matches = features.matches(first, second)
+    rays_first, rays_second = (
+        _unit_rays(features.camera(name), features.xy_px(name)[matches[:, k]]) for k, name in enumerate((first, second))
+    )
+    return _measure_parallax_rad(rays_first, rays_second, second_from_first)
+
+
+def _measure_parallax_rad(rays_first: Array, rays_second: Array, second_from_first: Array) -> float:
+    turned = rays_first @ second_from_first.T
+    sine = np.linalg.norm(cross(turned, rays_second), axis=1)
+    return float(np.nanmedian(np.arctan2(sine, np.sum(turned * rays_second, axis=1))))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
