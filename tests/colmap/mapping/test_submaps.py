@@ -406,7 +406,7 @@ def test_what_is_long_is_mapped_in_parts(ring, tmp_path, monkeypatch, least, pai
         in_time=NAMES,
     )
     expected = runs(FRAMES, longest=18, shared=6)
-    assert asked == ([NAMES[begin:end] for begin, end in expected] if in_parts else [[]])
+    assert asked == ([NAMES[begin:end] for begin, end in expected] if in_parts else [NAMES])
     assert bool(record.seams) == in_parts and all(seam.joined for seam in record.seams)
     number = len(expected) if in_parts else 1
     assert record == mapping.MapRecord(mapper="incremental", models=1, parts=number, seams=record.seams)
