@@ -173,7 +173,7 @@ def solve(problem: Problem, start: Estimate, *, most_steps: int = SOLVE.steps) -
     steps, stretch = 0, 1.0
     for steps in range(1, most_steps + 1):
         by, residual = _weight_rows(problem, at)
-        gained = pushed = False
+        gained = pushed = at_rest = False
         while not gained and not damping.is_exhausted:
             system = _build_system(problem, layout, at, by, residual, damping.value)
             step = _find_step(system, rows, by)
@@ -181,9 +181,12 @@ def solve(problem: Problem, start: Estimate, *, most_steps: int = SOLVE.steps) -
                 damping.grow()
                 continue
             promised = _predict_decrease(problem, at, residual, step)
-            if promised - _predict_decrease_by_points(system) < SOLVE.settled:
+            of_points = _predict_decrease_by_points(system)
+            # what frames promise is settled: points that promise more are false, if no step to them brings anything
+            at_rest |= damping.value <= SOLVE.rest_damping and promised - of_points < SOLVE.settled
+            if promised - min(of_points, SOLVE.settled_point * len(system.pull)) < SOLVE.settled:
                 if damping.value <= SOLVE.rest_damping or pushed:
-                    return _make_solution(at, steps, converged=damping.value <= SOLVE.rest_damping)
+                    return _make_solution(at, steps, converged=at_rest)
                 damping, pushed = _Damping(value=SOLVE.rest_damping), True
                 continue
             tried, length = _try_step(problem, at, step, stretch, promised)
@@ -198,7 +201,7 @@ def solve(problem: Problem, start: Estimate, *, most_steps: int = SOLVE.steps) -
             share = (2 * length - ratio) / length**2
             stretch = 1 / min(max(share, 1 / SOLVE.longest_stretch), 1.0)
         if not gained:
-            break
+            return _make_solution(at, steps, converged=at_rest)
     return _make_solution(at, steps, converged=False)
 
 
@@ -212,9 +215,8 @@ def _try_step(problem: Problem, at: _Point, step: Step, stretch: float, promised
 
 
 def _predict_decrease_by_points(system: System) -> float:
-    """Decrease of the cost that points by themselves promise, as far as a false one that creeps on may hide it."""
-    of_points = 0.5 * float(np.einsum("pi,pij,pj->", system.pull, system.inverse, system.pull))
-    return min(of_points, SOLVE.settled_point * len(system.pull))
+    """Decrease of the cost that points by themselves promise."""
+    return 0.5 * float(np.einsum("pi,pij,pj->", system.pull, system.inverse, system.pull))
 
 
 def _find_step(system: System, observations: Observations, by: Derivatives) -> Step | None:

@@ -271,6 +271,16 @@ def test_what_only_damping_holds_is_not_at_rest(small, monkeypatch):
     assert not solve(problem, off).converged
 
 
+def test_points_that_no_step_mends_do_not_keep_frames_from_rest(small, monkeypatch):
+    """Points that are off alone promise much, and frames nothing beyond them."""
+    _, problem, start, _ = small
+    rested = solve(problem, start).estimate
+    off = rested.points_m + 3e-4 * np.random.default_rng(4).standard_normal(rested.points_m.shape)
+    monkeypatch.setattr(solver, "_evaluate", lambda *given: replace(_evaluate(*given), cost=0.0))
+    assert solve(problem, replace(rested, points_m=off)).converged
+    assert not solve(problem, nudged(rested, np.random.default_rng(3), 2e-3)).converged
+
+
 def test_frames_that_hardly_see_anything_stop_nothing(subtests, small):
     for fewest in (0, 2):
         with subtests.test(fewest=fewest):
