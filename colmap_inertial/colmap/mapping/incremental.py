@@ -253,8 +253,9 @@ class _Making:
             turn = matrix_from_quat(np.array(theirs.rotation.quat))
             if pose is None or not _is_turned(pose.second_from_first, turn):
                 return _FirstPair(numbers=numbers, pose=None)
-            log.info("%s and %s: COLMAP would begin with a wrong pose", first, second)
-            return self.choose_own_pair(features, self.pipeline.get_mapper(), names)
+            log.info("%s and %s: COLMAP would begin with another pose", first, second)
+            own = self.choose_own_pair(features, self.pipeline.get_mapper(), names)
+            return own if own is not None or pose.unique else _FirstPair(numbers=numbers, pose=None)
 
     def choose_own_pair(
         self, features: Features, limits: pycolmap.IncrementalMapperOptions, names: Set[str]
@@ -280,7 +281,9 @@ class _Making:
                 first, second = (of_number[image] for image in pair)
                 rotation = self.orientations.find_rotation(first, second)
                 pose = estimate_relative_pose(features, first, second, rotation)
-                if pose is None or (rotation is not None and _is_turned(rotation, pose.second_from_first)):
+                if pose is None or not pose.unique:
+                    continue
+                if rotation is not None and _is_turned(rotation, pose.second_from_first):
                     continue
                 if abs(float(pose.translation[2])) < limits.init_max_forward_motion:
                     log.info("mapping begins with %s and %s", first, second)
@@ -293,7 +296,7 @@ class _Making:
         if rotation is not None:
             return measure_parallax_rad(features, first, second, rotation)
         pose = estimate_relative_pose(features, first, second)
-        return 0.0 if pose is None else pose.parallax_rad
+        return 0.0 if pose is None or not pose.unique else pose.parallax_rad
 
 
 def _reconstruct_pair(

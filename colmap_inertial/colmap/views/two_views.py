@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,6 +46,10 @@ class TwoViewLimits:
     #: Poses suit the matches alike up to this factor; shares of points in front are alike up to this difference.
     alike: float = 1.2
     as_many: float = 0.1
+    #: A pose is surely the right one where all others suit the matches worse by this factor: medians of 200 distances
+    #: scatter by a tenth. Poses that turn alike to so much are one.
+    sure: float = 1.4
+    one_rad: float = math.radians(1.0)
     #: A frame is localised by so many points of the track at least.
     least_placed: int = 12
     #: How far off they may lie.
@@ -156,11 +161,14 @@ class RelativePose:
         (3,) unit vector, frame of the second view.
     parallax_rad
         Median angle between the two rays to a point.
+    unique
+        Whether all other poses suit the matches clearly worse, or the gyroscope knows which is right.
     """
 
     second_from_first: Array
     translation: Array
     parallax_rad: float
+    unique: bool
 
 
 def compare(database: Path, pairs: Sequence[tuple[str, str]]) -> TwoViews:
@@ -177,7 +185,7 @@ def compare(database: Path, pairs: Sequence[tuple[str, str]]) -> TwoViews:
         for begin in range(0, len(pairs), _LIMITS.at_once):
             some = [_MatchedViews.read(features, pair, points) for pair in pairs[begin : begin + _LIMITS.at_once]]
             solved = [(begin + k, views) for k, views in enumerate(some) if views is not None and views.poses]
-            for (place, views), (turn, _) in zip(solved, _refine_poses([of for _, of in solved]), strict=True):
+            for (place, views), (turn, *_) in zip(solved, _refine_poses([of for _, of in solved]), strict=True):
                 rotations[place], covered[place] = turn.T, views.measure_coverage(turn)
     return TwoViews(first_from_second=rotations, covered=covered)
 
@@ -196,9 +204,9 @@ def estimate_relative_pose(
     views = _MatchedViews.read(features, (first, second), {})
     if views is None or not views.poses:
         return None
-    ((turn, move),) = _refine_poses([views], [rotation])
+    ((turn, move, unique),) = _refine_poses([views], [rotation])
     parallax_rad = _measure_parallax_rad(views.rays[0], views.rays[1], turn)
-    return RelativePose(second_from_first=turn, translation=move, parallax_rad=parallax_rad)
+    return RelativePose(second_from_first=turn, translation=move, parallax_rad=parallax_rad, unique=unique)
 
 
 def measure_parallax_rad(features: Features, first: str, second: str, second_from_first: Array) -> float:
@@ -269,10 +277,11 @@ class _MatchedViews:
 
 def _refine_poses(
     pairs: Sequence[_MatchedViews], rotations: Sequence[Array | None] | None = None
-) -> list[tuple[Array, Array]]:
-    """Each pair's ``second_from_first`` and unit translation: those that suit its matches best once refined.
+) -> list[tuple[Array, Array, bool]]:
+    """Each pair's ``second_from_first`` and unit translation that suit its matches best once refined; whether no others
+    do alike.
 
-    Of those that do alike, the one counts that is turned as known beforehand, where rotations are given.
+    Of those that do, the one counts that is turned as known beforehand, where rotations are given.
     """
     if not pairs:
         return []
@@ -287,7 +296,10 @@ def _refine_poses(
         else:
             turned_rad = np.linalg.norm(so3_log(known.T @ refined.second_from_first[own]), axis=1)
             chosen = begin + int(np.argmin(np.where(_are_alike(refined.usual_rad[own]), turned_rad, np.inf)))
-        best.append((refined.second_from_first[chosen], refined.translation[chosen]))
+        others = refined.second_from_first[own][_are_alike(refined.usual_rad[own], _LIMITS.sure)]
+        apart_rad = np.linalg.norm(so3_log(refined.second_from_first[chosen].T @ others), axis=1)
+        unique = known is not None or bool(apart_rad.max() < _LIMITS.one_rad)
+        best.append((refined.second_from_first[chosen], refined.translation[chosen], unique))
         begin = own.stop
     return best
 
@@ -299,9 +311,9 @@ def _choose_pose(usual_rad: Array, in_front: Array) -> int:
     return int(np.argmin(np.where(alike, usual_rad, np.inf)))
 
 
-def _are_alike(usual_rad: Array) -> BoolArray:
+def _are_alike(usual_rad: Array, factor: float = _LIMITS.alike) -> BoolArray:
     """Which poses suit the matches about as well as the best one."""
-    return np.asarray(usual_rad <= _LIMITS.alike * usual_rad.min())
+    return np.asarray(usual_rad <= factor * usual_rad.min())
 
 
 def _solve_pose(
