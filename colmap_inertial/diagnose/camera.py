@@ -74,7 +74,7 @@ _LIMITS = CameraCheckLimits()
 #: What is wrong with a gyroscope's own numbers keeps it from fitting the camera: it is named once.
 _OF_THE_GYROSCOPE = frozenset({*UNIT_FACTORS, "gyro-unit", "sensors-exchanged", "dead-sensor", "dead-axis"})
 #: Why camera and gyroscope cannot be aligned at any offset of their clocks.
-_TOO_LITTLE_ROTATION = frozenset({"camera-hardly-rotates", "rotation-axis-open"})
+TOO_LITTLE_ROTATION = frozenset({"camera-hardly-rotates", "rotation-axis-open"})
 
 
 def _find_mirroring(recorded: Recorded, imu: ImuRecording) -> Finding:
@@ -104,7 +104,7 @@ def check_belonging(recorded: Recorded) -> Iterator[Finding]:
     if recorded.wrong_unit is not None:
         yield _unit_finding(recorded.wrong_unit)
         return
-    if failed.code in _TOO_LITTLE_ROTATION:
+    if failed.code in TOO_LITTLE_ROTATION:
         yield Finding(fact=Fact("rotation-too-little", why=failed.fact), severity="error")
         return
     otherwise = _find_better_fit(recorded, imu)

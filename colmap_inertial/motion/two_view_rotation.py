@@ -1,8 +1,9 @@
 """Rotation of a camera between images seconds apart: photographs, keyframes, frames cut once a second.
 
 There the camera has moved, too, and the pixels' motion is no rotation. Features are matched, the geometry of two views
-with unknown translation is fitted (the five-point method of Nister, 2004, and RANSAC), and a rotation is kept only
-where it agrees with those to the image after: around a triangle of three images rotations must close.
+with unknown translation is fitted (the five-point method of Nister, 2004, and RANSAC) and refined (``epipolar``). A
+rotation is kept only where it agrees with those to the image after: around a triangle of three images rotations must
+close.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from colmap_inertial.core.arrays import Array, Float32Array, IndexArray
 from colmap_inertial.core.geometry import so3_log
 from colmap_inertial.core.types import FrameTiming, Projector
 from colmap_inertial.imaging.rolling_shutter import append_unit_depth
+from colmap_inertial.motion.epipolar import refine_poses
 from colmap_inertial.motion.flow import GreyFrame, VisualRotation
 
 #: Longer side of images that are compared (the 45 of the desk: 6.2 CPU-s, 10.8 at 640 px; rotations differ by .07
@@ -33,10 +35,10 @@ class TwoViewLimits:
     least_matches: int = 40
     #: How far a match may lie off, px of the reduced image.
     off_px: float = 1.5
-    #: Matches that one rotation explains to within this, px of the reduced image,
+    #: Matches weigh less in the rotation of a camera that did not move beyond so much, px of the reduced image.
     turned_px: float = 3.0
-    #: are of a camera that did not move, where they are more than this share.
-    turned_share: float = 0.8
+    #: Matches of a pair that its pose is refined by.
+    refined_matches: int = 200
     #: A match is clear where the second best is this much further away.
     ratio: float = 0.8
     #: Three rotations around a triangle close to within this.
@@ -142,13 +144,21 @@ def _estimate_rotation(first: _Features, second: _Features) -> tuple[Array, int]
         return None
     kept = inside.ravel() > 0
     a, b = a[kept], b[kept]
-    turned, share = _fit_pure_rotation(a, b, _LIMITS.turned_px * first.pixel_rad)
-    if share > _LIMITS.turned_share:
-        return turned, int(share * len(a))
-    count, second_from_first, _, _ = cv2.recoverPose(essential, a, b, np.eye(3))
-    if count < _LIMITS.least_matches:
-        return None
-    return np.asarray(second_from_first, dtype=np.float64).T, int(count)
+    a, b = (_unit_rays(rays) for rays in (a, b))
+    pure = _fit_pure_rotation(a, b, _LIMITS.turned_px * first.pixel_rad).T
+    *twins, move = cv2.decomposeEssentialMat(essential)
+    # half a turn about the translation apart
+    nearest = min(twins, key=lambda turn: float(np.linalg.norm(so3_log(pure.T @ turn))))
+    some = np.linspace(0, len(a) - 1, _LIMITS.refined_matches).astype(np.intp)
+    rays = np.stack([a[some], b[some]])[:, None].repeat(2, axis=1)
+    # of a camera that hardly moved, the essential matrix is poor
+    found = refine_poses(np.stack([nearest, pure]), np.stack([move.ravel()] * 2), *rays)
+    return found.second_from_first[int(np.argmin(found.usual_rad))].T, len(a)
+
+
+def _unit_rays(rays: Array) -> Array:
+    rays = append_unit_depth(rays)
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 
 def _match_descriptors(first: Float32Array, second: Float32Array) -> IndexArray:
@@ -162,14 +172,12 @@ def _match_descriptors(first: Float32Array, second: Float32Array) -> IndexArray:
     return np.stack([clear, nearest[clear]], axis=1)
 
 
-def _fit_pure_rotation(a: Array, b: Array, reach: float) -> tuple[Array, float]:
-    """The rotation ``a_from_b`` that turns most rays into each other, and the share that it explains."""
-    a, b = (append_unit_depth(rays) for rays in (a, b))
-    a, b = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (a, b))
+def _fit_pure_rotation(a: Array, b: Array, reach: float) -> Array:
+    """The rotation ``a_from_b`` that turns most unit rays into each other."""
     weight = np.ones(len(a))
     for _ in range(10):
         u, _, vt = np.linalg.svd((a * weight[:, None]).T @ b)
         rotation = u @ np.diag([1.0, 1.0, float(np.linalg.det(u @ vt))]) @ vt
         off = np.linalg.norm(a - b @ rotation.T, axis=1)
         weight = 1 / (1 + (off / reach) ** 2) ** 2
-    return rotation, float(np.mean(off < reach))
+    return np.asarray(rotation)

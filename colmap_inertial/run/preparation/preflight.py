@@ -17,6 +17,7 @@ from colmap_inertial.core.progress import Progress, report_each
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import CameraTrajectory, FrameTiming, ImuRecording
 from colmap_inertial.diagnose import Diagnosis, FramesInVideo, Recorded, diagnose
+from colmap_inertial.diagnose.camera import TOO_LITTLE_ROTATION
 from colmap_inertial.imaging.detail import is_blank
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import read_record, write_json, write_record
@@ -27,6 +28,7 @@ from colmap_inertial.io.recording import Recording
 from colmap_inertial.io.video import decode_grey, video_stamps_ns
 from colmap_inertial.io.video_match import match_to_video
 from colmap_inertial.model import colmap_camera
+from colmap_inertial.motion.align import Alignment
 from colmap_inertial.motion.flow import GreyFrame, VisualRotation
 from colmap_inertial.motion.two_view_rotation import measure_two_view_rotations
 from colmap_inertial.run.preparation.frame_reading import COMPARED, FOLLOWED, GLANCED_AT, WHOLE, GreyFrames
@@ -50,8 +52,10 @@ class PreflightEffort:
     frames: int = 400
     frame_spacing_s: float = 0.03
     video_step_s: float = 0.13
-    #: Images further apart that are compared two by two.
+    #: Images further apart that are compared two by two; those of a video that are, and how far apart at least.
     compared: int = 60
+    compared_in_video: int = 100
+    compared_spacing_s: float = 0.1
     #: Of those, so many are kept in full, where an exposure that nobody states is estimated by them: 0.2 GB of HD.
     in_full: int = 100
     #: Images that are looked for in the video they were cut from.
@@ -124,6 +128,10 @@ def add_images(recorded: Recorded, capture: Capture, progress: Progress, frames:
         if recorded.imu is not None and recorded.camera is not None and timing.exposure_s is None:
             seen.expect(WHOLE, in_full)
         rotation = reader.attempt(lambda: measure_images(seen, progress, looked))
+        if rotation is not None and _is_video(timing) and _is_doubtful(replace(recorded, rotation=rotation)):
+            compared = reader.attempt(lambda: _compare_images(seen, _choose_compared(timing), progress, lambda _: None))
+            if compared is not None and isinstance(replace(recorded, rotation=compared).aligned, Alignment):
+                rotation = compared
     in_video = reader.attempt(lambda: find_in_video(capture, timing, progress))
     return replace(
         recorded,
@@ -233,10 +241,34 @@ def measure_images(frames: GreyFrames, progress: Progress, looked: dict[str, boo
     frames.expect(FOLLOWED if is_video else COMPARED, names)
     camera = frames.guess_camera()
     if is_video:
+        frames.expect(COMPARED, _choose_compared(timing))  # where the gyroscope does not fit
         return measure_sampled_rotation(frames, camera, indices, progress, stage="check", look=look)
+    return _compare_images(frames, names, progress, look)
+
+
+def _compare_images(
+    frames: GreyFrames, names: Sequence[str], progress: Progress, look: Callable[[GreyFrame], None]
+) -> VisualRotation:
+    """The rotation between images by two views each."""
     compared = report_each(frames.look(COMPARED, names), len(names), "check", progress)
     with one_blas_thread():
-        return measure_two_view_rotations(show_frames(compared, look), colmap_camera(camera), timing)
+        camera = colmap_camera(frames.guess_camera())
+        return measure_two_view_rotations(show_frames(compared, look), camera, frames.timing)
+
+
+def _is_doubtful(recorded: Recorded) -> bool:
+    """Whether the gyroscope does not fit frames that were followed, which take a moving camera's parallax for rotation.
+
+    The geometry of two views knows it apart.
+    """
+    failed = recorded.aligned
+    return isinstance(failed, NotObservableError) and failed.code not in TOO_LITTLE_ROTATION
+
+
+def _choose_compared(timing: FrameTiming) -> list[str]:
+    """Names of the frames of a video that are compared two by two."""
+    indices = sample_beginning(timing, _EFFORT.compared_spacing_s, _EFFORT.compared_in_video)
+    return names_at(timing, indices)
 
 
 def _is_video(timing: FrameTiming) -> bool:
