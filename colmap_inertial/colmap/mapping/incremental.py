@@ -2,8 +2,7 @@
 
 Of two views of what passes as a plane there are two poses, and views in close succession pass as those of a plane,
 whatever they show. COLMAP begins a model with the pose by a homography then, and takes it for the parallax that it
-wants: of EuRoC MH_01 at 20 Hz it is off by 5 to 20 degrees for most pairs that COLMAP tries. A model that begins so
-never gets rid of it.
+wants. A model that begins so hardly ever gets rid of it.
 """
 
 from __future__ import annotations
@@ -40,8 +39,8 @@ log = logging.getLogger(__name__)
 class InitialPairLimits:
     """Limits for the two images that a model begins with."""
 
-    #: COLMAP's pose of two views is wrong that is turned so far from the one that suits their matches best: right ones
-    #: are off by .1 to .5 degrees. So is one of ours that is turned otherwise than the gyroscope.
+    #: COLMAP's pose of two views is wrong that is turned so far from the one that suits their matches best; so is one
+    #: of ours that is turned so far from the gyroscope's.
     wrong_rad: float = math.radians(1.5)
     #: Factors of COLMAP's least number of matches and of its least parallax, in the order in which it relaxes them ...
     relaxations: tuple[tuple[float, float], ...] = ((1, 1), (0.5, 1), (0.5, 0.5), (0.25, 0.5), (0.25, 0.25))
@@ -214,7 +213,6 @@ class _Making:
         model = pycolmap.Reconstruction()
         mapper.begin_reconstruction(model)
         limits = self.pipeline.get_mapper()
-        limits.num_threads = 1  # threads that look ahead would change what comes next
         options = pycolmap.IncrementalPipelineOptions()
         options.mergedict(self.pipeline.todict())
         options.multiple_models = False

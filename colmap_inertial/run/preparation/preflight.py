@@ -56,7 +56,8 @@ class PreflightEffort:
     compared: int = 60
     compared_in_video: int = 100
     compared_spacing_s: float = 0.1
-    #: Of those, so many are kept in full, where an exposure that nobody states is estimated by them: 0.2 GB of HD.
+    #: Of images that are looked at, so many are kept in full, where an exposure that nobody states is estimated by
+    #: them: 0.2 GB of HD.
     in_full: int = 100
     #: Images that are looked for in the video they were cut from.
     images_in_video: int = 60
@@ -239,10 +240,9 @@ def measure_images(frames: GreyFrames, progress: Progress, looked: dict[str, boo
     names = names_at(timing, indices)
     frames.expect(GLANCED_AT, names)
     frames.expect(FOLLOWED if is_video else COMPARED, names)
-    camera = frames.guess_camera()
     if is_video:
         frames.expect(COMPARED, _choose_compared(timing))  # where the gyroscope does not fit
-        return measure_sampled_rotation(frames, camera, indices, progress, stage="check", look=look)
+        return measure_sampled_rotation(frames, frames.guess_camera(), indices, progress, stage="check", look=look)
     return _compare_images(frames, names, progress, look)
 
 
